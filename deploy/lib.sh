@@ -1,0 +1,70 @@
+# Sourced by the scripts beside it: sets `root` and, through `environment`, makes `.venv`.
+# Needs Python 3.11 (with venv), flock and sha256sum; everything else comes with pip.
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
+venv=$root/.venv
+stamp=$venv/xrl.stamp       # what the environment was made from; absent while it is being made
+half_made=$venv/xrl.making  # stands from the first to the last step of making it
+
+say() { printf '%s\n' "deploy: $*" >&2; }
+die() { say "$*"; exit 1; }
+
+# The environment is right while this stays the same; scripts in it hold its absolute path.
+fingerprint() {
+  { printf '%s\n' "$root"; cat "$root/requirements.lock" "$root/pyproject.toml"; } | sha256sum
+}
+
+is_current() { [ -x "$venv/bin/python" ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(fingerprint)" ]; }
+
+# Not the first of its name only: a version manager's shim may stand before the real one.
+find_python() {
+  local candidate
+  while read -r candidate; do
+    if "$candidate" -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))' \
+      2>/dev/null; then
+      printf '%s\n' "$candidate"
+      return
+    fi
+  done < <(type -aP python3.11 python3 python)
+  die "no Python 3.11 with its venv module on PATH; install it (Debian, Ubuntu: python3.11 and" \
+    "python3.11-venv) and try again"
+}
+
+venv_is_sound() { [ ! -e "$half_made" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1; }
+
+make_environment() {
+  local python
+  rm -f "$stamp"
+  if ! venv_is_sound; then
+    python=$(find_python) || exit 1
+    say "making .venv with $("$python" --version) (once; a minute or two)"
+    mkdir -p "$venv" && : >"$half_made"  # the mark stands while what was there before goes
+    find "$venv" -mindepth 1 ! -path "$half_made" -delete
+    "$python" -m venv "$venv" || die "$python -m venv failed, see above"
+  else
+    say "bringing .venv up to date"
+    : >"$half_made"
+  fi
+  "$venv/bin/python" -m pip install --quiet --requirement "$root/requirements.lock" &&
+    "$venv/bin/python" -m pip install --quiet --no-deps --editable "$root" ||
+    die "pip could not install the locked packages, see above; the next try starts afresh"
+  fingerprint >"$stamp"
+  rm -f "$half_made"
+}
+
+# Make `.venv` from the lock file, or do nothing, quickly, if it is right already.
+# Two at once: the second waits. Stopped in the middle: the next one starts afresh.
+environment() {
+  is_current && return
+  command -v flock >/dev/null || die "flock is missing (package util-linux)"
+  exec 9<"$root"
+  flock --nonblock 9 || { say "waiting for another script that is making .venv"; flock 9; }
+  is_current || make_environment
+  exec 9<&-
+}
+
+# Become the verb of the command line: no shell stands between a Ctrl-C and the tool.
+xrl() {
+  environment
+  exec "$venv/bin/xrl" "$@"
+}

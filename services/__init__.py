@@ -1,0 +1,1 @@
+"""The processes of the runtime. A service imports `shared` and itself, no other service."""

@@ -1,0 +1,58 @@
+"""`python -m services.harness`: the harness sensor's service."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from services.harness.filter import WrenchFilter
+from services.harness.loop import HarnessLoop, run
+from services.harness.sensor import CanHarnessSensor
+from shared import bus, log, process, topics
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig, expand
+from shared.messages import Wrench
+
+FIFO_PRIORITY = 10
+"""Below the joint services and the planner: the wrench steers slow things only."""
+
+
+def main() -> int:
+    """Run the service until SIGTERM or SIGINT; return the exit code."""
+    parser = process.service_parser(__doc__ or "", "python -m services.harness")
+    arguments = parser.parse_args()
+    logger = log.setup("harness")
+    config = process.load_config(arguments.config)
+    sensor = make_sensor(config, arguments.run_dir)
+    law = WrenchFilter(config.harness)
+    stop = process.StopFlag()
+    granted = process.raise_priority(FIFO_PRIORITY)
+    with bus.open_session(config, "harness", arguments.run_dir) as session:
+        loop = HarnessLoop(sensor, law, session.publisher(topics.WRENCH, Wrench))
+        logger.info("started at %g Hz, priority %s", config.harness.rate_hz, granted)
+        process.freeze_garbage()
+        run(loop, config.harness.rate_hz, stop)
+    sensor.close()
+    logger.info(
+        "stopped: %d cycles, %d skipped, %d unsent, link opened %d times; "
+        "samples not finite %d, frames malformed %d",
+        loop.cycles,
+        loop.skipped,
+        loop.unsent,
+        sensor.opened,
+        loop.state.refused,
+        sensor.malformed,
+    )
+    return 0
+
+
+def make_sensor(config: RobotConfig, run_dir: Path) -> CanHarnessSensor:
+    """Return the sensor on the bus that the robot file names."""
+    harness = config.harness
+    link = config.can[harness.bus]
+    # At a low rate every read comes later than stale_ms: two periods are no pause.
+    pause_ns = max(harness.stale_ms * NS_PER_MS, 2.0 * NS_PER_S / harness.rate_hz)
+    return CanHarnessSensor(link.interface, expand(link.channel, run_dir), pause_ns=round(pause_ns))
+
+
+if __name__ == "__main__":
+    process.run_service(main)

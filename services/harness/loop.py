@@ -1,0 +1,82 @@
+"""The loop of the harness service: read, filter, publish."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from services.harness import filter as wrench_filter
+from services.harness.filter import FilterState, WrenchFilter
+from services.harness.sensor import HarnessSensor
+from shared import clock
+from shared.messages import Wrench
+
+
+class Publisher(Protocol):
+    """Where the wrench goes."""
+
+    def put(self, message: Wrench) -> bool:
+        """Send without waiting; False if it could not be sent."""
+
+
+class Stop(Protocol):
+    """Something that becomes true when the loop is to end."""
+
+    def __bool__(self) -> bool:
+        """Return True to stop."""
+
+
+class HarnessLoop:
+    """One cycle of the service, on whatever clock it is called with."""
+
+    def __init__(self, sensor: HarnessSensor, law: WrenchFilter, publisher: Publisher) -> None:
+        """Begin with a tare."""
+        self.state: FilterState = wrench_filter.initial_state()
+        self.cycles = 0
+        self.skipped = 0
+        """Deadlines that were missed and not made up for."""
+        self.unsent = 0
+        self._sensor = sensor
+        self._law = law
+        self._publisher = publisher
+
+    def cycle(self, now_ns: int) -> Wrench:
+        """Read, filter, publish; return what was published.
+
+        The wrench is in torso axes: the sensor is fixed to the torso and knows no other.
+        """
+        sample = self._sensor.read(now_ns)
+        self.state, reading = self._law.step(self.state, now_ns, sample)
+        fx, fy, fz, mx, my, mz = reading.wrench.tolist()
+        message = Wrench(
+            t_ns=now_ns,
+            seq=self.cycles,
+            force=(fx, fy, fz),
+            moment=(mx, my, mz),
+            valid=reading.valid,
+            saturated=reading.saturated,
+            age_ns=reading.age_ns,
+        )
+        self.unsent += not self._publisher.put(message)
+        self.cycles += 1
+        return message
+
+    def tare(self) -> None:
+        """Begin the tare anew; the harness must be unloaded."""
+        self.state = wrench_filter.start_tare(self.state)
+
+
+def next_deadline(deadline_ns: int, period_ns: int, now_ns: int) -> tuple[int, int]:
+    """Return the next deadline after now on the grid of periods, and how many were missed."""
+    missed = max(0, (now_ns - deadline_ns) // period_ns)
+    return deadline_ns + (missed + 1) * period_ns, missed
+
+
+def run(loop: HarnessLoop, rate_hz: float, stop: Stop) -> None:
+    """Run cycles at `rate_hz` until told to stop; missed ones are skipped, not piled up."""
+    period_ns = round(clock.NS_PER_S / rate_hz)
+    deadline_ns = clock.now_ns()
+    while not stop:
+        loop.cycle(clock.now_ns())
+        deadline_ns, missed = next_deadline(deadline_ns, period_ns, clock.now_ns())
+        loop.skipped += missed
+        clock.sleep_until(deadline_ns)

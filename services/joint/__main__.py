@@ -1,0 +1,66 @@
+"""`python -m services.joint MODULE`: the service of one module."""
+
+from __future__ import annotations
+
+from services.joint.controller import JointController
+from services.joint.drivers.odrive_can import OdriveCan
+from services.joint.loop import JointLoop, Ports
+from shared import config, log, topics
+from shared.bus import open_session
+from shared.config import CanConfig, RobotConfig
+from shared.joints import MODULES
+from shared.messages import Estop, JointCommand, JointEvent, JointState
+from shared.process import (
+    StopFlag,
+    freeze_garbage,
+    raise_priority,
+    run_service,
+    service_parser,
+)
+
+FIFO_PRIORITY = 20
+"""Above the planner: this tier stands when the others do not get the processor."""
+
+
+def main() -> int:
+    """Wire the controller to its drive and the bus and run it."""
+    parser = service_parser(
+        "Control one 2-DOF module.", "python -m services.joint ankle_right --run-dir /tmp/xrl"
+    )
+    parser.add_argument("module", choices=MODULES)
+    arguments = parser.parse_args()
+    module: str = arguments.module
+    logger = log.setup(module)
+    robot = config.load(arguments.config)
+    stop = StopFlag()
+    granted = raise_priority(FIFO_PRIORITY)
+    with open_session(robot, module, arguments.run_dir) as session:
+        ports = Ports(
+            commands=session.latest(topics.JOINT_COMMAND, JointCommand, module),
+            estops=session.latest(topics.ESTOP, Estop),
+            states=session.publisher(topics.JOINT_STATE, JointState, module),
+            events=session.publisher(topics.JOINT_EVENT, JointEvent, module),
+        )
+        drive = open_drive(robot, module, str(arguments.run_dir))
+        loop = JointLoop(robot, JointController(robot, module), drive, ports)
+        logger.info("up, %s", granted)
+        freeze_garbage()
+        loop.run(stop)
+        drive.close()
+    logger.info("stopped")
+    return 0
+
+
+def open_drive(robot: RobotConfig, module: str, run_dir: str) -> OdriveCan:
+    """Return the module's drive on its CAN bus."""
+    wiring = robot.module_named(module)
+    bus = robot.can[wiring.bus]
+    return OdriveCan(
+        CanConfig(interface=bus.interface, channel=bus.channel.replace("{run}", run_dir)),
+        wiring.node_ids,
+        robot.drive,
+    )
+
+
+if __name__ == "__main__":
+    run_service(main)

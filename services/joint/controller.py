@@ -1,0 +1,188 @@
+"""One control cycle of a joint service, without any I/O.
+
+Read, age, failsafe, law, gate: the same object runs live behind a drive and a bus, in
+lockstep under virtual time, and in re-execution from a log.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from services.joint import law
+from services.joint.differential import joint_from_motor
+from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.failsafe import Event, Failsafe, timing_of
+from services.joint.gate import gate, limits_of
+from services.joint.law import Setpoint
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig
+from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Pair
+
+_DRIVE_EVENT = {
+    DriveStatus.LOST: Event.DRIVE_LOST,
+    DriveStatus.IDLE: Event.DRIVE_DISARMED,
+    DriveStatus.ARMED: Event.DRIVE_ARMED,
+    DriveStatus.ERROR: Event.DRIVE_DISARMED,
+}
+
+
+class CycleResult(NamedTuple):
+    """What one cycle decided."""
+
+    tau: Pair
+    """Joint torque for the drive, N m, after the gate."""
+    event: JointEvent | None
+    """The change of state of this cycle, if there was one."""
+
+
+class JointController:
+    """The control law of one module and its memory."""
+
+    def __init__(self, config: RobotConfig, module: str) -> None:
+        """Take the module's limits and stand gains; start DISARMED."""
+        service = config.joint_service
+        stand = config.stand_gains(module)
+        self.failsafe = Failsafe()
+        self.timing = timing_of(config)
+        self._limits = limits_of(config, module)
+        self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
+        self._damp_k_d = service.damp_k_d
+        self._gear_ratio = config.joint.gear_ratio
+        self._aging_max_s = service.command_aging_max_ms / 1e3
+        self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
+        self._blend_ns = service.blend_ms * NS_PER_MS
+        self._damp_fade_ns = service.damp_fade_s * NS_PER_S
+        self._period_late_ns = round(2 * NS_PER_S / service.rate_hz)
+        self._anchor: Setpoint = law.stand(law.ZERO, self._stand_k_p, self._stand_k_d)
+        """The setpoint at the last change of state: what HOLD holds and TRACK blends from."""
+        self._setpoint: Setpoint = self._anchor
+        self._changed_ns = 0
+        self._last_cycle_ns = 0
+        self.q: Pair = law.ZERO
+        self.v: Pair = law.ZERO
+        self.tau: Pair = law.ZERO
+        self.cycle = 0
+        self.late = 0
+        self.drive_error = 0
+        self._events = 0
+        self._states = 0
+
+    def step(
+        self,
+        now_ns: int,
+        reading: DriveReading | None,
+        command: JointCommand | None,
+        estop: bool,
+    ) -> CycleResult:
+        """Run one cycle.
+
+        Args:
+            now_ns: this module's monotonic clock.
+            reading: the drive's newest sample; None if none came in time.
+            command: the newest command, if one came since the last cycle.
+            estop: the emergency stop is engaged.
+        """
+        self._count(now_ns)
+        drive = Event.NONE
+        if reading is not None:
+            drive = _DRIVE_EVENT[reading.status]
+            self.drive_error = reading.error
+            self.q = joint_from_motor(reading.pos_turns, self._gear_ratio)
+            self.v = joint_from_motor(reading.vel_turns, self._gear_ratio)
+        failsafe = self.failsafe
+        if command is not None:
+            failsafe.offer(command, now_ns, self.timing)
+        before = failsafe.mode
+        cause = failsafe.advance(now_ns, self.timing, drive, estop)
+        if cause is not None:
+            self._enter(now_ns, before)
+        self._setpoint = self._evaluate(now_ns)
+        tau_before = self.tau
+        if failsafe.mode in (Mode.DISARMED, Mode.FAULT):
+            self.tau = law.ZERO
+        else:
+            wanted = law.torque(self._setpoint, self.q, self.v)
+            self.tau = gate(wanted, self.q, tau_before, self._limits)
+        event = None
+        if cause is not None:
+            event = self._event(now_ns, before, cause, tau_before)
+        return CycleResult(self.tau, event)
+
+    def state(self, now_ns: int) -> JointState:
+        """Return the module's state message, stamped with its own clock."""
+        failsafe = self.failsafe
+        command = failsafe.command
+        self._states += 1
+        return JointState(
+            t_ns=now_ns,
+            seq=self._states,
+            q=self.q,
+            v=self.v,
+            tau=self.tau,
+            mode=int(failsafe.mode),
+            ready=failsafe.ready(now_ns, self.timing),
+            age_ns=failsafe.age_ns(now_ns),
+            session=failsafe.session,
+            command_seq=command.seq if command is not None else -1,
+            cycle=self.cycle,
+            late=self.late,
+            dropouts=failsafe.dropouts,
+            refused=failsafe.refused,
+            drive_error=self.drive_error,
+        )
+
+    def _count(self, now_ns: int) -> None:
+        self.cycle += 1
+        if self._last_cycle_ns and now_ns - self._last_cycle_ns > self._period_late_ns:
+            self.late += 1
+        self._last_cycle_ns = now_ns
+
+    def _enter(self, now_ns: int, before: Mode) -> None:
+        """Take the anchor of the new mode: what was in force until now, frozen."""
+        self._changed_ns = now_ns
+        if before is Mode.DISARMED:
+            self._anchor = law.stand(self.q, self._stand_k_p, self._stand_k_d)
+        else:
+            self._anchor = self._setpoint
+
+    def _evaluate(self, now_ns: int) -> Setpoint:
+        """Return the setpoint of this instant."""
+        mode = self.failsafe.mode
+        since_ns = now_ns - self._changed_ns
+        if mode is Mode.TRACK:
+            command = self.failsafe.command
+            assert command is not None  # noqa: S101 - TRACK is entered on fresh commands only
+            age_s = (now_ns - command.echo_t_ns) / NS_PER_S
+            fresh = law.aged(command, min(age_s, self._aging_max_s))
+            if since_ns >= self._blend_ns:
+                return fresh
+            return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
+        if mode is Mode.DAMP:
+            share = max(0.0, 1.0 - since_ns / self._damp_fade_ns)
+            return law.damped(self._anchor, self._damp_k_d, share)
+        return self._held(since_ns)
+
+    def _held(self, since_ns: int) -> Setpoint:
+        """Return HOLD's law: the anchor frozen, its gains rising to the stand gains.
+
+        With the gains left as they were (design section 4) the operator's 60 N m of pitch
+        moment in the crawl leaned the COM back by 42 mm and the soles tipped; the ankles'
+        stand gains keep it within 20 mm.
+        """
+        moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
+        risen = min(1.0, since_ns / self._blend_ns)
+        frozen = law.held(self._anchor, moving)
+        return law.stiffened(frozen, self._stand_k_p, self._stand_k_d, risen)
+
+    def _event(self, now_ns: int, before: Mode, cause: Cause, tau_before: Pair) -> JointEvent:
+        self._events += 1
+        return JointEvent(
+            t_ns=now_ns,
+            seq=self._events,
+            mode_before=int(before),
+            mode_after=int(self.failsafe.mode),
+            cause=int(cause),
+            age_ns=self.failsafe.age_ns(now_ns),
+            tau_before=tau_before,
+            tau_after=self.tau,
+        )

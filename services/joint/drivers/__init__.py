@@ -1,0 +1,1 @@
+"""Drivers of the motor drives, behind one interface."""

@@ -1,0 +1,336 @@
+"""One ODrive over CANSimple and python-can (design section 5).
+
+The same code on the robot (socketcan) and in the demo (`xrl_unix`): only the configured
+interface and channel differ.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import can
+
+from services.joint.drivers.base import DriveReading, DriveStatus
+from shared import cansimple
+from shared.cansimple import AxisError, AxisState, Command, ControlMode, InputMode
+from shared.clock import NS_PER_MS, NS_PER_S, now_ns
+from shared.config import CanConfig, DriveConfig
+from shared.exceptions import DriveError
+from shared.messages import Pair
+
+LOST_AFTER_MS: Final = 20
+"""Without a sample of both axes for so long the drive is lost, at the least. It is not lost
+before its own watchdog has fired: until then it holds the last torque and comes back as if
+nothing had been, while a FAULT is for good."""
+REBOOT_MS: Final = 500
+"""After so long a silence the drive may have been switched off and on: what its
+heartbeats said before is forgotten."""
+RETRY_MS: Final = 200
+"""Between two attempts to open the bus: on socketcan an attempt may cost a millisecond."""
+ARM_GRACE_MS: Final = 10
+"""Heartbeats this soon after `arm` may have been sent before it; they are not believed."""
+FEED_MS: Final = 1000
+"""So long after `arm` reading feeds the watchdogs until the drive is ARMED: that shows
+only in the next heartbeat, and a watchdog may run out before it."""
+
+_NMT_COMMAND = 0x000  # the firmware takes it as food for the watchdog and does nothing else
+_FRAMES_PER_READ = 512  # more than can wait in a socket; a flooded bus must not hold up the loop
+_BOTH = 0b11
+_unpack_estimates = struct.Struct("<ff").unpack_from
+_pack_torque = struct.Struct("<f").pack
+
+_Frame = tuple[int, bytes]
+
+
+class OdriveCan:
+    """Both axes of one ODrive; implements `services.joint.drivers.base.Drive`.
+
+    The bus need not be there yet: until it is, and whenever it goes away, the status is
+    LOST and reading retries by itself; it stays LOST until both axes have sent a
+    heartbeat, for only that tells their state. What is lost on the way to the drive is counted,
+    not raised.
+
+    Attributes:
+        write_failures: torque pairs that could not be handed to the bus.
+        connections: how often the bus was opened.
+    """
+
+    def __init__(
+        self,
+        can_config: CanConfig,
+        node_ids: tuple[int, int],
+        drive: DriveConfig,
+    ) -> None:
+        """Take the channel with `{run}` already expanded; open the bus if it is there.
+
+        Raises:
+            DriveError: python-can does not know the interface.
+        """
+        self.write_failures = 0
+        self.connections = 0
+        self._can_config = can_config
+        self._drive = drive
+        self._node_ids = node_ids
+        self._torque_max = drive.current_lim * drive.torque_constant
+        self._lost_after_ns = max(
+            LOST_AFTER_MS * NS_PER_MS, round(drive.watchdog_timeout * NS_PER_S)
+        )
+        self._torque_messages = [_message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in node_ids]
+        self._food = [_message(n, _NMT_COMMAND, b"") for n in node_ids]
+        self._encoder_axis = {
+            cansimple.arbitration_id(n, Command.GET_ENCODER_ESTIMATES): i
+            for i, n in enumerate(node_ids)
+        }
+        self._heartbeat_axis = {
+            cansimple.arbitration_id(n, Command.HEARTBEAT): i for i, n in enumerate(node_ids)
+        }
+        self._bus: can.BusABC | None = None
+        self._receive: Callable[[float], Sequence[_Frame]] = _nothing
+        self._send: Callable[[Sequence[can.Message]], None] = _drop
+        self._retry_at_ns = 0
+        self._believe_from_ns = 0
+        self._feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
+        self._estimates: list[Pair] = [(0.0, 0.0), (0.0, 0.0)]
+        self._fresh = 0  # bit i: axis i has a frame since the last sample
+        self._sample_ns = now_ns()
+        self._has_sample = False
+        self._states = [int(AxisState.UNDEFINED)] * 2
+        self._errors = [0, 0]
+        self._was_armed = [False, False]
+        self._status = DriveStatus.LOST
+        self._connect()
+
+    def read(self, timeout_s: float) -> DriveReading | None:
+        """Wait for the next encoder sample of both axes; see `Drive.read`.
+
+        All frames that wait are read and the newest of each axis wins. A reading with
+        status LOST repeats the last sample and its time.
+        """
+        now = now_ns()
+        deadline = now + int(timeout_s * NS_PER_S)
+        if self._bus is None and not self._connect():
+            time.sleep(max(0.0, timeout_s))
+            return self._reading(DriveStatus.LOST)
+        while True:
+            self._pump((deadline - now) / NS_PER_S)
+            now = now_ns()
+            if self._fresh == _BOTH:
+                self._fresh = 0
+                self._sample_ns = now
+                self._has_sample = True
+                if self._status != DriveStatus.ARMED and now < self._feed_until_ns:
+                    self._transmit(self._food)
+                return self._reading(self._status)
+            if now >= deadline or self._bus is None:
+                break
+        if self._bus is None or not self._has_sample:
+            return self._reading(DriveStatus.LOST)
+        silent_ns = now - self._sample_ns
+        if silent_ns <= self._lost_after_ns:
+            return None
+        if silent_ns > REBOOT_MS * NS_PER_MS:
+            self._forget()
+        return self._reading(DriveStatus.LOST)
+
+    def write_torque(self, torque: Pair) -> None:
+        """Send both motor torques, N m, at most `current_lim`'s worth; not a number is zero."""
+        messages = self._torque_messages
+        limit = self._torque_max
+        for message, value in zip(messages, torque, strict=True):
+            if not -limit <= value <= limit:
+                value = limit if value > limit else -limit if value < -limit else 0.0  # noqa: PLW2901
+            message.data[:] = _pack_torque(value)
+        if not self._transmit(messages):
+            self.write_failures += 1
+
+    def arm(self) -> None:
+        """Ask for closed loop torque control on both axes.
+
+        Errors are cleared and `input_torque` zeroed first: re-arming would otherwise
+        bring back the torque of before. `status` is IDLE until heartbeats tell more.
+        """
+        limits = cansimple.pack_two_floats(self._drive.vel_limit, self._drive.current_lim)
+        modes = cansimple.pack_two_ints(ControlMode.TORQUE, InputMode.PASSTHROUGH)
+        closed_loop = cansimple.pack_u32(AxisState.CLOSED_LOOP_CONTROL)
+        self._request(
+            (Command.CLEAR_ERRORS, b""),
+            (Command.SET_CONTROLLER_MODE, modes),
+            (Command.SET_LIMITS, limits),
+            (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
+            (Command.SET_AXIS_STATE, closed_loop),
+        )
+        self._feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
+
+    def idle(self) -> None:
+        """Ask both axes to go idle, with their input torque zeroed."""
+        self._request(
+            (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
+            (Command.SET_AXIS_STATE, cansimple.pack_u32(AxisState.IDLE)),
+        )
+
+    def close(self) -> None:
+        """Release the bus and stay away from it."""
+        self._disconnect()
+        self._retry_at_ns = 1 << 63
+
+    def _request(self, *commands: tuple[Command, bytes]) -> None:
+        """Send commands to both axes and forget what the axes reported before."""
+        self._states = [int(AxisState.UNDEFINED)] * 2
+        self._errors = [0, 0]
+        self._was_armed = [False, False]
+        self._status = DriveStatus.IDLE
+        self._feed_until_ns = 0
+        self._believe_from_ns = now_ns() + ARM_GRACE_MS * NS_PER_MS
+        self._transmit(
+            [_message(node, command, data) for command, data in commands for node in self._node_ids]
+        )
+
+    def _pump(self, timeout_s: float) -> None:
+        """Take in the frames of one wait; a link that fails is closed."""
+        try:
+            frames = self._receive(max(0.0, timeout_s))
+        except (can.CanError, OSError):
+            self._disconnect()
+            return
+        encoder_axis = self._encoder_axis
+        for can_id, data in frames:
+            axis = encoder_axis.get(can_id)
+            if axis is not None and len(data) == 8:
+                self._estimates[axis] = _unpack_estimates(data)
+                self._fresh |= 1 << axis
+            elif (axis := self._heartbeat_axis.get(can_id)) is not None and len(data) == 8:
+                self._hear(axis, data)
+
+    def _hear(self, axis: int, data: bytes) -> None:
+        """Take in a heartbeat and work out the status."""
+        if now_ns() < self._believe_from_ns:
+            return
+        heartbeat = cansimple.unpack_heartbeat(data)
+        closed_loop = heartbeat.axis_state == AxisState.CLOSED_LOOP_CONTROL
+        errors = int(heartbeat.errors)
+        if not closed_loop and self._feed_until_ns == 0:
+            # The watchdog also runs in IDLE: there it only says that nobody has written yet.
+            errors &= ~AxisError.WATCHDOG_TIMER_EXPIRED
+        self._states[axis] = heartbeat.axis_state
+        self._errors[axis] = errors
+        self._was_armed[axis] |= closed_loop
+        self._status = self._judge()
+
+    def _judge(self) -> DriveStatus:
+        """Return the status by the last heartbeats; axis_error 0 does not mean armed."""
+        closed = [state == AxisState.CLOSED_LOOP_CONTROL for state in self._states]
+        left = any(
+            was and state not in (AxisState.CLOSED_LOOP_CONTROL, AxisState.UNDEFINED)
+            for was, state in zip(self._was_armed, self._states, strict=True)
+        )
+        if left or any(self._errors):
+            return DriveStatus.ERROR
+        if AxisState.UNDEFINED in self._states:
+            return self._status  # LOST after connecting, IDLE after a request
+        return DriveStatus.ARMED if all(closed) else DriveStatus.IDLE
+
+    def _forget(self) -> None:
+        """Believe nothing of the axes' states until both have sent a heartbeat."""
+        self._states = [int(AxisState.UNDEFINED)] * 2
+        self._status = DriveStatus.LOST
+
+    def _reading(self, status: DriveStatus) -> DriveReading:
+        """Return the newest estimates with a status."""
+        (pos_0, vel_0), (pos_1, vel_1) = self._estimates
+        return DriveReading(
+            self._sample_ns,
+            (pos_0, pos_1),
+            (vel_0, vel_1),
+            status,
+            self._errors[0] | self._errors[1],
+        )
+
+    def _transmit(self, messages: Sequence[can.Message]) -> bool:
+        """Hand messages to the bus; False if it did not take them all."""
+        try:
+            self._send(messages)
+        except (can.CanError, OSError):
+            # A full queue of socketcan comes here too. A dead link shows in reading.
+            return False
+        return self._bus is not None
+
+    def _connect(self) -> bool:
+        """Open the bus, not more often than every `RETRY_MS`."""
+        now = now_ns()
+        if now < self._retry_at_ns:
+            return False
+        self._retry_at_ns = now + RETRY_MS * NS_PER_MS
+        try:
+            bus = can.Bus(
+                interface=self._can_config.interface,
+                channel=self._can_config.channel,
+                ignore_config=True,  # python-can would read its own files at every attempt
+            )
+        except NotImplementedError as error:
+            raise DriveError(
+                f"CAN interface {self._can_config.interface!r}: {error}; "
+                "use one that python-can knows, such as socketcan or xrl_unix"
+            ) from error
+        except (can.CanError, OSError):
+            return False
+        self._bus = bus
+        self.connections += 1
+        self._fresh = 0
+        self._forget()
+        self._receive = getattr(bus, "recv_many", None) or _slow_receive(bus)
+        self._send = getattr(bus, "send_many", None) or _slow_send(bus)
+        return True
+
+    def _disconnect(self) -> None:
+        """Close the bus."""
+        if self._bus is not None:
+            self._bus.shutdown()
+        self._bus = None
+        self._receive = _nothing
+        self._send = _drop
+
+
+def _message(node_id: int, command: int, data: bytes) -> can.Message:
+    """Return a frame to a node."""
+    return can.Message(
+        arbitration_id=cansimple.arbitration_id(node_id, command), data=data, is_extended_id=False
+    )
+
+
+def _nothing(_timeout_s: float) -> Sequence[_Frame]:
+    """Receive without a bus."""
+    return ()
+
+
+def _drop(_messages: Sequence[can.Message]) -> None:
+    """Send without a bus."""
+
+
+def _slow_receive(bus: can.BusABC) -> Callable[[float], Sequence[_Frame]]:
+    """Return `recv_many` for a bus that has none: one wait, then all that is there."""
+
+    def receive(timeout_s: float) -> Sequence[_Frame]:
+        frames: list[_Frame] = []
+        message = bus.recv(timeout_s)
+        while message is not None:
+            if not message.is_error_frame and not message.is_remote_frame:
+                frames.append((message.arbitration_id, bytes(message.data)))
+            if len(frames) >= _FRAMES_PER_READ:
+                break
+            message = bus.recv(0.0)
+        return frames
+
+    return receive
+
+
+def _slow_send(bus: can.BusABC) -> Callable[[Sequence[can.Message]], None]:
+    """Return `send_many` for a bus that has none."""
+
+    def send(messages: Sequence[can.Message]) -> None:
+        for message in messages:
+            bus.send(message, timeout=0.0)
+
+    return send

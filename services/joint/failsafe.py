@@ -1,0 +1,236 @@
+"""States of a joint service and what makes a command usable (design section 4).
+
+Pure: state, now, inputs -> state. The transitions are one table; `tests/safety` sweeps
+every state against every event.
+
+    DISARMED -> HOLD <-> TRACK;  any of them -> DAMP (e-stop);  any -> FAULT (drive lost)
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+import msgspec
+
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig
+from shared.messages import Cause, JointCommand, Mode
+
+
+class Event(IntEnum):
+    """What a cycle can bring, the gravest first: one event a cycle is acted on."""
+
+    ESTOP = 0
+    DRIVE_LOST = 1
+    DRIVE_DISARMED = 2
+    DRIVE_ARMED = 3
+    COMMAND_STALE = 4
+    HOLD_ASKED = 5
+    READY = 6
+    NONE = 7
+
+
+TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
+    Mode.DISARMED: {
+        Event.ESTOP: (Mode.DAMP, Cause.ESTOP),
+        Event.DRIVE_ARMED: (Mode.HOLD, Cause.DRIVE_ARMED),
+    },
+    Mode.HOLD: {
+        Event.ESTOP: (Mode.DAMP, Cause.ESTOP),
+        Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
+        Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
+        Event.READY: (Mode.TRACK, Cause.COMMANDS_FRESH),
+    },
+    Mode.TRACK: {
+        Event.ESTOP: (Mode.DAMP, Cause.ESTOP),
+        Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
+        Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
+        Event.COMMAND_STALE: (Mode.HOLD, Cause.COMMAND_STALE),
+        Event.HOLD_ASKED: (Mode.HOLD, Cause.HOLD_ALL),
+    },
+    Mode.DAMP: {
+        Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
+        Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
+    },
+    Mode.FAULT: {},
+}
+"""What is not listed stays where it is. DAMP and FAULT are left by a restart only: a robot
+under load never stiffens again by itself."""
+
+
+class Timing(msgspec.Struct, frozen=True):
+    """The failsafe's times and limits, in ns where not said otherwise."""
+
+    max_command_age_ns: int
+    engage_after_ns: int
+    engage_after_max_ns: int
+    dropout_forget_ns: int
+    k_p_max: float
+    k_d_max: float
+    v_max: float
+    tau_max: float
+
+
+def timing_of(config: RobotConfig) -> Timing:
+    """Return the timing from the configuration."""
+    service = config.joint_service
+    return Timing(
+        max_command_age_ns=round(service.max_command_age_ms * NS_PER_MS),
+        engage_after_ns=round(service.engage_after_ms * NS_PER_MS),
+        engage_after_max_ns=round(service.engage_after_max_ms * NS_PER_MS),
+        dropout_forget_ns=round(service.dropout_forget_s * NS_PER_S),
+        k_p_max=service.k_p_max,
+        k_d_max=service.k_d_max,
+        v_max=service.v_max,
+        tau_max=4.0 * config.joint.tau_module_max,
+    )
+
+
+class Refusal(IntEnum):
+    """Why a command is not taken; the one rule of design section 4."""
+
+    NONE = 0
+    TOO_OLD = 1
+    FROM_THE_FUTURE = 2
+    FOREIGN_SESSION = 3
+    NOT_NEWER = 4
+    OUT_OF_LIMITS = 5
+
+
+RETIRED_SESSIONS_KEPT: Final = 256
+
+
+class Failsafe(msgspec.Struct):
+    """The state of one joint service's failsafe."""
+
+    mode: Mode = Mode.DISARMED
+    command: JointCommand | None = None
+    """The newest command taken."""
+    session: int = 0
+    """Session of the commands that are taken; 0 before the first."""
+    retired: tuple[int, ...] = ()
+    """Sessions that were current once: they never become so again."""
+    fresh_since_ns: int = -1
+    """Since when commands have been usable without a break; -1 if they are not."""
+    dropouts: int = 0
+    """Drop-outs not yet forgotten: each doubles the wait before TRACK."""
+    steady_since_ns: int = 0
+    """Since when nothing has dropped out or been forgotten."""
+    refused: int = 0
+
+    def offer(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
+        """Take a command if it is usable; count it if not."""
+        refusal = self._judge(command, now_ns, timing)
+        if refusal is not Refusal.NONE:
+            self.refused += 1
+            return refusal
+        if command.session != self.session:
+            if self.session:
+                self.retired = (*self.retired[-RETIRED_SESSIONS_KEPT + 1 :], self.session)
+            self.session = command.session
+            self.fresh_since_ns = -1
+        self.command = command
+        return refusal
+
+    def age_ns(self, now_ns: int) -> int:
+        """Return the age of the newest command taken, by this module's clock; -1 if none."""
+        return now_ns - self.command.echo_t_ns if self.command is not None else -1
+
+    def usable(self, now_ns: int, timing: Timing) -> bool:
+        """Return True if the newest command taken is still young enough."""
+        return (
+            self.command is not None
+            and now_ns - self.command.echo_t_ns <= timing.max_command_age_ns
+        )
+
+    def engage_after_ns(self, timing: Timing) -> int:
+        """Return how long commands must be fresh before TRACK: doubled by each drop-out."""
+        wait = timing.engage_after_ns << min(self.dropouts, 16)
+        return min(wait, timing.engage_after_max_ns)
+
+    def ready(self, now_ns: int, timing: Timing) -> bool:
+        """Return True if commands have been fresh for long enough to track."""
+        return self.fresh_since_ns >= 0 and now_ns - self.fresh_since_ns >= self.engage_after_ns(
+            timing
+        )
+
+    def advance(self, now_ns: int, timing: Timing, drive: Event, estop: bool) -> Cause | None:
+        """Go one cycle on; return the cause if the mode changed.
+
+        Args:
+            now_ns: this module's clock.
+            timing: times and limits.
+            drive: DRIVE_LOST, DRIVE_DISARMED, DRIVE_ARMED or NONE.
+            estop: the emergency stop is engaged.
+        """
+        fresh = self.usable(now_ns, timing)
+        if not fresh:
+            self.fresh_since_ns = -1
+        elif self.fresh_since_ns < 0:
+            self.fresh_since_ns = now_ns
+        event = self._event(now_ns, timing, drive, estop, fresh)
+        row = TRANSITIONS[self.mode].get(event)
+        self._remember_dropouts(now_ns, timing, event)
+        if row is None:
+            return None
+        self.mode = row[0]
+        return row[1]
+
+    def _event(self, now_ns: int, timing: Timing, drive: Event, estop: bool, fresh: bool) -> Event:
+        if estop and self.mode not in (Mode.DAMP, Mode.FAULT):
+            return Event.ESTOP
+        armed_mode = self.mode is not Mode.DISARMED
+        if drive is Event.DRIVE_ARMED:
+            if not armed_mode:
+                return drive
+        elif drive is not Event.NONE:
+            return drive
+        if not fresh:
+            return Event.COMMAND_STALE
+        if self.command is not None and self.command.hold:
+            return Event.HOLD_ASKED
+        return Event.READY if self.ready(now_ns, timing) else Event.NONE
+
+    def _remember_dropouts(self, now_ns: int, timing: Timing, event: Event) -> None:
+        if self.mode is Mode.TRACK and event is Event.COMMAND_STALE:
+            self.dropouts += 1
+            self.steady_since_ns = now_ns
+        elif self.mode is not Mode.TRACK:
+            self.steady_since_ns = now_ns
+        elif self.dropouts and now_ns - self.steady_since_ns >= timing.dropout_forget_ns:
+            self.dropouts -= 1
+            self.steady_since_ns = now_ns
+
+    def _judge(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
+        age = now_ns - command.echo_t_ns
+        if age < 0:
+            return Refusal.FROM_THE_FUTURE
+        if age > timing.max_command_age_ns:
+            return Refusal.TOO_OLD
+        if command.session != self.session:
+            # a foreign session takes over only where nothing current is left to lose
+            if command.session in self.retired or self.usable(now_ns, timing):
+                return Refusal.FOREIGN_SESSION
+        elif self.command is not None and command.seq <= self.command.seq:
+            return Refusal.NOT_NEWER
+        return Refusal.NONE if within_limits(command, timing) else Refusal.OUT_OF_LIMITS
+
+
+def within_limits(command: JointCommand, timing: Timing) -> bool:
+    """Return True if every number is finite and inside the service's limits.
+
+    Written so that a NaN fails: every comparison with it is false.
+    """
+    for axis in (0, 1):
+        if not (
+            0.0 <= command.k_p[axis] <= timing.k_p_max
+            and 0.0 <= command.k_d[axis] <= timing.k_d_max
+            and abs(command.v_ref[axis]) <= timing.v_max
+            and abs(command.q_ref[axis]) <= 2.0 * 3.2
+            and abs(command.tau_ff[axis]) <= timing.tau_max
+            and abs(command.tau_coupled[axis]) <= timing.tau_max
+            and abs(command.dtau_ff[axis]) <= 1e3 * timing.tau_max
+        ):
+            return False
+    return True

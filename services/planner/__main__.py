@@ -1,0 +1,53 @@
+"""`python -m services.planner`: the whole-body law of the fleet."""
+
+from __future__ import annotations
+
+import secrets
+
+from services.planner.loop import PlannerLoop, Ports
+from services.planner.planner import Planner
+from shared import config, log, topics
+from shared.bus import open_session
+from shared.joints import MODULES
+from shared.messages import JointCommand, JointState, OperatorIntent, PlannerStatus, Wrench
+from shared.process import (
+    StopFlag,
+    freeze_garbage,
+    raise_priority,
+    run_service,
+    service_parser,
+)
+
+FIFO_PRIORITY = 15
+"""Below the joint services: the failsafe outranks the law."""
+
+
+def main() -> int:
+    """Wire the planner to the bus and run it."""
+    parser = service_parser(
+        "Run the whole-body law.", "python -m services.planner --run-dir /tmp/xrl"
+    )
+    arguments = parser.parse_args()
+    logger = log.setup("planner")
+    robot = config.load(arguments.config)
+    stop = StopFlag()
+    granted = raise_priority(FIFO_PRIORITY)
+    with open_session(robot, "planner", arguments.run_dir) as session:
+        ports = Ports(
+            states=[session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES],
+            wrench=session.latest(topics.WRENCH, Wrench),
+            intent=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
+            commands=[session.publisher(topics.JOINT_COMMAND, JointCommand, m) for m in MODULES],
+            status=session.publisher(topics.PLANNER_STATUS, PlannerStatus),
+        )
+        session_id = secrets.randbelow(1 << 53) + 1  # JSON readers keep 53 bits
+        loop = PlannerLoop(robot, Planner(robot, session_id), ports)
+        logger.info("up, %s, session %d", granted, session_id)
+        freeze_garbage()
+        loop.run(stop)
+    logger.info("stopped")
+    return 0
+
+
+if __name__ == "__main__":
+    run_service(main)

@@ -1,0 +1,113 @@
+"""The pose p, its Jacobian and the Hessian term, as numbers (paper section IV).
+
+p = [COM x y z; torso roll pitch yaw]. The two legs' estimates of the torso are mixed by
+the load-sharing matrices D: J_torso = [D_R^T J_R, D_L^T J_L], so that J^T F asks each
+foot for a wrench its sole can give. The knees' masses enter through their own leg. The
+equations stand in `services.planner.symbolic`.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner import symbolic
+from services.planner.model import leg_geometry
+from shared.config import RobotConfig
+
+Array = NDArray[np.float64]
+
+
+class Compiled:
+    """A graph with fixed memory for its arguments and results: a call allocates nothing.
+
+    `arguments` are written, the object is called, `results` are read; all are arrays of
+    the graph's shapes, column-major.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        buffer, self._call = function.buffer()
+        self._buffer = buffer
+        self.arguments = [_room(function.size_in(i)) for i in range(function.n_in())]
+        self.results = [_room(function.size_out(i)) for i in range(function.n_out())]
+        for index, array in enumerate(self.arguments):
+            buffer.set_arg(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
+        for index, array in enumerate(self.results):
+            buffer.set_res(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
+
+    def __call__(self) -> None:
+        """Compute the results from the arguments."""
+        self._call()
+
+
+def _room(shape: tuple[int, int]) -> Array:
+    """Return zeros, column-major; a column is a vector."""
+    rows, columns = shape
+    return np.zeros(rows) if columns == 1 else np.zeros((rows, columns), order="F")
+
+
+class Kinematics:
+    """p, J and the closure of the two legs at one joint configuration.
+
+    After `update(q)`; the arrays are overwritten by the next one:
+
+    - `p` (6,): m and rad; `J` (6, 12): dp/dq;
+    - `closure` (6,): left minus right estimate of the torso, m and rad; `C` (6, 12):
+      d closure/dq;
+    - `J_harness` (3, 12): harness point's velocity per joint rate, m/rad, world;
+    - `r_torso` (3,), `r_harness` (3,): m, world;
+    - `D_left` (6, 6): the left leg's share of a torso wrench; the right's is I - D_left.
+    """
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Build the graphs from the generated model."""
+        graphs = symbolic.build(config, leg_geometry(config))
+        self._sharing = Compiled(graphs.sharing)
+        self._pose = Compiled(graphs.pose)
+        self._hessian = Compiled(graphs.hessian)
+        self.D_left = self._sharing.results[0]
+        (
+            self.p,
+            self.closure,
+            self.J,
+            self.C,
+            self.J_harness,
+            self.r_torso,
+            self.r_harness,
+        ) = self._pose.results
+
+    def update(self, q: Array, D_left: Array | None = None) -> None:
+        """Compute everything at joint angles q (12,), rad.
+
+        Args:
+            q: joint angles.
+            D_left: load sharing (6, 6) to use; None computes that of q. Within a tick the
+                sharing is one choice, made where the robot is.
+        """
+        if D_left is None:
+            self._sharing.arguments[0][:] = q
+            self._sharing()
+        else:
+            self.D_left[:] = D_left
+        self._pose.arguments[0][:] = q
+        self._pose.arguments[1][:] = self.D_left
+        self._pose()
+
+    def hessian_times(self, F: Array, F_harness: Array) -> Array:
+        """Return sum_i H_i F_i (12, 12), plus the harness point's for its force, N m/rad.
+
+        d(J^T F)/dq where `update` was, with each leg's share of the wrench held; of moments
+        the symmetric part (design section 3). Overwritten by the next call.
+
+        Args:
+            F: wrench along p (6,): N, and N m along roll, pitch, yaw.
+            F_harness: force at the harness point (3,), N, world.
+        """
+        q, D_left, force, at_harness = self._hessian.arguments
+        q[:] = self._pose.arguments[0]
+        D_left[:] = self.D_left
+        force[:] = F
+        at_harness[:] = F_harness
+        self._hessian()
+        return self._hessian.results[0]

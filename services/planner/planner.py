@@ -1,0 +1,195 @@
+"""One planner tick without any I/O: six states in, six commands and a status out.
+
+The same object runs live behind the bus, in lockstep under virtual time, and in
+re-execution from a log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner.engagement import Engagement
+from services.planner.hocca import Hocca, LawOutput
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig
+from shared.joints import N_JOINTS, N_MODULES
+from shared.messages import (
+    JointCommand,
+    JointState,
+    Pair,
+    PlannerMode,
+    PlannerStatus,
+    Vector6,
+    Wrench,
+)
+
+Array = NDArray[np.float64]
+
+EARLY_SHARE = 0.5
+"""Of a period: states that come sooner after a tick belong to that tick still."""
+LATE_SHARE = 1.25
+"""Of a period: after so long the planner ticks with what it has."""
+TICK_GAP_MAX_S = 0.02
+"""A longer gap between ticks (a stopped process) is not integrated over."""
+
+_ALL_NEW = (1 << N_MODULES) - 1
+
+
+class Planner:
+    """The whole-body law behind its engagement rule."""
+
+    def __init__(self, config: RobotConfig, session: int) -> None:
+        """Start waiting for six fresh states.
+
+        Args:
+            config: the robot.
+            session: drawn at random for each start; told in every command.
+        """
+        self.session = session
+        self._law = Hocca(config)
+        self._engagement = Engagement()
+        self._stale_ns = round(config.planner.state_stale_ms * NS_PER_MS)
+        self._period_s = 1.0 / config.planner.rate_hz
+        self._states: list[JointState | None] = [None] * N_MODULES
+        self._arrived_ns = [0] * N_MODULES
+        self._q: Array = np.zeros(N_JOINTS)
+        self._v: Array = np.zeros(N_JOINTS)
+        self._assist_wanted = 0.0
+        self._wrench_seq = -1
+        self._last_ns = 0
+        self._new = 0  # bit i: module i has a state that no tick has used
+        self._seq = 0
+        self._output: LawOutput | None = None
+
+    def hear_state(self, module: int, state: JointState, now_ns: int) -> None:
+        """Take a module's newest state."""
+        self._states[module] = state
+        self._arrived_ns[module] = now_ns
+        self._new |= 1 << module
+        self._q[2 * module : 2 * module + 2] = state.q
+        self._v[2 * module : 2 * module + 2] = state.v
+
+    def hear_wrench(self, wrench: Wrench) -> None:
+        """Take the harness's newest wrench."""
+        self._wrench_seq = wrench.seq
+
+    def hear_assist(self, assist: float) -> None:
+        """Take the assist force that the operator asks for, N."""
+        self._assist_wanted = assist
+
+    def is_due(self, now_ns: int) -> bool:
+        """Return True if it is time to tick: as soon as all six have a new state.
+
+        Age is what costs: in the open directions the local gains are cancelled by fresh
+        references only. On a timer of its own the planner would let states lie for up to
+        a period; waiting for them it ticks at their rate, and on late ones it does not
+        wait for long.
+        """
+        since_s = (now_ns - self._last_ns) / NS_PER_S
+        if self._new == _ALL_NEW:
+            return since_s >= EARLY_SHARE * self._period_s
+        return since_s >= LATE_SHARE * self._period_s
+
+    def tick(self, now_ns: int) -> list[JointCommand]:
+        """Run the law; return six commands, or none while a module was never heard.
+
+        Args:
+            now_ns: the planner's monotonic clock.
+        """
+        dt = min((now_ns - self._last_ns) / NS_PER_S, TICK_GAP_MAX_S)
+        if not self._last_ns:
+            dt = self._period_s
+        self._last_ns = now_ns
+        self._new = 0
+        states = [state for state in self._states if state is not None]
+        if len(states) < N_MODULES:
+            return []
+        fresh = [now_ns - arrived <= self._stale_ns for arrived in self._arrived_ns]
+        engagement = self._engagement
+        engagement.advance(
+            now_ns, fresh, [state.ready for state in states], [state.mode for state in states]
+        )
+        # until all engage the law starts anew from the measured pose: there is no step
+        self._output = self._law.tick(
+            self._q, self._v, self._assist_wanted, dt, align=engagement.hold
+        )
+        self._seq += 1
+        return self._commands(now_ns, states, self._output)
+
+    def _commands(
+        self, now_ns: int, states: Sequence[JointState], output: LawOutput
+    ) -> list[JointCommand]:
+        rows = np.array(
+            (
+                output.q_ref,
+                output.v_ref,
+                output.tau_ff,
+                output.dtau_ff,
+                output.tau_coupled,
+                output.k_p,
+                output.k_d,
+            )
+        ).reshape(7, N_MODULES, 2)
+        by_module = rows.transpose(1, 0, 2).tolist()
+        hold = self._engagement.hold
+        return [
+            _command(now_ns, self._seq, self.session, state.t_ns, hold, by_module[index])
+            for index, state in enumerate(states)
+        ]
+
+    def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
+        """Return what the last tick saw and decided."""
+        output = self._output
+        states = self._states
+        seqs = [state.seq if state is not None else -1 for state in states]
+        ages = [
+            now_ns - arrived if state is not None else -1
+            for state, arrived in zip(states, self._arrived_ns, strict=True)
+        ]
+        zero: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return PlannerStatus(
+            t_ns=now_ns,
+            seq=self._seq,
+            session=self.session,
+            mode=int(self._engagement.mode) if output is not None else int(PlannerMode.WAITING),
+            hold=self._engagement.hold,
+            p=_six(output.p) if output is not None else zero,
+            pdot=_six(output.pdot) if output is not None else zero,
+            p_ref=_six(output.p_ref) if output is not None else zero,
+            closure=_six(output.closure) if output is not None else zero,
+            assist_n=output.assist if output is not None else 0.0,
+            ik_iterations=output.ik_iterations if output is not None else 0,
+            ik_residual=output.ik_residual if output is not None else 0.0,
+            tick_us=tick_us,
+            state_seq=(seqs[0], seqs[1], seqs[2], seqs[3], seqs[4], seqs[5]),
+            wrench_seq=self._wrench_seq,
+            state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
+        )
+
+
+def _command(
+    now_ns: int, seq: int, session: int, echo_t_ns: int, hold: bool, rows: list[list[float]]
+) -> JointCommand:
+    pairs: list[Pair] = [(row[0], row[1]) for row in rows]
+    return JointCommand(
+        t_ns=now_ns,
+        seq=seq,
+        session=session,
+        echo_t_ns=echo_t_ns,
+        hold=hold,
+        q_ref=pairs[0],
+        v_ref=pairs[1],
+        tau_ff=pairs[2],
+        dtau_ff=pairs[3],
+        tau_coupled=pairs[4],
+        k_p=pairs[5],
+        k_d=pairs[6],
+    )
+
+
+def _six(values: Array) -> Vector6:
+    a, b, c, d, e, f = values.tolist()
+    return a, b, c, d, e, f

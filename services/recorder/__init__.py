@@ -1,0 +1,1 @@
+"""The recorder: everything on the bus into one MCAP file (design section 10)."""

@@ -1,0 +1,36 @@
+"""Lost messages, told by the sequence numbers of one key. Pure."""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class KeyCount(msgspec.Struct, gc=False, kw_only=True):
+    """What came on one key so far; feed it every sequence number in order of arrival."""
+
+    count: int = 0
+    """Messages that came."""
+    gaps: int = 0
+    """Times the sequence jumped forward."""
+    missing: int = 0
+    """Messages jumped over, all gaps together."""
+    restarts: int = 0
+    """Times the sequence did not go up: a new sender counts from 0 again."""
+    last_seq: int = -1
+    """Newest sequence number; -1 before the first."""
+
+    def feed(self, seq: int) -> None:
+        """Take the sequence number of the next message.
+
+        What a sender said before its first message got here is not counted as lost:
+        a subscriber connects after the sender's start, or after its own.
+        """
+        step = seq - self.last_seq
+        if step != 1 and self.count:
+            if step > 1:
+                self.gaps += 1
+                self.missing += step - 1
+            else:
+                self.restarts += 1
+        self.count += 1
+        self.last_seq = seq

@@ -1,0 +1,118 @@
+"""JSON schemas of the messages, flat enough for Foxglove and PlotJuggler.
+
+Foxglove reads an object whose properties are booleans, strings, numbers, integers,
+objects, or arrays of one of these: no `$ref`, no unions, no null, no tuples and no
+array in an array. msgspec's own schemas have most of these (design section 10), so
+these are made from the types themselves.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, Final
+
+import msgspec
+from msgspec import inspect
+
+from shared import messages
+from shared.exceptions import RunError
+from shared.messages import Message
+
+ENCODING: Final = "jsonschema"
+"""MCAP's name for this kind of schema."""
+
+ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
+    (messages.JointState, "mode"): messages.Mode,
+    (messages.JointEvent, "mode_before"): messages.Mode,
+    (messages.JointEvent, "mode_after"): messages.Mode,
+    (messages.JointEvent, "cause"): messages.Cause,
+    (messages.PlannerStatus, "mode"): messages.PlannerMode,
+    (messages.RunEvent, "kind"): messages.RunEventKind,
+}
+"""Fields that are plain integers on the bus and enumerations in the mind."""
+
+_PLAIN: Final[dict[type[inspect.Type], str]] = {
+    inspect.BoolType: "boolean",
+    inspect.IntType: "integer",
+    inspect.FloatType: "number",
+    inspect.StrType: "string",
+}
+
+
+def name_of(message_type: type[Message]) -> str:
+    """Return the schema's name in the file, for example `xrl.JointState`."""
+    return f"xrl.{message_type.__name__}"
+
+
+def json_schema(message_type: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return the flat JSON schema of a message type.
+
+    Raises:
+        RunError: a field's type has no place in a flat schema; names type and field.
+    """
+    info = inspect.type_info(message_type)
+    if not isinstance(info, inspect.StructType):
+        raise RunError(f"{message_type}: no msgspec struct; recorded messages are structs")
+    return _object(info, message_type.__name__)
+
+
+def encoded(message_type: type[Message]) -> bytes:
+    """Return the schema as it goes into the file."""
+    return msgspec.json.encode(json_schema(message_type))
+
+
+def _object(info: inspect.StructType, where: str) -> dict[str, Any]:
+    properties: dict[str, Any] = {}
+    required = []
+    for field in info.fields:
+        node = _node(field.type, f"{where}.{field.name}")
+        enumeration = ENUMERATIONS.get((info.cls, field.name))
+        if enumeration is not None:
+            node = _enumeration(enumeration)
+        properties[field.encode_name] = node
+        if field.required:
+            required.append(field.encode_name)
+    return {
+        "title": info.cls.__name__,
+        "description": (info.cls.__doc__ or "").partition("\n")[0],
+        "type": "object",
+        "properties": properties,
+        "required": required,
+        "additionalProperties": False,
+    }
+
+
+def _node(info: inspect.Type, where: str) -> dict[str, Any]:
+    if type(info) in _PLAIN:
+        return {"type": _PLAIN[type(info)]}
+    if isinstance(info, inspect.Metadata):
+        return _node(info.type, where)
+    if isinstance(info, inspect.StructType):
+        return _object(info, where)
+    if isinstance(info, inspect.EnumType) and issubclass(info.cls, IntEnum):
+        return _enumeration(info.cls)
+    if isinstance(info, inspect.UnionType):
+        members = [member for member in info.types if not isinstance(member, inspect.NoneType)]
+        if len(members) == 1:
+            return _node(members[0], where)
+    if isinstance(info, inspect.TupleType):
+        items = [_node(item, f"{where}[]") for item in info.item_types]
+        if items and all(item == items[0] for item in items):
+            return _array(items[0], where) | {"minItems": len(items), "maxItems": len(items)}
+    if isinstance(info, inspect.ListType | inspect.VarTupleType):
+        return _array(_node(info.item_type, f"{where}[]"), where)
+    raise RunError(
+        f"{where}: {type(info).__name__} has no place in a flat JSON schema; use numbers, "
+        "strings, booleans, structs, integer enumerations, or arrays of one of them"
+    )
+
+
+def _array(items: dict[str, Any], where: str) -> dict[str, Any]:
+    if items["type"] == "array":
+        raise RunError(f"{where}: an array in an array, which Foxglove refuses; flatten it")
+    return {"type": "array", "items": items}
+
+
+def _enumeration(enumeration: type[IntEnum]) -> dict[str, Any]:
+    names = ", ".join(f"{member.value} {member.name}" for member in enumeration)
+    return {"type": "integer", "description": f"{enumeration.__name__}: {names}"}

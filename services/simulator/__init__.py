@@ -1,0 +1,1 @@
+"""The simulated robot: world, operator and emulated drives."""

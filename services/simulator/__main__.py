@@ -1,0 +1,93 @@
+"""`python -m services.simulator`: the robot, where there is none."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+from services.simulator.axis_bank import AxisBank
+from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.harness_front import HarnessFront
+from services.simulator.loop import Ports, SimulatorLoop
+from services.simulator.world import World
+from shared import config, log, scenario, topics
+from shared.bus import open_session
+from shared.config import RobotConfig, expand
+from shared.joints import MODULE_INDEX
+from shared.messages import OperatorIntent, SimControl, SimTruth
+from shared.process import (
+    DEFAULT_CONFIG,
+    StopFlag,
+    freeze_garbage,
+    raise_priority,
+    run_service,
+    service_parser,
+)
+from shared.unix_can import UnixCanHub
+
+FIFO_PRIORITY = 25
+"""The world waits for nobody."""
+
+DEFAULT_SCENARIO = DEFAULT_CONFIG.parent / "scenarios" / "stand.toml"
+
+
+def main() -> int:
+    """Wire the world to the emulated drives and the bus and run it."""
+    parser = service_parser(
+        "Simulate the robot, its drives and its operator.",
+        "python -m services.simulator --scenario deploy/scenarios/squat.toml",
+    )
+    parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, help="scenario (TOML)")
+    parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
+    arguments = parser.parse_args()
+    logger = log.setup("simulator")
+    robot = config.load(arguments.config)
+    story = scenario.load(arguments.scenario)
+    stop = StopFlag()
+    granted = raise_priority(FIFO_PRIORITY)
+    with ExitStack() as stack:
+        session = stack.enter_context(open_session(robot, "simulator", arguments.run_dir))
+        ports = Ports(
+            truth=session.publisher(topics.SIM_TRUTH, SimTruth),
+            intent=session.publisher(topics.OPERATOR_INTENT, OperatorIntent),
+            control=session.latest(topics.SIM_CONTROL, SimControl),
+        )
+        hubs = open_hubs(robot, arguments.run_dir, stack)
+        bank = AxisBank(robot.drive, encoder_counts_per_turn=robot.joint.encoder_counts_per_turn)
+        front = CanSimpleFront(
+            bank,
+            [hubs[name] for name in drive_buses(robot)],
+            list(drive_buses(robot).values()),
+            heartbeat_period_ms=robot.drive.heartbeat_period_ms,
+        )
+        harness = HarnessFront(robot, hubs[robot.harness.bus], arguments.seed)
+        world = World(robot, story)
+        logger.info("up, %s, scenario %s", granted, story.name)
+        freeze_garbage()
+        SimulatorLoop(robot, world, bank, front, harness, ports).run(stop)
+    logger.info("stopped")
+    return 0
+
+
+def drive_buses(robot: RobotConfig) -> dict[str, dict[int, int]]:
+    """Return, for each bus with drives, the axis (0..11) of each CAN node on it."""
+    buses: dict[str, dict[int, int]] = {}
+    for module in robot.module:
+        nodes = buses.setdefault(module.bus, {})
+        for side, node in enumerate(module.node_ids):
+            nodes[node] = 2 * MODULE_INDEX[module.name] + side
+    return buses
+
+
+def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, UnixCanHub]:
+    """Return the CAN buses of the robot, simulated, by name."""
+    run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    names = [*drive_buses(robot), robot.harness.bus]
+    return {
+        name: stack.enter_context(UnixCanHub(Path(expand(robot.can[name].channel, run_dir))))
+        for name in dict.fromkeys(names)
+    }
+
+
+if __name__ == "__main__":
+    run_service(main)

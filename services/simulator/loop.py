@@ -1,0 +1,113 @@
+"""The simulator's loop: drives, world and sensors in real time; it waits for nobody."""
+
+from __future__ import annotations
+
+import msgspec
+
+from services.simulator.axis_bank import AxisBank
+from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.harness_front import HarnessFront
+from services.simulator.world import World
+from shared.bus import Latest, Publisher
+from shared.cansimple import AxisState
+from shared.clock import NS_PER_MS, NS_PER_S, now_ns, sleep_until
+from shared.config import RobotConfig
+from shared.messages import OperatorIntent, SimControl, SimTruth
+from shared.process import StopFlag
+
+INTENT_RATE_HZ = 50.0
+
+
+class Ports(msgspec.Struct, frozen=True):
+    """The simulator's bus ends."""
+
+    truth: Publisher[SimTruth]
+    intent: Publisher[OperatorIntent]
+    control: Latest[SimControl]
+
+
+class SimulatorLoop:
+    """Steps twelve emulated axes and the world, and paces them by the clock.
+
+    The drives step at the rate of their encoder frames and hold their torque between;
+    the world steps at its own.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        world: World,
+        bank: AxisBank,
+        front: CanSimpleFront,
+        harness: HarnessFront,
+        ports: Ports,
+    ) -> None:
+        self._world, self._bank, self._front = world, bank, front
+        self._harness, self._ports = harness, ports
+        simulation = config.simulation
+        rate = 1.0 / simulation.timestep
+        self._step_ns = round(simulation.timestep * NS_PER_S)
+        self._encoder_every = max(1, round(rate / simulation.encoder_rate_hz))
+        self._harness_every = max(1, round(rate / config.harness.rate_hz))
+        self._truth_every = max(1, round(rate / simulation.truth_rate_hz))
+        self._intent_every = max(1, round(rate / INTENT_RATE_HZ))
+        self._slip_ns = round(simulation.late_slip_ms * NS_PER_MS)
+        self._torque = bank.torque
+        self._steps = 0
+        self._intents = 0
+        self._lost_ns = 0
+        self._start_ns = 0
+        self._start_step = 0
+        self._lost_at_start_ns = 0
+
+    def run(self, stop: StopFlag) -> None:
+        """Run until told to stop.
+
+        A step that comes late is followed at once by the next; time further behind than
+        `late_slip_ms` is given up and counted, for the services must not be fed a burst.
+        """
+        due = now_ns()
+        while not stop:
+            self.step()
+            due += self._step_ns
+            behind = now_ns() - due
+            if behind > self._slip_ns:
+                self._lost_ns += behind
+                due += behind
+            sleep_until(due)
+
+    def step(self) -> None:
+        """Take the drives' frames, move the world on by one step, send what is due."""
+        world, front, ports = self._world, self._front, self._ports
+        if self._steps % self._encoder_every == 0:
+            front.receive()
+            self._torque = self._bank.step(world.time, *world.motor_turns())
+            front.send_encoders()
+            front.send_heartbeats(world.time)
+        world.step(self._torque)
+        self._steps += 1
+        steps = self._steps
+        if steps % self._harness_every == 0:
+            self._harness.send(world.harness_force, world.harness_moment)
+        if steps % self._truth_every == 0:
+            self._publish_truth()
+        if steps % self._intent_every == 0:
+            self._intents += 1
+            intent = OperatorIntent(t_ns=now_ns(), seq=self._intents, assist_n=world.lead().assist)
+            ports.intent.put(intent)
+
+    def _publish_truth(self) -> None:
+        """Publish the truth, and look at what needs no more than its rate."""
+        world, now = self._world, now_ns()
+        control = self._ports.control.take()
+        if control is not None and control.start and world.scenario_s < 0.0:
+            world.start()
+            self._start_ns, self._start_step = now, self._steps
+            self._lost_at_start_ns = self._lost_ns
+        if all(state == AxisState.CLOSED_LOOP_CONTROL for state in self._bank.state):
+            world.release_hoist()
+        wall_ns = now - self._start_ns
+        simulated_ns = (self._steps - self._start_step) * self._step_ns
+        factor = simulated_ns / wall_ns if self._start_ns and wall_ns > 0 else 1.0
+        late_s = (self._lost_ns - self._lost_at_start_ns) / NS_PER_S
+        self._ports.truth.put(world.truth(now, factor, late_s))

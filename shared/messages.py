@@ -1,0 +1,260 @@
+"""Every message on the bus (design section 6).
+
+Payloads are JSON by msgspec. SI units; times are integers in ns; enumerations are
+integers. No field is optional: a `null` in a payload can then only be a number that
+was not finite, and `shared.codec` refuses it at both ends.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import msgspec
+
+Pair = tuple[float, float]
+"""(phi, theta) of one module."""
+Vector3 = tuple[float, float, float]
+Vector6 = tuple[float, float, float, float, float, float]
+Modules = tuple[int, int, int, int, int, int]
+"""One integer for each module, in `shared.joints.MODULES` order."""
+
+
+class Mode(IntEnum):
+    """State of a joint service (design section 4)."""
+
+    DISARMED = 0
+    HOLD = 1
+    TRACK = 2
+    DAMP = 3
+    FAULT = 4
+
+
+class Cause(IntEnum):
+    """Why a joint service changed its state."""
+
+    STARTED = 0
+    DRIVE_ARMED = 1
+    COMMANDS_FRESH = 2
+    COMMAND_STALE = 3
+    HOLD_ALL = 4
+    ESTOP = 5
+    DRIVE_LOST = 6
+    DRIVE_DISARMED = 7
+    SHUTDOWN = 8
+    RESET = 9
+
+
+class PlannerMode(IntEnum):
+    """What the planner asks of the six modules."""
+
+    WAITING = 0
+    """Not every module's state is fresh: nothing but `hold` can be said."""
+    ALIGNING = 1
+    """All six states are fresh; commands start from the measured pose, still with `hold`."""
+    LEADING = 2
+    """All six track."""
+
+
+class RunEventKind(IntEnum):
+    """What happened to a run from outside."""
+
+    STARTED = 0
+    KILLED = 1
+    RESTARTED = 2
+    PUSHED = 3
+    FINISHED = 4
+
+
+class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of all messages: the sender's monotonic time and a sequence number."""
+
+    t_ns: int
+    """Sender's monotonic clock when the content was true."""
+    seq: int
+    """Counts up by one for each message of this sender on this key."""
+
+
+class JointState(Message, frozen=True):
+    """One module as its joint service sees it. Published at the state rate.
+
+    `t_ns` is the stamp that the planner echoes in `JointCommand.echo_t_ns`.
+    """
+
+    q: Pair
+    """Joint angles in rad."""
+    v: Pair
+    """Joint rates in rad/s."""
+    tau: Pair
+    """Joint torques sent to the drive in this cycle, in N m, after the gate."""
+    mode: int
+    """`Mode`."""
+    ready: bool
+    """True if fresh commands have come for long enough to track, were `hold` lifted."""
+    age_ns: int
+    """Age of the newest command in use (design section 4); -1 if there is none."""
+    session: int
+    """Session of the newest command in use; 0 if there is none."""
+    command_seq: int
+    """Sequence number of the newest command in use; -1 if there is none."""
+    cycle: int
+    """Control cycles since the start."""
+    late: int
+    """Cycles that came later than twice the period after the one before."""
+    dropouts: int
+    """Drop-outs remembered by the re-engagement hysteresis."""
+    refused: int
+    """Commands refused since the start: old, foreign, out of order or out of limits."""
+    drive_error: int
+    """The drives' error bits, both axes or-ed; 0 if none."""
+
+
+class JointCommand(Message, frozen=True):
+    """References, local gains and torques for one module (design section 3 e)."""
+
+    session: int
+    """Drawn at random when the planner starts."""
+    echo_t_ns: int
+    """The `t_ns` of this module's own newest state: age is told on one clock."""
+    hold: bool
+    """True asks for HOLD (`hold_all`): no leg is to work against the other."""
+    q_ref: Pair
+    """rad"""
+    v_ref: Pair
+    """rad/s"""
+    tau_ff: Pair
+    """N m"""
+    dtau_ff: Pair
+    """N m/s"""
+    tau_coupled: Pair
+    """(K_q - D)(q_ref - q) + (B_q - B)(v_ref - v) in N m; dropped in HOLD."""
+    k_p: Pair
+    """Local stiffness D in N m/rad."""
+    k_d: Pair
+    """Local damping in N m s/rad."""
+
+
+class JointEvent(Message, frozen=True):
+    """A change of state of a joint service."""
+
+    mode_before: int
+    mode_after: int
+    cause: int
+    """`Cause`."""
+    age_ns: int
+    """Command age at the change; -1 if there was no command."""
+    tau_before: Pair
+    """Torque of the last cycle before the change, N m."""
+    tau_after: Pair
+    """Torque of the first cycle after the change, N m."""
+
+
+class Wrench(Message, frozen=True):
+    """What the operator does to the torso at the harness point.
+
+    In torso axes, for the sensor is fixed to the torso. The robot's assist on the
+    operator is the opposite.
+    """
+
+    force: Vector3
+    """N, torso axes."""
+    moment: Vector3
+    """N m, torso axes, about the harness point."""
+    valid: bool
+    """False while the sensor is stale or saturated: the numbers are then the last good ones."""
+    saturated: bool
+    age_ns: int
+    """Age of the sensor sample, by the harness service's clock."""
+
+
+class PlannerStatus(Message, frozen=True):
+    """What the planner saw and decided in one tick."""
+
+    session: int
+    mode: int
+    """`PlannerMode`."""
+    hold: bool
+    p: Vector6
+    """Measured [COM x y z in m; torso roll, pitch, yaw in rad], world."""
+    pdot: Vector6
+    p_ref: Vector6
+    closure: Vector6
+    """Left minus right leg's estimate of the torso pose: m and rad, world."""
+    assist_n: float
+    """Assist force in the feedforward, N."""
+    ik_iterations: int
+    ik_residual: float
+    tick_us: float
+    """Time this tick took: from reading the inputs to the last command put."""
+    state_seq: Modules
+    """Sequence number of the state consumed from each module."""
+    wrench_seq: int
+    state_age_ns: Modules
+    """Time since each module's newest state arrived, by the planner's clock; -1 if none yet."""
+
+
+class OperatorIntent(Message, frozen=True):
+    """What the person asks for beyond leading by hand."""
+
+    assist_n: float
+    """Upward force wanted at the harness, N."""
+
+
+class Estop(Message, frozen=True):
+    """The emergency stop: every module goes to DAMP."""
+
+    source: str
+    engaged: bool
+
+
+class SimTruth(Message, frozen=True):
+    """The simulated world as it really is; no controller reads it."""
+
+    scenario_s: float
+    """Scenario time; negative until the scenario starts."""
+    com: Vector3
+    """COM of the whole robot, m, world."""
+    torso: Vector3
+    """Torso origin, m, world."""
+    angles: Vector3
+    """Torso roll, pitch, yaw (3-1-2), rad."""
+    operator_force: Vector3
+    """Spring-damper force of the operator's hand on the torso, N, world."""
+    operator_moment: Vector3
+    """N m"""
+    load_n: float
+    """Weight the operator rests on the harness, N."""
+    harness_force_z: float
+    """Upward force the robot gives the operator: the load less what the hand lifts, N."""
+    push: Vector3
+    """Push on the torso, N, world."""
+    foot_right_tilt: float
+    """Angle between the right sole and the floor, rad."""
+    foot_left_tilt: float
+    feet_slip: float
+    """Largest distance of an ankle from where it stood at the start, m."""
+    hoist: float
+    """Share of the hoist's support: 1 hanging, 0 free."""
+    fallen: bool
+    real_time_factor: float
+    """Simulated time over wall time since the scenario started."""
+    late_s: float
+    """World time lost so far because the machine was too slow, s."""
+
+
+class SimControl(Message, frozen=True):
+    """A word from a tool to the simulated world."""
+
+    start: bool
+    """Start the scenario: its time becomes zero."""
+
+
+class RunEvent(Message, frozen=True):
+    """Something a tool did to the run, for the log and the verdict."""
+
+    kind: int
+    """`RunEventKind`."""
+    subject: str
+    """The service, or the push."""
+    detail: str
+    """The signal, or the push in words."""
+    scenario_s: float

@@ -1,0 +1,94 @@
+"""What every service's `__main__` does the same way: arguments, priority, stopping."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+from shared import config, log
+from shared.exceptions import XrlError
+
+RUN_DIR_VARIABLE = "XRL_RUN_DIR"
+"""Environment variable that names the run directory of the fleet."""
+
+DEFAULT_CONFIG = Path(__file__).resolve().parent.parent / "deploy" / "robot.toml"
+
+SOCKET_PATH_MAX = 100
+"""Longest path of a UNIX socket that works everywhere; the kernel takes 107 bytes."""
+
+
+def default_run_dir() -> Path:
+    """Return the run directory: sockets, logs and the supervisor's files of one fleet."""
+    return Path(os.environ.get(RUN_DIR_VARIABLE) or f"/tmp/xrl-{os.getuid()}")  # noqa: S108 - short on purpose: socket paths have 107 bytes
+
+
+def service_parser(description: str, example: str) -> argparse.ArgumentParser:
+    """Return a parser with the arguments that every service takes."""
+    parser = argparse.ArgumentParser(
+        description=description,
+        epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, help="robot file (TOML)")
+    parser.add_argument(
+        "--run-dir", type=Path, default=default_run_dir(), help="directory of the fleet's sockets"
+    )
+    return parser
+
+
+class StopFlag:
+    """True once SIGTERM or SIGINT has come; the loops look at it once a cycle."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        signal.signal(signal.SIGTERM, self._stop)
+        signal.signal(signal.SIGINT, self._stop)
+
+    def _stop(self, _signal: int, _frame: FrameType | None) -> None:
+        self.stopped = True
+
+    def __bool__(self) -> bool:
+        """Return True if the process is to stop."""
+        return self.stopped
+
+
+def raise_priority(fifo_priority: int) -> str:
+    """Ask for SCHED_FIFO, else for a better nice value; return what was granted.
+
+    Call it before the bus is opened: threads inherit it (design section 6).
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))
+    except (OSError, AttributeError):
+        with contextlib.suppress(OSError):
+            os.nice(-5)
+        return "normal"
+    return f"SCHED_FIFO {fifo_priority}"
+
+
+def freeze_garbage() -> None:
+    """Switch the cyclic collector off after start-up: no pauses on the control path."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def run_service(main: Callable[[], int]) -> None:
+    """Run a service's main; an expected error becomes one line and an exit code."""
+    try:
+        sys.exit(main())
+    except XrlError as error:
+        log.get("xrl").error("%s", error)
+        sys.exit(error.exit_code)
+
+
+def load_config(path: Path) -> config.RobotConfig:
+    """Read the robot file."""
+    return config.load(path)

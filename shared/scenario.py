@@ -1,0 +1,165 @@
+"""What happens in a run: the operator's hand, pushes, kills and restarts.
+
+A scenario is a TOML file (`deploy/scenarios/`); `xrl demo` adds to it from its flags.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import tomli_w
+
+from shared.config import SERVICES, Range, Section, read_toml
+from shared.exceptions import ConfigError
+
+Time = Annotated[float, Range(0.0, 86_400.0, "s")]
+Force = Annotated[float, Range(-2000.0, 2000.0, "N")]
+
+SIGNALS = ("KILL", "STOP", "TERM", "INT")
+"""What a kill can send; STOP freezes the process instead."""
+
+
+class Keyframe(Section, frozen=True):
+    """Where the operator's hand leads at a moment; cosine-eased to the next keyframe."""
+
+    at: Time
+    height: Annotated[float, Range(0.3, 2.0, "m")]
+    pitch: Annotated[float, Range(-1.5, 1.5, "rad")] = 0.0
+    assist: Annotated[float, Range(0.0, 500.0, "N")] = 0.0
+    """Weight that the operator rests on the harness and asks the robot to carry, N."""
+
+
+class Push(Section, frozen=True):
+    """A force on the torso for a while, world axes."""
+
+    at: Time
+    duration: Annotated[float, Range(0.001, 60.0, "s")]
+    force: tuple[Force, Force, Force]
+
+
+class Kill(Section, frozen=True):
+    """A signal to a service. It stays down until a `Restart` names it."""
+
+    service: str
+    at: Time
+    signal: Literal["KILL", "STOP", "TERM", "INT"] = "KILL"
+
+
+class Restart(Section, frozen=True):
+    """Starts a killed service again, or continues a stopped one."""
+
+    service: str
+    at: Time
+
+
+class Scenario(Section, frozen=True):
+    """The whole file."""
+
+    name: str
+    about: str
+    duration: Annotated[float, Range(0.1, 86_400.0, "s")]
+    keyframe: tuple[Keyframe, ...]
+    hand: bool = True
+    """False: the operator lets go; nothing leads."""
+    push: tuple[Push, ...] = ()
+    kill: tuple[Kill, ...] = ()
+    restart: tuple[Restart, ...] = ()
+
+
+class Lead(NamedTuple):
+    """What the operator wants at a moment."""
+
+    height: float
+    """m, torso origin above the ankles."""
+    height_rate: float
+    pitch: float
+    pitch_rate: float
+    assist: float
+    """N"""
+
+
+def lead(scenario: Scenario, t: float) -> Lead:
+    """Return where the hand leads at scenario time t (s); before 0, the first keyframe."""
+    frames = scenario.keyframe
+    if t <= frames[0].at:
+        first = frames[0]
+        return Lead(first.height, 0.0, first.pitch, 0.0, first.assist)
+    for a, b in pairwise(frames):
+        if t < b.at:
+            span = b.at - a.at
+            phase = math.pi * (t - a.at) / span
+            s = 0.5 - 0.5 * math.cos(phase)
+            s_rate = 0.5 * math.pi / span * math.sin(phase)
+            return Lead(
+                a.height + (b.height - a.height) * s,
+                (b.height - a.height) * s_rate,
+                a.pitch + (b.pitch - a.pitch) * s,
+                (b.pitch - a.pitch) * s_rate,
+                a.assist + (b.assist - a.assist) * s,
+            )
+    last = frames[-1]
+    return Lead(last.height, 0.0, last.pitch, 0.0, last.assist)
+
+
+def push_at(scenario: Scenario, t: float) -> tuple[float, float, float]:
+    """Return the sum of the pushes acting at scenario time t, N, world."""
+    x = y = z = 0.0
+    for push in scenario.push:
+        if push.at <= t < push.at + push.duration:
+            x, y, z = x + push.force[0], y + push.force[1], z + push.force[2]
+    return x, y, z
+
+
+def load(path: Path) -> Scenario:
+    """Read and check a scenario file.
+
+    Raises:
+        ConfigError: naming the file, the key, what stands there and what would be right.
+    """
+    scenario = read_toml(path, Scenario)
+    check(str(path), scenario)
+    return scenario
+
+
+def check(file: str, scenario: Scenario) -> None:
+    """Check what no single value shows: order, services, times inside the run."""
+    if not scenario.keyframe:
+        raise ConfigError(file, "keyframe", "none", "at least one [[keyframe]]")
+    times = [frame.at for frame in scenario.keyframe]
+    for index, (a, b) in enumerate(pairwise(times)):
+        if b <= a:
+            found = f"at {b:g} s does not follow {a:g} s"
+            raise ConfigError(file, f"keyframe[{index + 1}].at", found, "times must rise")
+    tables: tuple[tuple[str, Sequence[Kill | Restart]], ...] = (
+        ("kill", scenario.kill),
+        ("restart", scenario.restart),
+    )
+    for kind, rows in tables:
+        for index, row in enumerate(rows):
+            where = f"{kind}[{index}]"
+            if row.service not in SERVICES:
+                right = f"one of {', '.join(SERVICES)}"
+                raise ConfigError(file, f"{where}.service", f"{row.service!r}", right)
+            _check_inside(file, f"{where}.at", row.at, scenario.duration)
+    for index, push in enumerate(scenario.push):
+        _check_inside(file, f"push[{index}].at", push.at, scenario.duration)
+    for index, restart in enumerate(scenario.restart):
+        if not any(k.service == restart.service and k.at < restart.at for k in scenario.kill):
+            found = f"{restart.service} is not killed before {restart.at:g} s"
+            raise ConfigError(file, f"restart[{index}]", found, "kill it first")
+
+
+def _check_inside(file: str, key: str, at: float, duration: float) -> None:
+    if at >= duration:
+        found = f"{at:g} s is not inside the run of {duration:g} s"
+        raise ConfigError(file, key, found, "an earlier time, or a longer duration")
+
+
+def to_toml(scenario: Scenario) -> str:
+    """Return the scenario as TOML that `load` reads back."""
+    return tomli_w.dumps(msgspec.to_builtins(scenario))

@@ -1,0 +1,148 @@
+"""The one table of topics: key, type, rate, priority, recorded (design section 6)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+import msgspec
+
+from shared import messages
+from shared.joints import MODULES
+
+
+class Priority(IntEnum):
+    """Bus priority of a topic; control goes first."""
+
+    REAL_TIME = 1
+    DATA = 5
+    BACKGROUND = 7
+
+
+class Topic(msgspec.Struct, frozen=True, kw_only=True):
+    """One row of the table."""
+
+    name: str
+    """Key below `xrl/<robot>/`; `*` stands for a module."""
+    type: type[messages.Message]
+    rate_hz: float
+    """Nominal rate; 0 for events."""
+    priority: Priority
+    recorded: bool
+    why: str
+
+    def key(self, robot: str, module: str = "") -> str:
+        """Return the full key, for example `xrl/lab/joint/ankle_right/state`."""
+        return f"xrl/{robot}/{self.name.replace('*', module)}"
+
+    @property
+    def per_module(self) -> bool:
+        """True if there is one key for each module."""
+        return "*" in self.name
+
+
+JOINT_STATE: Final = Topic(
+    name="joint/*/state",
+    type=messages.JointState,
+    rate_hz=500.0,
+    priority=Priority.REAL_TIME,
+    recorded=True,
+    why="the planner's input; its stamp is echoed",
+)
+JOINT_COMMAND: Final = Topic(
+    name="joint/*/command",
+    type=messages.JointCommand,
+    rate_hz=250.0,
+    priority=Priority.REAL_TIME,
+    recorded=True,
+    why="references, gains and torques of the law",
+)
+JOINT_EVENT: Final = Topic(
+    name="joint/*/event",
+    type=messages.JointEvent,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="every change of state, with its cause and torque step",
+)
+WRENCH: Final = Topic(
+    name="harness/wrench",
+    type=messages.Wrench,
+    rate_hz=250.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="what the operator does to the torso",
+)
+PLANNER_STATUS: Final = Topic(
+    name="planner/status",
+    type=messages.PlannerStatus,
+    rate_hz=250.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="what the law saw and decided",
+)
+OPERATOR_INTENT: Final = Topic(
+    name="operator/intent",
+    type=messages.OperatorIntent,
+    rate_hz=50.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="the assist the person asks for",
+)
+ESTOP: Final = Topic(
+    name="estop",
+    type=messages.Estop,
+    rate_hz=0.0,
+    priority=Priority.REAL_TIME,
+    recorded=True,
+    why="every module to DAMP",
+)
+SIM_TRUTH: Final = Topic(
+    name="sim/truth",
+    type=messages.SimTruth,
+    rate_hz=100.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    why="the verdict is judged on it; no controller reads it",
+)
+SIM_CONTROL: Final = Topic(
+    name="sim/control",
+    type=messages.SimControl,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="starts the scenario",
+)
+RUN_EVENT: Final = Topic(
+    name="run/event",
+    type=messages.RunEvent,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="kills, restarts and pushes, for the verdict",
+)
+
+TOPICS: Final = (
+    JOINT_STATE,
+    JOINT_COMMAND,
+    JOINT_EVENT,
+    WRENCH,
+    PLANNER_STATUS,
+    OPERATOR_INTENT,
+    ESTOP,
+    SIM_TRUTH,
+    SIM_CONTROL,
+    RUN_EVENT,
+)
+
+
+def keys(topic: Topic, robot: str) -> tuple[str, ...]:
+    """Return every full key of a topic."""
+    if topic.per_module:
+        return tuple(topic.key(robot, module) for module in MODULES)
+    return (topic.key(robot),)
+
+
+def all_keys(robot: str) -> dict[str, Topic]:
+    """Return the topic of every full key of a robot."""
+    return {key: topic for topic in TOPICS for key in keys(topic, robot)}

@@ -1,0 +1,309 @@
+from __future__ import annotations
+
+import math
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from services.harness.__main__ import make_sensor
+from services.harness.filter import WrenchFilter
+from services.harness.loop import HarnessLoop, next_deadline, run
+from services.simulator.harness_front import BIAS_MAX, HarnessFront
+from shared import clock
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.codec import Decoder, encode
+from shared.config import CanConfig
+from shared.loadcell_can import LegSample, SampleAssembler, pack
+from shared.messages import Vector6, Wrench
+from shared.unix_can import UnixCanHub
+from tests.harness.helpers import HARNESS, PERIOD_NS, ROBOT, ZERO, G, legs, robot_with, sample, six
+
+T0 = 1_000 * NS_PER_S
+TARE_CYCLES = round(HARNESS.tare_s * NS_PER_S / PERIOD_NS)
+
+
+class ScriptedSensor:
+    """Gives the forces it is told to."""
+
+    def __init__(self) -> None:
+        self.forces: Vector6 | None = ZERO
+
+    def read(self, now_ns: int) -> LegSample | None:
+        return None if self.forces is None else sample(now_ns, self.forces)
+
+    def close(self) -> None:
+        pass
+
+
+class Sink:
+    """A bus that encodes as the real one does and keeps the bytes."""
+
+    def __init__(self) -> None:
+        self.payloads: list[bytes] = []
+        self.closed = False
+
+    def put(self, message: Wrench) -> bool:
+        self.payloads.append(encode(message))
+        return not self.closed
+
+
+class FrameList:
+    """A hub that keeps the packets."""
+
+    def __init__(self) -> None:
+        self.packets: list[list[tuple[int, bytes]]] = []
+
+    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
+        self.packets.append(frames)
+
+    def forces(self) -> npt.NDArray[np.float64]:
+        assembler = SampleAssembler()
+        found = [assembler.add(*frame) for packet in self.packets for frame in packet]
+        return np.array([forces for forces in found if forces is not None])
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    directory = tempfile.mkdtemp(dir="/tmp")
+    yield Path(directory)
+    shutil.rmtree(directory)
+
+
+def make_loop() -> tuple[HarnessLoop, ScriptedSensor, Sink]:
+    sensor, sink = ScriptedSensor(), Sink()
+    return HarnessLoop(sensor, WrenchFilter(HARNESS), sink), sensor, sink
+
+
+def cycles(loop: HarnessLoop, t_ns: int, count: int) -> tuple[Wrench, int]:
+    assert count > 0
+    for _ in range(count):
+        message = loop.cycle(t_ns)
+        t_ns += PERIOD_NS
+    return message, t_ns
+
+
+# -- the loop --------------------------------------------------------------------------
+
+
+def test_every_cycle_publishes_once_with_the_next_sequence_number() -> None:
+    loop, _, sink = make_loop()
+    cycles(loop, T0, 10)
+    decoder = Decoder(Wrench)
+    messages = [decoder.decode(payload) for payload in sink.payloads]
+    stamps = [(m.seq, m.t_ns) for m in messages if m is not None]
+    assert stamps == [(n, T0 + n * PERIOD_NS) for n in range(10)]
+
+
+def test_the_wrench_is_invalid_while_taring_and_while_stale_and_valid_between() -> None:
+    loop, sensor, _ = make_loop()
+    message, t_ns = cycles(loop, T0, TARE_CYCLES)
+    assert not message.valid
+    sensor.forces = legs((10.0, 0, 0, 0, 0, 0))
+    message, t_ns = cycles(loop, t_ns, 1)
+    assert message.valid
+    sensor.forces = None
+    message, t_ns = cycles(loop, t_ns, round(HARNESS.stale_ms * NS_PER_MS / PERIOD_NS))
+    assert message.valid
+    message, t_ns = cycles(loop, t_ns, 1)
+    assert not message.valid
+    sensor.forces = ZERO
+    message, t_ns = cycles(loop, t_ns, 1)
+    assert message.valid
+    loop.tare()
+    message, t_ns = cycles(loop, t_ns, TARE_CYCLES)
+    assert not message.valid
+    message, _ = cycles(loop, t_ns, 1)
+    assert message.valid
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_a_number_that_is_not_finite_never_reaches_the_bus(number: float) -> None:
+    loop, sensor, sink = make_loop()
+    _, t_ns = cycles(loop, T0, TARE_CYCLES + 1)
+    sensor.forces = (0.0, 0.0, number, 0.0, 0.0, 0.0)
+    message, _ = cycles(loop, t_ns, 10)
+    assert loop.state.refused == 10
+    assert not message.valid
+    assert len(sink.payloads) == TARE_CYCLES + 11, "Sink.put would have raised NonFiniteError"
+
+
+def test_what_the_bus_did_not_take_is_counted() -> None:
+    loop, _, sink = make_loop()
+    cycles(loop, T0, 3)
+    sink.closed = True
+    cycles(loop, T0 + 3 * PERIOD_NS, 2)
+    assert loop.unsent == 2
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "next_ns", "missed"),
+    [
+        (-1, 1000, 0),
+        (0, 1000, 0),
+        (999, 1000, 0),
+        (1000, 2000, 1),
+        (1001, 2000, 1),
+        (7500, 8000, 7),
+    ],
+)
+def test_missed_deadlines_are_skipped_and_the_grid_is_kept(
+    late_ns: int, next_ns: int, missed: int
+) -> None:
+    assert next_deadline(T0, 1000, T0 + late_ns) == (T0 + next_ns, missed)
+
+
+def test_a_long_cycle_is_followed_by_one_cycle_and_not_by_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_ns = T0
+    times: list[int] = []
+
+    class SlowOnce:
+        def put(self, message: Wrench) -> bool:
+            nonlocal now_ns
+            times.append(message.t_ns)
+            if message.seq == 3:
+                now_ns += 10 * PERIOD_NS + 1
+            return True
+
+    class StopAfterSix:
+        def __bool__(self) -> bool:
+            return len(times) >= 6
+
+    def sleep_until(deadline_ns: int) -> None:
+        nonlocal now_ns
+        now_ns = max(now_ns, deadline_ns)
+
+    monkeypatch.setattr(clock, "now_ns", lambda: now_ns)
+    monkeypatch.setattr(clock, "sleep_until", sleep_until)
+    loop = HarnessLoop(ScriptedSensor(), WrenchFilter(HARNESS), SlowOnce())
+    run(loop, HARNESS.rate_hz, StopAfterSix())
+    assert [(t_ns - T0) // PERIOD_NS for t_ns in times] == [0, 1, 2, 3, 14, 15]
+    assert loop.skipped == 10
+
+
+# -- the simulated sensor --------------------------------------------------------------
+
+
+def test_the_simulated_sensor_sends_three_frames_in_one_packet() -> None:
+    hub = FrameList()
+    HarnessFront(ROBOT, hub, seed=1).send([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])
+    assert [[can_id for can_id, _ in packet] for packet in hub.packets] == [[0x300, 0x301, 0x302]]
+
+
+def test_simulated_legs_carry_the_wrench_and_a_constant_bias_and_white_noise() -> None:
+    hub = FrameList()
+    front = HarnessFront(ROBOT, hub, seed=1)
+    wrench = np.array([10.0, -20.0, 100.0, 5.0, -6.0, 7.0])
+    for _ in range(2000):
+        front.send(wrench[:3], wrench[3:])
+    residual = hub.forces() - np.linalg.solve(G, wrench) - front.bias
+    noise = ROBOT.simulation.harness_noise
+    np.testing.assert_allclose(residual.std(axis=0), noise, rtol=0.1)
+    np.testing.assert_allclose(residual.mean(axis=0), 0.0, atol=5 * noise / math.sqrt(2000))
+    assert (np.abs(front.bias) <= BIAS_MAX).all()
+    assert np.abs(front.bias).max() > 1.0, "without a bias the tare would have nothing to do"
+
+
+def test_the_simulated_sensor_is_the_same_for_the_same_seed_and_another_for_another() -> None:
+    packets = []
+    for seed in (1, 1, 2):
+        hub = FrameList()
+        HarnessFront(ROBOT, hub, seed).send([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])
+        packets.append(hub.packets)
+    assert packets[0] == packets[1] != packets[2]
+
+
+def test_the_simulated_cells_clip_and_the_service_calls_that_saturated() -> None:
+    hub = FrameList()
+    front = HarnessFront(ROBOT, hub, seed=1)
+    loop, sensor, _ = make_loop()
+    _, t_ns = cycles(loop, T0, TARE_CYCLES + 1)
+    front.send([0.0, 0.0, 3000.0], [0.0, 0.0, 0.0])
+    forces = hub.forces()[0]
+    assert np.abs(forces).max() == HARNESS.leg_force_max
+    sensor.forces = six(forces)
+    message, _ = cycles(loop, t_ns, 1)
+    assert message.saturated
+    assert not message.valid
+
+
+# -- end to end ------------------------------------------------------------------------
+
+
+def test_the_operators_wrench_arrives_through_the_simulated_sensor_within_its_noise(
+    run_dir: Path,
+) -> None:
+    robot = robot_with(harness_noise=0.5)
+    path = run_dir / "can_harness.sock"
+    sensor = make_sensor(robot, run_dir)
+    law, sink = WrenchFilter(robot.harness), Sink()
+    loop = HarnessLoop(sensor, law, sink)
+    wrench = np.array([30.0, -20.0, 150.0, 4.0, 60.0, -5.0])
+    with UnixCanHub(path) as hub:
+        front = HarnessFront(robot, hub, seed=3)
+        t_ns = T0
+        message = loop.cycle(t_ns)
+        hub.poll()
+        errors = []
+        for n in range(TARE_CYCLES + 500):
+            t_ns += PERIOD_NS
+            load = wrench if n > TARE_CYCLES else np.zeros(6)
+            front.send(load[:3], load[3:])
+            message = loop.cycle(t_ns)
+            assert message.valid is (n >= TARE_CYCLES)
+            assert message.age_ns == 0
+            if n > TARE_CYCLES + 50:
+                errors.append(np.subtract([*message.force, *message.moment], wrench))
+        sensor.close()
+    # The noise of six legs through G, before the low-pass makes it smaller.
+    sigma = 0.5 * np.sqrt((G**2).sum(axis=1))
+    assert len(errors) > 400
+    assert (np.std(errors, axis=0) < sigma).all()
+    assert (np.abs(np.mean(errors, axis=0)) < sigma / 2.0).all()
+    assert (np.abs(errors) < 4.0 * sigma).all()
+
+
+def test_the_simulator_going_away_makes_the_wrench_invalid_until_it_is_back(
+    run_dir: Path,
+) -> None:
+    path = run_dir / "can_harness.sock"
+    sensor = make_sensor(ROBOT, run_dir)
+    loop = HarnessLoop(sensor, WrenchFilter(HARNESS), Sink())
+    seen: list[bool] = []
+    t_ns = T0
+    for present, count in ((True, 200), (False, 50), (True, 100)):
+        hub = UnixCanHub(path) if present else None
+        for _ in range(count):
+            if hub is not None:
+                hub.poll()
+                hub.broadcast(pack(ZERO))
+            seen.append(loop.cycle(t_ns).valid)
+            t_ns += PERIOD_NS
+        if hub is not None:
+            hub.close()
+    sensor.close()
+    # The last sample is still usable for `stale_ms`; the link is tried every 0.2 s.
+    assert seen[199]
+    assert not any(seen[206:250])
+    assert all(seen[310:])
+    assert sensor.opened == 2
+
+
+def test_a_low_rate_is_no_pause_of_the_process(run_dir: Path) -> None:
+    slow = msgspec.structs.replace(
+        ROBOT,
+        harness=msgspec.structs.replace(HARNESS, rate_hz=20.0),
+        can={**ROBOT.can, HARNESS.bus: CanConfig(interface="virtual", channel="{run}")},
+    )
+    sensor = make_sensor(slow, run_dir)
+    sensor.read(T0)
+    sensor.read(T0 + 50 * NS_PER_MS)
+    assert sensor.discarded == 0
+    sensor.close()

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from services.simulator.harness_front import HarnessFront
+from shared import topics
+from shared.bus import open_session
+from shared.messages import Wrench
+from shared.unix_can import UnixCanHub
+from tests.harness.helpers import ROBOT
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    directory = tempfile.mkdtemp(dir="/tmp")
+    yield Path(directory)
+    shutil.rmtree(directory)
+
+
+def test_the_service_publishes_the_operators_wrench_and_stops_when_told(run_dir: Path) -> None:
+    command = [sys.executable, "-m", "services.harness", "--run-dir", str(run_dir)]
+    taken: list[Wrench] = []
+    with (
+        UnixCanHub(run_dir / "can_harness.sock") as hub,
+        open_session(ROBOT, "test", run_dir) as session,
+        subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as service,
+    ):
+        try:
+            wrenches = session.latest(topics.WRENCH, Wrench)
+            front = HarnessFront(ROBOT, hub, seed=1)
+            give_up = time.monotonic() + 20.0
+            loaded_for = 0
+            while loaded_for < 100 and time.monotonic() < give_up:
+                hub.poll()
+                tared = bool(taken) and taken[-1].valid
+                loaded_for += tared
+                front.send([0.0, 0.0, 100.0 if tared else 0.0], [0.0, 0.0, 0.0])
+                newest = wrenches.take()
+                if newest is not None:
+                    taken.append(newest)
+                time.sleep(0.004)
+            service.terminate()
+            log = service.communicate(timeout=10.0)[1]
+        finally:
+            service.kill()
+    assert service.returncode == 0, log
+    assert "stopped:" in log
+    assert not taken[0].valid
+    assert taken[-1].force[2] == pytest.approx(100.0, abs=5.0)
+    numbers = [message.seq for message in taken]
+    assert numbers == sorted(set(numbers))

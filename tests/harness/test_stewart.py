@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from shared.exceptions import ConfigError
+from shared.stewart import CONDITION_MAX, condition_number, geometry_matrix, leg_points
+from tests.harness.helpers import HARNESS, G
+
+Array = npt.NDArray[np.float64]
+GEOMETRY = (HARNESS.base_radius, HARNESS.platform_radius, HARNESS.height)
+
+lengths = st.floats(0.05, 0.2)
+forces = st.lists(st.floats(-1500.0, 1500.0), min_size=6, max_size=6).map(np.array)
+wrenches = st.tuples(
+    st.lists(st.floats(-300.0, 300.0), min_size=3, max_size=3),
+    st.lists(st.floats(-60.0, 60.0), min_size=3, max_size=3),
+).map(lambda pair: np.array(pair[0] + pair[1]))
+
+
+def leg_lengths(base: Array, platform: Array, rotation: Array, shift: Array) -> Array:
+    """Leg lengths with the torso side moved by a small rigid motion about the harness point."""
+    moved = base @ rotation.T + shift
+    return np.asarray(np.linalg.norm(platform - moved, axis=1))
+
+
+@given(base_radius=lengths, platform_radius=lengths, height=lengths, leg_forces=forces)
+def test_wrench_is_the_sum_of_forces_and_moments_leg_by_leg(
+    base_radius: float, platform_radius: float, height: float, leg_forces: Array
+) -> None:
+    base, platform = leg_points(base_radius, platform_radius, height)
+    force, moment = np.zeros(3), np.zeros(3)
+    for b, p, f in zip(base, platform, leg_forces, strict=True):
+        pull = f * (p - b) / math.dist(b, p)
+        force += pull
+        # About the origin; the other end of the leg is on the same line, so it must agree.
+        moment += [p[1] * pull[2] - p[2] * pull[1], p[2] * pull[0] - p[0] * pull[2],
+                   p[0] * pull[1] - p[1] * pull[0]]  # fmt: skip
+    wrench = geometry_matrix(base_radius, platform_radius, height) @ leg_forces
+    np.testing.assert_allclose(wrench, np.concatenate((force, moment)), atol=1e-9)
+
+
+@given(leg_forces=forces)
+def test_wrench_does_the_work_of_the_legs(leg_forces: Array) -> None:
+    """Virtual work: wrench . twist = tension . shortening, by differences of leg lengths."""
+    base, platform = leg_points(*GEOMETRY)
+    step = 1e-6
+    for axis in range(6):
+        ends = []
+        for sign in (1.0, -1.0):
+            shift, rotation = np.zeros(3), np.eye(3)
+            if axis < 3:
+                shift[axis] = sign * step
+            else:
+                i, j = [(1, 2), (2, 0), (0, 1)][axis - 3]
+                rotation[i, i] = rotation[j, j] = math.cos(step)
+                rotation[j, i], rotation[i, j] = sign * math.sin(step), -sign * math.sin(step)
+            ends.append(leg_lengths(base, platform, rotation, shift))
+        shortening = (ends[1] - ends[0]) / (2.0 * step)
+        assert (G @ leg_forces)[axis] == pytest.approx(float(leg_forces @ shortening), abs=1e-4)
+
+
+@given(wrench=wrenches, base_radius=lengths, platform_radius=lengths, height=lengths)
+def test_a_wrench_goes_to_the_legs_and_back(
+    wrench: Array, base_radius: float, platform_radius: float, height: float
+) -> None:
+    matrix = geometry_matrix(base_radius, platform_radius, height)
+    back = matrix @ np.linalg.solve(matrix, wrench)
+    np.testing.assert_allclose(back, wrench, rtol=1e-9, atol=1e-9)
+
+
+def test_tension_pulls_the_torso_towards_the_operator() -> None:
+    force_x = (G @ np.ones(6))[0]
+    _, height = HARNESS.base_radius, HARNESS.height
+    base, platform = leg_points(*GEOMETRY)
+    length = math.dist(base[0], platform[0])
+    assert force_x == pytest.approx(6.0 * height / length)
+    np.testing.assert_allclose((G @ np.ones(6))[1:], 0.0, atol=1e-12)
+
+
+def test_layout_is_a_hexapod_with_six_equal_legs_that_do_not_cross() -> None:
+    base, platform = leg_points(*GEOMETRY)
+    np.testing.assert_allclose(np.linalg.norm(base[:, 1:], axis=1), HARNESS.base_radius)
+    np.testing.assert_allclose(np.linalg.norm(platform[:, 1:], axis=1), HARNESS.platform_radius)
+    np.testing.assert_allclose(platform[:, 0] - base[:, 0], HARNESS.height)
+    lengths = np.linalg.norm(platform - base, axis=1)
+    np.testing.assert_allclose(lengths, lengths[0])
+    for points in (base, platform):
+        angles = np.unwrap(np.arctan2(points[:, 2], points[:, 1]))
+        assert (np.diff(angles) > 0.0).all()
+
+
+def test_the_robots_sensor_is_well_conditioned_and_takes_its_loads() -> None:
+    assert condition_number(G, HARNESS.platform_radius) < 3.0
+    assist_and_lead = np.array([0.0, 0.0, 350.0, 0.0, 60.0, 0.0])  # 200 N assist, 150 N hand
+    assert np.abs(np.linalg.solve(G, assist_and_lead)).max() < HARNESS.leg_force_max
+
+
+@pytest.mark.parametrize(
+    ("base_radius", "platform_radius", "height"),
+    [
+        (2.0, 2.0, 0.005),  # flat: no leg can lift
+        (0.005, 0.005, 2.0),  # a bundle of parallel legs
+        (0.0, 0.07, 0.06),
+        (0.1, 0.0, 0.06),
+        (0.0, 0.0, 0.0),
+        (0.1, 0.07, 0.0),
+        (float("nan"), 0.07, 0.06),
+    ],
+)
+def test_a_singular_geometry_is_refused_with_its_numbers(
+    base_radius: float, platform_radius: float, height: float
+) -> None:
+    with pytest.raises(ConfigError, match="condition number") as refusal:
+        geometry_matrix(base_radius, platform_radius, height)
+    assert f"base_radius {base_radius:g} m" in str(refusal.value)
+    assert "similar size" in str(refusal.value)
+
+
+@given(base_radius=st.floats(0.005, 2.0), platform_radius=st.floats(0.005, 2.0),
+       height=st.floats(0.005, 2.0))  # fmt: skip
+def test_a_geometry_that_is_not_refused_is_well_conditioned(
+    base_radius: float, platform_radius: float, height: float
+) -> None:
+    try:
+        matrix = geometry_matrix(base_radius, platform_radius, height)
+    except ConfigError:
+        assume(False)
+    assert condition_number(matrix, platform_radius) <= CONDITION_MAX
+
+
+def test_condition_number_does_not_depend_on_the_unit_of_length() -> None:
+    in_mm = geometry_matrix(*GEOMETRY)
+    in_mm[3:] *= 1e3
+    in_m = condition_number(G, HARNESS.platform_radius)
+    assert condition_number(in_mm, HARNESS.platform_radius * 1e3) == pytest.approx(in_m)

@@ -1,0 +1,181 @@
+"""Forward kinematics and statics straight from the paper's equations (section IV).
+
+Plain numpy and the configuration's numbers; nothing of the code under test, so that an
+agreement means something. Each leg is taken on its own, from its foot up, as the paper
+writes it: R_torso = prod over (ankle, knee, hip) of Rx(phi) Ry(theta).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.config import RobotConfig
+
+Array = NDArray[np.float64]
+
+GRAVITY = 9.81
+RIGHT, LEFT = 0, 1
+LEG = (slice(0, 6), slice(6, 12))
+"""Where a leg's joints stand in q."""
+
+
+class Leg(NamedTuple):
+    """One leg at a configuration, world axes."""
+
+    ankle: Array
+    knee: Array
+    torso: Array
+    """The torso's origin as this leg carries it, m."""
+    R: Array
+    """Torso's rotation as this leg carries it (3, 3)."""
+
+
+def rx(angle: float) -> Array:
+    """Return an active rotation about x."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def ry(angle: float) -> Array:
+    """Return an active rotation about y: z turns towards x."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def rz(angle: float) -> Array:
+    """Return an active rotation about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def leg(config: RobotConfig, side: int, q: Array) -> Leg:
+    """Return one leg: ankle to knee l2, knee to hip l1, hip to torso centre w_hip / 2."""
+    geometry = config.geometry
+    y = -1.0 if side == RIGHT else 1.0
+    phi_a, theta_a, phi_k, theta_k, phi_h, theta_h = q[LEG[side]]
+    ankle = np.array([0.0, y * geometry.w_base / 2, 0.0])
+    R = rx(phi_a) @ ry(theta_a)
+    knee = ankle + R @ np.array([0.0, 0.0, geometry.l2])
+    R = R @ rx(phi_k) @ ry(theta_k)
+    hip = knee + R @ np.array([0.0, 0.0, geometry.l1])
+    R = R @ rx(phi_h) @ ry(theta_h)
+    return Leg(ankle, knee, hip - R @ np.array([0.0, y * geometry.w_hip / 2, 0.0]), R)
+
+
+def masses(config: RobotConfig) -> tuple[float, float]:
+    """Return (m_torso, m_total) of the paper, kg."""
+    mass = config.mass
+    m_torso = 2 * mass.module + 2 * mass.battery + mass.payload
+    return m_torso, m_torso + 4 * mass.module
+
+
+def com(config: RobotConfig, q: Array, torso: Array) -> Array:
+    """Return r_COM (paper's equation) for a torso centre given, m."""
+    m_torso, m_total = masses(config)
+    legs = [leg(config, side, q) for side in (RIGHT, LEFT)]
+    at_joints = sum((one.knee + one.ankle for one in legs), np.zeros(3))
+    return np.asarray((m_torso * torso + config.mass.module * at_joints) / m_total, float)
+
+
+def euler(R: Array) -> Array:
+    """Return (phi, theta, psi) of R = Rz(psi) Rx(phi) Ry(theta), rad.
+
+    The paper prints R transposed; its formulas index (2,3), (1,3), (3,3), (2,1), (2,2).
+    """
+    Rt = R.T
+    return np.array(
+        [np.arcsin(Rt[1, 2]), np.arctan2(-Rt[0, 2], Rt[2, 2]), np.arctan2(-Rt[1, 0], Rt[1, 1])]
+    )
+
+
+def pose(config: RobotConfig, q: Array, side: int = RIGHT) -> Array:
+    """Return p (6,) with the torso as one leg carries it: exact where the legs agree."""
+    one = leg(config, side, q)
+    return np.concatenate([com(config, q, one.torso), euler(one.R)])
+
+
+def rotation_vector(R: Array) -> Array:
+    """Return the rotation vector of a rotation by less than pi / 2."""
+    axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = float(np.linalg.norm(axis))
+    return axis if sine < 1e-12 else axis * (np.arcsin(sine) / sine)
+
+
+def closure(config: RobotConfig, q: Array) -> Array:
+    """Return left minus right estimate of the torso (6,): m, and a rotation vector, world."""
+    right, left = leg(config, RIGHT, q), leg(config, LEFT, q)
+    return np.concatenate([left.torso - right.torso, rotation_vector(left.R @ right.R.T)])
+
+
+def harness(config: RobotConfig, q: Array, side: int = RIGHT) -> Array:
+    """Return the harness point as one leg carries it, m."""
+    one = leg(config, side, q)
+    return one.torso + one.R @ np.array(config.geometry.harness_point)
+
+
+def derivative(f: Callable[[Array], Array], q: Array, step: float = 1e-6) -> Array:
+    """Return df/dq by central differences, the joint last."""
+    columns = []
+    for index in range(len(q)):
+        e = np.zeros(len(q))
+        e[index] = step
+        columns.append((f(q + e) - f(q - e)) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def leg_jacobian(config: RobotConfig, side: int, q: Array) -> Array:
+    """Return the leg's torso twist per joint rate (6, 6), linear first, world axes."""
+    R0 = leg(config, side, q).R
+
+    def place(q_near: Array) -> Array:
+        near = leg(config, side, q_near)
+        return np.concatenate([near.torso, rotation_vector(near.R @ R0.T)])
+
+    return derivative(place, q)[:, LEG[side]]
+
+
+def knee_jacobian(config: RobotConfig, side: int, q: Array) -> Array:
+    """Return the knee's velocity per joint rate of its leg (3, 6), world axes."""
+    return derivative(lambda near: leg(config, side, near).knee, q)[:, LEG[side]]
+
+
+def feasible(config: RobotConfig, q: Array) -> Array:
+    """Return T (12, 6): joint rates per unit of p along which the legs stay together."""
+    J = derivative(lambda near: pose(config, near), q)
+    C = derivative(lambda near: closure(config, near), q)
+    return np.asarray(np.linalg.solve(np.vstack([J, C]), np.eye(12)[:, :6]), float)
+
+
+def potential_energy(config: RobotConfig, q: Array) -> float:
+    """Return m g z_COM in J, the torso in the middle of what the legs say."""
+    torso = 0.5 * (leg(config, RIGHT, q).torso + leg(config, LEFT, q).torso)
+    return masses(config)[1] * GRAVITY * float(com(config, q, torso)[2])
+
+
+def torso_wrench(config: RobotConfig, side: int, q: Array, tau: Array) -> Array:
+    """Return the wrench (6,) that a leg gives the torso at rest under joint torques (12,).
+
+    Virtual work on the leg, its knee module's weight included: J_i^T w + J_knee^T m g z
+    = tau_i; force first, moment about the torso's centre.
+    """
+    weight = np.array([0.0, 0.0, config.mass.module * GRAVITY])
+    on_torso = tau[LEG[side]] - knee_jacobian(config, side, q).T @ weight
+    return np.asarray(np.linalg.solve(leg_jacobian(config, side, q).T, on_torso), float)
+
+
+def foot_wrench(config: RobotConfig, side: int, q: Array, tau: Array) -> Array:
+    """Return the wrench (6,) of the floor on a foot at rest, moment about the ankle."""
+    one = leg(config, side, q)
+    on_torso = torso_wrench(config, side, q, tau)
+    weight = np.array([0.0, 0.0, config.mass.module * GRAVITY])
+    force = on_torso[:3] + 2 * weight  # knee and ankle modules hang on this leg
+    moment = (
+        on_torso[3:]
+        + np.cross(one.torso - one.ankle, on_torso[:3])
+        + np.cross(one.knee - one.ankle, weight)
+    )
+    return np.concatenate([force, moment])

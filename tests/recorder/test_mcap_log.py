@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Attachment, Chunk, Header, Metadata
+from mcap.stream_reader import StreamReader
+
+from services.recorder import mcap_log
+from shared import codec
+from shared.exceptions import RunError
+from tests.recorder import runs
+from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, Queue, item
+from tools.run_log import read_run
+
+
+def test_every_recorded_topic_has_a_channel_and_a_schema(tmp_path: Path) -> None:
+    path = runs.write(tmp_path, [item(0)])
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    channels = {channel.topic: channel for channel in summary.channels.values()}
+    assert set(channels) == set(runs.recorded_topics())
+    for key, topic in runs.recorded_topics().items():
+        schema = summary.schemas[channels[key].schema_id]
+        assert (schema.name, schema.encoding) == (f"xrl.{topic.type.__name__}", "jsonschema")
+        assert json.loads(schema.data)["type"] == "object"
+        assert channels[key].message_encoding == "json"
+
+
+def test_metadata_and_attachments_come_before_the_first_chunk(tmp_path: Path) -> None:
+    path = runs.write(tmp_path, [item(seq) for seq in range(500)])
+    with path.open("rb") as file:
+        records = list(StreamReader(file, emit_chunks=True).records)
+    assert isinstance(records[0], Header)
+    first_chunk = next(i for i, record in enumerate(records) if isinstance(record, Chunk))
+    head = records[1:first_chunk]
+    names = [r.name for r in head if isinstance(r, Metadata | Attachment)]
+    assert names == ["run", "packages", "clock", *ATTACHMENTS]
+    assert len(names) == len(head)
+
+
+def test_a_finished_file_is_readable_by_the_ordinary_reader(tmp_path: Path) -> None:
+    items = [item(seq) for seq in range(300)]
+    with runs.write(tmp_path, items).open("rb") as file:
+        found = list(make_reader(file, validate_crcs=True).iter_messages())
+    assert [message.data for _, _, message in found] == [payload for _, payload, _ in items]
+
+
+def test_times_are_mapped_to_the_wall_clock_by_one_offset(tmp_path: Path) -> None:
+    with runs.write(tmp_path, [item(7)]).open("rb") as file:
+        ((_, channel, message),) = make_reader(file).iter_messages()
+    assert channel.topic == STATE_KEY
+    assert message.log_time == OFFSET_NS + 7_000_500
+    assert message.publish_time == OFFSET_NS + 7_000_000
+    assert message.sequence == 7
+
+
+def test_an_existing_file_is_left_alone_and_the_next_number_is_taken(tmp_path: Path) -> None:
+    first = runs.write(tmp_path, [item(0)])
+    before = first.read_bytes()
+    second = runs.write(tmp_path, [item(1)])
+    third = runs.write(tmp_path, [item(2)])
+    assert [p.name for p in (first, second, third)] == ["run.mcap", "run-1.mcap", "run-2.mcap"]
+    assert first.read_bytes() == before
+
+
+def test_foreign_keys_and_malformed_payloads_are_counted_and_not_written(tmp_path: Path) -> None:
+    bad = [b"", b"{", b"\xff", b"{}", b'{"t_ns":-1,"seq":0}', b'{"t_ns":1,"seq":1e99}']
+    with runs.writer(tmp_path) as run:
+        foreign = ("xrl/lab/nobody", codec.encode(runs.state(0)), 1)
+        run.take_from(Queue([foreign, *((STATE_KEY, p, 1) for p in bad), item(0)]), 100)
+        assert run.messages == 1
+        assert run.unknown == {"xrl/lab/nobody": 1}
+        assert run.malformed == {STATE_KEY: len(bad)}
+
+
+def test_counts_with_gaps_and_restarts_are_written_at_the_end(tmp_path: Path) -> None:
+    path = runs.write(tmp_path, [item(seq) for seq in (0, 1, 4, 0, 1)])
+    with path.open("rb") as file:
+        (counts,) = [r.metadata for r in make_reader(file).iter_metadata() if r.name == "counts"]
+    assert set(counts) == set(runs.recorded_topics())
+    found = json.loads(counts[STATE_KEY])
+    assert (found["count"], found["gaps"], found["missing"], found["restarts"]) == (5, 1, 2, 1)
+
+
+def test_take_from_takes_no_more_than_it_was_asked_to(tmp_path: Path) -> None:
+    source = Queue(item(seq) for seq in range(10))
+    with runs.writer(tmp_path) as run:
+        assert run.take_from(source, 4) == 4
+        assert len(source.items) == 6
+
+
+def test_a_full_disk_is_one_run_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = Path("/dev/full")
+    opened = []
+
+    def create(_directory: Path) -> tuple[Path, object]:
+        opened.append(full.open("wb"))
+        return full, opened[-1]
+
+    monkeypatch.setattr(mcap_log, "_create", create)
+    with pytest.raises(RunError, match=r"^/dev/full: cannot be written: No space left"):
+        runs.writer(tmp_path)
+    assert opened[0].closed
+
+
+def test_a_directory_that_cannot_be_made_is_one_run_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match="cannot be created"):
+        runs.writer(tmp_path / "file" / "out")
+
+
+def broken_off(directory: Path) -> None:
+    with runs.writer(directory) as run:
+        run.take_from(Queue([item(0)]), 10)
+        run.flush()
+        raise InterruptedError
+
+
+def test_a_block_left_by_an_exception_leaves_a_readable_file_without_summary(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(InterruptedError):
+        broken_off(tmp_path)
+    log = read_run(tmp_path / "run.mcap")
+    assert (log.complete, log.count(STATE_KEY)) == (False, 1)

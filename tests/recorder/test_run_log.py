@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from shared import codec, topics
+from shared.exceptions import RunError
+from shared.messages import Wrench
+from tests.recorder import runs
+from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Queue, item
+from tools.run_log import read_run
+
+WRENCH_KEY = topics.WRENCH.key(ROBOT)
+
+
+def test_a_finished_file_gives_back_every_message_in_order(tmp_path: Path) -> None:
+    log = read_run(runs.write(tmp_path, [item(seq) for seq in range(1000)]))
+    assert log.messages(topics.JOINT_STATE, "knee_right") == [runs.state(s) for s in range(1000)]
+    assert log.received_ns(topics.JOINT_STATE, "knee_right")[3] == 3_000_500
+    assert log.count(STATE_KEY) == 1000
+    assert log.keys() == [STATE_KEY]
+    assert (log.complete, log.damaged, log.offset_ns, log.robot) == (True, 0, OFFSET_NS, ROBOT)
+
+
+def test_a_key_without_messages_is_empty_and_no_error(tmp_path: Path) -> None:
+    log = read_run(runs.write(tmp_path, [item(0)]))
+    assert log.messages(topics.WRENCH) == []
+    assert log.received_ns(topics.WRENCH) == []
+    assert log.count("xrl/lab/nobody") == 0
+
+
+def test_metadata_and_attachments_are_read(tmp_path: Path) -> None:
+    log = read_run(runs.write(tmp_path, [item(0)]))
+    assert log.attachments == ATTACHMENTS
+    assert log.metadata["run"]["robot"] == ROBOT
+    assert set(log.metadata) == {"run", "packages", "clock", "counts"}
+
+
+def test_gaps_are_those_the_recorder_counted(tmp_path: Path) -> None:
+    wrenches = [(WRENCH_KEY, codec.encode(runs.sample(Wrench, seq=seq)), 1) for seq in (5, 6, 9, 0)]
+    with runs.writer(tmp_path) as run:
+        run.take_from(Queue([*(item(seq) for seq in (0, 1, 3)), *wrenches]), 100)
+    gaps = read_run(run.path).gaps()
+    assert gaps == {key: count for key, count in run.counts.items() if count.count}
+    assert (gaps[WRENCH_KEY].missing, gaps[WRENCH_KEY].restarts) == (2, 1)
+
+
+def killed_file(tmp_path: Path) -> tuple[Path, list[tuple[int, int]]]:
+    """Return a file as a kill leaves it, and (size, messages) after each flush."""
+    killed = tmp_path / "killed.mcap"
+    with runs.writer(tmp_path) as run:
+        flushed = [(run.path.stat().st_size, 0)]
+        for batch in range(12):
+            run.take_from(Queue(item(batch * 100 + n) for n in range(100)), 100)
+            run.flush()
+            flushed.append((run.path.stat().st_size, (batch + 1) * 100))
+        killed.write_bytes(run.path.read_bytes())
+    return killed, flushed
+
+
+def test_a_file_cut_anywhere_is_read_up_to_the_last_flush(tmp_path: Path) -> None:
+    path, flushed = killed_file(tmp_path)
+    data = path.read_bytes()
+    assert len(data) == flushed[-1][0]
+    dice = random.Random(7)
+    sent = [runs.state(seq) for seq in range(flushed[-1][1])]
+    cuts = [dice.randint(flushed[0][0], len(data)) for _ in range(200)]
+    cut_path = tmp_path / "cut.mcap"
+    for cut in [*cuts, *(size for size, _ in flushed)]:
+        cut_path.write_bytes(data[:cut])
+        log = read_run(cut_path)
+        found = log.messages(topics.JOINT_STATE, "knee_right")
+        assert len(found) >= max(count for size, count in flushed if size <= cut)
+        assert found == sent[: len(found)]
+        assert (log.complete, log.damaged) == (False, 0)
+        assert log.attachments == ATTACHMENTS
+
+
+def test_a_file_cut_before_its_first_messages_is_read_or_one_run_error(tmp_path: Path) -> None:
+    path, flushed = killed_file(tmp_path)
+    data = path.read_bytes()
+    cut_path = tmp_path / "cut.mcap"
+    outcomes = []
+    for cut in range(flushed[0][0]):
+        cut_path.write_bytes(data[:cut])
+        try:
+            outcomes.append(str(read_run(cut_path).keys()))
+        except RunError as error:
+            outcomes.append(str(error))
+    assert outcomes[-1] == "[]"
+    assert outcomes[0].endswith("is empty; an MCAP file is right")
+    assert not any("\n" in outcome for outcome in outcomes)
+
+
+def test_zeros_after_a_power_cut_are_the_end(tmp_path: Path) -> None:
+    path, flushed = killed_file(tmp_path)
+    with path.open("ab") as file:
+        file.write(bytes(10_000))
+    assert read_run(path).count(STATE_KEY) == flushed[-1][1]
+
+
+def test_a_damaged_chunk_is_counted_and_the_others_are_read(tmp_path: Path) -> None:
+    path, flushed = killed_file(tmp_path)
+    data = bytearray(path.read_bytes())
+    position = flushed[3][0] + 200  # inside the first chunk of the fourth batch
+    data[position : position + 50] = bytes(50)
+    path.write_bytes(data)
+    log = read_run(path)
+    assert log.damaged == 1
+    assert 0 < log.count(STATE_KEY) < flushed[-1][1]
+    assert log.messages(topics.JOINT_STATE, "knee_right")[-1] == runs.state(1199)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89", b"no mcap file at all", bytes(100)])
+def test_what_is_no_mcap_file_is_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(RunError, match=r"x\.mcap: is (empty|no MCAP file)") as caught:
+        read_run(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["absent.mcap", "."])
+def test_a_missing_file_and_a_directory_are_one_line(tmp_path: Path, name: str) -> None:
+    with pytest.raises(RunError, match="cannot be read"):
+        read_run(tmp_path / name)
+
+
+def test_messages_of_another_version_are_refused_with_the_key(tmp_path: Path) -> None:
+    old = (STATE_KEY, b'{"t_ns":1,"seq":1,"angle":3.0}', 1)
+    log = read_run(runs.write(tmp_path, [old]))
+    assert log.count(STATE_KEY) == 1
+    with pytest.raises(RunError, match=f"{STATE_KEY}.*JointState.*schema version 1"):
+        log.messages(topics.JOINT_STATE, "knee_right")
+
+
+def test_a_module_is_asked_for_exactly_where_there_is_one(tmp_path: Path) -> None:
+    log = read_run(runs.write(tmp_path, [item(0)]))
+    with pytest.raises(RunError, match="name a module"):
+        log.messages(topics.JOINT_STATE)
+    with pytest.raises(RunError, match="name none"):
+        log.messages(topics.WRENCH, "knee_right")

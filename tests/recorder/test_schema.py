@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any
+
+import msgspec
+import pytest
+
+from services.recorder import schema
+from shared import codec, messages, topics
+from shared.exceptions import RunError
+from shared.topics import Topic
+from tests.recorder.runs import sample
+
+RECORDED = [topic for topic in topics.TOPICS if topic.recorded]
+PLAIN = {"boolean": bool, "integer": int, "number": (int, float), "string": str}
+
+
+def fits(value: Any, node: dict[str, Any]) -> bool:
+    """Validate as JSON schema does, for the keywords that `schema` uses."""
+    if node["type"] == "object":
+        names = set(node["properties"])
+        return (
+            isinstance(value, dict)
+            and set(node["required"]) <= set(value) <= names
+            and all(fits(value[name], node["properties"][name]) for name in value)
+        )
+    if node["type"] == "array":
+        if not isinstance(value, list):
+            return False
+        low, high = node.get("minItems", 0), node.get("maxItems", len(value))
+        return low <= len(value) <= high and all(fits(entry, node["items"]) for entry in value)
+    if isinstance(value, bool) and node["type"] != "boolean":
+        return False
+    return isinstance(value, PLAIN[node["type"]])
+
+
+@pytest.mark.parametrize("topic", RECORDED, ids=lambda topic: topic.type.__name__)
+def test_schema_is_flat(topic: Topic) -> None:
+    text = schema.encoded(topic.type).decode()
+    for refused in ("$ref", "$defs", "anyOf", "oneOf", "prefixItems", "null", '"enum"'):
+        assert refused not in text
+    for node in msgspec.json.decode(text)["properties"].values():
+        item = node["items"] if node["type"] == "array" else node
+        assert item["type"] in PLAIN
+
+
+@pytest.mark.parametrize("topic", RECORDED, ids=lambda topic: topic.type.__name__)
+def test_encoded_message_fits_its_schema_and_a_damaged_one_does_not(topic: Topic) -> None:
+    node = schema.json_schema(topic.type)
+    value = msgspec.json.decode(codec.encode(sample(topic.type)))
+    assert fits(value, node)
+    for name in value:
+        assert not fits({**value, name: None}, node)
+        assert not fits({other: value[other] for other in value if other != name}, node)
+    assert not fits({**value, "extra": 1}, node)
+
+
+def test_every_enumeration_of_the_messages_names_its_values_in_a_schema() -> None:
+    described = "".join(schema.encoded(topic.type).decode() for topic in RECORDED)
+    enumerations = [
+        kind
+        for kind in vars(messages).values()
+        if isinstance(kind, type) and issubclass(kind, IntEnum) and kind is not IntEnum
+    ]
+    assert len(enumerations) >= 4
+    for enumeration in enumerations:
+        for member in enumeration:
+            assert f"{member.value} {member.name}" in described
+
+
+def test_every_field_of_the_enumeration_table_is_an_integer_field() -> None:
+    for message_type, field in schema.ENUMERATIONS:
+        node = schema.json_schema(message_type)["properties"][field]
+        assert node["type"] == "integer"
+
+
+class Colour(IntEnum):
+    RED = 3
+
+
+class Inner(msgspec.Struct):
+    x: float
+
+
+class Outer(msgspec.Struct):
+    inner: Inner
+    colour: Colour
+    rows: list[Inner]
+    perhaps: float | None = None
+
+
+def test_nested_structs_enumerations_and_optional_fields_become_flat() -> None:
+    node = schema.json_schema(Outer)
+    inner = {"type": "object", "title": "Inner", "properties": {"x": {"type": "number"}}}
+    properties = node["properties"]
+    assert inner.items() <= properties["inner"].items()
+    assert inner.items() <= properties["rows"]["items"].items()
+    assert properties["colour"] == {"type": "integer", "description": "Colour: 3 RED"}
+    assert properties["perhaps"] == {"type": "number"}
+    assert node["required"] == ["inner", "colour", "rows"]
+
+
+class Matrix(msgspec.Struct):
+    rows: tuple[tuple[float, float], tuple[float, float]]
+
+
+class Mixed(msgspec.Struct):
+    pair: tuple[int, str]
+
+
+class Either(msgspec.Struct):
+    value: int | str
+
+
+@pytest.mark.parametrize("refused", [Matrix, Mixed, Either])
+def test_what_foxglove_cannot_read_is_refused_with_type_and_field(
+    refused: type[msgspec.Struct],
+) -> None:
+    with pytest.raises(RunError, match=rf"^{refused.__name__}\.\w+: "):
+        schema.json_schema(refused)

@@ -1,0 +1,312 @@
+"""A fleet of stand-ins under the real supervisor: nothing may be left behind, ever."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from shared.exceptions import FleetError
+from shared.process import DEFAULT_CONFIG
+from tools import cli, procfs
+from tools.supervise import Fleet, ServiceInfo
+
+pytestmark = pytest.mark.system
+
+SLEEPER = "import time; print('awake', flush=True); time.sleep(600)"
+STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {SLEEPER}"
+FAILING = "print('no drive on can0'); raise SystemExit(3)"
+JOINT = """
+import sys, time
+from pathlib import Path
+from shared.bus import open_session
+from shared.config import load
+from shared.messages import JointState, Mode
+from shared.topics import JOINT_STATE
+zero = (0.0, 0.0)
+with open_session(load(Path(sys.argv[1])), "ankle_right", Path(sys.argv[2])) as session:
+    publisher = session.publisher(JOINT_STATE, JointState, "ankle_right")
+    for seq in range(100_000):
+        publisher.put(JointState(
+            t_ns=time.monotonic_ns(), seq=seq, q=zero, v=zero, tau=zero, mode=Mode.HOLD,
+            ready=False, age_ns=-1, session=0, command_seq=-1, cycle=seq, late=0, dropouts=0,
+            refused=0, drive_error=0))
+        time.sleep(0.01)
+"""
+
+
+def write_table(path: Path, programs: dict[str, str], *, ready: str = "running") -> Path:
+    files = {name: path.with_name(f"{name}.py") for name in programs}
+    for name, program in programs.items():
+        files[name].write_text(program, encoding="utf-8")
+    rows = [
+        f"""
+[[process]]
+name = {json.dumps(name)}
+kind = "planner"
+command = ["{{python}}", {json.dumps(str(files[name]))}, "{{config}}", "{{run}}"]
+autostart = true
+ready = {json.dumps(ready)}
+topic = {json.dumps("joint/*/state" if name == "ankle_right" else "")}
+stop_signal = "TERM"
+stop_s = 1
+settle_s = 1
+why = "a stand-in"
+"""
+        for name in programs
+    ]
+    path.write_text("[environment]\n" + "".join(rows), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as parent:
+        path = Path(parent) / "run"
+        yield path
+        Fleet(path).stop()
+
+
+Start = Callable[..., Fleet]
+
+
+@pytest.fixture
+def start(run_dir: Path, tmp_path: Path) -> Start:
+    def start(programs: dict[str, str] | None = None, **arguments: object) -> Fleet:
+        table = write_table(
+            tmp_path / "processes.toml", programs or {"planner": SLEEPER, "harness": SLEEPER}
+        )
+        return Fleet.start(DEFAULT_CONFIG, run_dir, table_path=table, **arguments)
+
+    return start
+
+
+def wait_for(truth: Callable[[], bool], timeout_s: float = 20.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not truth():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def service(fleet: Fleet, name: str) -> ServiceInfo:
+    return next(row for row in fleet.info() if row.name == name)
+
+
+def supervisor_pid(fleet: Fleet) -> int:
+    return int(fleet.run.supervisor_pid.read_text(encoding="utf-8"))
+
+
+def assert_nothing_left(run_dir: Path, pids: Sequence[int]) -> None:
+    assert procfs.fleet_pids(run_dir) == set()
+    assert all(procfs.is_gone(pid) for pid in pids)
+    assert not run_dir.exists() or {path.name for path in run_dir.iterdir()} <= {"logs"}
+
+
+def test_a_stopped_fleet_leaves_no_process_and_no_file(start: Start, run_dir: Path) -> None:
+    fleet = start()
+    assert [row.state for row in fleet.info()] == ["running", "running"]
+    pids = [*fleet.pids().values(), supervisor_pid(fleet)]
+    assert set(pids) == procfs.fleet_pids(run_dir)
+    fleet.stop()
+    assert_nothing_left(run_dir, pids)
+    assert not run_dir.exists()
+
+
+def test_a_killed_service_is_restarted_and_counted(start: Start) -> None:
+    fleet = start()
+    before = fleet.kill("planner", signal.SIGKILL)
+    assert wait_for(lambda: fleet.pids().get("planner", before) != before)
+    planner, harness = service(fleet, "planner"), service(fleet, "harness")
+    assert (planner.restarts, harness.restarts) == (1, 0)
+    assert "SIGKILL" in planner.last_exit
+
+
+def test_a_service_that_is_not_to_restart_stays_down_until_it_is_started(start: Start) -> None:
+    fleet = start(no_restart=frozenset({"planner"}))
+    fleet.kill("planner")
+    assert wait_for(lambda: service(fleet, "planner").state == "exited")
+    time.sleep(1.0)
+    assert service(fleet, "planner").pid is None
+    fleet.start_service("planner")
+    assert wait_for(lambda: service(fleet, "planner").state == "running")
+
+
+def test_a_suspended_service_is_shown_and_resumed(start: Start) -> None:
+    fleet = start()
+    pid = fleet.kill("planner", signal.SIGSTOP)
+    assert wait_for(lambda: service(fleet, "planner").state == "suspended")
+    assert fleet.resume("planner") == pid
+    assert wait_for(lambda: service(fleet, "planner").state == "running")
+    assert service(fleet, "planner").restarts == 0
+
+
+@pytest.mark.parametrize("program", [SLEEPER, STUBBORN])
+def test_a_suspended_or_stubborn_service_does_not_hold_the_stop(
+    start: Start, run_dir: Path, program: str
+) -> None:
+    fleet = start({"planner": program, "harness": SLEEPER})
+    pid = fleet.kill("planner", signal.SIGSTOP)
+    fleet.stop()
+    assert_nothing_left(run_dir, [pid])
+
+
+def test_a_suspended_supervisor_does_not_hold_the_stop(start: Start, run_dir: Path) -> None:
+    fleet = start()
+    pid = supervisor_pid(fleet)
+    os.kill(pid, signal.SIGSTOP)
+    fleet.stop()
+    assert_nothing_left(run_dir, [pid])
+
+
+def test_no_service_outlives_a_killed_supervisor(start: Start, run_dir: Path) -> None:
+    fleet = start({"planner": STUBBORN, "harness": SLEEPER})
+    pids = list(fleet.pids().values())
+    fleet.kill("harness", signal.SIGSTOP)
+    os.kill(supervisor_pid(fleet), signal.SIGKILL)
+    assert wait_for(lambda: all(procfs.is_gone(pid) for pid in pids))
+    with pytest.raises(FleetError, match="does not answer"):
+        Fleet.attach(run_dir)
+    Fleet(run_dir).stop()
+    assert_nothing_left(run_dir, pids)
+
+
+def test_a_fleet_can_start_where_one_was_killed(start: Start) -> None:
+    first = start()
+    pids = list(first.pids().values())
+    os.kill(supervisor_pid(first), signal.SIGKILL)
+    assert wait_for(lambda: all(procfs.is_gone(pid) for pid in pids))
+    assert wait_for(lambda: procfs.is_gone(supervisor_pid(first)))
+    assert len(start().pids()) == 2
+
+
+def test_a_second_fleet_in_the_same_directory_is_refused_and_harms_nothing(start: Start) -> None:
+    fleet = start()
+    before = fleet.pids()
+    with pytest.raises(FleetError, match="a fleet is up in"):
+        start()
+    assert fleet.pids() == before
+
+
+def test_a_service_that_ends_at_once_fails_the_start_with_its_log(
+    start: Start, run_dir: Path
+) -> None:
+    with pytest.raises(FleetError, match=r"planner ended at once \(exit status 3\)") as failure:
+        start({"harness": SLEEPER, "planner": FAILING})
+    assert "no drive on can0" in str(failure.value)
+    assert_nothing_left(run_dir, [])
+
+
+def test_a_service_that_never_listens_fails_the_start(run_dir: Path, tmp_path: Path) -> None:
+    table = write_table(tmp_path / "p.toml", {"planner": SLEEPER}, ready="endpoint")
+    with pytest.raises(FleetError, match="not up after 2 s: planner"):
+        Fleet.start(DEFAULT_CONFIG, run_dir, table_path=table, timeout_s=2.0)
+    assert_nothing_left(run_dir, [])
+
+
+def test_a_port_in_use_is_refused_before_anything_starts(run_dir: Path, tmp_path: Path) -> None:
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        config = tmp_path / "robot.toml"
+        config.write_text(text.replace("unixsock-stream/{run}/planner.zenoh", endpoint))
+        table = write_table(tmp_path / "p.toml", {"planner": SLEEPER})
+        with pytest.raises(FleetError, match=f"planner: {endpoint}: port in use"):
+            Fleet.start(config, run_dir, table_path=table)
+    assert_nothing_left(run_dir, [])
+
+
+def up_in_a_process(run_dir: Path, table: Path, *, then: str = "") -> subprocess.Popen[str]:
+    """Start a fleet as `xrl up` does, in a process of its own that may be interrupted."""
+    code = (
+        "import sys, time, tools.cli, tools.up, tools.supervise as s\n"
+        "from pathlib import Path\n"
+        "def run(args):\n"
+        f"    s.Fleet.start(args.config, args.run_dir, table_path=Path({str(table)!r}),"
+        f" leashed={bool(then)}, timeout_s=60)\n"
+        f"    {then or 'return 0'}\n"
+        "tools.up.run = run\n"
+        f"sys.exit(tools.cli.main(['up', '--run-dir', {str(run_dir)!r}]))\n"
+    )
+    return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("delay_s", [0.0, 0.4])
+def test_an_interrupt_in_the_middle_of_a_start_leaves_nothing(
+    run_dir: Path, tmp_path: Path, number: signal.Signals, delay_s: float
+) -> None:
+    table = write_table(tmp_path / "p.toml", {"planner": SLEEPER}, ready="endpoint")  # never up
+    process = up_in_a_process(run_dir, table)
+    assert wait_for(lambda: bool(procfs.fleet_pids(run_dir)))
+    time.sleep(delay_s)
+    pids = procfs.fleet_pids(run_dir)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 128 + number
+    assert "Traceback" not in errors
+    assert_nothing_left(run_dir, sorted(pids))
+    assert not run_dir.exists()
+
+
+def test_a_leashed_fleet_ends_when_its_owner_is_killed(run_dir: Path, tmp_path: Path) -> None:
+    table = write_table(tmp_path / "p.toml", {"planner": SLEEPER})
+    process = up_in_a_process(run_dir, table, then="print('up'); time.sleep(600)")
+    assert wait_for(lambda: len(procfs.fleet_pids(run_dir)) == 2)
+    time.sleep(0.5)
+    process.kill()
+    process.communicate(timeout=30)
+    assert wait_for(lambda: not procfs.fleet_pids(run_dir))
+
+
+@pytest.fixture
+def signal_handlers() -> Iterator[None]:
+    """Put back what `cli.main` changes in this process."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("signal_handlers")
+def test_status_shows_mode_tier_age_and_rate(
+    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
+    assert cli.main(["status", "--json", "--run-dir", str(run_dir)]) == 0
+    status = json.loads(capsys.readouterr().out)
+    ankle = status["services"]["ankle_right"]
+    assert ankle["pid"] == fleet.pids()["ankle_right"]
+    assert ankle["state"] == "running"
+    assert 20 < ankle["rate_hz"] < 150
+    assert 0 <= ankle["age_s"] < 1
+    assert status["modules"] == {"ankle_right": {"mode": "HOLD", "tier": 2}}
+    assert status["services"]["planner"]["rate_hz"] is None
+    assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
+    assert "ankle_right" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("signal_handlers")
+def test_kill_and_down_work_from_the_command_line(
+    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet = start()
+    pids = list(fleet.pids().values())
+    where = ["--run-dir", str(run_dir)]
+    assert cli.main(["kill", "plannr", *where]) == 2
+    assert "one of planner, harness" in capsys.readouterr().err
+    assert cli.main(["kill", "planner", "--signal", "STOP", *where]) == 0
+    assert wait_for(lambda: service(fleet, "planner").state == "suspended")
+    assert cli.main(["down", *where]) == 0
+    assert_nothing_left(run_dir, pids)

@@ -1,0 +1,263 @@
+"""The emulated drives: the firmware's law, its limits and its traps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.simulator.axis_bank import AXIS_NAMES, FAULTS, AxisBank
+from shared.cansimple import AxisError, AxisState, ControlMode, InputMode
+from shared.config import DriveConfig
+from shared.exceptions import DriveError
+
+DRIVE = DriveConfig(
+    torque_constant=0.0827,
+    current_lim=60.0,
+    vel_limit=60.0,
+    watchdog_timeout=0.1,
+    encoder_period_ms=1,
+    heartbeat_period_ms=100,
+)
+CPR = 16384
+DT = 0.001
+ZERO = np.zeros(12)
+
+
+def make_bank(mode: ControlMode = ControlMode.TORQUE, *, watchdog: bool = False) -> AxisBank:
+    """Return a bank with all axes in closed loop at position 0, at time 0."""
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=watchdog)
+    bank.step(0.0, ZERO, ZERO)
+    for axis in range(12):
+        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
+        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+    assert bank.state == [AxisState.CLOSED_LOOP_CONTROL] * 12
+    return bank
+
+
+def clamp(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))
+
+
+def firmware_torque(
+    bank: AxisBank, axis: int, mode: int, pos: float, vel: float, integrator: float = 0.0
+) -> float:
+    """Return the torque of one axis as controller.cpp computes it, one number at a time."""
+    vel_limit, gain = float(bank.vel_limit[axis]), float(bank.vel_gain[axis])
+    torque = float(bank.input_torque[axis])
+    if mode >= 2:
+        vel_des = float(bank.input_vel[axis])
+        if mode == 3:
+            vel_des += float(bank.pos_gain[axis]) * (float(bank.input_pos[axis]) - pos)
+        torque += gain * (clamp(vel_des, vel_limit) - vel) + integrator
+    else:
+        torque = max((-vel_limit - vel) * gain, min((vel_limit - vel) * gain, torque))
+    return clamp(torque, float(bank.current_lim[axis]) * DRIVE.torque_constant)
+
+
+number = st.floats(-50.0, 50.0)
+gain = st.floats(0.0, 40.0)
+
+
+@given(
+    modes=st.lists(st.sampled_from([1, 2, 3]), min_size=12, max_size=12),
+    inputs=st.lists(st.tuples(number, number, number), min_size=12, max_size=12),
+    gains=st.lists(st.tuples(gain, gain), min_size=12, max_size=12),
+    pos=st.lists(number, min_size=12, max_size=12),
+    vel=st.lists(number, min_size=12, max_size=12),
+)
+def test_torque_equals_the_scalar_law_of_the_firmware(modes, inputs, gains, pos, vel) -> None:
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=False)
+    bank.step(0.0, np.array(pos), np.array(vel))
+    for axis in range(12):
+        bank.set_modes(axis, modes[axis], InputMode.PASSTHROUGH)
+        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+        bank.input_pos[axis], bank.input_vel[axis], bank.input_torque[axis] = inputs[axis]
+        bank.pos_gain[axis], bank.vel_gain[axis] = gains[axis]
+    torque = bank.step(0.0, np.array(pos), np.array(vel))
+    for axis in range(12):
+        quantised = math.floor(pos[axis] * CPR) / CPR
+        expected = firmware_torque(bank, axis, modes[axis], quantised, vel[axis])
+        assert torque[axis] == pytest.approx(expected, abs=1e-9)
+
+
+def test_integrator_adds_gain_times_velocity_error_over_time() -> None:
+    bank = make_bank(ControlMode.VELOCITY)
+    bank.vel_gain[:] = 0.1
+    bank.vel_integrator_gain[:] = 0.5
+    bank.input_vel[4] = 2.0
+    torque = [float(bank.step(k * DT, ZERO, ZERO)[4]) for k in range(1, 101)]
+    # The first step regulates with an empty integrator, the 100th with 99 steps in it.
+    assert torque[0] == pytest.approx(0.2)
+    assert torque[-1] == pytest.approx(0.2 + 0.5 * 2.0 * 99 * DT)
+
+
+def test_integrator_decays_where_the_torque_is_limited() -> None:
+    bank = make_bank(ControlMode.VELOCITY)
+    bank.input_vel[0] = 10.0
+    for k in range(1, 200):
+        bank.step(k * DT, ZERO, ZERO)
+    bank.input_torque[0] = 100.0
+    for k in range(200, 400):
+        bank.step(k * DT, ZERO, ZERO)
+    bank.input_torque[0] = 0.0
+    assert bank.step(0.4, ZERO, ZERO)[0] == pytest.approx(10.0 / 6.0, rel=1e-3)
+
+
+def test_torque_is_clamped_to_current_lim_times_torque_constant() -> None:
+    bank = make_bank()
+    bank.vel_gain[:] = 10.0  # else the torque mode velocity limit clamps first
+    bank.input_torque[:6] = 99.0
+    bank.input_torque[6:] = -99.0
+    torque = bank.step(DT, ZERO, ZERO)
+    assert torque[:6] == pytest.approx(60.0 * 0.0827)
+    assert torque[6:] == pytest.approx(-60.0 * 0.0827)
+
+
+def test_overspeed_disarms_in_torque_mode_with_axis_error_zero() -> None:
+    bank = make_bank()
+    bank.input_torque[:] = 1.0
+    speed = np.zeros(12)
+    speed[3] = 80.0  # beyond 1.2 * 60 turn/s
+    torque = ZERO
+    for k in range(1, 30):
+        torque = bank.step(k * DT, speed * k * DT, speed)
+    heartbeat = bank.heartbeat(3)
+    assert torque[3] == 0.0
+    assert torque[2] == 1.0
+    assert heartbeat.axis_state == AxisState.IDLE
+    assert heartbeat.axis_error == 0
+    assert heartbeat.controller_failed
+
+
+def test_speed_below_the_tolerance_keeps_the_axis_armed() -> None:
+    bank = make_bank()
+    speed = np.full(12, 65.0)
+    for k in range(1, 100):
+        bank.step(k * DT, speed * k * DT, speed)
+    assert bank.state == [AxisState.CLOSED_LOOP_CONTROL] * 12
+
+
+def test_starved_watchdog_floats_the_axis_and_the_sibling_keeps_its_torque() -> None:
+    bank = make_bank(watchdog=True)
+    bank.input_torque[:] = 2.0
+    torque = ZERO
+    for k in range(1, 151):
+        for axis in range(1, 12):
+            bank.feed(axis)
+        torque = bank.step(k * DT, ZERO, ZERO)
+        if k == 90:
+            assert torque[0] == 2.0
+    assert torque[0] == 0.0
+    assert torque[1:] == pytest.approx(2.0)
+    assert bank.heartbeat(0).axis_error == AxisError.WATCHDOG_TIMER_EXPIRED
+    assert bank.heartbeat(0).axis_state == AxisState.IDLE
+    assert bank.heartbeat(1).axis_error == 0
+
+
+def test_watchdog_that_is_off_never_disarms() -> None:
+    bank = make_bank(watchdog=False)
+    bank.input_torque[:] = 2.0
+    assert bank.step(1000.0, ZERO, ZERO) == pytest.approx(2.0)
+
+
+def test_closed_loop_is_refused_while_an_error_stands() -> None:
+    bank = make_bank()
+    bank.inject("knee_right.axis1", "DRV_FAULT")
+    bank.request_state(3, AxisState.CLOSED_LOOP_CONTROL)
+    assert bank.state[3] == AxisState.IDLE
+    bank.clear_errors(2)  # through the sibling: the firmware clears the whole ODrive
+    bank.request_state(3, AxisState.CLOSED_LOOP_CONTROL)
+    assert bank.state[3] == AxisState.CLOSED_LOOP_CONTROL
+
+
+def test_rearming_brings_back_the_old_input_torque() -> None:
+    bank = make_bank()
+    bank.input_torque[5] = 1.25
+    bank.request_state(5, AxisState.IDLE)
+    assert bank.step(DT, ZERO, ZERO)[5] == 0.0
+    bank.request_state(5, AxisState.CLOSED_LOOP_CONTROL)
+    assert bank.step(2 * DT, ZERO, ZERO)[5] == 1.25
+
+
+def test_position_mode_is_entered_without_a_jump() -> None:
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=False)
+    pos = np.full(12, 3.7)
+    bank.step(0.0, pos, ZERO)
+    bank.request_state(0, AxisState.CLOSED_LOOP_CONTROL)
+    assert bank.step(DT, pos, ZERO)[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_state_that_is_not_emulated_is_invalid_and_leads_to_idle() -> None:
+    bank = make_bank()
+    bank.request_state(7, AxisState.MOTOR_CALIBRATION)
+    assert bank.state[7] == AxisState.IDLE
+    assert bank.heartbeat(7).axis_error == AxisError.INVALID_STATE
+
+
+def test_reboot_restarts_both_axes_of_one_odrive_only() -> None:
+    bank = make_bank()
+    bank.input_torque[:] = 1.0
+    bank.reboot(5)
+    torque = bank.step(DT, ZERO, ZERO)
+    assert list(np.flatnonzero(torque == 0.0)) == [4, 5]
+    assert bank.input_torque[4] == bank.input_torque[5] == 0.0
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_injected_fault_floats_that_axis_alone(fault: str) -> None:
+    bank = make_bank()
+    bank.input_torque[:] = 1.0
+    bank.inject("hip_left.axis0", fault)
+    torque = bank.step(DT, ZERO, ZERO)
+    assert AXIS_NAMES[10] == "hip_left.axis0"
+    assert torque[10] == 0.0
+    assert np.delete(torque, 10) == pytest.approx(1.0)
+    assert (bank.heartbeat(10).errors == 0) == (fault == "DISARM")
+
+
+def test_unknown_axis_or_fault_is_refused_with_the_names_there_are() -> None:
+    bank = make_bank()
+    with pytest.raises(DriveError, match=r"hip_left\.axis1"):
+        bank.inject("hip_middle.axis0", "DISARM")
+    with pytest.raises(DriveError, match="OVERSPEED"):
+        bank.inject("hip_left.axis0", "FIRE")
+
+
+@given(st.floats(-100.0, 100.0))
+def test_position_estimate_is_the_count_below_the_true_position(turns: float) -> None:
+    bank = make_bank()
+    bank.step(DT, np.full(12, turns), ZERO)
+    counts = bank.pos_estimate * CPR
+    assert counts == pytest.approx(np.floor(turns * CPR))
+
+
+def test_velocity_estimate_follows_a_step_as_the_firmware_pll_does() -> None:
+    """The same filter stepped at 80 kHz on the unquantised ramp is the reference."""
+    bank = make_bank()
+    speed, fine = 10.0, 80
+    pos_hat = vel_hat = 0.0
+    worst = 0.0
+    for k in range(1, 21):
+        for j in range(1, fine + 1):
+            h = DT / fine
+            true = speed * ((k - 1) * DT + j * h)
+            pos_hat += h * vel_hat
+            error = true - pos_hat
+            pos_hat += h * 2000.0 * error
+            vel_hat += h * 1e6 * error
+        bank.step(k * DT, np.full(12, speed * k * DT), np.full(12, speed))
+        worst = max(worst, abs(float(bank.vel_estimate[0]) - vel_hat))
+    assert vel_hat == pytest.approx(speed, rel=1e-3)
+    assert worst < 0.15  # one count per millisecond is 0.06 turn/s; the start differs by Euler
+
+
+def test_estimators_start_at_the_true_state() -> None:
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR)
+    bank.step(5.0, np.full(12, 2.0), np.full(12, 3.0))
+    assert bank.vel_estimate == pytest.approx(3.0)
+    bank.step(5.001, np.full(12, 2.003), np.full(12, 3.0))
+    assert bank.vel_estimate == pytest.approx(3.0, abs=0.1)

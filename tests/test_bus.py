@@ -1,0 +1,497 @@
+import math
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from shared import config, topics
+from shared.bus import Latest, Publisher, Session, open_session, peers_of
+from shared.exceptions import BusError
+from shared.joints import MODULES
+from shared.messages import Estop, JointCommand, JointEvent, Wrench
+from shared.process import DEFAULT_CONFIG
+from shared.topics import Topic
+
+ROOT = Path(__file__).resolve().parent.parent
+ROBOT = config.load(DEFAULT_CONFIG)
+TOOL = "test"
+
+PRELUDE = """
+import os, sys, time
+from pathlib import Path
+from shared import config, topics
+from shared.bus import open_session
+from shared.messages import Estop, JointCommand, JointEvent
+from shared.process import DEFAULT_CONFIG
+robot, run_dir = config.load(DEFAULT_CONFIG), Path(sys.argv[1])
+"""
+
+ECHO = """
+module = sys.argv[2]
+with open_session(robot, module, run_dir) as session:
+    commands = session.latest(topics.JOINT_COMMAND, JointCommand, module)
+    events = session.publisher(topics.JOINT_EVENT, JointEvent, module)
+    while True:
+        command = commands.take()
+        if command is not None:
+            events.put(JointEvent(
+                t_ns=command.t_ns, seq=command.seq, mode_before=0, mode_after=0, cause=0,
+                age_ns=0, tau_before=command.q_ref, tau_after=command.k_p))
+        time.sleep(0.001)
+"""
+"""A joint service that answers each command with an event of the same number."""
+
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    directory = Path(tempfile.mkdtemp(prefix="xrl-bus-", dir="/tmp"))
+    yield directory
+    shutil.rmtree(directory)
+
+
+@pytest.fixture
+def start(run_dir: Path) -> Iterator[Start]:
+    """Start a script in a process of its own; none outlives the test."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def start_script(script: str, *arguments: str) -> "subprocess.Popen[str]":
+        process = subprocess.Popen(
+            [sys.executable, "-c", PRELUDE + script, str(run_dir), *arguments],
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        processes.append(process)
+        return process
+
+    yield start_script
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def wait_until(condition: Callable[[], object], timeout_s: float = 20.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.002)
+    return True
+
+
+def command(seq: int, q_phi: float = 0.1) -> JointCommand:
+    pair = (0.25, -1e-300)
+    return JointCommand(
+        t_ns=time.monotonic_ns(),
+        seq=seq,
+        session=1,
+        echo_t_ns=0,
+        hold=False,
+        q_ref=(q_phi, 1 / 3),
+        v_ref=pair,
+        tau_ff=pair,
+        dtau_ff=pair,
+        tau_coupled=pair,
+        k_p=pair,
+        k_d=pair,
+    )
+
+
+def estop(seq: int) -> Estop:
+    return Estop(t_ns=time.monotonic_ns(), seq=seq, source="test", engaged=True)
+
+
+class Link:
+    """The planner's two ends of one module; `reaches` sends until an answer comes."""
+
+    def __init__(self, session: Session, module: str) -> None:
+        self.commands: Publisher[JointCommand] = session.publisher(
+            topics.JOINT_COMMAND, JointCommand, module
+        )
+        self.events: Latest[JointEvent] = session.latest(topics.JOINT_EVENT, JointEvent, module)
+        self.seq = 0
+        self.answered = -1
+
+    def send(self) -> bool:
+        self.seq += 1
+        return self.commands.put(command(self.seq))
+
+    def listen(self) -> int:
+        event = self.events.take()
+        if event is not None:
+            self.answered = event.seq
+        return self.answered
+
+    def reaches(self) -> bool:
+        """True once a command sent from now on is answered."""
+        first = self.seq + 1
+
+        def answered() -> bool:
+            return self.send() and self.listen() >= first
+
+        return wait_until(answered)
+
+
+def test_message_goes_there_and_back_between_processes(run_dir: Path, start: Start) -> None:
+    start(ECHO, "ankle_right")
+    with open_session(ROBOT, "planner", run_dir) as session:
+        link = Link(session, "ankle_right")
+        answers: list[JointEvent] = []
+
+        def answered() -> bool:
+            link.send()
+            answers.extend(event for event in [link.events.take()] if event is not None)
+            return bool(answers)
+
+        assert wait_until(answered)
+        assert answers[0].tau_before == (0.1, 1 / 3)
+        assert answers[0].tau_after == (0.25, -1e-300)
+        assert link.commands.failed == link.events.refused == 0
+
+
+def test_only_the_newest_message_is_kept(run_dir: Path) -> None:
+    with (
+        open_session(ROBOT, "ankle_right", run_dir) as joint,
+        open_session(ROBOT, "planner", run_dir) as planner,
+    ):
+        commands = joint.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
+        every = joint.stream([topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right")])
+        publisher = planner.publisher(topics.JOINT_COMMAND, JointCommand, "ankle_right")
+        assert wait_until(lambda: publisher.put(command(0)) and commands.take())
+        time.sleep(0.2)  # what was under way has come
+        while every.take():
+            pass
+        commands.take()
+        for seq in range(1, 11):
+            publisher.put(command(seq))
+            time.sleep(0.002)
+        seen: list[tuple[str, bytes, int]] = []
+
+        def all_came() -> bool:
+            seen.extend(iter(every.take, None))
+            return len(seen) == 10
+
+        assert wait_until(all_came)
+        newest = commands.take()
+        assert newest is not None
+        assert newest.seq == 10
+        assert commands.take() is None
+
+
+def test_stream_gives_every_sample_undecoded_with_its_key(run_dir: Path) -> None:
+    with (
+        open_session(ROBOT, "recorder", run_dir) as recorder,
+        open_session(ROBOT, TOOL, run_dir) as tool,
+    ):
+        before = time.monotonic_ns()
+        every = recorder.stream([f"xrl/{ROBOT.name}/joint/*/*", f"xrl/{ROBOT.name}/estop"])
+        stops = tool.publisher(topics.ESTOP, Estop)
+        commands = tool.publisher(topics.JOINT_COMMAND, JointCommand, "hip_left")
+        samples: list[tuple[str, bytes, int]] = []
+
+        def keys_heard() -> set[str]:
+            samples.extend(iter(every.take, None))
+            return {key for key, _, _ in samples}
+
+        def both_heard() -> bool:
+            return stops.put(estop(-1)) and commands.put(command(-1)) and len(keys_heard()) == 2
+
+        assert wait_until(both_heard)
+        for seq in range(50):
+            stops.put(estop(seq))
+            commands.put(command(seq))
+            time.sleep(0.001)
+
+        def numbers(key: str) -> list[int]:
+            return [msgspec.json.decode(text)["seq"] for name, text, _ in samples if name == key]
+
+        def complete() -> bool:
+            return all(numbers(key)[-1] == 49 for key in keys_heard())
+
+        assert wait_until(complete)
+        robot = f"xrl/{ROBOT.name}"
+        assert keys_heard() == {f"{robot}/joint/hip_left/command", f"{robot}/estop"}
+        for key in keys_heard():
+            assert numbers(key)[-50:] == list(range(50))
+        assert all(before < t_ns <= time.monotonic_ns() for _, _, t_ns in samples)
+
+
+def test_put_does_not_stall_while_a_subscriber_is_stopped(run_dir: Path, start: Start) -> None:
+    stopped = start(ECHO, "ankle_right")
+    start(ECHO, "knee_right")
+    with open_session(ROBOT, "planner", run_dir) as session:
+        deaf, other = Link(session, "ankle_right"), Link(session, "knee_right")
+        assert deaf.reaches()
+        assert other.reaches()
+        stopped.send_signal(signal.SIGSTOP)
+        heard_before, longest_s = other.listen(), 0.0
+        # 1 MB in all: several times what the stopped process's socket and queue can take
+        for _ in range(2000):
+            begin = time.monotonic()
+            assert deaf.send()
+            assert other.send()
+            longest_s = max(longest_s, time.monotonic() - begin)
+            other.listen()
+            time.sleep(0.0002)
+        assert longest_s < 2.0  # a blocking put waits 5 s for the queue
+        assert other.answered > heard_before + 100
+        assert other.reaches()
+        stopped.send_signal(signal.SIGCONT)
+        assert deaf.reaches()
+
+
+def test_session_closes_while_a_subscriber_is_stopped(run_dir: Path, start: Start) -> None:
+    stopped = start(ECHO, "ankle_right")
+    with open_session(ROBOT, "planner", run_dir) as session:
+        link = Link(session, "ankle_right")
+        assert link.reaches()
+        stopped.send_signal(signal.SIGSTOP)
+        for _ in range(2000):
+            link.send()
+    assert not (run_dir / "planner.zenoh").exists()
+    assert not link.send()
+    assert link.commands.failed == 1
+
+
+def test_messages_flow_again_after_subscriber_is_killed_and_restarted(
+    run_dir: Path, start: Start
+) -> None:
+    killed = start(ECHO, "ankle_right")
+    start(ECHO, "knee_right")
+    with open_session(ROBOT, "planner", run_dir) as session:
+        lost, other = Link(session, "ankle_right"), Link(session, "knee_right")
+        assert lost.reaches()
+        assert other.reaches()
+        killed.kill()
+        killed.wait()
+        assert (run_dir / "ankle_right.zenoh").exists()  # nobody cleaned up
+        heard_before = other.listen()
+        for _ in range(2000):
+            assert lost.send()
+            assert other.send()
+            other.listen()
+            time.sleep(0.0002)
+        assert other.answered > heard_before + 100
+        assert wait_until(lambda: session.alive() == {"planner", "knee_right"})
+        again = start(ECHO, "ankle_right")
+        assert lost.reaches()
+        assert again.poll() is None
+
+
+def test_publisher_reaches_its_subscriber_again_after_it_was_killed(
+    run_dir: Path, start: Start
+) -> None:
+    """The planner dials the joints: this is the restart of the side that dials."""
+    planner = """
+with open_session(robot, "planner", run_dir) as session:
+    publisher = session.publisher(topics.ESTOP, Estop)
+    while True:
+        publisher.put(Estop(t_ns=0, seq=int(sys.argv[2]), source="planner", engaged=True))
+        time.sleep(0.002)
+"""
+    with open_session(ROBOT, "ankle_right", run_dir) as session:
+        stops = session.latest(topics.ESTOP, Estop)
+
+        def heard(life: int) -> bool:
+            stop = stops.take()
+            return stop is not None and stop.seq == life
+
+        for life in (1, 2):
+            process = start(planner, str(life))
+            assert wait_until(lambda life=life: heard(life))  # type: ignore[misc]
+            process.kill()
+            process.wait()
+
+
+def test_number_that_is_not_finite_is_refused_and_counted_by_the_sender(run_dir: Path) -> None:
+    with (
+        open_session(ROBOT, "ankle_right", run_dir) as joint,
+        open_session(ROBOT, "planner", run_dir) as planner,
+    ):
+        commands = joint.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
+        publisher = planner.publisher(topics.JOINT_COMMAND, JointCommand, "ankle_right")
+        assert wait_until(lambda: publisher.put(command(0)) and commands.take())
+        assert publisher.failed == 0
+        for bad in (math.nan, math.inf, -math.inf):
+            assert not publisher.put(command(1, q_phi=bad))
+        assert publisher.failed == 3
+        assert publisher.put(command(2))
+        later: list[int] = []
+
+        def good_one_came() -> bool:
+            later.extend(m.seq for m in [commands.take()] if m is not None)
+            return 2 in later
+
+        assert wait_until(good_one_came)
+        assert 1 not in later
+        assert commands.refused == 0
+
+
+def test_null_is_refused_and_counted_by_the_receiver(run_dir: Path) -> None:
+    with (
+        open_session(ROBOT, "ankle_right", run_dir) as joint,
+        open_session(ROBOT, "planner", run_dir) as planner,
+    ):
+        commands = joint.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
+        publisher = planner.publisher(topics.JOINT_COMMAND, JointCommand, "ankle_right")
+        assert wait_until(lambda: publisher.put(command(0)) and commands.take())
+        key = topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right")
+        planner._session.put(key, b'{"t_ns":0,"seq":1,"q_ref":[null,0.0]}')
+        planner._session.put(key, b"no json")
+        assert wait_until(lambda: commands.take() is None and commands.refused >= 1)
+        assert wait_until(lambda: publisher.put(command(2)) and commands.take())
+
+
+def test_process_exits_by_itself_with_nobody_listening(start: Start) -> None:
+    script = """
+with open_session(robot, "planner", run_dir) as session:
+    latest = session.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
+    stream = session.stream([f"xrl/{robot.name}/**"])
+    publisher = session.publisher(topics.ESTOP, Estop)
+    for seq in range(100):
+        assert publisher.put(Estop(t_ns=0, seq=seq, source="x", engaged=True))
+    assert latest.take() is None
+    print("left", flush=True)
+    if sys.argv[2:]:
+        raise SystemExit(7)
+"""
+    for arguments, code in (((), 0), (("raise",), 7)):
+        process = start(script, *arguments)
+        out, err = process.communicate(timeout=30)
+        assert (out, err, process.returncode) == ("left\n", "", code)
+
+
+def test_second_process_of_a_name_is_told_that_the_endpoint_is_in_use(
+    run_dir: Path, start: Start
+) -> None:
+    script = """
+from shared.exceptions import BusError
+try:
+    open_session(robot, "planner", run_dir)
+except BusError as error:
+    print(error)
+"""
+    with open_session(ROBOT, "planner", run_dir) as session:
+        out, err = start(script).communicate(timeout=30)
+        assert out.count("\n") == 1
+        assert f"unixsock-stream/{run_dir}/planner.zenoh: in use" in out
+        assert "stop the planner" in out
+        assert err == ""
+        assert session.alive() == {"planner"}
+
+
+def test_socket_path_that_is_too_long_is_refused_by_name(run_dir: Path) -> None:
+    long_dir = run_dir / ("x" * 100)
+    for name in ("planner", "ankle_right", TOOL):
+        with pytest.raises(BusError, match=rf"unixsock-stream/{long_dir}/.*shorter run directory"):
+            open_session(ROBOT, name, long_dir)
+
+
+def test_directory_that_cannot_be_made_is_one_clear_error(run_dir: Path) -> None:
+    (run_dir / "file").write_text("in the way")
+    with pytest.raises(BusError, match=r"file/planner\.zenoh: planner cannot listen: ") as caught:
+        open_session(ROBOT, "planner", run_dir / "file")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "a b"])
+def test_name_that_cannot_stand_in_a_key_is_refused(run_dir: Path, name: str) -> None:
+    with pytest.raises(BusError, match="no name for a process"):
+        open_session(ROBOT, name, run_dir)
+
+
+def test_topic_used_with_a_wrong_type_or_module_is_refused(run_dir: Path) -> None:
+    with open_session(ROBOT, "planner", run_dir) as session:
+        with pytest.raises(BusError, match=r"harness/wrench: Estop is not its type; use Wrench"):
+            session.publisher(topics.WRENCH, Estop)
+        with pytest.raises(BusError, match=r"joint/\*/command: '' is no module"):
+            session.latest(topics.JOINT_COMMAND, JointCommand)
+        with pytest.raises(BusError, match="leave the module out"):
+            session.latest(topics.WRENCH, Wrench, "ankle_right")
+        with pytest.raises(BusError, match="xrl//estop"):
+            session.stream(["xrl//estop"])
+
+
+def test_mute_and_absent_peers_delay_neither_opening_nor_closing(run_dir: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as mute:
+        mute.bind(str(run_dir / "ankle_right.zenoh"))  # as a stopped process: never answers
+        mute.listen()
+        begin = time.monotonic()
+        with open_session(ROBOT, "planner", run_dir) as session:
+            assert session.alive() == {"planner"}
+            time.sleep(0.1)  # the handshake with the mute one is under way
+        assert time.monotonic() - begin < 5.0  # Zenoh's own limit for a handshake is 10 s
+
+
+def test_fleet_opened_dialling_side_first_is_linked_pair_by_pair(run_dir: Path) -> None:
+    names = (TOOL, "simulator", "recorder", "harness", "planner", *MODULES)
+    with ExitStack() as stack:
+        sessions = {n: stack.enter_context(open_session(ROBOT, n, run_dir)) for n in names}
+        for name, session in sessions.items():
+            expected = set(names) - (set(MODULES) - {name} if name in MODULES else set())
+            assert wait_until(lambda s=session, e=expected: s.alive() == e), name  # type: ignore[misc]
+            assert len(session._session.info.peers_zid()) == len(expected) - 1
+            assert len(session._session.info.links()) == len(expected) - 1
+
+
+def test_process_has_one_zenoh_thread_set(start: Start) -> None:
+    """Five thread pools make 8 threads and more; one makes 2, or 4 while it works."""
+    process = start("""
+with open_session(robot, "planner", run_dir) as session:
+    session.publisher(topics.ESTOP, Estop).put(Estop(t_ns=0, seq=0, source="x", engaged=True))
+    print(len(os.listdir("/proc/self/task")))
+""")
+    out, _ = process.communicate(timeout=30)
+    assert 2 <= int(out) <= 4
+
+
+TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    topics.JOINT_STATE: (MODULES, ("planner", "recorder", TOOL)),
+    topics.JOINT_COMMAND: (("planner",), (*MODULES, "recorder", TOOL)),
+    topics.JOINT_EVENT: (MODULES, ("recorder", TOOL)),
+    topics.WRENCH: (("harness",), ("planner", "recorder", TOOL)),
+    topics.PLANNER_STATUS: (("planner",), ("recorder", TOOL)),
+    topics.OPERATOR_INTENT: (("simulator", TOOL), ("planner", "recorder", TOOL)),
+    topics.ESTOP: (("planner", "harness", TOOL), (*MODULES, "planner", "recorder")),
+    topics.SIM_TRUTH: (("simulator",), ("recorder", TOOL)),
+    topics.SIM_CONTROL: ((TOOL,), ("simulator", "recorder")),
+    topics.RUN_EVENT: ((TOOL,), ("recorder",)),
+}
+"""Who puts each topic on the bus, and who takes it."""
+
+
+def linked(one: str, other: str) -> bool:
+    return one in peers_of(other) or other in peers_of(one)
+
+
+def test_every_publisher_has_a_link_to_every_subscriber() -> None:
+    assert set(TALK) == set(topics.TOPICS)
+    for topic, (publishers, subscribers) in TALK.items():
+        for publisher in publishers:
+            for subscriber in subscribers:
+                if publisher != subscriber:
+                    assert linked(publisher, subscriber), (topic.name, publisher, subscriber)
+
+
+def test_each_pair_is_linked_once_and_joint_services_not_to_one_another() -> None:
+    for one in config.SERVICES:
+        assert one not in peers_of(one)
+        assert len(set(peers_of(one))) == len(peers_of(one))
+        for other in config.SERVICES:
+            both = (one in peers_of(other)) + (other in peers_of(one))
+            expected = 0 if one == other or {one, other} <= set(MODULES) else 1
+            assert both == expected, (one, other)
+    assert set(peers_of(TOOL)) == set(config.SERVICES)
+    assert not any(TOOL in peers_of(service) for service in config.SERVICES)

@@ -1,0 +1,106 @@
+"""CANSimple 0.5.6: layouts against bytes written by hand from can-protocol and can_simple.cpp."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared import cansimple
+from shared.cansimple import AxisError, AxisState, Command, Heartbeat
+
+float32 = st.floats(width=32, allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("HEARTBEAT", 0x001),
+        ("ESTOP", 0x002),
+        ("GET_MOTOR_ERROR", 0x003),
+        ("GET_ENCODER_ERROR", 0x004),
+        ("SET_AXIS_STATE", 0x007),
+        ("GET_ENCODER_ESTIMATES", 0x009),
+        ("GET_ENCODER_COUNT", 0x00A),
+        ("SET_CONTROLLER_MODE", 0x00B),
+        ("SET_INPUT_POS", 0x00C),
+        ("SET_INPUT_VEL", 0x00D),
+        ("SET_INPUT_TORQUE", 0x00E),
+        ("SET_LIMITS", 0x00F),
+        ("GET_IQ", 0x014),
+        ("REBOOT", 0x016),
+        ("GET_VBUS", 0x017),
+        ("CLEAR_ERRORS", 0x018),
+        ("SET_POS_GAIN", 0x01A),
+        ("SET_VEL_GAINS", 0x01B),
+        ("GET_CONTROLLER_ERROR", 0x01D),
+    ],
+)
+def test_command_has_the_number_of_the_document(name: str, number: int) -> None:
+    assert Command[name] == number
+
+
+def test_arbitration_id_is_node_times_32_plus_command() -> None:
+    assert cansimple.arbitration_id(3, Command.SET_INPUT_TORQUE) == 0x06E
+    assert cansimple.arbitration_id(63, 0x1F) == 0x7FF
+    assert cansimple.split_id(0x06E) == (3, Command.SET_INPUT_TORQUE)
+
+
+@pytest.mark.parametrize(
+    ("packed", "by_hand"),
+    [
+        (cansimple.pack_u32(AxisState.CLOSED_LOOP_CONTROL), "08000000"),
+        (cansimple.pack_two_floats(1.5, -2.0), "0000c03f 000000c0"),
+        (cansimple.pack_float(-0.25), "000080be"),
+        (cansimple.pack_two_ints(1, -2), "01000000 feffffff"),
+        (cansimple.pack_input_pos(1.5, 1.0, -0.5), "0000c03f e803 0cfe"),
+        (cansimple.pack_motor_error(0x2_0000_0001), "01000000 02000000"),
+        (
+            cansimple.pack_heartbeat(Heartbeat(0x800, 8, True, False, True, True)),
+            "00080000 08 01 00 81",
+        ),
+    ],
+)
+def test_payload_equals_the_bytes_written_by_hand(packed: bytes, by_hand: str) -> None:
+    assert packed == bytes.fromhex(by_hand)
+
+
+def test_heartbeat_is_read_from_bytes_written_by_hand() -> None:
+    heartbeat = cansimple.unpack_heartbeat(bytes.fromhex("40000000 01 01 01 80"))
+    assert heartbeat == Heartbeat(AxisError.MOTOR_FAILED, AxisState.IDLE, True, True, False, True)
+
+
+def test_heartbeat_flags_count_as_errors_when_axis_error_is_zero() -> None:
+    heartbeat = Heartbeat(0, AxisState.IDLE, True, False, True, False)
+    assert heartbeat.errors == AxisError.MOTOR_FAILED | AxisError.CONTROLLER_FAILED
+    assert Heartbeat(0, AxisState.IDLE, False, False, False, True).errors == 0
+
+
+@given(float32, float32)
+def test_two_floats_survive_the_round_trip(first: float, second: float) -> None:
+    data = cansimple.pack_two_floats(first, second)
+    assert cansimple.unpack_two_floats(data) == (first, second)
+
+
+@given(
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(AxisState),
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+)
+def test_heartbeat_survives_the_round_trip(
+    error: int, state: AxisState, motor: bool, encoder: bool, controller: bool, done: bool
+) -> None:
+    heartbeat = Heartbeat(error, state, motor, encoder, controller, done)
+    assert cansimple.unpack_heartbeat(cansimple.pack_heartbeat(heartbeat)) == heartbeat
+
+
+@given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
+def test_feedforward_of_input_pos_saturates_and_never_wraps(vel: float, torque: float) -> None:
+    _, vel_back, torque_back = cansimple.unpack_input_pos(cansimple.pack_input_pos(0, vel, torque))
+    for asked, got in ((vel, vel_back), (torque, torque_back)):
+        assert math.isclose(got, max(-32.767, min(32.767, asked)), abs_tol=0.0006)

@@ -1,0 +1,157 @@
+import math
+import struct
+from typing import Any, get_args, get_origin, get_type_hints
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.codec import Decoder, encode
+from shared.exceptions import NonFiniteError
+from shared.joints import MODULES
+from shared.messages import JointCommand, Message
+from shared.topics import JOINT_STATE, TOPICS, WRENCH, Topic, all_keys, keys
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+NOT_FINITE = (math.nan, math.inf, -math.inf)
+INT64 = st.integers(min_value=-(2**63), max_value=2**63 - 1)
+WORDS = st.text(alphabet=st.characters(categories=["L", "N", "Zs"]))
+
+
+def strategy(hint: Any) -> st.SearchStrategy[Any]:
+    """Return a strategy for one field of a message."""
+    if get_origin(hint) is tuple:
+        return st.tuples(*(strategy(item) for item in get_args(hint)))
+    return {float: FINITE, int: INT64, bool: st.booleans(), str: WORDS}[hint]
+
+
+def messages_of(message_type: type[Message]) -> st.SearchStrategy[Message]:
+    """Return a strategy for messages whose numbers are all finite."""
+    hints = get_type_hints(message_type)
+    return st.builds(
+        message_type,
+        **{name: strategy(hints[name]) for name in message_type.__struct_fields__},
+    )
+
+
+def plain(message_type: type[Message], number: float = 1.5) -> Message:
+    """Return a message of a type with every float the same."""
+
+    def fill(hint: Any) -> Any:
+        if get_origin(hint) is tuple:
+            return tuple(fill(item) for item in get_args(hint))
+        return {float: number, int: 7, bool: True, str: "a null word"}[hint]
+
+    hints = get_type_hints(message_type)
+    return message_type(**{name: fill(hints[name]) for name in message_type.__struct_fields__})
+
+
+def floats_of(message: Message) -> list[float]:
+    values: list[Any] = []
+    for value in msgspec.structs.astuple(message):
+        values += value if isinstance(value, tuple) else (value,)
+    return [value for value in values if isinstance(value, float)]
+
+
+def with_float(message: Message, place: int, number: float) -> Message:
+    """Return a copy whose float number `place` is replaced."""
+    count = 0
+
+    def swap(value: Any) -> Any:
+        nonlocal count
+        if isinstance(value, tuple):
+            return tuple(swap(item) for item in value)
+        if not isinstance(value, float):
+            return value
+        count += 1
+        return number if count == place + 1 else value
+
+    fields = msgspec.structs.asdict(message)
+    return type(message)(**{name: swap(value) for name, value in fields.items()})
+
+
+def bits(message: Message) -> bytes:
+    numbers = floats_of(message)
+    return struct.pack(f"{len(numbers)}d", *numbers)
+
+
+@given(messages_of(JointCommand))
+def test_joint_command_round_trips_bit_exactly(command: Message) -> None:
+    decoded = Decoder(JointCommand).decode(encode(command))
+    assert decoded == command
+    assert len(bits(command)) == 14 * 8
+    assert bits(decoded) == bits(command)
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_every_message_type_round_trips(topic: Topic) -> None:
+    @given(messages_of(topic.type))
+    def round_trips(message: Message) -> None:
+        assert Decoder(topic.type).decode(encode(message)) == message
+
+    round_trips()
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(topic: Topic) -> None:
+    message = plain(topic.type)
+    assert encode(message)
+    for place in range(len(floats_of(message))):
+        for number in NOT_FINITE:
+            with pytest.raises(NonFiniteError, match=f"{topic.type.__name__} 7: .*not finite"):
+                encode(with_float(message, place, number))
+
+
+@pytest.mark.parametrize("word", [b"null", b"NaN", b"Infinity", b"1e999", b'"1.5"'])
+def test_what_is_no_finite_number_is_refused_and_counted_by_the_receiver(word: bytes) -> None:
+    decoder = Decoder(JointCommand)
+    good = encode(plain(JointCommand))
+    assert decoder.decode(good) is not None
+    assert decoder.decode(good.replace(b"1.5", word, 1)) is None
+    assert decoder.decode(good) is not None
+    assert decoder.refused == 1
+
+
+def test_payloads_of_another_type_or_of_no_type_are_refused_and_counted() -> None:
+    decoder = Decoder(JointCommand)
+    good = encode(plain(JointCommand))
+    bad = (
+        b"",
+        b"\xff\xfe",
+        b"{}",
+        b"[]",
+        good[:-1],
+        good + b"x",
+        good.replace(b'{"', b'{"extra":1,"', 1),
+        encode(plain(JOINT_STATE.type)),
+    )
+    assert [decoder.decode(payload) for payload in bad] == [None] * len(bad)
+    assert decoder.refused == len(bad)
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_make_the_decoder_raise(payload: bytes) -> None:
+    Decoder(JointCommand).decode(payload)
+
+
+def test_no_message_has_an_optional_field() -> None:
+    """The codec tells a number that is not finite by a null: no other null may exist."""
+    for topic in TOPICS:
+        schema = msgspec.json.schema(topic.type)
+        assert '"null"' not in msgspec.json.encode(schema).decode()
+
+
+def test_keys_name_the_robot_and_the_module() -> None:
+    assert JOINT_STATE.key("lab", "ankle_right") == "xrl/lab/joint/ankle_right/state"
+    assert WRENCH.key("lab") == "xrl/lab/harness/wrench"
+    assert keys(WRENCH, "lab") == ("xrl/lab/harness/wrench",)
+    assert keys(JOINT_STATE, "lab") == tuple(f"xrl/lab/joint/{name}/state" for name in MODULES)
+
+
+def test_every_key_has_one_topic() -> None:
+    every = [key for topic in TOPICS for key in keys(topic, "lab")]
+    assert len(set(every)) == len(every) == len(all_keys("lab"))
+    assert not [key for key in every if "*" in key]
+    for key, topic in all_keys("lab").items():
+        assert key in keys(topic, "lab")

@@ -1,0 +1,209 @@
+"""The CAN bus over UNIX sockets: framing, batching, and never waiting for a slow client."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from shared.exceptions import FleetError
+from shared.unix_can import REMOTE_FLAG, UnixCanBus, UnixCanHub, pack_frames, unpack_frames
+
+
+@pytest.fixture
+def path() -> Iterator[Path]:
+    """Return a socket path short enough for the kernel."""
+    directory = Path(tempfile.mkdtemp(dir="/tmp"))
+    yield directory / "bus.sock"
+    shutil.rmtree(directory)
+
+
+@pytest.fixture
+def hub(path: Path) -> Iterator[UnixCanHub]:
+    with UnixCanHub(path) as hub:
+        yield hub
+
+
+def connect(hub: UnixCanHub) -> UnixCanBus:
+    bus = UnixCanBus(str(hub.path))
+    before = hub.clients
+    hub.poll()
+    assert hub.clients == before + 1
+    return bus
+
+
+def message(can_id: int, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+
+
+def test_packet_has_the_layout_of_socketcan_frames() -> None:
+    packet = pack_frames([(0x02E, b"\x01\x02\x03\x04"), (0x7FF | REMOTE_FLAG, b"")])
+    assert packet == (
+        bytes.fromhex("2e000000 04000000 0102030400000000")
+        + bytes.fromhex("ff070040 00000000 0000000000000000")
+    )
+    assert unpack_frames(packet) == [(0x02E, b"\x01\x02\x03\x04"), (0x7FF | REMOTE_FLAG, b"")]
+
+
+def test_packet_that_is_no_row_of_whole_frames_holds_none() -> None:
+    assert unpack_frames(bytes(17)) == []
+
+
+def test_python_can_finds_the_interface_by_its_name(hub: UnixCanHub) -> None:
+    with can.Bus(interface="xrl_unix", channel=str(hub.path), ignore_config=True) as bus:
+        assert isinstance(bus, UnixCanBus)
+        bus.send(message(0x123, b"\xaa\xbb"))
+        assert hub.poll() == [(0x123, b"\xaa\xbb")]
+        hub.broadcast([(0x321, b"\x01"), (0x322, b"\x02\x03")])
+        first, second = bus.recv(1.0), bus.recv(1.0)
+        assert (first.arbitration_id, bytes(first.data)) == (0x321, b"\x01")
+        assert (second.arbitration_id, bytes(second.data)) == (0x322, b"\x02\x03")
+        assert not first.is_extended_id
+        assert bus.recv(0.0) is None
+
+
+def test_filters_of_python_can_apply(hub: UnixCanHub) -> None:
+    wanted = [{"can_id": 0x10, "can_mask": 0x7FF, "extended": False}]
+    with UnixCanBus(str(hub.path), can_filters=wanted) as bus:
+        hub.poll()
+        hub.broadcast([(0x11, b""), (0x10, b"\x07")])
+        received = bus.recv(1.0)
+        assert received is not None
+        assert received.arbitration_id == 0x10
+        assert bus.recv(0.01) is None
+
+
+def test_frames_of_several_packets_are_all_read_in_order(hub: UnixCanHub) -> None:
+    with connect(hub) as bus:
+        hub.broadcast([(1, b"a"), (2, b"b")])
+        hub.broadcast([(3, b"c")])
+        assert bus.recv_many(1.0) == [(1, b"a"), (2, b"b"), (3, b"c")]
+        assert bus.recv_many(0.0) == []
+
+
+def test_hub_reads_all_packets_and_all_frames_of_a_client(hub: UnixCanHub) -> None:
+    with connect(hub) as bus:
+        bus.send_many([message(1, b"a"), message(2, b"b")])
+        bus.send(message(3, b""))
+        assert hub.poll() == [(1, b"a"), (2, b"b"), (3, b"")]
+
+
+def test_hub_hands_frames_to_the_other_clients_and_not_back(hub: UnixCanHub) -> None:
+    with connect(hub) as sender, connect(hub) as listener:
+        sender.send(message(5, b"x"))
+        assert hub.poll() == [(5, b"x")]
+        assert listener.recv_many(1.0) == [(5, b"x")]
+        assert sender.recv_many(0.0) == []
+
+
+def test_client_that_does_not_read_neither_blocks_the_hub_nor_the_others(hub: UnixCanHub) -> None:
+    with connect(hub) as stopped, connect(hub) as reader:
+        sent = 5000
+        received = 0
+        for _ in range(sent):
+            hub.broadcast([(1, bytes(8))])
+            received += len(reader.recv_many(0.0))
+        assert received == sent
+        assert hub.dropped > 0
+        assert len(stopped.recv_many(0.0)) == sent - hub.dropped
+
+
+def test_send_to_a_hub_that_does_not_read_drops_and_counts(hub: UnixCanHub) -> None:
+    with connect(hub) as bus:
+        sent = 5000
+        for _ in range(sent):
+            bus.send(message(1, bytes(8)))
+        assert bus.dropped > 0
+        received = 0
+        while frames := hub.poll():
+            received += len(frames)
+        assert received == sent - bus.dropped
+
+
+def test_hub_parts_with_clients_that_leave(hub: UnixCanHub) -> None:
+    bus = connect(hub)
+    bus.shutdown()
+    hub.broadcast([(1, b"")])
+    assert hub.poll() == []
+    assert hub.clients == 0
+
+
+def test_client_learns_that_the_hub_has_closed(path: Path) -> None:
+    hub = UnixCanHub(path)
+    with connect(hub) as bus:
+        hub.close()
+        with pytest.raises(can.CanOperationError):
+            bus.recv_many(1.0)
+        with pytest.raises(can.CanOperationError):
+            bus.send(message(1, b""))
+
+
+def test_receiving_gives_up_after_the_timeout(hub: UnixCanHub) -> None:
+    with connect(hub) as bus:
+        begin = time.monotonic()
+        assert bus.recv_many(0.02) == []
+        assert time.monotonic() - begin >= 0.015
+
+
+def test_connecting_without_a_hub_is_an_initialization_error(path: Path) -> None:
+    with pytest.raises(can.CanInitializationError, match=r"bus\.sock"):
+        UnixCanBus(str(path))
+
+
+def test_connecting_does_not_wait_for_a_hub_that_does_not_accept(hub: UnixCanHub) -> None:
+    clients: list[UnixCanBus] = []
+
+    def connect_for_ever() -> None:
+        while len(clients) < 100:
+            clients.append(UnixCanBus(str(hub.path)))
+
+    with pytest.raises(can.CanInitializationError):
+        connect_for_ever()
+    for client in clients:
+        client.shutdown()
+    assert clients
+
+
+def test_stale_socket_file_is_replaced_and_removed_at_close(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as dead:
+        dead.bind(str(path))
+    assert path.exists()
+    with UnixCanHub(path) as hub, connect(hub) as bus:
+        bus.send(message(1, b""))
+        assert hub.poll() == [(1, b"")]
+    assert not path.exists()
+
+
+def test_path_in_use_is_refused_and_its_hub_goes_on(hub: UnixCanHub) -> None:
+    with pytest.raises(FleetError, match="in use"):
+        UnixCanHub(hub.path)
+    hub.poll()
+    with UnixCanBus(str(hub.path)) as bus:
+        bus.send(message(1, b"z"))
+        assert (1, b"z") in hub.poll()
+
+
+def test_file_that_is_no_socket_is_refused_and_kept(path: Path) -> None:
+    path.write_text("precious")
+    with pytest.raises(FleetError, match="no socket"):
+        UnixCanHub(path)
+    assert path.read_text() == "precious"
+
+
+def test_path_too_long_for_a_socket_is_refused_with_the_limit(tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match="107 bytes"):
+        UnixCanHub(tmp_path / ("x" * 120))
+
+
+def test_closing_leaves_the_socket_of_a_successor(path: Path) -> None:
+    old = UnixCanHub(path)
+    path.unlink()
+    with UnixCanHub(path):
+        old.close()
+        assert path.exists()

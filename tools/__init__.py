@@ -1,0 +1,1 @@
+"""The command line `xrl`: one file for each verb."""

@@ -1,0 +1,62 @@
+"""`xrl`: the command line. One file per verb beside this one; `tools.verbs` lists them."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import signal
+import sys
+from collections.abc import Sequence
+from types import FrameType
+
+from shared.exceptions import XrlError
+from tools.verbs import VERBS
+
+INTERRUPTED = 128 + signal.SIGINT
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code: 0, the verb's own, or that of an `XrlError`."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _leave)
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        args = _parser(arguments).parse_args(arguments)
+        return int(args.run(args))
+    except XrlError as error:
+        print(f"xrl: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("xrl: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()  # else the interpreter complains about stdout once more
+        return 128 + signal.SIGPIPE
+
+
+def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser, complete for the verb in use and with one line for each other."""
+    parser = argparse.ArgumentParser(
+        prog="xrl",
+        description="Runtime for Extra Robotic Legs: start, watch and break a fleet of services.",
+        epilog="`xrl VERB --help` shows a verb's arguments and examples.",
+    )
+    subparsers = parser.add_subparsers(metavar="VERB", required=True)
+    wanted = next((word for word in arguments if not word.startswith("-")), "")
+    for verb in VERBS:
+        if verb.name == wanted:
+            module = importlib.import_module(verb.module)
+            module.add_parser(subparsers)
+            subparsers.choices[verb.name].set_defaults(run=module.run)
+        else:
+            subparsers.add_parser(verb.name, help=verb.help)
+    return parser
+
+
+def _leave(number: int, _frame: FrameType | None) -> None:
+    """Leave as if by an exception, so that what a verb has started is stopped again."""
+    sys.exit(128 + number)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

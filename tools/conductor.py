@@ -1,0 +1,240 @@
+"""Leads a live run through its scenario: start, kills, restarts, end.
+
+It watches the simulated truth on the bus and acts by scenario time; what it does is put
+on the bus as run events, so that the log alone tells the whole story.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterable
+from typing import Final, NamedTuple
+
+from shared import topics
+from shared.bus import Latest, Session
+from shared.clock import NS_PER_S, now_ns
+from shared.exceptions import RunError
+from shared.joints import MODULES
+from shared.messages import (
+    JointState,
+    Mode,
+    RunEvent,
+    RunEventKind,
+    SimControl,
+    SimTruth,
+)
+from shared.scenario import Kill, Push, Restart, Scenario
+from tools import procfs
+from tools.supervise import Fleet
+
+READY_TIMEOUT_S: Final = 30.0
+SETTLE_S: Final = 2.0
+"""All six modules track for so long before the scenario starts."""
+AFTER_FALL_S: Final = 1.0
+"""A run is ended so long after a fall."""
+SILENT_S: Final = 3.0
+"""The simulated world says nothing for so long: the run is over."""
+POLL_S: Final = 0.004
+PIDS_EVERY_S: Final = 1.0
+
+
+class Snapshot(NamedTuple):
+    """What the live display shows."""
+
+    truth: SimTruth | None
+    modes: tuple[str, ...]
+    """One letter for each module: D, H, T, damp, FAULT; `-` if never heard."""
+    note: str
+
+
+class CpuMeter:
+    """CPU time of the fleet and of this process, summed over processes that come and go."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, float] = {}
+        self._begin_s = time.monotonic()
+        self._spent_s = 0.0
+
+    def sample(self, pids: Iterable[int]) -> None:
+        """Add what each process has used since the sample before."""
+        for pid in (*pids, os.getpid()):
+            used = procfs.cpu_s(pid)
+            if used is not None:
+                self._spent_s += used - self._last.get(pid, used)
+                self._last[pid] = used
+
+    @property
+    def share_pct(self) -> float:
+        """Mean use since the start: 100 is one core."""
+        return 100.0 * self._spent_s / max(1e-9, time.monotonic() - self._begin_s)
+
+
+class Conductor:
+    """One live run."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        session: Session,
+        scenario: Scenario,
+        show: Callable[[Snapshot], None],
+    ) -> None:
+        self._fleet = fleet
+        self._scenario = scenario
+        self._show = show
+        self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
+        self._states = {
+            module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
+        }
+        self._control = session.publisher(topics.SIM_CONTROL, SimControl)
+        self._events = session.publisher(topics.RUN_EVENT, RunEvent)
+        self._truth: SimTruth | None = None
+        self._truth_at_s = time.monotonic()
+        self._modes: dict[str, int] = {}
+        self._said = 0
+        self._start_ns = 0
+        self._note = ""
+        self._pids: dict[str, int] = {}
+        self._next_pids_s = 0.0
+
+    def run(self) -> float:
+        """Wait until the robot stands, run the scenario to its end; return the CPU use, %.
+
+        Raises:
+            RunError: the robot did not come to stand, or the simulated world went silent.
+            FleetError: a service that was to be restarted could not be.
+        """
+        self._wait_until_tracking()
+        self._start()
+        todo: list[Kill | Restart | Push] = [
+            *self._scenario.kill,
+            *self._scenario.restart,
+            *self._scenario.push,
+        ]
+        todo.sort(key=lambda row: row.at)
+        fallen_at_s = None
+        meter = CpuMeter()
+        while True:
+            self._listen()
+            self._look_at_processes(meter)
+            truth = self._truth
+            if truth is not None and truth.scenario_s >= 0.0:
+                # between two truths the scenario's clock runs on with ours
+                self._start_ns = truth.t_ns - round(truth.scenario_s * NS_PER_S)
+                if truth.fallen and fallen_at_s is None:
+                    fallen_at_s, self._note = truth.scenario_s, "FALLEN"
+                limit = self._scenario.duration
+                if fallen_at_s is not None:
+                    limit = min(limit, fallen_at_s + AFTER_FALL_S)
+                if truth.scenario_s >= limit:
+                    break
+            scenario_s = (now_ns() - self._start_ns) / NS_PER_S
+            while todo and scenario_s >= todo[0].at:
+                self._act(todo.pop(0))
+            time.sleep(POLL_S)
+        self._say(RunEventKind.FINISHED, self._scenario.name, "")
+        time.sleep(0.3)  # the last words reach the recorder
+        return meter.share_pct
+
+    def _look_at_processes(self, meter: CpuMeter) -> None:
+        """Once a second: a kill must not wait for the supervisor to tell the process."""
+        now_s = time.monotonic()
+        if now_s >= self._next_pids_s:
+            self._next_pids_s = now_s + PIDS_EVERY_S
+            self._pids = self._fleet.pids()
+            meter.sample(self._pids.values())
+
+    def _wait_until_tracking(self) -> None:
+        """Wait until the hoist is down and all six modules have tracked for a while."""
+        deadline = time.monotonic() + READY_TIMEOUT_S
+        since = None
+        self._note = "waiting for six modules to track"
+        while since is None or time.monotonic() - since < SETTLE_S:
+            self._listen()
+            tracking = [self._modes.get(module) == Mode.TRACK for module in MODULES]
+            standing = self._truth is not None and self._truth.hoist == 0.0
+            if self._truth is not None and self._truth.fallen:
+                raise RunError(f"the robot fell before the start; {self._modes_in_words()}")
+            if all(tracking) and standing:
+                since = since or time.monotonic()
+                self._note = "standing, settling"
+            else:
+                since = None
+            if time.monotonic() > deadline:
+                raise RunError(
+                    f"not all six modules track after {READY_TIMEOUT_S:.0f} s: "
+                    f"{self._modes_in_words()}; the services' logs tell more"
+                )
+            time.sleep(POLL_S)
+        self._note = ""
+
+    def _modes_in_words(self) -> str:
+        return ", ".join(
+            f"{module} {Mode(self._modes[module]).name if module in self._modes else 'silent'}"
+            for module in MODULES
+        )
+
+    def _start(self) -> None:
+        """Ask the world to start until it has."""
+        deadline = time.monotonic() + 5.0
+        while self._truth is None or self._truth.scenario_s < 0.0:
+            self._said += 1
+            self._control.put(SimControl(t_ns=now_ns(), seq=self._said, start=True))
+            time.sleep(0.05)
+            self._listen()
+            if time.monotonic() > deadline:
+                raise RunError("the simulator does not start the scenario; see its log")
+        self._start_ns = self._truth.t_ns - round(self._truth.scenario_s * NS_PER_S)
+        self._say(RunEventKind.STARTED, self._scenario.name, "")
+
+    def _listen(self) -> None:
+        """Take in what is new and show it."""
+        for module, latest in self._states.items():
+            state = latest.take()
+            if state is not None:
+                self._modes[module] = state.mode
+        truth = self._truths.take()
+        if truth is not None:
+            self._truth, self._truth_at_s = truth, time.monotonic()
+            modes = tuple(
+                Mode(self._modes[module]).name[0] if module in self._modes else "-"
+                for module in MODULES
+            )
+            self._show(Snapshot(truth, modes, self._note))
+        elif time.monotonic() - self._truth_at_s > SILENT_S and self._start_ns:
+            raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
+
+    def _act(self, row: Kill | Restart | Push) -> None:
+        if isinstance(row, Kill):
+            self._say(RunEventKind.KILLED, row.service, row.signal)
+            number = signal.Signals[f"SIG{row.signal}"]
+            try:
+                os.kill(self._pids[row.service], number)
+            except (KeyError, ProcessLookupError):
+                words = f"kill {row.service}@{row.at:g}: it has no process then"
+                raise RunError(f"{words}; see logs/{row.service}.log") from None
+            self._note = f"{row.service} {'stopped' if row.signal == 'STOP' else 'killed'}"
+        elif isinstance(row, Restart):
+            self._say(RunEventKind.RESTARTED, row.service, "")
+            self._fleet.start_service(row.service)
+            self._next_pids_s = 0.0
+            self._note = f"{row.service} restarted"
+        else:
+            x, y, z = row.force
+            self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
+
+    def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
+        now = now_ns()
+        self._said += 1
+        self._events.put(
+            RunEvent(
+                t_ns=now,
+                seq=self._said,
+                kind=int(kind),
+                subject=subject,
+                detail=detail,
+                scenario_s=(now - self._start_ns) / NS_PER_S,
+            )
+        )

@@ -1,0 +1,144 @@
+"""`xrl demo`: the paper's experiment, live: start the fleet, kill the planner, judge."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+from shared.bus import open_session
+from shared.config import SERVICES, RobotConfig
+from shared.exceptions import RunError
+from shared.robot_model import mjcf
+from shared.scenario import Scenario
+from tools import experiment, figure, verdict, verdict_table
+from tools.conductor import Conductor
+from tools.live_view import LiveView
+from tools.run_log import read_run
+from tools.supervise import Fleet
+from tools.verbs import Subparsers, add_verb
+
+EXIT_FELL = 1
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "demo",
+        """
+        xrl demo
+        xrl demo --out out/b --kill planner@6.2 --restart planner@9
+        xrl demo --kill planner@3.1:STOP --restart planner@7
+        xrl demo --scenario crawl --kill planner@8
+        xrl demo --jacobian average
+        xrl demo --duration 8 --push 4:0.3:40,0,0
+        """,
+    )
+    experiment.add_flags(parser)
+    parser.add_argument(
+        "--no-restart",
+        action="store_true",
+        help="services that end by themselves stay down; without it the supervisor restarts "
+        "them. What --kill kills stays down until its --restart either way",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="where results go (default: out/demo-<time>)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the experiment; 0 only if the robot stood to the end."""
+    console = Console()
+    robot, story = experiment.make_robot(args), experiment.make_scenario(args)
+    out = make_out(args.out)
+    console.print(f"[bold]{story.name}[/]: {story.about}")
+    cpu_pct = run_live(args, robot, story, out, console)
+    return judge(out, story, cpu_pct, console)
+
+
+def make_out(out: Path | None) -> Path:
+    """Make the directory of the results.
+
+    Raises:
+        RunError: it cannot be made, or holds a run already.
+    """
+    out = out if out is not None else Path("out") / time.strftime("demo-%Y%m%d-%H%M%S")
+    if (out / "run.mcap").exists():
+        raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+    return out
+
+
+def run_live(
+    args: argparse.Namespace, robot: RobotConfig, story: Scenario, out: Path, console: Console
+) -> float:
+    """Start the fleet in a run directory of its own, lead the run, stop the fleet.
+
+    Returns the CPU use of all processes together, %: 100 is one core.
+    """
+    robot_path, scenario_path = experiment.write_inputs(out, robot, story)
+    model_path = out / "model.xml"
+    model_path.write_text(mjcf(robot), encoding="utf-8")
+    killed = {kill.service for kill in story.kill}
+    run_dir = Path(tempfile.mkdtemp(prefix="xrl-demo-", dir="/tmp"))
+    try:
+        console.print("starting ten services ...", style="dim")
+        fleet = Fleet.start(
+            robot_path.absolute(),
+            run_dir,
+            overrides={
+                "recorder": _recorder_arguments(out, scenario_path, model_path),
+                "simulator": [
+                    "--scenario",
+                    str(scenario_path.absolute()),
+                    "--seed",
+                    str(args.seed),
+                ],
+            },
+            no_restart=frozenset(SERVICES if args.no_restart else killed),
+            leashed=True,
+        )
+        try:
+            with (
+                open_session(robot, "demo", run_dir) as session,
+                LiveView(console) as view,
+            ):
+                return Conductor(fleet, session, story, view.show).run()
+        finally:
+            fleet.stop(keep_logs=True)
+            logs = out / "logs"
+            shutil.rmtree(logs, ignore_errors=True)
+            shutil.copytree(fleet.run.logs, logs, dirs_exist_ok=True)
+    finally:
+        shutil.rmtree(run_dir, ignore_errors=True)
+
+
+def _recorder_arguments(out: Path, scenario_path: Path, model_path: Path) -> list[str]:
+    return [
+        "--out",
+        str(out.absolute()),
+        "--scenario",
+        str(scenario_path.absolute()),
+        "--attach",
+        f"model.xml={model_path.absolute()}",
+    ]
+
+
+def judge(out: Path, story: Scenario, cpu_pct: float, console: Console) -> int:
+    """Write summary and picture from the log, print the verdict, return the exit code."""
+    log = read_run(out / "run.mcap")
+    summary = verdict.summarise(log, story.duration) | {"fleet_cpu_pct": cpu_pct}
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    figure.draw(log, story.name, summary, out / "run.png")
+    verdict_table.show(summary, console)
+    console.print(f"{out}/run.mcap, run.png, summary.json, logs/", style="dim", highlight=False)
+    return 0 if summary["stood"] else EXIT_FELL

@@ -1,0 +1,162 @@
+"""What an experiment is to be: scenario and robot file, with the flags laid over them.
+
+Shared by the verbs that run scenarios: the flags mean the same everywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TypeVar, get_args, get_type_hints
+
+import msgspec
+
+from shared import config, scenario
+from shared.config import SERVICES, LawConfig, RobotConfig
+from shared.exceptions import RunError
+from shared.scenario import SIGNALS, Kill, Push, Restart, Scenario
+from tools.up import scenario_file
+from tools.verbs import add_config
+
+E = TypeVar("E", Kill, Restart, Push)
+
+_NUMBER = r"\d+(?:\.\d*)?"
+
+
+def choices(field: str) -> tuple[str, ...]:
+    """Return what a `[law]` key may be, for the flag of the same name."""
+    return get_args(get_type_hints(LawConfig)[field])
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that shape an experiment."""
+    add_config(parser)
+    parser.add_argument(
+        "--scenario",
+        default="squat",
+        metavar="NAME|FILE",
+        help="what happens: a name from deploy/scenarios, or a file (default: squat, "
+        "the paper's Fig. 7)",
+    )
+    parser.add_argument("--duration", type=float, metavar="S", help="scenario time to run, s")
+    parser.add_argument(
+        "--kill",
+        action="append",
+        type=parse_kill,
+        metavar="SERVICE@T[:SIGNAL]",
+        help=f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
+        "replaces the scenario's kills; may be repeated",
+    )
+    parser.add_argument(
+        "--restart",
+        action="append",
+        type=parse_restart,
+        metavar="SERVICE@T",
+        help="start a killed service again, or continue a stopped one; may be repeated",
+    )
+    parser.add_argument(
+        "--push",
+        action="append",
+        type=parse_push,
+        metavar="T:DUR:FX,FY,FZ",
+        help="push the torso by a force in N from T for DUR s; replaces the scenario's "
+        "pushes; may be repeated",
+    )
+    parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
+    parser.add_argument(
+        "--jacobian", choices=choices("jacobian"), help="how the legs share the load"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
+
+
+def parse_kill(text: str) -> Kill:
+    """Read SERVICE@T[:SIGNAL]."""
+    match = re.fullmatch(rf"(\w+)@({_NUMBER})(?::(?:SIG)?(\w+))?", text)
+    if match is None or match[1] not in SERVICES or (match[3] or "KILL") not in SIGNALS:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; write SERVICE@SECONDS or SERVICE@SECONDS:SIGNAL, for example "
+            f"planner@10:STOP; services: {', '.join(SERVICES)}; signals: {', '.join(SIGNALS)}"
+        )
+    row = {"service": match[1], "at": float(match[2]), "signal": match[3] or "KILL"}
+    return msgspec.convert(row, Kill)
+
+
+def parse_restart(text: str) -> Restart:
+    """Read SERVICE@T."""
+    match = re.fullmatch(rf"(\w+)@({_NUMBER})", text)
+    if match is None or match[1] not in SERVICES:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; write SERVICE@SECONDS, for example planner@9; "
+            f"services: {', '.join(SERVICES)}"
+        )
+    return Restart(service=match[1], at=float(match[2]))
+
+
+def parse_push(text: str) -> Push:
+    """Read T:DUR:FX,FY,FZ."""
+    signed = rf"(-?{_NUMBER})"
+    match = re.fullmatch(rf"({_NUMBER}):({_NUMBER}):{signed},{signed},{signed}", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; write START:DURATION:FX,FY,FZ in s and N, for example 12:0.3:40,0,0"
+        )
+    t, duration, x, y, z = (float(number) for number in match.groups())
+    return Push(at=t, duration=duration, force=(x, y, z))
+
+
+def make_scenario(args: argparse.Namespace) -> Scenario:
+    """Return the scenario with the flags laid over it.
+
+    A shorter duration leaves out what the file has beyond it; what a flag names beyond
+    it is refused.
+
+    Raises:
+        ConfigError: the file or the flags make no scenario.
+    """
+    path = scenario_file(args.scenario)
+    story = scenario.load(path)
+    duration = args.duration if args.duration is not None else story.duration
+    if duration <= 0.0:
+        raise RunError(f"--duration {duration:g}: must be more than 0 s")
+    kills = tuple(args.kill) if args.kill is not None else _inside(story.kill, duration)
+    restarts = tuple(args.restart or ()) if args.kill or args.restart else story.restart
+    pushes = tuple(args.push) if args.push is not None else _inside(story.push, duration)
+    story = msgspec.structs.replace(
+        story,
+        duration=duration,
+        kill=kills,
+        restart=_inside(restarts, duration) if not args.restart else restarts,
+        push=pushes,
+    )
+    scenario.check(str(path), story)
+    return story
+
+
+def _inside(rows: tuple[E, ...], duration: float) -> tuple[E, ...]:
+    return tuple(row for row in rows if row.at < duration)
+
+
+def make_robot(args: argparse.Namespace) -> RobotConfig:
+    """Return the robot with the flags laid over it.
+
+    Raises:
+        ConfigError: the file cannot be used.
+    """
+    robot = config.load(args.config)
+    changes = {
+        key: value
+        for key, value in (("split", args.split), ("jacobian", args.jacobian))
+        if value is not None
+    }
+    if not changes:
+        return robot
+    return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **changes))
+
+
+def write_inputs(out: Path, robot: RobotConfig, story: Scenario) -> tuple[Path, Path]:
+    """Write what the run is made from beside its results; return (robot, scenario) files."""
+    robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
+    robot_path.write_text(config.to_toml(robot), encoding="utf-8")
+    scenario_path.write_text(scenario.to_toml(story), encoding="utf-8")
+    return robot_path, scenario_path

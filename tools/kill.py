@@ -1,0 +1,42 @@
+"""`xrl kill`: send a signal to one service."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from typing import Final
+
+from tools.supervise import Fleet
+from tools.verbs import Subparsers, add_run_dir, add_verb
+
+SIGNALS: Final = {
+    "KILL": signal.SIGKILL,
+    "STOP": signal.SIGSTOP,
+    "CONT": signal.SIGCONT,
+    "TERM": signal.SIGTERM,
+}
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "kill",
+        """
+        xrl kill planner                        # dead at once; the supervisor starts it again
+        xrl kill knee_left --signal STOP        # frozen, as a hung process is
+        xrl kill knee_left --signal CONT        # and on again
+        """,
+    )
+    parser.add_argument("service", metavar="SERVICE", help="a name that `xrl status` shows")
+    parser.add_argument(
+        "--signal", choices=tuple(SIGNALS), default="KILL", help="default: %(default)s"
+    )
+    add_run_dir(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Send the signal."""
+    pid = Fleet.attach(args.run_dir).kill(args.service, SIGNALS[args.signal])
+    print(f"{args.service} (pid {pid}): {args.signal} sent")
+    return 0

@@ -1,0 +1,84 @@
+"""What the kernel knows of a fleet's processes (Linux /proc).
+
+Every process of a fleet has the run directory in `FLEET_VARIABLE` of its environment, so
+it can be found without its supervisor, and a process id used again is never mistaken.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+_POLL_S = 0.05
+
+FLEET_VARIABLE = "XRL_FLEET"
+"""Environment variable that marks a fleet's processes; set by the supervisor only."""
+
+
+def fleet_pids(run_dir: Path) -> set[int]:
+    """Return the processes of the fleet in this run directory, supervisor included."""
+    mark = os.fsencode(f"{FLEET_VARIABLE}={run_dir}")
+    found = set()
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdecimal() or int(entry.name) == os.getpid():
+            continue
+        try:
+            environment = (entry / "environ").read_bytes()
+        except OSError:
+            continue  # it has just ended, or is somebody else's
+        if mark in environment.split(b"\0"):
+            found.add(int(entry.name))
+    return found
+
+
+def is_suspended(pid: int) -> bool:
+    """Return True if the process has been stopped by SIGSTOP."""
+    return _state(pid) == "T"
+
+
+def is_gone(pid: int) -> bool:
+    """Return True if the process has ended: its files, sockets and locks are closed."""
+    return _state(pid) in {"", "Z", "X"}
+
+
+def signal_all(pids: Iterable[int], number: int) -> None:
+    """Send a signal to each process that still is there."""
+    for pid in pids:
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            continue
+
+
+def wait_until_gone(run_dir: Path, timeout_s: float) -> set[int]:
+    """Wait until no process of the fleet is left; return those that are after the timeout."""
+    deadline = time.monotonic() + timeout_s
+    left: set[int] = set()
+    while True:
+        # An ending process loses its environment before its sockets, so those seen once
+        # are followed by their id.
+        left = {pid for pid in left | fleet_pids(run_dir) if not is_gone(pid)}
+        if not left or time.monotonic() > deadline:
+            return left
+        time.sleep(_POLL_S)
+
+
+def _state(pid: int) -> str:
+    """Return the kernel's letter for a process's state; empty if there is no such process."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+    return fields.rpartition(")")[2].split()[0]
+
+
+def cpu_s(pid: int) -> float | None:
+    """Return the CPU time of a process and its threads so far, s; None if it is gone."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return None
+    fields = text.rpartition(")")[2].split()  # the name before may hold anything
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

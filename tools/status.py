@@ -1,0 +1,241 @@
+"""`xrl status`: every service and every module."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+
+from shared.bus import Latest, Session, open_session
+from shared.clock import NS_PER_S, now_ns
+from shared.config import load
+from shared.joints import MODULES
+from shared.messages import JointState, Message, Mode
+from shared.topics import TOPICS
+from tools.supervise import Fleet
+from tools.verbs import Subparsers, add_run_dir, add_verb
+
+TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
+"""Who holds a module up: the planner (1) or its joint service alone (2). In every other
+mode the joint service does not, and the mode says why."""
+
+_LINKS_S: Final = 1.0
+"""Longest wait for the first message of each service."""
+_WINDOW_S: Final = 0.5
+"""Time over which rates are counted."""
+_FRESH_S: Final = 1.0
+"""An older message is history: its sender is dead, suspended or cut off."""
+_POLL_S: Final = 0.002
+_WORDS: Final = ("state", "last exit")
+_GOOD: Final = ("running", "starting")
+
+
+class ServiceStatus(msgspec.Struct, frozen=True):
+    """One service, by its supervisor and by its messages."""
+
+    pid: int | None
+    state: str
+    uptime_s: float
+    age_s: float | None
+    """Age of its newest message; None if none has come, or it publishes none steadily."""
+    rate_hz: float | None
+    """Its messages per second, by their sequence numbers; None as for `age_s`."""
+    restarts: int
+    last_exit: str
+
+
+class ModuleStatus(msgspec.Struct, frozen=True):
+    """One module, by the newest state of its joint service."""
+
+    mode: str | None
+    """Name of its `Mode`; None if its joint service is not heard now."""
+    tier: int | None
+    """See `TIERS`; None in every other mode."""
+
+
+class FleetStatus(msgspec.Struct, frozen=True):
+    """What `xrl status --json` prints."""
+
+    run_dir: str
+    config: str
+    services: dict[str, ServiceStatus]
+    modules: dict[str, ModuleStatus]
+
+
+class Ear:
+    """Listens to one service: newest message, first and last of the present window."""
+
+    def __init__(self, latest: Latest[Message]) -> None:
+        self._latest = latest
+        self._first: Message | None = None
+        self.newest: Message | None = None
+
+    def listen(self) -> None:
+        """Take what has come."""
+        message = self._latest.take()
+        if message is None:
+            return
+        restarted = self.newest is not None and message.seq < self.newest.seq
+        if self._first is None or restarted:
+            self._first = message
+        self.newest = message
+
+    def new_window(self) -> None:
+        """Count the rate from here on."""
+        self._first = self.newest
+
+    def age_s(self) -> float | None:
+        """Return the time since the newest message was made."""
+        return None if self.newest is None else (now_ns() - self.newest.t_ns) / NS_PER_S
+
+    def is_fresh(self) -> bool:
+        """Return True if the newest message still says how things are."""
+        age_s = self.age_s()
+        return age_s is not None and age_s < _FRESH_S
+
+    def rate_hz(self) -> float | None:
+        """Return messages per second in this window; 0 if none has come in it."""
+        if self._first is None or self.newest is None:
+            return None
+        span_ns = self.newest.t_ns - self._first.t_ns
+        return (self.newest.seq - self._first.seq) * NS_PER_S / span_ns if span_ns > 0 else 0.0
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "status",
+        """
+        xrl status
+        xrl status --watch
+        xrl status --json | jq .services.planner
+        """,
+    )
+    add_run_dir(parser)
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print JSON, in SI units")
+    form.add_argument("--watch", action="store_true", help="keep showing until Ctrl-C")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look at the fleet once, or until interrupted."""
+    fleet = Fleet.attach(args.run_dir)
+    with open_session(load(Path(fleet.manifest.config)), "status", fleet.run.path) as session:
+        ears = ears_of(session, fleet.manifest.topics)
+        _listen(ears, _LINKS_S, until=lambda: all(ear.newest for ear in ears.values()))
+        if args.watch:
+            _watch(fleet, ears)
+        else:
+            status = look(fleet, ears)
+            if args.json:
+                print(msgspec.json.format(msgspec.json.encode(status)).decode())
+            else:
+                Console().print(tables(status))
+    return 0
+
+
+def ears_of(session: Session, topics: Mapping[str, str]) -> dict[str, Ear]:
+    """Return an ear for each service that publishes something steadily."""
+    by_name = {topic.name: topic for topic in TOPICS}
+    ears = {}
+    for service, name in topics.items():
+        if name:
+            topic = by_name[name]
+            module = service if topic.per_module else ""
+            ears[service] = Ear(session.latest(topic, topic.type, module))
+    return ears
+
+
+def look(fleet: Fleet, ears: Mapping[str, Ear]) -> FleetStatus:
+    """Listen for one window and return the fleet's status."""
+    for ear in ears.values():
+        ear.new_window()
+    _listen(ears, _WINDOW_S)
+    # Before the supervisor is asked: on a busy machine that takes a while.
+    heard = {name: (ear.age_s(), ear.rate_hz()) for name, ear in ears.items()}
+    fresh = {name for name, ear in ears.items() if ear.is_fresh()}
+    services = {}
+    for service in fleet.info():
+        age_s, rate_hz = heard.get(service.name, (None, None))
+        services[service.name] = ServiceStatus(
+            pid=service.pid,
+            state=service.state,
+            uptime_s=service.uptime_s,
+            age_s=age_s,
+            rate_hz=rate_hz,
+            restarts=service.restarts,
+            last_exit=service.last_exit,
+        )
+    modules = {
+        module: module_status(ears[module].newest if module in fresh else None)
+        for module in MODULES
+        if module in ears
+    }
+    return FleetStatus(str(fleet.run.path), fleet.manifest.config, services, modules)
+
+
+def module_status(state: Message | None) -> ModuleStatus:
+    """Return a module's mode and tier from the newest state of its joint service."""
+    if not isinstance(state, JointState):
+        return ModuleStatus(None, None)
+    mode = Mode(state.mode)
+    return ModuleStatus(mode.name, TIERS.get(mode))
+
+
+def tables(status: FleetStatus) -> Group:
+    """Return the status as two tables for the terminal."""
+    services = Table(title=f"services in {status.run_dir}", title_justify="left")
+    services.add_column("service", no_wrap=True, min_width=max(map(len, status.services)))
+    for heading in (
+        "service",
+        "state",
+        "pid",
+        "up s",
+        "age ms",
+        "rate Hz",
+        "restarts",
+        "last exit",
+    ):
+        words = heading in _WORDS
+        services.add_column(heading, justify="left" if words else "right", no_wrap=not words)
+    for name, row in status.services.items():
+        services.add_row(
+            name,
+            row.state if row.state in _GOOD else f"[bold red]{row.state}[/]",
+            "-" if row.pid is None else str(row.pid),
+            f"{row.uptime_s:.0f}",
+            "-" if row.age_s is None else f"{1e3 * row.age_s:.0f}",
+            "-" if row.rate_hz is None else f"{row.rate_hz:.0f}",
+            str(row.restarts),
+            row.last_exit,
+        )
+    modules = Table(title="modules", title_justify="left")
+    for heading in ("module", "mode", "tier"):
+        modules.add_column(heading)
+    for name, module in status.modules.items():
+        modules.add_row(name, module.mode or "not heard", str(module.tier or "-"))
+    return Group(services, modules)
+
+
+def _watch(fleet: Fleet, ears: Mapping[str, Ear]) -> None:
+    with Live(tables(look(fleet, ears)), console=Console(), auto_refresh=False) as live:
+        while True:
+            live.update(tables(look(fleet, ears)), refresh=True)
+
+
+def _listen(
+    ears: Mapping[str, Ear], duration_s: float, until: Callable[[], bool] = lambda: False
+) -> None:
+    deadline = time.monotonic() + duration_s
+    while time.monotonic() < deadline and not until():
+        for ear in ears.values():
+            ear.listen()
+        time.sleep(_POLL_S)

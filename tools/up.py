@@ -1,0 +1,74 @@
+"""`xrl up`: start the fleet."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from shared.exceptions import FleetError
+from shared.process import DEFAULT_CONFIG
+from tools.supervise import Fleet
+from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
+
+SCENARIOS = DEFAULT_CONFIG.parent / "scenarios"
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "up",
+        """
+        xrl up
+        xrl up --scenario crawl --out out/crawl
+        xrl up --config lab.toml --no-sim
+        """,
+    )
+    add_config(parser)
+    add_run_dir(parser)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where the recorder writes (default: out/ and the time)",
+    )
+    parser.add_argument(
+        "--scenario",
+        metavar="NAME|FILE",
+        help="what the simulated operator does: a file, or a name from deploy/scenarios",
+    )
+    parser.add_argument(
+        "--no-sim",
+        action="store_true",
+        help="start no simulator: the drives are real, or come later",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the fleet and say where it is."""
+    out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
+    overrides = {"recorder": ["--out", str(out.absolute())]}
+    if args.scenario is not None:
+        if args.no_sim:
+            raise FleetError("--scenario is for the simulator, and --no-sim starts none; leave one")
+        overrides["simulator"] = ["--scenario", str(scenario_file(args.scenario))]
+    fleet = Fleet.start(args.config, args.run_dir, overrides=overrides, simulation=not args.no_sim)
+    print(
+        f"{len(fleet.manifest.services)} services are up in {fleet.run.path} "
+        f"(logs: {fleet.run.logs}, record: {out}); `xrl status` shows them, `xrl down` stops them"
+    )
+    return 0
+
+
+def scenario_file(name: str) -> Path:
+    """Return the file of a scenario given by name or path, absolute.
+
+    Raises:
+        FleetError: there is none; the message lists the names.
+    """
+    path = Path(name) if name.endswith(".toml") else SCENARIOS / f"{name}.toml"
+    if not path.is_file():
+        known = ", ".join(sorted(file.stem for file in SCENARIOS.glob("*.toml"))) or "none yet"
+        raise FleetError(f"no scenario {name!r}; one of {known}, or the path of a .toml file")
+    return path.absolute()

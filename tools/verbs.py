@@ -1,0 +1,74 @@
+"""The verbs of the command line: one table, and what their parsers have in common."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Final, NamedTuple, TypeAlias
+
+from shared.process import DEFAULT_CONFIG, RUN_DIR_VARIABLE, default_run_dir
+
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
+"""What `add_parser` is given."""
+
+
+class Verb(NamedTuple):
+    """One row: `module` has `add_parser(subparsers)` and `run(args) -> int`."""
+
+    name: str
+    module: str
+    help: str
+
+
+VERBS: Final = (
+    Verb("demo", "tools.demo", "run the reference experiment, kill the planner, judge the outcome"),
+    Verb("up", "tools.up", "start the fleet"),
+    Verb("status", "tools.status", "show every service and every module"),
+    Verb("kill", "tools.kill", "send a signal to one service"),
+    Verb("down", "tools.down", "stop the fleet and leave nothing behind"),
+)
+"""A verb's module is imported only when the verb is used."""
+
+HELP: Final = {verb.name: verb.help for verb in VERBS}
+
+
+def add_verb(subparsers: Subparsers, name: str, examples: str) -> argparse.ArgumentParser:
+    """Add a verb's parser, with its line of the table as description and its examples.
+
+    Args:
+        subparsers: of `xrl`.
+        name: of the verb, as in `VERBS`.
+        examples: command lines, one per line.
+    """
+    lines = "\n".join(f"  {line.strip()}" for line in examples.strip().splitlines())
+    sentence = f"{HELP[name][0].upper()}{HELP[name][1:]}."
+    return subparsers.add_parser(
+        name,
+        help=HELP[name],
+        description=sentence,
+        epilog=f"examples:\n{lines}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_run_dir(parser: argparse.ArgumentParser) -> None:
+    """Add `--run-dir`: which fleet is meant."""
+    parser.add_argument(
+        "--run-dir",
+        type=Path,
+        default=default_run_dir(),
+        metavar="DIR",
+        help=f"directory of the fleet's sockets and logs (default {default_run_dir()}, "
+        f"or ${RUN_DIR_VARIABLE}); keep it short",
+    )
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """Add `--config`: the robot file."""
+    parser.add_argument(
+        "--config",
+        type=Path,
+        default=DEFAULT_CONFIG,
+        metavar="FILE",
+        help="robot file (default: deploy/robot.toml of this checkout)",
+    )

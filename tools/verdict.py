@@ -1,0 +1,204 @@
+"""What a run was worth: figures from its log alone, beside their limits.
+
+Everything is read from the MCAP file, so that a run can be judged again at any time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared import topics
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.exceptions import RunError
+from shared.joints import MODULES
+from shared.messages import JointEvent, JointState, Mode, RunEvent, RunEventKind, SimTruth
+from tools.run_log import RunLog
+
+Array = NDArray[np.float64]
+Summary = dict[str, Any]
+
+REAL_TIME_FACTOR_MIN: Final = 0.99
+LATE_MAX_S: Final = 0.05
+"""More world time given up than this: the run was not in real time."""
+
+
+class Limit(NamedTuple):
+    """One row of the verdict table."""
+
+    key: str
+    limit: float
+    unit: str
+    what: str
+
+
+LIMITS: Final = (
+    Limit("alive_com_x_max_mm", 20.0, "mm", "COM x, planner leading"),
+    Limit("alive_com_y_max_mm", 10.0, "mm", "COM y, planner leading"),
+    Limit("alive_roll_max_rad", 0.02, "rad", "roll, planner leading"),
+    Limit("alive_yaw_max_rad", 0.02, "rad", "yaw, planner leading"),
+    Limit("operator_peak_n", 40.0, "N", "operator's force, planner leading"),
+    Limit("assist_error_n", 10.0, "N", "assist force against what was asked"),
+    Limit("hold_com_x_max_mm", 80.0, "mm", "COM x after the kill"),
+    Limit("hold_com_y_max_mm", 100.0, "mm", "COM y after the kill"),
+    Limit("handover_max_ms", 65.0, "ms", "kill to HOLD, slowest module"),
+    Limit("handover_torque_step_nm", 5.0, "N m", "torque step at hand-over"),
+    Limit("reengage_s", 1.5, "s", "restart to TRACK, slowest module"),
+    Limit("pd_cycles_late_pct", 0.5, "%", "PD cycles later than two periods"),
+    Limit("fleet_cpu_pct", 160.0, "%", "CPU of all processes, of 200"),
+    Limit("sequence_gaps", 0.0, "", "messages lost on the way to the log"),
+)
+"""Live targets, design section 9 and issue figures. Only `stood` decides the exit code."""
+
+
+def summarise(log: RunLog, duration_s: float) -> Summary:
+    """Return the figures of a run.
+
+    Args:
+        log: the run.
+        duration_s: how long the scenario was to be, s.
+
+    Raises:
+        RunError: the log holds no simulated world, or the scenario never began.
+    """
+    truth: list[SimTruth] = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
+    if not truth:
+        raise RunError(f"{log.path}: the scenario never began in this log; nothing to judge")
+    events: list[RunEvent] = log.messages(topics.RUN_EVENT)
+    kills = [row for row in events if row.kind == RunEventKind.KILLED]
+    t = np.array([row.scenario_s for row in truth])
+    kill_s = kills[0].scenario_s if kills else np.inf
+    last = truth[-1]
+    fallen = any(row.fallen for row in truth)
+    reached = last.scenario_s >= duration_s - 0.1
+    summary: Summary = {
+        "stood": reached and not fallen,
+        "fallen_at_s": next((row.scenario_s for row in truth if row.fallen), None),
+        "duration_s": last.scenario_s,
+        "real_time_factor": last.real_time_factor,
+        "world_time_lost_s": last.late_s,
+        "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
+    }
+    poses = np.array([(*row.com, *row.angles) for row in truth])
+    for prefix, mask in (("", t >= 0.0), ("alive_", t < kill_s), ("hold_", t >= kill_s)):
+        summary |= _extent(prefix, poses[mask])
+    heights = [row.torso[2] for row in truth]
+    summary["torso_height_min_m"] = min(heights)
+    summary["torso_height_max_m"] = max(heights)
+    force = np.array([abs(row.operator_force[2]) for row in truth])
+    summary["operator_peak_n"] = _max(force[t < kill_s])
+    summary["hold_operator_peak_n"] = _max(force[t >= kill_s])
+    summary["assist_error_n"] = _assist_error([row for row in truth if row.scenario_s < kill_s])
+    summary |= _handover(log, kills)
+    summary["reengage_s"] = _reengage(log, events)
+    summary["hold_entries"] = _hold_entries(log, truth[0].t_ns)
+    summary["pd_cycles_late_pct"] = _late_share(log, truth[0].t_ns)
+    summary["planner_tick_us"] = _tick(log, truth[0].t_ns)
+    summary["messages_recorded"] = sum(log.count(key) for key in log.keys())  # noqa: SIM118 - not a dict
+    summary["sequence_gaps"] = sum(count.missing for count in log.gaps().values())
+    return summary
+
+
+def _extent(prefix: str, poses: Array) -> Summary:
+    names = ("com_x_max_mm", "com_y_max_mm", "", "roll_max_rad", "pitch_max_rad", "yaw_max_rad")
+    scales = (1e3, 1e3, 1.0, 1.0, 1.0, 1.0)
+    return {
+        prefix + name: _max(np.abs(poses[:, column]) * scale) if len(poses) else None
+        for column, (name, scale) in enumerate(zip(names, scales, strict=True))
+        if name
+    }
+
+
+def _max(values: Array) -> float | None:
+    return float(values.max()) if len(values) else None
+
+
+def _assist_error(truth: Sequence[SimTruth]) -> float | None:
+    """Return the mean error while a load rests steadily on the harness, N."""
+    errors = [
+        abs(b.harness_force_z - b.load_n)
+        for a, b in zip(truth, truth[100:], strict=False)
+        if b.load_n > 1.0 and abs(a.load_n - b.load_n) < 1e-6
+    ]
+    return float(np.mean(errors)) if errors else None
+
+
+def _transitions(log: RunLog, module: str) -> list[JointEvent]:
+    events: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
+    return events
+
+
+def _handover(log: RunLog, kills: Sequence[RunEvent]) -> Summary:
+    """Return the time from the first kill to HOLD and the largest torque step there."""
+    times: dict[str, float | None] = dict.fromkeys(MODULES)
+    step = None
+    for module in MODULES if kills else ():
+        for event in _transitions(log, module):
+            into_hold = event.mode_before == Mode.TRACK and event.mode_after == Mode.HOLD
+            if into_hold and event.t_ns >= kills[0].t_ns:
+                if times[module] is None:
+                    times[module] = (event.t_ns - kills[0].t_ns) / NS_PER_MS
+                step = max(step or 0.0, _step(event))
+    known = [value for value in times.values() if value is not None]
+    return {
+        "handover_ms": times if kills else None,
+        "handover_max_ms": max(known) if len(known) == len(MODULES) else None,
+        "handover_torque_step_nm": step,
+    }
+
+
+def _step(event: JointEvent) -> float:
+    return max(abs(b - a) for a, b in zip(event.tau_before, event.tau_after, strict=True))
+
+
+def _reengage(log: RunLog, events: Sequence[RunEvent]) -> float | None:
+    """Return the time from the first restart to the last module's TRACK, s."""
+    restarts = [row for row in events if row.kind == RunEventKind.RESTARTED]
+    if not restarts:
+        return None
+    slowest = 0.0
+    for module in MODULES:
+        tracks = [
+            event.t_ns
+            for event in _transitions(log, module)
+            if event.mode_after == Mode.TRACK and event.t_ns > restarts[0].t_ns
+        ]
+        if not tracks:
+            return None
+        slowest = max(slowest, (tracks[0] - restarts[0].t_ns) / NS_PER_S)
+    return slowest
+
+
+def _hold_entries(log: RunLog, start_ns: int) -> int:
+    """Return how often the busiest module went from TRACK to HOLD since the start."""
+    return max(
+        sum(
+            event.mode_before == Mode.TRACK and event.mode_after == Mode.HOLD
+            for event in _transitions(log, module)
+            if event.t_ns >= start_ns
+        )
+        for module in MODULES
+    )
+
+
+def _late_share(log: RunLog, start_ns: int) -> float | None:
+    late = cycles = 0
+    for module in MODULES:
+        states: list[JointState] = [
+            row for row in log.messages(topics.JOINT_STATE, module) if row.t_ns >= start_ns
+        ]
+        if len(states) > 1 and states[-1].cycle > states[0].cycle:
+            late += states[-1].late - states[0].late
+            cycles += states[-1].cycle - states[0].cycle
+    return 100.0 * late / cycles if cycles else None
+
+
+def _tick(log: RunLog, start_ns: int) -> dict[str, float] | None:
+    ticks = [row.tick_us for row in log.messages(topics.PLANNER_STATUS) if row.t_ns >= start_ns]
+    if not ticks:
+        return None
+    median, p99 = np.percentile(ticks, [50, 99])
+    return {"median": float(median), "p99": float(p99)}

@@ -1,0 +1,41 @@
+"""The verdict for people: one table in the terminal."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from tools.verdict import LIMITS, Summary
+
+
+def show(summary: Summary, console: Console) -> None:
+    """Print the verdict table."""
+    table = Table(title="Verdict", title_justify="left")
+    table.add_column("what")
+    table.add_column("measured", justify="right")
+    table.add_column("limit", justify="right")
+    table.add_column("")
+    for row in LIMITS:
+        value = summary.get(row.key)
+        if value is None:
+            continue
+        good = value <= row.limit
+        mark = "[green]ok[/]" if good else "[yellow]over[/]"
+        unit = f" {row.unit}" if row.unit else ""
+        table.add_row(row.what, f"{value:.3g}{unit}", f"{row.limit:g}{unit}", mark)
+    console.print(table)
+    if not summary["in_real_time"]:
+        console.print(
+            f"[yellow]The machine was too slow for real time: real-time factor "
+            f"{summary['real_time_factor']:.3f}, {summary['world_time_lost_s']:.2f} s of world "
+            f"time given up. The times above are not those of a robot.[/]"
+        )
+    console.print(_sentence(summary))
+
+
+def _sentence(summary: Summary) -> str:
+    if summary["stood"]:
+        return f"[bold green]STOOD[/] for {summary['duration_s']:.1f} s"
+    if summary["fallen_at_s"] is not None:
+        return f"[bold red]FELL[/] at {summary['fallen_at_s']:.1f} s"
+    return f"[bold red]NOT FINISHED[/]: the log ends at {summary['duration_s']:.1f} s"
