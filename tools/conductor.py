@@ -36,6 +36,8 @@ AFTER_FALL_S: Final = 1.0
 """A run is ended so long after a fall."""
 SILENT_S: Final = 3.0
 """The simulated world says nothing for so long: the run is over."""
+LAST_WORDS_S: Final = 0.3
+"""What was said last reaches the recorder in this time."""
 POLL_S: Final = 0.004
 PIDS_EVERY_S: Final = 1.0
 
@@ -99,14 +101,19 @@ class Conductor:
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
 
-    def run(self) -> float:
+    def run(self) -> float | None:
         """Wait until the robot stands, run the scenario to its end; return the CPU use, %.
+
+        None if the robot fell before the scenario could begin.
 
         Raises:
             RunError: the robot did not come to stand, or the simulated world went silent.
             FleetError: a service that was to be restarted could not be.
         """
-        self._wait_until_tracking()
+        if not self._wait_until_tracking():
+            self._say(RunEventKind.FINISHED, self._scenario.name, "fell before the start")
+            time.sleep(LAST_WORDS_S)
+            return None
         self._start()
         todo: list[Kill | Restart | Push] = [
             *self._scenario.kill,
@@ -135,7 +142,7 @@ class Conductor:
                 self._act(todo.pop(0))
             time.sleep(POLL_S)
         self._say(RunEventKind.FINISHED, self._scenario.name, "")
-        time.sleep(0.3)  # the last words reach the recorder
+        time.sleep(LAST_WORDS_S)
         return meter.share_pct
 
     def _look_at_processes(self, meter: CpuMeter) -> None:
@@ -146,8 +153,11 @@ class Conductor:
             self._pids = self._fleet.pids()
             meter.sample(self._pids.values())
 
-    def _wait_until_tracking(self) -> None:
-        """Wait until the hoist is down and all six modules have tracked for a while."""
+    def _wait_until_tracking(self) -> bool:
+        """Wait until the hoist is down and all six modules have tracked for a while.
+
+        Returns False if the robot falls first: that is a finding, not an error.
+        """
         deadline = time.monotonic() + READY_TIMEOUT_S
         since = None
         self._note = "waiting for six modules to track"
@@ -156,7 +166,7 @@ class Conductor:
             tracking = [self._modes.get(module) == Mode.TRACK for module in MODULES]
             standing = self._truth is not None and self._truth.hoist == 0.0
             if self._truth is not None and self._truth.fallen:
-                raise RunError(f"the robot fell before the start; {self._modes_in_words()}")
+                return False
             if all(tracking) and standing:
                 since = since or time.monotonic()
                 self._note = "standing, settling"
@@ -169,6 +179,7 @@ class Conductor:
                 )
             time.sleep(POLL_S)
         self._note = ""
+        return True
 
     def _modes_in_words(self) -> str:
         return ", ".join(

@@ -80,10 +80,11 @@ def make_out(out: Path | None) -> Path:
 
 def run_live(
     args: argparse.Namespace, robot: RobotConfig, story: Scenario, out: Path, console: Console
-) -> float:
+) -> float | None:
     """Start the fleet in a run directory of its own, lead the run, stop the fleet.
 
-    Returns the CPU use of all processes together, %: 100 is one core.
+    Returns the CPU use of all processes together, %: 100 is one core; None if
+    the scenario never began.
     """
     robot_path, scenario_path = experiment.write_inputs(out, robot, story)
     model_path = out / "model.xml"
@@ -133,7 +134,7 @@ def _recorder_arguments(out: Path, scenario_path: Path, model_path: Path) -> lis
     ]
 
 
-def judge(out: Path, story: Scenario, cpu_pct: float, console: Console) -> int:
+def judge(out: Path, story: Scenario, cpu_pct: float | None, console: Console) -> int:
     """Write summary and picture from the log, print the verdict, return the exit code."""
     log = read_run(out / "run.mcap")
     summary = verdict.summarise(log, story.duration) | {"fleet_cpu_pct": cpu_pct}

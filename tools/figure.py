@@ -13,9 +13,9 @@ from matplotlib.patches import Patch
 from shared import topics
 from shared.clock import NS_PER_S
 from shared.joints import MODULES
-from shared.messages import JointState, Mode, RunEvent, RunEventKind, SimTruth
+from shared.messages import JointState, Mode, RunEvent, RunEventKind
 from tools.run_log import RunLog
-from tools.verdict import Summary
+from tools.verdict import Summary, course
 
 mpl.use("Agg")
 
@@ -36,8 +36,7 @@ EVENT_COLOURS: Final = {
 
 def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     """Draw a run into a PNG file."""
-    rows: list[SimTruth] = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
-    t = np.array([row.scenario_s for row in rows])
+    t, rows, began, zero_ns = course(log)
     figure = Figure(figsize=(11, 9.5), dpi=110, layout="constrained")
     axes = figure.subplots(
         5, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1.6, 1.8, 1.6, 1.4]}
@@ -54,10 +53,9 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
         load = [row.load_n for row in rows]
         axes[3].plot(t, load, color=LINES[1], lw=1.1, label="weight on the harness")
         axes[3].legend(loc="upper right", fontsize=8, ncols=2, framealpha=0.8)
-    start_ns = rows[0].t_ns - round(rows[0].scenario_s * NS_PER_S)
-    _modes(axes[4], log, start_ns, float(t[-1]))
+    _modes(axes[4], log, zero_ns, float(t[-1]))
     _events(axes, log.messages(topics.RUN_EVENT))
-    axes[4].set_xlabel("scenario time in s")
+    axes[4].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
     axes[4].set_xlim(0.0, float(t[-1]))
     verdict = "stood" if summary["stood"] else "FELL" if summary["fallen_at_s"] else "not finished"
     figure.suptitle(f"{name}: {verdict}", fontsize=12)

@@ -195,7 +195,6 @@ def tables(status: FleetStatus) -> Group:
     services = Table(title=f"services in {status.run_dir}", title_justify="left")
     services.add_column("service", no_wrap=True, min_width=max(map(len, status.services)))
     for heading in (
-        "service",
         "state",
         "pid",
         "up s",

@@ -40,6 +40,7 @@ LIMITS: Final = (
     Limit("alive_com_y_max_mm", 10.0, "mm", "COM y, planner leading"),
     Limit("alive_roll_max_rad", 0.02, "rad", "roll, planner leading"),
     Limit("alive_yaw_max_rad", 0.02, "rad", "yaw, planner leading"),
+    Limit("alive_sole_tilt_max_rad", 0.02, "rad", "soles' tilt, planner leading"),
     Limit("operator_peak_n", 40.0, "N", "operator's force, planner leading"),
     Limit("assist_error_n", 10.0, "N", "assist force against what was asked"),
     Limit("hold_com_x_max_mm", 80.0, "mm", "COM x after the kill"),
@@ -54,6 +55,38 @@ LIMITS: Final = (
 """Live targets, design section 9 and issue figures. Only `stood` decides the exit code."""
 
 
+class Course(NamedTuple):
+    """The simulated world over a run."""
+
+    t: Array
+    """Time of each row, s: the scenario's, or since the hoist let go if it never began."""
+    rows: list[SimTruth]
+    began: bool
+    """False if the robot fell before the scenario could begin."""
+    zero_ns: int
+    """Monotonic time of t = 0."""
+
+
+def course(log: RunLog) -> Course:
+    """Return a run's course.
+
+    Raises:
+        RunError: the log holds no simulated world, or nothing to judge.
+    """
+    rows: list[SimTruth] = log.messages(topics.SIM_TRUTH)
+    scenario = [row for row in rows if row.scenario_s >= 0.0]
+    if scenario:
+        t = np.array([row.scenario_s for row in scenario])
+        zero_ns = scenario[0].t_ns - round(scenario[0].scenario_s * NS_PER_S)
+        return Course(t, scenario, began=True, zero_ns=zero_ns)
+    let_go = [row for row in rows if row.hoist < 1.0]
+    if not any(row.fallen for row in let_go):
+        raise RunError(f"{log.path}: the scenario never began in this log; nothing to judge")
+    zero_ns = let_go[0].t_ns
+    t = np.array([(row.t_ns - zero_ns) / NS_PER_S for row in let_go])
+    return Course(t, let_go, began=False, zero_ns=zero_ns)
+
+
 def summarise(log: RunLog, duration_s: float) -> Summary:
     """Return the figures of a run.
 
@@ -64,20 +97,20 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     Raises:
         RunError: the log holds no simulated world, or the scenario never began.
     """
-    truth: list[SimTruth] = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
-    if not truth:
-        raise RunError(f"{log.path}: the scenario never began in this log; nothing to judge")
+    t, truth, began, _ = course(log)
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row for row in events if row.kind == RunEventKind.KILLED]
-    t = np.array([row.scenario_s for row in truth])
     kill_s = kills[0].scenario_s if kills else np.inf
     last = truth[-1]
     fallen = any(row.fallen for row in truth)
-    reached = last.scenario_s >= duration_s - 0.1
+    reached = began and t[-1] >= duration_s - 0.1
     summary: Summary = {
         "stood": reached and not fallen,
-        "fallen_at_s": next((row.scenario_s for row in truth if row.fallen), None),
-        "duration_s": last.scenario_s,
+        "began": began,
+        "fallen_at_s": next(
+            (float(s) for s, row in zip(t, truth, strict=True) if row.fallen), None
+        ),
+        "duration_s": float(t[-1]),
         "real_time_factor": last.real_time_factor,
         "world_time_lost_s": last.late_s,
         "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
@@ -88,10 +121,15 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     heights = [row.torso[2] for row in truth]
     summary["torso_height_min_m"] = min(heights)
     summary["torso_height_max_m"] = max(heights)
+    tilt = np.array([max(row.foot_right_tilt, row.foot_left_tilt) for row in truth])
+    summary["sole_tilt_max_rad"] = _max(tilt)
+    summary["alive_sole_tilt_max_rad"] = _max(tilt[t < kill_s])
     force = np.array([abs(row.operator_force[2]) for row in truth])
     summary["operator_peak_n"] = _max(force[t < kill_s])
     summary["hold_operator_peak_n"] = _max(force[t >= kill_s])
-    summary["assist_error_n"] = _assist_error([row for row in truth if row.scenario_s < kill_s])
+    summary["assist_error_n"] = _assist_error(
+        [row for s, row in zip(t, truth, strict=True) if s < kill_s]
+    )
     summary |= _handover(log, kills)
     summary["reengage_s"] = _reengage(log, events)
     summary["hold_entries"] = _hold_entries(log, truth[0].t_ns)

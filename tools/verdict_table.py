@@ -36,6 +36,11 @@ def show(summary: Summary, console: Console) -> None:
 def _sentence(summary: Summary) -> str:
     if summary["stood"]:
         return f"[bold green]STOOD[/] for {summary['duration_s']:.1f} s"
+    if not summary["began"]:
+        return (
+            f"[bold red]FELL[/] {summary['fallen_at_s']:.1f} s after the hoist let go, before the "
+            "scenario began"
+        )
     if summary["fallen_at_s"] is not None:
         return f"[bold red]FELL[/] at {summary['fallen_at_s']:.1f} s"
     return f"[bold red]NOT FINISHED[/]: the log ends at {summary['duration_s']:.1f} s"

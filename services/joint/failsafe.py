@@ -165,8 +165,8 @@ class Failsafe(msgspec.Struct):
             estop: the emergency stop is engaged.
         """
         fresh = self.usable(now_ns, timing)
-        if not fresh:
-            self.fresh_since_ns = -1
+        if not fresh or self.mode is Mode.DISARMED:
+            self.fresh_since_ns = -1  # what came before the drive was armed does not count
         elif self.fresh_since_ns < 0:
             self.fresh_since_ns = now_ns
         event = self._event(now_ns, timing, drive, estop, fresh)

@@ -1,0 +1,388 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from services.joint.drivers.base import DriveReading, DriveStatus
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig
+from shared.messages import Cause, JointCommand, Mode, Pair
+from tests.joint.helpers import SESSION, T0, Bench, command, with_service
+
+K_P_STAND, K_D_STAND = (900.0, 1500.0), (30.0, 30.0)
+"""[stand.knee] of the shipped robot, as the bench is a knee."""
+
+
+@pytest.fixture
+def bench(robot: RobotConfig) -> Bench:
+    return Bench(robot)
+
+
+def pd(sent: JointCommand, q: Pair, v: Pair, age_s: float = 0.0) -> np.ndarray:
+    """Return the torque of a command at an age, told without the law under test."""
+    q_ref = np.add(sent.q_ref, np.multiply(sent.v_ref, age_s))
+    tau_ff = np.add(sent.tau_ff, np.multiply(sent.dtau_ff, age_s))
+    spring = np.multiply(sent.k_p, q_ref - q)
+    damper = np.multiply(sent.k_d, np.subtract(sent.v_ref, v))
+    return spring + damper + tau_ff + np.array(sent.tau_coupled)
+
+
+# ---- power-up
+
+
+@pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.LOST, DriveStatus.ERROR])
+def test_no_torque_and_no_change_before_the_drive_is_armed(
+    bench: Bench, status: DriveStatus
+) -> None:
+    bench.status = status
+    for result in bench.run(50, fresh=True):
+        assert result == ((0.0, 0.0), None)
+    assert bench.mode is Mode.DISARMED
+
+
+def test_power_up_holds_the_measured_pose_without_a_planner(bench: Bench) -> None:
+    bench.status = DriveStatus.IDLE
+    bench.run(3)
+    bench.q, bench.status = (0.1, -1.5), DriveStatus.ARMED
+    result = bench.cycle()
+    assert result.tau == pytest.approx((0.0, 0.0))
+    assert result.event is not None
+    assert (result.event.mode_before, result.event.mode_after) == (Mode.DISARMED, Mode.HOLD)
+    assert result.event.cause == Cause.DRIVE_ARMED
+    bench.q, bench.v = (0.11, -1.52), (0.1, -0.2)
+    expected = (-900.0 * 0.01 - 30.0 * 0.1, 1500.0 * 0.02 + 30.0 * 0.2)
+    assert bench.run(20)[-1].tau == pytest.approx(expected)
+
+
+# ---- track
+
+
+def test_track_gives_the_commands_torque_at_its_age(bench: Bench) -> None:
+    rates = {"v_ref": (0.1, -0.2), "dtau_ff": (30.0, -60.0), "tau_coupled": (4.0, -3.0)}
+    bench.to_track(**rates)
+    sent = bench.fresh(**rates)
+    bench.cycle(sent)
+    bench.v = (0.03, -0.05)
+    tau = bench.cycle().tau
+    age_s = (bench.now_ns - sent.echo_t_ns) / NS_PER_S
+    assert age_s == pytest.approx(0.004)
+    np.testing.assert_allclose(tau, pd(sent, bench.q, bench.v, age_s), atol=1e-9)
+
+
+def test_references_age_no_further_than_thirty_milliseconds(bench: Bench) -> None:
+    rates = {"v_ref": (0.1, -0.2), "dtau_ff": (30.0, -60.0)}
+    bench.to_track(**rates)
+    sent = bench.fresh(**rates)
+    taus = [bench.cycle(sent if n == 0 else None).tau for n in range(25)]
+    assert bench.mode is Mode.TRACK
+    np.testing.assert_allclose(taus[13], pd(sent, bench.q, bench.v, 0.028), atol=1e-9)
+    for tau in taus[14:]:
+        np.testing.assert_allclose(tau, pd(sent, bench.q, bench.v, 0.030), atol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])
+def test_track_blends_in_over_its_blend_time(robot: RobotConfig, share: float) -> None:
+    bench = Bench(robot)
+    bench.to_hold()
+    bench.q = (0.03, -1.02)
+    while bench.mode is Mode.HOLD:
+        held = bench.cycle(bench.fresh()).tau
+    result_ns = bench.now_ns
+    while bench.now_ns - result_ns < share * robot.joint_service.blend_ms * NS_PER_MS:
+        bench.cycle(bench.fresh())
+    fresh = pd(command(), bench.q, bench.v)
+    assert np.linalg.norm(fresh - held) > 5.0, "nothing to blend"
+    tau = bench.controller.tau
+    np.testing.assert_allclose(tau, (1.0 - share) * np.array(held) + share * fresh, atol=1e-6)
+
+
+# ---- hand-over
+
+SWING, OMEGA = 0.02, 5.0  # rad, rad/s: the references' motion
+COUPLED: Pair = (12.0, -9.0)
+
+
+def moving(bench: Bench, *, hold: bool = False) -> JointCommand:
+    """Return a command whose references move as in a squat."""
+    phase = OMEGA * (bench.now_ns - T0) / NS_PER_S
+    swing, rate = SWING * math.sin(phase), SWING * OMEGA * math.cos(phase)
+    return bench.fresh(
+        q_ref=(swing, -1.0 + swing), v_ref=(rate, rate), tau_coupled=COUPLED, hold=hold
+    )
+
+
+def largest_step(robot: RobotConfig, reach: float) -> float:
+    """Return what the ramps allow from one cycle to the next, N m.
+
+    Args:
+        robot: for the ramps.
+        reach: largest |q_ref - q|, rad.
+    """
+    service = robot.joint_service
+    dt_ms = 1e3 / service.rate_hz
+    k_p, k_d, v_ref = max(K_P_STAND), 50.0, SWING * OMEGA
+    coupled_out = (max(map(abs, COUPLED)) + k_d * v_ref) * dt_ms / service.coupled_ramp_ms
+    apart = k_p * 2.0 * reach + 2.0 * k_d * v_ref + max(map(abs, COUPLED)) + 25.0
+    blended = apart * dt_ms / service.blend_ms
+    references = (k_p * v_ref + k_d * SWING * OMEGA**2) * 2.0 * dt_ms / 1e3
+    return coupled_out + blended + references
+
+
+KINDS = ("fresh", "hold", "silent")
+scripts = st.lists(st.tuples(st.sampled_from(KINDS), st.integers(1, 60)), min_size=1, max_size=12)
+FIG_7 = [("fresh", 200), ("silent", 40), ("fresh", 300), ("hold", 30), ("fresh", 60)]
+
+
+def play(bench: Bench, script: list[tuple[str, int]]) -> tuple[list[Pair], set[tuple[Mode, Mode]]]:
+    """Run a script of commands; return every cycle's torque and the changes of mode."""
+    bench.to_hold()
+    taus, changes = [bench.controller.tau], set()
+    for kind, cycles in script:
+        for _ in range(cycles):
+            sent = moving(bench, hold=kind == "hold") if kind != "silent" else None
+            result = bench.cycle(sent)
+            taus.append(result.tau)
+            if result.event is not None:
+                event = result.event
+                changes.add((Mode(event.mode_before), Mode(event.mode_after)))
+    return taus, changes
+
+
+@given(script=scripts)
+@example(script=FIG_7)
+def test_torque_makes_no_larger_step_than_the_ramps_allow(
+    robot: RobotConfig, script: list[tuple[str, int]]
+) -> None:
+    quick = with_service(robot, engage_after_ms=10.0, engage_after_max_ms=20.0)
+    taus, _ = play(Bench(quick), script)
+    steps = np.abs(np.diff(np.array(taus), axis=0))
+    assert steps.max() <= largest_step(robot, reach=0.02 + SWING)
+
+
+def test_the_script_changes_over_both_ways_and_a_bare_switch_would_break_the_bound(
+    robot: RobotConfig,
+) -> None:
+    _, changes = play(Bench(robot), FIG_7)
+    assert {(Mode.HOLD, Mode.TRACK), (Mode.TRACK, Mode.HOLD)} <= changes
+    assert largest_step(robot, reach=0.02 + SWING) < 5.0 < max(map(abs, COUPLED))
+
+
+def test_hold_freezes_references_and_drops_the_coupled_torque_over_its_ramp(
+    bench: Bench,
+) -> None:
+    sent = {"tau_coupled": COUPLED, "k_p": K_P_STAND, "k_d": K_D_STAND}
+    bench.to_track(**sent)
+    before = np.array(bench.controller.tau)
+    bench.cycle(bench.fresh(hold=True, **sent))
+    np.testing.assert_allclose(bench.controller.tau, before, atol=1e-9)
+    bench.run(5)
+    np.testing.assert_allclose(bench.controller.tau, before - np.multiply(COUPLED, 0.5), atol=1e-9)
+    bench.run(400)
+    np.testing.assert_allclose(bench.controller.tau, before - np.array(COUPLED), atol=1e-9)
+
+
+def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> None:
+    """Two planners run and the first dies: the second one's references are its own."""
+    bench.to_track()
+    bench.run(25)
+    taus = [bench.controller.tau]
+    for _ in range(20):
+        sent = bench.fresh(session=SESSION + 1, q_ref=(0.02, -0.97))
+        taus.append(bench.cycle(sent).tau)
+    assert np.abs(np.diff(np.array(taus), axis=0)).max() < 5.0  # design section 9
+
+
+# ---- fault and emergency stop
+
+
+@pytest.mark.parametrize("status", [DriveStatus.LOST, DriveStatus.IDLE, DriveStatus.ERROR])
+@pytest.mark.parametrize("before", [Mode.HOLD, Mode.TRACK, Mode.DAMP])
+def test_torque_is_zero_after_drive_fault_whatever_comes(
+    bench: Bench, before: Mode, status: DriveStatus
+) -> None:
+    bench.to(before)
+    bench.status = status
+    result = bench.cycle(bench.fresh())
+    assert result.tau == (0.0, 0.0)
+    assert result.event is not None
+    assert result.event.mode_after == Mode.FAULT
+    bench.status, bench.q, bench.v = DriveStatus.ARMED, (0.5, -0.1), (1.0, 1.0)
+    for _ in range(100):
+        assert bench.cycle(bench.fresh(), estop=True) == ((0.0, 0.0), None)
+        assert bench.cycle(bench.fresh()) == ((0.0, 0.0), None)
+
+
+@pytest.mark.parametrize("before", [Mode.DISARMED, Mode.HOLD, Mode.TRACK])
+def test_emergency_stop_leads_from_any_mode_to_damp(bench: Bench, before: Mode) -> None:
+    bench.to(before)
+    event = bench.cycle(estop=True).event
+    assert event is not None
+    assert (event.mode_before, event.mode_after) == (before, Mode.DAMP)
+    assert event.cause == Cause.ESTOP
+
+
+@pytest.mark.parametrize("before", [Mode.HOLD, Mode.TRACK])
+def test_damp_has_no_stiffness_at_all(bench: Bench, before: Mode) -> None:
+    bench.to(before)
+    bench.cycle(estop=True)
+    bench.run(20)
+    here = bench.cycle().tau
+    bench.q = (bench.q[0] + 0.2, bench.q[1] - 0.2)
+    np.testing.assert_allclose(bench.cycle().tau, here, atol=0.05)
+
+
+def test_damp_fades_the_feedforward_to_zero_in_its_time(robot: RobotConfig, bench: Bench) -> None:
+    bench.to_track(tau_ff=(3.0, -25.0))
+    bench.cycle(estop=True)
+    entered_ns = bench.now_ns
+    fade_s = robot.joint_service.damp_fade_s
+    for result in bench.run(round(1.2 * fade_s * robot.joint_service.rate_hz)):
+        now_ns = entered_ns + bench.cycle_ns
+        entered_ns = now_ns
+        assert abs(result.tau[0]) <= 3.0
+        assert abs(result.tau[1]) <= 25.0
+    assert bench.controller.tau == (0.0, 0.0)
+
+
+def test_torque_in_damp_never_exceeds_what_is_left_of_the_feedforward(
+    robot: RobotConfig, bench: Bench
+) -> None:
+    bench.to_track(tau_ff=(3.0, -25.0), tau_coupled=COUPLED)
+    bench.cycle(estop=True)
+    entered_ns, fade_ns = bench.now_ns, robot.joint_service.damp_fade_s * NS_PER_S
+    for cycle in range(2400):
+        tau = bench.cycle(bench.fresh()).tau  # a planner that has not heard changes nothing
+        left = 1.0 - (bench.now_ns - entered_ns) / fade_ns
+        if cycle:
+            np.testing.assert_allclose(tau, np.multiply((3.0, -25.0), left), atol=1e-9)
+    assert left > 0.0
+
+
+def test_damp_resists_motion(robot: RobotConfig, bench: Bench) -> None:
+    bench.to_hold()
+    bench.cycle(estop=True)
+    bench.v = (0.5, -0.3)
+    k_d = robot.joint_service.damp_k_d
+    assert bench.run(10)[-1].tau == pytest.approx((-k_d * 0.5, k_d * 0.3))
+
+
+@pytest.mark.parametrize("before", [Mode.HOLD, Mode.TRACK])
+def test_emergency_stop_never_drops_the_load_that_the_springs_carried(
+    bench: Bench, before: Mode
+) -> None:
+    """Design section 4: a slow sink, never a drop. A stand without a planner has no feedforward."""
+    bench.to(before)
+    bench.q = (0.02, -1.02)
+    bench.run(5, fresh=before is Mode.TRACK)
+    carried = bench.controller.tau[1]
+    assert abs(carried) > 5.0
+    bench.cycle(estop=True)
+    bench.run(5)
+    assert abs(bench.controller.tau[1]) > 0.9 * abs(carried)
+
+
+# ---- the rest of a cycle
+
+
+def test_late_cycles_are_counted_beyond_twice_the_period(bench: Bench) -> None:
+    bench.to_hold()
+    period_ns = bench.cycle_ns
+    late = []
+    for after_ns in (period_ns, 2 * period_ns, 2 * period_ns + 1, 1, 10 * period_ns, period_ns):
+        bench.cycle(after_ns=after_ns)
+        late.append(bench.controller.late)
+    assert late == [0, 0, 1, 1, 2, 2]
+
+
+def test_a_stalled_drive_keeps_the_failsafe_going(bench: Bench) -> None:
+    bench.to_track()
+    events = [bench.cycle(stalled=True).event for _ in range(26)]
+    causes = [event.cause for event in events if event is not None]
+    assert causes == [Cause.COMMAND_STALE]
+    assert bench.mode is Mode.HOLD
+    assert bench.controller.q == pytest.approx(bench.q)
+    bench.cycle(stalled=True, estop=True)
+    assert bench.mode is Mode.DAMP
+
+
+def test_a_stalled_drive_still_tracks_fresh_commands(bench: Bench) -> None:
+    bench.to_track()
+    for _ in range(50):
+        bench.cycle(bench.fresh(), stalled=True)
+    assert bench.mode is Mode.TRACK
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_reading_that_is_no_number_lets_out_no_torque_that_is_none(
+    bench: Bench, bad: float
+) -> None:
+    bench.to_track()
+    before = bench.controller.tau
+    reading = DriveReading(bench.now_ns, (bad, 0.0), (0.0, bad), DriveStatus.ARMED, 0)
+    bench.now_ns += bench.cycle_ns
+    assert bench.controller.step(bench.now_ns, reading, None, False).tau == before
+
+
+def test_state_tells_what_the_cycle_saw_and_did(bench: Bench) -> None:
+    bench.to_track()
+    bench.v = (0.1, -0.1)
+    sent = bench.fresh(seq=5_000)
+    bench.cycle(sent)
+    bench.cycle(command(seq=1, echo_t_ns=bench.now_ns))
+    state = bench.controller.state(bench.now_ns)
+    assert state.t_ns == bench.now_ns
+    assert state.q == pytest.approx(bench.q)
+    assert state.v == pytest.approx(bench.v)
+    assert state.tau == bench.controller.tau
+    assert (state.mode, state.ready) == (Mode.TRACK, True)
+    assert (state.session, state.command_seq) == (SESSION, 5_000)
+    assert state.age_ns == bench.now_ns - sent.echo_t_ns == 2 * bench.cycle_ns
+    assert (state.refused, state.dropouts, state.late) == (1, 0, 0)
+    assert state.cycle == bench.controller.cycle > 400
+
+
+def test_states_count_up_by_one(bench: Bench) -> None:
+    seqs = [bench.controller.state(T0 + n).seq for n in range(3)]
+    assert seqs == [1, 2, 3]
+
+
+def test_state_before_any_command_says_so(bench: Bench) -> None:
+    bench.to_hold()
+    state = bench.controller.state(bench.now_ns)
+    assert (state.age_ns, state.session, state.command_seq) == (-1, 0, -1)
+    assert not state.ready
+
+
+@pytest.mark.parametrize("mode", [Mode.DISARMED, Mode.DAMP, Mode.FAULT])
+def test_a_module_that_cannot_track_does_not_say_it_is_ready(bench: Bench, mode: Mode) -> None:
+    """JointState.ready: fresh for long enough to track, were `hold` lifted."""
+    bench.to(mode)
+    bench.run(100, fresh=True, hold=True)
+    assert bench.mode is mode
+    assert not bench.controller.state(bench.now_ns).ready
+
+
+def test_drive_error_bits_are_told(bench: Bench) -> None:
+    bench.to_hold()
+    at = bench.now_ns + bench.cycle_ns
+    reading = DriveReading(at, (0.0, 0.0), (0.0, 0.0), DriveStatus.ERROR, 0x40)
+    bench.controller.step(at, reading, None, False)
+    assert bench.controller.state(at).drive_error == 0x40
+
+
+def test_event_tells_the_torque_on_both_sides_of_the_change(bench: Bench) -> None:
+    bench.to_track(tau_coupled=COUPLED)
+    before = bench.controller.tau
+    result = bench.cycle(bench.fresh(hold=True))
+    event = result.event
+    assert event is not None
+    assert (event.tau_before, event.tau_after) == (before, result.tau)
+    assert event.t_ns == bench.now_ns
+    assert event.age_ns == bench.cycle_ns
+    assert (event.mode_before, event.mode_after) == (Mode.TRACK, Mode.HOLD)
+    assert event.cause == Cause.HOLD_ALL
+    assert event.seq == 3

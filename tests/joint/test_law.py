@@ -1,0 +1,114 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from services.joint import law
+from services.joint.law import Setpoint
+from shared.messages import Pair
+from tests.joint.helpers import command
+
+shares = st.floats(0.0, 1.0)
+gains = st.just(0.0) | st.floats(1e-3, 6000.0)
+
+
+def pairs(elements: st.SearchStrategy[float]) -> st.SearchStrategy[Pair]:
+    return st.tuples(elements, elements)
+
+
+angles = pairs(st.floats(-6.0, 6.0))
+rates = pairs(st.floats(-20.0, 20.0))
+torques = pairs(st.floats(-200.0, 200.0))
+setpoints = st.builds(Setpoint, angles, rates, torques, torques, pairs(gains), pairs(gains))
+
+SOFT = Setpoint((0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 0.0), (10.0, 0.0))
+
+
+@given(s=setpoints, q=angles, v=rates)
+def test_torque_is_pd_plus_feedforward_plus_coupled(s: Setpoint, q: Pair, v: Pair) -> None:
+    k_p, k_d = np.diag(s.k_p), np.diag(s.k_d)
+    expected = k_p @ np.subtract(s.q_ref, q) + k_d @ np.subtract(s.v_ref, v)
+    expected += np.add(s.tau_ff, s.tau_coupled)
+    np.testing.assert_allclose(law.torque(s, q, v), expected, rtol=1e-12, atol=1e-9)
+
+
+@given(a=setpoints, b=setpoints, share=shares, q=angles, v=rates)
+@example(a=SOFT, b=SOFT, share=0.5, q=(0.0, 0.0), v=(0.0, 0.0))
+def test_blend_of_two_laws_gives_the_blended_torque_everywhere(
+    a: Setpoint, b: Setpoint, share: float, q: Pair, v: Pair
+) -> None:
+    blended = law.torque(law.blend(a, b, share), q, v)
+    apart = np.array([law.torque(a, q, v), law.torque(b, q, v)])
+    np.testing.assert_allclose(blended, [1.0 - share, share] @ apart, rtol=1e-9, atol=1e-6)
+
+
+@given(a=setpoints, b=setpoints, share=shares)
+def test_blend_of_two_laws_has_no_negative_gain(a: Setpoint, b: Setpoint, share: float) -> None:
+    blended = law.blend(a, b, share)
+    assert min(*blended.k_p, *blended.k_d) >= 0.0
+
+
+@given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains), share=shares)
+def test_stiffened_never_lowers_a_gain(s: Setpoint, k_p: Pair, k_d: Pair, share: float) -> None:
+    risen = law.stiffened(s, k_p, k_d, share)
+    assert np.all(np.subtract(risen.k_p, s.k_p) >= 0.0)
+    assert np.all(np.subtract(risen.k_d, s.k_d) >= 0.0)
+    changed = Setpoint(s.q_ref, s.v_ref, s.tau_ff, s.tau_coupled, risen.k_p, risen.k_d)
+    assert risen == changed, "only gains are changed"
+
+
+@given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains))
+def test_stiffened_fully_has_at_least_the_gains_asked_for(
+    s: Setpoint, k_p: Pair, k_d: Pair
+) -> None:
+    risen = law.stiffened(s, k_p, k_d, 1.0)
+    np.testing.assert_allclose(risen.k_p, np.maximum(s.k_p, k_p), rtol=1e-12)
+    np.testing.assert_allclose(risen.k_d, np.maximum(s.k_d, k_d), rtol=1e-12)
+
+
+@given(s=setpoints, share=shares)
+def test_held_keeps_references_feedforward_and_gains(s: Setpoint, share: float) -> None:
+    kept = law.held(s, share)
+    assert (kept.q_ref, kept.tau_ff, kept.k_p, kept.k_d) == (s.q_ref, s.tau_ff, s.k_p, s.k_d)
+
+
+@given(s=setpoints, share=shares)
+def test_held_drops_rates_and_coupled_torque_by_share(s: Setpoint, share: float) -> None:
+    kept = law.held(s, share)
+    np.testing.assert_allclose(kept.v_ref, share * np.array(s.v_ref), rtol=1e-12)
+    np.testing.assert_allclose(kept.tau_coupled, share * np.array(s.tau_coupled), rtol=1e-12)
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1])
+def test_held_with_nothing_left_moving_has_neither_rate_nor_coupled_torque(share: float) -> None:
+    kept = law.held(SOFT, share)
+    assert kept.v_ref == (0.0, 0.0)
+    assert kept.tau_coupled == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("age_s", [0.0, 0.004, 0.03])
+def test_aged_moves_references_on_by_their_rates(age_s: float) -> None:
+    sent = command(v_ref=(0.5, -2.0), dtau_ff=(100.0, -40.0), tau_coupled=(1.0, -2.0))
+    now = law.aged(sent, age_s)
+    np.testing.assert_allclose(now.q_ref, np.add(sent.q_ref, age_s * np.array(sent.v_ref)))
+    np.testing.assert_allclose(now.tau_ff, np.add(sent.tau_ff, age_s * np.array(sent.dtau_ff)))
+    assert (now.v_ref, now.tau_coupled) == (sent.v_ref, sent.tau_coupled)
+    assert (now.k_p, now.k_d) == (sent.k_p, sent.k_d)
+
+
+@given(s=setpoints, share=shares, q=angles, v=rates)
+def test_damped_has_no_stiffness_and_only_what_is_left_of_the_feedforward(
+    s: Setpoint, share: float, q: Pair, v: Pair
+) -> None:
+    expected = share * np.array(s.tau_ff) - 60.0 * np.array(v)
+    np.testing.assert_allclose(
+        law.torque(law.damped(s, 60.0, share), q, v), expected, rtol=1e-12, atol=1e-9
+    )
+
+
+@given(q=angles)
+def test_stand_asks_for_no_torque_where_it_stands(q: Pair) -> None:
+    s = law.stand(q, (900.0, 1500.0), (40.0, 60.0))
+    assert law.torque(s, q, (0.0, 0.0)) == (0.0, 0.0)

@@ -1,0 +1,89 @@
+"""A robot, its kinematics, and closed configurations made by the inverse kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.planner.inverse_kinematics import InverseKinematics
+from services.planner.kinematics import Kinematics
+from shared.config import RobotConfig, load
+from shared.robot_model import stand_pose
+from tests.planner import oracle
+from tests.planner.oracle import Array
+
+ROBOT_TOML = Path(__file__).parents[2] / "deploy" / "robot.toml"
+
+Closed = Callable[..., Array]
+"""closed(height, x=, y=, roll=, pitch=, yaw=) -> q (12,) where the legs agree."""
+
+SQUAT = (1.25, 1.188, 1.1, 1.0, 0.948, 0.85)
+"""Torso heights over which the robot squats, m."""
+
+
+@pytest.fixture(scope="session")
+def robot() -> RobotConfig:
+    return load(ROBOT_TOML)
+
+
+@pytest.fixture(scope="session")
+def kinematics(robot: RobotConfig) -> Kinematics:
+    """Return kinematics that every test updates before it reads them."""
+    return Kinematics(robot)
+
+
+@pytest.fixture(scope="session")
+def averaging(robot: RobotConfig) -> Kinematics:
+    """Return kinematics that mix the legs by a plain average."""
+    law = msgspec.structs.replace(robot.law, jacobian="average")
+    return Kinematics(msgspec.structs.replace(robot, law=law))
+
+
+@pytest.fixture(scope="session")
+def limits(robot: RobotConfig) -> Array:
+    return np.array(robot.joint_limits())
+
+
+@pytest.fixture(scope="session")
+def ik(robot: RobotConfig, limits: Array) -> InverseKinematics:
+    return InverseKinematics(Kinematics(robot), limits)
+
+
+def com_height(robot: RobotConfig, height: float) -> float:
+    """Return the COM's height of a level stand with its torso at a height, m."""
+    return float(oracle.pose(robot, np.array(stand_pose(robot, height)))[2])
+
+
+def p_at(robot: RobotConfig, height: float, **parts: float) -> Array:
+    """Return p (6,) for a torso height of a level stand, and the other parts as named."""
+    x, y, roll, pitch, yaw = (parts.get(n, 0.0) for n in ("x", "y", "roll", "pitch", "yaw"))
+    return np.array([x, y, com_height(robot, height), roll, pitch, yaw])
+
+
+def at_pose(robot: RobotConfig, ik: InverseKinematics, p: Array, start: Array) -> Array:
+    """Return q (12,) at p, polished so that the oracle agrees to 1e-9; asserts it got there."""
+    ik.q[:] = start
+    for _ in range(3):  # each solve stops at its tolerance; the next goes on from there
+        ik.solve(p, iterations_max=60)
+    q = ik.q.copy()
+    for _ in range(3):
+        J = oracle.derivative(lambda x: oracle.pose(robot, x), q)
+        C = oracle.derivative(lambda x: oracle.closure(robot, x), q)
+        error = np.concatenate([p - oracle.pose(robot, q), -oracle.closure(robot, q)])
+        q += np.linalg.solve(np.vstack([J, C]), error)
+    assert np.abs(p - oracle.pose(robot, q)).max() < 1e-9
+    assert np.abs(oracle.closure(robot, q)).max() < 1e-9
+    return q
+
+
+@pytest.fixture(scope="session")
+def closed(robot: RobotConfig, ik: InverseKinematics) -> Closed:
+    def make(height: float, **parts: float) -> Array:
+        start = np.array(stand_pose(robot, 1.188))
+        return at_pose(robot, ik, p_at(robot, height, **parts), start)
+
+    return make

@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import pytest
+
+from services.planner.engagement import GRACE_NS, Engagement
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.joints import MODULES
+from shared.messages import JointCommand, Mode, PlannerMode
+from tests.joint.helpers import Bench
+
+YES = [True] * 6
+HOLD = [int(Mode.HOLD)] * 6
+TRACK = [int(Mode.TRACK)] * 6
+T0 = 10**12
+
+
+def but(values: list[bool] | list[int], index: int, value: int) -> list[int]:
+    """Return the list with one module's entry changed."""
+    return [*values[:index], value, *values[index + 1 :]]
+
+
+def leading() -> Engagement:
+    """Return an engagement that has led for longer than the grace time."""
+    return Engagement(PlannerMode.LEADING, T0 - GRACE_NS - 1)
+
+
+def test_it_waits_aligns_and_leads_in_three_steps() -> None:
+    engagement = Engagement()
+    ready = but(YES, 4, False)
+    told = []
+    for fresh, modules_ready in ((but(YES, 2, False), ready), (YES, ready), (YES, ready)):
+        engagement.advance(T0, [*map(bool, fresh)], [*map(bool, modules_ready)], HOLD)
+        told.append((engagement.mode, engagement.hold))
+    assert told == [
+        (PlannerMode.WAITING, True),
+        (PlannerMode.ALIGNING, True),
+        (PlannerMode.ALIGNING, True),
+    ]
+    assert engagement.advance(T0, YES, YES, HOLD)
+    assert (engagement.mode, engagement.hold) == (PlannerMode.LEADING, False)
+
+
+def test_modules_that_are_ready_at_once_are_aligned_before_they_are_led() -> None:
+    engagement = Engagement()
+    engagement.advance(T0, YES, YES, HOLD)
+    assert engagement.hold
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_hold_is_not_lifted_while_one_module_is_not_ready(index: int) -> None:
+    engagement = Engagement(PlannerMode.ALIGNING, T0)
+    for tick in range(1000):
+        engagement.advance(
+            T0 + tick * 4 * NS_PER_MS, YES, [*map(bool, but(YES, index, False))], HOLD
+        )
+        assert engagement.hold
+
+
+@pytest.mark.parametrize("index", range(6))
+@pytest.mark.parametrize("mode", [PlannerMode.ALIGNING, PlannerMode.LEADING])
+def test_one_stale_state_holds_all(mode: PlannerMode, index: int) -> None:
+    engagement = Engagement(mode, T0)
+    assert engagement.advance(T0, [*map(bool, but(YES, index, False))], YES, TRACK)
+    assert (engagement.mode, engagement.hold) == (PlannerMode.WAITING, True)
+
+
+@pytest.mark.parametrize("index", range(6))
+@pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.TRACK])
+def test_one_module_that_leaves_track_holds_all(mode: Mode, index: int) -> None:
+    engagement = leading()
+    assert engagement.advance(T0, YES, YES, but(TRACK, index, mode))
+    assert engagement.hold
+
+
+@pytest.mark.parametrize(("off_ns", "hold"), [(-1, False), (0, False), (1, True)])
+def test_modules_may_take_the_grace_time_to_report_track(off_ns: int, hold: bool) -> None:
+    engagement = Engagement(PlannerMode.LEADING, T0)
+    engagement.advance(T0 + GRACE_NS + off_ns, YES, YES, but(TRACK, 3, Mode.HOLD))
+    assert engagement.hold is hold
+
+
+def test_it_goes_on_leading_while_all_six_track() -> None:
+    engagement = leading()
+    assert not any(engagement.advance(T0 + tick, YES, YES, TRACK) for tick in range(100))
+    assert not engagement.hold
+
+
+class Fleet:
+    """Six controllers and one engagement, without a network in between."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self.benches = [Bench(robot, module) for module in MODULES]
+        self.engagement = Engagement()
+
+    def run(self, cycles: int) -> list[list[Mode]]:
+        """Run; return the six modes after each cycle."""
+        rows = []
+        for _ in range(cycles):
+            states = [bench.controller.state(bench.now_ns) for bench in self.benches]
+            self.engagement.advance(
+                self.benches[0].now_ns, YES, [s.ready for s in states], [s.mode for s in states]
+            )
+            for bench in self.benches:
+                bench.cycle(self._command(bench))
+            rows.append([bench.mode for bench in self.benches])
+        return rows
+
+    def _command(self, bench: Bench) -> JointCommand:
+        return bench.fresh(hold=self.engagement.hold, q_ref=bench.q)
+
+
+def test_all_six_track_in_the_same_tick(robot: RobotConfig) -> None:
+    fleet = Fleet(robot)
+    rows = fleet.run(200)
+    tracking = [row.count(Mode.TRACK) for row in rows]
+    assert set(tracking) == {0, 6}
+    assert tracking == sorted(tracking)
+
+
+@pytest.mark.parametrize("mode", [Mode.FAULT, Mode.DAMP, Mode.DISARMED])
+def test_no_module_tracks_while_one_cannot(robot: RobotConfig, mode: Mode) -> None:
+    """All six track or none does: no leg is to work against the other."""
+    fleet = Fleet(robot)
+    fleet.benches[1].to(mode)
+    tracking = [row.count(Mode.TRACK) for row in fleet.run(1000)]
+    assert max(tracking) == 0
+
+
+def test_five_modules_hold_for_good_once_the_sixth_has_faulted(robot: RobotConfig) -> None:
+    fleet = Fleet(robot)
+    assert fleet.run(300)[-1] == [Mode.TRACK] * 6
+    fleet.benches[1].to(Mode.FAULT) if fleet.benches[1].mode is Mode.FAULT else None
+    fleet.benches[1].controller.failsafe.mode = Mode.FAULT
+    tracking = [row.count(Mode.TRACK) for row in fleet.run(1000)]
+    assert max(tracking[2:]) == 0

@@ -1,0 +1,255 @@
+"""p, J, closure, load sharing and the Hessian against the paper's equations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.planner.kinematics import Kinematics
+from services.planner.rotations import angles_from_rotation, rotation_from_angles
+from shared.config import RobotConfig
+from tests.planner import oracle
+from tests.planner.conftest import SQUAT, Closed
+from tests.planner.oracle import LEFT, RIGHT, Array
+
+POSES = (
+    {"height": 1.188},
+    {"height": 1.0, "pitch": 0.5, "x": 0.03, "y": -0.02, "roll": 0.05, "yaw": 0.05},
+    {"height": 0.85, "pitch": 1.0, "x": -0.03, "y": 0.04, "roll": -0.05, "yaw": -0.05},
+    {"height": 0.80, "pitch": 1.2},
+)
+WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
+NO_FORCE = np.zeros(3)
+
+
+@pytest.fixture(params=POSES, ids=lambda p: f"{p['height']:g}m-{p.get('pitch', 0):g}rad")
+def q(request: pytest.FixtureRequest, closed: Closed) -> Array:
+    return closed(**request.param)
+
+
+def slope(kinematics: Kinematics, name: str, q: Array, D_left: Array | None = None) -> Array:
+    """Return the central difference of one of the kinematics' vectors by q."""
+
+    def value(q_near: Array) -> Array:
+        kinematics.update(q_near, D_left)
+        return np.array(getattr(kinematics, name))
+
+    return oracle.derivative(value, q)
+
+
+def test_pose_closure_and_harness_are_the_papers_where_the_legs_agree(
+    robot: RobotConfig, kinematics: Kinematics, q: Array
+) -> None:
+    kinematics.update(q)
+    for side in (RIGHT, LEFT):
+        np.testing.assert_allclose(kinematics.p, oracle.pose(robot, q, side), atol=1e-8)
+        np.testing.assert_allclose(kinematics.r_harness, oracle.harness(robot, q, side), atol=1e-8)
+        np.testing.assert_allclose(kinematics.r_torso, oracle.leg(robot, side, q).torso, atol=1e-8)
+    np.testing.assert_allclose(kinematics.closure, 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("opening", [1e-3, 1e-2])
+def test_closure_is_the_legs_disagreement_when_they_are_open(
+    robot: RobotConfig, kinematics: Kinematics, q: Array, opening: float
+) -> None:
+    q_open = q + opening * np.random.default_rng(5).normal(size=12)
+    kinematics.update(q_open)
+    assert np.abs(kinematics.closure).max() > opening / 2
+    np.testing.assert_allclose(kinematics.closure, oracle.closure(robot, q_open), atol=1e-9)
+
+
+def test_an_open_pose_lies_between_what_the_legs_say(
+    robot: RobotConfig, averaging: Kinematics, q: Array
+) -> None:
+    q_open = q + 1e-3 * np.random.default_rng(5).normal(size=12)
+    averaging.update(q_open)
+    middle = 0.5 * (oracle.pose(robot, q_open, RIGHT) + oracle.pose(robot, q_open, LEFT))
+    np.testing.assert_allclose(averaging.p, middle, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "vector"), [("J", "p"), ("C", "closure"), ("J_harness", "r_harness")]
+)
+def test_jacobians_are_slopes_where_the_legs_agree(
+    kinematics: Kinematics, q: Array, matrix: str, vector: str
+) -> None:
+    kinematics.update(q)
+    got = np.array(getattr(kinematics, matrix))
+    np.testing.assert_allclose(got, slope(kinematics, vector, q), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "vector"), [("J", "p"), ("C", "closure"), ("J_harness", "r_harness")]
+)
+@pytest.mark.parametrize("opening", [1e-4, 1e-3, 1e-2])
+def test_jacobians_err_by_no_more_than_the_opening_of_the_legs(
+    kinematics: Kinematics, q: Array, matrix: str, vector: str, opening: float
+) -> None:
+    """To first order in the closure: J mixes twists, p mixes a rotation vector."""
+    q_open = q + opening * np.random.default_rng(5).normal(size=12)
+    kinematics.update(q_open)
+    got, D_left = np.array(getattr(kinematics, matrix)), kinematics.D_left.copy()
+    opened = np.abs(kinematics.closure).max()
+    np.testing.assert_allclose(got, slope(kinematics, vector, q_open, D_left), atol=1.5 * opened)
+
+
+def test_the_legs_shares_sum_to_one(robot: RobotConfig, kinematics: Kinematics, q: Array) -> None:
+    """D_R + D_L = I, D_R by the same formula from the right foot (design section 3 a)."""
+    kinematics.update(q)
+    share_x, share_y, l_z = robot.law.load_sharing_moment_arms
+    l_x, l_y = share_x * robot.geometry.l_foot / 2, share_y * robot.geometry.w_foot / 2
+    W = np.diag([1.0, 1.0, 1.0, l_y**2, l_x**2, l_z**2])
+    weighted = []
+    for side in (RIGHT, LEFT):
+        leg = oracle.leg(robot, side, q)
+        x, y, z = leg.ankle - leg.torso
+        X = np.eye(6)
+        X[3:, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+        weighted.append(X @ W @ X.T)
+    D_right, D_left = (w @ np.linalg.inv(sum(weighted)) for w in weighted)
+    np.testing.assert_allclose(D_right + D_left, np.eye(6), atol=1e-9)
+    np.testing.assert_allclose(kinematics.D_left, D_left, atol=1e-7)
+
+
+def ankle_roll_moment(robot: RobotConfig, J_torso_z: Array, side: int, q: Array) -> Array:
+    """Return a foot's wrench when the legs give the torso 1 N upward and weigh nothing."""
+    w = np.linalg.solve(oracle.leg_jacobian(robot, side, q).T, J_torso_z[oracle.LEG[side]])
+    leg = oracle.leg(robot, side, q)
+    return np.concatenate([w[:3], w[3:] + np.cross(leg.torso - leg.ankle, w[:3])])
+
+
+def up_at_torso(robot: RobotConfig, kinematics: Kinematics) -> Array:
+    """Return the joint torques (12,) that lift the torso's centre by 1 N.
+
+    From J's COM rows with the knees' own part taken off again.
+    """
+    m_torso, m_total = oracle.masses(robot)
+    q = np.array(kinematics._pose.arguments[0])
+    knees = np.concatenate([oracle.knee_jacobian(robot, s, q)[2] for s in (RIGHT, LEFT)])
+    return np.asarray((m_total * kinematics.J[2] - robot.mass.module * knees) / m_torso, float)
+
+
+def test_load_sharing_asks_each_foot_for_less_than_its_edge_gives_and_average_for_more(
+    robot: RobotConfig, kinematics: Kinematics, averaging: Kinematics, closed: Closed
+) -> None:
+    force = oracle.masses(robot)[1] * oracle.GRAVITY
+    asked: dict[str, list[float]] = {"load_sharing": [], "average": []}
+    capacity = []
+    for height in SQUAT:
+        q = closed(height)
+        for name, model in (("load_sharing", kinematics), ("average", averaging)):
+            model.update(q)
+            lift = up_at_torso(robot, model)
+            for side in (RIGHT, LEFT):
+                foot = force * ankle_roll_moment(robot, lift, side, q)
+                edge = foot[2] * robot.geometry.w_foot / 2
+                asked[name].append(abs(foot[3]))
+                capacity.append(edge)
+                assert (abs(foot[3]) < edge) == (name == "load_sharing")
+    print(
+        f"roll moment per foot under {force:.0f} N: load sharing {max(asked['load_sharing']):.1f},"
+        f" average {max(asked['average']):.1f}, edge {min(capacity):.1f} N m"
+    )
+    assert max(asked["average"]) == pytest.approx(127, abs=1.0)  # design section 3 a
+    assert min(capacity) == pytest.approx(23, abs=0.5)
+
+
+def test_under_its_own_weight_load_sharing_stays_within_the_edge_and_average_does_not(
+    robot: RobotConfig, kinematics: Kinematics, averaging: Kinematics, closed: Closed
+) -> None:
+    weight = np.array([0.0, 0.0, oracle.masses(robot)[1] * oracle.GRAVITY, 0.0, 0.0, 0.0])
+    for height in SQUAT:
+        q = closed(height)
+        for name, model in (("load_sharing", kinematics), ("average", averaging)):
+            model.update(q)
+            for side in (RIGHT, LEFT):
+                foot = oracle.foot_wrench(robot, side, q, model.J.T @ weight)
+                edge = foot[2] * robot.geometry.w_foot / 2
+                assert (abs(foot[3]) < edge) == (name == "load_sharing")
+
+
+def torque_slope(kinematics: Kinematics, q: Array, F: Array, F_h: Array) -> Array:
+    """Return d(J^T F + J_harness^T F_h)/dq (12, 12) by differences, the shares held."""
+    kinematics.update(q)
+    D_left = kinematics.D_left.copy()
+
+    def torque(q_near: Array) -> Array:
+        kinematics.update(q_near, D_left)
+        return np.asarray(kinematics.J.T @ F + kinematics.J_harness.T @ F_h, float)
+
+    return oracle.derivative(torque, q)
+
+
+def symmetric_error(kinematics: Kinematics, q: Array, F: Array, F_h: Array) -> Array:
+    """Return the symmetric part of the slope less what `hessian_times` says."""
+    want = torque_slope(kinematics, q, F, F_h)
+    kinematics.update(q)
+    return np.asarray(0.5 * (want + want.T) - kinematics.hessian_times(F, F_h), float)
+
+
+def test_hessian_is_symmetric(kinematics: Kinematics, q: Array) -> None:
+    kinematics.update(q)
+    F = np.array([30.0, -20.0, 731.0, 10.0, 5.0, 3.0])
+    hessian = kinematics.hessian_times(F, np.array([5.0, -5.0, 50.0]))
+    assert np.abs(hessian).max() > 100.0
+    np.testing.assert_array_equal(hessian, hessian.T)
+
+
+@pytest.mark.parametrize("force", [(0, 0, 731.6), (50, 0, 0), (0, 50, 0), (30, -20, 731)])
+def test_hessian_of_a_force_is_the_slopes_symmetric_part(
+    kinematics: Kinematics, q: Array, force: tuple[float, float, float]
+) -> None:
+    F = np.array([*force, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(symmetric_error(kinematics, q, F, NO_FORCE), 0.0, atol=1e-5)
+
+
+def test_hessian_with_50_n_at_the_harness_errs_by_under_3_of_300(
+    kinematics: Kinematics, q: Array
+) -> None:
+    F_h = np.array([0.0, 0.0, 50.0])
+    kinematics.update(q)
+    assert np.abs(kinematics.hessian_times(WEIGHT, F_h)).max() > 280.0
+    assert np.abs(symmetric_error(kinematics, q, WEIGHT, F_h)).max() < 3.0
+
+
+def test_hessian_leaves_out_only_the_turning_of_the_harness_arm(
+    robot: RobotConfig, kinematics: Kinematics, q: Array
+) -> None:
+    """Where the error of a force at the harness comes from.
+
+    Its moment is arm x F_h, and the arm turns with the torso: by omega = J_omega v,
+    d(moment) = (omega x arm) x F_h. That part is not in the Hessian.
+    """
+    F_h = np.array([10.0, -20.0, 200.0])
+    error = symmetric_error(kinematics, q, np.zeros(6), F_h)
+    kinematics.update(q)
+    arm = kinematics.r_harness - kinematics.r_torso
+    roll, _, yaw = kinematics.p[3:]
+    axes = [oracle.rz(yaw) @ [1, 0, 0], oracle.rz(yaw) @ oracle.rx(roll) @ [0, 1, 0], [0, 0, 1]]
+    J_omega = np.column_stack(axes) @ kinematics.J[3:]
+    turn = np.outer(arm, F_h) - (arm @ F_h) * np.eye(3)
+    np.testing.assert_allclose(error, J_omega.T @ (0.5 * (turn + turn.T)) @ J_omega, atol=1e-5)
+
+
+def test_holding_the_shares_changes_internal_torques_only(
+    robot: RobotConfig, kinematics: Kinematics, q: Array
+) -> None:
+    """The slope with the shares let free differs a lot, but not along what the robot can do."""
+
+    def torque(q_near: Array) -> Array:
+        kinematics.update(q_near)
+        return np.asarray(kinematics.J.T @ WEIGHT, float)
+
+    free = oracle.derivative(torque, q)
+    error = free - torque_slope(kinematics, q, WEIGHT, NO_FORCE)
+    T = oracle.feasible(robot, q)
+    assert np.abs(error).max() > 10.0
+    np.testing.assert_allclose(T.T @ error @ T, 0.0, atol=1e-3)
+
+
+def test_euler_angles_are_the_papers() -> None:
+    for roll, pitch, yaw in np.random.default_rng(2).uniform(-1.2, 1.2, (50, 3)):
+        R = oracle.rz(yaw) @ oracle.rx(roll) @ oracle.ry(pitch)
+        np.testing.assert_allclose(rotation_from_angles(roll, pitch, yaw), R, atol=1e-14)
+        np.testing.assert_allclose(oracle.euler(R), (roll, pitch, yaw), atol=1e-12)
+        np.testing.assert_allclose(angles_from_rotation(R), (roll, pitch, yaw), atol=1e-12)

@@ -1,0 +1,188 @@
+"""One generated model: Pinocchio, MuJoCo and the paper's equations tell the same robot."""
+
+from __future__ import annotations
+
+import msgspec
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from services.planner.model import leg_geometry, load_pinocchio, q_tree
+from shared.config import RobotConfig
+from shared.joints import JOINTS, SIDES
+from shared.robot_model import mjcf
+from tests.planner import oracle
+from tests.planner.oracle import Array
+
+MIRROR = np.tile([-1.0, 1.0], 6)
+"""Frontal angles change sign in a mirror, sagittal ones do not."""
+
+
+def random_q(count: int) -> Array:
+    return np.random.default_rng(7).uniform(-1.2, 1.2, (count, 12))
+
+
+class Simulated:
+    """The model in MuJoCo, the torso at the origin, level."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self.model = mujoco.MjModel.from_xml_string(mjcf(robot))
+        self.data = mujoco.MjData(self.model)
+        self.index = [self.model.joint(name).qposadr[0] for name in JOINTS]
+
+    def update(self, q: Array) -> None:
+        self.data.qpos[:] = 0.0
+        self.data.qpos[3] = 1.0
+        self.data.qpos[self.index] = q
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+
+    def seen_from_foot(self, side: str, place: Array) -> Array:
+        """Return a place in the axes of a foot, from its ankle."""
+        foot = self.data.body(f"foot_{side}")
+        return np.asarray(foot.xmat.reshape(3, 3).T @ (place - foot.xpos), float)
+
+
+class Rigid:
+    """The model in Pinocchio, the torso at the origin, level."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self.model = load_pinocchio(robot)
+        self.data = self.model.createData()
+
+    def update(self, q: Array) -> None:
+        full = q_tree(q, self.model)
+        pin.forwardKinematics(self.model, self.data, full)
+        pin.centerOfMass(self.model, self.data, full)
+
+    def joint(self, kind: str, side: str) -> pin.SE3:
+        """Return where the body below a module is; its two joints are one in Pinocchio."""
+        name = f"{kind}_{side}"
+        return self.data.oMi[next(i for i, n in enumerate(self.model.names) if name in n)]
+
+
+def test_total_mass_is_the_papers_in_both(robot: RobotConfig) -> None:
+    simulated, rigid = Simulated(robot), Rigid(robot)
+    assert oracle.masses(robot)[1] == pytest.approx(74.58)
+    assert simulated.model.body_mass.sum() == pytest.approx(74.58)
+    assert pin.computeTotalMass(rigid.model) == pytest.approx(74.58)
+    assert simulated.model.body("torso").mass[0] == pytest.approx(39.66)
+
+
+def test_pinocchio_and_mujoco_agree_on_com_feet_and_knees(robot: RobotConfig) -> None:
+    simulated, rigid = Simulated(robot), Rigid(robot)
+    for q in random_q(100):
+        simulated.update(q)
+        rigid.update(q)
+        np.testing.assert_allclose(rigid.data.com[0], simulated.data.subtree_com[0], atol=1e-12)
+        for side in SIDES:
+            for kind, body in (("ankle", f"foot_{side}"), ("knee", f"shin_{side}")):
+                there, here = simulated.data.body(body), rigid.joint(kind, side)
+                np.testing.assert_allclose(here.translation, there.xpos, atol=1e-12)
+                np.testing.assert_allclose(here.rotation.ravel(), there.xmat, atol=1e-12)
+
+
+def test_both_agree_with_the_papers_equations_seen_from_each_foot(robot: RobotConfig) -> None:
+    simulated = Simulated(robot)
+    for q in random_q(100):
+        simulated.update(q)
+        for index, side in enumerate(SIDES):
+            want = oracle.leg(robot, index, q)
+            data = simulated.data
+            for place, expected in (
+                (data.body("torso").xpos, want.torso),
+                (data.body(f"shin_{side}").xpos, want.knee),
+                (
+                    data.site("harness").xpos,
+                    want.torso + want.R @ np.array(robot.geometry.harness_point),
+                ),
+            ):
+                got = simulated.seen_from_foot(side, place)
+                np.testing.assert_allclose(got, expected - want.ankle, atol=1e-12)
+            foot = data.body(f"foot_{side}").xmat.reshape(3, 3)
+            np.testing.assert_allclose(foot.T, want.R, atol=1e-12)
+
+
+def test_com_agrees_with_the_papers_equation_where_the_legs_agree(robot: RobotConfig) -> None:
+    simulated = Simulated(robot)
+    for theta in np.random.default_rng(3).uniform(-1.0, 1.0, (50, 3)):
+        # the paper's feet stand flat, so both legs alike, with equal spreads of hip and base
+        level = msgspec.structs.replace(robot.geometry, w_base=robot.geometry.w_hip)
+        same = msgspec.structs.replace(robot, geometry=level)
+        q = np.tile([0.0, theta[0], 0.0, theta[1], 0.0, theta[2]], 2)
+        simulated.update(q)
+        right = simulated.data.body("foot_right")
+        got = simulated.seen_from_foot("right", simulated.data.subtree_com[0])
+        want = oracle.pose(same, q)[:3] - oracle.leg(same, 0, q).ankle
+        assert right.xmat.shape == (9,)
+        np.testing.assert_allclose(got, want, atol=1e-12)
+
+
+def test_leg_geometry_is_the_papers_from_the_foot_up(robot: RobotConfig) -> None:
+    right, left = leg_geometry(robot)
+    for index, geometry in enumerate((right, left)):
+        want = oracle.leg(robot, index, np.zeros(12))
+        np.testing.assert_allclose(geometry.r_foot, want.ankle, atol=1e-12)
+        np.testing.assert_allclose(geometry.r_knee, want.knee, atol=1e-12)
+        np.testing.assert_allclose(geometry.r_torso, want.torso, atol=1e-12)
+        np.testing.assert_allclose(geometry.axes, [[1, 0, 0], [0, 1, 0]] * 3, atol=1e-12)
+
+
+@pytest.mark.parametrize("joint", [i for i, name in enumerate(JOINTS) if "theta" in name])
+def test_positive_theta_leans_forward(robot: RobotConfig, joint: int) -> None:
+    simulated = Simulated(robot)
+    q = np.zeros(12)
+    q[joint] = 0.1
+    simulated.update(q)
+    side = SIDES[joint // 6]
+    head = simulated.seen_from_foot(side, np.array([0.0, 0.0, 1.0]))
+    assert head[0] > 0.09  # a point 1 m above the torso's centre is carried forward
+
+
+@pytest.mark.parametrize("joint", [i for i, name in enumerate(JOINTS) if "phi" in name])
+def test_positive_phi_leans_to_the_right(robot: RobotConfig, joint: int) -> None:
+    simulated = Simulated(robot)
+    side = SIDES[joint // 6]
+    q = np.zeros(12)
+    simulated.update(q)
+    before = simulated.seen_from_foot(side, np.array([0.0, 0.0, 1.0]))
+    q[joint] = 0.1
+    simulated.update(q)
+    after = simulated.seen_from_foot(side, np.array([0.0, 0.0, 1.0]))
+    assert after[1] - before[1] < -0.09
+
+
+def test_only_its_own_joint_moves_when_one_angle_changes(robot: RobotConfig) -> None:
+    simulated = Simulated(robot)
+    for index, name in enumerate(JOINTS):
+        q = np.zeros(12)
+        q[index] = 0.3
+        simulated.update(q)
+        moved = [j for j in JOINTS if simulated.data.joint(j).qpos[0] != 0.0]
+        assert moved == [name]
+
+
+def test_the_robot_is_its_own_mirror_image(robot: RobotConfig) -> None:
+    simulated = Simulated(robot)
+    flip = np.array([1.0, -1.0, 1.0])
+    for q in random_q(50):
+        simulated.update(q)
+        com = simulated.data.subtree_com[0].copy()
+        foot = simulated.data.body("foot_right").xpos.copy()
+        simulated.update(np.roll(q, 6) * MIRROR)
+        np.testing.assert_allclose(simulated.data.subtree_com[0], flip * com, atol=1e-12)
+        np.testing.assert_allclose(simulated.data.body("foot_left").xpos, flip * foot, atol=1e-12)
+
+
+def test_a_changed_payload_changes_both(robot: RobotConfig) -> None:
+    lighter = msgspec.structs.replace(robot, mass=msgspec.structs.replace(robot.mass, payload=5.0))
+    full, empty = Simulated(robot), Simulated(lighter)
+    rigid = Rigid(lighter)
+    q = random_q(1)[0]
+    for one in (full, empty, rigid):
+        one.update(q)
+    assert empty.model.body_mass.sum() == pytest.approx(74.58 - 15.4)
+    assert pin.computeTotalMass(rigid.model) == pytest.approx(74.58 - 15.4)
+    np.testing.assert_allclose(rigid.data.com[0], empty.data.subtree_com[0], atol=1e-12)
+    assert np.abs(empty.data.subtree_com[0] - full.data.subtree_com[0]).max() > 0.01

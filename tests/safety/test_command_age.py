@@ -1,0 +1,248 @@
+"""The one rule of design section 4: when is a command usable?"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.joint.failsafe import Event, Failsafe, Refusal, Timing, timing_of
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig
+from shared.messages import Mode
+from tests.joint.helpers import SESSION, T0, command
+
+OTHER = 8
+THIRD = 9
+
+
+@pytest.fixture(scope="module")
+def timing(robot: RobotConfig) -> Timing:
+    return timing_of(robot)
+
+
+def taken(timing: Timing, **changes: object) -> Failsafe:
+    """Return a failsafe that has taken one command, by default of age 0 at T0."""
+    failsafe = Failsafe(mode=Mode.HOLD)
+    assert failsafe.offer(command(**changes), T0, timing) is Refusal.NONE
+    return failsafe
+
+
+def test_the_limit_is_fifty_milliseconds(timing: Timing) -> None:
+    assert timing.max_command_age_ns == 50 * NS_PER_MS
+
+
+@pytest.mark.parametrize(
+    ("off_ns", "refusal"), [(-1, Refusal.NONE), (0, Refusal.NONE), (1, Refusal.TOO_OLD)]
+)
+def test_a_command_is_taken_up_to_the_limit_to_the_nanosecond(
+    off_ns: int, refusal: Refusal, timing: Timing
+) -> None:
+    sent = command(echo_t_ns=T0 - timing.max_command_age_ns - off_ns)
+    assert Failsafe().offer(sent, T0, timing) is refusal
+
+
+@pytest.mark.parametrize(("off_ns", "usable"), [(-1, True), (0, True), (1, False)])
+def test_a_taken_command_is_usable_up_to_the_limit_to_the_nanosecond(
+    off_ns: int, usable: bool, timing: Timing
+) -> None:
+    failsafe = taken(timing)
+    assert failsafe.usable(T0 + timing.max_command_age_ns + off_ns, timing) is usable
+
+
+@pytest.mark.parametrize(("off_ns", "mode"), [(-1, Mode.TRACK), (0, Mode.TRACK), (1, Mode.HOLD)])
+def test_track_is_left_one_nanosecond_past_the_limit(
+    off_ns: int, mode: Mode, timing: Timing
+) -> None:
+    failsafe = taken(timing)
+    failsafe.mode = Mode.TRACK
+    failsafe.advance(T0 + timing.max_command_age_ns + off_ns, timing, Event.NONE, estop=False)
+    assert failsafe.mode is mode
+
+
+@pytest.mark.parametrize(
+    ("ahead_ns", "refusal"),
+    [
+        (0, Refusal.NONE),
+        (1, Refusal.FROM_THE_FUTURE),
+        (NS_PER_S, Refusal.FROM_THE_FUTURE),
+        (1 << 62, Refusal.FROM_THE_FUTURE),
+    ],
+)
+def test_a_stamp_this_module_has_not_given_yet_is_refused(
+    ahead_ns: int, refusal: Refusal, timing: Timing
+) -> None:
+    assert Failsafe().offer(command(echo_t_ns=T0 + ahead_ns), T0, timing) is refusal
+
+
+def test_only_the_echoed_stamp_tells_the_age_and_not_the_planners_clock(timing: Timing) -> None:
+    for t_ns in (0, T0 - NS_PER_S, T0 + 10 * NS_PER_S):
+        assert Failsafe().offer(command(t_ns=t_ns), T0, timing) is Refusal.NONE
+
+
+@pytest.mark.parametrize(
+    ("seq", "refusal"), [(4, Refusal.NOT_NEWER), (5, Refusal.NOT_NEWER), (6, Refusal.NONE)]
+)
+def test_only_a_newer_sequence_is_taken(seq: int, refusal: Refusal, timing: Timing) -> None:
+    failsafe = taken(timing, seq=5)
+    assert failsafe.offer(command(seq=seq, echo_t_ns=T0 + 1), T0 + 2, timing) is refusal
+
+
+@pytest.mark.parametrize("seconds", [1, 3, 3600])
+def test_a_packet_sent_again_after_seconds_is_refused(seconds: int, timing: Timing) -> None:
+    now_ns = T0 + seconds * NS_PER_S
+    failsafe = taken(timing, seq=5)
+    assert failsafe.offer(command(seq=5), now_ns, timing) is not Refusal.NONE
+    # seconds in a stalled link: never seen before, and still too old
+    assert failsafe.offer(command(seq=6), now_ns, timing) is Refusal.TOO_OLD
+    assert not failsafe.usable(now_ns, timing)
+
+
+def test_a_foreign_session_is_refused_while_the_current_one_is_usable(timing: Timing) -> None:
+    failsafe = taken(timing, seq=5)
+    last_ns = T0 + timing.max_command_age_ns
+    foreign = command(session=OTHER, seq=99, echo_t_ns=last_ns)
+    assert failsafe.offer(foreign, last_ns, timing) is Refusal.FOREIGN_SESSION
+    assert failsafe.session == SESSION
+
+
+def test_a_restarted_planner_is_taken_once_the_old_session_is_stale(timing: Timing) -> None:
+    failsafe = taken(timing, seq=5_000)
+    now_ns = T0 + timing.max_command_age_ns + 1
+    restarted = command(session=OTHER, seq=1, echo_t_ns=now_ns)
+    assert failsafe.offer(restarted, now_ns, timing) is Refusal.NONE
+    assert (failsafe.session, failsafe.command) == (OTHER, restarted)
+
+
+def test_a_retired_session_never_comes_back(timing: Timing) -> None:
+    failsafe = taken(timing)
+    now_ns = T0
+    for session in (OTHER, THIRD):
+        now_ns += timing.max_command_age_ns + 1
+        sent = command(session=session, echo_t_ns=now_ns)
+        assert failsafe.offer(sent, now_ns, timing) is Refusal.NONE
+    now_ns += NS_PER_S
+    for session in (SESSION, OTHER):
+        back = command(session=session, seq=9_999, echo_t_ns=now_ns)
+        assert failsafe.offer(back, now_ns, timing) is Refusal.FOREIGN_SESSION
+    assert failsafe.session == THIRD
+
+
+def test_the_command_that_brings_a_new_session_must_itself_be_within_limits(
+    timing: Timing,
+) -> None:
+    failsafe = taken(timing)
+    now_ns = T0 + timing.max_command_age_ns + 1
+    bad = command(session=OTHER, echo_t_ns=now_ns, k_p=(math.nan, 1.0))
+    assert failsafe.offer(bad, now_ns, timing) is Refusal.OUT_OF_LIMITS
+    assert failsafe.session == SESSION
+
+
+def test_a_new_session_waits_for_its_own_unbroken_time_before_track(timing: Timing) -> None:
+    failsafe = taken(timing)
+    failsafe.fresh_since_ns = T0 - NS_PER_S
+    now_ns = T0 + timing.max_command_age_ns + 1
+    failsafe.offer(command(session=OTHER, echo_t_ns=now_ns), now_ns, timing)
+    failsafe.advance(now_ns, timing, Event.NONE, estop=False)
+    assert failsafe.mode is Mode.HOLD
+    assert not failsafe.ready(now_ns + timing.engage_after_ns - 1, timing)
+
+
+def test_a_new_session_never_leads_in_track_without_its_own_unbroken_time(timing: Timing) -> None:
+    """Two planners run and the first dies: the second one's commands are there at once."""
+    failsafe = taken(timing)
+    failsafe.mode = Mode.TRACK
+    failsafe.fresh_since_ns = T0 - NS_PER_S
+    now_ns = T0 + timing.max_command_age_ns + 1
+    assert failsafe.offer(command(session=OTHER, echo_t_ns=now_ns), now_ns, timing) is Refusal.NONE
+    failsafe.advance(now_ns, timing, Event.NONE, estop=False)
+    assert failsafe.mode is Mode.HOLD
+
+
+# what within_limits guards: field, largest value taken, whether its negative is taken too
+LIMITS = [
+    ("q_ref", lambda t: 6.4, True),
+    ("v_ref", lambda t: t.v_max, True),
+    ("tau_ff", lambda t: t.tau_max, True),
+    ("dtau_ff", lambda t: 1e3 * t.tau_max, True),
+    ("tau_coupled", lambda t: t.tau_max, True),
+    ("k_p", lambda t: t.k_p_max, False),
+    ("k_d", lambda t: t.k_d_max, False),
+]
+PAIR_FIELDS = {field for field, _, _ in LIMITS}
+
+
+def test_every_number_of_the_law_is_on_the_list_of_limits() -> None:
+    sent = command()
+    pairs = {name for name in sent.__struct_fields__ if isinstance(getattr(sent, name), tuple)}
+    assert pairs == PAIR_FIELDS
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("field", "largest_of", "signed"), LIMITS)
+def test_each_field_is_taken_up_to_its_limit_and_refused_beyond(
+    field: str, largest_of: object, signed: bool, axis: int, timing: Timing
+) -> None:
+    assert callable(largest_of)
+    top = largest_of(timing)
+    beyond = math.nextafter(top, math.inf)
+    good = [0.0, top, *([-top] if signed else [])]
+    bad = [beyond, math.inf, -math.inf, math.nan, -beyond if signed else -5e-324]
+    for value, refusal in [(v, Refusal.NONE) for v in good] + [
+        (v, Refusal.OUT_OF_LIMITS) for v in bad
+    ]:
+        pair = (value, 0.0) if axis == 0 else (0.0, value)
+        failsafe = Failsafe()
+        assert failsafe.offer(command(**{field: pair}), T0, timing) is refusal, value
+        assert failsafe.refused == (refusal is not Refusal.NONE)
+
+
+def test_a_refused_command_leaves_the_one_in_use_alone(timing: Timing) -> None:
+    failsafe = taken(timing, seq=5)
+    in_use = failsafe.command
+    for bad in (
+        command(seq=6, k_p=(math.nan, 0.0)),
+        command(seq=4),
+        command(seq=6, echo_t_ns=T0 + 1),
+        command(session=OTHER, seq=6),
+        command(seq=6, echo_t_ns=0),
+    ):
+        assert failsafe.offer(bad, T0, timing) is not Refusal.NONE
+    assert failsafe.command is in_use
+    assert failsafe.refused == 5
+
+
+@given(
+    offers=st.lists(
+        st.tuples(
+            st.integers(0, 40 * NS_PER_MS),  # time since the last offer
+            st.integers(-5 * NS_PER_MS, 120 * NS_PER_MS),  # age
+            st.integers(1, 3),  # session
+            st.integers(0, 6),  # sequence
+            st.booleans(),  # within limits
+        ),
+        max_size=40,
+    )
+)
+def test_whatever_is_in_use_met_the_whole_rule_when_it_was_taken(
+    robot: RobotConfig, offers: list[tuple[int, int, int, int, bool]]
+) -> None:
+    timing = timing_of(robot)
+    failsafe, now_ns, retired = Failsafe(), T0, set[int]()
+    for wait_ns, age_ns, session, seq, good in offers:
+        now_ns += wait_ns
+        before, current = failsafe.command, failsafe.session
+        was_usable = failsafe.usable(now_ns, timing)
+        k_p = (1.0, 1.0) if good else (1.0, math.inf)
+        sent = command(echo_t_ns=now_ns - age_ns, session=session, seq=seq, k_p=k_p)
+        rule = 0 <= age_ns <= timing.max_command_age_ns and good and session not in retired
+        if before is not None and session == current:
+            rule = rule and seq > before.seq
+        elif before is not None:
+            rule = rule and not was_usable
+        assert (failsafe.offer(sent, now_ns, timing) is Refusal.NONE) is rule
+        assert failsafe.command is (sent if rule else before)
+        if rule and before is not None and session != current:
+            retired.add(current)
