@@ -89,11 +89,12 @@ class Lockstep:
                 if restarts.pop(0).service == "planner":
                     self._sessions += 1
                     self.planner = Planner(self.config, self._sessions)
-            self._advance()
+            self.advance()
             if t >= 0.0 and self.now_ns % self._truth_ns == 0:
                 yield self.world.truth(self.now_ns, 1.0, 0.0)
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
+        """Move virtual time on by one step of the world."""
         now = self.now_ns
         if now % self._cycle_ns == 0:
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())

@@ -1,9 +1,8 @@
-"""A robot, its kinematics, and closed configurations made by the inverse kinematics."""
+"""The kinematics, and closed configurations made by the inverse kinematics."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -11,23 +10,16 @@ import pytest
 
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
-from shared.config import RobotConfig, load
+from shared.config import RobotConfig
 from shared.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.oracle import Array
-
-ROBOT_TOML = Path(__file__).parents[2] / "deploy" / "robot.toml"
 
 Closed = Callable[..., Array]
 """closed(height, x=, y=, roll=, pitch=, yaw=) -> q (12,) where the legs agree."""
 
 SQUAT = (1.25, 1.188, 1.1, 1.0, 0.948, 0.85)
 """Torso heights over which the robot squats, m."""
-
-
-@pytest.fixture(scope="session")
-def robot() -> RobotConfig:
-    return load(ROBOT_TOML)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+from typing import TypeVar
+
 import pytest
 
+from services.joint.drivers.base import DriveStatus
 from services.planner.engagement import GRACE_NS, Engagement
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
@@ -9,13 +12,15 @@ from shared.joints import MODULES
 from shared.messages import JointCommand, Mode, PlannerMode
 from tests.joint.helpers import Bench
 
+T = TypeVar("T")
+
 YES = [True] * 6
 HOLD = [int(Mode.HOLD)] * 6
 TRACK = [int(Mode.TRACK)] * 6
 T0 = 10**12
 
 
-def but(values: list[bool] | list[int], index: int, value: int) -> list[int]:
+def but(values: list[T], index: int, value: T) -> list[T]:
     """Return the list with one module's entry changed."""
     return [*values[:index], value, *values[index + 1 :]]
 
@@ -30,7 +35,7 @@ def test_it_waits_aligns_and_leads_in_three_steps() -> None:
     ready = but(YES, 4, False)
     told = []
     for fresh, modules_ready in ((but(YES, 2, False), ready), (YES, ready), (YES, ready)):
-        engagement.advance(T0, [*map(bool, fresh)], [*map(bool, modules_ready)], HOLD)
+        engagement.advance(T0, fresh, modules_ready, HOLD)
         told.append((engagement.mode, engagement.hold))
     assert told == [
         (PlannerMode.WAITING, True),
@@ -51,9 +56,8 @@ def test_modules_that_are_ready_at_once_are_aligned_before_they_are_led() -> Non
 def test_hold_is_not_lifted_while_one_module_is_not_ready(index: int) -> None:
     engagement = Engagement(PlannerMode.ALIGNING, T0)
     for tick in range(1000):
-        engagement.advance(
-            T0 + tick * 4 * NS_PER_MS, YES, [*map(bool, but(YES, index, False))], HOLD
-        )
+        now_ns = T0 + tick * 4 * NS_PER_MS
+        engagement.advance(now_ns, YES, but(YES, index, False), HOLD)
         assert engagement.hold
 
 
@@ -61,7 +65,7 @@ def test_hold_is_not_lifted_while_one_module_is_not_ready(index: int) -> None:
 @pytest.mark.parametrize("mode", [PlannerMode.ALIGNING, PlannerMode.LEADING])
 def test_one_stale_state_holds_all(mode: PlannerMode, index: int) -> None:
     engagement = Engagement(mode, T0)
-    assert engagement.advance(T0, [*map(bool, but(YES, index, False))], YES, TRACK)
+    assert engagement.advance(T0, but(YES, index, False), YES, TRACK)
     assert (engagement.mode, engagement.hold) == (PlannerMode.WAITING, True)
 
 
@@ -69,14 +73,14 @@ def test_one_stale_state_holds_all(mode: PlannerMode, index: int) -> None:
 @pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.TRACK])
 def test_one_module_that_leaves_track_holds_all(mode: Mode, index: int) -> None:
     engagement = leading()
-    assert engagement.advance(T0, YES, YES, but(TRACK, index, mode))
+    assert engagement.advance(T0, YES, YES, but(TRACK, index, int(mode)))
     assert engagement.hold
 
 
 @pytest.mark.parametrize(("off_ns", "hold"), [(-1, False), (0, False), (1, True)])
 def test_modules_may_take_the_grace_time_to_report_track(off_ns: int, hold: bool) -> None:
     engagement = Engagement(PlannerMode.LEADING, T0)
-    engagement.advance(T0 + GRACE_NS + off_ns, YES, YES, but(TRACK, 3, Mode.HOLD))
+    engagement.advance(T0 + GRACE_NS + off_ns, YES, YES, but(TRACK, 3, int(Mode.HOLD)))
     assert engagement.hold is hold
 
 
@@ -130,7 +134,7 @@ def test_no_module_tracks_while_one_cannot(robot: RobotConfig, mode: Mode) -> No
 def test_five_modules_hold_for_good_once_the_sixth_has_faulted(robot: RobotConfig) -> None:
     fleet = Fleet(robot)
     assert fleet.run(300)[-1] == [Mode.TRACK] * 6
-    fleet.benches[1].to(Mode.FAULT) if fleet.benches[1].mode is Mode.FAULT else None
-    fleet.benches[1].controller.failsafe.mode = Mode.FAULT
-    tracking = [row.count(Mode.TRACK) for row in fleet.run(1000)]
-    assert max(tracking[2:]) == 0
+    fleet.benches[1].status = DriveStatus.LOST
+    rows = fleet.run(1000)
+    assert rows[-1][1] is Mode.FAULT
+    assert max(row.count(Mode.TRACK) for row in rows[2:]) == 0

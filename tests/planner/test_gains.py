@@ -99,14 +99,14 @@ def test_null_space_projector_keeps_clear_of_the_task_up_to_its_damping(
     assert np.linalg.norm(at.J @ N, 2) <= robot.law.damping_lambda / 2 + 1e-12
 
 
-def test_local_gains_are_the_diagonals_within_the_limits(
+def test_local_gains_are_their_share_of_the_diagonals_within_the_limits(
     robot: RobotConfig, at: Kinematics
 ) -> None:
     gains = gains_under_weight(robot, at)
-    service = robot.joint_service
+    service, damping_share = robot.joint_service, robot.law.local_damping_share
     for diagonal, local, limit in (
         (np.diagonal(gains.K_q), gains.D, service.k_p_max),
-        (np.diagonal(gains.B_q), gains.D_B, service.k_d_max),
+        (damping_share * np.diagonal(gains.B_q), gains.D_B, service.k_d_max),
     ):
         np.testing.assert_array_equal(local, np.clip(diagonal, 0.0, limit))
         assert local.max() > 1.0

@@ -203,13 +203,15 @@ def test_hessian_of_a_force_is_the_slopes_symmetric_part(
     np.testing.assert_allclose(symmetric_error(kinematics, q, F, NO_FORCE), 0.0, atol=1e-5)
 
 
-def test_hessian_with_50_n_at_the_harness_errs_by_under_3_of_300(
+def test_hessian_with_50_n_at_the_harness_errs_by_under_one_percent(
     kinematics: Kinematics, q: Array
 ) -> None:
     F_h = np.array([0.0, 0.0, 50.0])
     kinematics.update(q)
-    assert np.abs(kinematics.hessian_times(WEIGHT, F_h)).max() > 280.0
-    assert np.abs(symmetric_error(kinematics, q, WEIGHT, F_h)).max() < 3.0
+    largest = np.abs(kinematics.hessian_times(WEIGHT, F_h)).max()
+    error = np.abs(symmetric_error(kinematics, q, WEIGHT, F_h)).max()
+    print(f"error {error:.1f} of {largest:.0f} N m/rad")
+    assert error < 0.01 * largest
 
 
 def test_hessian_leaves_out_only_the_turning_of_the_harness_arm(

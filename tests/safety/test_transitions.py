@@ -32,7 +32,11 @@ class Situation(NamedTuple):
 
 DRIVE_EVENTS = (Event.NONE, Event.DRIVE_ARMED, Event.DRIVE_DISARMED, Event.DRIVE_LOST)
 FLAGS = (False, True)
-SITUATIONS = [Situation(*row) for row in product(Mode, DRIVE_EVENTS, *[FLAGS] * 4)]
+SITUATIONS = [
+    Situation(mode, drive, *flags)
+    for mode, drive in product(Mode, DRIVE_EVENTS)
+    for flags in product(FLAGS, FLAGS, FLAGS, FLAGS)
+]
 
 
 def section_4(s: Situation) -> Mode:

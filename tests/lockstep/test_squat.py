@@ -1,0 +1,107 @@
+"""The paper's experiment in virtual time: claims about physics, free of the machine's noise."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from shared.config import RobotConfig
+from shared.messages import Cause, Mode
+from tests.lockstep.runs import Run, kill, push, restart, run, still, story
+
+
+@pytest.fixture(scope="module")
+def squat(robot: RobotConfig) -> Run:
+    """The whole of Fig. 7: two squats, the planner killed at 10 s, three pushes."""
+    return run(robot, story("squat"))
+
+
+def test_the_robot_balances_while_the_operator_leads_two_squats(squat: Run) -> None:
+    alive = squat.t < 10.0
+    assert np.abs(squat.com_mm[alive, 0]).max() <= 10.0
+    assert np.abs(squat.com_mm[alive, 1]).max() <= 5.0
+    assert np.abs(squat.angles[alive][:, [0, 2]]).max() <= 0.01
+
+
+def test_the_operator_leads_the_height_by_hand(squat: Run) -> None:
+    alive = squat.t < 10.0
+    height = np.array([row.torso[2] for row in squat.rows])[alive]
+    assert height.min() < 0.97
+    assert height.max() > 1.17
+    assert np.abs(squat.operator_n[alive]).max() <= 40.0
+
+
+def test_the_robot_stands_through_pushes_with_the_planner_dead(squat: Run) -> None:
+    assert squat.stood
+    hold = squat.t >= 10.0
+    assert np.abs(squat.com_mm[hold, 0]).max() <= 80.0
+    assert np.abs(squat.com_mm[hold, 1]).max() <= 100.0
+    assert np.abs(squat.com_mm[hold, 1]).max() >= 10.0, "the pushes must be felt"
+
+
+def test_all_six_modules_hold_within_the_command_age_of_the_kill(squat: Run) -> None:
+    controllers = squat.lockstep.controllers
+    assert all(controller.failsafe.mode is Mode.HOLD for controller in controllers)
+    into_hold = [e for _, e in squat.lockstep.events if e.cause == Cause.COMMAND_STALE]
+    assert len(into_hold) == 6
+    start_ns = squat.rows[0].t_ns - round(squat.rows[0].scenario_s * 1e9)
+    for event in into_hold:
+        since_kill_ms = (event.t_ns - start_ns) / 1e6 - 10_000.0
+        assert 0.0 <= since_kill_ms <= 55.0
+
+
+def test_handing_over_makes_no_torque_step(squat: Run) -> None:
+    for _, event in squat.lockstep.events:
+        if event.mode_before == Mode.TRACK:
+            assert np.abs(np.subtract(event.tau_after, event.tau_before)).max() <= 5.0
+
+
+def test_the_soles_stay_flat(squat: Run) -> None:
+    alive = [row for row in squat.rows if row.scenario_s < 10.0]
+    assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in alive) <= 0.005
+
+
+def test_runs_are_bit_identical(robot: RobotConfig) -> None:
+    first, second = (run(robot, still(1.0, push=(push(0.2, 20, 10, 0),))) for _ in range(2))
+    assert first.rows == second.rows
+
+
+@pytest.mark.parametrize("at", [0.7, 1.3, 2.5, 3.9])
+def test_the_robot_stands_whenever_the_planner_dies(robot: RobotConfig, at: float) -> None:
+    pushes = (push(at + 0.5, 40, 0, 0), push(at + 1.5, 0, -40, 0))
+    outcome = run(robot, story("squat", duration=at + 3.0, kill=kill(at), push=pushes))
+    assert outcome.stood
+
+
+def test_a_restarted_planner_takes_over_without_a_step(robot: RobotConfig) -> None:
+    outcome = run(
+        robot, story("squat", duration=8.0, kill=kill(2.2), restart=restart(4.0), push=())
+    )
+    assert outcome.stood
+    assert all(c.failsafe.mode is Mode.TRACK for c in outcome.lockstep.controllers)
+    assert all(c.failsafe.dropouts == 1 for c in outcome.lockstep.controllers)
+    for _, event in outcome.lockstep.events:
+        step = np.abs(np.subtract(event.tau_after, event.tau_before)).max()
+        assert step <= 5.0 or event.mode_before == Mode.DISARMED
+
+
+def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
+    averaged = msgspec.structs.replace(
+        robot, law=msgspec.structs.replace(robot.law, jacobian="average")
+    )
+    from tools.lockstep import Lockstep  # noqa: PLC0415
+
+    world = Lockstep(averaged, still(5.0))
+    tilt = 0.0
+    for _ in range(1200):
+        world.advance()
+        truth = world.world.truth(0, 1.0, 0.0)
+        tilt = max(tilt, truth.foot_left_tilt, truth.foot_right_tilt)
+    assert tilt > 0.05
+
+
+@pytest.mark.parametrize("delay_ms", [0.0, 5.0, 10.0])
+def test_the_robot_stands_at_any_delay_of_the_bus(robot: RobotConfig, delay_ms: float) -> None:
+    scenario = story("squat", duration=5.0, kill=(), push=(push(2.0, 40, 0, 0),))
+    assert run(robot, scenario, delay_ms).stood

@@ -1,0 +1,269 @@
+"""The simulated world: how it starts, what acts on it, and that it repeats itself."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.simulator.world import World
+from shared.config import GRAVITY, RobotConfig
+from shared.messages import SimTruth
+from shared.scenario import Keyframe, Push, Scenario
+
+IDLE = np.zeros(12)
+SIDES = ("right", "left")
+STAND = Scenario(
+    name="stand", about="nothing leads", duration=60.0, hand=False, keyframe=(Keyframe(at=0.0, height=1.188),)
+)  # fmt: skip
+
+
+def world_of(robot: RobotConfig, **changes: object) -> World:
+    return World(robot, msgspec.structs.replace(STAND, **changes))
+
+
+def seen(world: World) -> SimTruth:
+    return world.truth(0, 1.0, 0.0)
+
+
+def run(world: World, seconds: float) -> None:
+    for _ in range(round(seconds / world.timestep)):
+        world.step(IDLE)
+
+
+def motor_work_matches(world: World, torque: np.ndarray) -> tuple[float, float]:
+    """Return power at the joints and at the motors, W, at the present rates."""
+    _, turns_per_s = world.motor_turns()
+    at_motors = float(torque @ turns_per_s) * 2 * math.pi
+    return float(world._tau_from_motor @ torque @ world.data.qvel), at_motors
+
+
+def test_at_the_start_the_soles_lie_flat_on_the_floor(robot: RobotConfig) -> None:
+    world = world_of(robot)
+    truth = seen(world)
+    assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
+    for side in SIDES:
+        foot = world.data.body(f"foot_{side}")
+        assert foot.xpos[2] == pytest.approx(0.0, abs=1e-3)
+        heading = foot.xmat.reshape(3, 3)[:, 0]
+        assert heading[1] == pytest.approx(0.0, abs=2e-3)  # toes forward
+
+
+def test_at_the_start_the_ankles_are_where_the_planner_takes_them_to_be(
+    robot: RobotConfig,
+) -> None:
+    world = world_of(robot)
+    for side, sign in zip(SIDES, (-1.0, 1.0), strict=True):
+        wanted = (0.0, sign * robot.geometry.w_base / 2, 0.0)
+        np.testing.assert_allclose(world.data.body(f"foot_{side}").xpos, wanted, atol=2e-3)
+
+
+def test_at_the_start_the_torso_is_level_at_the_stand_height(robot: RobotConfig) -> None:
+    truth = seen(world_of(robot))
+    assert truth.torso[2] == pytest.approx(robot.simulation.stand_height, abs=5e-4)
+    assert truth.angles == pytest.approx((0.0, 0.0, 0.0), abs=1e-3)
+    assert truth.com[:2] == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert not truth.fallen
+
+
+def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
+    """q_phi, q_theta = (m1 - m2) / 2N, (m1 + m2) / 2N (design section 2)."""
+    world = world_of(robot)
+    rng = np.random.default_rng(1)
+    q, v = rng.uniform(-1, 1, 12), rng.uniform(-1, 1, 12)
+    world.data.qpos[world._q_index] = q
+    world.data.qvel[6:] = 0.0
+    for index, name in enumerate(_joint_names()):
+        world.data.joint(name).qvel[0] = v[index]
+    for turns, joints in zip(world.motor_turns(), (q, v), strict=True):
+        m1, m2 = 2 * math.pi * turns[0::2], 2 * math.pi * turns[1::2]
+        two_n = 2 * robot.joint.gear_ratio
+        np.testing.assert_allclose((m1 - m2) / two_n, joints[0::2], atol=1e-12)
+        np.testing.assert_allclose((m1 + m2) / two_n, joints[1::2], atol=1e-12)
+
+
+def _joint_names() -> list[str]:
+    return [f"{k}_{s}_{a}" for s in SIDES for k in ("ankle", "knee", "hip") for a in ("phi", "theta")]  # fmt: skip
+
+
+def test_power_is_the_same_at_motors_and_joints(robot: RobotConfig) -> None:
+    world = world_of(robot)
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        world.data.qvel[:] = rng.normal(size=world.model.nv)
+        at_joints, at_motors = motor_work_matches(world, rng.normal(size=12))
+        assert at_joints == pytest.approx(at_motors, rel=1e-12)
+        assert abs(at_motors) > 1e-3
+
+
+def test_both_motors_of_a_module_add_up_along_one_axis(robot: RobotConfig) -> None:
+    world = world_of(robot)
+    torque = np.zeros(12)
+    torque[2:4] = 1.0  # both motors of the right knee
+    world.step(torque)
+    assert world.data.joint("knee_right_theta").qfrc_applied[0] == pytest.approx(
+        2 * robot.joint.gear_ratio
+    )
+    assert world.data.joint("knee_right_phi").qfrc_applied[0] == pytest.approx(0.0)
+
+
+def test_the_hoist_holds_an_unpowered_robot(robot: RobotConfig) -> None:
+    world = world_of(robot)
+    run(world, 5.0)
+    truth = seen(world)
+    assert truth.hoist == 1.0
+    assert not truth.fallen
+    assert truth.torso[2] == pytest.approx(robot.simulation.stand_height, abs=0.03)
+    assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 0.01
+    assert truth.feet_slip < 5e-3
+
+
+def test_an_unpowered_robot_falls_once_the_hoist_lets_go(robot: RobotConfig) -> None:
+    world = world_of(robot)
+    run(world, 0.5)
+    world.release_hoist()
+    run(world, robot.simulation.hoist_s / 2)
+    assert seen(world).hoist == pytest.approx(0.5, abs=0.01)
+    run(world, robot.simulation.hoist_s / 2 + 3.0)
+    truth = seen(world)
+    assert truth.hoist == 0.0
+    assert truth.fallen
+    assert math.isfinite(truth.torso[2])
+
+
+def test_fallen_is_for_good(robot: RobotConfig) -> None:
+    world = world_of(robot)
+    upright = world.data.qpos.copy()
+    world.data.qpos[2] = 0.3
+    run(world, 0.002)
+    assert seen(world).fallen
+    world.data.qpos[:] = upright
+    world.data.qvel[:] = 0.0
+    run(world, 0.002)
+    truth = seen(world)
+    assert truth.torso[2] > 1.0
+    assert truth.fallen
+
+
+def test_a_push_gives_the_impulse_asked(robot: RobotConfig) -> None:
+    push = Push(at=0.1, duration=0.3, force=(40.0, -20.0, 10.0))
+    world = world_of(robot, push=(push,))
+    world.start()
+    impulse = np.zeros(3)
+    for _ in range(600):
+        world.step(IDLE)
+        impulse += np.array(world.push) * world.timestep
+    tolerance = 40.0 * world.timestep  # one step's worth
+    np.testing.assert_allclose(impulse, 0.3 * np.array(push.force), atol=1.01 * tolerance)
+
+
+def test_a_push_moves_a_free_body_by_its_impulse(robot: RobotConfig) -> None:
+    """In the air, hoist gone: the momentum gained is the impulse."""
+    push = Push(at=0.0, duration=0.1, force=(40.0, 0.0, 0.0))
+    world = world_of(robot, push=(push,))
+    world.hoist = 0.0
+    world.data.qpos[2] += 5.0
+    world.start()
+    run(world, 0.1)
+    momentum = _momentum(world)
+    np.testing.assert_allclose(momentum[:2], (4.0, 0.0), atol=0.05)
+    assert momentum[2] == pytest.approx(-74.58 * GRAVITY * 0.1, rel=0.01)
+
+
+def _momentum(world: World) -> np.ndarray:
+    """Return the whole robot's momentum (3,), N s, from its COM before and after a step."""
+    before = world.data.subtree_com[0].copy()
+    run(world, 0.002)
+    run_s = 0.002
+    return 74.58 * (world.data.subtree_com[0] - before) / run_s
+
+
+def test_nothing_pushes_before_the_scenario_starts(robot: RobotConfig) -> None:
+    world = world_of(robot, push=(Push(at=0.0, duration=1.0, force=(500.0, 0.0, 0.0)),))
+    run(world, 0.05)
+    assert world.scenario_s < 0.0
+    assert world.push == (0.0, 0.0, 0.0)
+    assert seen(world).push == (0.0, 0.0, 0.0)
+
+
+def test_the_hand_waits_for_the_hoist_and_keeps_within_its_strength(robot: RobotConfig) -> None:
+    world = world_of(robot, hand=True, keyframe=(Keyframe(at=0.0, height=2.0, pitch=1.5),))
+    run(world, 0.01)
+    assert world.hand == (0.0, 0.0)
+    world.hoist = 0.0
+    hand, strongest = robot.simulation.operator, [0.0, 0.0]
+    for _ in range(500):
+        world.step(IDLE)
+        strongest = [max(s, abs(f)) for s, f in zip(strongest, world.hand, strict=True)]
+    assert strongest == [hand.force_max, hand.moment_max]
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.6, 1.2])
+def test_the_harness_feels_hand_and_load_in_torso_axes(robot: RobotConfig, pitch: float) -> None:
+    """Hand up, load down, along world z; turned into the torso, the hand's moment about its y."""
+    lead = Keyframe(at=0.0, height=1.25, pitch=pitch + 0.1, assist=120.0)
+    world = world_of(robot, hand=True, keyframe=(lead,))
+    world.hoist = 0.0
+    world.data.qpos[3:7] = (math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0)
+    run(world, 0.002)
+    R = world.data.body("torso").xmat.reshape(3, 3)
+    truth = seen(world)
+    assert truth.load_n == 120.0
+    assert truth.harness_force_z == pytest.approx(120.0 - world.hand.force_z)
+    upward = R @ np.array(world.harness_force)
+    np.testing.assert_allclose(upward, (0.0, 0.0, world.hand.force_z - 120.0), atol=1.5)
+    assert world.harness_moment == (0.0, world.hand.moment_pitch, 0.0)
+    assert world.hand.moment_pitch != 0.0
+    np.testing.assert_allclose(truth.operator_moment, R[:, 1] * world.hand.moment_pitch, atol=1e-9)
+    assert truth.operator_force == (0.0, 0.0, world.hand.force_z)
+
+
+def test_what_the_harness_feels_is_what_acts_on_the_torso(robot: RobotConfig) -> None:
+    """Same wrench: at the harness point in torso axes, and at the torso's centre in world's."""
+    lead = Keyframe(at=0.0, height=1.3, pitch=0.5, assist=80.0)
+    world = world_of(robot, hand=True, keyframe=(lead,))
+    world.hoist = 0.0
+    world.data.qpos[3:7] = (math.cos(0.3), math.sin(0.3) * 0.6, math.sin(0.3) * 0.8, 0.0)
+    world.data.qvel[:] = 0.0
+    world.step(IDLE)  # the pose set above is known to the world from its next step on
+    R = world.data.body("torso").xmat.reshape(3, 3).copy()
+    world.step(IDLE)
+    force = R @ np.array(world.harness_force)
+    arm = R @ np.array(robot.geometry.harness_point)
+    moment = R @ np.array(world.harness_moment) + np.cross(arm, force)
+    applied = world.data.xfrc_applied[world.model.body("torso").id]
+    assert np.abs(force).max() > 10.0
+    np.testing.assert_allclose(applied, [*force, *moment], atol=1e-9)
+
+
+def test_truth_is_finite_and_counts_up(robot: RobotConfig) -> None:
+    world = world_of(robot)
+    world.start()
+    for count in range(1, 6):
+        run(world, 0.01)
+        truth = seen(world)
+        assert truth.seq == count
+        assert truth.scenario_s == pytest.approx(0.01 * count)
+        for value in msgspec.structs.astuple(truth):
+            assert np.all(np.isfinite(value))
+
+
+def test_two_worlds_stepped_alike_are_the_same_to_the_bit(robot: RobotConfig) -> None:
+    """Through contact, a push, the hoist letting go and the hand."""
+    scenario = msgspec.structs.replace(
+        STAND, hand=True, push=(Push(at=0.2, duration=0.1, force=(40.0, 10.0, 0.0)),)
+    )
+    worlds = [World(robot, scenario) for _ in range(2)]
+    torques = 0.5 * np.random.default_rng(3).normal(size=(2000, 12))
+    for world in worlds:
+        world.start()
+        world.release_hoist()
+        for torque in torques:
+            world.step(torque)
+    one, other = worlds
+    np.testing.assert_array_equal(one.data.qpos, other.data.qpos)
+    np.testing.assert_array_equal(one.data.qvel, other.data.qvel)
+    assert seen(one) == seen(other)
+    assert one.hoist == 0.0

@@ -1,0 +1,135 @@
+"""The real fleet, live: ten processes, a kill and a verdict. Outcomes only, no milliseconds."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared import topics
+from shared.config import RobotConfig
+from shared.joints import MODULES
+from tools import procfs
+from tools.run_log import read_run
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+
+SUMMARY_KEYS = {
+    "stood", "duration_s", "real_time_factor", "com_x_max_mm", "com_y_max_mm", "roll_max_rad",
+    "pitch_max_rad", "yaw_max_rad", "torso_height_min_m", "torso_height_max_m",
+    "operator_peak_n", "assist_error_n", "handover_ms", "handover_torque_step_nm", "reengage_s",
+    "pd_cycles_late_pct", "planner_tick_us", "messages_recorded", "sequence_gaps",
+    *(
+        f"{phase}_{key}"
+        for phase in ("alive", "hold")
+        for key in ("com_x_max_mm", "com_y_max_mm", "roll_max_rad", "pitch_max_rad", "yaw_max_rad")
+    ),
+}  # fmt: skip
+
+
+def demo(out: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tools.cli", "demo", "--out", str(out), *flags]
+    root = Path(__file__).resolve().parents[2]
+    return subprocess.run(
+        command, cwd=root, capture_output=True, text=True, timeout=150, check=False
+    )
+
+
+def fleet_processes() -> list[int]:
+    """Return processes of demo fleets that are alive."""
+    left = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                environment = (entry / "environ").read_bytes()
+            except OSError:
+                continue
+            if b"XRL_FLEET=/tmp/xrl-demo-" in environment and not procfs.is_gone(int(entry.name)):
+                left.append(int(entry.name))
+    return left
+
+
+def test_a_killed_and_restarted_planner_is_survived_and_recorded(
+    tmp_path: Path, robot: RobotConfig
+) -> None:
+    before = set(fleet_processes())
+    flags = ("--duration", "8", "--kill", "planner@2.2", "--restart", "planner@4")
+    result = demo(tmp_path, *flags, "--push", "3:0.3:30,0,0")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "STOOD" in result.stdout
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary.keys() >= SUMMARY_KEYS
+    assert summary["stood"] is True
+    assert set(summary["handover_ms"]) == set(MODULES)
+    assert all(value is not None for value in summary["handover_ms"].values())
+    assert summary["reengage_s"] is not None
+    assert (tmp_path / "run.png").stat().st_size > 20_000
+    log = read_run(tmp_path / "run.mcap")
+    assert log.complete
+    silent = [
+        key
+        for key, topic in topics.all_keys(robot.name).items()
+        if topic.recorded and topic is not topics.ESTOP and not log.count(key)
+    ]
+    assert not silent
+    assert {"robot.toml", "scenario.toml", "model.xml"} <= set(log.attachments)
+    assert set(fleet_processes()) <= before
+
+
+def test_a_frozen_planner_is_survived_and_taken_back(tmp_path: Path) -> None:
+    flags = ("--duration", "7", "--kill", "planner@2:STOP", "--restart", "planner@4")
+    result = demo(tmp_path, *flags)
+    assert result.returncode == 0, result.stdout + result.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["stood"] is True
+    assert summary["reengage_s"] is not None
+
+
+def test_a_robot_that_cannot_stand_is_a_finding_and_not_an_error(tmp_path: Path) -> None:
+    result = demo(tmp_path, "--jacobian", "average", "--duration", "6")
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert "FELL" in result.stdout
+    assert json.loads((tmp_path / "summary.json").read_text())["stood"] is False
+
+
+def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path) -> None:
+    before = set(fleet_processes())
+    folders = set(Path("/tmp").glob("xrl-demo-*"))
+    command = [sys.executable, "-m", "tools.cli", "demo", "--out", str(tmp_path)]
+    root = Path(__file__).resolve().parents[2]
+    process = subprocess.Popen(
+        command, cwd=root, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "modes" in line:
+            break
+    os.killpg(process.pid, 2)
+    assert process.wait(timeout=60) == 130
+    process.stdout.close()
+    assert set(fleet_processes()) <= before
+    assert set(Path("/tmp").glob("xrl-demo-*")) <= folders
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--scenario", "flight"), "no scenario 'flight'"),
+        (("--kill", "plannner@3"), "services:"),
+        (("--kill", "planner@3:BLINK"), "signals:"),
+        (("--kill", "planner@30"), "not inside the run"),
+        (("--restart", "planner@3"), "kill it first"),
+        (("--push", "1:2:3"), "START:DURATION:FX,FY,FZ"),
+        (("--duration", "0"), "more than 0"),
+        (("--config", "no_such.toml"), "not found"),
+    ],
+)
+def test_bad_input_is_one_clear_line(tmp_path: Path, flags: tuple[str, ...], words: str) -> None:
+    result = demo(tmp_path / "out", *flags)
+    assert result.returncode == 2
+    assert words in result.stderr
+    assert "Traceback" not in result.stderr

@@ -1,0 +1,211 @@
+"""The walls of design section 7, read from the source by its imports."""
+
+from __future__ import annotations
+
+import ast
+import fnmatch
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("services", "shared", "tools")
+
+
+class Import(NamedTuple):
+    """One import: `from module import name`, or `import module` with no name."""
+
+    module: str
+    name: str
+
+    @property
+    def top(self) -> str:
+        return self.module.partition(".")[0]
+
+    @property
+    def full(self) -> str:
+        return f"{self.module}.{self.name}".rstrip(".")
+
+
+def imports_in(source: str) -> list[Import]:
+    """Return every import of a source text, also those inside functions."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [Import(alias.name, "") for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            module = "." * node.level + (node.module or "")
+            found += [Import(module, alias.name) for alias in node.names]
+    return found
+
+
+SOURCES = {
+    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+    for package in PACKAGES
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
+IMPORTS = {file: imports_in(source) for file, source in SOURCES.items()}
+
+VENDORS = {
+    "zenoh": ["shared/bus.py"],
+    "mujoco": ["services/simulator/world.py"],
+    "pinocchio": ["services/planner/model.py"],
+    "casadi": ["services/planner/symbolic.py", "services/planner/kinematics.py"],
+    "odrive": ["services/joint/drivers/odrive_usb.py"],
+    "mcap": ["services/recorder/mcap_log.py", "tools/run_log.py"],
+    "supervisor": ["tools/*.py"],
+    "can": [
+        "shared/unix_can.py",
+        "services/joint/drivers/odrive_can.py",
+        "services/harness/sensor.py",
+    ],
+}
+"""Who may import a vendor's package: one owner each; MCAP is written and read in two places,
+and python-can is the wire itself to the two that speak on it."""
+
+LAWS = [
+    "services/joint/law.py",
+    "services/joint/differential.py",
+    "services/joint/gate.py",
+    "services/joint/failsafe.py",
+    "services/joint/controller.py",
+    "services/planner/engagement.py",
+    "services/planner/gains.py",
+    "services/planner/hocca.py",
+    "services/planner/inverse_kinematics.py",
+    "services/planner/kinematics.py",
+    "services/planner/planner.py",
+    "services/planner/symbolic.py",
+    "services/harness/filter.py",
+    "services/simulator/operator.py",
+    "services/simulator/world.py",
+]
+"""Pure: state, now, inputs -> outputs."""
+
+IMPURE = {
+    "asyncio", "can", "datetime", "logging", "multiprocessing", "odrive", "os", "queue", "random",
+    "secrets", "select", "signal", "socket", "subprocess", "sys", "threading", "time", "zenoh",
+    "shared.bus", "shared.log", "shared.process", "shared.unix_can",
+}  # fmt: skip
+
+LONG_FILES = {
+    "shared/config.py": "one table: every key of robot.toml with its range, and the checks",
+    "shared/unix_can.py": "one class: a python-can bus and its server over one socket",
+    "tests/test_bus.py": "one claim after the other about one module",
+    "tests/test_odrive_can.py": "one claim after the other about one module",
+}
+"""Files of 350 lines and more, each with the reason."""
+
+FOLDERS = {"services", "shared", "deploy", "tests", "tools", ".ci"}
+
+
+def service_of(file: str) -> str:
+    """Return "joint" for services/joint/law.py; "" outside of the services."""
+    parts = file.split("/")
+    return parts[1] if parts[0] == "services" and len(parts) > 2 else ""
+
+
+def test_the_sources_are_read() -> None:
+    assert {service_of(file) for file in SOURCES} == {
+        "", "joint", "planner", "harness", "simulator", "recorder",
+    }  # fmt: skip
+    assert sum(len(found) for found in IMPORTS.values()) > 300
+
+
+def test_an_import_is_found_wherever_it_stands() -> None:
+    source = "import a.b as c\ndef f():\n    from d.e import g, h\nfrom .i import j"
+    found = {imported.full for imported in imports_in(source)}
+    assert found == {"a.b", "d.e.g", "d.e.h", ".i.j"}
+
+
+@pytest.mark.parametrize("file", IMPORTS)
+def test_imports_are_absolute(file: str) -> None:
+    assert [i.full for i in IMPORTS[file] if i.module.startswith(".")] == []
+
+
+@pytest.mark.parametrize("file", [file for file in IMPORTS if file.startswith("shared/")])
+def test_shared_imports_no_service_and_no_tool(file: str) -> None:
+    assert [i.full for i in IMPORTS[file] if i.top in ("services", "tools", "tests")] == []
+
+
+@pytest.mark.parametrize("file", [file for file in IMPORTS if file.startswith("services/")])
+def test_a_service_imports_only_shared_and_itself(file: str) -> None:
+    own = f"services.{service_of(file)}."
+    foreign = [
+        imported.full
+        for imported in IMPORTS[file]
+        if imported.top in ("tools", "tests")
+        or (imported.top == "services" and not f"{imported.full}.".startswith(own))
+    ]
+    assert foreign == []
+
+
+@pytest.mark.parametrize("file", [file for file in IMPORTS if file.startswith("tools/")])
+def test_a_tool_imports_no_test(file: str) -> None:
+    assert [i.full for i in IMPORTS[file] if i.top == "tests"] == []
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+def test_a_vendor_package_has_its_owner_and_no_other(vendor: str) -> None:
+    users = {file for file, found in IMPORTS.items() if any(i.top == vendor for i in found)}
+    strangers = {
+        file for file in users if not any(fnmatch.fnmatch(file, owner) for owner in VENDORS[vendor])
+    }
+    assert strangers == set()
+    if vendor != "odrive":  # its driver is not here yet
+        assert users, f"nothing imports {vendor}: the row can go"
+
+
+@pytest.mark.parametrize("file", LAWS)
+def test_a_law_knows_no_clock_bus_thread_process_or_log(file: str) -> None:
+    impure = [
+        i.full for i in IMPORTS[file] if i.top in IMPURE or i.module in IMPURE or i.full in IMPURE
+    ]
+    assert impure == []
+
+
+@pytest.mark.parametrize("file", LAWS)
+def test_a_law_takes_from_the_clock_its_units_only(file: str) -> None:
+    taken = [i.name for i in IMPORTS[file] if i.full.startswith("shared.clock")]
+    assert [name for name in taken if not name.startswith("NS_PER_")] == []
+
+
+def test_only_tools_speak_to_the_terminal() -> None:
+    printing = {
+        file
+        for file, source in SOURCES.items()
+        if not file.startswith("tools/")
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "print"
+    }
+    assert printing <= {"shared/process.py"}, "errors at the start go through run_service"
+
+
+def test_every_package_says_what_it_is() -> None:
+    silent = [file for file, source in SOURCES.items() if not ast.get_docstring(ast.parse(source))]
+    assert silent == []
+
+
+def test_there_is_no_folder_beside_those_of_the_design() -> None:
+    ignored = (ROOT / ".gitignore").read_text(encoding="utf-8").split()
+    patterns = [".git", *(line.rstrip("/") for line in ignored)]
+    folders = {
+        path.name
+        for path in ROOT.iterdir()
+        if path.is_dir() and not any(fnmatch.fnmatch(path.name, pattern) for pattern in patterns)
+    }
+    assert folders == FOLDERS
+
+
+def test_long_files_are_few_and_have_a_reason() -> None:
+    files = [path for top in (*PACKAGES, "tests") for path in (ROOT / top).rglob("*.py")]
+    long = {
+        path.relative_to(ROOT).as_posix()
+        for path in files
+        if len(path.read_text(encoding="utf-8").splitlines()) >= 350
+    }
+    assert long - set(LONG_FILES) == set()
+    assert set(LONG_FILES) - long == set(), "short again: take it off the list"

@@ -1,0 +1,317 @@
+from __future__ import annotations
+
+import copy
+import math
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import msgspec
+import pytest
+import tomli_w
+
+from shared import config
+from shared.config import Range, RobotConfig
+from shared.exceptions import ConfigError
+from shared.joints import MODULES
+from shared.scenario import Scenario
+from tests.conftest import ROBOT_FILE
+
+Table = dict[str, Any]
+RAW: Table = tomllib.loads(ROBOT_FILE.read_text(encoding="utf-8"))
+
+
+def load_changed(tmp_path: Path, change: Callable[[Table], object]) -> RobotConfig:
+    """Load the shipped robot after one change."""
+    raw = copy.deepcopy(RAW)
+    change(raw)
+    assert raw != RAW
+    path = tmp_path / "robot.toml"
+    path.write_text(tomli_w.dumps(raw), encoding="utf-8")
+    return config.load(path)
+
+
+def setting(dotted: str, value: object) -> Callable[[Table], None]:
+    """Return a change that sets a dotted key; a number in it is an index."""
+
+    def change(raw: Table) -> None:
+        *path, last = [int(part) if part.isdigit() else part for part in dotted.split(".")]
+        at: Any = raw
+        for part in path:
+            at = at[part]
+        at[last] = value
+
+    return change
+
+
+def without(dotted: str) -> Callable[[Table], None]:
+    def change(raw: Table) -> None:
+        *path, last = dotted.split(".")
+        at = raw
+        for part in path:
+            at = at[part]
+        del at[last]
+
+    return change
+
+
+def on_one_bus(raw: Table) -> None:
+    raw["module"][1] |= {"bus": "ankle_right", "node_ids": [1, 2]}
+
+
+# change; the key the error names; what stands there; a word of what would be right
+REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
+    # unknown and missing keys
+    (setting("wheels", 4), "wheels", "unknown", "spelling"),
+    (setting("mass.wheel", 1.0), "mass.wheel", "unknown", "spelling"),
+    (setting("module.2.colour", "red"), "module[2].colour", "unknown", "spelling"),
+    (setting("simulation.operator.k_x", 1.0), "simulation.operator.k_x", "unknown", "spelling"),
+    (without("mass"), "mass", "missing", "required"),
+    (without("mass.battery"), "mass.battery", "missing", "required"),
+    (without("limits.knee.why"), "limits.knee.why", "missing", "required"),
+    # types and sizes
+    (setting("mass.payload", "heavy"), "mass.payload", "'heavy'", "float"),
+    (setting("joint.gear_ratio", True), "joint.gear_ratio", "True", "float"),
+    (setting("drive.encoder_period_ms", 2.5), "drive.encoder_period_ms", "2.5", "int"),
+    (setting("mass", 3), "mass", "3", "object"),
+    (setting("law.K_p", [1.0] * 5), "law.K_p", "[1.0, 1.0, 1.0, 1.0, 1.0]", "length 6"),
+    (setting("module.1.node_ids", [2, 3, 4]), "module[1].node_ids", "[2, 3, 4]", "length 2"),
+    (setting("module.1.node_ids.1", "x"), "module[1].node_ids[1]", "'x'", "int"),
+    (setting("law.S.2", 7), "law.S[2]", "7", "Invalid enum value"),
+    # ranges
+    (setting("mass.battery", -0.9), "mass.battery", "-0.9", "0 to 200 kg"),
+    (setting("mass.module", 0.0), "mass.module", "0.0", "0.1 to 50 kg"),
+    (setting("mass.payload", math.nan), "mass.payload", "nan", "0 to 200 kg"),
+    (setting("mass.payload", math.inf), "mass.payload", "inf", "0 to 200 kg"),
+    (setting("geometry.torso_size.2", 9.0), "geometry.torso_size[2]", "9.0", "2 m"),
+    (setting("law.K_p.5", -1.0), "law.K_p[5]", "-1.0", "N m/rad"),
+    (setting("module.3.node_ids.0", 63), "module[3].node_ids[0]", "63", "0 to 62"),
+    (setting("joint_service.rate_hz", 0.0), "joint_service.rate_hz", "0.0", "Hz"),
+    (setting("simulation.operator.k_z", -1.0), "simulation.operator.k_z", "-1.0", "N/m"),
+    # names
+    (setting("name", "a/b"), "name", "'a/b'", "letters"),
+    (setting("module.0.name", "toe"), "module[0].name", "'toe'", "ankle_right, knee_right"),
+    (setting("module.1.name", "ankle_right"), "module[1].name", "'ankle_right'", "once"),
+    (lambda raw: raw["module"].pop(), "module", "hip_left", "six modules"),
+    (lambda raw: raw["module"].append(RAW["module"][0]), "module[6].name", "twice", "once"),
+    (setting("module.4.bus", "can9"), "module[4].bus", "'can9'", "one of ankle_right"),
+    (setting("harness.bus", "can9"), "harness.bus", "'can9'", "one of ankle_right"),
+    (setting("module.1.node_ids", [2, 2]), "module[1].node_ids", "node 2", "free"),
+    (on_one_bus, "module[1].node_ids", "node 1", "free"),
+    (without("bus.endpoints.planner"), "bus.endpoints.planner", "missing", "each service"),
+    (setting("bus.endpoints.wheel", "tcp/a:1"), "bus.endpoints.wheel", "no such", "recorder"),
+    (setting("bus.endpoints.planner", "udp/a:1"), "bus.endpoints.planner", "'udp/a:1'", "tcp/"),
+    (
+        setting("bus.endpoints.harness", RAW["bus"]["endpoints"]["planner"]),
+        "bus.endpoints.harness",
+        "planner",
+        "one for each",
+    ),
+    (setting("assumed", ["mass.module", "mass.wheel"]), "assumed[1]", "'mass.wheel'", "key"),
+    (setting("assumed", ["wheels"]), "assumed[0]", "'wheels'", "key"),
+    # physics
+    (setting("mass.payload", 20.5), "mass.payload", "20.5", "at most 20.4 kg"),
+    (setting("limits.hip.phi", [1.0, -1.0]), "limits.hip.phi", "[1, -1]", "low below high"),
+    (setting("limits.ankle.theta", [0.9, 0.9]), "limits.ankle.theta", "0.9", "low below high"),
+    (setting("limits.knee.theta.1", 0.0), "limits.knee.theta[1]", "0 rad", "negative"),
+    (setting("limits.knee.theta.1", 0.1), "limits.knee.theta[1]", "0.1 rad", "negative"),
+    (setting("simulation.stand_height", 1.3), "simulation.stand_height", "1.3", "0.762 to 1.296"),
+    (setting("simulation.stand_height", 0.76), "simulation.stand_height", "0.76", "0.762 to"),
+    (setting("law.K_p.0", 0.0), "law.K_p[0]", "0 in a direction", "positive"),
+    # timing
+    (setting("joint_service.state_rate_hz", 501.0), "joint_service.state_rate_hz", "501", "500"),
+    (setting("planner.rate_hz", 251.0), "planner.rate_hz", "251", "at most 250"),
+    (
+        setting("joint_service.command_aging_max_ms", 51.0),
+        "joint_service.command_aging_max_ms",
+        "51",
+        "at most 50",
+    ),
+    (
+        setting("joint_service.engage_after_ms", 3201.0),
+        "joint_service.engage_after_ms",
+        "3201",
+        "at most 3200",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "found", "right"), REFUSALS, ids=[f"{r[1]}-{r[2]}" for r in REFUSALS]
+)
+def test_a_refusal_names_file_key_value_and_what_would_be_right(
+    tmp_path: Path, change: Callable[[Table], object], key: str, found: str, right: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_changed(tmp_path, change)
+    error = caught.value
+    assert (error.file, error.key) == (str(tmp_path / "robot.toml"), key)
+    assert found in error.found
+    assert right in error.expected
+    for part in (error.file, error.key, error.found, error.expected):
+        assert part in str(error)
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "found"),
+    [
+        (setting("can.harness.interface", 3), "can.harness.interface", "3"),
+        (setting("can.harness.speed", 3), "can.harness.speed", "unknown key"),
+        (without("can.harness.channel"), "can.harness.channel", "missing"),
+        (setting("bus.endpoints.planner", 3), "bus.endpoints.planner", "3"),
+    ],
+    ids=["type", "unknown", "missing", "endpoint"],
+)
+def test_an_entry_of_a_free_table_is_named_in_full(
+    tmp_path: Path, change: Callable[[Table], object], key: str, found: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_changed(tmp_path, change)
+    assert caught.value.key == key
+    assert caught.value.found.startswith(found)
+
+
+@pytest.mark.parametrize(
+    ("key", "bad", "right"),
+    [("law.jacobian", "mean", "load_sharing"), ("joint_service.driver", "usb", "odrive_can")],
+)
+def test_a_choice_that_does_not_exist_is_refused_with_the_choices(
+    tmp_path: Path, key: str, bad: str, right: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_changed(tmp_path, setting(key, bad))
+    assert caught.value.key == key
+    assert right in caught.value.expected
+
+
+@pytest.mark.parametrize("key", ["torso_mass", "module_named", "mass.__class__", "can.keys"])
+def test_assumed_takes_no_name_that_is_not_in_the_file(tmp_path: Path, key: str) -> None:
+    with pytest.raises(ConfigError):
+        load_changed(tmp_path, setting("assumed", [key]))
+
+
+@pytest.mark.parametrize("key", ["law.K_p", "limits.knee.theta", "can.harness.channel"])
+def test_assumed_takes_every_key_of_the_file(tmp_path: Path, key: str) -> None:
+    assert load_changed(tmp_path, setting("assumed", [key])).assumed == (key,)
+
+
+@pytest.mark.parametrize("kind", ["absent", "directory", "not toml", "not text"])
+def test_a_file_that_cannot_be_read_is_refused_by_name(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "robot.toml"
+    if kind == "directory":
+        path.mkdir()
+    elif kind == "not toml":
+        path.write_text("name = = 3", encoding="utf-8")
+    elif kind == "not text":
+        path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError) as caught:
+        config.load(path)
+    assert str(path) in str(caught.value)
+    assert "TOML" in caught.value.expected
+
+
+def test_payload_may_be_all_that_is_allowed_and_nothing(tmp_path: Path) -> None:
+    assert load_changed(tmp_path, setting("mass.payload", 0.0)).mass.payload == 0.0
+    assert load_changed(tmp_path, setting("mass.payload_max", 20.5)).mass.payload == 20.4
+
+
+# ---- ranges
+
+
+def numbers_without_a_range(hint: Any, where: str, in_range: bool = False) -> Iterator[str]:
+    """Yield the path of every number below a type hint that no Range bounds."""
+    origin = get_origin(hint)
+    if origin is Annotated:
+        inner, *notes = get_args(hint)
+        yield from numbers_without_a_range(inner, where, any(isinstance(n, Range) for n in notes))
+    elif origin in (tuple, dict):
+        for index, item in enumerate(get_args(hint)):
+            if item is not Ellipsis:
+                yield from numbers_without_a_range(item, f"{where}[{index}]")
+    elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        for name, field in get_type_hints(hint, include_extras=True).items():
+            yield from numbers_without_a_range(field, f"{where}.{name}")
+    elif hint in (int, float):
+        if not in_range:
+            yield where
+    else:
+        assert origin is Literal or hint in (str, bool, NoneType), f"{where}: {hint} is not checked"
+
+
+def test_every_number_of_a_robot_and_a_scenario_has_a_range() -> None:
+    assert list(numbers_without_a_range(RobotConfig, "robot")) == []
+    assert list(numbers_without_a_range(Scenario, "scenario")) == []
+
+
+def test_a_number_without_a_range_would_be_found() -> None:
+    class Bare(msgspec.Struct):
+        pair: tuple[Annotated[float, Range(0.0, 1.0, "m")], float]
+
+    assert list(numbers_without_a_range(Bare, "bare")) == ["bare.pair[1]"]
+
+
+def numbers_in(value: Any, key: str) -> Iterator[str]:
+    """Yield the dotted key of every number of a TOML table; choices of 0 or 1 are none."""
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from numbers_in(item, f"{key}.{name}".lstrip("."))
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from numbers_in(item, f"{key}.{index}")
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield key
+
+
+@pytest.mark.parametrize("huge", [1e12, -1e12])
+def test_every_number_of_the_file_is_refused_when_it_is_absurd(tmp_path: Path, huge: float) -> None:
+    keys = list(numbers_in(RAW, ""))
+    assert len(keys) > 100
+    for key in keys:
+        at: Any = RAW
+        for part in key.split("."):
+            at = at[int(part) if part.isdigit() else part]
+        absurd = int(huge) if isinstance(at, int) else huge
+        with pytest.raises(ConfigError) as caught:
+            load_changed(tmp_path, setting(key, absurd))
+        named = caught.value.key.replace("[", ".").replace("]", "")
+        assert named == key
+
+
+# ---- what is read
+
+
+def test_a_robot_comes_back_from_its_own_toml(robot: RobotConfig, tmp_path: Path) -> None:
+    path = tmp_path / "again.toml"
+    path.write_text(config.to_toml(robot), encoding="utf-8")
+    assert config.load(path) == robot
+
+
+def test_a_frozen_robot_cannot_be_changed(robot: RobotConfig) -> None:
+    with pytest.raises(AttributeError):
+        robot.mass.payload = 0.0  # type: ignore[misc]
+
+
+def test_masses_add_up_to_table_i(robot: RobotConfig) -> None:
+    assert robot.torso_mass == pytest.approx(39.66)
+    assert robot.total_mass == pytest.approx(74.58)
+
+
+def test_joint_limits_stand_in_joint_order(robot: RobotConfig) -> None:
+    rows = robot.joint_limits()
+    assert len(rows) == 12
+    assert rows[:6] == rows[6:]
+    assert rows[2:4] == (robot.limits.knee.phi, robot.limits.knee.theta)
+
+
+def test_modules_and_their_gains_are_found_by_name(robot: RobotConfig) -> None:
+    for module in MODULES:
+        assert robot.module_named(module).name == module
+    assert robot.stand_gains("ankle_left") == robot.stand.ankle
+    assert robot.stand_gains("hip_right") == robot.stand.hip
+
+
+def test_the_run_directory_is_filled_in_wherever_it_stands(tmp_path: Path) -> None:
+    assert config.expand("unixsock-stream/{run}/a", tmp_path) == f"unixsock-stream/{tmp_path}/a"
+    assert config.expand("tcp/10.0.0.1:7447", tmp_path) == "tcp/10.0.0.1:7447"

@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+
+from shared import scenario
+from shared.config import RobotConfig
+from shared.exceptions import ConfigError
+from shared.scenario import Keyframe, Push, Scenario, lead, push_at
+from tests.conftest import ROBOT_FILE
+
+SHIPPED = sorted((ROBOT_FILE.parent / "scenarios").glob("*.toml"))
+SQUAT = ROBOT_FILE.parent / "scenarios" / "squat.toml"
+CRAWL = ROBOT_FILE.parent / "scenarios" / "crawl.toml"
+
+Table = dict[str, Any]
+RAW: Table = {
+    "name": "two",
+    "about": "one way and back",
+    "duration": 10.0,
+    "keyframe": [{"at": 1.0, "height": 1.1}, {"at": 3.0, "height": 0.9, "pitch": 0.4}],
+    "push": [{"at": 2.0, "duration": 0.3, "force": [40.0, 0.0, 0.0]}],
+    "kill": [{"service": "planner", "at": 4.0}],
+    "restart": [{"service": "planner", "at": 6.0}],
+}
+
+
+def load_changed(tmp_path: Path, change: Callable[[Table], object]) -> Scenario:
+    raw = copy.deepcopy(RAW)
+    change(raw)
+    path = tmp_path / "scenario.toml"
+    path.write_text(tomli_w.dumps(raw), encoding="utf-8")
+    return scenario.load(path)
+
+
+def row(table: str, **changes: object) -> Callable[[Table], object]:
+    """Return a change of a table's first row; of a keyframe, the second."""
+    return lambda raw: raw[table][-1].update(changes)
+
+
+# change; the key the error names; what stands there; a word of what would be right
+REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
+    (lambda raw: raw.update(speed=1), "speed", "unknown", "spelling"),
+    (row("keyframe", roll=0.1), "keyframe[1].roll", "unknown", "spelling"),
+    (row("keyframe", height="low"), "keyframe[1].height", "'low'", "float"),
+    (row("keyframe", height=0.2), "keyframe[1].height", "0.2", "0.3 to 2 m"),
+    (row("keyframe", height=math.nan), "keyframe[1].height", "nan", "0.3 to 2 m"),
+    (row("keyframe", pitch=1.6), "keyframe[1].pitch", "1.6", "rad"),
+    (row("keyframe", assist=-1.0), "keyframe[1].assist", "-1.0", "500 N"),
+    (row("keyframe", at=1.0), "keyframe[1].at", "1 s does not follow 1 s", "rise"),
+    (row("keyframe", at=0.5), "keyframe[1].at", "0.5 s", "rise"),
+    (row("keyframe", at=-0.5), "keyframe[1].at", "-0.5", "0 to"),
+    (lambda raw: raw.update(keyframe=[]), "keyframe", "none", "at least one"),
+    (lambda raw: raw.pop("keyframe"), "keyframe", "missing", "required"),
+    (lambda raw: raw.pop("duration"), "duration", "missing", "required"),
+    (lambda raw: raw.update(duration=0.0), "duration", "0.0", "0.1 to"),
+    (row("push", force=[1.0, 2.0]), "push[0].force", "[1.0, 2.0]", "length 3"),
+    (row("push", force=[0.0, 2001.0, 0.0]), "push[0].force[1]", "2001.0", "2000 N"),
+    (row("push", duration=0.0), "push[0].duration", "0.0", "s"),
+    (row("push", at=10.0), "push[0].at", "10 s is not inside", "longer duration"),
+    (row("kill", service="toe"), "kill[0].service", "'toe'", "planner, harness"),
+    (row("kill", at=10.0), "kill[0].at", "10 s is not inside", "longer duration"),
+    (row("kill", signal="HUP"), "kill[0].signal", "'HUP'", "Invalid enum value"),
+    (row("restart", service="toe"), "restart[0].service", "'toe'", "planner, harness"),
+    (row("restart", at=11.0), "restart[0].at", "11 s is not inside", "longer duration"),
+    (row("restart", at=4.0), "restart[0]", "not killed before 4 s", "kill it first"),
+    (row("restart", service="recorder"), "restart[0]", "recorder is not killed", "kill it first"),
+]
+
+
+@pytest.mark.parametrize(
+    ("change", "key", "found", "right"), REFUSALS, ids=[f"{r[1]}-{r[2]}" for r in REFUSALS]
+)
+def test_a_refusal_names_file_key_value_and_what_would_be_right(
+    tmp_path: Path, change: Callable[[Table], object], key: str, found: str, right: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_changed(tmp_path, change)
+    error = caught.value
+    assert (error.file, error.key) == (str(tmp_path / "scenario.toml"), key)
+    assert found in error.found
+    assert right in error.expected
+    for part in (error.file, error.key, error.found, error.expected):
+        assert part in str(error)
+
+
+def test_the_scenario_that_the_refusals_start_from_is_itself_taken(tmp_path: Path) -> None:
+    assert load_changed(tmp_path, dict.copy).name == "two"
+
+
+def test_a_scenario_comes_back_from_its_own_toml(tmp_path: Path) -> None:
+    first = load_changed(tmp_path, dict.copy)
+    path = tmp_path / "again.toml"
+    path.write_text(scenario.to_toml(first), encoding="utf-8")
+    assert scenario.load(path) == first
+
+
+# ---- the hand
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_lead_passes_through_every_keyframe_at_rest(path: Path) -> None:
+    shipped = scenario.load(path)
+    for frame in shipped.keyframe:
+        at = lead(shipped, frame.at)
+        assert (at.height, at.pitch) == pytest.approx((frame.height, frame.pitch))
+        assert at.assist == pytest.approx(frame.assist)
+        assert (at.height_rate, at.pitch_rate) == pytest.approx((0.0, 0.0), abs=1e-12)
+
+
+@pytest.mark.parametrize("path", [SQUAT, CRAWL], ids=lambda path: path.stem)
+def test_lead_and_its_rates_are_continuous_and_fit_each_other(path: Path) -> None:
+    shipped = scenario.load(path)
+    dt = 1e-4
+    times = np.arange(-1.0, shipped.duration + 1.0, dt)
+    rows = np.array([lead(shipped, t) for t in times])
+    height, height_rate, pitch, pitch_rate, assist = rows.T
+    for value, rate in ((height, height_rate), (pitch, pitch_rate)):
+        assert np.abs(rate).max() > 0.0 or not np.ptp(value)
+        middle = 0.5 * (rate[1:] + rate[:-1])
+        np.testing.assert_allclose(np.diff(value) / dt, middle, atol=1e-6)
+        assert np.abs(np.diff(rate)).max() < 10.0 * dt
+    assert np.abs(np.diff(assist)).max() < 200.0 * dt
+    assert np.ptp(height) > 0.2
+
+
+def test_squat_is_the_cosine_of_the_reference_scenario() -> None:
+    squat = scenario.load(SQUAT)
+    for t in np.linspace(0.0, 10.0, 1001):
+        expected = 1.188 - 0.12 * (1.0 - math.cos(2.0 * math.pi * t / 5.0))
+        assert lead(squat, t).height == pytest.approx(expected, abs=1e-12)
+        assert (lead(squat, t).pitch, lead(squat, t).assist) == (0.0, 0.0)
+
+
+def test_squat_kills_the_planner_and_pushes_as_in_the_reference_scenario() -> None:
+    squat = scenario.load(SQUAT)
+    assert [(kill.service, kill.at, kill.signal) for kill in squat.kill] == [
+        ("planner", 10.0, "KILL")
+    ]
+    assert [(push.at, push.duration, push.force) for push in squat.push] == [
+        (12.0, 0.3, (40.0, 0.0, 0.0)),
+        (14.0, 0.3, (0.0, 40.0, 0.0)),
+        (16.0, 0.3, (-40.0, 0.0, 0.0)),
+    ]
+    assert squat.duration == 20.0
+    assert squat.hand
+
+
+def test_crawl_is_the_reference_scenarios() -> None:
+    crawl = scenario.load(CRAWL)
+    for t in (5.0, 7.5, 10.0):
+        assert lead(crawl, t) == pytest.approx((0.79, 0.0, 1.2, 0.0, 200.0), abs=1e-12)
+    assert lead(crawl, 15.0).height == pytest.approx(1.188)
+
+
+def test_lead_waits_at_the_first_keyframe_and_stays_at_the_last() -> None:
+    frames = (Keyframe(at=1.0, height=1.1), Keyframe(at=3.0, height=0.9, pitch=0.4))
+    two = Scenario(name="two", about="", duration=10.0, keyframe=frames)
+    for t in (-5.0, 0.0, 1.0):
+        assert lead(two, t) == (1.1, 0.0, 0.0, 0.0, 0.0)
+    for t in (3.0, 100.0):
+        assert lead(two, t) == (0.9, 0.0, 0.4, 0.0, 0.0)
+
+
+def test_one_keyframe_is_a_stand() -> None:
+    one = Scenario(name="one", about="", duration=1.0, keyframe=(Keyframe(at=0.0, height=1.0),))
+    assert {lead(one, t).height for t in (-1.0, 0.0, 0.5, 2.0)} == {1.0}
+
+
+# ---- pushes
+
+
+def test_a_push_acts_from_its_start_up_to_its_end() -> None:
+    squat = scenario.load(SQUAT)
+    before, start = push_at(squat, math.nextafter(12.0, 0.0)), push_at(squat, 12.0)
+    last, end = push_at(squat, math.nextafter(12.3, 0.0)), push_at(squat, 12.3)
+    assert before == end == (0.0, 0.0, 0.0)
+    assert start == last == (40.0, 0.0, 0.0)
+
+
+def test_pushes_at_one_time_add_up() -> None:
+    pushes = (
+        Push(at=0.0, duration=2.0, force=(1.0, 2.0, 3.0)),
+        Push(at=1.0, duration=2.0, force=(10.0, 0.0, -3.0)),
+    )
+    frames = (Keyframe(at=0.0, height=1.0),)
+    both = Scenario(name="both", about="", duration=5.0, keyframe=frames, push=pushes)
+    assert [push_at(both, t) for t in (0.5, 1.5, 2.5)] == [
+        (1.0, 2.0, 3.0),
+        (11.0, 2.0, 0.0),
+        (10.0, 0.0, -3.0),
+    ]
+
+
+# ---- what is shipped
+
+
+def test_the_reference_scenarios_are_shipped() -> None:
+    assert {"squat", "crawl", "stand"} <= {path.stem for path in SHIPPED}
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_every_shipped_scenario_loads_under_its_own_name(path: Path, robot: RobotConfig) -> None:
+    shipped = scenario.load(path)
+    assert shipped.name == path.stem
+    assert shipped.keyframe[0].height == robot.simulation.stand_height
+    assert shipped.keyframe[-1].at <= shipped.duration
