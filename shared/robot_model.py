@@ -121,12 +121,13 @@ def _numbers(*values: float) -> str:
 
 
 def stand_pose(config: RobotConfig, height: float) -> tuple[float, ...]:
-    """Return q (12, rad) of a stand with the torso upright and the COM over the ankles.
+    """Return q (12, rad) close to a stand with the torso upright and the COM over the ankles.
 
-    Sagittal plane in closed form: the shin leans by a, the thigh by b, with
-    x_COM = 0: m_torso (l2 sin a + l1 sin b) + 2 m_act l2 sin a = 0 and
-    height = l2 cos a + l1 cos b; solved by bisection on a. The small frontal angles that
-    spread the ankles to the hips are left to the inverse kinematics.
+    In the plane of a leg: the shin leans by a, the thigh by b, with
+    x_COM = 0: m_torso (l2 sin a + l1 sin b) + 2 m_act l2 sin a = 0 and the leg's length
+    l2 cos a + l1 cos b = hypot(height, span); solved by bisection on a. The small frontal
+    angles that lean each leg by its span from ankle to hip are left at zero: an inverse
+    kinematics finds them from here.
 
     Args:
         config: the robot.
@@ -142,7 +143,7 @@ def stand_pose(config: RobotConfig, height: float) -> tuple[float, ...]:
 
     def height_error(a: float, folded: bool) -> float:
         b = -math.pi - thigh(a) if folded else thigh(a)
-        return math.hypot(l2 * math.cos(a) + l1 * math.cos(b), span) - height
+        return l2 * math.cos(a) + l1 * math.cos(b) - math.hypot(height, span)
 
     a_max = math.asin(l1 / (share * l2))
     folded = height_error(a_max, folded=False) > 0.0

@@ -14,8 +14,9 @@ from typing import Annotated, Literal, NamedTuple
 import msgspec
 import tomli_w
 
-from shared.config import SERVICES, Range, Section, read_toml
+from shared.config import SERVICES
 from shared.exceptions import ConfigError
+from shared.toml_file import Range, Section, read_toml
 
 Time = Annotated[float, Range(0.0, 86_400.0, "s")]
 Force = Annotated[float, Range(-2000.0, 2000.0, "N")]

@@ -26,7 +26,7 @@ class Topic(msgspec.Struct, frozen=True, kw_only=True):
     """Key below `xrl/<robot>/`; `*` stands for a module."""
     type: type[messages.Message]
     rate_hz: float
-    """Nominal rate; 0 for events."""
+    """Nominal rate, as `deploy/robot.toml` sets it; 0 for events."""
     priority: Priority
     recorded: bool
     why: str
@@ -44,7 +44,7 @@ class Topic(msgspec.Struct, frozen=True, kw_only=True):
 JOINT_STATE: Final = Topic(
     name="joint/*/state",
     type=messages.JointState,
-    rate_hz=500.0,
+    rate_hz=250.0,
     priority=Priority.REAL_TIME,
     recorded=True,
     why="the planner's input; its stamp is echoed",

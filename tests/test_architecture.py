@@ -90,8 +90,6 @@ IMPURE = {
 }  # fmt: skip
 
 LONG_FILES = {
-    "shared/config.py": "one table: every key of robot.toml with its range, and the checks",
-    "shared/unix_can.py": "one class: a python-can bus and its server over one socket",
     "tests/test_bus.py": "one claim after the other about one module",
     "tests/test_odrive_can.py": "one claim after the other about one module",
 }

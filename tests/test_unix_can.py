@@ -13,7 +13,8 @@ import can
 import pytest
 
 from shared.exceptions import FleetError
-from shared.unix_can import REMOTE_FLAG, UnixCanBus, UnixCanHub, pack_frames, unpack_frames
+from shared.unix_can import REMOTE_FLAG, UnixCanBus, pack_frames, unpack_frames
+from shared.unix_can_hub import UnixCanHub
 
 
 @pytest.fixture

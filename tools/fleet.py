@@ -15,10 +15,11 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 
-from shared.config import Range, RobotConfig, Section, expand, load, read_toml
+from shared.config import RobotConfig, expand, load
 from shared.exceptions import ConfigError, FleetError
 from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG, SOCKET_PATH_MAX
+from shared.toml_file import Range, Section, read_toml
 from shared.topics import TOPICS
 
 TABLE = DEFAULT_CONFIG.parent / "processes.toml"

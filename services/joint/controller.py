@@ -142,6 +142,8 @@ class JointController:
         self._changed_ns = now_ns
         if before is Mode.DISARMED:
             self._anchor = law.stand(self.q, self._stand_k_p, self._stand_k_d)
+        elif self.failsafe.mode is Mode.DAMP:
+            self._anchor = law.carrying(self._setpoint, self.q)
         else:
             self._anchor = self._setpoint
 

@@ -3,11 +3,12 @@
 Pure: state, now, inputs -> state. The transitions are one table; `tests/safety` sweeps
 every state against every event.
 
-    DISARMED -> HOLD <-> TRACK;  any of them -> DAMP (e-stop);  any -> FAULT (drive lost)
+    DISARMED -> HOLD <-> TRACK;  any of them -> DAMP (e-stop);  any armed -> FAULT (drive lost)
 """
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import Final
 
@@ -66,6 +67,8 @@ class Timing(msgspec.Struct, frozen=True):
     engage_after_ns: int
     engage_after_max_ns: int
     dropout_forget_ns: int
+    dropouts_max: int
+    """As many double the wait to its maximum; more would only be slower to forget."""
     k_p_max: float
     k_d_max: float
     v_max: float
@@ -80,6 +83,7 @@ def timing_of(config: RobotConfig) -> Timing:
         engage_after_ns=round(service.engage_after_ms * NS_PER_MS),
         engage_after_max_ns=round(service.engage_after_max_ms * NS_PER_MS),
         dropout_forget_ns=round(service.dropout_forget_s * NS_PER_S),
+        dropouts_max=math.ceil(math.log2(service.engage_after_max_ms / service.engage_after_ms)),
         k_p_max=service.k_p_max,
         k_d_max=service.k_d_max,
         v_max=service.v_max,
@@ -150,9 +154,11 @@ class Failsafe(msgspec.Struct):
         return min(wait, timing.engage_after_max_ns)
 
     def ready(self, now_ns: int, timing: Timing) -> bool:
-        """Return True if commands have been fresh for long enough to track."""
-        return self.fresh_since_ns >= 0 and now_ns - self.fresh_since_ns >= self.engage_after_ns(
-            timing
+        """Return True if this module can track and commands have been fresh for long enough."""
+        return (
+            self.mode in (Mode.HOLD, Mode.TRACK)
+            and self.fresh_since_ns >= 0
+            and now_ns - self.fresh_since_ns >= self.engage_after_ns(timing)
         )
 
     def advance(self, now_ns: int, timing: Timing, drive: Event, estop: bool) -> Cause | None:
@@ -165,11 +171,13 @@ class Failsafe(msgspec.Struct):
             estop: the emergency stop is engaged.
         """
         fresh = self.usable(now_ns, timing)
+        # a new session took over from a current one that went stale in this very cycle
+        broken = self.mode is Mode.TRACK and self.fresh_since_ns < 0
         if not fresh or self.mode is Mode.DISARMED:
             self.fresh_since_ns = -1  # what came before the drive was armed does not count
         elif self.fresh_since_ns < 0:
             self.fresh_since_ns = now_ns
-        event = self._event(now_ns, timing, drive, estop, fresh)
+        event = self._event(now_ns, timing, drive, estop, fresh and not broken)
         row = TRANSITIONS[self.mode].get(event)
         self._remember_dropouts(now_ns, timing, event)
         if row is None:
@@ -194,7 +202,7 @@ class Failsafe(msgspec.Struct):
 
     def _remember_dropouts(self, now_ns: int, timing: Timing, event: Event) -> None:
         if self.mode is Mode.TRACK and event is Event.COMMAND_STALE:
-            self.dropouts += 1
+            self.dropouts = min(self.dropouts + 1, timing.dropouts_max)
             self.steady_since_ns = now_ns
         elif self.mode is not Mode.TRACK:
             self.steady_since_ns = now_ns

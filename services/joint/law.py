@@ -107,6 +107,20 @@ def stiffened(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoin
     )
 
 
+def carrying(setpoint: Setpoint, q: Pair) -> Setpoint:
+    """Return a setpoint whose feedforward is all that its springs and feedforward carry at q.
+
+    DAMP lets go of the springs, but not of the load: a stand without a planner has no
+    other feedforward to fade.
+    """
+    s = setpoint
+    load = (
+        s.k_p[0] * (s.q_ref[0] - q[0]) + s.tau_ff[0],
+        s.k_p[1] * (s.q_ref[1] - q[1]) + s.tau_ff[1],
+    )
+    return Setpoint(s.q_ref, ZERO, load, ZERO, s.k_p, s.k_d)
+
+
 def damped(setpoint: Setpoint, k_d: float, feedforward_share: float) -> Setpoint:
     """Return DAMP's law: no stiffness, damping k_d, feedforward by its remaining share."""
     s = setpoint

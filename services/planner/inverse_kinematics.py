@@ -68,16 +68,37 @@ class InverseKinematics:
         residual = self._residual(p_ref, D_left)
         iterations = 0
         while residual > TOLERANCE and iterations < iterations_max:
-            step = self.solve_rates(self._error)
-            largest = float(np.abs(step).max())
-            if largest > STEP_MAX:
-                step *= STEP_MAX / largest
-            np.minimum(np.maximum(self.q + step, self._low), self._high, out=self.q)
+            before = self.q.copy()
+            step, limited = self._limited_step()
+            self.q += step
             iterations += 1
-            if largest < STEP_SURE:
+            largest = float(np.abs(step).max())
+            if largest < STEP_SURE and not limited:
                 return IkResult(iterations, largest * largest)
-            residual = self._residual(p_ref, D_left)
+            after = self._residual(p_ref, D_left)
+            if after > residual and (limited or largest < STEP_MAX / 2):
+                self.q[:] = before  # at a limit there may be nothing better
+                return IkResult(iterations, self._residual(p_ref, D_left))
+            residual = after
         return IkResult(iterations, residual)
+
+    def _limited_step(self) -> tuple[Array, bool]:
+        """Return the next step (12,), inside the joint limits, and whether they changed it.
+
+        Joints that a step would push out of a limit they stand at are held, and the
+        others do what is left to do: clipping alone lets the rest run away.
+        """
+        step = self.solve_rates(self._error)
+        held = ((self.q >= self._high) & (step > 0.0)) | ((self.q <= self._low) & (step < 0.0))
+        limited = bool(held.any())
+        if limited:
+            A = self._system * ~held
+            step = np.asarray(np.linalg.solve(A.T @ A + self._damping, A.T @ self._error), float)
+        largest = float(np.abs(step).max())
+        if largest > STEP_MAX:
+            step *= STEP_MAX / largest
+        inside = np.minimum(np.maximum(self.q + step, self._low), self._high) - self.q
+        return inside, limited or bool((inside != step).any())
 
     def solve_rates(self, right_side: Array) -> Array:
         """Return x (12,) with [J; C] x = right side (12,), damped."""

@@ -23,7 +23,7 @@ from shared.process import (
     run_service,
     service_parser,
 )
-from shared.unix_can import UnixCanHub
+from shared.unix_can_hub import UnixCanHub
 
 FIFO_PRIORITY = 25
 """The world waits for nobody."""

@@ -10,7 +10,8 @@ from typing import Final
 from services.simulator.axis_bank import AxisBank
 from shared import cansimple
 from shared.cansimple import Command
-from shared.unix_can import REMOTE_FLAG, UnixCanHub, pack_frames
+from shared.unix_can import REMOTE_FLAG, pack_frames
+from shared.unix_can_hub import UnixCanHub
 
 BUS_VOLTAGE: Final = 48.0
 """V, what the emulated drives report."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from services.simulator.operator import HandForce, Operator
 from shared.config import GRAVITY, RobotConfig
-from shared.joints import JOINTS, MODULES, SIDES
+from shared.joints import JOINTS, MODULES, N_LEG, SIDES
 from shared.messages import SimTruth, Vector3
 from shared.robot_model import ankle_positions, mjcf, stand_pose
 from shared.scenario import Lead, Scenario, lead, push_at
@@ -34,6 +34,8 @@ HOIST_DAMPING: Final = (2e3, 2e2)
 """N s/m and N m s/rad."""
 HOIST_WEIGHT_SHARE: Final = 0.75
 """Part of the weight the hoist takes: the soles stay on the floor."""
+STAND_ITERATIONS: Final = 8
+"""Newton steps from `stand_pose` to soles that are flat to rounding."""
 
 
 class World:
@@ -49,12 +51,12 @@ class World:
         self._weight = config.total_mass * GRAVITY
         joints = [self.model.joint(name) for name in JOINTS]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])
-        v_index = np.array([joint.dofadr[0] for joint in joints])
+        self._v_index = np.array([joint.dofadr[0] for joint in joints])
         motor = _motor_from_joint(config.joint.gear_ratio)
         self._motor_from_q: Array = np.zeros((len(JOINTS), self.model.nq))
         self._motor_from_q[:, self._q_index] = motor
         self._motor_from_v: Array = np.zeros((len(JOINTS), self.model.nv))
-        self._motor_from_v[:, v_index] = motor
+        self._motor_from_v[:, self._v_index] = motor
         # power is the same on both sides: tau = (d motor angle / d joint angle)^T torque
         self._tau_from_motor: Array = 2.0 * math.pi * self._motor_from_v.T.copy()
         self._torso = self.model.body("torso").id
@@ -77,12 +79,24 @@ class World:
         self._place(config)
 
     def _place(self, config: RobotConfig) -> None:
-        """Set the standing pose and find the free base by putting the right foot down."""
+        """Stand the robot: torso level at the stand height, soles flat, COM over the ankles."""
         data, model = self.data, self.model
-        data.qpos[self._q_index] = _feet_apart(config)
+        data.qpos[self._q_index] = stand_pose(config, config.simulation.stand_height)
         mujoco.mj_kinematics(model, data)
-        feet = np.array([data.xpos[foot] for foot in self._feet])
-        data.qpos[:3] += np.mean(ankle_positions(config), axis=0) - feet.mean(axis=0)
+        data.qpos[0] -= data.xpos[self._feet[0]][0]
+        wanted = ankle_positions(config)
+        jacobian = np.zeros((6, model.nv))
+        for _ in range(STAND_ITERATIONS):
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            for leg, foot in enumerate(self._feet):
+                columns = self._v_index[leg * N_LEG : (leg + 1) * N_LEG]
+                mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], foot)
+                r = data.xmat[foot].reshape(3, 3)
+                turn = 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+                error = np.concatenate((wanted[leg] - data.xpos[foot], -turn))
+                step = np.linalg.solve(jacobian[:, columns], error)
+                data.qpos[self._q_index[leg * N_LEG : (leg + 1) * N_LEG]] += step
         mujoco.mj_forward(model, data)
         self._hoist_position = data.qpos[:3].copy()
         self._ankles = np.array([data.xpos[foot] for foot in self._feet])
@@ -231,36 +245,6 @@ def _motor_from_joint(gear_ratio: float) -> Array:
     """
     pair = np.array([[1.0, 1.0], [-1.0, 1.0]]) * gear_ratio / (2.0 * math.pi)
     return np.asarray(np.kron(np.eye(len(MODULES)), pair), float)
-
-
-def _feet_apart(config: RobotConfig) -> tuple[float, ...]:
-    """Return the stand pose (12,) with the legs spread from the hips to the ankles.
-
-    Frontal angles from the spread alone: ankle and hip opposite; the small sagittal
-    correction this needs is taken up by the hoist before the robot stands.
-    """
-    q = list(stand_pose(config, config.simulation.stand_height))
-    half_span = (config.geometry.w_hip - config.geometry.w_base) / 2
-    lean = math.asin(half_span / config.simulation.stand_height)
-    for leg, sign in ((0, 1.0), (6, -1.0)):
-        ankle, knee = q[leg + 1], q[leg + 3]
-        # with theta between them the knee and hip turn about tilted axes: solve the last two
-        q[leg] = sign * lean
-        q[leg + 2], q[leg + 4] = _close_frontal(sign * lean, ankle, knee)
-    return tuple(q)
-
-
-def _close_frontal(phi_ankle: float, theta_ankle: float, theta_knee: float) -> tuple[float, float]:
-    """Return (phi_knee, phi_hip) that bring roll and yaw of the torso to zero, to first order.
-
-    Roll: phi_a + phi_k cos(theta_a) + phi_h cos(theta_a + theta_k) = 0, yaw (minus):
-    phi_k sin(theta_a) + phi_h sin(theta_a + theta_k) = 0.
-    """
-    shin, thigh = theta_ankle, theta_ankle + theta_knee
-    determinant = math.cos(shin) * math.sin(thigh) - math.cos(thigh) * math.sin(shin)
-    phi_knee = -phi_ankle * math.sin(thigh) / determinant
-    phi_hip = phi_ankle * math.sin(shin) / determinant
-    return phi_knee, phi_hip
 
 
 def _vector(values: Array) -> Vector3:

@@ -21,7 +21,7 @@ from shared.codec import Decoder, encode
 from shared.config import CanConfig
 from shared.loadcell_can import LegSample, SampleAssembler, pack
 from shared.messages import Vector6, Wrench
-from shared.unix_can import UnixCanHub
+from shared.unix_can_hub import UnixCanHub
 from tests.harness.helpers import HARNESS, PERIOD_NS, ROBOT, ZERO, G, legs, robot_with, sample, six
 
 T0 = 1_000 * NS_PER_S

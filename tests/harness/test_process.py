@@ -14,7 +14,7 @@ from services.simulator.harness_front import HarnessFront
 from shared import topics
 from shared.bus import open_session
 from shared.messages import Wrench
-from shared.unix_can import UnixCanHub
+from shared.unix_can_hub import UnixCanHub
 from tests.harness.helpers import ROBOT
 
 pytestmark = pytest.mark.system

@@ -12,7 +12,7 @@ from services.harness.sensor import DRAIN_MAX, RETRY_NS, CanHarnessSensor
 from shared import loadcell_can
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import ConfigError
-from shared.unix_can import UnixCanHub
+from shared.unix_can_hub import UnixCanHub
 from tests.harness.helpers import PERIOD_NS, CanHub
 
 PAUSE_NS = 20 * NS_PER_MS

@@ -108,6 +108,15 @@ def test_damped_has_no_stiffness_and_only_what_is_left_of_the_feedforward(
     )
 
 
+@given(s=setpoints, q=angles, k_d=gains)
+def test_damping_takes_over_at_rest_what_springs_and_feedforward_carried(
+    s: Setpoint, q: Pair, k_d: float
+) -> None:
+    at_rest = law.torque(law.damped(law.carrying(s, q), k_d, 1.0), q, (0.0, 0.0))
+    static = Setpoint(s.q_ref, law.ZERO, s.tau_ff, law.ZERO, s.k_p, s.k_d)
+    np.testing.assert_allclose(at_rest, law.torque(static, q, (0.0, 0.0)), rtol=1e-12, atol=1e-9)
+
+
 @given(q=angles)
 def test_stand_asks_for_no_torque_where_it_stands(q: Pair) -> None:
     s = law.stand(q, (900.0, 1500.0), (40.0, 60.0))

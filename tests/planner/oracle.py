@@ -102,7 +102,8 @@ def rotation_vector(R: Array) -> Array:
     """Return the rotation vector of a rotation by less than pi / 2."""
     axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = float(np.linalg.norm(axis))
-    return axis if sine < 1e-12 else axis * (np.arcsin(sine) / sine)
+    scale = float(np.arcsin(sine)) / sine if sine > 1e-12 else 1.0
+    return np.asarray(scale * axis, float)
 
 
 def closure(config: RobotConfig, q: Array) -> Array:
@@ -114,7 +115,7 @@ def closure(config: RobotConfig, q: Array) -> Array:
 def harness(config: RobotConfig, q: Array, side: int = RIGHT) -> Array:
     """Return the harness point as one leg carries it, m."""
     one = leg(config, side, q)
-    return one.torso + one.R @ np.array(config.geometry.harness_point)
+    return np.asarray(one.torso + one.R @ np.array(config.geometry.harness_point), float)
 
 
 def derivative(f: Callable[[Array], Array], q: Array, step: float = 1e-6) -> Array:

@@ -56,9 +56,8 @@ def test_gains_are_the_papers_sum(robot: RobotConfig, at: Kinematics) -> None:
 
 
 def test_k_p_in_an_open_direction_is_filtered_out(robot: RobotConfig, at: Kinematics) -> None:
-    law = robot.law
-    stiff = msgspec.structs.replace(law, K_p=tuple(2000.0 if i in OPEN else k for i, k in
-                                                   enumerate(law.K_p)))  # fmt: skip
+    K_p = tuple(2000.0 if i in OPEN else k for i, k in enumerate(robot.law.K_p))
+    stiff = msgspec.structs.replace(robot.law, K_p=K_p)
     same = GainLaw(msgspec.structs.replace(robot, law=stiff)).gains(at, NO_HESSIAN)
     np.testing.assert_array_equal(same.K_q, GainLaw(robot).gains(at, NO_HESSIAN).K_q)
 

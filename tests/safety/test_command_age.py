@@ -58,6 +58,7 @@ def test_track_is_left_one_nanosecond_past_the_limit(
 ) -> None:
     failsafe = taken(timing)
     failsafe.mode = Mode.TRACK
+    failsafe.fresh_since_ns = T0
     failsafe.advance(T0 + timing.max_command_age_ns + off_ns, timing, Event.NONE, estop=False)
     assert failsafe.mode is mode
 

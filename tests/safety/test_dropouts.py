@@ -88,6 +88,18 @@ def test_a_drop_out_is_forgotten_after_steady_tracking(timing: Timing) -> None:
     assert module.failsafe.engage_after_ns(timing) == timing.engage_after_ns
 
 
+def test_drop_outs_are_forgotten_one_at_a_time(timing: Timing) -> None:
+    module = Module(timing)
+    for _ in range(3):
+        module.drop_out()
+    module.until(Mode.TRACK, fresh=True)
+    left = []
+    for _ in range(4):
+        module.track_for(timing.dropout_forget_ns)
+        left.append(module.failsafe.dropouts)
+    assert left == [2, 1, 0, 0]
+
+
 def test_steady_tracking_halves_the_wait_however_many_drop_outs_there_were(
     timing: Timing,
 ) -> None:

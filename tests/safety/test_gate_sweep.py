@@ -79,9 +79,10 @@ def test_no_motor_gets_more_than_its_share_at_any_angle_in_the_plane() -> None:
 def test_soft_stop_pushes_only_inwards_and_only_beyond_the_stop(limits: GateLimits) -> None:
     beyond_count = 0
     for axis, (low, high) in enumerate((limits.phi, limits.theta)):
-        for step in range(-300, 301):
+        tiny = [sign * 10.0**-power for sign in (-1, 1) for power in range(5, 13)]
+        for offset in (*(step * 1e-4 for step in range(-300, 301)), *tiny):
             for stop in (low, high):
-                angle = stop + step * 1e-4
+                angle = stop + offset
                 q = (angle, -0.5) if axis == 0 else (0.0, angle)
                 push = gate((0.0, 0.0), q, (0.0, 0.0), limits)[axis]
                 if angle < low:
@@ -91,4 +92,4 @@ def test_soft_stop_pushes_only_inwards_and_only_beyond_the_stop(limits: GateLimi
                 else:
                     assert push == 0.0
                 beyond_count += push != 0.0
-    assert beyond_count == 1200
+    assert beyond_count == 2 * 2 * (300 + 8)

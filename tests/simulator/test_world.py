@@ -7,17 +7,24 @@ import math
 import msgspec
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from services.simulator.world import World
 from shared.config import GRAVITY, RobotConfig
+from shared.joints import JOINTS, SIDES
 from shared.messages import SimTruth
 from shared.scenario import Keyframe, Push, Scenario
 
+Array = NDArray[np.float64]
+
 IDLE = np.zeros(12)
-SIDES = ("right", "left")
 STAND = Scenario(
-    name="stand", about="nothing leads", duration=60.0, hand=False, keyframe=(Keyframe(at=0.0, height=1.188),)
-)  # fmt: skip
+    name="stand",
+    about="nothing leads",
+    duration=60.0,
+    hand=False,
+    keyframe=(Keyframe(at=0.0, height=1.188),),
+)
 
 
 def world_of(robot: RobotConfig, **changes: object) -> World:
@@ -33,7 +40,7 @@ def run(world: World, seconds: float) -> None:
         world.step(IDLE)
 
 
-def motor_work_matches(world: World, torque: np.ndarray) -> tuple[float, float]:
+def powers(world: World, torque: Array) -> tuple[float, float]:
     """Return power at the joints and at the motors, W, at the present rates."""
     _, turns_per_s = world.motor_turns()
     at_motors = float(torque @ turns_per_s) * 2 * math.pi
@@ -75,7 +82,7 @@ def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
     q, v = rng.uniform(-1, 1, 12), rng.uniform(-1, 1, 12)
     world.data.qpos[world._q_index] = q
     world.data.qvel[6:] = 0.0
-    for index, name in enumerate(_joint_names()):
+    for index, name in enumerate(JOINTS):
         world.data.joint(name).qvel[0] = v[index]
     for turns, joints in zip(world.motor_turns(), (q, v), strict=True):
         m1, m2 = 2 * math.pi * turns[0::2], 2 * math.pi * turns[1::2]
@@ -84,16 +91,12 @@ def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
         np.testing.assert_allclose((m1 + m2) / two_n, joints[1::2], atol=1e-12)
 
 
-def _joint_names() -> list[str]:
-    return [f"{k}_{s}_{a}" for s in SIDES for k in ("ankle", "knee", "hip") for a in ("phi", "theta")]  # fmt: skip
-
-
 def test_power_is_the_same_at_motors_and_joints(robot: RobotConfig) -> None:
     world = world_of(robot)
     rng = np.random.default_rng(2)
     for _ in range(20):
         world.data.qvel[:] = rng.normal(size=world.model.nv)
-        at_joints, at_motors = motor_work_matches(world, rng.normal(size=12))
+        at_joints, at_motors = powers(world, rng.normal(size=12))
         assert at_joints == pytest.approx(at_motors, rel=1e-12)
         assert abs(at_motors) > 1e-3
 
@@ -172,12 +175,11 @@ def test_a_push_moves_a_free_body_by_its_impulse(robot: RobotConfig) -> None:
     assert momentum[2] == pytest.approx(-74.58 * GRAVITY * 0.1, rel=0.01)
 
 
-def _momentum(world: World) -> np.ndarray:
-    """Return the whole robot's momentum (3,), N s, from its COM before and after a step."""
+def _momentum(world: World) -> Array:
+    """Return the whole robot's momentum (3,), N s, from where its COM is 2 ms later."""
     before = world.data.subtree_com[0].copy()
     run(world, 0.002)
-    run_s = 0.002
-    return 74.58 * (world.data.subtree_com[0] - before) / run_s
+    return np.asarray(74.58 * (world.data.subtree_com[0] - before) / 0.002, float)
 
 
 def test_nothing_pushes_before_the_scenario_starts(robot: RobotConfig) -> None:

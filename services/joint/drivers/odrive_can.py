@@ -21,10 +21,6 @@ from shared.config import CanConfig, DriveConfig
 from shared.exceptions import DriveError
 from shared.messages import Pair
 
-LOST_AFTER_MS: Final = 20
-"""Without a sample of both axes for so long the drive is lost, at the least. It is not lost
-before its own watchdog has fired: until then it holds the last torque and comes back as if
-nothing had been, while a FAULT is for good."""
 REBOOT_MS: Final = 500
 """After so long a silence the drive may have been switched off and on: what its
 heartbeats said before is forgotten."""
@@ -75,9 +71,9 @@ class OdriveCan:
         self._drive = drive
         self._node_ids = node_ids
         self._torque_max = drive.current_lim * drive.torque_constant
-        self._lost_after_ns = max(
-            LOST_AFTER_MS * NS_PER_MS, round(drive.watchdog_timeout * NS_PER_S)
-        )
+        # Not before its own watchdog has fired: until then a silent drive holds its last
+        # torque and comes back as if nothing had been, while a FAULT is for good.
+        self._lost_after_ns = round(drive.watchdog_timeout * NS_PER_S)
         self._torque_messages = [_message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in node_ids]
         self._food = [_message(n, _NMT_COMMAND, b"") for n in node_ids]
         self._encoder_axis = {

@@ -1,0 +1,135 @@
+"""What a robot file must make sense of as a whole; see `shared.config`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from shared.exceptions import ConfigError
+from shared.joints import KINDS, MODULES
+
+if TYPE_CHECKING:
+    from shared.config import LimitConfig, RobotConfig
+
+
+def check(file: str, config: RobotConfig, services: Sequence[str]) -> None:
+    """Check what no single number shows: duplicates, crossings, dangling names.
+
+    Args:
+        file: for the error.
+        config: the robot, each of its values in range.
+        services: that need an endpoint on the bus.
+
+    Raises:
+        ConfigError: naming the file, the key, what stands there and what would be right.
+    """
+    _check_names(file, config, services)
+    _check_physics(file, config)
+    _check_timing(file, config)
+
+
+def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> None:
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", config.name):
+        raise ConfigError(file, "name", f"{config.name!r}", "use letters, digits, _ and - only")
+    names = [module.name for module in config.module]
+    for index, name in enumerate(names):
+        where = f"module[{index}].name"
+        if name in names[:index]:
+            raise ConfigError(file, where, f"{name!r} stands twice", "each module once")
+        if name not in MODULES:
+            raise ConfigError(file, where, f"{name!r} is no module", f"one of {_words(MODULES)}")
+    absent = [name for name in MODULES if name not in names]
+    if absent:
+        raise ConfigError(file, "module", f"no entry for {_words(absent)}", "six modules in all")
+    nodes: dict[tuple[str, int], str] = {}
+    for index, module in enumerate(config.module):
+        if module.bus not in config.can:
+            buses = _words(config.can)
+            raise ConfigError(file, f"module[{index}].bus", f"{module.bus!r}", f"one of {buses}")
+        for node in module.node_ids:
+            other = nodes.setdefault((config.can[module.bus].channel, node), module.name)
+            if other != module.name or len(set(module.node_ids)) < 2:
+                where = f"module[{index}].node_ids"
+                raise ConfigError(file, where, f"node {node} is taken on this bus", "a free node")
+    if config.harness.bus not in config.can:
+        buses = _words(config.can)
+        raise ConfigError(file, "harness.bus", f"{config.harness.bus!r}", f"one of {buses}")
+    _check_endpoints(file, config.bus.endpoints, services)
+    table = msgspec.to_builtins(config)
+    for index, key in enumerate(config.assumed):
+        value: Any = table
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if value is None:
+            raise ConfigError(file, f"assumed[{index}]", f"{key!r} is no key", "a dotted key")
+
+
+def _check_endpoints(file: str, endpoints: dict[str, str], services: Sequence[str]) -> None:
+    for service in services:
+        if service not in endpoints:
+            raise ConfigError(file, f"bus.endpoints.{service}", "missing", "one for each service")
+    seen: dict[str, str] = {}
+    for service, endpoint in endpoints.items():
+        where = f"bus.endpoints.{service}"
+        if service not in services:
+            raise ConfigError(file, where, "no such service", f"one of {_words(services)}")
+        if not re.match(r"(unixsock-stream|tcp|tls)/.", endpoint):
+            right = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
+            raise ConfigError(file, where, f"{endpoint!r}", right)
+        if endpoint in seen:
+            raise ConfigError(
+                file, where, f"{endpoint!r} is {seen[endpoint]}'s too", "one for each service"
+            )
+        seen[endpoint] = service
+
+
+def _check_physics(file: str, config: RobotConfig) -> None:
+    mass, geometry = config.mass, config.geometry
+    if mass.payload > mass.payload_max:
+        found = f"{mass.payload:g} kg is more than payload_max"
+        raise ConfigError(file, "mass.payload", found, f"at most {mass.payload_max:g} kg")
+    for kind in KINDS:
+        limit: LimitConfig = getattr(config.limits, kind)
+        for axis, (low, high) in (("phi", limit.phi), ("theta", limit.theta)):
+            if low >= high:
+                where = f"limits.{kind}.{axis}"
+                raise ConfigError(file, where, f"[{low:g}, {high:g}] is crossed", "low below high")
+    if config.limits.knee.theta[1] >= 0.0:
+        found = f"{config.limits.knee.theta[1]:g} rad lets the knee straighten"
+        right = "negative: a straight knee (0) is singular"
+        raise ConfigError(file, "limits.knee.theta[1]", found, right)
+    reach = geometry.l1 + geometry.l2
+    if not abs(geometry.l1 - geometry.l2) < config.simulation.stand_height < reach:
+        found = f"{config.simulation.stand_height:g} m"
+        right = f"inside the legs' reach, {abs(geometry.l1 - geometry.l2):.3f} to {reach:.3f} m"
+        raise ConfigError(file, "simulation.stand_height", found, right)
+    for index, selected in enumerate(config.law.S):
+        if not selected and config.law.K_p[index] <= 0.0:
+            where = f"law.K_p[{index}]"
+            raise ConfigError(file, where, "0 in a direction the robot balances", "positive")
+
+
+def _check_timing(file: str, config: RobotConfig) -> None:
+    service = config.joint_service
+    pairs = (
+        ("joint_service.state_rate_hz", service.state_rate_hz, service.rate_hz),
+        ("planner.rate_hz", config.planner.rate_hz, service.state_rate_hz),
+        ("joint_service.command_aging_max_ms", service.command_aging_max_ms,
+         service.max_command_age_ms),
+        ("joint_service.engage_after_ms", service.engage_after_ms, service.engage_after_max_ms),
+    )  # fmt: skip
+    for key, value, limit in pairs:
+        if value > limit:
+            raise ConfigError(file, key, f"{value:g} is too large", f"at most {limit:g}")
+    command_period_ms = 1e3 / config.planner.rate_hz
+    if service.max_command_age_ms < 3 * command_period_ms:
+        found = f"{service.max_command_age_ms:g} ms is under three planner periods"
+        right = f"at least {3 * command_period_ms:g} ms, or every hiccup is a drop-out"
+        raise ConfigError(file, "joint_service.max_command_age_ms", found, right)
+
+
+def _words(names: Iterable[str]) -> str:
+    return ", ".join(names)

@@ -1,0 +1,137 @@
+"""TOML files read into typed structs, every number inside its `Range`.
+
+What does not fit is refused with the file, the key, the value and what would be right
+(`shared.exceptions.ConfigError`).
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import msgspec
+
+from shared.exceptions import ConfigError
+
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+class Range(NamedTuple):
+    """What a number may be, in words that an error can use."""
+
+    low: float
+    high: float
+    unit: str
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the file; unknown keys are refused."""
+
+
+def read_toml(path: Path, into: type[S]) -> S:
+    """Read a TOML file into a struct, with every number inside its `Range`.
+
+    Raises:
+        ConfigError: naming the file, the key, what stands there and what would be right.
+    """
+    file = str(path)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(file, "(file)", "not found", "give the path of a TOML file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(file, "(file)", f"cannot be read: {error}", "a TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(file, "(syntax)", str(error), "TOML 1.0 is read") from None
+    try:
+        config = msgspec.convert(raw, into)
+    except msgspec.ValidationError as error:
+        raise _as_config_error(file, raw, into, str(error)) from None
+    _check_ranges(file, "", config, into)
+    return config
+
+
+def _as_config_error(file: str, raw: dict[str, Any], into: Any, message: str) -> ConfigError:
+    """Turn msgspec's "Expected `float`, got `str` - at `$.mass.module`" into our words."""
+    reason, _, place = message.partition(" - at `")
+    path = place.rstrip("`").removeprefix("$").removeprefix(".")
+    key, found, hint = _follow(path, raw, into)
+    unknown = re.search(r"unknown field `(.*)`", reason)
+    if unknown:
+        full = f"{key}.{unknown[1]}".lstrip(".")
+        return ConfigError(file, full, "unknown key", "remove it, or correct its spelling")
+    missing = re.search(r"missing required field `(.*)`", reason)
+    if missing:
+        full = f"{key}.{missing[1]}".lstrip(".")
+        return ConfigError(file, full, "missing", "this key is required")
+    if get_origin(hint) is Literal:
+        reason = f"one of {', '.join(map(str, get_args(hint)))}"
+    return ConfigError(file, key or "(file)", f"{found!r} does not fit", reason)
+
+
+def _follow(path: str, raw: Any, hint: Any) -> tuple[str, Any, Any]:
+    """Return the full key, the value and the type hint at a msgspec path.
+
+    msgspec writes `[...]` for an entry of a free table: it is the first that does not fit.
+    """
+    key, value = "", raw
+    for name, index in re.findall(r"([A-Za-z_]\w*)|\[(\d+|\.\.\.)\]", path):
+        if name:
+            hint = get_type_hints(hint, include_extras=True)[name]
+            key, value = f"{key}.{name}".lstrip("."), value[name]
+        elif index == "...":
+            hint = get_args(hint)[1]
+            entry, value = next(
+                (row for row in value.items() if not _fits(row[1], hint)), ("?", value)
+            )
+            key = f"{key}.{entry}"
+        else:
+            items = get_args(hint)
+            hint = items[0] if items[-1] is Ellipsis else items[int(index)]
+            key, value = f"{key}[{index}]", value[int(index)]
+        if get_origin(hint) is Annotated:
+            hint = get_args(hint)[0]
+    return key, value, hint
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    try:
+        msgspec.convert(value, hint)
+    except msgspec.ValidationError:
+        return False
+    return True
+
+
+def _check_ranges(file: str, key: str, value: Any, hint: Any) -> None:
+    """Walk a struct by its type hints and check each number against its `Range`."""
+    origin = get_origin(hint)
+    if origin is Annotated:
+        for note in hint.__metadata__:
+            if isinstance(note, Range) and not note.low <= value <= note.high:
+                allowed = f"must be from {note.low:g} to {note.high:g} {note.unit}"
+                raise ConfigError(file, key, f"{value!r} is out of range", allowed)
+        return
+    if isinstance(value, msgspec.Struct):
+        hints = get_type_hints(type(value), include_extras=True)
+        for name in value.__struct_fields__:
+            _check_ranges(file, f"{key}.{name}".lstrip("."), getattr(value, name), hints[name])
+    elif origin is tuple:
+        hints_of_items = get_args(hint)
+        repeated = len(hints_of_items) == 2 and hints_of_items[1] is Ellipsis
+        for index, item in enumerate(value):
+            item_hint = hints_of_items[0 if repeated else index]
+            _check_ranges(file, f"{key}[{index}]", item, item_hint)
+    elif origin is dict:
+        for name, item in value.items():
+            _check_ranges(file, f"{key}.{name}", item, get_args(hint)[1])
