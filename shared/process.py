@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import gc
 import os
 import signal
@@ -57,20 +56,6 @@ class StopFlag:
     def __bool__(self) -> bool:
         """Return True if the process is to stop."""
         return self.stopped
-
-
-def raise_priority(fifo_priority: int) -> str:
-    """Ask for SCHED_FIFO, else for a better nice value; return what was granted.
-
-    Call it before the bus is opened: threads inherit it (design section 6).
-    """
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))
-    except (OSError, AttributeError):
-        with contextlib.suppress(OSError):
-            os.nice(-5)
-        return "normal"
-    return f"SCHED_FIFO {fifo_priority}"
 
 
 def freeze_garbage() -> None:

@@ -58,7 +58,7 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     axes[4].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
     axes[4].set_xlim(0.0, float(t[-1]))
     verdict = "stood" if summary["stood"] else "FELL" if summary["fallen_at_s"] else "not finished"
-    figure.suptitle(f"{name}: {verdict}", fontsize=12)
+    figure.suptitle(f"{name}: {verdict}", fontsize=12, x=0.01, ha="left")
     figure.savefig(path)
 
 
@@ -99,6 +99,7 @@ def _modes(axis: Any, log: RunLog, start_ns: int, end_s: float) -> None:
 
 
 def _events(axes: Any, events: list[RunEvent]) -> None:
+    """Mark kills, restarts and pushes in every panel, with their names above the first."""
     for event in events:
         kind = RunEventKind(event.kind)
         colour = EVENT_COLOURS.get(kind)
@@ -106,17 +107,21 @@ def _events(axes: Any, events: list[RunEvent]) -> None:
             continue
         for axis in axes:
             axis.axvline(event.scenario_s, color=colour, lw=1.0, ls="--")
-        text = event.detail if kind is RunEventKind.PUSHED else f"{event.subject} {event.detail}"
-        if kind is RunEventKind.RESTARTED:
-            text = f"{event.subject} back"
         axes[0].annotate(
-            text.strip(),
+            _label(kind, event),
             (event.scenario_s, 1.0),
             xycoords=("data", "axes fraction"),
-            xytext=(3, -4),
+            xytext=(0, 3),
             textcoords="offset points",
-            rotation=90,
-            va="top",
-            fontsize=7,
+            ha="center",
+            fontsize=8,
             color=colour,
         )
+
+
+def _label(kind: RunEventKind, event: RunEvent) -> str:
+    if kind is RunEventKind.PUSHED:
+        return f"push {event.detail.partition(' for ')[0]}"
+    if kind is RunEventKind.RESTARTED:
+        return f"{event.subject} back"
+    return f"{event.subject} {event.detail}"

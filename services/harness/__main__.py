@@ -11,6 +11,7 @@ from shared import bus, log, process, topics
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig, expand
 from shared.messages import Wrench
+from shared.priority import raise_priority
 
 FIFO_PRIORITY = 10
 """Below the joint services and the planner: the wrench steers slow things only."""
@@ -25,7 +26,7 @@ def main() -> int:
     sensor = make_sensor(config, arguments.run_dir)
     law = WrenchFilter(config.harness)
     stop = process.StopFlag()
-    granted = process.raise_priority(FIFO_PRIORITY)
+    granted = raise_priority(FIFO_PRIORITY)
     with bus.open_session(config, "harness", arguments.run_dir) as session:
         loop = HarnessLoop(sensor, law, session.publisher(topics.WRENCH, Wrench))
         logger.info("started at %g Hz, priority %s", config.harness.rate_hz, granted)

@@ -10,10 +10,10 @@ from shared.bus import open_session
 from shared.config import CanConfig, RobotConfig
 from shared.joints import MODULES
 from shared.messages import Estop, JointCommand, JointEvent, JointState
+from shared.priority import raise_priority
 from shared.process import (
     StopFlag,
     freeze_garbage,
-    raise_priority,
     run_service,
     service_parser,
 )

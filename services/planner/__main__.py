@@ -10,10 +10,10 @@ from shared import config, log, topics
 from shared.bus import open_session
 from shared.joints import MODULES
 from shared.messages import JointCommand, JointState, OperatorIntent, PlannerStatus, Wrench
+from shared.priority import raise_priority
 from shared.process import (
     StopFlag,
     freeze_garbage,
-    raise_priority,
     run_service,
     service_parser,
 )

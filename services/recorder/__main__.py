@@ -20,7 +20,8 @@ from shared.bus import open_session
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.config import RecorderConfig
 from shared.exceptions import ConfigError, RunError
-from shared.process import StopFlag, load_config, raise_priority, run_service, service_parser
+from shared.priority import raise_priority
+from shared.process import StopFlag, load_config, run_service, service_parser
 
 FIFO_PRIORITY: Final = 5
 """Below every control service, above what has no such priority: a starved recorder's

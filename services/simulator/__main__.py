@@ -15,11 +15,11 @@ from shared.bus import open_session
 from shared.config import RobotConfig, expand
 from shared.joints import MODULE_INDEX
 from shared.messages import OperatorIntent, SimControl, SimTruth
+from shared.priority import raise_priority
 from shared.process import (
     DEFAULT_CONFIG,
     StopFlag,
     freeze_garbage,
-    raise_priority,
     run_service,
     service_parser,
 )
