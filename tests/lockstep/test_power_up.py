@@ -1,0 +1,29 @@
+"""Power-up without a planner: the second tier stands by itself."""
+
+from __future__ import annotations
+
+from shared.config import RobotConfig
+from shared.messages import Mode, SimTruth
+from tests.lockstep.runs import push, still
+from tools.lockstep import Lockstep
+
+
+def stand_without_planner(robot: RobotConfig, seconds: float) -> tuple[Lockstep, SimTruth]:
+    """Power up, let the hoist down, start the scenario after 2 s, go on."""
+    fleet = Lockstep(robot, still(seconds, push=(push(0.5, 30, 0, 0), push(1.5, 0, 30, 0))))
+    fleet.planner = None
+    steps = round(seconds / robot.simulation.timestep)
+    for step in range(steps):
+        fleet.advance()
+        if step == round(2.5 / robot.simulation.timestep):
+            fleet.world.start()
+    return fleet, fleet.world.truth(0, 1.0, 0.0)
+
+
+def test_the_robot_stands_through_pushes_with_no_planner_at_all(robot: RobotConfig) -> None:
+    fleet, truth = stand_without_planner(robot, 7.0)
+    assert truth.hoist == 0.0, "it must stand on its own feet"
+    assert not truth.fallen
+    assert truth.torso[2] > 1.1
+    assert max(truth.foot_left_tilt, truth.foot_right_tilt) < 0.02
+    assert all(controller.failsafe.mode is Mode.HOLD for controller in fleet.controllers)
