@@ -51,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
     console.print(table)
     edge = math.degrees(design["y"].theta_edge)
     console.print(
-        f"theta_edge along y: {edge:.2f} deg. The paper's numbers are the column y: its theta_edge is that of w_foot / 2, though its "
-        "formula prints l_foot.",
+        f"theta_edge along y: {edge:.2f} deg. The paper's numbers are the column y: its "
+        "theta_edge is that of w_foot / 2, though its formula prints l_foot.",
         style="dim",
     )
     for direction, stiffness in zip(design, robot.law.K_p, strict=False):
