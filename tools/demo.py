@@ -6,14 +6,12 @@ import argparse
 import json
 import shutil
 import tempfile
-import time
 from pathlib import Path
 
 from rich.console import Console
 
 from shared.bus import open_session
 from shared.config import SERVICES, RobotConfig
-from shared.exceptions import RunError
 from shared.robot_model import mjcf
 from shared.scenario import Scenario
 from tools import experiment, figure, verdict, verdict_table
@@ -56,26 +54,10 @@ def run(args: argparse.Namespace) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
     console = Console()
     robot, story = experiment.make_robot(args), experiment.make_scenario(args)
-    out = make_out(args.out)
+    out = experiment.make_out(args.out, "demo")
     console.print(f"[bold]{story.name}[/]: {story.about}")
     cpu_pct = run_live(args, robot, story, out, console)
     return judge(out, story, cpu_pct, console)
-
-
-def make_out(out: Path | None) -> Path:
-    """Make the directory of the results.
-
-    Raises:
-        RunError: it cannot be made, or holds a run already.
-    """
-    out = out if out is not None else Path("out") / time.strftime("demo-%Y%m%d-%H%M%S")
-    if (out / "run.mcap").exists():
-        raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
-    return out
 
 
 def run_live(

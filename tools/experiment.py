@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import time
 from pathlib import Path
 from typing import TypeVar, get_args, get_type_hints
 
@@ -152,6 +153,22 @@ def make_robot(args: argparse.Namespace) -> RobotConfig:
     if not changes:
         return robot
     return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **changes))
+
+
+def make_out(out: Path | None, verb: str) -> Path:
+    """Make the directory of a run's results; without a name, one of this verb and time.
+
+    Raises:
+        RunError: it cannot be made, or holds a run already.
+    """
+    out = out if out is not None else Path("out") / time.strftime(f"{verb}-%Y%m%d-%H%M%S")
+    if (out / "run.mcap").exists():
+        raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+    return out
 
 
 def write_inputs(out: Path, robot: RobotConfig, story: Scenario) -> tuple[Path, Path]:

@@ -1,15 +1,13 @@
 """Lockstep: the same objects as live, in one process under virtual time (design section 7).
 
 World, twelve emulated axes, six joint controllers and the planner step in a fixed order;
-messages between them pass a modelled network with a constant delay. No process, clock or
-bus: bit-identical from run to run.
+messages between them pass a modelled network. No process, clock or bus: bit-identical
+from run to run with the same seed.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator
-from typing import Generic, TypeVar
+from collections.abc import Callable, Iterator
 
 from services.joint.controller import JointController
 from services.joint.differential import motor_torque
@@ -17,81 +15,120 @@ from services.joint.drivers.base import DriveReading, DriveStatus
 from services.planner.planner import Planner
 from services.simulator.axis_bank import AxisBank
 from services.simulator.world import World
+from shared import topics
 from shared.cansimple import AxisState, ControlMode, InputMode
-from shared.clock import NS_PER_MS, NS_PER_S
+from shared.clock import NS_PER_S
 from shared.config import RobotConfig
+from shared.exceptions import RunError
 from shared.joints import MODULES, N_JOINTS
-from shared.messages import JointCommand, JointEvent, JointState, Mode, SimTruth
-from shared.scenario import Scenario
-
-T = TypeVar("T")
+from shared.messages import (
+    JointCommand,
+    JointEvent,
+    JointState,
+    Message,
+    Mode,
+    PlannerStatus,
+    RunEvent,
+    RunEventKind,
+    SimTruth,
+)
+from shared.scenario import Kill, Push, Restart, Scenario
+from shared.topics import Topic
+from tools.network import Impairment, Link
 
 SETTLE_NS = NS_PER_S
 """The scenario starts this long after all six modules track."""
+READY_NS = 20 * NS_PER_S
+"""They have so long to do it."""
+
+Record = Callable[[Topic, str, Message], None]
+"""Takes what live would be on the bus: topic, module or "", message."""
 
 
-class Link(Generic[T]):
-    """One direction of a network link with a constant delay."""
-
-    def __init__(self, delay_ns: int) -> None:
-        self._delay_ns = delay_ns
-        self._queue: deque[tuple[int, T]] = deque()
-
-    def put(self, now_ns: int, message: T) -> None:
-        """Send."""
-        self._queue.append((now_ns + self._delay_ns, message))
-
-    def take(self, now_ns: int) -> T | None:
-        """Return the newest message that has arrived, as a ring of depth 1 does."""
-        newest = None
-        while self._queue and self._queue[0][0] <= now_ns:
-            newest = self._queue.popleft()[1]
-        return newest
+def _forget(_topic: Topic, _module: str, _message: Message) -> None:
+    """Record nothing."""
 
 
 class Lockstep:
     """A whole fleet in virtual time."""
 
-    def __init__(self, config: RobotConfig, scenario: Scenario, delay_ms: float = 1.0) -> None:
+    def __init__(
+        self,
+        config: RobotConfig,
+        scenario: Scenario,
+        network: Impairment | None = None,
+        *,
+        seed: int = 0,
+        record: Record = _forget,
+    ) -> None:
+        """Put the robot on the hoist, drives idle.
+
+        Args:
+            config: the robot.
+            scenario: what happens; kills and restarts of the planner only.
+            network: what every link does, each way; None is 1 ms.
+            seed: of the network.
+            record: takes every message.
+
+        Raises:
+            RunError: the scenario kills what has no process here.
+        """
+        named = [(row.service, row.at) for row in scenario.kill]
+        for service, at in named + [(row.service, row.at) for row in scenario.restart]:
+            if service != "planner":
+                raise RunError(
+                    f"{service}@{at:g}: in lockstep only the planner can be killed; "
+                    "use `xrl demo` for the others"
+                )
         self.config = config
         self.scenario = scenario
         self.world = World(config, scenario)
         self.controllers = [JointController(config, module) for module in MODULES]
         self.planner: Planner | None = Planner(config, session=1)
+        self.events: list[tuple[str, JointEvent]] = []
+        self.now_ns = NS_PER_S
+        self._record = record
+        self._frozen = False
         self._sessions = 1
-        delay_ns = round(delay_ms * NS_PER_MS)
-        self._states: list[Link[JointState]] = [Link(delay_ns) for _ in MODULES]
-        self._commands: list[Link[JointCommand]] = [Link(delay_ns) for _ in MODULES]
+        network = network or Impairment()
+        self._states: list[Link[JointState]] = [
+            Link(network, f"{seed} {module} state") for module in MODULES
+        ]
+        self._commands: list[Link[JointCommand]] = [
+            Link(network, f"{seed} {module} command") for module in MODULES
+        ]
         self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
         self._state_ns = round(NS_PER_S / config.joint_service.state_rate_hz)
         self._step_ns = round(config.simulation.timestep * NS_PER_S)
         self._truth_ns = round(NS_PER_S / config.simulation.truth_rate_hz)
-        self.now_ns = NS_PER_S
         self._tracked_since_ns = 0
+        self._todo: list[Kill | Restart | Push] = sorted(
+            (*scenario.kill, *scenario.restart, *scenario.push), key=lambda row: row.at
+        )
+        self._said = 0
         self.bank = AxisBank(
             config.drive, encoder_counts_per_turn=config.joint.encoder_counts_per_turn
         )
         self._torque = self.bank.torque
         for axis in range(N_JOINTS):
             self.bank.set_modes(axis, ControlMode.TORQUE, InputMode.PASSTHROUGH)
-        self.events: list[tuple[str, JointEvent]] = []
 
     def run(self) -> Iterator[SimTruth]:
-        """Run to the scenario's end; yield the truth at its rate from the start on."""
-        kills = sorted(self.scenario.kill, key=lambda kill: kill.at)
-        restarts = sorted(self.scenario.restart, key=lambda restart: restart.at)
+        """Run to the scenario's end; yield the truth at its rate.
+
+        Before the scenario begins its time is negative. Ends early if the robot falls
+        or never comes to track.
+        """
         while self.world.scenario_s < self.scenario.duration:
-            t = self.world.scenario_s
-            while kills and t >= kills[0].at:
-                if kills.pop(0).service == "planner":
-                    self.planner = None
-            while restarts and t >= restarts[0].at:
-                if restarts.pop(0).service == "planner":
-                    self._sessions += 1
-                    self.planner = Planner(self.config, self._sessions)
+            while self._todo and self.world.scenario_s >= self._todo[0].at:
+                self._act(self._todo.pop(0))
             self.advance()
-            if t >= 0.0 and self.now_ns % self._truth_ns == 0:
-                yield self.world.truth(self.now_ns, 1.0, 0.0)
+            if self.now_ns % self._truth_ns == 0:
+                truth = self.world.truth(self.now_ns, 1.0, 0.0)
+                self._record(topics.SIM_TRUTH, "", truth)
+                yield truth
+                if truth.scenario_s < 0.0 and (truth.fallen or self.now_ns > READY_NS):
+                    return
 
     def advance(self) -> None:
         """Move virtual time on by one step of the world."""
@@ -99,7 +136,7 @@ class Lockstep:
         if now % self._cycle_ns == 0:
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
             self._cycle_joints(now)
-        if self.planner is not None:
+        if self.planner is not None and not self._frozen:
             self._advance_planner(self.planner, now)
         self._begin_when_tracking(now)
         self.world.step(self._torque)
@@ -108,10 +145,40 @@ class Lockstep:
                 self.bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
         self.now_ns += self._step_ns
 
+    def _act(self, row: Kill | Restart | Push) -> None:
+        """Do what the scenario asks for, and say so."""
+        if isinstance(row, Kill):
+            self._say(RunEventKind.KILLED, row.service, row.signal)
+            if row.signal == "STOP":
+                self._frozen = True
+            else:
+                self.planner = None
+        elif isinstance(row, Restart):
+            self._say(RunEventKind.RESTARTED, row.service, "")
+            if self.planner is None:
+                self._sessions += 1
+                self.planner = Planner(self.config, self._sessions)
+            self._frozen = False
+        else:
+            x, y, z = row.force
+            self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
+
+    def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
+        self._said += 1
+        event = RunEvent(
+            t_ns=self.now_ns,
+            seq=self._said,
+            kind=int(kind),
+            subject=subject,
+            detail=detail,
+            scenario_s=self.world.scenario_s,
+        )
+        self._record(topics.RUN_EVENT, "", event)
+
     def _cycle_joints(self, now: int) -> None:
         bank = self.bank
         pos, vel = bank.pos_estimate.tolist(), bank.vel_estimate.tolist()
-        for index, controller in enumerate(self.controllers):
+        for index, (module, controller) in enumerate(zip(MODULES, self.controllers, strict=True)):
             a, b = 2 * index, 2 * index + 1
             armed = bank.state[a] == bank.state[b] == AxisState.CLOSED_LOOP_CONTROL
             status = DriveStatus.ARMED if armed else DriveStatus.IDLE
@@ -119,12 +186,15 @@ class Lockstep:
             command = self._commands[index].take(now)
             result = controller.step(now, reading, command, estop=False)
             if result.event is not None:
-                self.events.append((MODULES[index], result.event))
+                self.events.append((module, result.event))
+                self._record(topics.JOINT_EVENT, module, result.event)
             bank.input_torque[a : b + 1] = motor_torque(result.tau, self.config.joint.gear_ratio)
             bank.feed(a)
             bank.feed(b)
             if now % self._state_ns == 0:
-                self._states[index].put(now, controller.state(now))
+                state = controller.state(now)
+                self._states[index].put(now, state)
+                self._record(topics.JOINT_STATE, module, state)
 
     def _advance_planner(self, planner: Planner, now: int) -> None:
         """Hand over what has arrived, and tick as the live loop does."""
@@ -132,10 +202,14 @@ class Lockstep:
             state = link.take(now)
             if state is not None:
                 planner.hear_state(index, state, now)
-        if planner.is_due(now):
-            planner.hear_assist(self.world.lead().assist)
-            for index, command in enumerate(planner.tick(now)):
-                self._commands[index].put(now, command)
+        if not planner.is_due(now):
+            return
+        planner.hear_assist(self.world.lead().assist)
+        for index, command in enumerate(planner.tick(now)):
+            self._commands[index].put(now, command)
+            self._record(topics.JOINT_COMMAND, MODULES[index], command)
+        status: PlannerStatus = planner.status(now, 0.0)
+        self._record(topics.PLANNER_STATUS, "", status)
 
     def _begin_when_tracking(self, now: int) -> None:
         if self.world.scenario_s >= 0.0:
@@ -147,3 +221,4 @@ class Lockstep:
             self._tracked_since_ns = now
         elif now - self._tracked_since_ns >= SETTLE_NS:
             self.world.start()
+            self._say(RunEventKind.STARTED, self.scenario.name, "")

@@ -22,6 +22,7 @@ class Verb(NamedTuple):
 
 VERBS: Final = (
     Verb("demo", "tools.demo", "run the reference experiment, kill the planner, judge the outcome"),
+    Verb("sim", "tools.sim", "run the same experiment in virtual time, with a modelled network"),
     Verb("up", "tools.up", "start the fleet"),
     Verb("status", "tools.status", "show every service and every module"),
     Verb("kill", "tools.kill", "send a signal to one service"),

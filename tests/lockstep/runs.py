@@ -14,6 +14,7 @@ from shared.config import RobotConfig
 from shared.messages import SimTruth
 from shared.scenario import Keyframe, Kill, Push, Restart, Scenario
 from tools.lockstep import Lockstep
+from tools.network import Impairment
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 
@@ -72,10 +73,11 @@ def still(duration: float, height: float = 1.188, **changes: object) -> Scenario
 
 def run(robot: RobotConfig, scenario: Scenario, delay_ms: float = 1.0) -> Run:
     """Run to the end, or to a fall."""
-    lockstep = Lockstep(robot, scenario, delay_ms)
+    lockstep = Lockstep(robot, scenario, Impairment(delay_ms=delay_ms))
     rows = []
     for row in lockstep.run():
-        rows.append(row)
+        if row.scenario_s >= 0.0:
+            rows.append(row)
         if row.fallen:
             break
     return Run(lockstep, rows)

@@ -1,0 +1,67 @@
+"""`xrl sim`: the verb around lockstep."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from shared import topics
+from shared.messages import PlannerStatus
+from tools import cli
+from tools.run_log import read_run
+
+
+def sim(out: Path, *flags: str) -> int:
+    return cli.main(["sim", "--out", str(out), *flags])
+
+
+def test_a_run_is_recorded_judged_and_drawn(tmp_path: Path) -> None:
+    flags = ("--duration", "3", "--kill", "planner@1", "--restart", "planner@1.6")
+    assert sim(tmp_path, *flags) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["stood"] is True
+    assert summary["reengage_s"] < 1.5
+    assert max(summary["handover_ms"].values()) <= 55.0
+    assert (tmp_path / "run.png").stat().st_size > 20_000
+    log = read_run(tmp_path / "run.mcap")
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    assert len({status.session for status in statuses}) == 2
+
+
+def test_a_frozen_planner_goes_on_in_its_session(tmp_path: Path) -> None:
+    flags = ("--duration", "3", "--kill", "planner@1:STOP", "--restart", "planner@1.6")
+    assert sim(tmp_path, *flags) == 0
+    log = read_run(tmp_path / "run.mcap")
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    assert len({status.session for status in statuses}) == 1
+    assert json.loads((tmp_path / "summary.json").read_text())["reengage_s"] < 1.5
+
+
+def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
+    flags = ("--duration", "1", "--jitter", "3", "--delay", "3", "--loss", "0.2", "--kill",
+             "planner@0.9", "--seed")  # fmt: skip
+    for name, seed in (("a", "5"), ("b", "5"), ("c", "6")):
+        assert sim(tmp_path / name, *flags, seed) == 0
+    states = [
+        read_run(tmp_path / name / "run.mcap").messages(topics.JOINT_STATE, "knee_left")
+        for name in "abc"
+    ]
+    assert states[0] == states[1]
+    assert states[0] != states[2]
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--loss", "1.5"), "from 0 to 1"),
+        (("--delay", "-1"), "at least 0 ms"),
+        (("--kill", "knee_left@1"), "only the planner"),
+    ],
+)
+def test_bad_input_is_one_clear_line(
+    tmp_path: Path, flags: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert sim(tmp_path / "out", *flags) == 2
+    assert words in capsys.readouterr().err

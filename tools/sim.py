@@ -1,0 +1,167 @@
+"""`xrl sim`: the experiment in virtual time: no processes, bit-identical, as fast as it can."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import deque
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from services.recorder import provenance
+from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
+from shared import topics
+from shared.codec import encode
+from shared.config import RobotConfig
+from shared.exceptions import RunError
+from shared.messages import Message
+from shared.robot_model import mjcf
+from shared.scenario import Scenario
+from shared.topics import Topic
+from tools import experiment, figure, verdict, verdict_table
+from tools.lockstep import Lockstep
+from tools.network import Impairment
+from tools.run_log import read_run
+from tools.verbs import Subparsers, add_verb
+
+AFTER_FALL_S = 1.0
+DRAIN_EVERY = 512
+NOT_HERE = ("pd_cycles_late_pct", "planner_tick_us", "real_time_factor", "world_time_lost_s")
+"""Figures of real time: none in virtual time."""
+
+
+class Outbox:
+    """Messages on their way into the log."""
+
+    def __init__(self, robot: str) -> None:
+        self._robot = robot
+        self._queue: deque[tuple[str, bytes, int]] = deque()
+
+    def __len__(self) -> int:
+        """Return how many wait."""
+        return len(self._queue)
+
+    def put(self, topic: Topic, module: str, message: Message) -> None:
+        """Take a message as the bus would."""
+        self._queue.append((topic.key(self._robot, module), encode(message), message.t_ns))
+
+    def take(self) -> tuple[str, bytes, int] | None:
+        """Return the oldest, or None."""
+        return self._queue.popleft() if self._queue else None
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "sim",
+        """
+        xrl sim
+        xrl sim --delay 10 --out out/slow
+        xrl sim --delay 5 --jitter 5 --loss 0.1 --seed 3
+        xrl sim --scenario crawl --kill planner@8
+        """,
+    )
+    experiment.add_flags(parser)
+    parser.add_argument(
+        "--delay", type=float, default=1.0, metavar="MS", help="of every link, each way (1)"
+    )
+    parser.add_argument(
+        "--jitter", type=float, default=0.0, metavar="MS", help="uniform, +- so much (0)"
+    )
+    parser.add_argument(
+        "--loss", type=float, default=0.0, metavar="P", help="share of messages lost, 0 to 1 (0)"
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="where results go (default: out/sim-<time>)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the experiment; 0 only if the robot stood to the end."""
+    if args.delay < 0.0 or args.jitter < 0.0 or not 0.0 <= args.loss <= 1.0:
+        raise RunError("--delay and --jitter must be at least 0 ms, --loss from 0 to 1")
+    console = Console()
+    robot, story = experiment.make_robot(args), experiment.make_scenario(args)
+    network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
+    out = experiment.make_out(args.out, "sim")
+    console.print(f"[bold]{story.name}[/]: {story.about}")
+    begin = time.monotonic()
+    simulated_s = simulate(robot, story, network, args.seed, out, console)
+    factor = simulated_s / (time.monotonic() - begin)
+    log = read_run(out / "run.mcap")
+    summary = verdict.summarise(log, story.duration)
+    summary |= dict.fromkeys(NOT_HERE) | {"in_real_time": True, "speed": factor}
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    figure.draw(log, f"{story.name} in lockstep", summary, out / "run.png")
+    verdict_table.show(summary, console)
+    console.print(f"{factor:.1f} x real time; {out}/run.mcap, run.png, summary.json", style="dim")
+    return 0 if summary["stood"] else 1
+
+
+def simulate(
+    robot: RobotConfig,
+    story: Scenario,
+    network: Impairment,
+    seed: int,
+    out: Path,
+    console: Console,
+) -> float:
+    """Run lockstep into a log with a progress bar; return the time simulated, s."""
+    robot_path, scenario_path = experiment.write_inputs(out, robot, story)
+    outbox = Outbox(robot.name)
+    fleet = Lockstep(robot, story, network, seed=seed, record=outbox.put)
+    bar = Progress(
+        BarColumn(), TextColumn("{task.completed:5.1f} of {task.total:g} s"),
+        TimeRemainingColumn(), console=console, transient=True,
+    )  # fmt: skip
+    recorded = {key: topic for key, topic in topics.all_keys(robot.name).items() if topic.recorded}
+    with (
+        RunWriter(
+            out,
+            recorded,
+            offset_ns=0,
+            metadata=_metadata(robot.name, story.name, network, seed),
+            attachments={
+                "robot.toml": robot_path.read_bytes(),
+                "scenario.toml": scenario_path.read_bytes(),
+                "model.xml": mjcf(robot).encode(),
+            },
+            chunk_kib=robot.recorder.chunk_kib,
+        ) as writer,
+        bar as progress,
+    ):
+        task = progress.add_task("", total=story.duration)
+        fallen_at_s = None
+        for truth in fleet.run():
+            if len(outbox) >= DRAIN_EVERY:
+                writer.take_from(outbox, len(outbox))
+                progress.update(task, completed=max(0.0, truth.scenario_s))
+            if truth.fallen and fallen_at_s is None:
+                fallen_at_s = truth.scenario_s
+            if fallen_at_s is not None and truth.scenario_s > fallen_at_s + AFTER_FALL_S:
+                break
+        writer.take_from(outbox, len(outbox))
+    return fleet.now_ns / 1e9
+
+
+def _metadata(
+    robot: str, scenario: str, network: Impairment, seed: int
+) -> dict[str, dict[str, str]]:
+    run_facts = {
+        "schema_version": SCHEMA_VERSION,
+        "robot": robot,
+        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "scenario": scenario,
+        "lockstep": f"delay {network.delay_ms:g} ms, jitter {network.jitter_ms:g} ms, "
+        f"loss {network.loss:g}, seed {seed}",
+    }
+    root = Path(__file__).resolve().parents[1]
+    return {
+        "run": run_facts | provenance.code(root) | provenance.machine(),
+        "packages": provenance.packages(),
+    }
