@@ -169,6 +169,8 @@ class JointServiceConfig(Section, frozen=True):
     blend_ms: Milliseconds
     damp_fade_s: Seconds
     damp_k_d: LocalDamping
+    damp_knee_stop: Angle
+    damp_sinks: tuple[Literal["ankle", "knee", "hip"], ...]
     torque_rate_max: Annotated[float, Range(100.0, 1e6, "N m/s")]
     soft_stop_k_p: LocalStiffness
     k_p_max: LocalStiffness

@@ -106,6 +106,14 @@ def _check_physics(file: str, config: RobotConfig) -> None:
         found = f"{config.simulation.stand_height:g} m"
         right = f"inside the legs' reach, {abs(geometry.l1 - geometry.l2):.3f} to {reach:.3f} m"
         raise ConfigError(file, "simulation.stand_height", found, right)
+    if geometry.l1 >= geometry.l2:
+        found = f"{geometry.l1:g} m is not below l2 = {geometry.l2:g} m"
+        raise ConfigError(file, "geometry.l1", found, "a thigh shorter than the shin")
+    tau_drive = 2 * config.joint.gear_ratio * config.drive.torque_constant
+    if tau_drive * config.drive.current_lim < config.joint.tau_module_max:
+        found = f"{config.drive.current_lim:g} A gives less than tau_module_max"
+        right = f"at least {config.joint.tau_module_max / tau_drive:.1f} A"
+        raise ConfigError(file, "drive.current_lim", found, right)
     for index, selected in enumerate(config.law.S):
         if not selected and config.law.K_p[index] <= 0.0:
             where = f"law.K_p[{index}]"
@@ -124,6 +132,28 @@ def _check_timing(file: str, config: RobotConfig) -> None:
     for key, value, limit in pairs:
         if value > limit:
             raise ConfigError(file, key, f"{value:g} is too large", f"at most {limit:g}")
+    period_ms = 1e3 / service.rate_hz
+    if abs(config.simulation.encoder_rate_hz - service.rate_hz) > 1e-6:
+        found = f"{config.simulation.encoder_rate_hz:g} Hz is not joint_service.rate_hz"
+        raise ConfigError(
+            file, "simulation.encoder_rate_hz", found, f"{service.rate_hz:g} Hz: they are its clock"
+        )
+    if abs(config.drive.encoder_period_ms - period_ms) > 1e-6:
+        found = f"{config.drive.encoder_period_ms} ms is not the period of joint_service.rate_hz"
+        raise ConfigError(file, "drive.encoder_period_ms", found, f"{period_ms:g} ms")
+    if (
+        abs(
+            round(service.rate_hz / service.state_rate_hz) * service.state_rate_hz - service.rate_hz
+        )
+        > 1e-6
+    ):
+        found = f"{service.state_rate_hz:g} Hz does not divide joint_service.rate_hz"
+        right = f"{service.rate_hz:g} Hz divided by a whole number"
+        raise ConfigError(file, "joint_service.state_rate_hz", found, right)
+    if config.drive.watchdog_timeout < 10e-3 * period_ms:
+        found = f"{config.drive.watchdog_timeout:g} s is under ten control periods"
+        right = f"at least {10e-3 * period_ms:g} s, or a hiccup disarms the drive"
+        raise ConfigError(file, "drive.watchdog_timeout", found, right)
     command_period_ms = 1e3 / config.planner.rate_hz
     if service.max_command_age_ms < 3 * command_period_ms:
         found = f"{service.max_command_age_ms:g} ms is under three planner periods"

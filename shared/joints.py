@@ -40,14 +40,3 @@ MODULE_INDEX: Final = {name: index for index, name in enumerate(MODULES)}
 def kind_of(module: str) -> str:
     """Return "ankle", "knee" or "hip" for a module name."""
     return module.rpartition("_")[0]
-
-
-def side_of(module: str) -> str:
-    """Return "right" or "left" for a module name."""
-    return module.rpartition("_")[2]
-
-
-def module_slice(module: str) -> slice:
-    """Return the slice of the module's (phi, theta) in q, v and tau."""
-    index = MODULE_INDEX[module]
-    return slice(2 * index, 2 * index + 2)

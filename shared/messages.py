@@ -32,7 +32,6 @@ class Mode(IntEnum):
 class Cause(IntEnum):
     """Why a joint service changed its state."""
 
-    STARTED = 0
     DRIVE_ARMED = 1
     COMMANDS_FRESH = 2
     COMMAND_STALE = 3
@@ -40,8 +39,6 @@ class Cause(IntEnum):
     ESTOP = 5
     DRIVE_LOST = 6
     DRIVE_DISARMED = 7
-    SHUTDOWN = 8
-    RESET = 9
 
 
 class PlannerMode(IntEnum):
@@ -200,10 +197,10 @@ class OperatorIntent(Message, frozen=True):
 
 
 class Estop(Message, frozen=True):
-    """The emergency stop: every module goes to DAMP."""
+    """The emergency stop: every module goes to DAMP, and leaves it by a restart only."""
 
     source: str
-    engaged: bool
+    """Who stopped, in words."""
 
 
 class SimTruth(Message, frozen=True):

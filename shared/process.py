@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
-from shared import config, log
+from shared import log
 from shared.exceptions import XrlError
 
 RUN_DIR_VARIABLE = "XRL_RUN_DIR"
@@ -72,8 +72,3 @@ def run_service(main: Callable[[], int]) -> None:
     except XrlError as error:
         log.get("xrl").error("%s", error)
         sys.exit(error.exit_code)
-
-
-def load_config(path: Path) -> config.RobotConfig:
-    """Read the robot file."""
-    return config.load(path)

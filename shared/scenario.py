@@ -16,7 +16,7 @@ import tomli_w
 
 from shared.config import SERVICES
 from shared.exceptions import ConfigError
-from shared.toml_file import Range, Section, read_toml
+from shared.toml_file import Range, Section, check_ranges, read_toml
 
 Time = Annotated[float, Range(0.0, 86_400.0, "s")]
 Force = Annotated[float, Range(-2000.0, 2000.0, "N")]
@@ -129,6 +129,7 @@ def load(path: Path) -> Scenario:
 
 def check(file: str, scenario: Scenario) -> None:
     """Check what no single value shows: order, services, times inside the run."""
+    check_ranges(file, scenario)
     if not scenario.keyframe:
         raise ConfigError(file, "keyframe", "none", "at least one [[keyframe]]")
     times = [frame.at for frame in scenario.keyframe]

@@ -58,7 +58,7 @@ def read_toml(path: Path, into: type[S]) -> S:
         config = msgspec.convert(raw, into)
     except msgspec.ValidationError as error:
         raise _as_config_error(file, raw, into, str(error)) from None
-    _check_ranges(file, "", config, into)
+    check_ranges(file, config)
     return config
 
 
@@ -111,6 +111,15 @@ def _fits(value: Any, hint: Any) -> bool:
     except msgspec.ValidationError:
         return False
     return True
+
+
+def check_ranges(file: str, config: msgspec.Struct) -> None:
+    """Check each number of a struct against the `Range` of its type hint.
+
+    Raises:
+        ConfigError: naming the file, the key, the value and what is allowed.
+    """
+    _check_ranges(file, "", config, type(config))
 
 
 def _check_ranges(file: str, key: str, value: Any, hint: Any) -> None:

@@ -110,7 +110,7 @@ def command(seq: int, q_phi: float = 0.1) -> JointCommand:
 
 
 def estop(seq: int) -> Estop:
-    return Estop(t_ns=time.monotonic_ns(), seq=seq, source="test", engaged=True)
+    return Estop(t_ns=time.monotonic_ns(), seq=seq, source="test")
 
 
 class Link:
@@ -298,7 +298,7 @@ def test_publisher_reaches_its_subscriber_again_after_it_was_killed(
 with open_session(robot, "planner", run_dir) as session:
     publisher = session.publisher(topics.ESTOP, Estop)
     while True:
-        publisher.put(Estop(t_ns=0, seq=int(sys.argv[2]), source="planner", engaged=True))
+        publisher.put(Estop(t_ns=0, seq=int(sys.argv[2]), source="planner"))
         time.sleep(0.002)
 """
     with open_session(ROBOT, "ankle_right", run_dir) as session:
@@ -361,7 +361,7 @@ with open_session(robot, "planner", run_dir) as session:
     stream = session.stream([f"xrl/{robot.name}/**"])
     publisher = session.publisher(topics.ESTOP, Estop)
     for seq in range(100):
-        assert publisher.put(Estop(t_ns=0, seq=seq, source="x", engaged=True))
+        assert publisher.put(Estop(t_ns=0, seq=seq, source="x"))
     assert latest.take() is None
     print("left", flush=True)
     if sys.argv[2:]:
@@ -450,7 +450,7 @@ def test_process_has_one_zenoh_thread_set(start: Start) -> None:
     """Five thread pools make 8 threads and more; one makes 2, or 4 while it works."""
     process = start("""
 with open_session(robot, "planner", run_dir) as session:
-    session.publisher(topics.ESTOP, Estop).put(Estop(t_ns=0, seq=0, source="x", engaged=True))
+    session.publisher(topics.ESTOP, Estop).put(Estop(t_ns=0, seq=0, source="x"))
     print(len(os.listdir("/proc/self/task")))
 """)
     out, _ = process.communicate(timeout=30)

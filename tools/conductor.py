@@ -40,6 +40,8 @@ LAST_WORDS_S: Final = 0.3
 """What was said last reaches the recorder in this time."""
 POLL_S: Final = 0.004
 PIDS_EVERY_S: Final = 1.0
+ENDING_S: Final = 3.0
+"""A service that was asked to end has done so by then, or was killed by its supervisor."""
 
 
 class Snapshot(NamedTuple):
@@ -56,11 +58,12 @@ class CpuMeter:
 
     def __init__(self) -> None:
         self._last: dict[int, float] = {}
-        self._begin_s = time.monotonic()
+        self._begin_s = self._end_s = time.monotonic()
         self._spent_s = 0.0
 
     def sample(self, pids: Iterable[int]) -> None:
         """Add what each process has used since the sample before."""
+        self._end_s = time.monotonic()
         for pid in (*pids, os.getpid()):
             used = procfs.cpu_s(pid)
             if used is not None:
@@ -69,8 +72,8 @@ class CpuMeter:
 
     @property
     def share_pct(self) -> float:
-        """Mean use since the start: 100 is one core."""
-        return 100.0 * self._spent_s / max(1e-9, time.monotonic() - self._begin_s)
+        """Mean use from the first sample to the last: 100 is one core."""
+        return 100.0 * self._spent_s / max(1e-9, self._end_s - self._begin_s)
 
 
 class Conductor:
@@ -141,6 +144,7 @@ class Conductor:
             while todo and scenario_s >= todo[0].at:
                 self._act(todo.pop(0))
             time.sleep(POLL_S)
+        meter.sample(self._pids.values())
         self._say(RunEventKind.FINISHED, self._scenario.name, "")
         time.sleep(LAST_WORDS_S)
         return meter.share_pct
@@ -228,6 +232,7 @@ class Conductor:
                 raise RunError(f"{words}; see logs/{row.service}.log") from None
             self._note = f"{row.service} {'stopped' if row.signal == 'STOP' else 'killed'}"
         elif isinstance(row, Restart):
+            self._wait_until_ended(row.service)
             self._say(RunEventKind.RESTARTED, row.service, "")
             self._fleet.start_service(row.service)
             self._next_pids_s = 0.0
@@ -235,6 +240,15 @@ class Conductor:
         else:
             x, y, z = row.force
             self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
+
+    def _wait_until_ended(self, service: str) -> None:
+        """Wait for a service that is still leaving after TERM or INT; one that is stopped stays."""
+        pid = self._pids.get(service)
+        deadline = time.monotonic() + ENDING_S
+        while pid is not None and time.monotonic() < deadline:
+            if procfs.is_gone(pid) or procfs.is_suspended(pid):
+                return
+            time.sleep(POLL_S)
 
     def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
         now = now_ns()

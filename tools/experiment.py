@@ -22,6 +22,9 @@ from tools.verbs import add_config
 
 E = TypeVar("E", Kill, Restart, Push)
 
+UNJUDGED = ("simulator", "recorder")
+"""A run cannot be judged without their part of it."""
+
 _NUMBER = r"\d+(?:\.\d*)?"
 
 
@@ -78,6 +81,11 @@ def parse_kill(text: str) -> Kill:
         raise argparse.ArgumentTypeError(
             f"{text!r}; write SERVICE@SECONDS or SERVICE@SECONDS:SIGNAL, for example "
             f"planner@10:STOP; services: {', '.join(SERVICES)}; signals: {', '.join(SIGNALS)}"
+        )
+    if match[1] in UNJUDGED:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: without the {match[1]} there is nothing to judge the run by; "
+            "`xrl up` and `xrl kill` show what the fleet does then"
         )
     row = {"service": match[1], "at": float(match[2]), "signal": match[3] or "KILL"}
     return msgspec.convert(row, Kill)

@@ -86,6 +86,8 @@ class Lockstep:
         self.controllers = [JointController(config, module) for module in MODULES]
         self.planner: Planner | None = Planner(config, session=1)
         self.events: list[tuple[str, JointEvent]] = []
+        self.estop = False
+        """Set it to stop every module."""
         self.now_ns = NS_PER_S
         self._record = record
         self._frozen = False
@@ -184,7 +186,7 @@ class Lockstep:
             status = DriveStatus.ARMED if armed else DriveStatus.IDLE
             reading = DriveReading(now, (pos[a], pos[b]), (vel[a], vel[b]), status, 0)
             command = self._commands[index].take(now)
-            result = controller.step(now, reading, command, estop=False)
+            result = controller.step(now, reading, command, self.estop)
             if result.event is not None:
                 self.events.append((module, result.event))
                 self._record(topics.JOINT_EVENT, module, result.event)

@@ -26,6 +26,7 @@ VERBS: Final = (
     Verb("up", "tools.up", "start the fleet"),
     Verb("status", "tools.status", "show every service and every module"),
     Verb("kill", "tools.kill", "send a signal to one service"),
+    Verb("estop", "tools.estop", "stop every module: a slow sink, never a drop"),
     Verb("stiffness", "tools.stiffness", "print how stiff the body must be to balance"),
     Verb("down", "tools.down", "stop the fleet and leave nothing behind"),
 )

@@ -9,12 +9,12 @@ from services.harness.loop import HarnessLoop, run
 from services.harness.sensor import CanHarnessSensor
 from shared import bus, log, process, topics
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig, expand
+from shared.config import RobotConfig, expand, load
 from shared.messages import Wrench
 from shared.priority import raise_priority
 
 FIFO_PRIORITY = 10
-"""Below the joint services and the planner: the wrench steers slow things only."""
+"""Below the joint services and the planner: the wrench is for the log so far."""
 
 
 def main() -> int:
@@ -22,7 +22,7 @@ def main() -> int:
     parser = process.service_parser(__doc__ or "", "python -m services.harness")
     arguments = parser.parse_args()
     logger = log.setup("harness")
-    config = process.load_config(arguments.config)
+    config = load(arguments.config)
     sensor = make_sensor(config, arguments.run_dir)
     law = WrenchFilter(config.harness)
     stop = process.StopFlag()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from services.joint.controller import JointController
 from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.loop import JointLoop, Ports
 from shared import config, log, topics
 from shared.bus import open_session
-from shared.config import CanConfig, RobotConfig
+from shared.config import CanConfig, RobotConfig, expand
 from shared.joints import MODULES
 from shared.messages import Estop, JointCommand, JointEvent, JointState
 from shared.priority import raise_priority
@@ -41,7 +43,7 @@ def main() -> int:
             states=session.publisher(topics.JOINT_STATE, JointState, module),
             events=session.publisher(topics.JOINT_EVENT, JointEvent, module),
         )
-        drive = open_drive(robot, module, str(arguments.run_dir))
+        drive = open_drive(robot, module, arguments.run_dir)
         loop = JointLoop(robot, JointController(robot, module), drive, ports)
         logger.info("up, %s", granted)
         freeze_garbage()
@@ -51,12 +53,12 @@ def main() -> int:
     return 0
 
 
-def open_drive(robot: RobotConfig, module: str, run_dir: str) -> OdriveCan:
+def open_drive(robot: RobotConfig, module: str, run_dir: Path) -> OdriveCan:
     """Return the module's drive on its CAN bus."""
     wiring = robot.module_named(module)
     bus = robot.can[wiring.bus]
     return OdriveCan(
-        CanConfig(interface=bus.interface, channel=bus.channel.replace("{run}", run_dir)),
+        CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir)),
         wiring.node_ids,
         robot.drive,
     )

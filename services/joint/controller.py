@@ -6,6 +6,7 @@ lockstep under virtual time, and in re-execution from a log.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from services.joint import law
@@ -16,6 +17,7 @@ from services.joint.gate import gate, limits_of
 from services.joint.law import Setpoint
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
+from shared.joints import kind_of
 from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Pair
 
 _DRIVE_EVENT = {
@@ -47,6 +49,9 @@ class JointController:
         self._limits = limits_of(config, module)
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
         self._damp_k_d = service.damp_k_d
+        self._sinks = (False, kind_of(module) in service.damp_sinks)
+        knee = kind_of(module) == "knee"
+        self._damp_stop = service.damp_knee_stop if knee else -math.inf
         self._gear_ratio = config.joint.gear_ratio
         self._aging_max_s = service.command_aging_max_ms / 1e3
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
@@ -58,6 +63,7 @@ class JointController:
         self._setpoint: Setpoint = self._anchor
         self._changed_ns = 0
         self._last_cycle_ns = 0
+        self._sampled_ns = 0
         self.q: Pair = law.ZERO
         self.v: Pair = law.ZERO
         self.tau: Pair = law.ZERO
@@ -87,6 +93,7 @@ class JointController:
         if reading is not None:
             drive = _DRIVE_EVENT[reading.status]
             self.drive_error = reading.error
+            self._sampled_ns = reading.t_ns
             self.q = joint_from_motor(reading.pos_turns, self._gear_ratio)
             self.v = joint_from_motor(reading.vel_turns, self._gear_ratio)
         failsafe = self.failsafe
@@ -109,12 +116,15 @@ class JointController:
         return CycleResult(self.tau, event)
 
     def state(self, now_ns: int) -> JointState:
-        """Return the module's state message, stamped with its own clock."""
+        """Return the module's state message.
+
+        Its stamp is when the drive's sample came: commands made from old samples are old.
+        """
         failsafe = self.failsafe
         command = failsafe.command
         self._states += 1
         return JointState(
-            t_ns=now_ns,
+            t_ns=self._sampled_ns,
             seq=self._states,
             q=self.q,
             v=self.v,
@@ -131,6 +141,14 @@ class JointController:
             drive_error=self.drive_error,
         )
 
+    def inside_limits(self) -> bool:
+        """Return True if the joint was last seen inside its soft stops."""
+        limits = self._limits
+        return (
+            limits.phi[0] <= self.q[0] <= limits.phi[1]
+            and limits.theta[0] <= self.q[1] <= limits.theta[1]
+        )
+
     def _count(self, now_ns: int) -> None:
         self.cycle += 1
         if self._last_cycle_ns and now_ns - self._last_cycle_ns > self._period_late_ns:
@@ -143,7 +161,8 @@ class JointController:
         if before is Mode.DISARMED:
             self._anchor = law.stand(self.q, self._stand_k_p, self._stand_k_d)
         elif self.failsafe.mode is Mode.DAMP:
-            self._anchor = law.carrying(self._setpoint, self.q)
+            self._damp_stop = min(self._damp_stop, self.q[1])
+            self._anchor = law.carrying(law.held(self._setpoint, 0.0), self._sinks, self.q)
         else:
             self._anchor = self._setpoint
 
@@ -161,7 +180,11 @@ class JointController:
             return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
         if mode is Mode.DAMP:
             share = max(0.0, 1.0 - since_ns / self._damp_fade_ns)
-            return law.damped(self._anchor, self._damp_k_d, share)
+            held = law.stiffened(self._anchor, self._stand_k_p, self._stand_k_d, 1.0 - share)
+            sunk = law.damped(held, self._sinks, self._damp_k_d, share)
+            if self.q[1] < self._damp_stop:
+                return law.caught(sunk, self._damp_stop, self._stand_k_p[1], self._stand_k_d[1])
+            return sunk
         return self._held(since_ns)
 
     def _held(self, since_ns: int) -> Setpoint:

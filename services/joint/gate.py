@@ -1,4 +1,4 @@
-"""The last gate before the drive: it only ever reduces (design section 4).
+"""The last gate before the drive: but for the soft stop it only reduces (design section 4).
 
 In order: a one-sided spring at the joint's soft stop, finite, the rate, and last the torque
 diamond |tau_phi| + |tau_theta| <= tau_module_max, which nothing may exceed. Pure.

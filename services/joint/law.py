@@ -107,25 +107,59 @@ def stiffened(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoin
     )
 
 
-def carrying(setpoint: Setpoint, q: Pair) -> Setpoint:
-    """Return a setpoint whose feedforward is all that its springs and feedforward carry at q.
+def carrying(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:
+    """Return a setpoint in which the axes that are to sink carry their load as feedforward.
 
-    DAMP lets go of the springs, but not of the load: a stand without a planner has no
+    DAMP lets go of their springs, but not of the load: a stand without a planner has no
     other feedforward to fade.
+
+    Args:
+        setpoint: in force until now, frozen.
+        sinks: for (phi, theta), True if the axis is to sink.
+        q: where it is, rad.
     """
     s = setpoint
-    load = (
-        s.k_p[0] * (s.q_ref[0] - q[0]) + s.tau_ff[0],
-        s.k_p[1] * (s.q_ref[1] - q[1]) + s.tau_ff[1],
+    tau_ff = (
+        s.tau_ff[0] + (s.k_p[0] * (s.q_ref[0] - q[0]) if sinks[0] else 0.0),
+        s.tau_ff[1] + (s.k_p[1] * (s.q_ref[1] - q[1]) if sinks[1] else 0.0),
     )
-    return Setpoint(s.q_ref, ZERO, load, ZERO, s.k_p, s.k_d)
+    return Setpoint(s.q_ref, ZERO, tau_ff, ZERO, s.k_p, s.k_d)
 
 
-def damped(setpoint: Setpoint, k_d: float, feedforward_share: float) -> Setpoint:
-    """Return DAMP's law: no stiffness, damping k_d, feedforward by its remaining share."""
+def damped(
+    setpoint: Setpoint, sinks: tuple[bool, bool], k_d: float, feedforward_share: float
+) -> Setpoint:
+    """Return DAMP's law: axes that sink lose their stiffness, the others hold.
+
+    Args:
+        setpoint: what `carrying` gave.
+        sinks: for (phi, theta), True if the axis is to sink.
+        k_d: damping of an axis that sinks, N m s/rad.
+        feedforward_share: what is left of its feedforward, 1 .. 0.
+    """
+    s, share = setpoint, feedforward_share
+    phi, theta = sinks
+    return Setpoint(
+        s.q_ref,
+        ZERO,
+        (s.tau_ff[0] * (share if phi else 1.0), s.tau_ff[1] * (share if theta else 1.0)),
+        ZERO,
+        (0.0 if phi else s.k_p[0], 0.0 if theta else s.k_p[1]),
+        (k_d if phi else s.k_d[0], k_d if theta else s.k_d[1]),
+    )
+
+
+def caught(setpoint: Setpoint, stop: float, k_p: float, k_d: float) -> Setpoint:
+    """Return DAMP's law with theta caught by a spring at a stop, rad, N m/rad, N m s/rad."""
     s = setpoint
-    tau_ff = (s.tau_ff[0] * feedforward_share, s.tau_ff[1] * feedforward_share)
-    return Setpoint(s.q_ref, ZERO, tau_ff, ZERO, ZERO, (k_d, k_d))
+    return Setpoint(
+        (s.q_ref[0], stop),
+        ZERO,
+        s.tau_ff,
+        ZERO,
+        (s.k_p[0], k_p),
+        (s.k_d[0], k_d),
+    )
 
 
 def blend(a: Setpoint, b: Setpoint, share: float) -> Setpoint:

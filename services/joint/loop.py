@@ -6,7 +6,8 @@ import msgspec
 
 from services.joint.controller import JointController
 from services.joint.differential import motor_torque
-from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.drivers.base import Drive, DriveReading, DriveStatus
+from shared import log
 from shared.bus import Latest, Publisher
 from shared.clock import NS_PER_MS, now_ns
 from shared.config import RobotConfig
@@ -16,10 +17,11 @@ from shared.process import StopFlag
 READ_TIMEOUT_S = 0.005
 """A cycle without an encoder sample runs all the same: ages and the failsafe go on."""
 
-ESTOP_EVERY = 8
-"""Cycles between two looks for an emergency stop: 16 ms at 500 Hz, against a sink of 5 s."""
 ARM_EVERY_NS = 500 * NS_PER_MS
 """Arming is asked for again after this long, while DISARMED."""
+
+ARM_TRIES = 10
+"""A drive that has not armed by then needs a person."""
 
 
 class Ports(msgspec.Struct, frozen=True):
@@ -44,6 +46,7 @@ class JointLoop:
         self._gear_ratio = config.joint.gear_ratio
         self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._arm_at_ns = 0
+        self._tries = 0
         self._estop = False
 
     def run(self, stop: StopFlag) -> None:
@@ -57,10 +60,9 @@ class JointLoop:
         drive, ports, controller = self._drive, self._ports, self._controller
         reading = drive.read(READ_TIMEOUT_S)
         now = now_ns()
-        if controller.cycle % ESTOP_EVERY == 0:
-            estop = ports.estops.take()
-            if estop is not None:
-                self._estop = self._estop or estop.engaged  # released by a restart only
+        self._estop = self._estop or ports.estops.take() is not None
+        if self._tries == 0 and reading is not None and reading.status is DriveStatus.ARMED:
+            reading = msgspec.structs.replace(reading, status=DriveStatus.IDLE)  # not by us
         result = controller.step(now, reading, ports.commands.take(), self._estop)
         drive.write_torque(motor_torque(result.tau, self._gear_ratio))
         if controller.cycle % self._state_every == 0:
@@ -69,11 +71,25 @@ class JointLoop:
             ports.events.put(result.event)
             if result.event.mode_after == Mode.FAULT:
                 drive.idle()  # one axis that disarms leaves its sibling's torque on
-        mode = controller.failsafe.mode
-        if mode is Mode.DISARMED and reading is not None and reading.status is DriveStatus.IDLE:
-            self._arm(now)
+        if controller.failsafe.mode is Mode.DISARMED and now >= self._arm_at_ns:
+            self._arm(now, reading)
 
-    def _arm(self, now: int) -> None:
-        if now >= self._arm_at_ns:
-            self._arm_at_ns = now + ARM_EVERY_NS
+    def _arm(self, now: int, reading: DriveReading | None) -> None:
+        """Ask the drive to arm, with its errors cleared, if the joint is where it may be."""
+        if reading is None or reading.status is DriveStatus.LOST:
+            return
+        self._arm_at_ns = now + ARM_EVERY_NS
+        if not self._controller.inside_limits():
+            log.get("xrl").error(
+                "not armed: the joint is at phi %.3f, theta %.3f rad, outside its limits; "
+                "bring it inside, or correct the joint's zero",
+                *self._controller.q,
+            )
+        elif self._tries < ARM_TRIES:
+            self._tries += 1
             self._drive.arm()
+        elif self._tries == ARM_TRIES:
+            self._tries += 1
+            log.get("xrl").error(
+                "not armed after %d tries: drive error 0x%x", ARM_TRIES, reading.error
+            )

@@ -18,10 +18,10 @@ from services.recorder.mcap_log import FILE_NAME, SCHEMA_VERSION, RunWriter, Sou
 from shared import log, topics
 from shared.bus import open_session
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
-from shared.config import RecorderConfig
+from shared.config import RecorderConfig, load
 from shared.exceptions import ConfigError, RunError
 from shared.priority import raise_priority
-from shared.process import StopFlag, load_config, run_service, service_parser
+from shared.process import StopFlag, run_service, service_parser
 
 FIFO_PRIORITY: Final = 5
 """Below every control service, above what has no such priority: a starved recorder's
@@ -103,7 +103,7 @@ def main() -> int:
     stop = StopFlag()
     logger = log.setup("recorder")
     arguments = _arguments()
-    config = load_config(arguments.config)
+    config = load(arguments.config)
     attachments = _attachments(arguments)
     metadata = _metadata(config.name, arguments)
     recorded = {key: t for key, t in topics.all_keys(config.name).items() if t.recorded}

@@ -68,6 +68,7 @@ class World:
         self.time = 0.0
         self._start_time = math.inf
         self._fallen = False
+        self._hand_on = scenario.hand
         self.hand = HandForce(0.0, 0.0)
         self.load_n = 0.0
         self.push: Vector3 = (0.0, 0.0, 0.0)
@@ -110,6 +111,10 @@ class World:
         """Let the scenario begin now."""
         self._start_time = self.time
 
+    def let_go(self) -> None:
+        """Let the operator take the hand off."""
+        self._hand_on = False
+
     def release_hoist(self) -> None:
         """Let the hoist down."""
         self._releasing = True
@@ -151,7 +156,7 @@ class World:
         arm_x = r[0] * x + r[1] * y + r[2] * z
         arm_y = r[3] * x + r[4] * y + r[5] * z
         self.hand = HandForce(0.0, 0.0)
-        if self._scenario.hand and self.hoist == 0.0:
+        if self._hand_on and self.hoist == 0.0:
             height = float(data.qpos[2]) + r[6] * x + r[7] * y + r[8] * z
             _, _, v_z, w_x, w_y, w_z = data.qvel[:6].tolist()  # omega in torso axes
             omega_x = r[0] * w_x + r[1] * w_y + r[2] * w_z

@@ -252,7 +252,17 @@ def test_assist_wanted_at_align_is_within_the_cap(
 ) -> None:
     q = closed(1.188)
     assert law.tick(q, STILL, 1e4, DT, align=True).assist == robot.assist.force_max
-    assert law.tick(q, STILL, -1e4, DT, align=True).assist == 0.0
+    assert Hocca(robot).tick(q, STILL, -1e4, DT, align=True).assist == 0.0
+
+
+def test_assist_is_rate_limited_while_aligning_too(
+    robot: RobotConfig, law: Hocca, closed: Closed
+) -> None:
+    """Only the very first tick takes over at once what HOLD carries."""
+    q = closed(1.188)
+    assert law.tick(q, STILL, 0.0, DT, align=True).assist == 0.0
+    step = robot.assist.rate_max * DT
+    assert law.tick(q, STILL, 200.0, DT, align=True).assist == pytest.approx(step)
 
 
 def test_references_come_back_after_a_lift_past_the_knees_soft_stop(

@@ -16,15 +16,16 @@ import pytest
 
 from shared import topics
 from shared.bus import Publisher, open_session
+from shared.config import load
 from shared.exceptions import RunError
 from shared.messages import JointState
-from shared.process import DEFAULT_CONFIG, load_config
+from shared.process import DEFAULT_CONFIG
 from tests.recorder import runs
 from tools.run_log import RunLog, read_run
 
 pytestmark = pytest.mark.system
 
-CONFIG = load_config(DEFAULT_CONFIG)
+CONFIG = load(DEFAULT_CONFIG)
 KEY = topics.JOINT_STATE.key(CONFIG.name, "knee_right")
 DEADLINE_S = 20.0
 

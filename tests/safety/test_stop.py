@@ -8,8 +8,16 @@ import pytest
 from services.joint.drivers.base import DriveStatus
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
+from shared.joints import kind_of
 from shared.messages import Cause, Mode
 from tests.joint.helpers import Bench
+
+
+def at_rest(robot: RobotConfig, module: str) -> Bench:
+    """Return a bench whose joint is inside its limits."""
+    bench = Bench(robot, module)
+    bench.q = {"ankle": (0.02, 0.14), "knee": (0.02, -1.0), "hip": (0.02, 0.9)}[kind_of(module)]
+    return bench
 
 
 @pytest.fixture
@@ -44,26 +52,50 @@ def test_emergency_stop_leads_from_any_mode_to_damp(bench: Bench, before: Mode) 
 
 
 @pytest.mark.parametrize("before", [Mode.HOLD, Mode.TRACK])
-def test_damp_has_no_stiffness_at_all(bench: Bench, before: Mode) -> None:
+@pytest.mark.parametrize("module", ["knee_right", "hip_left"])
+def test_the_axes_that_sink_have_no_stiffness_in_damp(
+    robot: RobotConfig, before: Mode, module: str
+) -> None:
+    bench = at_rest(robot, module)
     bench.to(before)
     bench.cycle(estop=True)
     bench.run(20)
     here = bench.cycle().tau
-    bench.q = (bench.q[0] + 0.2, bench.q[1] - 0.2)
+    bench.q = (bench.q[0], bench.q[1] - 0.2)
     np.testing.assert_allclose(bench.cycle().tau, here, atol=0.05)
 
 
-def test_damp_fades_the_feedforward_to_zero_in_its_time(robot: RobotConfig, bench: Bench) -> None:
+@pytest.mark.parametrize(
+    ("module", "axis"), [("ankle_left", 0), ("ankle_left", 1), ("knee_right", 0), ("hip_right", 0)]
+)
+def test_ankles_and_frontal_axes_keep_holding_in_damp(
+    robot: RobotConfig, module: str, axis: int
+) -> None:
+    """With every stiffness off, an inverted pendulum is left: it toppled."""
+    bench = at_rest(robot, module)
+    bench.to_hold()
+    bench.cycle(estop=True)
+    bench.run(3000)
+    moved = [bench.q[0], bench.q[1]]
+    moved[axis] += 0.01
+    bench.q = (moved[0], moved[1])
+    stand = robot.stand_gains(module).k_p[axis]
+    assert bench.run(5)[-1].tau[axis] == pytest.approx(-0.01 * stand)
+
+
+def test_damp_fades_the_sinking_feedforward_to_zero_in_its_time(
+    robot: RobotConfig, bench: Bench
+) -> None:
     bench.to_track(tau_ff=(3.0, -25.0))
     bench.cycle(estop=True)
     cycles = round(robot.joint_service.damp_fade_s * robot.joint_service.rate_hz)
-    taus = np.abs([result.tau for result in bench.run(cycles)])
-    assert np.all(np.diff(taus, axis=0) <= 0.0)
-    assert taus[-2].max() > 0.0
-    assert bench.controller.tau == (0.0, 0.0)
+    theta = np.abs([result.tau[1] for result in bench.run(cycles)])
+    assert np.all(np.diff(theta) <= 0.0)
+    assert theta[-2] > 0.0
+    assert bench.controller.tau[1] == 0.0
 
 
-def test_torque_in_damp_never_exceeds_what_is_left_of_the_feedforward(
+def test_torque_in_damp_is_what_is_left_of_the_feedforward(
     robot: RobotConfig, bench: Bench
 ) -> None:
     bench.to_track(tau_ff=(3.0, -25.0), tau_coupled=(12.0, -9.0))
@@ -73,16 +105,28 @@ def test_torque_in_damp_never_exceeds_what_is_left_of_the_feedforward(
         tau = bench.cycle(bench.fresh()).tau  # a planner that has not heard changes nothing
         left = 1.0 - (bench.now_ns - entered_ns) / fade_ns
         if cycle:
-            np.testing.assert_allclose(tau, np.multiply((3.0, -25.0), left), atol=1e-9)
+            np.testing.assert_allclose(tau, (3.0, -25.0 * left), atol=1e-9)
     assert left > 0.0
 
 
 def test_damp_resists_motion(robot: RobotConfig, bench: Bench) -> None:
     bench.to_hold()
     bench.cycle(estop=True)
-    bench.v = (0.5, -0.3)
-    k_d = robot.joint_service.damp_k_d
-    assert bench.run(10)[-1].tau == pytest.approx((-k_d * 0.5, k_d * 0.3))
+    bench.v = (0.0, -0.3)
+    assert bench.run(10)[-1].tau[1] == pytest.approx(robot.joint_service.damp_k_d * 0.3)
+
+
+def test_a_knee_is_caught_before_it_folds_so_far_that_the_robot_topples(
+    robot: RobotConfig,
+) -> None:
+    bench = Bench(robot, "knee_left")
+    bench.to_hold()
+    bench.cycle(estop=True)
+    bench.run(3000)
+    stop = robot.joint_service.damp_knee_stop
+    bench.q = (bench.q[0], stop - 0.02)
+    caught = bench.run(5)[-1].tau[1]
+    assert caught == pytest.approx(0.02 * robot.stand_gains("knee_left").k_p[1])
 
 
 def test_emergency_stop_never_drops_the_load_that_the_springs_carried(bench: Bench) -> None:

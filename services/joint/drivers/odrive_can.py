@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable, Sequence
+from math import isfinite
 from typing import Final
 
 import can
@@ -109,7 +110,7 @@ class OdriveCan:
         deadline = now + int(timeout_s * NS_PER_S)
         if self._bus is None and not self._connect():
             time.sleep(max(0.0, timeout_s))
-            return self._reading(DriveStatus.LOST)
+            return self._silence(now_ns())
         while True:
             self._pump((deadline - now) / NS_PER_S)
             now = now_ns()
@@ -122,10 +123,16 @@ class OdriveCan:
                 return self._reading(self._status)
             if now >= deadline or self._bus is None:
                 break
-        if self._bus is None or not self._has_sample:
-            return self._reading(DriveStatus.LOST)
+        return self._silence(now)
+
+    def _silence(self, now: int) -> DriveReading | None:
+        """Return None while the drive may yet come back as it was, then LOST.
+
+        A link that failed counts as silence too: an interface that restarts is not a lost
+        drive.
+        """
         silent_ns = now - self._sample_ns
-        if silent_ns <= self._lost_after_ns:
+        if self._has_sample and silent_ns <= self._lost_after_ns:
             return None
         if silent_ns > REBOOT_MS * NS_PER_MS:
             self._forget()
@@ -195,8 +202,10 @@ class OdriveCan:
         for can_id, data in frames:
             axis = encoder_axis.get(can_id)
             if axis is not None and len(data) == 8:
-                self._estimates[axis] = _unpack_estimates(data)
-                self._fresh |= 1 << axis
+                pos, vel = estimates = _unpack_estimates(data)
+                if isfinite(pos) and isfinite(vel):  # what is no number is no sample
+                    self._estimates[axis] = estimates
+                    self._fresh |= 1 << axis
             elif (axis := self._heartbeat_axis.get(can_id)) is not None and len(data) == 8:
                 self._hear(axis, data)
 
@@ -275,7 +284,8 @@ class OdriveCan:
         self._bus = bus
         self.connections += 1
         self._fresh = 0
-        self._forget()
+        if not self._has_sample or now - self._sample_ns > self._lost_after_ns:
+            self._forget()
         self._receive = getattr(bus, "recv_many", None) or _slow_receive(bus)
         self._send = getattr(bus, "send_many", None) or _slow_send(bus)
         return True
