@@ -53,8 +53,8 @@ VENDORS = {
     "pinocchio": ["services/planner/model.py"],
     "casadi": ["services/planner/symbolic.py", "services/planner/kinematics.py"],
     "odrive": ["services/joint/drivers/odrive_usb.py"],
-    "mcap": ["services/recorder/mcap_log.py", "tools/run_log.py"],
-    "supervisor": ["tools/*.py"],
+    "mcap": ["services/recorder/mcap_log.py", "tools/runs/run_log.py"],
+    "supervisor": ["tools/supervision/*.py"],
     "can": [
         "shared/unix_can.py",
         "services/joint/drivers/odrive_can.py",

@@ -14,8 +14,8 @@ from shared.config import SERVICES, load
 from shared.exceptions import ConfigError, FleetError
 from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
-from tools import fleet
-from tools.run_dir import RunDir, supervisor_config
+from tools.supervision import fleet
+from tools.supervision.run_dir import RunDir, supervisor_config
 
 
 @pytest.fixture

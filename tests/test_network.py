@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from shared.clock import NS_PER_MS
-from tools.network import Impairment, Link
+from tools.runs.network import Impairment, Link
 
 
 def arrivals(link: Link[int], until_ms: int) -> list[tuple[int, int]]:

@@ -14,11 +14,11 @@ from shared.bus import open_session
 from shared.config import SERVICES, RobotConfig
 from shared.robot_model import mjcf
 from shared.scenario import Scenario
-from tools import experiment, figure, verdict, verdict_table
-from tools.conductor import Conductor
-from tools.live_view import LiveView
-from tools.run_log import read_run
-from tools.supervise import Fleet
+from tools.runs import experiment, figure, verdict, verdict_table
+from tools.runs.conductor import Conductor
+from tools.runs.live_view import LiveView
+from tools.runs.run_log import read_run
+from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_verb
 
 EXIT_FELL = 1

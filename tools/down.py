@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from tools.supervise import Fleet
+from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 

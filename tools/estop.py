@@ -16,7 +16,7 @@ from shared.config import load
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.messages import Estop, JointState, Mode
-from tools.supervise import Fleet
+from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 REPEAT_S = 0.05

@@ -6,7 +6,7 @@ import argparse
 import signal
 from typing import Final
 
-from tools.supervise import Fleet
+from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 SIGNALS: Final = {

@@ -22,10 +22,10 @@ from shared.messages import Message
 from shared.robot_model import mjcf
 from shared.scenario import Scenario
 from shared.topics import Topic
-from tools import experiment, figure, verdict, verdict_table
-from tools.lockstep import Lockstep
-from tools.network import Impairment
-from tools.run_log import read_run
+from tools.runs import experiment, figure, verdict, verdict_table
+from tools.runs.lockstep import Lockstep
+from tools.runs.network import Impairment
+from tools.runs.run_log import read_run
 from tools.verbs import Subparsers, add_verb
 
 AFTER_FALL_S = 1.0

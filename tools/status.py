@@ -19,7 +19,7 @@ from shared.config import load
 from shared.joints import MODULES
 from shared.messages import JointState, Message, Mode
 from shared.topics import TOPICS
-from tools.supervise import Fleet
+from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}

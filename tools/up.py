@@ -7,11 +7,9 @@ import time
 from pathlib import Path
 
 from shared.exceptions import FleetError
-from shared.process import DEFAULT_CONFIG
-from tools.supervise import Fleet
+from tools.runs.experiment import scenario_file
+from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
-
-SCENARIOS = DEFAULT_CONFIG.parent / "scenarios"
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -59,16 +57,3 @@ def run(args: argparse.Namespace) -> int:
         f"(logs: {fleet.run.logs}, record: {out}); `xrl status` shows them, `xrl down` stops them"
     )
     return 0
-
-
-def scenario_file(name: str) -> Path:
-    """Return the file of a scenario given by name or path, absolute.
-
-    Raises:
-        FleetError: there is none; the message lists the names.
-    """
-    path = Path(name) if name.endswith(".toml") else SCENARIOS / f"{name}.toml"
-    if not path.is_file():
-        known = ", ".join(sorted(file.stem for file in SCENARIOS.glob("*.toml"))) or "none yet"
-        raise FleetError(f"no scenario {name!r}; one of {known}, or the path of a .toml file")
-    return path.absolute()

@@ -9,7 +9,7 @@ clocks; one offset, taken at the start and written as `offset_ns` into metadata 
 maps them to ns since 1970 so that viewers show dates: wall = monotonic + offset_ns.
 `publish_time` therefore means something only for senders on the recorder's host.
 
-A file whose writer was killed has no summary: read it with `tools/run_log.py`.
+A file whose writer was killed has no summary: read it with `tools/runs/run_log.py`.
 """
 
 from __future__ import annotations

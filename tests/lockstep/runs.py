@@ -13,8 +13,8 @@ from shared import scenario
 from shared.config import RobotConfig
 from shared.messages import SimTruth
 from shared.scenario import Keyframe, Kill, Push, Restart, Scenario
-from tools.lockstep import Lockstep
-from tools.network import Impairment
+from tools.runs.lockstep import Lockstep
+from tools.runs.network import Impairment
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 

@@ -9,7 +9,7 @@ import pytest
 from shared.config import RobotConfig
 from shared.messages import Mode
 from tests.lockstep.runs import still
-from tools.lockstep import Lockstep
+from tools.runs.lockstep import Lockstep
 
 
 @pytest.mark.parametrize("height", [1.188, 1.0, 0.9])

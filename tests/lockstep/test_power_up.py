@@ -5,7 +5,7 @@ from __future__ import annotations
 from shared.config import RobotConfig
 from shared.messages import Mode, SimTruth
 from tests.lockstep.runs import push, still
-from tools.lockstep import Lockstep
+from tools.runs.lockstep import Lockstep
 
 
 def stand_without_planner(robot: RobotConfig, seconds: float) -> tuple[Lockstep, SimTruth]:

@@ -10,7 +10,7 @@ import pytest
 from shared import topics
 from shared.messages import PlannerStatus
 from tools import cli
-from tools.run_log import read_run
+from tools.runs.run_log import read_run
 
 
 def sim(out: Path, *flags: str) -> int:

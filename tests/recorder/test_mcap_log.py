@@ -13,7 +13,7 @@ from shared import codec
 from shared.exceptions import RunError
 from tests.recorder import runs
 from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, Queue, item
-from tools.run_log import read_run
+from tools.runs.run_log import read_run
 
 
 def test_every_recorded_topic_has_a_channel_and_a_schema(tmp_path: Path) -> None:

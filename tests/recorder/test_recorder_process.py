@@ -21,7 +21,7 @@ from shared.exceptions import RunError
 from shared.messages import JointState
 from shared.process import DEFAULT_CONFIG
 from tests.recorder import runs
-from tools.run_log import RunLog, read_run
+from tools.runs.run_log import RunLog, read_run
 
 pytestmark = pytest.mark.system
 

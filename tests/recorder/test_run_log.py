@@ -10,7 +10,7 @@ from shared.exceptions import RunError
 from shared.messages import Wrench
 from tests.recorder import runs
 from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Queue, item
-from tools.run_log import read_run
+from tools.runs.run_log import read_run
 
 WRENCH_KEY = topics.WRENCH.key(ROBOT)
 

@@ -13,8 +13,8 @@ import pytest
 from shared import topics
 from shared.config import RobotConfig
 from shared.joints import MODULES
-from tools import procfs
-from tools.run_log import read_run
+from tools.runs.run_log import read_run
+from tools.supervision import procfs
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 

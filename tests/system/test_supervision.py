@@ -17,8 +17,9 @@ import pytest
 
 from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
-from tools import cli, procfs
-from tools.supervise import Fleet, ServiceInfo
+from tools import cli
+from tools.supervision import procfs
+from tools.supervision.supervise import Fleet, ServiceInfo
 
 pytestmark = pytest.mark.system
 
@@ -230,7 +231,7 @@ def test_a_port_in_use_is_refused_before_anything_starts(run_dir: Path, tmp_path
 def up_in_a_process(run_dir: Path, table: Path, *, then: str = "") -> subprocess.Popen[str]:
     """Start a fleet as `xrl up` does, in a process of its own that may be interrupted."""
     code = (
-        "import sys, time, tools.cli, tools.up, tools.supervise as s\n"
+        "import sys, time, tools.cli, tools.up, tools.supervision.supervise as s\n"
         "from pathlib import Path\n"
         "def run(args):\n"
         f"    s.Fleet.start(args.config, args.run_dir, table_path=Path({str(table)!r}),"

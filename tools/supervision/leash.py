@@ -1,6 +1,6 @@
 """supervisord on a leash: no service outlives its supervisor, whatever kills it.
 
-`python -m tools.leash [--parent PID] -- SUPERVISORD ARGUMENTS`. The kernel ends each
+`python -m tools.supervision.leash [--parent PID] -- SUPERVISORD ARGUMENTS`. The kernel ends each
 service with SIGKILL when the supervisor dies (PR_SET_PDEATHSIG), and, with `--parent`,
 asks the supervisor to stop the fleet when that process dies.
 """

@@ -1,7 +1,7 @@
 """A fleet of services under supervisord: start, look, signal, stop.
 
 supervisord restarts what ends, with a growing delay for what ends at once. It runs on a
-leash (`tools.leash`): if it is killed, so is every service.
+leash (`tools.supervision.leash`): if it is killed, so is every service.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Self
 
 from shared.exceptions import FleetError
-from tools import fleet, procfs
-from tools.run_dir import Manifest, RunDir, supervisor_config
-from tools.supervisor_client import RefusedError, ServiceInfo, Supervisor
+from tools.supervision import fleet, procfs
+from tools.supervision.run_dir import Manifest, RunDir, supervisor_config
+from tools.supervision.supervisor_client import RefusedError, ServiceInfo, Supervisor
 
 _POLL_S = 0.1
 _KILLED_S = 5.0  # until the kernel has cleared away what SIGKILL has ended
@@ -213,11 +213,11 @@ class Fleet:
 
     def _launch(self, environment: Mapping[str, str], lock: int, *, leashed: bool) -> None:
         leash = ["--parent", str(os.getpid())] if leashed else []
-        command = [sys.executable, "-m", "tools.leash", *leash, "--", "--nodaemon"]
+        command = [sys.executable, "-m", "tools.supervision.leash", *leash, "--", "--nodaemon"]
         command += ["--configuration", str(self.run.supervisor_config)]
         marked = {**os.environ, **environment, procfs.FLEET_VARIABLE: str(self.run.path)}
         # An interrupt between fork and exec would leave a process that nobody can find;
-        # `tools.leash` unblocks in the child.
+        # `tools.supervision.leash` unblocks in the child.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
         try:
             with self.run.supervisor_stderr.open("wb") as output:

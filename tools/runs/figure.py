@@ -14,8 +14,8 @@ from shared import topics
 from shared.clock import NS_PER_S
 from shared.joints import MODULES
 from shared.messages import JointState, Mode, RunEvent, RunEventKind
-from tools.run_log import RunLog
-from tools.verdict import Summary, course
+from tools.runs.run_log import RunLog
+from tools.runs.verdict import Summary, course
 
 mpl.use("Agg")
 

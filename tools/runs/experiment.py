@@ -15,12 +15,14 @@ import msgspec
 
 from shared import config, scenario
 from shared.config import SERVICES, LawConfig, RobotConfig
-from shared.exceptions import RunError
+from shared.exceptions import FleetError, RunError
+from shared.process import DEFAULT_CONFIG
 from shared.scenario import SIGNALS, Kill, Push, Restart, Scenario
-from tools.up import scenario_file
 from tools.verbs import add_config
 
 E = TypeVar("E", Kill, Restart, Push)
+
+SCENARIOS = DEFAULT_CONFIG.parent / "scenarios"
 
 UNJUDGED = ("simulator", "recorder")
 """A run cannot be judged without their part of it."""
@@ -112,6 +114,19 @@ def parse_push(text: str) -> Push:
         )
     t, duration, x, y, z = (float(number) for number in match.groups())
     return Push(at=t, duration=duration, force=(x, y, z))
+
+
+def scenario_file(name: str) -> Path:
+    """Return the file of a scenario given by name or path, absolute.
+
+    Raises:
+        FleetError: there is none; the message lists the names.
+    """
+    path = Path(name) if name.endswith(".toml") else SCENARIOS / f"{name}.toml"
+    if not path.is_file():
+        known = ", ".join(sorted(file.stem for file in SCENARIOS.glob("*.toml"))) or "none yet"
+        raise FleetError(f"no scenario {name!r}; one of {known}, or the path of a .toml file")
+    return path.absolute()
 
 
 def make_scenario(args: argparse.Namespace) -> Scenario:

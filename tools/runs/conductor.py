@@ -26,8 +26,8 @@ from shared.messages import (
     SimTruth,
 )
 from shared.scenario import Kill, Push, Restart, Scenario
-from tools import procfs
-from tools.supervise import Fleet
+from tools.supervision import procfs
+from tools.supervision.supervise import Fleet
 
 READY_TIMEOUT_S: Final = 30.0
 SETTLE_S: Final = 2.0

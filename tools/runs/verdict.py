@@ -16,7 +16,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.messages import JointEvent, JointState, Mode, RunEvent, RunEventKind, SimTruth
-from tools.run_log import RunLog
+from tools.runs.run_log import RunLog
 
 Array = NDArray[np.float64]
 Summary = dict[str, Any]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from tools.verdict import LIMITS, Summary
+from tools.runs.verdict import LIMITS, Summary
 
 
 def show(summary: Summary, console: Console) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from shared.exceptions import FleetError
-from tools.fleet import SUPERVISOR_SOCKET, UNIX, Plan, is_listening
+from tools.supervision.fleet import SUPERVISOR_SOCKET, UNIX, Plan, is_listening
 
 _NEVER_GIVE_UP = 1_000_000
 """Starts that may fail in a row; each waits a second longer than the one before."""

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from tools.conductor import Snapshot
+from tools.runs.conductor import Snapshot
 
 PERIOD_S = 0.1
 PLAIN_PERIOD_S = 1.0

@@ -1,6 +1,6 @@
 """Which processes make up the fleet, and whether they can be started here.
 
-The table is `deploy/processes.toml`; `tools.supervise` runs what this file selects.
+The table is `deploy/processes.toml`; `tools.supervision.supervise` runs what this file selects.
 """
 
 from __future__ import annotations

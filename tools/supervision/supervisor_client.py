@@ -14,8 +14,8 @@ import msgspec
 from supervisor.xmlrpc import SupervisorTransport
 
 from shared.exceptions import FleetError
-from tools.procfs import is_suspended
-from tools.run_dir import RunDir
+from tools.supervision.procfs import is_suspended
+from tools.supervision.run_dir import RunDir
 
 _TIMEOUT_S = 3.0
 _ENDED = re.compile(r"(?:exited|stopped): (\S+) \((.*?)(?:; (?:not )?expected)?\)$")

@@ -34,7 +34,7 @@ from shared.messages import (
 )
 from shared.scenario import Kill, Push, Restart, Scenario
 from shared.topics import Topic
-from tools.network import Impairment, Link
+from tools.runs.network import Impairment, Link
 
 SETTLE_NS = NS_PER_S
 """The scenario starts this long after all six modules track."""
