@@ -121,6 +121,17 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (setting("simulation.stand_height", 1.3), "simulation.stand_height", "1.3", "0.762 to 1.296"),
     (setting("simulation.stand_height", 0.76), "simulation.stand_height", "0.76", "0.762 to"),
     (setting("law.K_p.0", 0.0), "law.K_p[0]", "0 in a direction", "positive"),
+    (setting("geometry.l1", 1.1), "geometry.l1", "1.1 m", "shorter than the shin"),
+    (setting("drive.current_lim", 5.0), "drive.current_lim", "5 A", "at least 39.9 A"),
+    (setting("drive.watchdog_timeout", 0.01), "drive.watchdog_timeout", "0.01 s", "at least 0.02"),
+    (setting("drive.encoder_period_ms", 10), "drive.encoder_period_ms", "10 ms", "2 ms"),
+    (
+        setting("simulation.encoder_rate_hz", 50.0),
+        "simulation.encoder_rate_hz",
+        "50 Hz",
+        "500 Hz: they are its clock",
+    ),
+    (setting("joint_service.state_rate_hz", 300.0), "joint_service.state_rate_hz", "300", "whole"),
     # timing
     (setting("joint_service.state_rate_hz", 501.0), "joint_service.state_rate_hz", "501", "500"),
     (setting("planner.rate_hz", 251.0), "planner.rate_hz", "251", "at most 250"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import struct
 import tempfile
@@ -431,3 +432,28 @@ def test_front_sets_positions_and_gains_and_ignores_other_nodes(rig: Rig, path: 
     assert (bank.input_pos[5], bank.input_vel[5], bank.input_torque[5]) == (1.5, 0.25, -0.5)
     assert (bank.pos_gain[5], bank.vel_gain[5], bank.vel_integrator_gain[5]) == (30.0, 0.5, 0.0)
     assert not np.delete(bank.input_torque, [4, 5]).any()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_an_estimate_that_is_no_number_is_no_sample(rig: Rig, path: Path, bad: float) -> None:
+    driver = connected(rig, path)
+    for node in NODES:
+        can_id = arbitration_id(node, Command.GET_ENCODER_ESTIMATES)
+        rig.hub.broadcast([(can_id, pack_two_floats(bad, 0.0))])
+    assert driver.read(0.01) is None
+    assert rig.cycle(driver).pos_turns == (0.0, 0.0), "the next good one counts"
+    driver.close()
+
+
+def test_a_link_that_fails_and_comes_back_at_once_is_no_lost_drive(path: Path) -> None:
+    """An interface that restarts: the drive has held its last torque all the while."""
+    rig = Rig(path)
+    driver = connected(rig, path)
+    arm(rig, driver)
+    rig.hub.close()
+    assert driver.read(0.0) is None, "silence, not yet lost"
+    rig.hub = UnixCanHub(path)
+    reading = driver.read(0.0)
+    assert reading is None or reading.status != DriveStatus.LOST
+    driver.close()
+    rig.hub.close()
