@@ -32,6 +32,7 @@ class Mode(IntEnum):
 class Cause(IntEnum):
     """Why a joint service changed its state."""
 
+    NONE = 0
     DRIVE_ARMED = 1
     COMMANDS_FRESH = 2
     COMMAND_STALE = 3
@@ -85,6 +86,8 @@ class JointState(Message, frozen=True):
     """Joint torques sent to the drive in this cycle, in N m, after the gate."""
     mode: int
     """`Mode`."""
+    cause: int
+    """`Cause` of the last change of mode; 0 before the first."""
     ready: bool
     """True if fresh commands have come for long enough to track, were `hold` lifted."""
     age_ns: int

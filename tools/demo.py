@@ -18,6 +18,7 @@ from tools.runs import experiment, figure, verdict, verdict_table
 from tools.runs.conductor import Conductor
 from tools.runs.live_view import LiveView
 from tools.runs.run_log import read_run
+from tools.supervision import procfs
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_verb
 
@@ -55,8 +56,17 @@ def run(args: argparse.Namespace) -> int:
     console = Console()
     robot, story = experiment.make_robot(args), experiment.make_scenario(args)
     out = experiment.make_out(args.out, "demo")
-    console.print(f"[bold]{story.name}[/]: {story.about}")
-    cpu_pct = run_live(args, robot, story, out, console)
+    console.print(f"[bold]{story.name}[/]: {story.about}{experiment.in_words(story)}")
+    for other in procfs.fleets():
+        console.print(
+            f"[yellow]another fleet runs in {other}: two do not fit on two cores; "
+            f"`xrl down --run-dir {other}` stops it[/]"
+        )
+    try:
+        cpu_pct = run_live(args, robot, story, out, console)
+    except KeyboardInterrupt:
+        console.print(f"interrupted; what was recorded until then is in {out}")
+        raise
     return judge(out, story, cpu_pct, console)
 
 
@@ -74,7 +84,11 @@ def run_live(
     killed = {kill.service for kill in story.kill}
     run_dir = Path(tempfile.mkdtemp(prefix="xrl-demo-", dir="/tmp"))
     try:
-        console.print("starting ten services ...", style="dim")
+        console.print(
+            "starting ten services; modes below: right ankle, knee, hip, then left; "
+            "D disarmed, H hold, T track, F fault, - silent",
+            style="dim",
+        )
         fleet = Fleet.start(
             robot_path.absolute(),
             run_dir,
@@ -111,6 +125,8 @@ def _recorder_arguments(out: Path, scenario_path: Path, model_path: Path) -> lis
         str(out.absolute()),
         "--scenario",
         str(scenario_path.absolute()),
+        "--scenario-text",
+        scenario_path.parent.name,
         "--attach",
         f"model.xml={model_path.absolute()}",
     ]

@@ -24,8 +24,9 @@ def add_parser(subparsers: Subparsers) -> None:
         "kill",
         """
         xrl kill planner                        # dead at once; the supervisor starts it again
-        xrl kill knee_left --signal STOP        # frozen, as a hung process is
-        xrl kill knee_left --signal CONT        # and on again
+        xrl kill planner --signal STOP          # frozen, as a hung process is
+        xrl kill planner --signal CONT          # and on again
+        xrl kill knee_left                      # its drive disarms; the restart arms it anew
         """,
     )
     parser.add_argument("service", metavar="SERVICE", help="a name that `xrl status` shows")

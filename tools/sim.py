@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     robot, story = experiment.make_robot(args), experiment.make_scenario(args)
     network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
     out = experiment.make_out(args.out, "sim")
-    console.print(f"[bold]{story.name}[/]: {story.about}")
+    console.print(f"[bold]{story.name}[/]: {story.about}{experiment.in_words(story)}")
     begin = time.monotonic()
     simulated_s = simulate(robot, story, network, args.seed, out, console)
     factor = simulated_s / (time.monotonic() - begin)

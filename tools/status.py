@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
+from rich import box
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -17,7 +18,7 @@ from shared.bus import Latest, Session, open_session
 from shared.clock import NS_PER_S, now_ns
 from shared.config import load
 from shared.joints import MODULES
-from shared.messages import JointState, Message, Mode
+from shared.messages import Cause, JointState, Message, Mode
 from shared.topics import TOPICS
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
@@ -33,6 +34,8 @@ _WINDOW_S: Final = 0.5
 _FRESH_S: Final = 1.0
 """An older message is history: its sender is dead, suspended or cut off."""
 _POLL_S: Final = 0.002
+LEFT_BY_RESTART: Final = (Mode.FAULT.name, Mode.DAMP.name)
+
 _WORDS: Final = ("state", "last exit")
 _GOOD: Final = ("running", "starting")
 
@@ -58,6 +61,8 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """Name of its `Mode`; None if its joint service is not heard now."""
     tier: int | None
     """See `TIERS`; None in every other mode."""
+    cause: str | None
+    """Name of the `Cause` of its last change of mode."""
 
 
 class FleetStatus(msgspec.Struct, frozen=True):
@@ -185,14 +190,16 @@ def look(fleet: Fleet, ears: Mapping[str, Ear]) -> FleetStatus:
 def module_status(state: Message | None) -> ModuleStatus:
     """Return a module's mode and tier from the newest state of its joint service."""
     if not isinstance(state, JointState):
-        return ModuleStatus(None, None)
+        return ModuleStatus(None, None, None)
     mode = Mode(state.mode)
-    return ModuleStatus(mode.name, TIERS.get(mode))
+    return ModuleStatus(mode.name, TIERS.get(mode), Cause(state.cause).name)
 
 
 def tables(status: FleetStatus) -> Group:
     """Return the status as two tables for the terminal."""
-    services = Table(title=f"services in {status.run_dir}", title_justify="left")
+    services = Table(
+        title=f"services in {status.run_dir}", title_justify="left", box=box.SIMPLE_HEAD
+    )
     services.add_column("service", no_wrap=True, min_width=max(map(len, status.services)))
     for heading in (
         "state",
@@ -204,7 +211,9 @@ def tables(status: FleetStatus) -> Group:
         "last exit",
     ):
         words = heading in _WORDS
-        services.add_column(heading, justify="left" if words else "right", no_wrap=not words)
+        services.add_column(
+            heading, justify="left" if words else "right", no_wrap=heading != "last exit"
+        )
     for name, row in status.services.items():
         services.add_row(
             name,
@@ -216,11 +225,13 @@ def tables(status: FleetStatus) -> Group:
             str(row.restarts),
             row.last_exit,
         )
-    modules = Table(title="modules", title_justify="left")
-    for heading in ("module", "mode", "tier"):
+    modules = Table(title="modules", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("module", "mode", "tier", "because", "to leave it"):
         modules.add_column(heading)
     for name, module in status.modules.items():
-        modules.add_row(name, module.mode or "not heard", str(module.tier or "-"))
+        way_out = f"xrl kill {name} (a restart)" if module.mode in LEFT_BY_RESTART else ""
+        mode = module.mode or "not heard"
+        modules.add_row(name, mode, str(module.tier or "-"), module.cause or "", way_out)
     return Group(services, modules)
 
 

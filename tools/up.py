@@ -7,9 +7,12 @@ import time
 from pathlib import Path
 
 from shared.exceptions import FleetError
-from tools.runs.experiment import scenario_file
+from tools.runs.experiment import make_out, scenario_file
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
+
+SETTLE_S = 3.0
+"""A scenario starts so long after the hoist is down."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -34,7 +37,8 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--scenario",
         metavar="NAME|FILE",
-        help="what the simulated operator does: a file, or a name from deploy/scenarios",
+        help="what the simulated operator does once the robot stands: a file, or a name from "
+        "deploy/scenarios (its kills are left to you)",
     )
     parser.add_argument(
         "--no-sim",
@@ -46,11 +50,14 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Start the fleet and say where it is."""
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
+    make_out(out, "up")
     overrides = {"recorder": ["--out", str(out.absolute())]}
     if args.scenario is not None:
         if args.no_sim:
             raise FleetError("--scenario is for the simulator, and --no-sim starts none; leave one")
-        overrides["simulator"] = ["--scenario", str(scenario_file(args.scenario))]
+        path = str(scenario_file(args.scenario))
+        overrides["simulator"] = ["--scenario", path, "--autostart", str(SETTLE_S)]
+        overrides["recorder"] += ["--scenario", path, "--scenario-text", args.scenario]
     fleet = Fleet.start(args.config, args.run_dir, overrides=overrides, simulation=not args.no_sim)
     print(
         f"{len(fleet.manifest.services)} services are up in {fleet.run.path} "

@@ -64,6 +64,7 @@ class JointController:
         self._changed_ns = 0
         self._last_cycle_ns = 0
         self._sampled_ns = 0
+        self._cause = 0
         self.q: Pair = law.ZERO
         self.v: Pair = law.ZERO
         self.tau: Pair = law.ZERO
@@ -102,6 +103,7 @@ class JointController:
         before = failsafe.mode
         cause = failsafe.advance(now_ns, self.timing, drive, estop)
         if cause is not None:
+            self._cause = int(cause)
             self._enter(now_ns, before)
         self._setpoint = self._evaluate(now_ns)
         tau_before = self.tau
@@ -130,6 +132,7 @@ class JointController:
             v=self.v,
             tau=self.tau,
             mode=int(failsafe.mode),
+            cause=self._cause,
             ready=failsafe.ready(now_ns, self.timing),
             age_ns=failsafe.age_ns(now_ns),
             session=failsafe.session,

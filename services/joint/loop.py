@@ -11,7 +11,7 @@ from shared import log
 from shared.bus import Latest, Publisher
 from shared.clock import NS_PER_MS, now_ns
 from shared.config import RobotConfig
-from shared.messages import Estop, JointCommand, JointEvent, JointState, Mode
+from shared.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode
 from shared.process import StopFlag
 
 READ_TIMEOUT_S = 0.005
@@ -71,6 +71,11 @@ class JointLoop:
             ports.events.put(result.event)
             if result.event.mode_after == Mode.FAULT:
                 drive.idle()  # one axis that disarms leaves its sibling's torque on
+                log.get("xrl").error(  # nothing is controlled any more: a line does no harm
+                    "FAULT: %s, drive error 0x%x; restart this service to leave it",
+                    Cause(result.event.cause).name,
+                    controller.drive_error,
+                )
         if controller.failsafe.mode is Mode.DISARMED and now >= self._arm_at_ns:
             self._arm(now, reading)
 

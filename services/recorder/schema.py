@@ -23,6 +23,7 @@ ENCODING: Final = "jsonschema"
 
 ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.JointState, "mode"): messages.Mode,
+    (messages.JointState, "cause"): messages.Cause,
     (messages.JointEvent, "mode_before"): messages.Mode,
     (messages.JointEvent, "mode_after"): messages.Mode,
     (messages.JointEvent, "cause"): messages.Cause,

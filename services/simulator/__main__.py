@@ -38,6 +38,12 @@ def main() -> int:
         "python -m services.simulator --scenario deploy/scenarios/squat.toml",
     )
     parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, help="scenario (TOML)")
+    parser.add_argument(
+        "--autostart",
+        type=float,
+        metavar="S",
+        help="start the scenario so long after the hoist is down (default: when told on the bus)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
     arguments = parser.parse_args()
     logger = log.setup("simulator")
@@ -64,7 +70,9 @@ def main() -> int:
         world = World(robot, story)
         logger.info("up, %s, scenario %s", granted, story.name)
         freeze_garbage()
-        SimulatorLoop(robot, world, bank, front, harness, ports).run(stop)
+        loop = SimulatorLoop(robot, world, bank, front, harness, ports)
+        loop.autostart_s = arguments.autostart
+        loop.run(stop)
     logger.info("stopped")
     return 0
 

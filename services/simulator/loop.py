@@ -52,6 +52,9 @@ class SimulatorLoop:
         self._truth_every = max(1, round(rate / simulation.truth_rate_hz))
         self._intent_every = max(1, round(rate / INTENT_RATE_HZ))
         self._slip_ns = round(simulation.late_slip_ms * NS_PER_MS)
+        self.autostart_s: float | None = None
+        """Start the scenario by itself, so long after the hoist is down."""
+        self._hoisted_step = 0
         self._torque = bank.torque
         self._steps = 0
         self._intents = 0
@@ -100,7 +103,12 @@ class SimulatorLoop:
         """Publish the truth, and look at what needs no more than its rate."""
         world, now = self._world, now_ns()
         control = self._ports.control.take()
-        if control is not None and control.start and world.scenario_s < 0.0:
+        if world.hoist > 0.0:
+            self._hoisted_step = self._steps
+        down_s = (self._steps - self._hoisted_step) * world.timestep
+        by_itself = self.autostart_s is not None and down_s > self.autostart_s
+        told = control is not None and control.start
+        if (told or by_itself) and world.scenario_s < 0.0:
             world.start()
             self._start_ns, self._start_step = now, self._steps
             self._lost_at_start_ns = self._lost_ns

@@ -35,6 +35,7 @@ def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
         "v": (0.0, 0.0),
         "tau": (0.0, 0.0),
         "mode": int(Mode.TRACK),
+        "cause": 0,
         "ready": True,
         "age_ns": -1,
         "session": 0,

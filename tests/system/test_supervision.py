@@ -39,8 +39,8 @@ with open_session(load(Path(sys.argv[1])), "ankle_right", Path(sys.argv[2])) as 
     for seq in range(100_000):
         publisher.put(JointState(
             t_ns=time.monotonic_ns(), seq=seq, q=zero, v=zero, tau=zero, mode=Mode.HOLD,
-            ready=False, age_ns=-1, session=0, command_seq=-1, cycle=seq, late=0, dropouts=0,
-            refused=0, drive_error=0))
+            cause=0, ready=False, age_ns=-1, session=0, command_seq=-1, cycle=seq, late=0,
+            dropouts=0, refused=0, drive_error=0))
         time.sleep(0.01)
 """
 
@@ -292,7 +292,7 @@ def test_status_shows_mode_tier_age_and_rate(
     assert ankle["state"] == "running"
     assert 20 < ankle["rate_hz"] < 150
     assert 0 <= ankle["age_s"] < 1
-    assert status["modules"] == {"ankle_right": {"mode": "HOLD", "tier": 2}}
+    assert status["modules"] == {"ankle_right": {"mode": "HOLD", "tier": 2, "cause": "NONE"}}
     assert status["services"]["planner"]["rate_hz"] is None
     assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
     assert "ankle_right" in capsys.readouterr().out

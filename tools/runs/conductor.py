@@ -39,6 +39,8 @@ SILENT_S: Final = 3.0
 LAST_WORDS_S: Final = 0.3
 """What was said last reaches the recorder in this time."""
 POLL_S: Final = 0.004
+UNHEARD_S: Final = 0.5
+"""A module that says nothing for so long is shown as silent."""
 PIDS_EVERY_S: Final = 1.0
 ENDING_S: Final = 3.0
 """A service that was asked to end has done so by then, or was killed by its supervisor."""
@@ -98,6 +100,7 @@ class Conductor:
         self._truth: SimTruth | None = None
         self._truth_at_s = time.monotonic()
         self._modes: dict[str, int] = {}
+        self._heard_s: dict[str, float] = {}
         self._said = 0
         self._start_ns = 0
         self._note = ""
@@ -210,6 +213,9 @@ class Conductor:
             state = latest.take()
             if state is not None:
                 self._modes[module] = state.mode
+                self._heard_s[module] = time.monotonic()
+            elif time.monotonic() - self._heard_s.get(module, 0.0) > UNHEARD_S:
+                self._modes.pop(module, None)
         truth = self._truths.take()
         if truth is not None:
             self._truth, self._truth_at_s = truth, time.monotonic()
@@ -236,7 +242,7 @@ class Conductor:
             self._say(RunEventKind.RESTARTED, row.service, "")
             self._fleet.start_service(row.service)
             self._next_pids_s = 0.0
-            self._note = f"{row.service} restarted"
+            self._note = f"{row.service} back"
         else:
             x, y, z = row.force
             self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")

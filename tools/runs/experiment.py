@@ -161,6 +161,14 @@ def _inside(rows: tuple[E, ...], duration: float) -> tuple[E, ...]:
     return tuple(row for row in rows if row.at < duration)
 
 
+def in_words(story: Scenario) -> str:
+    """Return what is done to the run, as a clause for its first line."""
+    done = [f"{row.service} {row.signal} at {row.at:g} s" for row in story.kill]
+    done += [f"{row.service} back at {row.at:g} s" for row in story.restart]
+    done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in story.push]
+    return f"; {', '.join(done)}" if done else ""
+
+
 def make_robot(args: argparse.Namespace) -> RobotConfig:
     """Return the robot with the flags laid over it.
 

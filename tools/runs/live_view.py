@@ -54,7 +54,6 @@ def _line(snapshot: Snapshot) -> str:
     clock = f"{truth.scenario_s:6.2f} s" if truth.scenario_s >= 0.0 else "   --  s"
     x, y = truth.com[0] * 1e3, truth.com[1] * 1e3
     return (
-        f"{clock}  height {truth.torso[2]:.3f} m  COM {x:+6.1f} {y:+6.1f} mm  "
-        f"operator {truth.operator_force[2]:+6.1f} N  modes {''.join(snapshot.modes)}  "
-        f"{snapshot.note}"
+        f"{clock}  height {truth.torso[2]:.3f} m  COM {x:+5.1f} {y:+5.1f} mm  "
+        f"hand {truth.operator_force[2]:+6.1f} N  modes {''.join(snapshot.modes)}  {snapshot.note}"
     )

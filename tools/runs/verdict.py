@@ -135,6 +135,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary["hold_entries"] = _hold_entries(log, truth[0].t_ns)
     summary["pd_cycles_late_pct"] = _late_share(log, truth[0].t_ns)
     summary["planner_tick_us"] = _tick(log, truth[0].t_ns)
+    summary["stopped"] = sorted({row.subject for row in kills if row.detail == "STOP"})
     summary["messages_recorded"] = sum(log.count(key) for key in log.keys())  # noqa: SIM118 - not a dict
     summary["sequence_gaps"] = sum(count.missing for count in log.gaps().values())
     return summary

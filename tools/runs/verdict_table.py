@@ -21,6 +21,8 @@ def show(summary: Summary, console: Console) -> None:
             continue
         good = value <= row.limit
         mark = "[green]ok[/]" if good else "[yellow]over[/]"
+        if row.key == "sequence_gaps" and not good and summary["stopped"]:
+            mark = "of a service that was stopped"
         unit = f" {row.unit}" if row.unit else ""
         table.add_row(row.what, f"{value:.3g}{unit}", f"{row.limit:g}{unit}", mark)
     console.print(table)

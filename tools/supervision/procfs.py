@@ -33,6 +33,21 @@ def fleet_pids(run_dir: Path) -> set[int]:
     return found
 
 
+def fleets() -> set[str]:
+    """Return the run directories of all fleets that have a process now."""
+    mark = os.fsencode(f"{FLEET_VARIABLE}=")
+    found = set()
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdecimal():
+            continue
+        try:
+            variables = (entry / "environ").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        found |= {os.fsdecode(v.removeprefix(mark)) for v in variables if v.startswith(mark)}
+    return found
+
+
 def is_suspended(pid: int) -> bool:
     """Return True if the process has been stopped by SIGSTOP."""
     return _state(pid) == "T"
