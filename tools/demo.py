@@ -93,7 +93,7 @@ def run_live(
             robot_path.absolute(),
             run_dir,
             overrides={
-                "recorder": _recorder_arguments(out, scenario_path, model_path),
+                "recorder": _recorder_arguments(out, story, scenario_path, model_path),
                 "simulator": [
                     "--scenario",
                     str(scenario_path.absolute()),
@@ -119,14 +119,16 @@ def run_live(
         shutil.rmtree(run_dir, ignore_errors=True)
 
 
-def _recorder_arguments(out: Path, scenario_path: Path, model_path: Path) -> list[str]:
+def _recorder_arguments(
+    out: Path, story: Scenario, scenario_path: Path, model_path: Path
+) -> list[str]:
     return [
         "--out",
         str(out.absolute()),
         "--scenario",
         str(scenario_path.absolute()),
         "--scenario-text",
-        scenario_path.parent.name,
+        story.name,
         "--attach",
         f"model.xml={model_path.absolute()}",
     ]

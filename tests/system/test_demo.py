@@ -76,6 +76,7 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
         if topic.recorded and topic is not topics.ESTOP and not log.count(key)
     ]
     assert not silent
+    assert log.metadata["run"]["scenario"] == "squat"
     assert {"robot.toml", "scenario.toml", "model.xml"} <= set(log.attachments)
     assert set(fleet_processes()) <= before
 

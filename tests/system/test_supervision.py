@@ -147,7 +147,7 @@ def test_a_suspended_service_is_shown_and_resumed(start: Start) -> None:
     fleet = start()
     pid = fleet.kill("planner", signal.SIGSTOP)
     assert wait_for(lambda: service(fleet, "planner").state == "suspended")
-    assert fleet.resume("planner") == pid
+    assert fleet.kill("planner", signal.SIGCONT) == pid
     assert wait_for(lambda: service(fleet, "planner").state == "running")
     assert service(fleet, "planner").restarts == 0
 

@@ -162,14 +162,6 @@ class Fleet:
         elif procfs.is_suspended(pid):
             os.kill(pid, signal.SIGCONT)
 
-    def resume(self, service: str) -> int:
-        """Continue a service after SIGSTOP; return its process id.
-
-        Raises:
-            FleetError: the service is unknown or has no process now.
-        """
-        return self.kill(service, signal.SIGCONT)
-
     def stop(self, *, keep_logs: bool = False) -> None:
         """Stop every service and the supervisor, and remove what they have made.
 

@@ -1,0 +1,181 @@
+"""The joint service's loop against a drive and a bus that the test holds."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, Generic, TypeVar, cast
+
+import pytest
+
+from services.joint import loop as joint_loop
+from services.joint.controller import JointController
+from services.joint.differential import motor_from_joint
+from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.loop import ARM_EVERY_NS, ARM_TRIES, JointLoop, Ports
+from shared.config import RobotConfig
+from shared.messages import Estop, JointEvent, JointState, Mode, Pair
+from tests.joint.helpers import T0, command
+
+M = TypeVar("M")
+
+
+class Inbox(Generic[M]):
+    def __init__(self) -> None:
+        self.waiting: deque[M] = deque()
+
+    def take(self) -> M | None:
+        return self.waiting.popleft() if self.waiting else None
+
+
+class Outbox(Generic[M]):
+    def __init__(self) -> None:
+        self.sent: list[M] = []
+
+    def put(self, message: M) -> bool:
+        self.sent.append(message)
+        return True
+
+
+class FakeDrive:
+    """Answers with the status and the pose that the test gives it; arms if it is to."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.status = DriveStatus.IDLE
+        self.q: Pair = (0.0, -1.0)
+        self.silent = False
+        self.obeys = True
+        self.armed = self.idled = 0
+        self.torques: list[Pair] = []
+
+    def read(self, _timeout_s: float) -> DriveReading | None:
+        if self.silent:
+            return None
+        pos = motor_from_joint(self.q, self.rig.gear_ratio)
+        return DriveReading(self.rig.now_ns, pos, (0.0, 0.0), self.status, 0)
+
+    def write_torque(self, torque: Pair) -> None:
+        self.torques.append(torque)
+
+    def arm(self) -> None:
+        self.armed += 1
+        if self.obeys:
+            self.status = DriveStatus.ARMED
+
+    def idle(self) -> None:
+        self.idled += 1
+
+    def close(self) -> None:
+        pass
+
+
+class Rig:
+    def __init__(self, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_ns = T0
+        self.gear_ratio = robot.joint.gear_ratio
+        self.period_ns = round(1e9 / robot.joint_service.rate_hz)
+        monkeypatch.setattr(joint_loop, "now_ns", lambda: self.now_ns)
+        self.drive = FakeDrive(self)
+        self.controller = JointController(robot, "knee_right")
+        self.commands, self.estops = Inbox[Any](), Inbox[Estop]()
+        self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
+        ports = Ports(
+            commands=cast("Any", self.commands),
+            estops=cast("Any", self.estops),
+            states=cast("Any", self.states),
+            events=cast("Any", self.events),
+        )
+        self.loop = JointLoop(robot, self.controller, self.drive, ports)
+
+    def run(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.now_ns += self.period_ns
+            self.loop.cycle()
+
+    @property
+    def mode(self) -> Mode:
+        return self.controller.failsafe.mode
+
+
+@pytest.fixture
+def rig(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    return Rig(robot, monkeypatch)
+
+
+@pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ERROR])
+def test_a_drive_that_answers_is_armed_with_its_latched_errors(
+    rig: Rig, status: DriveStatus
+) -> None:
+    rig.drive.status = status
+    rig.run(2)
+    assert rig.drive.armed == 1
+    assert rig.mode is Mode.HOLD
+
+
+def test_a_drive_that_somebody_else_armed_is_armed_by_us_before_it_is_held(rig: Rig) -> None:
+    rig.drive.status = DriveStatus.ARMED
+    rig.run(1)
+    assert rig.mode is Mode.DISARMED
+    assert rig.drive.armed == 1
+    rig.run(1)
+    assert rig.mode is Mode.HOLD
+
+
+def test_a_joint_outside_its_limits_is_not_armed_until_it_is_inside(rig: Rig) -> None:
+    """A knee that has not been zeroed reads 0: its soft stop would kick it with 80 N m."""
+    rig.drive.q = (0.0, 0.0)
+    rig.run(1000)
+    assert rig.drive.armed == 0
+    assert set(rig.drive.torques) == {(0.0, 0.0)}
+    rig.drive.q = (0.0, -1.0)
+    rig.run(2 + ARM_EVERY_NS // rig.period_ns)
+    assert rig.mode is Mode.HOLD
+
+
+def test_a_drive_that_does_not_arm_is_given_up(rig: Rig) -> None:
+    rig.drive.obeys = False
+    rig.run(3 * ARM_TRIES * ARM_EVERY_NS // rig.period_ns)
+    assert rig.drive.armed == ARM_TRIES
+    assert rig.mode is Mode.DISARMED
+
+
+def test_a_lost_drive_is_not_asked_to_arm(rig: Rig) -> None:
+    rig.drive.status = DriveStatus.LOST
+    rig.run(100)
+    assert rig.drive.armed == 0
+
+
+def test_both_axes_go_idle_once_one_disarms(rig: Rig) -> None:
+    rig.run(5)
+    rig.drive.status = DriveStatus.ERROR
+    rig.run(50)
+    assert rig.mode is Mode.FAULT
+    assert rig.drive.idled == 1
+    assert rig.drive.armed == 1, "never again by itself"
+
+
+def test_one_estop_message_is_for_good(rig: Rig) -> None:
+    rig.run(5)
+    rig.estops.waiting.append(Estop(t_ns=0, seq=1, source="test"))
+    rig.run(1)
+    assert rig.mode is Mode.DAMP
+    rig.run(1000)
+    assert rig.mode is Mode.DAMP
+
+
+def test_states_carry_the_stamp_of_the_drives_sample(rig: Rig) -> None:
+    """Commands made from old samples are old: a silent drive ends in HOLD, not in TRACK."""
+    rig.run(5)
+    for seq in range(200):
+        stamp = rig.states.sent[-1].t_ns
+        rig.commands.waiting.append(command(seq=seq + 1, echo_t_ns=stamp))
+        rig.run(2)
+    assert rig.mode is Mode.TRACK
+    rig.drive.silent = True
+    sampled = rig.states.sent[-1].t_ns
+    for seq in range(200, 230):  # 120 ms: a planner that goes on with what it hears
+        stamp = rig.states.sent[-1].t_ns
+        rig.commands.waiting.append(command(seq=seq + 1, echo_t_ns=stamp))
+        rig.run(2)
+    assert rig.states.sent[-1].t_ns - sampled <= 2 * rig.period_ns
+    assert rig.mode is Mode.HOLD
