@@ -12,7 +12,8 @@ from shared.exceptions import ConfigError
 from shared.joints import KINDS, MODULES
 
 if TYPE_CHECKING:
-    from shared.config import LimitConfig, RobotConfig
+    from shared.config import RobotConfig
+    from shared.config_sections import LimitConfig
 
 
 def check(file: str, config: RobotConfig, services: Sequence[str]) -> None:

@@ -51,6 +51,33 @@ class PlannerMode(IntEnum):
     """All six states are fresh; commands start from the measured pose, still with `hold`."""
     LEADING = 2
     """All six track."""
+    OVERLOADED = 3
+    """The harness carries more than it may: `hold` until it has been let go for a while."""
+    UNCERTIFIED = 4
+    """No local gains stand alone in this pose: `hold`."""
+
+
+class SplitSource(IntEnum):
+    """Where the local gains of a tick come from (design section 3 c)."""
+
+    DIAGONAL = 0
+    """diag(K_q), as configured."""
+    SCHEDULE = 1
+    """The certified schedule."""
+    STIFFENED = 2
+    """The certificate was not met by these: stiffer ones that meet it."""
+    UNCERTIFIED = 3
+    """None met it; `hold`."""
+
+
+class Tare(IntEnum):
+    """Whether the harness sensor knows its zero."""
+
+    RUNNING = 0
+    """The zero is being averaged; the harness must be unloaded and still."""
+    UNSTEADY = 1
+    """So it is, but the forces moved too much for a zero so far: it began anew."""
+    DONE = 2
 
 
 class RunEventKind(IntEnum):
@@ -126,11 +153,16 @@ class JointCommand(Message, frozen=True):
     dtau_ff: Pair
     """N m/s"""
     tau_coupled: Pair
-    """(K_q - D)(q_ref - q) + (B_q - B)(v_ref - v) in N m; dropped in HOLD."""
+    """(K_q - D)(q_ref - q) + (B_q - D_B)(v_ref - v) in N m; dropped in HOLD."""
     k_p: Pair
     """Local stiffness D in N m/rad."""
     k_d: Pair
     """Local damping in N m s/rad."""
+    margin: float
+    """Failsafe certificate of these gains, all six modules (design section 3 d): 1 is the
+    stiffness required, 0 is a fall."""
+    margin_onboard: float
+    """The same with the joint services gone and the drives' own loops left."""
 
 
 class JointEvent(Message, frozen=True):
@@ -160,10 +192,20 @@ class Wrench(Message, frozen=True):
     moment: Vector3
     """N m, torso axes, about the harness point."""
     valid: bool
-    """False while the sensor is stale or saturated: the numbers are then the last good ones."""
+    """False while the sensor is stale, saturated or without a zero: the numbers are then
+    the last good ones."""
     saturated: bool
+    tare: int
+    """`Tare`."""
     age_ns: int
     """Age of the sensor sample, by the harness service's clock."""
+
+
+class TareRequest(Message, frozen=True):
+    """Asks the harness service for a new zero: what acts now is to read as nothing."""
+
+    source: str
+    """Who asks, in words."""
 
 
 class PlannerStatus(Message, frozen=True):
@@ -181,6 +223,11 @@ class PlannerStatus(Message, frozen=True):
     """Left minus right leg's estimate of the torso pose: m and rad, world."""
     assist_n: float
     """Assist force in the feedforward, N."""
+    margin: float
+    """Failsafe certificate, as in the commands; 0 before the first tick."""
+    margin_onboard: float
+    split: int
+    """`SplitSource`."""
     ik_iterations: int
     ik_residual: float
     tick_us: float

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 
-from shared.config import GRAVITY, LimitConfig, RobotConfig
+from shared.config import GRAVITY, RobotConfig
+from shared.config_sections import LimitConfig
 from shared.joints import KINDS, SIDES
 
 MODULE_RADIUS = 0.08

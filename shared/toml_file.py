@@ -47,11 +47,22 @@ def read_toml(path: Path, into: type[S]) -> S:
     """
     file = str(path)
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(file, "(file)", "not found", "give the path of a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(file, "(file)", f"cannot be read: {error}", "a TOML file") from None
+    return parse_toml(text, file, into)
+
+
+def parse_toml(text: str, file: str, into: type[S]) -> S:
+    """Read TOML text into a struct, as `read_toml` does; `file` names it in errors.
+
+    Raises:
+        ConfigError: naming the file, the key, what stands there and what would be right.
+    """
+    try:
+        raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(file, "(syntax)", str(error), "TOML 1.0 is read") from None
     try:

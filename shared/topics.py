@@ -73,6 +73,14 @@ WRENCH: Final = Topic(
     recorded=True,
     why="what the operator does to the torso",
 )
+HARNESS_TARE: Final = Topic(
+    name="harness/tare",
+    type=messages.TareRequest,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="asks for a new zero of the harness sensor",
+)
 PLANNER_STATUS: Final = Topic(
     name="planner/status",
     type=messages.PlannerStatus,
@@ -127,6 +135,7 @@ TOPICS: Final = (
     JOINT_COMMAND,
     JOINT_EVENT,
     WRENCH,
+    HARNESS_TARE,
     PLANNER_STATUS,
     OPERATOR_INTENT,
     ESTOP,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from services.simulator.axis_bank import AXIS_NAMES, FAULTS, AxisBank
 from shared.cansimple import AxisError, AxisState, ControlMode, InputMode
-from shared.config import DriveConfig
+from shared.config_sections import DriveConfig
 from shared.exceptions import DriveError
 
 DRIVE = DriveConfig(

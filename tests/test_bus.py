@@ -106,6 +106,8 @@ def command(seq: int, q_phi: float = 0.1) -> JointCommand:
         tau_coupled=pair,
         k_p=pair,
         k_d=pair,
+        margin=1.0,
+        margin_onboard=0.5,
     )
 
 
@@ -462,6 +464,7 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.JOINT_COMMAND: (("planner",), (*MODULES, "recorder", TOOL)),
     topics.JOINT_EVENT: (MODULES, ("recorder", TOOL)),
     topics.WRENCH: (("harness",), ("planner", "recorder", TOOL)),
+    topics.HARNESS_TARE: ((TOOL,), ("harness", "recorder")),
     topics.PLANNER_STATUS: (("planner",), ("recorder", TOOL)),
     topics.OPERATOR_INTENT: (("simulator", TOOL), ("planner", "recorder", TOOL)),
     topics.ESTOP: (("planner", "harness", TOOL), (*MODULES, "planner", "recorder")),

@@ -10,7 +10,7 @@ import pytest
 
 from tools.verbs import VERBS
 
-MINE = ("up", "status", "kill", "down")
+MINE = ("up", "status", "kill", "tare", "down")
 
 
 def xrl(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -63,7 +63,7 @@ def test_an_unknown_verb_is_refused() -> None:
 
 
 def test_no_fleet_is_one_line(tmp_path: Path) -> None:
-    for verb in (("status",), ("kill", "planner")):
+    for verb in (("status",), ("kill", "planner"), ("tare",)):
         assert_one_line_error(xrl(*verb, "--run-dir", str(tmp_path)))
 
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import math
+import shutil
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +22,8 @@ from shared.toml_file import Range
 from tests.conftest import ROBOT_FILE
 
 Table = dict[str, Any]
-RAW: Table = tomllib.loads(ROBOT_FILE.read_text(encoding="utf-8"))
+TEXT = ROBOT_FILE.read_text(encoding="utf-8")
+RAW: Table = tomllib.loads(TEXT)
 
 
 def load_changed(tmp_path: Path, change: Callable[[Table], object]) -> RobotConfig:
@@ -88,6 +90,8 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (setting("mass.payload", math.inf), "mass.payload", "inf", "0 to 200 kg"),
     (setting("geometry.torso_size.2", 9.0), "geometry.torso_size[2]", "9.0", "2 m"),
     (setting("law.K_p.5", -1.0), "law.K_p[5]", "-1.0", "N m/rad"),
+    (setting("certificate.K_required.0", 0.0), "certificate.K_required[0]", "0.0", "N/m"),
+    (setting("certificate.margin_min", 1.5), "certificate.margin_min", "1.5", "0 to 1"),
     (setting("module.3.node_ids.0", 63), "module[3].node_ids[0]", "63", "0 to 62"),
     (setting("joint_service.rate_hz", 0.0), "joint_service.rate_hz", "0.0", "Hz"),
     (setting("simulation.operator.k_z", -1.0), "simulation.operator.k_z", "-1.0", "N/m"),
@@ -187,7 +191,11 @@ def test_an_entry_of_a_free_table_is_named_in_full(
 
 @pytest.mark.parametrize(
     ("key", "bad", "right"),
-    [("law.jacobian", "mean", "load_sharing"), ("joint_service.driver", "usb", "odrive_can")],
+    [
+        ("law.jacobian", "mean", "load_sharing"),
+        ("law.split", "paper", "certified, diagonal"),
+        ("joint_service.driver", "usb", "odrive_can"),
+    ],
 )
 def test_a_choice_that_does_not_exist_is_refused_with_the_choices(
     tmp_path: Path, key: str, bad: str, right: str
@@ -231,6 +239,8 @@ def test_payload_may_be_all_that_is_allowed_and_nothing(tmp_path: Path) -> None:
 
 # ---- ranges
 
+BESIDE = "gain_schedule"  # of a robot but not of its file: see tests/test_gain_schedule.py
+
 
 def numbers_without_a_range(hint: Any, where: str, in_range: bool = False) -> Iterator[str]:
     """Yield the path of every number below a type hint that no Range bounds."""
@@ -244,7 +254,8 @@ def numbers_without_a_range(hint: Any, where: str, in_range: bool = False) -> It
                 yield from numbers_without_a_range(item, f"{where}[{index}]")
     elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         for name, field in get_type_hints(hint, include_extras=True).items():
-            yield from numbers_without_a_range(field, f"{where}.{name}")
+            if name != BESIDE:
+                yield from numbers_without_a_range(field, f"{where}.{name}")
     elif hint in (int, float):
         if not in_range:
             yield where
@@ -295,9 +306,19 @@ def test_every_number_of_the_file_is_refused_when_it_is_absurd(tmp_path: Path, h
 
 
 def test_a_robot_comes_back_from_its_own_toml(robot: RobotConfig, tmp_path: Path) -> None:
+    assert robot.gain_schedule is not None
     path = tmp_path / "again.toml"
     path.write_text(config.to_toml(robot), encoding="utf-8")
+    assert config.load(path).gain_schedule is None
+    shutil.copy(ROBOT_FILE.with_name("robot.gains.json"), tmp_path / "again.gains.json")
     assert config.load(path) == robot
+
+
+def test_text_is_read_as_a_file_is_without_a_schedule(robot: RobotConfig) -> None:
+    parsed = config.parse(TEXT, "robot.toml of a log")
+    assert parsed == msgspec.structs.replace(robot, gain_schedule=None)
+    with pytest.raises(ConfigError, match=r"robot\.toml of a log"):
+        config.parse("name = 3", "robot.toml of a log")
 
 
 def test_a_frozen_robot_cannot_be_changed(robot: RobotConfig) -> None:
@@ -306,8 +327,7 @@ def test_a_frozen_robot_cannot_be_changed(robot: RobotConfig) -> None:
 
 
 def test_masses_add_up_to_table_i(robot: RobotConfig) -> None:
-    assert robot.torso_mass == pytest.approx(39.66)
-    assert robot.total_mass == pytest.approx(74.58)
+    assert (robot.torso_mass, robot.total_mass) == pytest.approx((39.66, 74.58))
 
 
 def test_joint_limits_stand_in_joint_order(robot: RobotConfig) -> None:

@@ -19,7 +19,7 @@ from services.joint.drivers.odrive_can import ARM_GRACE_MS, RETRY_MS, OdriveCan
 from services.simulator.axis_bank import AxisBank
 from services.simulator.cansimple_front import CanSimpleFront
 from shared.cansimple import AxisError, AxisState, Command, arbitration_id, pack_two_floats
-from shared.config import CanConfig, DriveConfig
+from shared.config_sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
 from shared.unix_can import UnixCanBus
 from shared.unix_can_hub import UnixCanHub

@@ -78,7 +78,7 @@ def run_live(
     Returns the CPU use of all processes together, %: 100 is one core; None if
     the scenario never began.
     """
-    robot_path, scenario_path = experiment.write_inputs(out, robot, story)
+    robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, story)
     model_path = out / "model.xml"
     model_path.write_text(mjcf(robot), encoding="utf-8")
     killed = {kill.service for kill in story.kill}

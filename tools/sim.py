@@ -112,7 +112,7 @@ def simulate(
     console: Console,
 ) -> float:
     """Run lockstep into a log with a progress bar; return the time simulated, s."""
-    robot_path, scenario_path = experiment.write_inputs(out, robot, story)
+    inputs = experiment.write_inputs(out, robot, story)
     outbox = Outbox(robot.name)
     fleet = Lockstep(robot, story, network, seed=seed, record=outbox.put)
     bar = Progress(
@@ -126,11 +126,8 @@ def simulate(
             recorded,
             offset_ns=0,
             metadata=_metadata(robot.name, story.name, network, seed),
-            attachments={
-                "robot.toml": robot_path.read_bytes(),
-                "scenario.toml": scenario_path.read_bytes(),
-                "model.xml": mjcf(robot).encode(),
-            },
+            attachments={file.name: file.read_bytes() for file in inputs}
+            | {"model.xml": mjcf(robot).encode()},
             chunk_kib=robot.recorder.chunk_kib,
         ) as writer,
         bar as progress,

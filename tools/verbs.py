@@ -23,10 +23,15 @@ class Verb(NamedTuple):
 VERBS: Final = (
     Verb("demo", "tools.demo", "run the reference experiment, kill the planner, judge the outcome"),
     Verb("sim", "tools.sim", "run the same experiment in virtual time, with a modelled network"),
+    Verb("sweep", "tools.sweep", "run many random cases in virtual time, and count the falls"),
     Verb("up", "tools.up", "start the fleet"),
     Verb("status", "tools.status", "show every service and every module"),
     Verb("kill", "tools.kill", "send a signal to one service"),
     Verb("estop", "tools.estop", "stop every module: a slow sink, never a drop"),
+    Verb("gains", "tools.gains", "compute the certified gain schedule of a robot"),
+    Verb("tare", "tools.tare", "take what the harness reads now, unloaded, for its zero"),
+    Verb("explain", "tools.explain", "lay one tick of the law open: gains, margins, torques"),
+    Verb("bench", "tools.bench", "measure how fast the law and lockstep are here"),
     Verb("stiffness", "tools.stiffness", "print how stiff the body must be to balance"),
     Verb("down", "tools.down", "stop the fleet and leave nothing behind"),
 )

@@ -10,11 +10,11 @@ from services.harness.sensor import CanHarnessSensor
 from shared import bus, log, process, topics
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig, expand, load
-from shared.messages import Wrench
+from shared.messages import TareRequest, Wrench
 from shared.priority import raise_priority
 
 FIFO_PRIORITY = 10
-"""Below the joint services and the planner: the wrench is for the log so far."""
+"""Below the joint services and the planner: both stand and lead without it."""
 
 
 def main() -> int:
@@ -28,7 +28,9 @@ def main() -> int:
     stop = process.StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
     with bus.open_session(config, "harness", arguments.run_dir) as session:
-        loop = HarnessLoop(sensor, law, session.publisher(topics.WRENCH, Wrench))
+        wrenches = session.publisher(topics.WRENCH, Wrench)
+        requests = session.latest(topics.HARNESS_TARE, TareRequest)
+        loop = HarnessLoop(sensor, law, wrenches, requests)
         logger.info("started at %g Hz, priority %s", config.harness.rate_hz, granted)
         process.freeze_garbage()
         run(loop, config.harness.rate_hz, stop)

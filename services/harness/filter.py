@@ -3,8 +3,9 @@
 Pure: a state, the time and a sample go in, the next state and a reading come out
 (design section 3 f). The rules:
 
-- *Tare*: the mean leg forces over `tare_s` become the zero. A saturated cell, or a gap
-  longer than `stale_ms`, begins it anew. Nothing is valid until it is done.
+- *Tare*: the mean leg forces over `tare_s` become the zero. A saturated cell, a gap
+  longer than `stale_ms`, or forces that moved too much begin it anew. Nothing is valid
+  until it is done. A load that rests still cannot be told from a zero.
 - *Low-pass*: first order at `low_pass_hz`, exact for any time between samples. After a
   gap it therefore weighs the new sample as much as the gap was long.
 - *Saturation*: a sample with any raw leg force at or beyond `leg_force_max` is not used.
@@ -15,39 +16,44 @@ Pure: a state, the time and a sample go in, the next state and a reading come ou
 from __future__ import annotations
 
 import math
-from enum import IntEnum
+from typing import Final
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import HarnessConfig
+from shared.config_sections import HarnessConfig
 from shared.loadcell_can import LegSample, as_sent
+from shared.messages import Tare
 from shared.stewart import N_LEGS, geometry_matrix
 
 Array = npt.NDArray[np.float64]
+
+_ZERO: Final[Array] = np.zeros(N_LEGS)
 
 NEVER_NS = -1
 """Stands for the time of something that has not happened."""
 
 
-class Phase(IntEnum):
-    """What the samples are used for."""
-
-    TARING = 0
-    MEASURING = 1
+TARE_DEVIATION_MAX: Final = 3.0
+"""Largest standard deviation of a leg force in a tare, N: several times a cell's noise, and
+less than a hand on the harness makes, or a robot that sways."""
 
 
 class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     """All that the filter remembers; its arrays are never written to."""
 
-    phase: Phase
+    tare: Tare
     tare_start_ns: int
     """Time of the first sample of the tare; `NEVER_NS` before it."""
     tare_count: int
+    tare_first: Array
+    """(6,) raw leg forces of that sample, N: near the mean, so that squares stay small."""
     tare_sum: Array
-    """(6,) sum of the raw leg forces since then, N."""
+    """(6,) sum of the raw leg forces since then, less those of the first, N."""
+    tare_squares: Array
+    """(6,) sum of the squares of the same, N^2."""
     offset: Array
     """(6,) leg forces that count as zero, N."""
     wrench: Array
@@ -77,11 +83,13 @@ class Reading(msgspec.Struct, frozen=True, gc=False, kw_only=True):
 def initial_state() -> FilterState:
     """Return the state at power-up: waiting for the first sample of the tare."""
     return FilterState(
-        phase=Phase.TARING,
+        tare=Tare.RUNNING,
         tare_start_ns=NEVER_NS,
         tare_count=0,
-        tare_sum=np.zeros(N_LEGS),
-        offset=np.zeros(N_LEGS),
+        tare_first=_ZERO,
+        tare_sum=_ZERO,
+        tare_squares=_ZERO,
+        offset=_ZERO,
         wrench=np.zeros(6),
         wrench_t_ns=NEVER_NS,
         sample_t_ns=NEVER_NS,
@@ -91,14 +99,8 @@ def initial_state() -> FilterState:
 
 
 def start_tare(state: FilterState) -> FilterState:
-    """Return the state with the tare begun anew; the harness must be unloaded."""
-    return msgspec.structs.replace(
-        state,
-        phase=Phase.TARING,
-        tare_start_ns=NEVER_NS,
-        tare_count=0,
-        tare_sum=np.zeros(N_LEGS),
-    )
+    """Return the state with the tare begun, unless it runs already."""
+    return state if state.tare is not Tare.DONE else _begin_tare(state, Tare.RUNNING)
 
 
 class WrenchFilter:
@@ -128,7 +130,7 @@ class WrenchFilter:
         fresh = 0 <= age_ns <= self._stale_ns
         reading = Reading(
             wrench=state.wrench,
-            valid=fresh and not state.saturated and state.phase is Phase.MEASURING,
+            valid=fresh and not state.saturated and state.tare is Tare.DONE,
             saturated=state.saturated,
             age_ns=age_ns,
         )
@@ -139,7 +141,7 @@ class WrenchFilter:
             return msgspec.structs.replace(state, refused=state.refused + 1)
         saturated = max(map(abs, sample.forces)) >= self._force_limit
         forces = np.array(sample.forces)
-        if state.phase is Phase.TARING:
+        if state.tare is not Tare.DONE:
             state = self._tare(state, sample.t_ns, forces, saturated)
         elif not saturated:
             state = self._measure(state, sample.t_ns, forces)
@@ -148,20 +150,26 @@ class WrenchFilter:
     def _tare(self, state: FilterState, t_ns: int, forces: Array, saturated: bool) -> FilterState:
         gap = t_ns - state.sample_t_ns > self._stale_ns
         if saturated or gap:
-            state = start_tare(state)
+            state = _begin_tare(state, state.tare)
         if saturated:
             return state
-        start_ns = t_ns if state.tare_start_ns == NEVER_NS else state.tare_start_ns
-        total = state.tare_sum + forces
+        if state.tare_start_ns == NEVER_NS:
+            state = msgspec.structs.replace(state, tare_start_ns=t_ns, tare_first=forces)
+        moved = forces - state.tare_first
+        total = state.tare_sum + moved
+        squares = state.tare_squares + moved * moved
         count = state.tare_count + 1
-        if t_ns - start_ns < self._tare_ns:
+        if t_ns - state.tare_start_ns < self._tare_ns:
             return msgspec.structs.replace(
-                state, tare_start_ns=start_ns, tare_count=count, tare_sum=total
+                state, tare_count=count, tare_sum=total, tare_squares=squares
             )
+        mean = total / count
+        if np.max(squares / count - mean * mean) > TARE_DEVIATION_MAX**2:
+            return _begin_tare(state, Tare.UNSTEADY)
         return msgspec.structs.replace(
             state,
-            phase=Phase.MEASURING,
-            offset=total / count,
+            tare=Tare.DONE,
+            offset=state.tare_first + mean,
             wrench=np.zeros(6),
             wrench_t_ns=t_ns,
         )
@@ -171,3 +179,15 @@ class WrenchFilter:
         weight = -math.expm1(-self._cutoff * dt)
         wrench = state.wrench + weight * (self._G @ (forces - state.offset) - state.wrench)
         return msgspec.structs.replace(state, wrench=wrench, wrench_t_ns=t_ns)
+
+
+def _begin_tare(state: FilterState, tare: Tare) -> FilterState:
+    return msgspec.structs.replace(
+        state,
+        tare=tare,
+        tare_start_ns=NEVER_NS,
+        tare_count=0,
+        tare_first=_ZERO,
+        tare_sum=_ZERO,
+        tare_squares=_ZERO,
+    )

@@ -1,4 +1,4 @@
-"""The loop of the harness service: read, filter, publish."""
+"""The loop of the harness service: read, tare if asked to, filter, publish."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from services.harness import filter as wrench_filter
 from services.harness.filter import FilterState, WrenchFilter
 from services.harness.sensor import HarnessSensor
 from shared import clock
-from shared.messages import Wrench
+from shared.messages import TareRequest, Wrench
 
 
 class Publisher(Protocol):
@@ -16,6 +16,13 @@ class Publisher(Protocol):
 
     def put(self, message: Wrench) -> bool:
         """Send without waiting; False if it could not be sent."""
+
+
+class Requests(Protocol):
+    """Where requests for a tare come from."""
+
+    def take(self) -> TareRequest | None:
+        """Return the newest request that came since the last call, or None; never blocks."""
 
 
 class Stop(Protocol):
@@ -28,7 +35,13 @@ class Stop(Protocol):
 class HarnessLoop:
     """One cycle of the service, on whatever clock it is called with."""
 
-    def __init__(self, sensor: HarnessSensor, law: WrenchFilter, publisher: Publisher) -> None:
+    def __init__(
+        self,
+        sensor: HarnessSensor,
+        law: WrenchFilter,
+        publisher: Publisher,
+        requests: Requests,
+    ) -> None:
         """Begin with a tare."""
         self.state: FilterState = wrench_filter.initial_state()
         self.cycles = 0
@@ -38,13 +51,16 @@ class HarnessLoop:
         self._sensor = sensor
         self._law = law
         self._publisher = publisher
+        self._requests = requests
 
     def cycle(self, now_ns: int) -> Wrench:
-        """Read, filter, publish; return what was published.
+        """Read, tare if asked to, filter, publish; return what was published.
 
         The wrench is in torso axes: the sensor is fixed to the torso and knows no other.
         """
         sample = self._sensor.read(now_ns)
+        if self._requests.take() is not None:
+            self.state = wrench_filter.start_tare(self.state)
         self.state, reading = self._law.step(self.state, now_ns, sample)
         fx, fy, fz, mx, my, mz = reading.wrench.tolist()
         message = Wrench(
@@ -54,15 +70,12 @@ class HarnessLoop:
             moment=(mx, my, mz),
             valid=reading.valid,
             saturated=reading.saturated,
+            tare=int(self.state.tare),
             age_ns=reading.age_ns,
         )
         self.unsent += not self._publisher.put(message)
         self.cycles += 1
         return message
-
-    def tare(self) -> None:
-        """Begin the tare anew; the harness must be unloaded."""
-        self.state = wrench_filter.start_tare(self.state)
 
 
 def next_deadline(deadline_ns: int, period_ns: int, now_ns: int) -> tuple[int, int]:

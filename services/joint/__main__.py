@@ -9,7 +9,8 @@ from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.loop import JointLoop, Ports
 from shared import config, log, topics
 from shared.bus import open_session
-from shared.config import CanConfig, RobotConfig, expand
+from shared.config import RobotConfig, expand
+from shared.config_sections import CanConfig
 from shared.joints import MODULES
 from shared.messages import Estop, JointCommand, JointEvent, JointState
 from shared.priority import raise_priority

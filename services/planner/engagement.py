@@ -3,7 +3,8 @@
 All six track or none does: while one module's state is stale, or one is not in TRACK,
 every command carries `hold`, so that no leg works against the other. Modules tell
 `ready` once fresh commands have come for long enough; when all are ready, `hold` is
-lifted for all in the same tick. Pure: state, inputs -> outputs.
+lifted for all in the same tick. An overload at the harness and gains that would not stand
+alone ask for `hold` too. Pure: state, inputs -> outputs.
 """
 
 from __future__ import annotations
@@ -23,7 +24,14 @@ class Engagement(msgspec.Struct):
     since_ns: int = 0
     """When the mode was entered."""
 
-    def advance(self, now_ns: int, fresh: list[bool], ready: list[bool], modes: list[int]) -> bool:
+    def advance(
+        self,
+        now_ns: int,
+        fresh: list[bool],
+        ready: list[bool],
+        modes: list[int],
+        forbidden: PlannerMode | None = None,
+    ) -> bool:
         """Take the six modules' news; return True if the mode changed.
 
         Args:
@@ -31,26 +39,33 @@ class Engagement(msgspec.Struct):
             fresh: per module, a state has come within `planner.state_stale_ms`.
             ready: per module, `JointState.ready`.
             modes: per module, `JointState.mode`.
+            forbidden: OVERLOADED or UNCERTIFIED while the planner may not lead.
         """
-        after = self._next(now_ns, fresh, ready, modes)
+        after = self._next(now_ns, fresh, ready, modes, forbidden)
         changed = after is not self.mode
         if changed:
             self.mode, self.since_ns = after, now_ns
         return changed
 
     def _next(
-        self, now_ns: int, fresh: list[bool], ready: list[bool], modes: list[int]
+        self,
+        now_ns: int,
+        fresh: list[bool],
+        ready: list[bool],
+        modes: list[int],
+        forbidden: PlannerMode | None,
     ) -> PlannerMode:
         if not all(fresh):
             return PlannerMode.WAITING
-        if self.mode is PlannerMode.WAITING:
-            return PlannerMode.ALIGNING
-        if self.mode is PlannerMode.ALIGNING:
-            return PlannerMode.LEADING if all(ready) else PlannerMode.ALIGNING
-        settled = now_ns - self.since_ns > GRACE_NS
-        if settled and any(mode != Mode.TRACK for mode in modes):
-            return PlannerMode.ALIGNING
-        return PlannerMode.LEADING
+        if forbidden is not None:
+            return forbidden
+        if self.mode is PlannerMode.LEADING:
+            settled = now_ns - self.since_ns > GRACE_NS
+            lost = settled and any(mode != Mode.TRACK for mode in modes)
+            return PlannerMode.ALIGNING if lost else PlannerMode.LEADING
+        if self.mode is PlannerMode.ALIGNING and all(ready):
+            return PlannerMode.LEADING
+        return PlannerMode.ALIGNING
 
     @property
     def hold(self) -> bool:

@@ -1,4 +1,4 @@
-"""Joint stiffness and damping of the whole body, and their split (paper section III).
+"""Joint stiffness and damping of the whole body (paper section III). Pure.
 
 K_q = N K_0 + J^T K_p J - sum_i H_i F_i, B_q = N B_0 + J^T B_p J, N = I - J^+ J.
 """
@@ -18,16 +18,12 @@ Array = NDArray[np.float64]
 
 
 class JointGains(NamedTuple):
-    """Whole-body joint gains and what of them the joint services hold alone."""
+    """Whole-body joint gains."""
 
     K_q: Array
     """(12, 12) N m/rad, symmetric."""
     B_q: Array
     """(12, 12) N m s/rad, symmetric."""
-    D: Array
-    """(12,) local stiffness, N m/rad, >= 0."""
-    D_B: Array
-    """(12,) local damping, N m s/rad, >= 0."""
 
 
 class GainLaw:
@@ -43,9 +39,6 @@ class GainLaw:
         self._K_0, self._B_0 = law.K_0, law.B_0
         self._damping = law.damping_lambda**2 * np.eye(6)
         self._identity = np.eye(N_JOINTS)
-        self._damping_share = law.local_damping_share
-        self._k_max = config.joint_service.k_p_max
-        self._d_max = config.joint_service.k_d_max
 
     def gains(self, kinematics: Kinematics, hessian_F: Array) -> JointGains:
         """Return the gains.
@@ -59,11 +52,4 @@ class GainLaw:
         N = self._identity - J.T @ np.linalg.solve(J @ J.T + self._damping, J)
         K_q = self._K_0 * N + (J.T * self.K_p) @ J - hessian_F
         B_q = self._B_0 * N + (J.T * self.B_p) @ J
-        K_q = 0.5 * (K_q + K_q.T)
-        B_q = 0.5 * (B_q + B_q.T)
-        return JointGains(
-            K_q,
-            B_q,
-            np.minimum(np.maximum(np.diagonal(K_q), 0.0), self._k_max),
-            np.minimum(np.maximum(self._damping_share * np.diagonal(B_q), 0.0), self._d_max),
-        )
+        return JointGains(0.5 * (K_q + K_q.T), 0.5 * (B_q + B_q.T))

@@ -7,7 +7,9 @@ One tick, in the paper's letters:
     q_ref = IK(p_ref)
     v_ref                J v_ref = S J v + S_perp pdot_C, C v_ref = 0
     F     = K_p (p_ref - p) + B_p (pdot_ref - pdot) + F_O
-    K_q, B_q             at q_ref; D the part that the joint services hold alone
+    T                    [J; C] T = [I; 0] at q_ref, so v_ref = T (S J v + S_perp pdot_C)
+    K_q, B_q             at q_ref
+    D, D_B               what the joint services hold alone: schedule and certificate
     tau_ff  = J^T (m g z) + J_harness^T F_assist
     tau_coupled = (K_q - D)(q_ref - q) + (B_q - D_B)(v_ref - v)
 
@@ -21,24 +23,27 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still
 from services.planner.gains import GainLaw
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
+from services.planner.split import GainSplit, LocalGains
 from shared.config import GRAVITY, RobotConfig
+from shared.messages import Wrench
 
 Array = NDArray[np.float64]
 
 
 class LawOutput(NamedTuple):
-    """What one tick asks of the twelve joints, each (12,)."""
+    """What one tick asks of the twelve joints, (12,) where not said otherwise."""
 
     q_ref: Array
     v_ref: Array
     tau_ff: Array
     dtau_ff: Array
     tau_coupled: Array
-    k_p: Array
-    k_d: Array
+    local: LocalGains
+    """D and D_B, certified."""
     p: Array
     """Measured pose (6,)."""
     pdot: Array
@@ -59,22 +64,32 @@ class Hocca:
         limits = np.array(config.joint_limits())
         self._ik = InverseKinematics(Kinematics(config), limits)
         self._gains = GainLaw(config)
+        self._split = GainSplit(config)
         self._S = self._gains.S
         self._S_perp = 1.0 - self._S
         self._F_O: Array = np.zeros(6)
         self._F_O[2] = config.total_mass * GRAVITY
-        self._assist_max = config.assist.force_max
-        self._assist_rate_max = config.assist.rate_max
+        assist = config.assist
+        self._assist = AssistLaw(
+            assist.force_max, assist.rate_max, assist.integral_max, assist.integral_s
+        )
+        self._easing = LeadEasing(config.law.lead_easing)
         self._recentre_s = config.law.recentre_s
         self._p_C0: Array = np.zeros(6)
         self._since_align_s = 0.0
-        self._assist = 0.0
         self._aligned = False
         self._F_assist: Array = np.zeros(3)
-        self._closed_rates: Array = np.zeros(12)
+        self._per_p: Array = np.eye(12)[:, :6].copy()
 
     def tick(
-        self, q: Array, v: Array, assist_wanted: float, dt: float, *, align: bool = False
+        self,
+        q: Array,
+        v: Array,
+        assist_wanted: float,
+        dt: float,
+        *,
+        align: bool = False,
+        wrench: Wrench | None = None,
     ) -> LawOutput:
         """Run the law once.
 
@@ -87,54 +102,60 @@ class Hocca:
             align: start from the measured pose, so that taking over makes no step: p_C is
                 where the robot is, and glides to zero (COM over the ankles, no roll, no
                 yaw) in `law.recentre_s` of ticks without `align`.
+            wrench: of the operator on the torso, if it is fresh and valid.
         """
         measured, ik = self._measured, self._ik
         measured.update(q)
         if align or not self._aligned:
-            self._align(q, assist_wanted)
+            self._align(q)
         pdot = measured.J @ v
         p_C, pdot_C = self._closed_loop_reference(dt)
         p_ref = self._S_perp * p_C + self._S * measured.p
         pdot_ref = self._S_perp * pdot_C + self._S * pdot
-        assist_rate = self._advance_assist(assist_wanted, dt)
+        up, moment_pitch = None, 0.0
+        if wrench is not None:
+            up = force_up(wrench.force, measured.p[3], measured.p[4])
+            moment_pitch = wrench.moment[1]
+        still = not align and is_still(pdot[2], pdot[4])
+        given = None if up is None else -up
+        assist_rate = self._assist.advance(assist_wanted, given, dt, still=still)
+        ease_z, ease_pitch = self._easing.ease(up, moment_pitch, self._assist.assist, dt)
 
         result = ik.solve(p_ref, measured.D_left)
         q_ref = ik.q.copy()
-        self._closed_rates[:6] = pdot_ref
-        v_ref = ik.solve_rates(self._closed_rates)
+        T = ik.solve_rates(self._per_p)
+        v_ref = T @ pdot_ref
 
         at_ref = ik.kinematics
-        self._F_assist[2] = self._assist
+        self._F_assist[2] = self._assist.assist
         gains = self._gains
-        F = gains.K_p * (p_ref - measured.p) + gains.B_p * (pdot_ref - pdot) + self._F_O
-        hessian_F = at_ref.hessian_times(F, self._F_assist)
-        K_q, B_q, D, D_B = gains.gains(at_ref, hessian_F)
         tau_ff = self._F_O @ at_ref.J + self._F_assist @ at_ref.J_harness
-        # with F for F_O: what the feedback adds is of second order, 0.4 N m at 30 ms in a push
-        dtau_ff = hessian_F @ v_ref + at_ref.J_harness[2] * assist_rate
+        hessian_O = at_ref.hessian_times(self._F_O, self._F_assist).copy()
+        dtau_ff = hessian_O @ v_ref + at_ref.J_harness[2] * assist_rate
+        F = gains.K_p * (p_ref - measured.p) + gains.B_p * (pdot_ref - pdot) + self._F_O
+        K_q, B_q = gains.gains(at_ref, at_ref.hessian_times(F, self._F_assist))
+        local = self._split.split(K_q, B_q, at_ref.p[2], at_ref.p[4], T, hessian_O)
         e_q, e_v = q_ref - q, v_ref - v
-        tau_coupled = K_q @ e_q - D * e_q + B_q @ e_v - D_B * e_v
+        tau_coupled = K_q @ e_q - local.D * e_q + B_q @ e_v - local.D_B * e_v
+        # the eased lead goes where HOLD drops it: in tau_ff it would outlive the hand
+        tau_coupled += ease_z * at_ref.J_harness[2] + ease_pitch * at_ref.J[4]
         return LawOutput(
             q_ref,
             v_ref,
             tau_ff,
             dtau_ff,
             tau_coupled,
-            D,
-            D_B,
+            local,
             measured.p.copy(),
             pdot,
             p_ref,
             measured.closure.copy(),
-            self._assist,
+            self._assist.assist,
             result.iterations,
             result.residual,
         )
 
-    def _align(self, q: Array, assist: float) -> None:
-        if not self._aligned:
-            # a planner that takes over from HOLD finds the assist in HOLD's feedforward
-            self._assist = min(self._assist_max, max(0.0, assist))
+    def _align(self, q: Array) -> None:
         self._aligned = True
         self._p_C0 = self._measured.p * self._S_perp
         self._since_align_s = 0.0
@@ -147,11 +168,3 @@ class Hocca:
         left = 1.0 - s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
         rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / self._recentre_s
         return self._p_C0 * left, self._p_C0 * rate
-
-    def _advance_assist(self, wanted: float, dt: float) -> float:
-        """Move the assist towards what is wanted; return its rate in N/s."""
-        wanted = min(self._assist_max, max(0.0, wanted))
-        change_max = self._assist_rate_max * dt
-        change = min(change_max, max(-change_max, wanted - self._assist))
-        self._assist += change
-        return change / dt if dt > 0.0 else 0.0

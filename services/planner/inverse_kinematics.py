@@ -1,19 +1,26 @@
 """Inverse kinematics with both feet on the ground (design section 3).
 
 Six task rows (p = p_ref) and six closure rows (both legs agree on the torso) make a
-square system in the 12 joint angles. Gauss-Newton from the last solution: one or two
-steps a tick.
+square system in the 12 joint angles. Two ways to solve it:
+
+- `solve`, each tick: Gauss-Newton from the last solution, one or two steps;
+- `solve_from_anywhere`, at the start and in tools: Levenberg-Marquardt inside the joint
+  limits from several starts; where p_ref is out of reach it ends at the nearest pose at
+  which the legs still agree, and says what stands in the way.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
-from shared.joints import N_JOINTS
+from shared.joints import JOINTS, N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
 
@@ -25,6 +32,27 @@ STEP_SURE = 1e-3
 """rad; the error of a Gauss-Newton step is below its square (m or rad), so below `TOLERANCE`."""
 STEP_MAX = 0.2
 """rad; a longer step leaves the region where the linearisation is good."""
+
+GAIN_AT_LIMIT = 0.01
+"""Of the sum of squares: for less, out of reach, the legs would creep into a twist."""
+
+COLD_STEP_MAX = 0.5
+"""rad; longer than `STEP_MAX`, for here a step that does not pay is taken back."""
+EVALUATIONS_MAX = 60
+"""Of the kinematics, for one start; from a bent stand the median is 8."""
+CLOSURE_WEIGHT = 10.0
+"""Of the closure against p, where not all can be had; what it leaves, the shift takes."""
+CLOSING_ROUNDS = 5
+"""Each makes what is left of the closure about a hundred times smaller."""
+STATIONARY = 1e-3
+"""Of the error: joint gradients below this share of it move nothing any more."""
+EQUAL_SHARES: Array = 0.5 * np.eye(6)
+"""Load sharing (6, 6) for a cold start: the same at every q, so that J is what p changes by."""
+POSE_ROWS = (
+    *(("COM x", "m"), ("COM y", "m"), ("COM z", "m")),
+    *(("roll", "rad"), ("pitch", "rad"), ("yaw", "rad")),
+)
+"""Names and units of p."""
 
 
 class IkResult(NamedTuple):
@@ -40,8 +68,39 @@ class IkResult(NamedTuple):
         return self.residual <= TOLERANCE
 
 
+class Outcome(IntEnum):
+    """How a solve from anywhere ended."""
+
+    CONVERGED = 0
+    JOINT_LIMIT = 1
+    """As near as the joints' limits let it come."""
+    OUT_OF_REACH = 2
+    """As near as the legs reach; no joint limit stands in the way."""
+    UNFINISHED = 3
+    """Evaluations ran out on the way; there may be something nearer."""
+
+
+class Reach(NamedTuple):
+    """How near p_ref a configuration is, and what keeps it from coming nearer."""
+
+    outcome: Outcome
+    error: Array
+    """p_ref - p (6,), m and rad: which rows are missed, and to which side."""
+    closure: float
+    """Largest disagreement of the legs, m or rad."""
+    stopped: tuple[int, ...]
+    """For each of the 12 joints: +1 pressed against its upper limit, -1 its lower, else 0."""
+    evaluations: int
+    """Of the kinematics, since the last solve began."""
+
+    @property
+    def converged(self) -> bool:
+        """True if p_ref was reached and the legs agree."""
+        return self.outcome is Outcome.CONVERGED
+
+
 class InverseKinematics:
-    """q_ref = IK(p_ref), warm-started; `kinematics` is left updated at the solution."""
+    """q_ref = IK(p_ref), in `q`; `kinematics` is left updated at the solution."""
 
     def __init__(self, kinematics: Kinematics, limits: Array) -> None:
         """Take the kinematics to solve with and the joint limits (12, 2), rad."""
@@ -51,6 +110,7 @@ class InverseKinematics:
         self._system: Array = np.zeros((N_JOINTS, N_JOINTS))
         self._error: Array = np.zeros(N_JOINTS)
         self._damping = DAMPING**2 * np.eye(N_JOINTS)
+        self._evaluations = 0
 
     def solve(self, p_ref: Array, D_left: Array | None = None, iterations_max: int = 4) -> IkResult:
         """Improve `q` until p(q) = p_ref and the legs agree.
@@ -65,19 +125,24 @@ class InverseKinematics:
                 agree they change J but not p.
             iterations_max: Gauss-Newton steps at most.
         """
+        self._evaluations = 0
         residual = self._residual(p_ref, D_left)
         iterations = 0
         while residual > TOLERANCE and iterations < iterations_max:
-            before = self.q.copy()
+            before, cost = self.q.copy(), float(self._error @ self._error)
             step, limited = self._limited_step()
             self.q += step
+            if limited:
+                self.q[:] = self._inside(self.q)  # to the last bit
             iterations += 1
             largest = float(np.abs(step).max())
             if largest < STEP_SURE and not limited:
                 return IkResult(iterations, largest * largest)
             after = self._residual(p_ref, D_left)
-            if after > residual and (limited or largest < STEP_MAX / 2):
-                self.q[:] = before  # at a limit there may be nothing better
+            gained = cost - float(self._error @ self._error)
+            far = not limited and largest >= STEP_MAX / 2  # uphill first may be the way there
+            if not far and gained < (GAIN_AT_LIMIT * cost if limited else 0.0):
+                self.q[:] = before
                 return IkResult(iterations, self._residual(p_ref, D_left))
             residual = after
         return IkResult(iterations, residual)
@@ -85,30 +150,199 @@ class InverseKinematics:
     def _limited_step(self) -> tuple[Array, bool]:
         """Return the next step (12,), inside the joint limits, and whether they changed it.
 
-        Joints that a step would push out of a limit they stand at are held, and the
-        others do what is left to do: clipping alone lets the rest run away.
+        Clipping alone would let the other joints go on without the one that stopped.
         """
-        step = self.solve_rates(self._error)
-        held = ((self.q >= self._high) & (step > 0.0)) | ((self.q <= self._low) & (step < 0.0))
-        limited = bool(held.any())
+        step = _shortened(self.solve_rates(self._error), STEP_MAX)
+        limited = bool((self._inside(self.q + step) != self.q + step).any())
         if limited:
-            A = self._system * ~held
-            step = np.asarray(np.linalg.solve(A.T @ A + self._damping, A.T @ self._error), float)
-        largest = float(np.abs(step).max())
-        if largest > STEP_MAX:
-            step *= STEP_MAX / largest
-        inside = np.minimum(np.maximum(self.q + step, self._low), self._high) - self.q
-        return inside, limited or bool((inside != step).any())
+            step = self._step_inside(self._system, self._error, DAMPING**2)
+            step = _shortened(step, STEP_MAX)
+        return step, limited
 
     def solve_rates(self, right_side: Array) -> Array:
         """Return x (12,) with [J; C] x = right side (12,), damped."""
         A = self._system
         return np.asarray(np.linalg.solve(A.T @ A + self._damping, A.T @ right_side), float)
 
+    def solve_from_anywhere(self, p_ref: Array) -> Reach:
+        """Improve `q` as far as it goes, from wherever it is, inside the joint limits.
+
+        Starts at `q`, then at bent stands with the asked pitch, then with one knee twisted
+        (near the top of the workspace some poses lie beyond a fold that no descent from a
+        stand crosses). If none reaches p_ref, `q` is the nearest pose found at which the
+        legs agree. Nothing in it is random. Not for every tick: out of reach it takes
+        several hundred evaluations.
+
+        Args:
+            p_ref: (6,), m and rad.
+        """
+        self._evaluations = 0
+        begin = self._inside(self.q)
+        nearest, cost_least = begin, math.inf
+        for start in (begin, *self._starts(float(p_ref[4]))):
+            self.q[:] = start
+            cost = self._descend(p_ref, np.ones(N_JOINTS), np.zeros(N_JOINTS))
+            if cost < cost_least:
+                nearest, cost_least = self.q.copy(), cost
+            if float(np.abs(self._error).max()) <= TOLERANCE:
+                break
+        else:
+            # from `begin` too: what is nearest with the legs apart need not be nearest with them
+            found = [self._nearest_closed(p_ref, start) for start in (nearest, begin)]
+            self.q[:] = min(found, key=lambda one: one[0])[1]
+        return self.examine(p_ref)
+
+    def examine(self, p_ref: Array) -> Reach:
+        """Return how near p_ref `q` is and what keeps it from coming nearer; moves nothing.
+
+        At the nearest pose where the legs agree, J^T e + C^T mu is zero for some mu but at
+        joints that stand at a limit and would go on (the optimality conditions of
+        min |e|^2 / 2, e = p_ref - p, subject to closure = 0 and the limits).
+
+        Args:
+            p_ref: (6,), m and rad.
+        """
+        residual = self._residual(p_ref, None)
+        error = self._error[:6].copy()
+        closure = float(np.abs(self._error[6:]).max())
+        if residual <= TOLERANCE:
+            outcome, stopped = Outcome.CONVERGED, np.zeros(N_JOINTS)
+        else:
+            at_limit = 1.0 * (self.q >= self._high - 1e-9) - (self.q <= self._low + 1e-9)
+            pull, C = error @ self._system[:6], self._system[6:]
+            free = at_limit == 0.0
+            mu = np.linalg.lstsq(C[:, free].T, -pull[free], rcond=None)[0]
+            left = pull + mu @ C
+            moves = np.abs(left) > STATIONARY * float(np.abs(error).max())
+            stopped = at_limit * (moves & (left * at_limit > 0.0))
+            if closure > STEP_SURE or bool((moves & (stopped == 0.0)).any()):
+                outcome = Outcome.UNFINISHED
+            else:
+                outcome = Outcome.JOINT_LIMIT if stopped.any() else Outcome.OUT_OF_REACH
+        return Reach(outcome, error, closure, tuple(map(int, stopped)), self._evaluations)
+
+    def _starts(self, pitch: float) -> Iterator[Array]:
+        """Yield configurations (12,) to start from, with a torso pitch in rad."""
+        for knee in (-0.5, -1.6):
+            yield self._inside(np.tile([0.0, 0.2, 0.0, knee, 0.0, pitch - 0.2 - knee], 2))
+        for twist in (-0.5, 0.5):
+            for leg in (slice(0, N_LEG), slice(N_LEG, N_JOINTS)):
+                q = np.tile([0.0, 0.0, 0.0, -0.5, 0.0, pitch + 0.5], 2)
+                q[leg] = [0.0, 0.0, twist, -0.3, -twist, pitch + 0.3]
+                yield self._inside(q)
+
+    def _nearest_closed(self, p_ref: Array, start: Array) -> tuple[float, Array]:
+        """Return the miss and q of the nearest pose downhill at which the legs agree.
+
+        The method of multipliers: `shift` is what holds the closure against the pull of p_ref.
+        """
+        self.q[:] = start
+        weights = np.repeat([1.0, CLOSURE_WEIGHT], 6)
+        shift = np.zeros(N_JOINTS)
+        for _ in range(CLOSING_ROUNDS):
+            self._descend(p_ref, weights, shift)
+            shift[6:] += weights[6:] * self._error[6:]
+        return float(np.linalg.norm(weights * self._error)), self.q.copy()
+
+    def _descend(self, p_ref: Array, weights: Array, shift: Array) -> float:
+        """Move `q` downhill in |weights * error + shift|^2 until nothing moves; return it.
+
+        Levenberg-Marquardt with the joint limits as an active set; a step is taken only
+        if it gains a part of what the linearisation promises.
+        """
+        self._residual(p_ref, EQUAL_SHARES)
+        e, A = weights * self._error + shift, weights[:, None] * self._system
+        cost, damping = float(e @ e), 1e-3
+        last = self._evaluations + EVALUATIONS_MAX
+        while self._evaluations < last and damping < 1e6:
+            if float(np.abs(self._error).max()) <= 0.1 * TOLERANCE:
+                break
+            before, kept = self.q.copy(), self._error.copy()
+            step = _shortened(self._step_inside(A, e, damping), COLD_STEP_MAX)
+            e_linear = e - A @ step
+            promised = cost - float(e_linear @ e_linear)
+            if abs(promised) <= 1e-14 * cost:
+                break
+            self.q[:] = self._inside(self.q + step)  # to the last bit
+            self._residual(p_ref, EQUAL_SHARES)
+            e_after = weights * self._error + shift
+            gained = cost - float(e_after @ e_after)
+            if gained > max(0.0, 1e-3 * promised):
+                e, A, cost = e_after, weights[:, None] * self._system, cost - gained
+                damping = max(1e-12, damping * (0.1 if gained > 0.75 * promised else 1.0))
+            else:
+                self.q[:], self._error[:] = before, kept
+                damping = 8.0 * max(damping, 1e-6)
+        return cost
+
+    def _step_inside(self, A: Array, e: Array, damping: float) -> Array:
+        """Return a damped step (12,) towards A step = e that ends inside the joint limits.
+
+        Joints that stand at a limit with the gradient pointing out are held from the start
+        (all others may come off theirs); joints that the step would take out of their range
+        go as far as it goes. What is then left is for the others.
+        """
+        room_low, room_high = self._low - self.q, self._high - self.q
+        step = np.zeros(N_JOINTS)
+        downhill = A.T @ e
+        held = ((room_high <= 0.0) & (downhill > 0.0)) | ((room_low >= 0.0) & (downhill < 0.0))
+        free = leaving = ~held
+        while leaving.any():
+            J = A * free
+            to_do = J.T @ (e - A @ (step * ~free))
+            wanted = np.linalg.solve(J.T @ J + damping * np.eye(N_JOINTS), to_do)
+            inside = np.minimum(np.maximum(wanted, room_low), room_high)
+            step = np.where(free, inside, step)
+            leaving = free & (inside != wanted)
+            free = free & ~leaving
+        return step
+
+    def _inside(self, q: Array) -> Array:
+        return np.minimum(np.maximum(q, self._low), self._high)
+
     def _residual(self, p_ref: Array, D_left: Array | None) -> float:
+        self._evaluations += 1
         kinematics = self.kinematics
         kinematics.update(self.q, D_left)
         self._system[:6], self._system[6:] = kinematics.J, kinematics.C
         np.subtract(p_ref, kinematics.p, out=self._error[:6])
         np.negative(kinematics.closure, out=self._error[6:])
         return float(np.abs(self._error).max())
+
+
+def _shortened(step: Array, largest: float) -> Array:
+    """Return a step of the same direction with no part over the largest."""
+    return step * (largest / max(largest, float(np.abs(step).max())))
+
+
+def in_words(reach: Reach, p_ref: Array, limits: Array) -> str:
+    """Return one line for people: what was asked, how far it goes and what stops it.
+
+    Args:
+        reach: of a solve for p_ref.
+        p_ref: (6,), m and rad.
+        limits: of the joints (12, 2), rad.
+    """
+    if reach.converged:
+        return "p_ref is reached"
+    scale = max(float(np.abs(reach.error).max()), TOLERANCE)
+    digits = max(2, 1 - math.floor(math.log10(scale)))
+    missed = [
+        f"{name} {p_ref[row]:.{digits}f} {unit} asked, "
+        f"{p_ref[row] - reach.error[row]:.{digits}f} {unit}"
+        for row, (name, unit) in sorted(enumerate(POSE_ROWS), key=lambda r: -abs(reach.error[r[0]]))
+        if abs(reach.error[row]) >= 0.1 * scale
+    ] or [f"the legs disagree by {reach.closure:.{digits}g} m or rad, which"]
+    stops = ", ".join(
+        f"{joint} at its limit {limits[index, 0 if side < 0 else 1]:g} rad"
+        for index, (joint, side) in enumerate(zip(JOINTS, reach.stopped, strict=True))
+        if side
+    )
+    if reach.outcome is Outcome.UNFINISHED:
+        verdict = "was not reached"
+        why = f"given up after {reach.evaluations} evaluations, there may be something nearer"
+    else:
+        verdict = "cannot be reached"
+        why = stops or "the legs reach no further, no joint is at its limit"
+    others = "".join(f"; {row} there" for row in missed[1:])
+    return f"p_ref {verdict}: {missed[0]} is as far as it goes: {why}{others}"

@@ -97,8 +97,8 @@ class Kinematics:
     def hessian_times(self, F: Array, F_harness: Array) -> Array:
         """Return sum_i H_i F_i (12, 12), plus the harness point's for its force, N m/rad.
 
-        d(J^T F)/dq where `update` was, with each leg's share of the wrench held; of moments
-        the symmetric part (design section 3). Overwritten by the next call.
+        d(J^T F)/dq where `update` was, with each leg's share of the wrench held: symmetric,
+        and exact along the closed chain. Overwritten by the next call.
 
         Args:
             F: wrench along p (6,): N, and N m along roll, pitch, yaw.

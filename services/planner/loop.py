@@ -62,7 +62,7 @@ class PlannerLoop:
         planner, ports = self._planner, self._ports
         wrench = ports.wrench.take()
         if wrench is not None:
-            planner.hear_wrench(wrench)
+            planner.hear_wrench(wrench, now)
         intent = ports.intent.take()
         if intent is not None:
             planner.hear_assist(intent.assist_n)

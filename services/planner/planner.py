@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from services.planner.assist import Overload
+from services.planner.certificate import Margins
 from services.planner.engagement import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -22,6 +24,7 @@ from shared.messages import (
     Pair,
     PlannerMode,
     PlannerStatus,
+    SplitSource,
     Vector6,
     Wrench,
 )
@@ -58,6 +61,16 @@ class Planner:
         self._q: Array = np.zeros(N_JOINTS)
         self._v: Array = np.zeros(N_JOINTS)
         self._assist_wanted = 0.0
+        self._wrench: Wrench | None = None
+        self._wrench_ns = 0
+        harness = config.harness
+        self._wrench_stale_ns = round(harness.stale_ms * NS_PER_MS)
+        self._overload = Overload(
+            harness.overload_force,
+            harness.overload_moment,
+            round(harness.overload_after_ms * NS_PER_MS),
+            round(harness.overload_release_s * NS_PER_S),
+        )
         self._wrench_seq = -1
         self._last_ns = 0
         self._new = 0  # bit i: module i has a state that no tick has used
@@ -72,9 +85,11 @@ class Planner:
         self._q[2 * module : 2 * module + 2] = state.q
         self._v[2 * module : 2 * module + 2] = state.v
 
-    def hear_wrench(self, wrench: Wrench) -> None:
+    def hear_wrench(self, wrench: Wrench, now_ns: int) -> None:
         """Take the harness's newest wrench."""
         self._wrench_seq = wrench.seq
+        self._wrench, self._wrench_ns = wrench, now_ns
+        self._overload.hear(wrench, now_ns)
 
     def hear_assist(self, assist: float) -> None:
         """Take the assist force that the operator asks for, N."""
@@ -110,14 +125,46 @@ class Planner:
         fresh = [now_ns - arrived <= self._stale_ns for arrived in self._arrived_ns]
         engagement = self._engagement
         engagement.advance(
-            now_ns, fresh, [state.ready for state in states], [state.mode for state in states]
+            now_ns,
+            fresh,
+            [state.ready for state in states],
+            [state.mode for state in states],
+            self._forbidden(),
         )
         # until all engage the law starts anew from the measured pose: there is no step
         self._output = self._law.tick(
-            self._q, self._v, self._assist_wanted, dt, align=engagement.hold
+            self._q,
+            self._v,
+            self._assist_wanted,
+            dt,
+            align=engagement.hold,
+            wrench=self._usable_wrench(now_ns),
         )
         self._seq += 1
         return self._commands(now_ns, states, self._output)
+
+    def _usable_wrench(self, now_ns: int) -> Wrench | None:
+        """Return the newest wrench, or None if it is not valid or has come too long ago."""
+        wrench = self._wrench
+        if wrench is None or not wrench.valid or now_ns - self._wrench_ns > self._wrench_stale_ns:
+            return None
+        return wrench
+
+    def _forbidden(self) -> PlannerMode | None:
+        """Return why the planner may not lead, by what the last tick found; None if it may."""
+        if self._overload.hold:
+            return PlannerMode.OVERLOADED
+        output = self._output
+        if output is not None and output.local.source is SplitSource.UNCERTIFIED:
+            return PlannerMode.UNCERTIFIED
+        return None
+
+    def _hold(self) -> bool:
+        """Return True if commands carry `hold`.
+
+        By what this very tick found: no gains are lent to TRACK without a certificate.
+        """
+        return self._engagement.hold or self._forbidden() is not None
 
     def _commands(
         self, now_ns: int, states: Sequence[JointState], output: LawOutput
@@ -129,15 +176,16 @@ class Planner:
                 output.tau_ff,
                 output.dtau_ff,
                 output.tau_coupled,
-                output.k_p,
-                output.k_d,
+                output.local.D,
+                output.local.D_B,
             )
         ).reshape(7, N_MODULES, 2)
         by_module = rows.transpose(1, 0, 2).tolist()
-        hold = self._engagement.hold
+        hold = self._hold()
+        margins = output.local.margins
         return [
-            _command(now_ns, self._seq, self.session, state.t_ns, hold, by_module[index])
-            for index, state in enumerate(states)
+            _command(now_ns, self._seq, self.session, state.t_ns, hold, margins, rows)
+            for state, rows in zip(states, by_module, strict=True)
         ]
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
@@ -155,12 +203,15 @@ class Planner:
             seq=self._seq,
             session=self.session,
             mode=int(self._engagement.mode) if output is not None else int(PlannerMode.WAITING),
-            hold=self._engagement.hold,
+            hold=self._hold(),
             p=_six(output.p) if output is not None else zero,
             pdot=_six(output.pdot) if output is not None else zero,
             p_ref=_six(output.p_ref) if output is not None else zero,
             closure=_six(output.closure) if output is not None else zero,
             assist_n=output.assist if output is not None else 0.0,
+            margin=output.local.margins.service if output is not None else 0.0,
+            margin_onboard=output.local.margins.onboard if output is not None else 0.0,
+            split=int(output.local.source) if output is not None else int(SplitSource.DIAGONAL),
             ik_iterations=output.ik_iterations if output is not None else 0,
             ik_residual=output.ik_residual if output is not None else 0.0,
             tick_us=tick_us,
@@ -171,7 +222,13 @@ class Planner:
 
 
 def _command(
-    now_ns: int, seq: int, session: int, echo_t_ns: int, hold: bool, rows: list[list[float]]
+    now_ns: int,
+    seq: int,
+    session: int,
+    echo_t_ns: int,
+    hold: bool,
+    margins: Margins,
+    rows: list[list[float]],
 ) -> JointCommand:
     pairs: list[Pair] = [(row[0], row[1]) for row in rows]
     return JointCommand(
@@ -187,6 +244,8 @@ def _command(
         tau_coupled=pairs[4],
         k_p=pairs[5],
         k_d=pairs[6],
+        margin=margins.service,
+        margin_onboard=margins.onboard,
     )
 
 

@@ -96,6 +96,7 @@ class _Pose(NamedTuple):
     r_torso: ca.SX
     r_harness: ca.SX
     E_inverse: ca.SX
+    rotation: ca.SX
 
 
 def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
@@ -113,13 +114,11 @@ def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
     knee_share = config.mass.module / config.total_mass
     r_com = torso_share * r_torso + knee_share * (right.r_knee + left.r_knee)
     J_com = torso_share * J_torso[:3, :] + knee_share * ca.horzcat(right.J_knee, left.J_knee)
-    roll = ca.asin(rotation[2, 1])
-    pitch = ca.atan2(-rotation[2, 0], rotation[2, 2])
-    yaw = ca.atan2(-rotation[0, 1], rotation[1, 1])
-    E_inverse = _angle_rates_from_omega(roll, yaw)
+    angles = _angles(rotation)
+    E_inverse = _angle_rates_from_omega(angles[0], angles[2])
     arm = rotation @ ca.DM(config.geometry.harness_point)
     return _Pose(
-        p=ca.vertcat(r_com, roll, pitch, yaw),
+        p=ca.vertcat(r_com, angles),
         closure=closure,
         J=ca.vertcat(J_com, E_inverse @ J_torso[3:, :]),
         C=ca.horzcat(-twists[0], twists[1]),
@@ -127,17 +126,21 @@ def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
         r_torso=r_torso,
         r_harness=r_torso + arm,
         E_inverse=E_inverse,
+        rotation=rotation,
     )
 
 
 def _hessian(
     config: RobotConfig, legs: list[_Leg], D_left: ca.SX, pose: _Pose, F: ca.SX, F_harness: ca.SX
 ) -> ca.SX:
-    """Return d(J^T F + J_harness^T F_harness)/dq with each leg's share of the wrench held.
+    """Return d(J^T F + J_harness^T F_harness)/dq, symmetric, block diagonal by leg.
 
-    Block diagonal by leg. For joint j below joint k, dJ_k/dq_j = a_j x J_k and
-    da_k/dq_j = a_j x a_k, so forces give a symmetric block; of moments the symmetric part
-    is kept, so that K_q stays symmetric (design section 3).
+    Each leg's share of the wrench is held: how the sharing turns with q moves forces
+    between the legs only, which no motion of the closed chain feels. For joint j below
+    joint k, dJ_k/dq_j = a_j x J_k and da_k/dq_j = a_j x a_k; of a moment the symmetric part
+    is its second derivative by the torso's rotation vector. What the angles and the arm to
+    the harness point curve by that rotation is told by AD and half of it laid on each leg.
+    Along the closed chain (J T = I, C T = 0) T^T H T is then exact: -F . d2q/dp2.
     """
     torso_share = config.torso_mass / config.total_mass
     knee_force = config.mass.module / config.total_mass * F[:3]
@@ -145,6 +148,7 @@ def _hessian(
     moment = pose.E_inverse.T @ F[3:] + ca.cross(pose.r_harness - pose.r_torso, F_harness)
     wrench = ca.vertcat(force, moment)
     left_share = D_left @ wrench
+    by_rotation = _by_rotation(config, pose.rotation, F[3:], F_harness)
     blocks = []
     for leg, share in zip(legs, (wrench - left_share, left_share), strict=True):
         block = ca.SX.zeros(N_LEG, N_LEG)
@@ -157,8 +161,17 @@ def _hessian(
                 if j < k:
                     value += 0.5 * ca.dot(ca.cross(share[3:], a_j), leg.J_ang[:, k])
                 block[j, k] = block[k, j] = value
-        blocks.append(block)
+        blocks.append(block + 0.5 * leg.J_ang.T @ by_rotation @ leg.J_ang)
     return ca.diagcat(*blocks)
+
+
+def _by_rotation(config: RobotConfig, rotation: ca.SX, moment: ca.SX, F_harness: ca.SX) -> ca.SX:
+    """Return the Hessian (3, 3) of moment . angles + F_harness . arm by a small rotation."""
+    turn = ca.SX.sym("turn", 3)
+    turned = _rotation(turn) @ rotation
+    arm = turned @ ca.DM(config.geometry.harness_point)
+    work = ca.dot(moment, _angles(turned)) + ca.dot(F_harness, arm)
+    return ca.substitute(ca.hessian(work, turn)[0], turn, ca.SX.zeros(3))
 
 
 def _share(
@@ -191,6 +204,15 @@ def _share(
 def _rodrigues(axis: ca.DM, angle: ca.SX) -> ca.SX:
     k = ca.sparsify(ca.skew(axis))
     return ca.SX.eye(3) + ca.sin(angle) * k + (1 - ca.cos(angle)) * ca.sparsify(k @ k)
+
+
+def _angles(rotation: ca.SX) -> ca.SX:
+    """Return (roll, pitch, yaw) of R = Rz(yaw) Rx(roll) Ry(pitch), rad."""
+    return ca.vertcat(
+        ca.asin(rotation[2, 1]),
+        ca.atan2(-rotation[2, 0], rotation[2, 2]),
+        ca.atan2(-rotation[0, 1], rotation[1, 1]),
+    )
 
 
 def _angle_rates_from_omega(roll: ca.SX, yaw: ca.SX) -> ca.SX:

@@ -15,10 +15,11 @@ from typing import Final
 
 from services.recorder import provenance
 from services.recorder.mcap_log import FILE_NAME, SCHEMA_VERSION, RunWriter, Source
-from shared import log, topics
+from shared import gain_schedule, log, topics
 from shared.bus import open_session
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
-from shared.config import RecorderConfig, load
+from shared.config import load
+from shared.config_sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
 from shared.priority import raise_priority
 from shared.process import StopFlag, run_service, service_parser
@@ -151,6 +152,9 @@ def _arguments() -> argparse.Namespace:
 
 def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
     files: dict[str, Path] = {"robot.toml": arguments.config}
+    schedule = gain_schedule.path_beside(arguments.config)
+    if schedule.is_file():
+        files["robot.gains.json"] = schedule
     if arguments.scenario is not None:
         files["scenario.toml"] = arguments.scenario
     for text in arguments.attach:

@@ -27,7 +27,9 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.JointEvent, "mode_before"): messages.Mode,
     (messages.JointEvent, "mode_after"): messages.Mode,
     (messages.JointEvent, "cause"): messages.Cause,
+    (messages.Wrench, "tare"): messages.Tare,
     (messages.PlannerStatus, "mode"): messages.PlannerMode,
+    (messages.PlannerStatus, "split"): messages.SplitSource,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }
 """Fields that are plain integers on the bus and enumerations in the mind."""

@@ -28,7 +28,7 @@ from shared.cansimple import (
     InputMode,
     MotorError,
 )
-from shared.config import DriveConfig
+from shared.config_sections import DriveConfig
 from shared.exceptions import DriveError
 from shared.joints import MODULES, N_JOINTS
 

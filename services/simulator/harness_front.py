@@ -16,7 +16,10 @@ BIAS_MAX: Final = 20.0
 
 
 class FrameHub(Protocol):
-    """The side of the simulated CAN bus that all clients listen to."""
+    """The sensor's end of its simulated CAN bus."""
+
+    def poll(self) -> object:
+        """Admit new clients and take what they sent; never waits."""
 
     def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
         """Send frames (id, data) to every client, as one packet."""
@@ -61,4 +64,5 @@ class HarnessFront:
         forces += self.bias
         forces += self._noise * self._random.standard_normal(stewart.N_LEGS)
         np.clip(forces, -self._leg_force_max, self._leg_force_max, out=forces)
+        self._hub.poll()  # nobody tells a load cell anything, but who listens must be let in
         self._hub.broadcast(loadcell_can.pack(forces.tolist()))

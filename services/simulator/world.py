@@ -62,6 +62,7 @@ class World:
         self._torso = self.model.body("torso").id
         self._feet = [self.model.body(f"foot_{side}").id for side in SIDES]
         self._harness_point = config.geometry.harness_point
+        self._ankles_wanted = np.array(ankle_positions(config))
         self._hoist_time = config.simulation.hoist_s
         self.hoist = 1.0
         self._releasing = False
@@ -85,7 +86,29 @@ class World:
         data.qpos[self._q_index] = stand_pose(config, config.simulation.stand_height)
         mujoco.mj_kinematics(model, data)
         data.qpos[0] -= data.xpos[self._feet[0]][0]
-        wanted = ankle_positions(config)
+        self._flatten_soles()
+        self._hoist_position = data.qpos[:3].copy()
+
+    def stand_at(self, q: Array) -> None:
+        """Stand the robot still, soles flat, at joint angles q (12,), rad; no hoist.
+
+        The two legs must agree on the torso, as `InverseKinematics` makes them.
+        """
+        data = self.data
+        data.qpos[:7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+        data.qpos[self._q_index] = q
+        mujoco.mj_kinematics(self.model, data)
+        foot = self._feet[0]
+        rotation_sole_torso = data.xmat[foot].reshape(3, 3).T.copy()
+        data.qpos[:3] = self._ankles_wanted[0] - rotation_sole_torso @ data.xpos[foot]
+        mujoco.mju_mat2Quat(data.qpos[3:7], rotation_sole_torso.ravel())
+        data.qvel[:] = 0.0
+        self._flatten_soles()
+        self.hoist = 0.0
+
+    def _flatten_soles(self) -> None:
+        """Move the legs until both ankles are in their places, soles flat."""
+        data, model, wanted = self.data, self.model, self._ankles_wanted
         jacobian = np.zeros((6, model.nv))
         for _ in range(STAND_ITERATIONS):
             mujoco.mj_kinematics(model, data)
@@ -99,7 +122,6 @@ class World:
                 step = np.linalg.solve(jacobian[:, columns], error)
                 data.qpos[self._q_index[leg * N_LEG : (leg + 1) * N_LEG]] += step
         mujoco.mj_forward(model, data)
-        self._hoist_position = data.qpos[:3].copy()
         self._ankles = np.array([data.xpos[foot] for foot in self._feet])
 
     @property

@@ -10,11 +10,15 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from services.harness.filter import WrenchFilter
+from services.harness.loop import HarnessLoop
 from shared import config, loadcell_can
-from shared.clock import NS_PER_MS
-from shared.config import HarnessConfig, RobotConfig
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.codec import encode
+from shared.config import RobotConfig
+from shared.config_sections import HarnessConfig
 from shared.loadcell_can import LegSample
-from shared.messages import Vector6
+from shared.messages import TareRequest, Vector6, Wrench
 from shared.process import DEFAULT_CONFIG
 from shared.stewart import geometry_matrix
 
@@ -22,6 +26,8 @@ ROBOT = config.load(DEFAULT_CONFIG)
 HARNESS = ROBOT.harness
 G = geometry_matrix(HARNESS.base_radius, HARNESS.platform_radius, HARNESS.height)
 PERIOD_NS = 4 * NS_PER_MS
+T0 = 1_000 * NS_PER_S
+TARE_CYCLES = round(HARNESS.tare_s * NS_PER_S / PERIOD_NS)
 ZERO: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -53,9 +59,61 @@ class CanHub:
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
 
+    def poll(self) -> None:
+        """Nobody speaks to a load cell."""
+
     def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
         for can_id, data in frames:
             self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
     def send_forces(self, forces: Sequence[float]) -> None:
         self.broadcast(loadcell_can.pack(forces))
+
+
+class ScriptedSensor:
+    """Gives the forces it is told to."""
+
+    def __init__(self) -> None:
+        self.forces: Vector6 | None = ZERO
+
+    def read(self, now_ns: int) -> LegSample | None:
+        return None if self.forces is None else sample(now_ns, self.forces)
+
+    def close(self) -> None:
+        pass
+
+
+class Sink:
+    """A bus that encodes as the real one does and keeps the bytes."""
+
+    def __init__(self) -> None:
+        self.payloads: list[bytes] = []
+        self.closed = False
+
+    def put(self, message: Wrench) -> bool:
+        self.payloads.append(encode(message))
+        return not self.closed
+
+
+class Asked:
+    """Gives a request for a tare once it is told to."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def take(self) -> TareRequest | None:
+        asked, self.asked = self.asked, False
+        return TareRequest(t_ns=0, seq=0, source="a test") if asked else None
+
+
+def make_loop(asked: Asked | None = None) -> tuple[HarnessLoop, ScriptedSensor, Sink]:
+    sensor, sink = ScriptedSensor(), Sink()
+    return HarnessLoop(sensor, WrenchFilter(HARNESS), sink, asked or Asked()), sensor, sink
+
+
+def cycles(loop: HarnessLoop, t_ns: int, count: int) -> tuple[Wrench, int]:
+    assert count > 0
+    for _ in range(count):
+        message = loop.cycle(t_ns)
+        t_ns += PERIOD_NS
+    return message, t_ns

@@ -13,7 +13,8 @@ import pytest
 from services.simulator.harness_front import HarnessFront
 from shared import topics
 from shared.bus import open_session
-from shared.messages import Wrench
+from shared.clock import now_ns
+from shared.messages import Tare, TareRequest, Wrench
 from shared.unix_can_hub import UnixCanHub
 from tests.harness.helpers import ROBOT
 
@@ -27,7 +28,15 @@ def run_dir() -> Iterator[Path]:
     shutil.rmtree(directory)
 
 
-def test_the_service_publishes_the_operators_wrench_and_stops_when_told(run_dir: Path) -> None:
+def retared(taken: list[Wrench]) -> bool:
+    """Return True once a tare has begun after a wrench was valid."""
+    states = [wrench.tare for wrench in taken]
+    return Tare.DONE in states and Tare.RUNNING in states[states.index(Tare.DONE) :]
+
+
+def test_the_service_publishes_the_operators_wrench_tares_when_asked_and_stops_when_told(
+    run_dir: Path,
+) -> None:
     command = [sys.executable, "-m", "services.harness", "--run-dir", str(run_dir)]
     taken: list[Wrench] = []
     with (
@@ -39,12 +48,22 @@ def test_the_service_publishes_the_operators_wrench_and_stops_when_told(run_dir:
             wrenches = session.latest(topics.WRENCH, Wrench)
             front = HarnessFront(ROBOT, hub, seed=1)
             give_up = time.monotonic() + 20.0
+            requests = session.publisher(topics.HARNESS_TARE, TareRequest)
             loaded_for = 0
             while loaded_for < 100 and time.monotonic() < give_up:
-                hub.poll()
                 tared = bool(taken) and taken[-1].valid
                 loaded_for += tared
                 front.send([0.0, 0.0, 100.0 if tared else 0.0], [0.0, 0.0, 0.0])
+                newest = wrenches.take()
+                if newest is not None:
+                    taken.append(newest)
+                time.sleep(0.004)
+            loaded = taken[-1]
+            while not (retared(taken) and taken[-1].valid):
+                assert time.monotonic() < give_up, taken[-1]
+                front.send([0.0, 0.0, 100.0], [0.0, 0.0, 0.0])
+                if not retared(taken):
+                    requests.put(TareRequest(t_ns=now_ns(), seq=0, source="a test"))
                 newest = wrenches.take()
                 if newest is not None:
                     taken.append(newest)
@@ -56,6 +75,7 @@ def test_the_service_publishes_the_operators_wrench_and_stops_when_told(run_dir:
     assert service.returncode == 0, log
     assert "stopped:" in log
     assert not taken[0].valid
-    assert taken[-1].force[2] == pytest.approx(100.0, abs=5.0)
+    assert loaded.force[2] == pytest.approx(100.0, abs=5.0)
+    assert taken[-1].force[2] == pytest.approx(0.0, abs=5.0), "asked to, it took that for zero"
     numbers = [message.seq for message in taken]
     assert numbers == sorted(set(numbers))

@@ -32,6 +32,8 @@ def command(**changes: Any) -> JointCommand:
         "tau_coupled": (0.0, 0.0),
         "k_p": (600.0, 800.0),
         "k_d": (40.0, 50.0),
+        "margin": 1.0,
+        "margin_onboard": 0.5,
     }
     return JointCommand(**(fields | changes))
 

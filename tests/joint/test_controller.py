@@ -188,6 +188,23 @@ def test_hold_freezes_references_and_drops_the_coupled_torque_over_its_ramp(
     np.testing.assert_allclose(bench.controller.tau, before - np.array(COUPLED), atol=1e-9)
 
 
+@pytest.mark.parametrize(("module", "theta_rises"), [("ankle_left", True), ("knee_left", False)])
+def test_in_hold_ankles_and_every_phi_stiffen_and_the_rest_stays_as_it_was_certified(
+    robot: RobotConfig, module: str, theta_rises: bool
+) -> None:
+    bench = Bench(robot, module)
+    bench.q = (0.02, -0.3)  # inside both kinds' limits
+    sent = {"k_p": (100.0, 200.0), "k_d": (1.0, 1.0), "q_ref": bench.q}
+    bench.to_track(**sent)
+    bench.cycle(bench.fresh(hold=True, **sent))
+    before = np.array(bench.run(400)[-1].tau)
+    bench.q = (0.03, -0.31)
+    change = np.array(bench.run(50)[-1].tau) - before
+    phi, theta = robot.stand_gains(module).k_p
+    expected = (-0.01 * phi, 0.01 * (theta if theta_rises else 200.0))
+    np.testing.assert_allclose(change, expected, atol=1e-9)
+
+
 def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> None:
     """Two planners run and the first dies: the second one's references are its own."""
     bench.to_track()

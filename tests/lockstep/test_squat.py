@@ -88,7 +88,7 @@ def test_a_restarted_planner_takes_over_without_a_step(robot: RobotConfig) -> No
 
 def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
     averaged = msgspec.structs.replace(
-        robot, law=msgspec.structs.replace(robot.law, jacobian="average")
+        robot, law=msgspec.structs.replace(robot.law, jacobian="average", split="diagonal")
     )
     from tools.runs.lockstep import Lockstep  # noqa: PLC0415
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -57,25 +58,21 @@ def p_at(robot: RobotConfig, height: float, **parts: float) -> Array:
 
 
 def at_pose(robot: RobotConfig, ik: InverseKinematics, p: Array, start: Array) -> Array:
-    """Return q (12,) at p, polished so that the oracle agrees to 1e-9; asserts it got there."""
+    """Return q (12,) at p, polished until the oracle agrees to 1e-13; asserts it got there."""
     ik.q[:] = start
     for _ in range(3):  # each solve stops at its tolerance; the next goes on from there
         ik.solve(p, iterations_max=60)
-    q = ik.q.copy()
-    for _ in range(3):
-        J = oracle.derivative(lambda x: oracle.pose(robot, x), q)
-        C = oracle.derivative(lambda x: oracle.closure(robot, x), q)
-        error = np.concatenate([p - oracle.pose(robot, q), -oracle.closure(robot, q)])
-        q += np.linalg.solve(np.vstack([J, C]), error)
-    assert np.abs(p - oracle.pose(robot, q)).max() < 1e-9
-    assert np.abs(oracle.closure(robot, q)).max() < 1e-9
-    return q
+    return oracle.closed_chain(robot, ik.q.copy())(p)
 
 
 @pytest.fixture(scope="session")
 def closed(robot: RobotConfig, ik: InverseKinematics) -> Closed:
-    def make(height: float, **parts: float) -> Array:
+    @cache
+    def made(height: float, parts: frozenset[tuple[str, float]]) -> Array:
         start = np.array(stand_pose(robot, 1.188))
-        return at_pose(robot, ik, p_at(robot, height, **parts), start)
+        return at_pose(robot, ik, p_at(robot, height, **dict(parts)), start)
+
+    def make(height: float, **parts: float) -> Array:
+        return made(height, frozenset(parts.items())).copy()
 
     return make

@@ -128,6 +128,58 @@ def derivative(f: Callable[[Array], Array], q: Array, step: float = 1e-6) -> Arr
     return np.stack(columns, axis=-1)
 
 
+def precise_derivative(f: Callable[[Array], Array], q: Array, step: float = 3e-3) -> Array:
+    """Return df/dq as `derivative` does, to 1e-12 of f's size: differences of sixth order."""
+    columns = []
+    for index in range(len(q)):
+        e = np.zeros(len(q))
+        e[index] = step
+        near, mid, far = (f(q + n * e) - f(q - n * e) for n in (1, 2, 3))
+        columns.append((45.0 * near - 9.0 * mid + far) / (60.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+def second_derivative(f: Callable[[Array], Array], p: Array, step: float) -> Array:
+    """Return d2f/dp2 (..., n, n) by central differences."""
+    n = len(p)
+    e = step * np.eye(n)
+    middle = f(p)
+    up, down = [f(p + row) for row in e], [f(p - row) for row in e]
+    result = np.zeros((*np.shape(middle), n, n))
+    for i in range(n):
+        result[..., i, i] = up[i] - 2.0 * middle + down[i]
+        for j in range(i):
+            same = f(p + e[i] + e[j]) + f(p - e[i] - e[j])
+            # the corners less what the axes alone curve by
+            mixed = 0.5 * (same + 2.0 * middle - up[i] - down[i] - up[j] - down[j])
+            result[..., i, j] = result[..., j, i] = mixed
+    return result / step**2
+
+
+def closed_chain(config: RobotConfig, q_near: Array) -> Callable[[Array], Array]:
+    """Return q(p) for p near that of q_near, exact to rounding: Newton, its slope held.
+
+    The legs agree in all that it returns; it refuses p that is too far away.
+    """
+
+    def rows(q: Array) -> Array:
+        return np.concatenate([pose(config, q), closure(config, q)])
+
+    inverse = np.linalg.inv(precise_derivative(rows, q_near))
+
+    def q_of(p: Array) -> Array:
+        q, wanted = q_near.copy(), np.concatenate([p, np.zeros(6)])
+        for _ in range(40):
+            step = inverse @ (wanted - rows(q))
+            q += step
+            if np.abs(step).max() < 1e-14:
+                break
+        assert np.abs(wanted - rows(q)).max() < 1e-13, "p is too far from q_near"
+        return q
+
+    return q_of
+
+
 def leg_jacobian(config: RobotConfig, side: int, q: Array) -> Array:
     """Return the leg's torso twist per joint rate (6, 6), linear first, world axes."""
     R0 = leg(config, side, q).R
@@ -146,8 +198,8 @@ def knee_jacobian(config: RobotConfig, side: int, q: Array) -> Array:
 
 def feasible(config: RobotConfig, q: Array) -> Array:
     """Return T (12, 6): joint rates per unit of p along which the legs stay together."""
-    J = derivative(lambda near: pose(config, near), q)
-    C = derivative(lambda near: closure(config, near), q)
+    J = precise_derivative(lambda near: pose(config, near), q)
+    C = precise_derivative(lambda near: closure(config, near), q)
     return np.asarray(np.linalg.solve(np.vstack([J, C]), np.eye(12)[:, :6]), float)
 
 

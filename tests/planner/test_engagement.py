@@ -138,3 +138,33 @@ def test_five_modules_hold_for_good_once_the_sixth_has_faulted(robot: RobotConfi
     rows = fleet.run(1000)
     assert rows[-1][1] is Mode.FAULT
     assert max(row.count(Mode.TRACK) for row in rows[2:]) == 0
+
+
+FORBIDDEN = [PlannerMode.OVERLOADED, PlannerMode.UNCERTIFIED]
+
+
+@pytest.mark.parametrize("forbidden", FORBIDDEN)
+@pytest.mark.parametrize("mode", list(PlannerMode))
+def test_what_is_forbidden_holds_from_every_mode_at_once(
+    mode: PlannerMode, forbidden: PlannerMode
+) -> None:
+    """Within the grace time too."""
+    engagement = Engagement(mode, T0)
+    engagement.advance(T0, YES, YES, TRACK, forbidden)
+    assert (engagement.mode, engagement.hold) == (forbidden, True)
+
+
+@pytest.mark.parametrize("forbidden", FORBIDDEN)
+def test_allowed_again_it_aligns_before_it_leads(forbidden: PlannerMode) -> None:
+    engagement = Engagement(forbidden, T0)
+    engagement.advance(T0 + 1, YES, YES, TRACK)
+    assert (engagement.mode, engagement.hold) == (PlannerMode.ALIGNING, True)
+    engagement.advance(T0 + 2, YES, YES, TRACK)
+    assert (engagement.mode, engagement.hold) == (PlannerMode.LEADING, False)
+
+
+@pytest.mark.parametrize("forbidden", FORBIDDEN)
+def test_a_silent_module_counts_before_what_is_forbidden(forbidden: PlannerMode) -> None:
+    engagement = leading()
+    engagement.advance(T0, but(YES, 3, False), YES, TRACK, forbidden)
+    assert engagement.mode is PlannerMode.WAITING

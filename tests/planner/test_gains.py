@@ -1,4 +1,4 @@
-"""K_q = N K_0 + J^T K_p J - sum_i H_i F_i, B_q = N B_0 + J^T B_p J, and their split."""
+"""K_q = N K_0 + J^T K_p J - sum_i H_i F_i, B_q = N B_0 + J^T B_p J."""
 
 from __future__ import annotations
 
@@ -96,25 +96,3 @@ def test_null_space_projector_keeps_clear_of_the_task_up_to_its_damping(
     assert values.max() <= 1.0 + 1e-12
     assert np.sum(values > 1 - 1e-9) == 6  # the six directions that J does not see are whole
     assert np.linalg.norm(at.J @ N, 2) <= robot.law.damping_lambda / 2 + 1e-12
-
-
-def test_local_gains_are_their_share_of_the_diagonals_within_the_limits(
-    robot: RobotConfig, at: Kinematics
-) -> None:
-    gains = gains_under_weight(robot, at)
-    service, damping_share = robot.joint_service, robot.law.local_damping_share
-    for diagonal, local, limit in (
-        (np.diagonal(gains.K_q), gains.D, service.k_p_max),
-        (damping_share * np.diagonal(gains.B_q), gains.D_B, service.k_d_max),
-    ):
-        np.testing.assert_array_equal(local, np.clip(diagonal, 0.0, limit))
-        assert local.max() > 1.0
-
-
-def test_local_gains_are_never_negative_nor_over_the_limit(
-    robot: RobotConfig, at: Kinematics
-) -> None:
-    for hessian in (1e5 * np.eye(12), -1e5 * np.eye(12)):
-        gains = GainLaw(robot).gains(at, hessian)
-        assert gains.D.min() >= 0.0
-        assert gains.D.max() <= robot.joint_service.k_p_max

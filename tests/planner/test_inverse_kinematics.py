@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from services.planner.inverse_kinematics import TOLERANCE, InverseKinematics
+from services.planner.inverse_kinematics import TOLERANCE, InverseKinematics, Outcome, in_words
+from services.planner.kinematics import Kinematics
 from shared.config import RobotConfig
 from shared.robot_model import stand_pose
 from tests.planner import oracle
@@ -21,6 +22,18 @@ def true_residual(robot: RobotConfig, q: Array, p_ref: Array) -> float:
     """Return the largest error in p or in the closure by the oracle, m or rad."""
     errors = (oracle.pose(robot, q) - p_ref, oracle.closure(robot, q))
     return float(max(np.abs(error).max() for error in errors))
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, ik: InverseKinematics) -> list[int]:
+    """Count in the list's only entry how often the kinematics are computed."""
+    count, update = [0], ik.kinematics.update
+
+    def counting(q: Array, D_left: Array | None = None) -> None:
+        count[0] += 1
+        update(q, D_left)
+
+    monkeypatch.setattr(ik.kinematics, "update", counting)
+    return count
 
 
 def assert_within(q: Array, limits: Array) -> None:
@@ -75,6 +88,21 @@ def test_a_squat_takes_at_most_two_iterations_a_tick(
         assert result.iterations <= 2
         assert result.converged
         assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE
+
+
+def test_a_tick_computes_the_kinematics_twice_in_a_squat_and_three_times_out_of_reach(
+    robot: RobotConfig, ik: InverseKinematics, closed: Closed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Warm, without a search; at a limit the third takes back a step that led nowhere."""
+    ik.q[:] = closed(1.188)
+    count = counted(monkeypatch, ik)
+    high = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
+    squat = [p_at(robot, height) for height in np.linspace(1.188, 0.948, 600)]
+    for poses, most in ((squat, 2), ([high] * 10, 5), ([high] * 100, 3)):
+        for p_ref in poses:
+            before = count[0]
+            ik.solve(p_ref)
+            assert count[0] - before <= most
 
 
 def test_an_unreachable_pose_keeps_the_limits_and_says_so(
@@ -141,3 +169,181 @@ def test_stand_pose_is_level_with_its_com_over_the_ankles(robot: RobotConfig) ->
     for height in (0.85, 0.948, 1.188, 1.25):
         p = oracle.pose(robot, np.array(stand_pose(robot, height)))
         np.testing.assert_allclose(p[[0, 3, 4, 5]], 0.0, atol=1e-9)
+
+
+def reachable(robot: RobotConfig, limits: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return (q, p) drawn inside the limits and the workspace, by the oracle alone.
+
+    The right leg's joints are drawn; the left leg is brought to carry the same torso by
+    Newton's method; what leaves the limits or the workspace is drawn again.
+    """
+    low, high = limits[:6].T
+    while True:
+        roll, pitch = rng.uniform(-0.2, 0.2), rng.uniform(-0.3, 1.3)
+        right = rng.uniform(low, high)
+        right[[0, 2]] = rng.uniform(-0.25, 0.25), rng.uniform(-0.4, 0.4)
+        right[4] = roll - right[0] - right[2] + rng.uniform(-0.1, 0.1)
+        right[5] = pitch - right[1] - right[3]
+        q = np.concatenate([right, right])
+        torso, yaw = oracle.leg(robot, oracle.RIGHT, q).torso, oracle.pose(robot, q)[5]
+        if not 0.75 <= torso[2] <= 1.25 or abs(torso[0]) > 0.3 or abs(yaw) > 0.3:
+            continue
+        for _ in range(8):
+            J = oracle.leg_jacobian(robot, oracle.LEFT, q)
+            q[6:] -= np.clip(np.linalg.solve(J, oracle.closure(robot, q)), -0.4, 0.4)
+        p = oracle.pose(robot, q)
+        inside = np.all((q >= limits[:, 0]) & (q <= limits[:, 1]))
+        most = np.array([0.1, 0.1, 2.0, 0.2, 1.3, 0.3])
+        closed = np.abs(oracle.closure(robot, q)).max() < 1e-9
+        if inside and closed and np.all(np.abs(p) <= most) and p[4] >= -0.3:
+            return q, p
+
+
+def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
+    robot: RobotConfig, ik: InverseKinematics, limits: Array
+) -> None:
+    """Of 7 500 poses drawn so, each from a random start and from a stand, none failed."""
+    rng = np.random.default_rng(2024)
+    for _ in range(30):
+        _, p_ref = reachable(robot, limits, rng)
+        for _ in range(8):
+            ik.q[:] = rng.uniform(limits[:, 0], limits[:, 1])
+            reach = ik.solve_from_anywhere(p_ref)
+            assert reach.converged, in_words(reach, p_ref, limits)
+            assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE
+            assert_within(ik.q, limits)
+
+
+def test_a_pose_beyond_the_fold_is_reached(
+    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
+) -> None:
+    """Made with a left knee twisted by -0.535 rad; every stand ends 0.35 mm short of it."""
+    p_ref = np.array([-0.07247, 0.06702, 0.90433, -0.03099, 0.82851, 0.13846])
+    ik.q[:] = closed(1.188)
+    assert ik.solve_from_anywhere(p_ref).converged
+    assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE
+    assert_within(ik.q, limits)
+
+
+UNREACHABLE = {
+    "too high, twisted": (0.05, -0.03, 1.1, 0.1, 0.4, 0.15),
+    "below the floor": (0.0, 0.0, -0.3, 0.0, 0.2, 0.0),
+    "too far ahead": (1.2, 0.0, 0.8, 0.0, 0.0, 0.0),
+    "too far to the left": (0.0, 0.9, 0.8, 0.1, 0.0, 0.0),
+    "too far rolled": (0.0, 0.0, 0.8, -0.9, 0.0, 0.0),
+    "too far turned": (0.0, 0.0, 0.85, 0.0, 0.3, 1.4),
+    "bent too far back": (0.0, 0.0, 0.8, 0.0, -2.5, 0.0),
+}
+
+
+@pytest.fixture(params=UNREACHABLE.values(), ids=list(UNREACHABLE))
+def p_unreachable(request: pytest.FixtureRequest) -> Array:
+    return np.array(request.param)
+
+
+def test_out_of_reach_it_ends_inside_the_limits_with_legs_that_agree(
+    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, p_unreachable: Array
+) -> None:
+    rng, misses = np.random.default_rng(3), []
+    for start in (rng.uniform(*limits.T), closed(1.188), closed(0.85, pitch=1.0)):
+        ik.q[:] = start
+        reach = ik.solve_from_anywhere(p_unreachable)
+        assert reach.outcome in (Outcome.JOINT_LIMIT, Outcome.OUT_OF_REACH)
+        assert np.isfinite(ik.q).all()
+        assert_within(ik.q, limits)
+        assert np.abs(oracle.closure(robot, ik.q)).max() < 1e-5
+        np.testing.assert_allclose(
+            p_unreachable - oracle.pose(robot, ik.q), reach.error, atol=2 * TOLERANCE
+        )
+        misses.append(float(np.linalg.norm(reach.error)))
+    assert misses[1] == pytest.approx(misses[2], abs=1e-5)  # any stand ends as near
+
+
+def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
+    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, p_unreachable: Array
+) -> None:
+    """By the oracle, to first order: moves of 1 mrad that keep the legs together."""
+    ik.q[:] = closed(1.188)
+    reach = ik.solve_from_anywhere(p_unreachable)
+    C = oracle.derivative(lambda near: oracle.closure(robot, near), ik.q)
+    J = oracle.derivative(lambda near: oracle.pose(robot, near), ik.q)
+    at_limit = (ik.q >= limits[:, 1] - 1e-6) * 1.0 - (ik.q <= limits[:, 0] + 1e-6)
+    rng = np.random.default_rng(8)
+    for _ in range(200):
+        move = rng.normal(size=12) + rng.uniform(0.0, 100.0) * (reach.error @ J)
+        outward = move * at_limit > 0.0
+        move[outward] *= -rng.uniform(0.0, 1.0) * (rng.random(12)[outward] < 0.5)
+        free = at_limit == 0.0
+        move[free] -= np.linalg.pinv(C[:, free], rcond=1e-6) @ (C @ move)
+        move *= 1e-3 / np.abs(move).max()
+        nearer = float(reach.error @ J @ move) / float(np.linalg.norm(reach.error))
+        assert nearer <= 2e-6 or np.abs(C @ move).max() > 1e-9
+
+
+def test_out_of_reach_it_is_not_worse_than_where_it_started(
+    robot: RobotConfig, ik: InverseKinematics
+) -> None:
+    """A start near the best pose there is, where all other starts end 8 mm further away."""
+    right, left = [0.1676, 0.1146, -0.5614, -0.5274, 0.3547], [0.0495, 0.0588, -0.2621, -0.9647]
+    ik.q[:] = np.array([*right, 1.5819, *left, 0.2394, 2.0868])
+    p_ref = np.array([-0.03, -0.109, 1.167, -0.154, 1.216, 0.231])
+    at_start = np.linalg.norm(p_ref - oracle.pose(robot, ik.q))
+    assert np.linalg.norm(ik.solve_from_anywhere(p_ref).error) <= at_start
+
+
+def test_too_high_says_how_far_it_goes_and_which_joints_stop_it(
+    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
+) -> None:
+    p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
+    ik.q[:] = closed(1.188)
+    reach = ik.solve_from_anywhere(p_ref)
+    assert reach.outcome is Outcome.JOINT_LIMIT
+    assert reach.stopped == (0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0)
+    assert in_words(reach, p_ref, limits) == (
+        "p_ref cannot be reached: COM z 1.31 m asked, 0.93 m is as far as it goes: "
+        "knee_right_theta at its limit -0.2 rad, knee_left_theta at its limit -0.2 rad"
+    )
+
+
+def test_beyond_straight_legs_no_joint_limit_is_blamed(robot: RobotConfig, limits: Array) -> None:
+    wide = limits.copy()
+    wide[list(KNEES), 1] = 0.3
+    ik = InverseKinematics(Kinematics(robot), wide)
+    ik.q[:] = stand_pose(robot, 1.188)
+    p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
+    reach = ik.solve_from_anywhere(p_ref)
+    assert reach.outcome is Outcome.OUT_OF_REACH
+    assert set(reach.stopped) == {0}
+    assert in_words(reach, p_ref, wide).endswith("reach no further, no joint is at its limit")
+
+
+def test_a_configuration_on_the_way_is_not_called_the_nearest(
+    ik: InverseKinematics, limits: Array, closed: Closed
+) -> None:
+    p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
+    ik.q[:] = closed(1.0)
+    reach = ik.examine(p_ref)
+    assert reach.outcome is Outcome.UNFINISHED
+    assert in_words(reach, p_ref, limits).startswith("p_ref was not reached: COM z 1.31 m asked")
+    ik.solve_from_anywhere(p_ref)  # its knees now stand at their limit, and can come off it
+    reach = ik.examine(np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]))
+    assert reach.outcome is Outcome.UNFINISHED
+    assert set(reach.stopped) == {0}
+
+
+def test_a_reached_pose_is_said_to_be_reached(
+    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
+) -> None:
+    ik.q[:] = closed(1.188)
+    p_ref = p_at(robot, 1.0, pitch=0.3)
+    assert in_words(ik.solve_from_anywhere(p_ref), p_ref, limits) == "p_ref is reached"
+
+
+def test_the_same_start_and_pose_give_the_same_bits(
+    ik: InverseKinematics, closed: Closed, p_unreachable: Array
+) -> None:
+    ik.q[:] = closed(1.0)
+    ik.solve_from_anywhere(p_unreachable)
+    first, ik.q[:] = ik.q.copy(), closed(1.0)
+    ik.solve_from_anywhere(p_unreachable)
+    np.testing.assert_array_equal(ik.q, first)

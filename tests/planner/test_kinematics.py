@@ -1,4 +1,4 @@
-"""p, J, closure, load sharing and the Hessian against the paper's equations."""
+"""p, J, closure and load sharing against the paper's equations; test_hessian.py has the rest."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ POSES = (
     {"height": 0.85, "pitch": 1.0, "x": -0.03, "y": 0.04, "roll": -0.05, "yaw": -0.05},
     {"height": 0.80, "pitch": 1.2},
 )
-WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
-NO_FORCE = np.zeros(3)
 
 
 @pytest.fixture(params=POSES, ids=lambda p: f"{p['height']:g}m-{p.get('pitch', 0):g}rad")
@@ -166,85 +164,3 @@ def test_under_its_own_weight_load_sharing_stays_within_the_edge_and_average_doe
                 foot = oracle.foot_wrench(robot, side, q, model.J.T @ weight)
                 edge = foot[2] * robot.geometry.w_foot / 2
                 assert (abs(foot[3]) < edge) == (name == "load_sharing")
-
-
-def torque_slope(kinematics: Kinematics, q: Array, F: Array, F_h: Array) -> Array:
-    """Return d(J^T F + J_harness^T F_h)/dq (12, 12) by differences, the shares held."""
-    kinematics.update(q)
-    D_left = kinematics.D_left.copy()
-
-    def torque(q_near: Array) -> Array:
-        kinematics.update(q_near, D_left)
-        return np.asarray(kinematics.J.T @ F + kinematics.J_harness.T @ F_h, float)
-
-    return oracle.derivative(torque, q)
-
-
-def symmetric_error(kinematics: Kinematics, q: Array, F: Array, F_h: Array) -> Array:
-    """Return the symmetric part of the slope less what `hessian_times` says."""
-    want = torque_slope(kinematics, q, F, F_h)
-    kinematics.update(q)
-    return np.asarray(0.5 * (want + want.T) - kinematics.hessian_times(F, F_h), float)
-
-
-def test_hessian_is_symmetric(kinematics: Kinematics, q: Array) -> None:
-    kinematics.update(q)
-    F = np.array([30.0, -20.0, 731.0, 10.0, 5.0, 3.0])
-    hessian = kinematics.hessian_times(F, np.array([5.0, -5.0, 50.0]))
-    assert np.abs(hessian).max() > 100.0
-    np.testing.assert_array_equal(hessian, hessian.T)
-
-
-@pytest.mark.parametrize("force", [(0, 0, 731.6), (50, 0, 0), (0, 50, 0), (30, -20, 731)])
-def test_hessian_of_a_force_is_the_slopes_symmetric_part(
-    kinematics: Kinematics, q: Array, force: tuple[float, float, float]
-) -> None:
-    F = np.array([*force, 0.0, 0.0, 0.0])
-    np.testing.assert_allclose(symmetric_error(kinematics, q, F, NO_FORCE), 0.0, atol=1e-5)
-
-
-def test_hessian_with_50_n_at_the_harness_errs_by_under_one_percent(
-    kinematics: Kinematics, q: Array
-) -> None:
-    F_h = np.array([0.0, 0.0, 50.0])
-    kinematics.update(q)
-    largest = np.abs(kinematics.hessian_times(WEIGHT, F_h)).max()
-    error = np.abs(symmetric_error(kinematics, q, WEIGHT, F_h)).max()
-    assert error < 0.01 * largest
-
-
-def test_hessian_leaves_out_only_the_turning_of_the_harness_arm(
-    robot: RobotConfig, kinematics: Kinematics, q: Array
-) -> None:
-    """Where the error of a force at the harness comes from.
-
-    Its moment is arm x F_h, and the arm turns with the torso: by omega = J_omega v,
-    d(moment) = (omega x arm) x F_h. That part is not in the Hessian.
-    """
-    F_h = np.array([10.0, -20.0, 200.0])
-    error = symmetric_error(kinematics, q, np.zeros(6), F_h)
-    kinematics.update(q)
-    arm = kinematics.r_harness - kinematics.r_torso
-    roll, _, yaw = kinematics.p[3:]
-    about_z = oracle.rz(yaw)
-    x_axis, y_axis = about_z[:, 0], (about_z @ oracle.rx(roll))[:, 1]
-    E = np.column_stack([x_axis, y_axis, np.array([0.0, 0.0, 1.0])])
-    J_omega = E @ kinematics.J[3:]
-    turn = np.outer(arm, F_h) - (arm @ F_h) * np.eye(3)
-    np.testing.assert_allclose(error, J_omega.T @ (0.5 * (turn + turn.T)) @ J_omega, atol=1e-5)
-
-
-def test_holding_the_shares_changes_internal_torques_only(
-    robot: RobotConfig, kinematics: Kinematics, q: Array
-) -> None:
-    """The slope with the shares let free differs a lot, but not along what the robot can do."""
-
-    def torque(q_near: Array) -> Array:
-        kinematics.update(q_near)
-        return np.asarray(kinematics.J.T @ WEIGHT, float)
-
-    free = oracle.derivative(torque, q)
-    error = free - torque_slope(kinematics, q, WEIGHT, NO_FORCE)
-    T = oracle.feasible(robot, q)
-    assert np.abs(error).max() > 10.0
-    np.testing.assert_allclose(T.T @ error @ T, 0.0, atol=1e-3)

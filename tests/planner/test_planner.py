@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
+from services.planner.certificate import Margins
 from services.planner.planner import EARLY_SHARE, LATE_SHARE, TICK_GAP_MAX_S, Planner
+from shared import gain_schedule
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import N_MODULES
-from shared.messages import JointCommand, JointState, Mode, PlannerMode, Wrench
+from shared.messages import (
+    JointCommand,
+    JointState,
+    Mode,
+    PlannerMode,
+    SplitSource,
+    Tare,
+    Wrench,
+)
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 
@@ -217,8 +228,10 @@ def test_status_tells_what_the_tick_saw(planner: Planner, q: Array) -> None:
             moment=(0.0, 0.0, 0.0),
             valid=True,
             saturated=False,
+            tare=Tare.DONE,
             age_ns=0,
-        )
+        ),
+        START_NS + 1,
     )
     planner.tick(START_NS + 2)
     status = planner.status(START_NS + 2, 123.0)
@@ -236,6 +249,76 @@ def test_status_tells_what_the_tick_saw(planner: Planner, q: Array) -> None:
     assert status.closure == pytest.approx((0.0,) * 6, abs=1e-6)
     assert status.pdot == (0.0,) * 6
     assert status.ik_residual < 1e-6
+
+
+def test_commands_and_status_tell_both_margins_and_where_the_gains_come_from(
+    robot: RobotConfig, planner: Planner, q: Array
+) -> None:
+    now = lead(planner, q)
+    hear_all(planner, q, now, seq=50)
+    commands = planner.tick(now + 4 * NS_PER_MS)
+    status = planner.status(now + 4 * NS_PER_MS, 0.0)
+    assert {command.margin for command in commands} == {status.margin}
+    assert {command.margin_onboard for command in commands} == {status.margin_onboard}
+    assert status.split == SplitSource.SCHEDULE
+    assert status.margin >= robot.certificate.margin_min
+    assert status.margin_onboard >= robot.certificate.onboard_margin_min
+
+
+def test_gains_that_would_not_stand_ask_for_hold_in_that_very_tick(
+    robot: RobotConfig, planner: Planner, q: Array
+) -> None:
+    """The mode follows a tick later; when the gains stand again the planner takes over anew."""
+    now = lead(planner, q)
+    split = planner._law._split
+    least = split._margins_min
+    seen = []
+    for tick, fails in enumerate((False, True, True, False, False, False)):
+        split._margins_min = Margins(1e9, 1e9) if fails else least
+        now += 4 * NS_PER_MS
+        hear_all(planner, q, now, seq=50 + tick)
+        commands = planner.tick(now)
+        status = planner.status(now, 0.0)
+        assert (status.split == SplitSource.UNCERTIFIED) == fails
+        seen.append((PlannerMode(status.mode), {command.hold for command in commands}))
+    assert seen == [
+        (PlannerMode.LEADING, {False}),
+        (PlannerMode.LEADING, {True}),
+        (PlannerMode.UNCERTIFIED, {True}),
+        (PlannerMode.UNCERTIFIED, {True}),
+        (PlannerMode.ALIGNING, {True}),
+        (PlannerMode.LEADING, {False}),
+    ]
+
+
+def test_a_robot_that_nothing_holds_is_never_lead(robot: RobotConfig, q: Array) -> None:
+    certificate = msgspec.structs.replace(robot.certificate, K_required=(1e5,) * 6)
+    stiff = msgspec.structs.replace(robot, certificate=certificate)
+    inputs = gain_schedule.inputs_of(stiff)
+    assert robot.gain_schedule is not None
+    fitting = msgspec.structs.replace(
+        robot.gain_schedule, inputs=inputs, digest=gain_schedule.digest_of(inputs)
+    )
+    planner = Planner(msgspec.structs.replace(stiff, gain_schedule=fitting), SESSION)
+    for tick in range(10):
+        now = START_NS + tick * 4 * NS_PER_MS
+        hear_all(planner, q, now, seq=tick)
+        assert all(command.hold for command in planner.tick(now))
+    status = planner.status(now, 0.0)
+    assert status.mode == PlannerMode.UNCERTIFIED
+    assert status.hold
+    assert status.margin < robot.certificate.margin_min
+
+
+def test_a_stale_state_counts_before_uncertified_gains(
+    robot: RobotConfig, planner: Planner, q: Array
+) -> None:
+    now = lead(planner, q)
+    planner._law._split._margins_min = Margins(1e9, 1e9)
+    for silence_ms in (4, 200):
+        now += silence_ms * NS_PER_MS
+        planner.tick(now)
+    assert planner.status(now, 0.0).mode == PlannerMode.WAITING
 
 
 def test_status_before_anything_was_heard_is_finite(planner: Planner) -> None:

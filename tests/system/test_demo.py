@@ -13,6 +13,7 @@ import pytest
 from shared import topics
 from shared.config import RobotConfig
 from shared.joints import MODULES
+from shared.messages import Wrench
 from tools.runs.run_log import read_run
 from tools.supervision import procfs
 
@@ -77,7 +78,11 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
     ]
     assert not silent
     assert log.metadata["run"]["scenario"] == "squat"
-    assert {"robot.toml", "scenario.toml", "model.xml"} <= set(log.attachments)
+    wrenches: list[Wrench] = log.messages(topics.WRENCH)
+    felt = max(abs(wrench.force[2]) for wrench in wrenches if wrench.valid)
+    given = max(abs(row.operator_force[2]) for row in log.messages(topics.SIM_TRUTH))
+    assert felt == pytest.approx(given, rel=0.25)
+    assert {"robot.toml", "robot.gains.json", "scenario.toml", "model.xml"} <= set(log.attachments)
     assert set(fleet_processes()) <= before
 
 

@@ -13,8 +13,9 @@ from typing import TypeVar, get_args, get_type_hints
 
 import msgspec
 
-from shared import config, scenario
-from shared.config import SERVICES, LawConfig, RobotConfig
+from shared import config, gain_schedule, scenario
+from shared.config import SERVICES, RobotConfig
+from shared.config_sections import LawConfig
 from shared.exceptions import FleetError, RunError
 from shared.process import DEFAULT_CONFIG
 from shared.scenario import SIGNALS, Kill, Push, Restart, Scenario
@@ -71,7 +72,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
     parser.add_argument(
-        "--jacobian", choices=choices("jacobian"), help="how the legs share the load"
+        "--jacobian",
+        choices=choices("jacobian"),
+        help="how the legs share the load; average comes with the diagonal split: no gains "
+        "certify it",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
 
@@ -173,7 +177,7 @@ def make_robot(args: argparse.Namespace) -> RobotConfig:
     """Return the robot with the flags laid over it.
 
     Raises:
-        ConfigError: the file cannot be used.
+        ConfigError: the file cannot be used, or the gain split lacks its schedule.
     """
     robot = config.load(args.config)
     changes = {
@@ -181,9 +185,12 @@ def make_robot(args: argparse.Namespace) -> RobotConfig:
         for key, value in (("split", args.split), ("jacobian", args.jacobian))
         if value is not None
     }
-    if not changes:
-        return robot
-    return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **changes))
+    if changes.get("jacobian") == "average" and "split" not in changes:
+        changes["split"] = "diagonal"  # no local gains certify it: there is no schedule
+    law = msgspec.structs.replace(robot.law, **changes)
+    robot = msgspec.structs.replace(robot, law=law)
+    gain_schedule.require(robot, args.config)
+    return robot
 
 
 def make_out(out: Path | None, verb: str) -> Path:
@@ -202,9 +209,17 @@ def make_out(out: Path | None, verb: str) -> Path:
     return out
 
 
-def write_inputs(out: Path, robot: RobotConfig, story: Scenario) -> tuple[Path, Path]:
-    """Write what the run is made from beside its results; return (robot, scenario) files."""
+def write_inputs(out: Path, robot: RobotConfig, story: Scenario) -> tuple[Path, ...]:
+    """Write what the run is made from beside its results.
+
+    Returns:
+        The files: robot, scenario and, if the robot has one, its gain schedule.
+    """
     robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
     robot_path.write_text(config.to_toml(robot), encoding="utf-8")
     scenario_path.write_text(scenario.to_toml(story), encoding="utf-8")
-    return robot_path, scenario_path
+    if robot.gain_schedule is None:
+        return robot_path, scenario_path
+    schedule_path = gain_schedule.path_beside(robot_path)
+    gain_schedule.write(schedule_path, robot.gain_schedule)
+    return robot_path, scenario_path, schedule_path

@@ -1,8 +1,8 @@
 """Lockstep: the same objects as live, in one process under virtual time (design section 7).
 
-World, twelve emulated axes, six joint controllers and the planner step in a fixed order;
-messages between them pass a modelled network. No process, clock or bus: bit-identical
-from run to run with the same seed.
+World, twelve emulated axes, six joint controllers, the harness sensor and the planner step
+in a fixed order; messages between them pass a modelled network. No process, clock or bus:
+bit-identical from run to run with the same seed.
 """
 
 from __future__ import annotations
@@ -31,10 +31,12 @@ from shared.messages import (
     RunEvent,
     RunEventKind,
     SimTruth,
+    Wrench,
 )
 from shared.scenario import Kill, Push, Restart, Scenario
 from shared.topics import Topic
 from tools.runs.network import Impairment, Link
+from tools.runs.virtual_harness import VirtualHarness
 
 SETTLE_NS = NS_PER_S
 """The scenario starts this long after all six modules track."""
@@ -67,7 +69,7 @@ class Lockstep:
             config: the robot.
             scenario: what happens; kills and restarts of the planner only.
             network: what every link does, each way; None is 1 ms.
-            seed: of the network.
+            seed: of the network and of the harness sensor's noise.
             record: takes every message.
 
         Raises:
@@ -99,6 +101,11 @@ class Lockstep:
         self._commands: list[Link[JointCommand]] = [
             Link(network, f"{seed} {module} command") for module in MODULES
         ]
+        self._wrenches: Link[Wrench] = Link(network, f"{seed} harness wrench")
+        self.harness = VirtualHarness(
+            config, self._wrenches, lambda wrench: record(topics.WRENCH, "", wrench), seed
+        )
+        self._harness_ns = round(NS_PER_S / config.harness.rate_hz)
         self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
         self._state_ns = round(NS_PER_S / config.joint_service.state_rate_hz)
         self._step_ns = round(config.simulation.timestep * NS_PER_S)
@@ -138,6 +145,8 @@ class Lockstep:
         if now % self._cycle_ns == 0:
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
             self._cycle_joints(now)
+        if now % self._harness_ns == 0:
+            self.harness.advance(self.world, now)
         if self.planner is not None and not self._frozen:
             self._advance_planner(self.planner, now)
         self._begin_when_tracking(now)
@@ -206,6 +215,9 @@ class Lockstep:
                 planner.hear_state(index, state, now)
         if not planner.is_due(now):
             return
+        wrench = self._wrenches.take(now)
+        if wrench is not None:
+            planner.hear_wrench(wrench, now)
         planner.hear_assist(self.world.lead().assist)
         for index, command in enumerate(planner.tick(now)):
             self._commands[index].put(now, command)

@@ -18,7 +18,7 @@ from services.joint.drivers.base import DriveReading, DriveStatus
 from shared import cansimple
 from shared.cansimple import AxisError, AxisState, Command, ControlMode, InputMode
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
-from shared.config import CanConfig, DriveConfig
+from shared.config_sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
 from shared.messages import Pair
 

@@ -1,0 +1,281 @@
+"""The harness in the loop: assist, easing of the lead, overload (design section 3 f).
+
+The wrench is what the operator does to the torso at the harness point, in torso axes. The
+robot's upward force on him is minus its part along the world's z. Pure: inputs -> outputs.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+
+from shared.messages import Vector3, Wrench
+
+ERROR_MIN: Final = 5.0
+"""N: what dry friction in the joints hides. Within it the force does not follow the assist
+(0.3 N m a joint: 5 to 6 N at the harness), and an integral would hunt."""
+SETTLE_S: Final = 0.3
+"""The integral waits so long after the wish or the pose has moved."""
+STILL_RATE_Z: Final = 0.02
+"""m/s of the COM: above it the operator is leading."""
+STILL_RATE_PITCH: Final = 0.05
+"""rad/s of the torso: above it the operator is leading."""
+LEAD_MAX: Final = (150.0, 60.0)
+"""N and N m: a hand that leads does no more, and no more is amplified."""
+LEAD_FADE_S: Final = 0.1
+"""The easing goes out over this time when the wrench is lost."""
+RELEASE_SHARE: Final = 0.8
+"""Of an overload's limits: below them the harness counts as let go."""
+_W_RAD_S: Final = tuple(10.0 ** (exponent / 1000.0) for exponent in range(-1000, 3000))
+"""0.1 to 1000 rad/s: a person's slowest lead, and far beyond what a joint service follows."""
+
+
+def force_up(force: Vector3, roll: float, pitch: float) -> float:
+    """Return the part of a force along the world's z, N.
+
+    Args:
+        force: N, torso axes.
+        roll: of the torso, rad; R = Rz(yaw) Rx(roll) Ry(pitch), whose third row this is.
+        pitch: rad.
+    """
+    x, y, z = force
+    return math.sin(roll) * y + math.cos(roll) * (z * math.cos(pitch) - x * math.sin(pitch))
+
+
+def is_still(rate_z: float, rate_pitch: float) -> bool:
+    """Return True if the operator is not leading: COM rate in m/s, torso's pitch in rad/s."""
+    return abs(rate_z) <= STILL_RATE_Z and abs(rate_pitch) <= STILL_RATE_PITCH
+
+
+class AssistLaw:
+    """The assist force: what is wanted, rate limited, and a slow integral on its error.
+
+    assist = ramp + integral; while a wish stands and the pose is still
+
+        d integral / dt = e / integral_s,  |integral| <= integral_max
+
+    with e = wanted - measured beyond `ERROR_MIN`.
+
+    The integral is frozen while there is no reading (stale, invalid or saturated), while
+    the robot holds, while the wish moves, and while the operator leads: what his hand adds
+    is then no error of the assist, and an integral over it would outlast the lead and pull
+    at him after the turn. With no wish it leaks to zero with the same time constant. It
+    never takes the assist below zero: the robot does not pull the operator down.
+
+    Stability: `integral_s_min`.
+    """
+
+    def __init__(
+        self, force_max: float, rate_max: float, integral_max: float, integral_s: float
+    ) -> None:
+        """Start with nothing; the first `advance` takes over what is wanted at once.
+
+        Args:
+            force_max: of the ramp, N.
+            rate_max: of the ramp, N/s.
+            integral_max: N either way; 0 leaves the integral out.
+            integral_s: time constant, s.
+        """
+        self._force_max = force_max
+        self._rate_max = rate_max
+        self._integral_max = integral_max
+        self._integral_s = integral_s
+        self._ramp: float | None = None
+        self._wanted = 0.0
+        self._still_s = 0.0
+        self.integral = 0.0
+        """N"""
+
+    @property
+    def assist(self) -> float:
+        """What the feedforward carries, N."""
+        return (self._ramp or 0.0) + self.integral
+
+    def advance(self, wanted: float, measured: float | None, dt: float, *, still: bool) -> float:
+        """Move on by one tick; return the rate of `assist` in N/s.
+
+        Args:
+            wanted: upward force on the operator, N.
+            measured: the same as the harness feels it, N; None if not known now.
+            dt: since the last tick, s.
+            still: False while the robot holds or the operator leads.
+        """
+        wanted = min(self._force_max, max(0.0, wanted))
+        if self._ramp is None:
+            # a planner that takes over from HOLD finds the assist in HOLD's feedforward
+            self._ramp = wanted
+        before = self._ramp + self.integral
+        change_max = self._rate_max * dt
+        self._ramp += min(change_max, max(-change_max, wanted - self._ramp))
+        steady = still and wanted == self._wanted == self._ramp
+        self._wanted = wanted
+        self._still_s = self._still_s + dt if steady else 0.0
+        if wanted == 0.0:
+            self.integral -= self.integral * min(1.0, dt / self._integral_s)
+        elif measured is not None and self._still_s > SETTLE_S:
+            error = wanted - measured
+            error -= min(ERROR_MIN, max(-ERROR_MIN, error))
+            self.integral += error * dt / self._integral_s
+        low = max(-self._integral_max, -self._ramp)
+        self.integral = min(self._integral_max, max(low, self.integral))
+        return (self._ramp + self.integral - before) / dt if dt > 0.0 else 0.0
+
+
+class LeadEasing:
+    """The lead made lighter: F_O += alpha S w_h (design section 3 f).
+
+    w_h is what the operator does in the directions he leads: his upward force beyond the
+    load that the assist carries, f + assist, and his moment about the torso's pitch axis.
+    With alpha the robot's apparent mass falls from M to M / (1 + alpha). As with F_assist,
+    the force belongs through the Jacobian of the harness point, not of the COM; and it
+    belongs into tau_coupled, which HOLD drops: in tau_ff it would outlive the hand.
+
+    Stability: `alpha_max`.
+    """
+
+    def __init__(self, alpha: float) -> None:
+        """Take alpha in [0, 1); 0 leaves it out."""
+        self._alpha = alpha
+        self._lead = (0.0, 0.0)
+        self._left = 0.0
+
+    def ease(
+        self, up: float | None, moment_pitch: float, assist: float, dt: float
+    ) -> tuple[float, float]:
+        """Return alpha w_h: N along the world's z at the harness, N m about the pitch axis.
+
+        Args:
+            up: of the operator's force, N, world; None if not known now: the easing fades.
+            moment_pitch: of the operator about the torso's y, N m.
+            assist: that the feedforward carries, N.
+            dt: since the last tick, s.
+        """
+        if up is None:
+            self._left = max(0.0, self._left - dt / LEAD_FADE_S)
+        else:
+            self._left = min(1.0, self._left + dt / LEAD_FADE_S)
+            force_max, moment_max = LEAD_MAX
+            self._lead = (
+                min(force_max, max(-force_max, up + assist)),
+                min(moment_max, max(-moment_max, moment_pitch)),
+            )
+        gain = self._alpha * self._left
+        return gain * self._lead[0], gain * self._lead[1]
+
+
+class Overload:
+    """Whether the harness carries more than it may: then all six modules are to hold.
+
+    It begins when the force or the moment has been beyond its limit for `after_ns`, or at
+    once with a saturated cell. It ends when both have been below `RELEASE_SHARE` of their
+    limits for `release_ns`. Numbers that are not valid neither begin nor end it.
+    """
+
+    def __init__(self, force_max: float, moment_max: float, after_ns: int, release_ns: int) -> None:
+        """Take the limits: N, N m, ns, ns."""
+        self._force_max = force_max
+        self._moment_max = moment_max
+        self._after_ns = after_ns
+        self._release_ns = release_ns
+        self._beyond_since_ns: int | None = None
+        self._below_since_ns: int | None = None
+        self.hold = False
+        """True while it lasts."""
+
+    def hear(self, wrench: Wrench, now_ns: int) -> None:
+        """Take a wrench that arrived now."""
+        share = max(
+            math.hypot(*wrench.force) / self._force_max,
+            math.hypot(*wrench.moment) / self._moment_max,
+        )
+        beyond = wrench.valid and share > 1.0
+        below = wrench.valid and share < RELEASE_SHARE
+        self._beyond_since_ns = _since(self._beyond_since_ns, now_ns, beyond)
+        self._below_since_ns = _since(self._below_since_ns, now_ns, below)
+        if wrench.saturated or _lasted(self._beyond_since_ns, now_ns, self._after_ns):
+            self.hold = True
+        elif _lasted(self._below_since_ns, now_ns, self._release_ns):
+            self.hold = False
+
+
+def _since(since_ns: int | None, now_ns: int, true: bool) -> int | None:
+    if not true:
+        return None
+    return now_ns if since_ns is None else since_ns
+
+
+def _lasted(since_ns: int | None, now_ns: int, for_ns: int) -> bool:
+    return since_ns is not None and now_ns - since_ns >= for_ns
+
+
+class Coupling(msgspec.Struct, frozen=True, kw_only=True):
+    """One direction, z or pitch: the robot, the hand on it and the way between them.
+
+    m s^2 x = -(b_r s + k_r) x + w,   w = -(b s + k) x      (units of the direction)
+    """
+
+    mass: float
+    """m: the robot's effective mass, kg, or inertia, kg m^2."""
+    b_r: float
+    """Its own damping: joints, and local gains that references do not cancel."""
+    k_r: float
+    """Its own stiffness: 0 where it is free to be led."""
+    k: float
+    """Stiffness of the hand."""
+    b: float
+    """Damping of the hand."""
+    delay_s: float
+    """From wrench to torque: once each way over the bus, and the periods between."""
+    low_pass_hz: float
+    """Of the harness filter."""
+
+    def force_by_force(self, s: complex) -> complex:
+        """Return G: what the hand feels of a force of the robot, delayed and filtered.
+
+        G(s) = (b s + k) / (m s^2 + (b + b_r) s + k + k_r) e^(-s delay) / (1 + s / w_f)
+        """
+        hand = self.b * s + self.k
+        robot = (self.mass * s + self.b_r) * s + self.k_r
+        late = cmath.exp(-s * self.delay_s) / (1.0 + s / (2.0 * math.pi * self.low_pass_hz))
+        return hand / (robot + hand) * late
+
+
+def alpha_max(coupling: Coupling) -> float:
+    """Return the alpha below which the eased lead is stable; infinite if every one is.
+
+    Robot and hand, with alpha w fed back: 1 + alpha G(s) = 0. By Nyquist it is stable if
+
+        alpha |G(j w)| < 1   wherever the phase of G(j w) is -180 degrees
+
+    Seen from the hand: a force late by t is damping of -alpha k t, so that for slow modes
+    this says alpha (k t - b) < b + b_r. A well damped hand (k t < b) is then limited at
+    higher frequencies only, where m is what counts: alpha < m w / b, about.
+    """
+    return gain_max(coupling.force_by_force)
+
+
+def integral_s_min(coupling: Coupling) -> float:
+    """Return the time constant above which the integral on the assist is stable, s.
+
+    The measured force follows the assist by G, so the loop is G / (integral_s s). With no
+    delay, and nothing of the robot's own but its mass, that is m / b - b / k.
+    """
+    limit = gain_max(lambda s: coupling.force_by_force(s) / s)
+    return 1.0 / limit
+
+
+def gain_max(loop: Callable[[complex], complex]) -> float:
+    """Return the gain below which a loop that is stable at rest is stable when closed."""
+    limit = math.inf
+    low = _W_RAD_S[0]
+    for high in _W_RAD_S[1:]:
+        a, b = loop(1j * low), loop(1j * high)
+        if a.imag * b.imag <= 0.0 and a.real + b.real < 0.0:
+            share = a.imag / (a.imag - b.imag)
+            limit = min(limit, -1.0 / (a.real + share * (b.real - a.real)))
+        low = high
+    return limit

@@ -1,0 +1,112 @@
+"""The failsafe certificate: do these local gains stand alone? (design section 3 d). Pure.
+
+With the planner gone, tau = D (q_ref - q) + tau_ff, and both feet stay where they are.
+T (12, 6) are the joint rates per unit of p along the closed chain: [J; C] T = [I; 0].
+The stiffness that p then feels is
+
+    K_fail = sym(T^T D T) + K_geo,    K_geo = T^T H T,
+    H = d(J^T F_O + J_harness^T F_assist)/dq,
+
+K_geo being minus d/dp of T^T (tau_ff held - gravity and load). The robot stands only if
+K_fail > 0. A margin is its smallest eigenvalue with every direction measured by what is
+required of it (`certificate.K_required`): 1 is all that is required, 0 is a fall.
+
+Tier 3: with its joint service gone too, each motor of a module holds with the mean of the
+two joints' stiffnesses (design section 5), so D is averaged module by module.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.config import RobotConfig
+from shared.joints import N_JOINTS
+
+Array = NDArray[np.float64]
+
+DIRECTIONS = ("lean forward", "lean sideways", "sink", "roll", "pitch", "yaw")
+"""What a motion along each part of p is, in words."""
+UNITS = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
+
+
+class Margins(NamedTuple):
+    """Smallest eigenvalues, in shares of what is required."""
+
+    service: float
+    """Tier 2: the joint services hold."""
+    onboard: float
+    """Tier 3: the drives' own loops hold."""
+
+
+class Weakest(NamedTuple):
+    """The direction in which a stiffness gives way first."""
+
+    direction: str
+    margin: float
+    stiffness: float
+    """Along that direction, N/m or N m/rad: margin times what is required."""
+    required: float
+    unit: str
+    p: Array
+    """(6,) m and rad, its largest part 1 in units of the required stiffness's root."""
+
+
+def motor_mean(D: Array) -> Array:
+    """Return D (12,) with each module's two stiffnesses replaced by their mean."""
+    return np.asarray(np.repeat(D.reshape(-1, 2).mean(axis=1), 2), float)
+
+
+class Certificate:
+    """The certificate at one configuration; `at` moves it there."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Take what is required."""
+        self.K_required: Array = np.array(config.certificate.K_required)
+        self._scale = 1.0 / np.sqrt(self.K_required)
+        self._T_scaled: Array = np.zeros((N_JOINTS, 6))
+        self._K_geo: Array = np.zeros((6, 6))
+        self._pair: Array = np.zeros((2, N_JOINTS, 1))
+
+    def at(self, T: Array, hessian_O: Array) -> None:
+        """Move to a configuration.
+
+        Args:
+            T: joint rates per unit of p along the closed chain (12, 6).
+            hessian_O: `Kinematics.hessian_times` of F_O and F_assist (12, 12), N m/rad.
+        """
+        np.multiply(T, self._scale, out=self._T_scaled)
+        K_geo = self._T_scaled.T @ hessian_O @ self._T_scaled
+        self._K_geo = 0.5 * (K_geo + K_geo.T)
+
+    def margins(self, D: Array) -> Margins:
+        """Return how far local stiffnesses D (12,), N m/rad, are from a fall."""
+        pair = self._pair
+        pair[0, :, 0] = D
+        pair[1, :, 0] = motor_mean(D)
+        K = self._T_scaled.T @ (pair * self._T_scaled) + self._K_geo
+        smallest = np.linalg.eigvalsh(K)[:, 0]
+        return Margins(float(smallest[0]), float(smallest[1]))
+
+    def weakest(self, D: Array) -> Weakest:
+        """Return the weakest direction under local stiffnesses D (12,), N m/rad."""
+        K = self._T_scaled.T @ (D[:, np.newaxis] * self._T_scaled) + self._K_geo
+        values, vectors = np.linalg.eigh(K)
+        u = vectors[:, 0]
+        index = int(np.abs(u).argmax())
+        required = float(self.K_required[index])
+        return Weakest(
+            DIRECTIONS[index],
+            float(values[0]),
+            float(values[0]) * required,
+            required,
+            UNITS[index],
+            np.asarray(u / u[index] * self._scale, float),
+        )
+
+    def failsafe_stiffness(self, D: Array) -> Array:
+        """Return K_fail (6, 6) of local stiffnesses D (12,): N/m, N/rad and N m/rad."""
+        K = self._T_scaled.T @ (D[:, np.newaxis] * self._T_scaled) + self._K_geo
+        return np.asarray(K / np.outer(self._scale, self._scale), float)

@@ -1,0 +1,267 @@
+"""The tables of `deploy/robot.toml` as typed structs; `shared.config` reads them."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from shared.toml_file import Range, Section
+
+Mass = Annotated[float, Range(0.0, 200.0, "kg")]
+Length = Annotated[float, Range(0.005, 2.0, "m")]
+Share = Annotated[float, Range(0.0, 1.0, "1")]
+Rate = Annotated[float, Range(1.0, 8000.0, "Hz")]
+Milliseconds = Annotated[float, Range(0.1, 10_000.0, "ms")]
+Seconds = Annotated[float, Range(0.001, 60.0, "s")]
+Angle = Annotated[float, Range(-2 * math.pi, 2 * math.pi, "rad")]
+
+
+class MassConfig(Section, frozen=True):
+    """Masses, paper Table I."""
+
+    module: Annotated[float, Range(0.1, 50.0, "kg")]
+    battery: Mass
+    payload: Mass
+    payload_max: Mass
+
+
+class GeometryConfig(Section, frozen=True):
+    """Lengths, paper Table I."""
+
+    l1: Length
+    l2: Length
+    w_hip: Length
+    w_base: Length
+    l_foot: Length
+    w_foot: Length
+    foot_height: Length
+    harness_point: tuple[
+        Annotated[float, Range(-1.0, 1.0, "m")],
+        Annotated[float, Range(-1.0, 1.0, "m")],
+        Annotated[float, Range(-1.0, 1.0, "m")],
+    ]
+    torso_size: tuple[Length, Length, Length]
+
+
+class JointConfig(Section, frozen=True):
+    """The 2-DOF module: motors, gear and differential."""
+
+    gear_ratio: Annotated[float, Range(1.0, 200.0, "1")]
+    armature: Annotated[float, Range(0.001, 5.0, "kg m^2")]
+    damping: Annotated[float, Range(0.0, 50.0, "N m s/rad")]
+    friction_loss: Annotated[float, Range(0.0, 20.0, "N m")]
+    encoder_counts_per_turn: Annotated[int, Range(64, 1 << 24, "counts")]
+    tau_module_max: Annotated[float, Range(1.0, 1000.0, "N m")]
+
+
+class ContactConfig(Section, frozen=True):
+    """Sole on floor."""
+
+    friction: Annotated[float, Range(0.05, 2.0, "1")]
+
+
+class LimitConfig(Section, frozen=True):
+    """Joint range of one kind of module, and why it is so."""
+
+    phi: tuple[Angle, Angle]
+    theta: tuple[Angle, Angle]
+    why: str
+
+
+class LimitsConfig(Section, frozen=True):
+    """Joint ranges by kind."""
+
+    ankle: LimitConfig
+    knee: LimitConfig
+    hip: LimitConfig
+
+
+class ModuleConfig(Section, frozen=True):
+    """One module: which bus, which two CAN nodes."""
+
+    name: str
+    bus: str
+    node_ids: tuple[Annotated[int, Range(0, 62, "1")], Annotated[int, Range(0, 62, "1")]]
+
+
+Stiffness6 = tuple[
+    Annotated[float, Range(0.0, 1e5, "N/m")],
+    Annotated[float, Range(0.0, 1e5, "N/m")],
+    Annotated[float, Range(0.0, 1e5, "N/m")],
+    Annotated[float, Range(0.0, 1e5, "N m/rad")],
+    Annotated[float, Range(0.0, 1e5, "N m/rad")],
+    Annotated[float, Range(0.0, 1e5, "N m/rad")],
+]
+Selection = Literal[0, 1]
+
+
+class LawConfig(Section, frozen=True):
+    """Gains and choices of the law (design section 3)."""
+
+    K_p: Stiffness6
+    B_p: Stiffness6
+    K_0: Annotated[float, Range(0.0, 1e4, "N m/rad")]
+    B_0: Annotated[float, Range(0.0, 1e3, "N m s/rad")]
+    S: tuple[Selection, Selection, Selection, Selection, Selection, Selection]
+    damping_lambda: Annotated[float, Range(1e-6, 0.5, "m")]
+    jacobian: Literal["load_sharing", "average"]
+    split: Literal["certified", "diagonal"]
+    local_damping_share: Annotated[float, Range(0.0, 1.0, "1")]
+    load_sharing_moment_arms: tuple[Share, Share, Annotated[float, Range(0.001, 0.5, "m")]]
+    recentre_s: Seconds
+    lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
+
+
+RequiredStiffness6 = tuple[
+    Annotated[float, Range(1.0, 1e5, "N/m")],
+    Annotated[float, Range(1.0, 1e5, "N/m")],
+    Annotated[float, Range(1.0, 1e5, "N/m")],
+    Annotated[float, Range(1.0, 1e5, "N m/rad")],
+    Annotated[float, Range(1.0, 1e5, "N m/rad")],
+    Annotated[float, Range(1.0, 1e5, "N m/rad")],
+]
+
+
+class CertificateConfig(Section, frozen=True):
+    """What local gains must hold alone (design sections 3 c and 3 d)."""
+
+    K_required: RequiredStiffness6
+    onboard_share: Share
+    k_q_share_max: Annotated[float, Range(0.1, 10.0, "1")]
+    margin_min: Share
+    onboard_margin_min: Share
+
+
+class AssistConfig(Section, frozen=True):
+    """Assist force on the operator."""
+
+    force_max: Annotated[float, Range(0.0, 500.0, "N")]
+    rate_max: Annotated[float, Range(1.0, 5000.0, "N/s")]
+    integral_max: Annotated[float, Range(0.0, 100.0, "N")]
+    integral_s: Annotated[float, Range(0.5, 60.0, "s")]
+
+
+LocalStiffness = Annotated[float, Range(0.0, 1e4, "N m/rad")]
+LocalDamping = Annotated[float, Range(0.0, 1e3, "N m s/rad")]
+
+
+class StandGains(Section, frozen=True):
+    """Local gains of HOLD at power-up, (phi, theta)."""
+
+    k_p: tuple[LocalStiffness, LocalStiffness]
+    k_d: tuple[LocalDamping, LocalDamping]
+
+
+class StandConfig(Section, frozen=True):
+    """Stand gains by kind."""
+
+    ankle: StandGains
+    knee: StandGains
+    hip: StandGains
+
+
+class JointServiceConfig(Section, frozen=True):
+    """Timing and limits of the joint service (design section 4)."""
+
+    driver: Literal["odrive_can"]
+    rate_hz: Rate
+    state_rate_hz: Rate
+    max_command_age_ms: Milliseconds
+    command_aging_max_ms: Milliseconds
+    coupled_ramp_ms: Milliseconds
+    engage_after_ms: Milliseconds
+    engage_after_max_ms: Milliseconds
+    dropout_forget_s: Seconds
+    blend_ms: Milliseconds
+    damp_fade_s: Seconds
+    damp_k_d: LocalDamping
+    damp_knee_stop: Angle
+    hold_stiffens_theta: tuple[Literal["ankle", "knee", "hip"], ...]
+    damp_sinks: tuple[Literal["ankle", "knee", "hip"], ...]
+    torque_rate_max: Annotated[float, Range(100.0, 1e6, "N m/s")]
+    soft_stop_k_p: LocalStiffness
+    k_p_max: LocalStiffness
+    k_d_max: LocalDamping
+    v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
+
+
+class PlannerConfig(Section, frozen=True):
+    """Planner timing."""
+
+    rate_hz: Rate
+    state_stale_ms: Milliseconds
+
+
+class HarnessConfig(Section, frozen=True):
+    """Six-axis harness sensor: a Stewart platform of six load cells."""
+
+    bus: str
+    rate_hz: Rate
+    base_radius: Length
+    platform_radius: Length
+    height: Length
+    leg_force_max: Annotated[float, Range(1.0, 1e5, "N")]
+    low_pass_hz: Annotated[float, Range(0.1, 500.0, "Hz")]
+    stale_ms: Milliseconds
+    tare_s: Seconds
+    overload_force: Annotated[float, Range(10.0, 1e4, "N")]
+    overload_moment: Annotated[float, Range(1.0, 1e3, "N m")]
+    overload_after_ms: Milliseconds
+    overload_release_s: Seconds
+
+
+class DriveConfig(Section, frozen=True):
+    """ODrive settings that the joint service relies on (design section 5)."""
+
+    torque_constant: Annotated[float, Range(0.001, 5.0, "N m/A")]
+    current_lim: Annotated[float, Range(1.0, 200.0, "A")]
+    vel_limit: Annotated[float, Range(0.1, 500.0, "turn/s")]
+    watchdog_timeout: Annotated[float, Range(0.005, 10.0, "s")]
+    encoder_period_ms: Annotated[int, Range(1, 100, "ms")]
+    heartbeat_period_ms: Annotated[int, Range(1, 10_000, "ms")]
+
+
+class CanConfig(Section, frozen=True):
+    """A CAN bus as python-can takes it."""
+
+    interface: str
+    channel: str
+
+
+class BusConfig(Section, frozen=True):
+    """The Zenoh bus: fixed endpoints, no scouting."""
+
+    lease_ms: Annotated[int, Range(100, 60_000, "ms")]
+    endpoints: dict[str, str]
+
+
+class RecorderConfig(Section, frozen=True):
+    """MCAP file parameters (design section 10)."""
+
+    chunk_kib: Annotated[int, Range(1, 65_536, "KiB")]
+    flush_ms: Milliseconds
+    fsync_s: Seconds
+
+
+class OperatorConfig(Section, frozen=True):
+    """The simulated operator's hand: a clipped spring-damper (design section 8)."""
+
+    k_z: Annotated[float, Range(0.0, 1e5, "N/m")]
+    b_z: Annotated[float, Range(0.0, 1e4, "N s/m")]
+    force_max: Annotated[float, Range(0.0, 1e4, "N")]
+    k_pitch: Annotated[float, Range(0.0, 1e5, "N m/rad")]
+    b_pitch: Annotated[float, Range(0.0, 1e4, "N m s/rad")]
+    moment_max: Annotated[float, Range(0.0, 1e4, "N m")]
+
+
+class SimulationConfig(Section, frozen=True):
+    """The simulated world."""
+
+    timestep: Annotated[float, Range(1e-5, 0.005, "s")]
+    stand_height: Length
+    hoist_s: Seconds
+    encoder_rate_hz: Rate
+    truth_rate_hz: Rate
+    harness_noise: Annotated[float, Range(0.0, 100.0, "N")]
+    late_slip_ms: Milliseconds
+    operator: OperatorConfig

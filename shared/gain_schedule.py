@@ -1,0 +1,168 @@
+"""The certified gain schedule: a file beside the robot's, made offline by `xrl gains`.
+
+Local joint stiffnesses over COM height and torso pitch (design section 3 c). The file
+holds what it was made from; a robot that differs is refused until it is made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+import msgspec
+
+from shared.exceptions import ConfigError
+from shared.toml_file import Range, check_ranges
+
+if TYPE_CHECKING:
+    from shared.config import RobotConfig
+
+VERSION = 1
+"""Of the file and of the program that makes it: another one is made again."""
+
+Stiffness: TypeAlias = Annotated[float, Range(0.0, 1e4, "N m/rad")]
+LegGains: TypeAlias = tuple[Stiffness, Stiffness, Stiffness, Stiffness, Stiffness, Stiffness]
+"""(ankle phi, theta, knee phi, theta, hip phi, theta), N m/rad; both legs are alike."""
+
+
+class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The file."""
+
+    version: int
+    digest: str
+    """SHA-256 of the inputs."""
+    inputs: dict[str, Any]
+    """What the robot was when this was made, by dotted key."""
+    z: tuple[float, ...]
+    """COM heights of the nodes, m above the ankles, rising."""
+    pitch: tuple[float, ...]
+    """Torso pitches of the nodes, rad, rising."""
+    D: tuple[tuple[LegGains, ...], ...]
+    """Local stiffness at [z][pitch]."""
+
+
+def inputs_of(config: RobotConfig) -> dict[str, Any]:
+    """Return everything that the schedule depends on, by dotted key."""
+    law, limits = config.law, config.limits
+    table = {
+        "mass": msgspec.to_builtins(config.mass),
+        "geometry": msgspec.to_builtins(config.geometry),
+        "certificate": {
+            "K_required": config.certificate.K_required,
+            "onboard_share": config.certificate.onboard_share,
+            "k_q_share_max": config.certificate.k_q_share_max,
+        },
+        "law": {
+            "K_p": law.K_p,
+            "K_0": law.K_0,
+            "S": law.S,
+            "jacobian": law.jacobian,
+            "damping_lambda": law.damping_lambda,
+            "load_sharing_moment_arms": law.load_sharing_moment_arms,
+        },
+        "assist": {"force_max": config.assist.force_max},
+        "joint_service": {"k_p_max": config.joint_service.k_p_max},
+        "limits": {
+            kind: [*limit.phi, *limit.theta]
+            for kind, limit in (
+                ("ankle", limits.ankle), ("knee", limits.knee), ("hip", limits.hip),
+            )
+        },
+    }  # fmt: skip
+    flat = {
+        f"{section}.{key}": value for section, part in table.items() for key, value in part.items()
+    }
+    plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(flat))
+    return plain
+
+
+def digest_of(inputs: dict[str, Any]) -> str:
+    """Return the SHA-256 of the inputs."""
+    return hashlib.sha256(msgspec.json.encode(inputs, order="sorted")).hexdigest()
+
+
+def path_beside(robot_file: Path) -> Path:
+    """Return the schedule's file of a robot file: lab.toml -> lab.gains.json."""
+    return robot_file.with_suffix(".gains.json")
+
+
+def read(path: Path) -> GainSchedule | None:
+    """Read a schedule; None if there is no such file.
+
+    Raises:
+        ConfigError: the file cannot be read, or its tables do not fit together.
+    """
+    again = "make it again: `xrl gains`"
+    try:
+        schedule = msgspec.json.decode(path.read_bytes(), type=GainSchedule)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(str(path), "(file)", f"cannot be read: {error}", again) from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), "(file)", f"is no gain schedule: {error}", again) from None
+    for name, nodes in (("z", schedule.z), ("pitch", schedule.pitch)):
+        if len(nodes) < 2 or any(b <= a for a, b in pairwise(nodes)):
+            raise ConfigError(str(path), name, "the nodes do not rise", again)
+    try:
+        check_ranges(str(path), schedule)
+    except ConfigError as error:
+        expected = f"{error.expected}; {again}"
+        raise ConfigError(error.file, error.key, error.found, expected) from None
+    sizes = {len(row) for row in schedule.D}
+    if len(schedule.D) != len(schedule.z) or sizes != {len(schedule.pitch)}:
+        raise ConfigError(str(path), "D", "does not fit its nodes", again)
+    return schedule
+
+
+def write(path: Path, schedule: GainSchedule) -> None:
+    """Write a schedule, one node a line; the file is whole or not there."""
+    parts = [
+        f'"{name}": {msgspec.json.encode(getattr(schedule, name)).decode()}'
+        for name in ("version", "digest", "inputs", "z", "pitch")
+    ]
+    rows = ",\n".join(
+        "[" + ",\n ".join(msgspec.json.encode(node).decode() for node in row) + "]"
+        for row in schedule.D
+    )
+    parts.append(f'"D": [\n{rows}\n]')
+    text = "{" + ",\n".join(parts) + "}\n"
+    temporary = path.with_suffix(".tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        found = f"cannot be written: {error.strerror}"
+        raise ConfigError(str(path), "(file)", found, "a folder that you may write to") from None
+
+
+def why_stale(config: RobotConfig) -> str:
+    """Return why the robot's schedule does not fit the robot, in words; "" if it does."""
+    schedule = config.gain_schedule
+    if schedule is None:
+        return "there is no gain schedule"
+    if schedule.version != VERSION:
+        return f"the gain schedule is of version {schedule.version}, not {VERSION}"
+    inputs = inputs_of(config)
+    if schedule.digest == digest_of(inputs):
+        return ""
+    for key, value in inputs.items():
+        if schedule.inputs.get(key) != value:
+            return f"the gain schedule was made for {key} = {schedule.inputs.get(key)}, not {value}"
+    return "the gain schedule's digest is not that of its inputs"
+
+
+def require(config: RobotConfig, robot_file: Path) -> None:
+    """Refuse a robot whose gain split needs a schedule that it has not.
+
+    Raises:
+        ConfigError: naming the difference and the command to run.
+    """
+    if config.law.split != "certified":
+        return
+    stale = why_stale(config)
+    if stale:
+        right = f"run `xrl gains --config {robot_file}`"
+        raise ConfigError(str(path_beside(robot_file)), "(file)", stale, right)

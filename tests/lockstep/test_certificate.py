@@ -1,0 +1,117 @@
+"""The certificate against the simulation, at the few cases where it is hardest to be right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from shared.config import RobotConfig
+from shared.messages import SimTruth
+from tests.planner import oracle
+from tools.sweeps import certificate_study as study
+from tools.sweeps.certificate_study import Case, Cases, Outcome
+
+SEED = 1
+DRAWN = 300
+CLEAR = 0.1
+"""Of K_required; nearer to zero the floor's own elasticity may decide."""
+TRIED = 8
+"""The nearest on either side."""
+
+
+@pytest.fixture(scope="module")
+def drawn(robot: RobotConfig) -> list[Case]:
+    cases = Cases(robot)
+    return sorted((cases.draw(SEED, number) for number in range(DRAWN)), key=margin_of)
+
+
+def margin_of(case: Case) -> float:
+    return case.weakest.margin
+
+
+def outcome(case: Case, *, stood: bool, margin: float | None = None) -> Outcome:
+    told = case.weakest.margin if margin is None else margin
+    case = case._replace(weakest=case.weakest._replace(margin=told))
+    return Outcome(case, stood, not stood, 1.0, 0.01, 0.01, 0.5)
+
+
+def test_the_cases_are_about_half_of_either_kind(drawn: list[Case]) -> None:
+    positive = sum(margin_of(case) > 0.0 for case in drawn)
+    assert 0.4 * DRAWN < positive < 0.6 * DRAWN
+
+
+def test_a_case_starts_at_rest_in_its_posture_on_flat_soles(
+    robot: RobotConfig, drawn: list[Case]
+) -> None:
+    """p by the oracle's own kinematics, and by where the simulated robot is."""
+    for case in (drawn[0], drawn[DRAWN // 2], drawn[-1]):
+        loaded = study.with_payload(robot, case.posture.payload)
+        world = study.world_of(robot, case, 1.0, rigid=False)
+        truth = world.truth(0, 1.0, 0.0)
+        p = np.array([*truth.com, *truth.angles])
+        np.testing.assert_allclose(p, oracle.pose(loaded, case.posture.q), atol=1e-5)
+        np.testing.assert_allclose(p[[0, 1, 3, 4, 5]], [0, 0, 0, case.posture.pitch, 0], atol=1e-5)
+        assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 1e-5
+        assert np.abs(world.data.qvel).max() == 0.0
+        assert truth.hoist == 0.0
+
+
+def test_what_the_certificate_lets_stand_stands(robot: RobotConfig, drawn: list[Case]) -> None:
+    nearest = [case for case in drawn if margin_of(case) > CLEAR][:TRIED]
+    assert len(nearest) == TRIED
+    frictionless = study.without_friction(robot)
+    fell = [case.number for case in nearest if not study.run(frictionless, case).stood]
+    assert fell == []
+
+
+def test_what_the_certificate_refuses_falls(robot: RobotConfig, drawn: list[Case]) -> None:
+    nearest = [case for case in drawn if margin_of(case) < -CLEAR][-TRIED:]
+    assert len(nearest) == TRIED
+    frictionless = study.without_friction(robot)
+    stood = [case.number for case in nearest if study.run(frictionless, case).stood]
+    assert stood == []
+
+
+def test_on_a_rigid_floor_the_sign_is_right_much_nearer_to_zero(
+    robot: RobotConfig, drawn: list[Case]
+) -> None:
+    near = [case for case in drawn if 0.005 < abs(margin_of(case)) < 0.03]
+    assert {margin_of(case) > 0.0 for case in near} == {True, False}
+    frictionless = study.without_friction(robot)
+    outcomes = [study.run(frictionless, case, rigid=True) for case in near]
+    wrong = [o.case.number for o in outcomes if o.stood is not (o.margin > 0.0)]
+    assert wrong == []
+
+
+def test_a_slow_drift_away_is_no_stand(robot: RobotConfig, drawn: list[Case]) -> None:
+    case = drawn[-1]
+    world = study.world_of(robot, case, 1.0, rigid=False)
+    still = world.truth(0, 1.0, 0.0)
+
+    def course(*com_x: float) -> list[SimTruth]:
+        rows = []
+        for x in com_x:
+            world.data.subtree_com[0][0] = x
+            rows.append(world.truth(0, 1.0, 0.0))
+        return rows
+
+    assert not still.fallen
+    assert study.judge(case, course(0.0, 0.02, 0.03, 0.02, 0.01, 0.01)).stood
+    assert not study.judge(case, course(0.0, 0.01, 0.02, 0.03, 0.04, 0.05)).stood
+    assert not study.judge(case, course(0.0, 0.1, 0.2, 0.1, 0.0, 0.0)).stood
+
+
+def test_the_same_number_is_the_same_case_whatever_was_drawn_before(
+    robot: RobotConfig, drawn: list[Case]
+) -> None:
+    case = drawn[7]
+    again = Cases(robot).draw(SEED, case.number)
+    np.testing.assert_array_equal(again.D, case.D)
+    np.testing.assert_array_equal(again.posture.q, case.posture.q)
+    assert again.nudge == case.nudge
+
+
+def test_confusion_counts_what_was_said_against_what_came() -> None:
+    said = [(0.5, True), (0.2, True), (0.1, False), (-0.3, False), (-0.4, False), (-0.5, False)]
+    assert study.confusion(said) == (2, 1, 0, 3)
+    assert study.threshold(said) == pytest.approx(0.15)

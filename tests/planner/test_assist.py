@@ -1,0 +1,293 @@
+"""The harness in the loop: assist, easing of the lead, overload."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.planner.assist import (
+    ERROR_MIN,
+    LEAD_FADE_S,
+    LEAD_MAX,
+    RELEASE_SHARE,
+    SETTLE_S,
+    STILL_RATE_PITCH,
+    STILL_RATE_Z,
+    AssistLaw,
+    LeadEasing,
+    Overload,
+    force_up,
+    is_still,
+)
+from shared.clock import NS_PER_MS
+from shared.messages import Tare, Vector3, Wrench
+from tests.planner import oracle
+
+DT = 0.004
+FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S = 200.0, 100.0, 50.0, 3.0
+
+# -- the assist ------------------------------------------------------------------------
+
+
+def make_law(wanted: float = 100.0) -> AssistLaw:
+    """Return a law that has carried `wanted` for long enough to integrate."""
+    law = AssistLaw(FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S)
+    run(law, SETTLE_S + 2 * DT, wanted, wanted)
+    assert (law.assist, law.integral) == (wanted, 0.0)
+    return law
+
+
+def run(
+    law: AssistLaw, seconds: float, wanted: float, measured: float | None, *, still: bool = True
+) -> None:
+    for _ in range(round(seconds / DT)):
+        law.advance(wanted, measured, DT, still=still)
+
+
+def test_the_first_tick_takes_over_what_hold_carries() -> None:
+    law = AssistLaw(FORCE_MAX, RATE_MAX, INTEGRAL_MAX, INTEGRAL_S)
+    assert law.advance(150.0, None, DT, still=False) == 0.0
+    assert law.assist == 150.0
+
+
+@pytest.mark.parametrize("wanted", [-1e4, 1e4])
+def test_the_wish_is_capped_and_rate_limited(wanted: float) -> None:
+    law, step = make_law(), RATE_MAX * DT
+    target = FORCE_MAX if wanted > 0.0 else 0.0
+    for _ in range(600):
+        before = law.assist
+        rate = law.advance(wanted, None, DT, still=True)
+        assert rate == pytest.approx((law.assist - before) / DT)
+        assert abs(law.assist - before) <= step + 1e-9
+    assert law.assist == target
+
+
+@pytest.mark.parametrize("error", [30.0, -30.0])
+def test_a_steady_error_is_integrated_beyond_what_friction_hides(error: float) -> None:
+    law = make_law()
+    run(law, 1.5, 100.0, 100.0 - error)
+    expected = math.copysign(abs(error) - ERROR_MIN, error) * 1.5 / INTEGRAL_S
+    assert law.integral == pytest.approx(expected)
+    assert law.assist == pytest.approx(100.0 + expected)
+
+
+@pytest.mark.parametrize("share", [-1.0, -0.9, 0.9, 1.0])
+def test_an_error_within_friction_is_left_alone(share: float) -> None:
+    law = make_law()
+    run(law, 60.0, 100.0, 100.0 + share * ERROR_MIN)
+    assert law.integral == 0.0
+
+
+@pytest.mark.parametrize(("measured", "end"), [(-1e3, INTEGRAL_MAX), (1e3, -INTEGRAL_MAX)])
+def test_the_integral_stops_at_its_limit_and_turns_at_once(measured: float, end: float) -> None:
+    law = make_law()
+    run(law, 60.0, 100.0, measured)
+    assert law.integral == end
+    law.advance(100.0, 100.0 + math.copysign(50.0, end), DT, still=True)
+    assert abs(law.integral) < INTEGRAL_MAX
+
+
+def test_the_robot_never_pulls_the_operator_down() -> None:
+    law = make_law(20.0)
+    run(law, 60.0, 20.0, 500.0)
+    assert law.assist == 0.0
+    law.advance(10.0, 500.0, DT, still=True)
+    assert law.assist >= 0.0
+
+
+def test_the_integral_freezes_without_a_reading() -> None:
+    law = make_law()
+    run(law, 1.0, 100.0, 70.0)
+    before = law.integral
+    assert before > 0.0
+    run(law, 5.0, 100.0, None)
+    assert law.integral == before
+
+
+def test_the_integral_freezes_while_the_operator_leads_and_a_little_longer() -> None:
+    law = make_law()
+    run(law, 5.0, 100.0, 60.0, still=False)
+    run(law, SETTLE_S - DT, 100.0, 60.0)
+    assert law.integral == 0.0
+    run(law, 3 * DT, 100.0, 60.0)
+    assert law.integral > 0.0
+
+
+def test_the_integral_freezes_while_the_wish_moves() -> None:
+    law, wanted = make_law(), 100.0
+    for _ in range(500):
+        wanted += 0.1
+        law.advance(wanted, 60.0, DT, still=True)
+    assert law.integral == 0.0
+
+
+def test_the_integral_leaks_away_when_nothing_is_wanted() -> None:
+    law = make_law()
+    run(law, 2.0, 100.0, 20.0)
+    before = law.integral
+    assert before > 20.0
+    run(law, INTEGRAL_S, 0.0, 300.0)
+    assert law.integral == pytest.approx(before * math.exp(-1.0), rel=0.01)
+    run(law, 10 * INTEGRAL_S, 0.0, 300.0)
+    assert law.assist == pytest.approx(0.0, abs=0.01)
+
+
+def test_no_wish_no_integral() -> None:
+    """The squat: the operator leads with up to 30 N and asks for nothing."""
+    law = make_law(0.0)
+    run(law, 60.0, 0.0, 30.0)
+    assert law.assist == 0.0
+
+
+@pytest.mark.parametrize("stop", ["wish", "lead", "reading"])
+def test_the_assist_makes_no_step_when_the_integral_starts_or_stops(stop: str) -> None:
+    law, last = make_law(), 100.0
+    for tick in range(3000):
+        on = tick // 500 % 2 == 0
+        wanted = 0.0 if stop == "wish" and not on else 100.0
+        measured = None if stop == "reading" and not on else -500.0
+        law.advance(wanted, measured, DT, still=on or stop != "lead")
+        step_max = (RATE_MAX + 700.0 / INTEGRAL_S) * DT
+        assert abs(law.assist - last) <= step_max + 1e-9
+        last = law.assist
+
+
+# -- directions ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("roll", [-0.3, 0.0, 0.2])
+@pytest.mark.parametrize("pitch", [-0.2, 0.0, 1.2])
+def test_force_up_is_the_world_z_of_a_force_in_torso_axes(roll: float, pitch: float) -> None:
+    rng = np.random.default_rng(1)
+    R = oracle.rz(0.7) @ oracle.rx(roll) @ oracle.ry(pitch)
+    force = rng.standard_normal(3)
+    x, y, z = (R.T @ force).tolist()
+    assert force_up((x, y, z), roll, pitch) == pytest.approx(force[2])
+
+
+@pytest.mark.parametrize("share", [-1.01, -0.99, 0.0, 0.99, 1.01])
+def test_still_is_within_both_rates(share: float) -> None:
+    still = abs(share) < 1.0
+    assert is_still(share * STILL_RATE_Z, 0.0) is still
+    assert is_still(0.0, share * STILL_RATE_PITCH) is still
+
+
+# -- easing the lead -------------------------------------------------------------------
+
+
+def eased(easing: LeadEasing, up: float | None, moment: float = 0.0, assist: float = 0.0) -> Any:
+    for _ in range(round(LEAD_FADE_S / DT) + 1):
+        result = easing.ease(up, moment, assist, DT)
+    return result
+
+
+def test_only_what_exceeds_the_assist_load_is_amplified() -> None:
+    assert eased(LeadEasing(0.5), -200.0, assist=200.0) == (0.0, 0.0)
+    assert eased(LeadEasing(0.5), -180.0, 8.0, assist=200.0) == pytest.approx((10.0, 4.0))
+
+
+def test_alpha_zero_adds_nothing() -> None:
+    assert eased(LeadEasing(0.0), 100.0, 50.0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_no_more_than_a_hand_can_do_is_amplified(sign: float) -> None:
+    expected = (sign * 0.5 * LEAD_MAX[0], sign * 0.5 * LEAD_MAX[1])
+    assert eased(LeadEasing(0.5), sign * 1e4, sign * 1e4) == pytest.approx(expected)
+
+
+def test_the_easing_fades_out_when_the_wrench_is_lost_and_in_when_it_is_back() -> None:
+    easing, last = LeadEasing(0.5), 50.0
+    assert eased(easing, 100.0)[0] == pytest.approx(last)
+    for up in (None, 100.0):
+        for _ in range(round(LEAD_FADE_S / DT)):
+            force, _ = easing.ease(up, 0.0, 0.0, DT)
+            assert abs(force - last) <= 50.0 * DT / LEAD_FADE_S + 1e-9
+            last = force
+        assert last == pytest.approx(0.0 if up is None else 50.0)
+
+
+# -- overload --------------------------------------------------------------------------
+
+AFTER, RELEASE = 100 * NS_PER_MS, 1000 * NS_PER_MS
+T0 = 10**12
+
+
+def wrench(
+    force: Vector3 = (0.0, 0.0, 0.0),
+    moment: Vector3 = (0.0, 0.0, 0.0),
+    *,
+    valid: bool = True,
+    saturated: bool = False,
+) -> Wrench:
+    return Wrench(
+        t_ns=0, seq=0, force=force, moment=moment, valid=valid, saturated=saturated,
+        tare=Tare.DONE, age_ns=0,
+    )  # fmt: skip
+
+
+def at(share: float, kind: str) -> Wrench:
+    """Return a wrench at a share of one limit, in a slanted direction."""
+    part = share / math.sqrt(3.0)
+    if kind == "force":
+        return wrench((500.0 * part, -500.0 * part, 500.0 * part))
+    return wrench(moment=(100.0 * part, 100.0 * part, -100.0 * part))
+
+
+def make_overload() -> Overload:
+    return Overload(500.0, 100.0, AFTER, RELEASE)
+
+
+@pytest.mark.parametrize("kind", ["force", "moment"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999, 1.001, 2.0])
+@pytest.mark.parametrize("for_ns", [0, AFTER - 1, AFTER, 10 * AFTER])
+def test_hold_is_asked_for_beyond_a_limit_for_its_time(
+    kind: str, share: float, for_ns: int
+) -> None:
+    overload = make_overload()
+    for t_ns in sorted({0, for_ns // 3, for_ns}):
+        overload.hear(at(share, kind), T0 + t_ns)
+    assert overload.hold is (share > 1.0 and for_ns >= AFTER)
+
+
+def test_a_moment_below_the_limit_begins_the_time_anew() -> None:
+    overload = make_overload()
+    for t_ns, share in ((0, 1.1), (60, 1.1), (64, 0.99), (68, 1.1), (167, 1.1)):
+        overload.hear(at(share, "force"), T0 + t_ns * NS_PER_MS)
+        assert not overload.hold
+    overload.hear(at(1.1, "force"), T0 + 168 * NS_PER_MS)
+    assert overload.hold
+
+
+@pytest.mark.parametrize("valid", [True, False])
+def test_a_saturated_cell_asks_for_hold_at_once(valid: bool) -> None:
+    overload = make_overload()
+    overload.hear(wrench(valid=valid, saturated=True), T0)
+    assert overload.hold
+
+
+@pytest.mark.parametrize("kind", ["force", "moment"])
+@pytest.mark.parametrize("share", [0.0, RELEASE_SHARE - 0.001, RELEASE_SHARE + 0.001, 0.99])
+@pytest.mark.parametrize("for_ns", [RELEASE - 1, RELEASE, 3 * RELEASE])
+def test_hold_ends_below_the_lower_limit_for_its_time(kind: str, share: float, for_ns: int) -> None:
+    overload = make_overload()
+    overload.hear(wrench(valid=False, saturated=True), T0)
+    overload.hear(at(share, kind), T0)
+    overload.hear(at(share, kind), T0 + for_ns)
+    assert overload.hold is not (share < RELEASE_SHARE and for_ns >= RELEASE)
+
+
+def test_numbers_that_are_not_valid_neither_begin_nor_end_it() -> None:
+    overload = make_overload()
+    old = msgspec.structs.replace(at(2.0, "force"), valid=False)
+    for t_ns in (0, AFTER, 10 * AFTER):
+        overload.hear(old, T0 + t_ns)
+    assert not overload.hold
+    overload.hear(wrench(valid=False, saturated=True), T0 + 20 * AFTER)
+    for t_ns in (0, RELEASE, 10 * RELEASE):
+        overload.hear(wrench(valid=False), T0 + 30 * AFTER + t_ns)
+    assert overload.hold

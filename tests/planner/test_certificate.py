@@ -1,0 +1,224 @@
+"""K_fail against the energy of a robot that springs hold, and what is read from it."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.joint.differential import motor_from_joint
+from services.planner.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
+from services.planner.gains import GainLaw
+from services.planner.inverse_kinematics import InverseKinematics
+from shared.config import RobotConfig
+from shared.robot_model import stand_pose
+from tests.planner.conftest import Closed, at_pose, p_at
+from tests.planner.oracle import Array
+from tests.planner.stands import Stand
+
+POSES = (
+    {"height": 1.188},
+    {"height": 1.0, "x": 0.02, "y": -0.015, "roll": 0.03, "pitch": 0.3, "yaw": 0.04},
+    {"height": 0.85, "pitch": 0.6},
+    {"height": 0.80, "pitch": 1.2, "yaw": -0.02},
+)
+ASSISTS = (0.0, 200.0)
+
+
+@pytest.fixture(
+    scope="module",
+    params=product(POSES, ASSISTS),
+    ids=lambda s: f"{s[0]['height']:g}m-{s[1]:g}N",
+)
+def stand(request: pytest.FixtureRequest, robot: RobotConfig, closed: Closed) -> Stand:
+    pose, assist = request.param
+    return Stand(robot, closed(**pose), assist)
+
+
+@pytest.fixture(scope="module")
+def crouched(robot: RobotConfig, closed: Closed) -> Stand:
+    return Stand(robot, closed(1.0, pitch=0.3, x=0.01), 200.0)
+
+
+def random_stiffness(seed: int) -> Array:
+    return np.asarray(np.random.default_rng(seed).uniform(0.0, 2000.0, 12), float)
+
+
+def scheduled(robot: RobotConfig, stand: Stand) -> Array:
+    """Return D (12,) of the schedule's node nearest to a stand."""
+    schedule = robot.gain_schedule
+    assert schedule is not None
+    i = int(np.abs(np.array(schedule.z) - stand.p[2]).argmin())
+    j = int(np.abs(np.array(schedule.pitch) - stand.p[4]).argmin())
+    return np.tile(schedule.D[i][j], 2)
+
+
+def smallest(robot: RobotConfig, K: Array) -> tuple[float, Array]:
+    """Return the smallest mu with K p = mu diag(K_required) p, and p (6,)."""
+    values, vectors = np.linalg.eig(K / np.array(robot.certificate.K_required)[:, np.newaxis])
+    index = int(values.real.argmin())
+    assert abs(values[index].imag) < 1e-6
+    return float(values[index].real), np.asarray(vectors[:, index].real, float)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_failsafe_stiffness_is_the_curvature_of_the_energy(stand: Stand, seed: int) -> None:
+    D = random_stiffness(seed)
+    want = stand.stiffness_felt(D)
+    got = stand.certificate.failsafe_stiffness(D)
+    np.testing.assert_allclose(got, want, atol=5e-5 * np.abs(want).max())
+    np.testing.assert_allclose(got, got.T, rtol=1e-9, atol=1e-6)
+
+
+def test_failsafe_stiffness_of_the_scheduled_gains_is_exact_to_a_newton_per_metre(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    """Where the numbers are small and the verdict hangs on them."""
+    D = scheduled(robot, stand)
+    np.testing.assert_allclose(
+        stand.certificate.failsafe_stiffness(D), stand.stiffness_felt(D), rtol=1e-3, atol=1.0
+    )
+
+
+def test_margins_are_the_smallest_eigenvalues_in_shares_of_what_is_required(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    D = scheduled(robot, stand)
+    margins = stand.certificate.margins(D)
+    service, _ = smallest(robot, stand.stiffness_felt(D))
+    assert margins.service == pytest.approx(service, abs=2e-3)
+    assert margins.service > 0.5
+
+
+def in_motor_space(D_module: Array, gear_ratio: float) -> Array:
+    """Return a module's joint stiffness (2, 2) when each motor springs back on its own.
+
+    Of the stiffness at the motors only the diagonal runs on the drives (design section 5).
+    """
+    columns = [motor_from_joint((1.0, 0.0), gear_ratio), motor_from_joint((0.0, 1.0), gear_ratio)]
+    motors = 2.0 * np.pi * np.array(columns).T  # rad at the motors per rad of the joint
+    joints = np.linalg.inv(motors)
+    at_motors = joints.T @ np.diag(D_module) @ joints
+    k_1, k_2 = D_module
+    twice = (2.0 * gear_ratio) ** 2
+    assert at_motors[0, 0] == pytest.approx((k_1 + k_2) / twice)  # the design's formula
+    return np.asarray(motors.T @ np.diag(np.diagonal(at_motors)) @ motors, float)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_onboard_margin_is_that_of_what_the_motors_hold_alone(
+    robot: RobotConfig, stand: Stand, seed: int
+) -> None:
+    D = random_stiffness(seed)
+    D_onboard = np.zeros(12)
+    for module in range(6):
+        pair = slice(2 * module, 2 * module + 2)
+        K = in_motor_space(D[pair], robot.joint.gear_ratio)
+        assert K[0, 1] == pytest.approx(0.0, abs=1e-9)
+        D_onboard[pair] = np.diagonal(K)
+    np.testing.assert_allclose(motor_mean(D), D_onboard, rtol=1e-12)
+    onboard, _ = smallest(robot, stand.stiffness_felt(D_onboard))
+    assert stand.certificate.margins(D).onboard == pytest.approx(onboard, rel=1e-3, abs=1e-3)
+
+
+def test_all_of_k_q_gives_k_p_in_the_closed_directions(stand: Stand) -> None:
+    """T^T K_q T + K_geo = S_perp K_p + K_0 T^T N T: the paper's law holds with its own gains."""
+    robot, T = stand.robot, stand.T
+    K_q = GainLaw(robot).gains(stand.kinematics, stand.hessian_O).K_q
+    K_geo = stand.certificate.failsafe_stiffness(np.zeros(12))
+    J, law = stand.kinematics.J, robot.law
+    N = np.eye(12) - J.T @ np.linalg.inv(J @ J.T + law.damping_lambda**2 * np.eye(6)) @ J
+    K_p = np.diag(np.array(law.K_p) * (1.0 - np.array(law.S)))
+    assert np.abs(K_geo).max() > 500.0
+    np.testing.assert_allclose(T.T @ K_q @ T + K_geo, K_p + law.K_0 * T.T @ N @ T, atol=1e-5)
+
+
+def test_a_robot_without_stiffness_falls(stand: Stand) -> None:
+    """Held torques do not hold: forward and sideways the weight wins."""
+    K = stand.certificate.failsafe_stiffness(np.zeros(12))
+    assert K[0, 0] < -500.0
+    assert K[1, 1] < -500.0
+    assert stand.certificate.margins(np.zeros(12)).service < -0.3
+
+
+def test_more_assist_leaves_less_margin_in_a_deep_lean(robot: RobotConfig, closed: Closed) -> None:
+    q = closed(0.80, pitch=1.2)
+    D = np.full(12, 500.0)
+    margins = [Stand(robot, q, assist).certificate.margins(D).onboard for assist in ASSISTS]
+    assert margins[1] < margins[0] - 1e-3
+
+
+@given(
+    st.lists(st.floats(0.0, 5000.0), min_size=12, max_size=12),
+    st.lists(st.floats(0.0, 2000.0), min_size=12, max_size=12),
+)
+def test_stiffer_joints_never_lower_a_margin(
+    crouched: Stand, D: list[float], more: list[float]
+) -> None:
+    before = crouched.certificate.margins(np.array(D))
+    after = crouched.certificate.margins(np.array(D) + np.array(more))
+    assert after.service >= before.service - 1e-9
+    assert after.onboard >= before.onboard - 1e-9
+
+
+def test_all_a_certificate_requires_is_a_margin_of_one(robot: RobotConfig, stand: Stand) -> None:
+    """Required as much as is there in every direction: 1. Twice as much: a half."""
+    K = stand.certificate.failsafe_stiffness(np.full(12, 4000.0))
+    least = float(np.linalg.eigvalsh(K)[0])
+    for share in (1.0, 2.0):
+        required = msgspec.structs.replace(robot.certificate, K_required=(share * least,) * 6)
+        certificate = Certificate(msgspec.structs.replace(robot, certificate=required))
+        certificate.at(stand.T, stand.hessian_O)
+        assert certificate.margins(np.full(12, 4000.0)).service == pytest.approx(1.0 / share)
+
+
+def test_weakest_is_the_direction_of_an_independent_decomposition(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    required = np.array(robot.certificate.K_required)
+    for D in (scheduled(robot, stand), *(random_stiffness(seed) for seed in range(6, 12))):
+        weakest = stand.certificate.weakest(D)
+        K = stand.certificate.failsafe_stiffness(D)
+        margin, p = smallest(robot, K)
+        index = int(np.abs(p * np.sqrt(required)).argmax())
+        assert weakest.direction == DIRECTIONS[index]
+        assert weakest.unit == UNITS[index]
+        assert weakest.required == required[index]
+        assert weakest.margin == pytest.approx(margin, rel=1e-6, abs=1e-6)
+        assert weakest.stiffness == pytest.approx(margin * required[index], rel=1e-6, abs=1e-3)
+        along = weakest.p @ K @ weakest.p / (weakest.p @ (required * weakest.p))
+        assert along == pytest.approx(margin, rel=1e-6, abs=1e-6)
+        assert weakest.p[index] == pytest.approx(1.0 / np.sqrt(required[index]))
+
+
+@pytest.mark.parametrize(
+    ("soft", "direction"),
+    [(slice(0, 12, 2), "lean sideways"), (slice(1, 12, 2), "lean forward")],
+    ids=["phi", "theta"],
+)
+def test_weakest_names_the_way_a_robot_with_soft_joints_falls(
+    robot: RobotConfig, closed: Closed, soft: slice, direction: str
+) -> None:
+    D = np.full(12, 3000.0)
+    D[soft] = 100.0
+    weakest = Stand(robot, closed(1.188), 0.0).certificate.weakest(D)
+    assert weakest.direction == direction
+    assert weakest.margin < 0.0
+
+
+def test_the_worst_pose_of_the_design_falls_forward_and_a_stiff_one_stands(
+    robot: RobotConfig, ik: InverseKinematics
+) -> None:
+    """The sign changes with the ankles: 0.948 m, ankle theta from limp to stiff."""
+    q = at_pose(robot, ik, p_at(robot, 0.948), np.array(stand_pose(robot, 1.188)))
+    certificate = Stand(robot, q, 0.0).certificate
+    D = np.full(12, 500.0)
+    verdicts = []
+    for ankle in (0.0, 1000.0):
+        D[[1, 7]] = ankle
+        verdicts.append(certificate.margins(D).service)
+    assert verdicts[0] < 0.0 < verdicts[1]

@@ -1,0 +1,329 @@
+"""What the joint services hold alone: the schedule's D, certified, or stiffer."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.planner.certificate import Certificate
+from services.planner.inverse_kinematics import InverseKinematics
+from services.planner.kinematics import Kinematics
+from services.planner.split import GainSplit, ScheduledGains
+from shared.config import GRAVITY, RobotConfig
+from shared.exceptions import ConfigError
+from shared.gain_schedule import GainSchedule, digest_of, inputs_of
+from shared.messages import SplitSource
+from shared.robot_model import stand_pose
+from tests.planner.conftest import Closed
+from tests.planner.oracle import Array
+from tests.planner.stands import Stand
+
+POSES = ((1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
+MARGIN, MARGIN_ONBOARD = 0.9, 0.45
+"""Of what is required; asked for at the nodes are 1 and 0.5."""
+
+
+@pytest.fixture(
+    scope="module",
+    params=product(POSES, (0.0, 200.0)),
+    ids=lambda s: f"{s[0][0]:g}m-{s[0][1]:g}rad-{s[1]:g}N",
+)
+def stand(request: pytest.FixtureRequest, robot: RobotConfig, closed: Closed) -> Stand:
+    (height, pitch), assist = request.param
+    return Stand(robot, closed(height, pitch=pitch), assist)
+
+
+@pytest.fixture(scope="session")
+def schedule(robot: RobotConfig) -> GainSchedule:
+    assert robot.gain_schedule is not None
+    return robot.gain_schedule
+
+
+def with_law(robot: RobotConfig, **changes: object) -> RobotConfig:
+    return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **changes))
+
+
+def with_table(robot: RobotConfig, scale: float) -> RobotConfig:
+    """Return the robot with its schedule's D scaled; what it was made from is kept."""
+    schedule = robot.gain_schedule
+    assert schedule is not None
+    table = (scale * np.array(schedule.D)).tolist()
+    D = msgspec.convert(
+        table, tuple[tuple[tuple[float, float, float, float, float, float], ...], ...]
+    )
+    return msgspec.structs.replace(
+        robot, gain_schedule=msgspec.structs.replace(schedule, D=D)
+    )  # fmt: skip
+
+
+def requiring(robot: RobotConfig, **changes: object) -> RobotConfig:
+    """Return the robot with some keys of [certificate] changed, its schedule made out to fit."""
+    certificate = msgspec.structs.replace(robot.certificate, **changes)
+    changed = msgspec.structs.replace(robot, certificate=certificate)
+    schedule = robot.gain_schedule
+    assert schedule is not None
+    inputs = inputs_of(changed)
+    fitting = msgspec.structs.replace(schedule, inputs=inputs, digest=digest_of(inputs))
+    return msgspec.structs.replace(changed, gain_schedule=fitting)
+
+
+# -- the schedule, live ----------------------------------------------------------------
+
+
+def made_of(function: object, z: list[float], pitch: list[float]) -> GainSchedule:
+    assert callable(function)
+    D = tuple(tuple(tuple(function(a, b)) for b in pitch) for a in z)
+    return GainSchedule(version=1, digest="", inputs={}, z=tuple(z), pitch=tuple(pitch), D=D)
+
+
+@given(st.floats(0.5, 1.1), st.floats(-0.5, 1.7))
+def test_between_nodes_each_gain_is_linear_in_height_and_in_pitch(z: float, pitch: float) -> None:
+    """A table made of a + b z + c pitch + d z pitch comes back exactly; beyond it is held."""
+
+    def bilinear(z: float, pitch: float) -> list[float]:
+        return [100.0 * n + 300.0 * z - 20.0 * n * pitch + 70.0 * z * pitch for n in range(1, 7)]
+
+    scheduled = ScheduledGains(made_of(bilinear, [0.6, 0.65, 0.8, 1.0], [-0.4, 0.0, 1.0, 1.5]))
+    inside = bilinear(float(np.clip(z, 0.6, 1.0)), float(np.clip(pitch, -0.4, 1.5)))
+    np.testing.assert_allclose(scheduled.at(z, pitch), np.tile(inside, 2), rtol=1e-12)
+
+
+def test_at_a_node_the_gains_are_the_tables_for_both_legs(schedule: GainSchedule) -> None:
+    scheduled = ScheduledGains(schedule)
+    for (i, z), (j, pitch) in product(enumerate(schedule.z), enumerate(schedule.pitch)):
+        np.testing.assert_allclose(scheduled.at(z, pitch), np.tile(schedule.D[i][j], 2))
+
+
+def test_gains_do_not_step_from_node_to_node(schedule: GainSchedule) -> None:
+    """Over the squat and the crawl, 0.2 mm at a time: no jump of a gain."""
+    scheduled = ScheduledGains(schedule)
+    for pitch_end in (0.0, 1.2):
+        path = zip(np.linspace(0.95, 0.63, 1600), np.linspace(0.0, pitch_end, 1600), strict=True)
+        table = np.array([scheduled.at(z, pitch) for z, pitch in path])
+        assert np.abs(np.diff(table, axis=0)).max() < 10.0
+
+
+def halved(nodes: tuple[float, ...]) -> Array:
+    return np.sort(np.concatenate([nodes, 0.5 * (np.array(nodes[1:]) + np.array(nodes[:-1]))]))
+
+
+def test_the_schedule_is_certified_at_every_node_and_half_way_between(
+    robot: RobotConfig, schedule: GainSchedule
+) -> None:
+    """Both margins, without and with the full assist, wherever the robot can stand."""
+    kinematics, certificate = Kinematics(robot), Certificate(robot)
+    ik = InverseKinematics(kinematics, np.array(robot.joint_limits()))
+    scheduled = ScheduledGains(schedule)
+    F_O = np.array([0.0, 0.0, robot.total_mass * GRAVITY, 0.0, 0.0, 0.0])
+    seen, failing = 0, []
+    for pitch in halved(schedule.pitch):
+        ik.q[:] = stand_pose(robot, 1.0)
+        for z in halved(schedule.z):
+            before = ik.q.copy()
+            if not ik.solve(np.array([0.0, 0.0, z, 0.0, pitch, 0.0]), iterations_max=60).converged:
+                ik.q[:] = before
+                continue
+            kinematics.update(ik.q)
+            A = np.vstack([kinematics.J, kinematics.C])
+            T = np.asarray(np.linalg.solve(A, np.eye(12)[:, :6]), float)
+            for assist in (0.0, 100.0, robot.assist.force_max):
+                force = np.array([0.0, 0.0, assist])
+                certificate.at(T, kinematics.hessian_times(F_O, force))
+                margins = certificate.margins(scheduled.at(z, pitch))
+                seen += 1
+                if margins.service < MARGIN or margins.onboard < MARGIN_ONBOARD:
+                    failing.append((round(z, 4), pitch, assist, margins))
+    assert seen > 3 * 400
+    assert failing == []
+
+
+def test_in_the_squat_and_the_crawl_the_schedule_is_enough(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    local = stand.split(GainSplit(robot))
+    assert local.source is SplitSource.SCHEDULE
+    assert local.margins.service >= MARGIN
+    assert local.margins.onboard >= MARGIN_ONBOARD
+    schedule = robot.gain_schedule
+    assert schedule is not None
+    np.testing.assert_array_equal(
+        local.D, ScheduledGains(schedule).at(float(stand.p[2]), float(stand.p[4]))
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_off_centre_leaning_and_twisted_the_schedule_is_still_enough(
+    robot: RobotConfig, closed: Closed, seed: int
+) -> None:
+    """What a push leaves: up to 4 cm, 0.04 rad of roll and of yaw."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-0.04, 0.04, 2)
+    roll, yaw = rng.uniform(-0.04, 0.04, 2)
+    q = closed(rng.uniform(0.9, 1.18), pitch=rng.uniform(-0.1, 0.6), x=x, y=y, roll=roll, yaw=yaw)
+    local = Stand(robot, q, float(rng.uniform(0.0, 200.0))).split(GainSplit(robot))
+    assert local.source is SplitSource.SCHEDULE
+
+
+def test_the_margins_told_are_the_certificates_of_what_is_sent(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    for changed in (robot, with_table(robot, 0.0), with_law(robot, split="diagonal")):
+        local = stand.split(GainSplit(changed))
+        assert local.margins == pytest.approx(stand.certificate.margins(local.D))
+
+
+def test_scheduled_gains_are_far_softer_than_the_papers_where_the_person_leads(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    """Design section 3 c: along z; diag(K_q) gives 2-3e5 N/m there."""
+    soft = stand.split(GainSplit(robot)).D
+    stiff = stand.split(GainSplit(with_law(robot, split="diagonal"))).D
+    K_z = [float(stand.T[:, 2] @ (D * stand.T[:, 2])) for D in (soft, stiff)]
+    assert K_z[0] < 0.35 * K_z[1]
+
+
+# -- where the margin is not met -------------------------------------------------------
+
+
+def test_gains_that_would_fall_are_stiffened_until_they_stand(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    limp = with_table(robot, 0.0)
+    assert stand.certificate.margins(np.zeros(12)).service < 0.0
+    local = stand.split(GainSplit(limp))
+    assert local.source is SplitSource.STIFFENED
+    assert local.margins.service >= robot.certificate.margin_min
+    assert local.margins.onboard >= robot.certificate.onboard_margin_min
+
+
+def test_of_stiffer_gains_the_nearest_that_stand_are_taken(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    """A quarter of the way less would not have stood."""
+    limp = stand.split(GainSplit(with_table(robot, 0.0)))
+    stiff = stand.split(GainSplit(requiring(robot, K_required=(1e5,) * 6))).D
+    assert np.all(stiff - limp.D >= -1e-9)
+    softer = limp.D - 0.25 * stiff
+    assert softer.min() >= -1e-9
+    margins = stand.certificate.margins(softer)
+    least = robot.certificate
+    assert margins.service < least.margin_min or margins.onboard < least.onboard_margin_min
+
+
+def test_either_margin_alone_is_enough_to_be_stiffened(robot: RobotConfig, stand: Stand) -> None:
+    scheduled = stand.split(GainSplit(robot))
+    service = requiring(robot, margin_min=min(1.0, scheduled.margins.service + 0.01))
+    onboard = requiring(robot, onboard_margin_min=min(1.0, scheduled.margins.onboard + 0.01))
+    for changed in (service, onboard):
+        local = stand.split(GainSplit(changed))
+        least = changed.certificate
+        lacking = (
+            scheduled.margins.service < least.margin_min
+            or scheduled.margins.onboard < least.onboard_margin_min
+        )
+        assert lacking == (local.source is not SplitSource.SCHEDULE)
+        if local.source is SplitSource.STIFFENED:
+            assert local.margins.service >= least.margin_min
+            assert local.margins.onboard >= least.onboard_margin_min
+
+
+def test_where_nothing_stands_the_split_says_so(robot: RobotConfig, stand: Stand) -> None:
+    impossible = requiring(robot, K_required=(1e5,) * 6)
+    local = stand.split(GainSplit(impossible))
+    assert local.source is SplitSource.UNCERTIFIED
+    assert local.margins.service < robot.certificate.margin_min
+    assert local.D.min() >= 0.0
+
+
+def test_uncertified_gains_are_the_stiffest_that_are_allowed(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    D = stand.split(GainSplit(requiring(robot, K_required=(1e5,) * 6))).D
+    own = stand.split(GainSplit(robot)).D
+    power_up = np.tile(
+        [*robot.stand.ankle.k_p, *robot.stand.knee.k_p, *robot.stand.hip.k_p], 2
+    )  # fmt: skip
+    share = robot.certificate.k_q_share_max
+    for least in (own, power_up, share * np.diagonal(stand.gains().K_q)):
+        np.testing.assert_array_less(np.minimum(least, robot.joint_service.k_p_max), D + 1e-9)
+
+
+# -- damping and limits ----------------------------------------------------------------
+
+
+def test_damping_is_scaled_as_the_stiffness_is(robot: RobotConfig, stand: Stand) -> None:
+    """D_B / diag(B_q) = share D / diag(K_q), up to what k_q_share_max allows."""
+    K_q, B_q = stand.gains()
+    diagonal = np.clip(np.diagonal(K_q), 1.0, robot.joint_service.k_p_max)
+    most = robot.certificate.k_q_share_max
+    below = 0
+    for scale in (1.0, 0.8, 0.0):
+        local = stand.split(GainSplit(with_table(robot, scale)))
+        of_k_q = np.minimum(local.D / diagonal, most)
+        below += int(np.sum(of_k_q < most))
+        expected = robot.law.local_damping_share * of_k_q * np.diagonal(B_q)
+        np.testing.assert_allclose(local.D_B, np.clip(expected, 0.0, robot.joint_service.k_d_max))
+    assert below > 10
+
+
+@given(
+    st.integers(0, 10_000),
+    st.floats(1.0, 1e5),
+    st.sampled_from(["certified", "diagonal"]),
+    st.sampled_from([0.0, 1.0]),
+)
+def test_gains_are_never_negative_nor_over_the_limits(
+    robot: RobotConfig, seed: int, size: float, split: str, load: float
+) -> None:
+    """Whatever K_q, B_q, T and the Hessian are; without a load the first choice stands."""
+    rng = np.random.default_rng(seed)
+    K_q, B_q, hessian = (size * rng.normal(size=(12, 12)) for _ in range(3))
+    hessian *= load
+    service = msgspec.structs.replace(robot.joint_service, k_p_max=2000.0, k_d_max=50.0)
+    limited = requiring(
+        msgspec.structs.replace(with_law(robot, split=split), joint_service=service)
+    )
+    z, pitch = rng.uniform(0.4, 1.3), rng.uniform(-1.0, 2.0)
+    local = GainSplit(limited).split(K_q, B_q, z, pitch, rng.normal(size=(12, 6)), hessian)
+    assert np.isfinite([*local.D, *local.D_B, *local.margins]).all()
+    for gains, limit in ((local.D, 2000.0), (local.D_B, 50.0)):
+        assert gains.min() >= 0.0
+        assert gains.max() <= limit
+
+
+# -- the paper's split -----------------------------------------------------------------
+
+
+def test_the_papers_split_is_the_diagonal_and_needs_no_schedule(
+    robot: RobotConfig, stand: Stand
+) -> None:
+    bare = msgspec.structs.replace(with_law(robot, split="diagonal"), gain_schedule=None)
+    local = stand.split(GainSplit(bare))
+    K_q, B_q = stand.gains()
+    share = robot.law.local_damping_share
+    assert local.source is SplitSource.DIAGONAL
+    np.testing.assert_array_equal(
+        local.D, np.clip(np.diagonal(K_q), 0.0, bare.joint_service.k_p_max)
+    )
+    expected = np.clip(share * np.diagonal(B_q), 0.0, bare.joint_service.k_d_max)
+    np.testing.assert_allclose(local.D_B, expected)
+    assert local.D_B.max() > 1.0
+
+
+# -- no schedule -----------------------------------------------------------------------
+
+
+def test_a_certified_split_without_its_schedule_is_refused(robot: RobotConfig) -> None:
+    mass = msgspec.structs.replace(robot.mass, payload=5.0)
+    for changed, found in (
+        (msgspec.structs.replace(robot, gain_schedule=None), "no gain schedule"),
+        (msgspec.structs.replace(robot, mass=mass), "mass.payload = 20.4, not 5.0"),
+    ):
+        with pytest.raises(ConfigError, match="xrl gains") as caught:
+            GainSplit(changed)
+        assert found in caught.value.found

@@ -1,0 +1,243 @@
+"""At and near straight knees: N, the gains, v_ref and the IK go through without a jump.
+
+At straight knees no joint rate lifts the torso while the legs stay together: [J; C] is
+singular. J alone loses its rank there where the hips are as wide as the feet; the shipped
+robot's legs lean by 41 mm each, and J keeps a smallest singular value of 0.019.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.planner.gains import GainLaw
+from services.planner.inverse_kinematics import TOLERANCE, InverseKinematics
+from services.planner.kinematics import Kinematics
+from services.planner.split import GainSplit
+from shared.config import RobotConfig
+from tests.planner import oracle
+from tests.planner.conftest import Closed
+from tests.planner.oracle import Array
+
+KNEES = [3, 9]
+OTHERS = [joint for joint in range(12) if joint not in KNEES]
+WEIGHT = np.array([0.0, 0.0, 731.6, 0.0, 0.0, 0.0])
+ASSIST = np.array([0.0, 0.0, 200.0])
+STEP = 0.005
+"""rad; of the knees along the path."""
+
+
+class Path(NamedTuple):
+    """Configurations from knees of -0.5 rad over 0 to +0.1: level, legs closed."""
+
+    robot: RobotConfig
+    q: list[Array]
+    J: list[Array]
+
+
+def path_of(robot: RobotConfig) -> Path:
+    """Return the path, closed by the oracle, and what `Kinematics` makes of it."""
+
+    def rows(q: Array) -> Array:
+        return np.concatenate([oracle.pose(robot, q)[[0, 1, 3, 4, 5]], oracle.closure(robot, q)])
+
+    kinematics, path = Kinematics(robot), Path(robot, [], [])
+    q = np.tile([0.0, 0.1, 0.0, 0.0, 0.0, 0.4], 2)
+    for index in range(-100, 21):
+        q[KNEES] = index * STEP
+        for _ in range(8):
+            A = oracle.derivative(rows, q)[:, OTHERS]
+            q[OTHERS] -= np.linalg.lstsq(A, rows(q), rcond=1e-6)[0]
+            if np.abs(rows(q)).max() < 1e-11:
+                break
+        assert np.abs(rows(q)).max() < 1e-9
+        kinematics.update(q)
+        path.q.append(q.copy())
+        path.J.append(kinematics.J.copy())
+    return path
+
+
+@pytest.fixture(scope="module")
+def leaning(robot: RobotConfig) -> Path:
+    return path_of(robot)
+
+
+@pytest.fixture(scope="module")
+def upright(robot: RobotConfig) -> Path:
+    """Return the path of a robot whose feet are as wide as its hips."""
+    geometry = msgspec.structs.replace(robot.geometry, w_base=robot.geometry.w_hip)
+    return path_of(msgspec.structs.replace(robot, geometry=geometry))
+
+
+@pytest.fixture(params=["leaning", "upright"])
+def path(request: pytest.FixtureRequest) -> Path:
+    made = request.getfixturevalue(request.param)
+    assert isinstance(made, Path)
+    return made
+
+
+def changes(values: list[Array]) -> list[float]:
+    """Return how far (2-norm) each value is from the one before it."""
+    return [float(np.linalg.norm(b - a, 2)) for a, b in itertools.pairwise(values)]
+
+
+def damped_null_spaces(path: Path) -> list[Array]:
+    """Return N (12, 12) along the path as the law uses it: with no K_p, K_q = N K_0."""
+    law = msgspec.structs.replace(path.robot.law, K_p=(0.0,) * 6, K_0=1.0)
+    gains = GainLaw(msgspec.structs.replace(path.robot, law=law))
+    kinematics, found = Kinematics(path.robot), []
+    for q in path.q:
+        kinematics.update(q)
+        found.append(gains.gains(kinematics, np.zeros((12, 12))).K_q)
+    return found
+
+
+def test_j_loses_a_rank_at_straight_upright_legs_only(leaning: Path, upright: Path) -> None:
+    smallest = [[np.linalg.svd(J)[1][-1] for J in path.J] for path in (leaning, upright)]
+    assert min(smallest[0]) == pytest.approx(0.0190, abs=1e-4)
+    assert min(smallest[1]) < 1e-9
+    assert upright.q[int(np.argmin(smallest[1]))][KNEES] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_n_moves_no_faster_than_j_over_lambda(path: Path) -> None:
+    """N = lambda^2 (J^T J + lambda^2 I)^-1, so |dN| <= |dJ| / lambda, at any singular value."""
+    moved = changes(damped_null_spaces(path))
+    for change, change_J in zip(moved, changes(path.J), strict=True):
+        assert change <= change_J / path.robot.law.damping_lambda + 1e-12
+    assert max(moved) <= 10.0 * STEP
+
+
+def test_undamped_the_null_space_jumps_at_straight_upright_legs(upright: Path) -> None:
+    """What the damping is for: one whole direction turns up and is gone 5 mrad later."""
+    undamped = [np.eye(12) - np.linalg.pinv(J, rcond=1e-12) @ J for J in upright.J]
+    assert max(changes(undamped)) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_gains_go_through_straight_knees_without_a_jump(path: Path) -> None:
+    """No change is more than its slope (per rad of knee) allows; K_q itself is 4400 at most."""
+    law, kinematics = GainLaw(path.robot), Kinematics(path.robot)
+    K_q, B_q = [], []
+    for q in path.q:
+        kinematics.update(q)
+        gains = law.gains(kinematics, kinematics.hessian_times(WEIGHT, ASSIST))
+        K_q.append(gains.K_q)
+        B_q.append(gains.B_q)
+    assert np.isfinite(K_q).all()
+    assert np.isfinite(B_q).all()
+    assert max(changes(K_q)) <= 1000.0 * STEP
+    assert max(changes(B_q)) <= 120.0 * STEP
+
+
+@pytest.mark.parametrize("split", ["certified", "diagonal"])
+def test_the_local_gains_go_through_straight_knees_without_a_jump(
+    leaning: Path, limits: Array, split: str
+) -> None:
+    robot = leaning.robot
+    law = msgspec.structs.replace(robot.law, split=split)
+    splitting, gain_law = GainSplit(msgspec.structs.replace(robot, law=law)), GainLaw(robot)
+    ik = InverseKinematics(Kinematics(robot), limits)
+    D, D_B = [], []
+    for q in leaning.q:
+        T = per_p(ik, q)
+        hessian_F = ik.kinematics.hessian_times(WEIGHT, ASSIST).copy()
+        K_q, B_q = gain_law.gains(ik.kinematics, hessian_F)
+        p = ik.kinematics.p
+        local = splitting.split(K_q, B_q, float(p[2]), float(p[4]), T, hessian_F)
+        D.append(local.D)
+        D_B.append(local.D_B)
+    for values, slope in ((D, 4000.0), (D_B, 400.0)):
+        assert np.isfinite(values).all()
+        assert np.abs(np.diff(values, axis=0)).max() <= slope * STEP
+
+
+def per_p(ik: InverseKinematics, q: Array) -> Array:
+    """Return joint rates per unit of p (12, 6) at q, as the law makes them."""
+    ik.q[:] = q
+    ik.examine(np.zeros(6))
+    return ik.solve_rates(np.eye(12)[:, :6])
+
+
+def test_rates_that_follow_the_robots_own_motion_are_never_larger_than_it(
+    leaning: Path, limits: Array
+) -> None:
+    """The robot led through straight knees: v_ref = T S J v."""
+    ik = InverseKinematics(Kinematics(leaning.robot), limits)
+    S = np.array(leaning.robot.law.S)
+    for before, q, after in zip(leaning.q, leaning.q[1:], leaning.q[2:], strict=False):
+        v = (after - before) / (2 * STEP)
+        T = per_p(ik, q)
+        v_ref = T @ (S * (ik.kinematics.J @ v))
+        assert np.linalg.norm(v_ref) <= 1.01 * np.linalg.norm(v)
+
+
+def test_rates_are_bounded_whatever_is_asked(path: Path, limits: Array) -> None:
+    """By the damping: 1 / (2 * 1e-4) per unit of pdot. Undamped, no number bounds them."""
+    ik = InverseKinematics(Kinematics(path.robot), limits)
+    largest = max(float(np.linalg.norm(per_p(ik, q), 2)) for q in path.q)
+    assert largest <= 5000.0
+    at_straight = path.q[100]
+    per_p(ik, at_straight)
+    assert np.linalg.cond(np.vstack([ik.kinematics.J, ik.kinematics.C])) > 1e6
+
+
+TOP = 0.92693
+"""Height of the level COM with both knees at their limit, m, but for 0.01 mm."""
+
+
+def led(z: float) -> Array:
+    return np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("beyond", [0.001, 0.01, 0.1])
+def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_no_trace(
+    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, beyond: float
+) -> None:
+    start = closed(1.188)
+    low = float(oracle.pose(robot, start)[2])
+    ik.q[:] = start
+    for _ in range(3):
+        ik.solve(led(low))
+    start = ik.q.copy()
+    up = np.concatenate([np.linspace(low, TOP, 1000), np.linspace(TOP, TOP + beyond, 200)])
+    passed: list[tuple[Array, Array]] = []
+    for z in (*up, *up[::-1]):
+        before = ik.q.copy()
+        ik.solve(led(float(z)))
+        assert np.isfinite(ik.q).all()
+        assert np.all(ik.q >= limits[:, 0])
+        assert np.all(ik.q <= limits[:, 1])
+        assert np.abs(ik.q - before).max() < 0.01
+        passed.append((ik.q.copy(), oracle.pose(robot, ik.q)))
+    assert passed[len(up)][0][KNEES] == pytest.approx(-0.2, abs=1e-12)
+    for (q_up, p_up), (q_down, p_down) in zip(passed, passed[::-1], strict=True):
+        np.testing.assert_allclose(p_down, p_up, atol=2 * TOLERANCE)
+        # the same p to its tolerance; near the limit 1 m of it is up to 80 rad of joints
+        np.testing.assert_allclose(q_down, q_up, atol=80.0 * TOLERANCE)
+    for _ in range(3):
+        ik.solve(led(low))
+    np.testing.assert_allclose(ik.q, start, atol=1e-6)
+
+
+def test_with_knees_free_to_straighten_a_height_beyond_is_finite_and_the_least_miss(
+    robot: RobotConfig, limits: Array, closed: Closed
+) -> None:
+    wide = limits.copy()
+    wide[KNEES, 1] = 0.1
+    ik = InverseKinematics(Kinematics(robot), wide)
+    ik.q[:] = closed(1.188)
+    straight = float(oracle.pose(robot, leaning_straight(robot))[2])
+    for z in np.linspace(0.92, straight + 0.1, 500):
+        before = ik.q.copy()
+        ik.solve(led(float(z)))
+        assert np.isfinite(ik.q).all()
+        assert np.abs(ik.q - before).max() <= 0.2 * 4
+    assert oracle.pose(robot, ik.q)[2] == pytest.approx(straight, abs=1e-4)
+
+
+def leaning_straight(robot: RobotConfig) -> Array:
+    """Return q (12,) with straight knees: only the legs' lean from ankle to hip remains."""
+    return path_of(robot).q[100]

@@ -1,0 +1,88 @@
+"""The harness sensor of lockstep: the simulated cells and the live loop, without a bus.
+
+The frames of the simulated load cells go to the live service's own loop, and what that
+publishes to a modelled link and to the log (design section 7).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from services.harness.filter import WrenchFilter
+from services.harness.loop import HarnessLoop
+from services.simulator.harness_front import HarnessFront
+from services.simulator.world import World
+from shared.config import RobotConfig
+from shared.loadcell_can import LegSample, SampleAssembler
+from shared.messages import TareRequest, Vector6, Wrench
+from tools.runs.network import Link
+
+
+class Cells:
+    """The sensor's CAN bus: what the front sends, the loop reads at once."""
+
+    def __init__(self) -> None:
+        self._assembler = SampleAssembler()
+        self._forces: Vector6 | None = None
+
+    def poll(self) -> None:
+        """Do nothing: nobody has to be let in."""
+
+    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
+        """Take the frames of one sample."""
+        for can_id, data in frames:
+            self._forces = self._assembler.add(can_id, data) or self._forces
+
+    def read(self, now_ns: int) -> LegSample | None:
+        """Return the newest sample since the last read, or None."""
+        forces, self._forces = self._forces, None
+        return None if forces is None else LegSample(now_ns, forces)
+
+    def close(self) -> None:
+        """Do nothing: there is no link."""
+
+
+class VirtualHarness:
+    """Sensor and service in one; both begin with a tare, while the hoist holds."""
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        wrenches: Link[Wrench],
+        record: Callable[[Wrench], None],
+        seed: int,
+    ) -> None:
+        """Draw the cells' zero offsets.
+
+        Args:
+            config: the robot.
+            wrenches: the link to the planner.
+            record: takes every wrench.
+            seed: of the cells' offsets and noise.
+        """
+        cells = Cells()
+        self._front = HarnessFront(config, cells, seed)
+        self._loop = HarnessLoop(cells, WrenchFilter(config.harness), self, self)
+        self._wrenches = wrenches
+        self._record = record
+        self._request: TareRequest | None = None
+
+    def advance(self, world: World, now_ns: int) -> None:
+        """Sample what acts on the torso, and run one cycle of the service."""
+        self._front.send(world.harness_force, world.harness_moment)
+        self._loop.cycle(now_ns)
+
+    def tare(self, request: TareRequest) -> None:
+        """Ask for a new zero, from the next cycle on."""
+        self._request = request
+
+    def put(self, message: Wrench) -> bool:
+        """Send a wrench to the planner and the log."""
+        self._wrenches.put(message.t_ns, message)
+        self._record(message)
+        return True
+
+    def take(self) -> TareRequest | None:
+        """Return the request that has come, or None."""
+        request, self._request = self._request, None
+        return request

@@ -1,0 +1,1 @@
+"""Studies over many lockstep runs: cases drawn from a seed, run over processes, in one table."""

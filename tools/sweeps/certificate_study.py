@@ -1,0 +1,348 @@
+"""The certificate on trial: the sign of K_fail against a simulated fall or stand.
+
+A case is a random posture, payload, assist and set of local gains. The robot starts in the
+posture, on free feet, with what is left without a planner (design section 3 d):
+
+    tau = D (q_ref - q) - D_B v + tau_ff
+
+sampled as the joint services do, through their gate. It is nudged; then it stands, or it
+goes. A margin above zero says that it stands.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import matplotlib as mpl
+import msgspec
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from services.joint import differential
+from services.joint.gate import gate, limits_of
+from services.joint.law import ZERO, Setpoint, torque
+from services.planner.certificate import Certificate, Weakest
+from services.planner.gains import GainLaw
+from services.planner.inverse_kinematics import InverseKinematics
+from services.planner.kinematics import Kinematics
+from services.simulator.world import World
+from shared.config import GRAVITY, RobotConfig
+from shared.exceptions import RunError
+from shared.joints import MODULES, N_JOINTS, N_LEG
+from shared.messages import Pair, SimTruth
+from shared.robot_model import stand_pose
+from shared.scenario import Keyframe, Push, Scenario
+
+mpl.use("Agg")
+
+Array = NDArray[np.float64]
+
+HEIGHTS: Final = (0.79, 1.25)
+"""m; the torso's in a level stand: from the crawl to nearly straight legs."""
+PITCHES: Final = (-0.2, 1.2)
+"""rad"""
+PAYLOADS: Final = (0.0, 6.8, 13.6, 20.4)
+"""kg"""
+FACTORS: Final = (0.15, 5.0)
+"""Of diag(K_q): each joint its own, log-uniform, the legs alike. About half do not stand."""
+DAMPING_S: Final = 0.04
+"""s; D_B is so much of D, as in the stand gains, up to the largest of theirs."""
+DAMPING_MAX: Final = 60.0
+"""N m s/rad"""
+NUDGES: Final = (3.0, 10.0)
+"""N"""
+NUDGE_AT: Final = 0.5
+"""s; until then the soles sink into the floor's elastic skin, 0.2 to 0.5 mm."""
+NUDGE_S: Final = 0.2
+OFF_AXIS: Final = (0.35, 1.22)
+"""rad off the x axis: a nudge moves the sagittal and the lateral plane, which hardly couple."""
+DURATION_S: Final = 12.0
+SAMPLE_EVERY: Final = 10
+"""Ticks of the joint services."""
+LIMIT_MARGIN: Final = 0.1
+"""rad inside the joint limits: a soft stop would hold what the gains do not."""
+TORQUE_SHARE_MAX: Final = 0.8
+"""Of a module's torque, what a posture may need to be carried."""
+DRAWS_MAX: Final = 100
+RIGID_STEPS: Final = 4
+"""Time constant of a rigid floor's skin (MuJoCo's is 20 ms), in time steps; 2 is its least."""
+
+COM_BOUND: Final = 0.15
+"""m; farther from the posture than this, or than the next two, is not standing."""
+ANGLE_BOUND: Final = 0.3
+"""rad, of the torso."""
+TILT_BOUND: Final = 0.05
+"""rad, of a sole."""
+GROWTH_BOUND: Final = 1.2
+"""Farthest in the last third of a run over farthest before: beyond, it drifts away."""
+STILL: Final = 0.02
+"""Of the bounds; what moves less does not drift."""
+
+
+class Posture(NamedTuple):
+    """A stand with the COM over the ankles, and what carries it."""
+
+    height: float
+    """m, of the torso in a level stand with its COM as high."""
+    pitch: float
+    """rad"""
+    payload: float
+    """kg"""
+    assist: float
+    """N, rested on the harness and carried by tau_ff."""
+    q: Array
+    """(12,) rad"""
+    tau_ff: Array
+    """(12,) N m"""
+
+
+class Case(NamedTuple):
+    """A posture with local gains and a nudge."""
+
+    number: int
+    posture: Posture
+    D: Array
+    """(12,) N m/rad"""
+    D_B: Array
+    """(12,) N m s/rad"""
+    nudge: tuple[float, float]
+    """N along x and y, for `NUDGE_S`."""
+    weakest: Weakest
+    """With tier 2's margin (`services.planner.certificate`)."""
+
+
+class Outcome(NamedTuple):
+    """What the simulation did."""
+
+    case: Case
+    stood: bool
+    fallen: bool
+    """True if it lay on the floor within the time; False also for a drift away."""
+    ended_s: float
+    com_m: float
+    """The COM's farthest from the posture."""
+    angle_rad: float
+    """The torso's farthest, about any axis."""
+    growth: float
+    """As for `GROWTH_BOUND`."""
+
+    @property
+    def margin(self) -> float:
+        """What the certificate said: above 0 it stands."""
+        return self.case.weakest.margin
+
+
+class Confusion(NamedTuple):
+    """How often what was said came about."""
+
+    stand_stood: int
+    stand_fell: int
+    """The certificate said stand, and it fell: the dangerous mistake."""
+    fall_stood: int
+    fall_fell: int
+
+
+def without_friction(robot: RobotConfig) -> RobotConfig:
+    """Return the robot without dry friction, which holds up what is but a little too soft."""
+    joint = msgspec.structs.replace(robot.joint, friction_loss=0.0)
+    return msgspec.structs.replace(robot, joint=joint)
+
+
+def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
+    """Return the robot with another payload, kg."""
+    mass = msgspec.structs.replace(robot.mass, payload=payload)
+    return msgspec.structs.replace(robot, mass=mass)
+
+
+class Cases:
+    """Draws cases of a robot; each number is its own, whatever was drawn before."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        """Build the kinematics, one for each payload."""
+        self._robots = [with_payload(robot, payload) for payload in PAYLOADS]
+        self._kinematics = [Kinematics(loaded) for loaded in self._robots]
+        self._limits: Array = np.array(robot.joint_limits())
+
+    def draw(self, seed: int, number: int) -> Case:
+        """Return a case; raise `RunError` if the robot can hardly stand in any posture."""
+        rng, (low, high) = np.random.default_rng((seed, number)), FACTORS
+        for _ in range(DRAWS_MAX):
+            load = int(rng.integers(len(PAYLOADS)))
+            robot, kinematics = self._robots[load], self._kinematics[load]
+            F_O = np.array([0.0, 0.0, robot.total_mass * GRAVITY, 0.0, 0.0, 0.0])
+            F_assist = np.array([0.0, 0.0, rng.choice((0.0, robot.assist.force_max))])
+            posture = self._posture(rng, load, F_O, F_assist)
+            if posture is None:
+                continue
+            hessian_O = kinematics.hessian_times(F_O, F_assist)
+            K_q = GainLaw(robot).gains(kinematics, hessian_O).K_q
+            factors = np.tile(low * (high / low) ** rng.uniform(size=N_LEG), 2)
+            D = np.clip(factors * np.diagonal(K_q), 0.0, robot.joint_service.k_p_max)
+            chain = np.vstack((kinematics.J, kinematics.C))
+            certificate = Certificate(robot)
+            T = np.asarray(np.linalg.solve(chain, np.eye(N_JOINTS)[:, :6]), float)
+            certificate.at(T, hessian_O)
+            D_B = np.minimum(DAMPING_S * D, DAMPING_MAX)
+            return Case(number, posture, D, D_B, _nudge(rng), certificate.weakest(D))
+        raise RunError(
+            f"case {number}: of {DRAWS_MAX} postures none can be reached and carried; "
+            "see limits, geometry and mass in the robot file"
+        )
+
+    def _posture(
+        self, rng: np.random.Generator, load: int, F_O: Array, F_assist: Array
+    ) -> Posture | None:
+        """Draw a posture and move the kinematics there; None if no robot can stand in it."""
+        robot, kinematics = self._robots[load], self._kinematics[load]
+        height, pitch = float(rng.uniform(*HEIGHTS)), float(rng.uniform(*PITCHES))
+        ik = InverseKinematics(kinematics, self._limits)
+        ik.q[:] = stand_pose(robot, height)
+        kinematics.update(ik.q)
+        p_ref = np.array([0.0, 0.0, kinematics.p[2], 0.0, pitch, 0.0])
+        reached = ik.solve(p_ref, iterations_max=60).converged
+        kinematics.update(ik.q)
+        inside = np.minimum(ik.q - self._limits[:, 0], self._limits[:, 1] - ik.q).min()
+        tau_ff = F_O @ kinematics.J + F_assist @ kinematics.J_harness
+        module = np.abs(tau_ff).reshape(-1, 2).sum(axis=1).max()
+        carried = module < TORQUE_SHARE_MAX * robot.joint.tau_module_max
+        if not (reached and inside > LIMIT_MARGIN and carried):
+            return None
+        return Posture(height, pitch, PAYLOADS[load], float(F_assist[2]), ik.q, tau_ff)
+
+
+def _nudge(rng: np.random.Generator) -> tuple[float, float]:
+    force, off_axis = rng.uniform(*NUDGES), rng.uniform(*OFF_AXIS)
+    x, y = rng.choice((-force, force), 2)
+    return float(x * math.cos(off_axis)), float(y * math.sin(off_axis))
+
+
+class _Module:
+    """A joint service that holds: its law frozen, its gate and its differential."""
+
+    def __init__(self, robot: RobotConfig, case: Case, index: int) -> None:
+        def pair(values: Array) -> Pair:
+            return float(values[2 * index]), float(values[2 * index + 1])
+
+        q_ref, tau_ff = pair(case.posture.q), pair(case.posture.tau_ff)
+        self._setpoint = Setpoint(q_ref, ZERO, tau_ff, ZERO, pair(case.D), pair(case.D_B))
+        self._limits = limits_of(robot, MODULES[index])
+        self._tau = self._setpoint.tau_ff
+        self._gear_ratio = robot.joint.gear_ratio
+
+    def motor_torque(self, turns: Pair, turns_per_s: Pair) -> Pair:
+        q = differential.joint_from_motor(turns, self._gear_ratio)
+        v = differential.joint_from_motor(turns_per_s, self._gear_ratio)
+        self._tau = gate(torque(self._setpoint, q, v), q, self._tau, self._limits)
+        return differential.motor_torque(self._tau, self._gear_ratio)
+
+
+def world_of(robot: RobotConfig, case: Case, nudge_share: float, *, rigid: bool) -> World:
+    """Return the world with the robot in the case's posture, the nudge to come.
+
+    The payload is the case's. `rigid`: the floor is hard, as the certificate has it.
+    """
+    posture, (x, y) = case.posture, case.nudge
+    force = (nudge_share * x, nudge_share * y, 0.0)
+    scenario = Scenario(
+        name="certificate",
+        about="a posture held by local gains alone, and a nudge",
+        duration=DURATION_S,
+        keyframe=(Keyframe(at=0.0, height=posture.height, assist=posture.assist),),
+        hand=False,
+        push=(Push(at=NUDGE_AT, duration=NUDGE_S, force=force),),
+    )
+    world = World(with_payload(robot, posture.payload), scenario)
+    if rigid:
+        world.model.geom_solref[:, 0] = RIGID_STEPS * world.timestep
+    world.stand_at(posture.q)
+    world.start()
+    return world
+
+
+def run(
+    robot: RobotConfig, case: Case, nudge_share: float = 1.0, *, rigid: bool = False
+) -> Outcome:
+    """Simulate a case; arguments as for `world_of`."""
+    world = world_of(robot, case, nudge_share, rigid=rigid)
+    modules = [_Module(robot, case, index) for index in range(len(MODULES))]
+    steps = round(1.0 / (robot.joint_service.rate_hz * world.timestep))
+    motor = np.zeros(N_JOINTS)
+    rows: list[SimTruth] = []
+    for tick in range(round(DURATION_S / (steps * world.timestep))):
+        turns, rates = (values.tolist() for values in world.motor_turns())
+        for index, module in enumerate(modules):
+            a, b = 2 * index, 2 * index + 1
+            motor[a], motor[b] = module.motor_torque((turns[a], turns[b]), (rates[a], rates[b]))
+        for _ in range(steps):
+            world.step(motor)
+        if world.time > 0.9 * NUDGE_AT and tick % SAMPLE_EVERY == 0:
+            rows.append(world.truth(0, 1.0, 0.0))
+            if rows[-1].fallen:
+                break
+    return judge(case, rows)
+
+
+def judge(case: Case, rows: Sequence[SimTruth]) -> Outcome:
+    """Return the outcome of a run, whose first row is from before the nudge."""
+    com = np.array([row.com for row in rows])
+    angles = np.array([row.angles for row in rows])
+    com_m = np.linalg.norm(com - com[0], axis=1)
+    angle_rad = np.abs(angles - angles[0]).max(axis=1)
+    tilt = max(max(row.foot_right_tilt, row.foot_left_tilt) for row in rows)
+    departure = np.maximum(com_m / COM_BOUND, angle_rad / ANGLE_BOUND)
+    late = 2 * len(rows) // 3
+    growth = float(departure[late:].max(initial=0.0) / departure[:late].max(initial=STILL))
+    stays = departure.max() < 1.0 and tilt < TILT_BOUND and growth < GROWTH_BOUND
+    return Outcome(
+        case=case,
+        stood=bool(stays and not rows[-1].fallen),
+        fallen=rows[-1].fallen,
+        ended_s=rows[-1].scenario_s,
+        com_m=float(com_m.max()),
+        angle_rad=float(angle_rad.max()),
+        growth=growth,
+    )
+
+
+def confusion(said: Sequence[tuple[float, bool]]) -> Confusion:
+    """Count what was said against what came about: pairs of a margin and whether it stood."""
+    pairs = [(margin > 0.0, stood) for margin, stood in said]
+    return Confusion(*(pairs.count((says, was)) for says in (True, False) for was in (True, False)))
+
+
+def threshold(said: Sequence[tuple[float, bool]]) -> float:
+    """Return the margin that parts falls from stands with the fewest mistakes.
+
+    In the middle of the gap between two cases; not a number with fewer than two.
+    """
+    if len(said) < 2:
+        return math.nan
+    ordered = sorted(said)
+    stood = np.array([was for _, was in ordered])
+    # of a cut above each case: stands up to it, falls beyond it
+    mistakes = np.cumsum(stood) + np.sum(~stood) - np.cumsum(~stood)
+    cut = int(mistakes[:-1].argmin())
+    return 0.5 * (ordered[cut][0] + ordered[cut + 1][0])
+
+
+def draw_picture(rows: Sequence[Mapping[str, str]], title: str, path: Path) -> None:
+    """Draw margin against how far the COM went, into a PNG file; rows as in the table."""
+    figure = Figure(figsize=(9, 5.5), dpi=110, layout="constrained")
+    axis = figure.subplots()
+    for stood, colour in ((True, "#4c9f70"), (False, "#c0392b")):
+        some = [row for row in rows if row["stood"] == str(stood)]
+        x, y = ([float(row[name]) for row in some] for name in ("margin", "com_mm"))
+        label = f"{'stood' if stood else 'fell'} ({len(some)})"
+        axis.scatter(x, y, s=18, color=colour, alpha=0.7, label=label)
+    axis.axvline(0.0, color="#7f7f7f", lw=1.0, ls="--")
+    axis.set(xscale="symlog", yscale="log")
+    axis.set_xlabel("the certificate's margin, in shares of what is required")
+    axis.set_ylabel("COM, farthest from the posture in mm")
+    axis.grid(visible=True, lw=0.3, color="#bbbbbb")
+    axis.legend(fontsize=8, framealpha=0.8)
+    figure.suptitle(title, fontsize=11, x=0.01, ha="left")
+    figure.savefig(path)

@@ -1,0 +1,87 @@
+"""Work spread over processes: spawned, one per core by default, none of them left behind.
+
+Workers leave Ctrl-C to the process that started them, and end when it does, whatever
+ended it.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from threading import Thread
+from typing import TypeVar
+
+from shared.exceptions import RunError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def results(
+    work: Callable[[T], R], tasks: Sequence[T], workers: int, name: Callable[[T], str]
+) -> Iterator[tuple[T, R]]:
+    """Yield each task with its result as it is done, in no order.
+
+    Leaving the loop early, by an exception or by `close`, ends the workers at once.
+
+    Args:
+        work: a function of a module; it runs in the workers.
+        tasks: what it is given, one after the other.
+        workers: processes, at least 1.
+        name: what a task is called in an error.
+
+    Raises:
+        RunError: the work failed on a task, or a worker died.
+    """
+    if not tasks:
+        return
+    before = set(multiprocessing.active_children())
+    executor = ProcessPoolExecutor(
+        min(workers, len(tasks)), multiprocessing.get_context("spawn"), _begin
+    )
+    try:
+        futures = {executor.submit(work, task): task for task in tasks}
+        for future in as_completed(futures):
+            task = futures.pop(future)
+            yield task, _result(future.result, name(task))
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _result(get: Callable[[], R], name: str) -> R:
+    try:
+        return get()
+    except BrokenProcessPool:
+        raise RunError(
+            "a worker process was killed (out of memory?); what is done is kept: "
+            "run the same command again to go on, perhaps with fewer --workers"
+        ) from None
+    except Exception as error:
+        raise RunError(f"{name}: {type(error).__name__}: {error}") from error
+
+
+def _begin() -> None:
+    """Prepare a worker."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    Thread(target=_follow_parent, daemon=True).start()
+
+
+def _follow_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
