@@ -261,11 +261,13 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
             os.kill(pid, signal.SIGKILL)
 
 
-@pytest.mark.parametrize("words", [("sweep",), ("sweep", "kill")])
+@pytest.mark.parametrize("words", [("sweep",), ("sweep", "kill"), ("sweep", "certificate")])
 def test_the_verb_and_its_study_have_help_with_examples(
     words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main([*words, "--help"])
     assert left.value.code == 0
-    assert "examples:\n  xrl sweep kill" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert f"examples:\n  xrl sweep {words[1] if len(words) > 1 else ''}" in shown
+    assert f"xrl sweep {words[-1] if len(words) > 1 else 'kill'}" in shown
