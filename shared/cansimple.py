@@ -6,7 +6,7 @@ turns, velocities in turn/s, torques in N m, currents in A.
 
 Source: odriverobotics/ODrive, docs/can-protocol and
 Firmware/communication/can/can_simple.cpp. Firmware 0.6 differs in 0x003 to 0x005 and in
-heartbeat bytes 5 to 7.
+heartbeat bytes 5 to 7: see `shared.cansimple_06`.
 """
 
 from __future__ import annotations
@@ -119,14 +119,30 @@ class MotorError(IntFlag):
     NONE = 0
     DRV_FAULT = 0x0000_0008
     CURRENT_LIMIT_VIOLATION = 0x0000_1000
+    MOTOR_THERMISTOR_OVER_TEMP = 0x0002_0000
+    FET_THERMISTOR_OVER_TEMP = 0x0004_0000
     CONTROLLER_FAILED = 0x0020_0000
     I_BUS_OUT_OF_RANGE = 0x0040_0000
+    SYSTEM_LEVEL = 0x0100_0000
+    UNKNOWN_PHASE_ESTIMATE = 0x0400_0000
+
+
+class OdriveError(IntFlag):
+    """`odrv.error`: disarms both axes; CANSimple 0.5 shows it as the motors' SYSTEM_LEVEL only."""
+
+    NONE = 0
+    CONTROL_ITERATION_MISSED = 0x01
+    DC_BUS_UNDER_VOLTAGE = 0x02
+    DC_BUS_OVER_VOLTAGE = 0x04
+    DC_BUS_OVER_REGEN_CURRENT = 0x08
+    DC_BUS_OVER_CURRENT = 0x10
 
 
 class EncoderError(IntFlag):
     """The part of `encoder.error` that this project names."""
 
     NONE = 0
+    CPR_POLEPAIRS_MISMATCH = 0x02
     NO_RESPONSE = 0x04
 
 

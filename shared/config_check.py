@@ -55,6 +55,8 @@ def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> Non
             if other != module.name or len(set(module.node_ids)) < 2:
                 where = f"module[{index}].node_ids"
                 raise ConfigError(file, where, f"node {node} is taken on this bus", "a free node")
+    if config.joint_service.driver == "odrive_usb":
+        _check_serial_numbers(file, config)
     if config.harness.bus not in config.can:
         buses = _words(config.can)
         raise ConfigError(file, "harness.bus", f"{config.harness.bus!r}", f"one of {buses}")
@@ -66,6 +68,18 @@ def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> Non
             value = value.get(part) if isinstance(value, dict) else None
         if value is None:
             raise ConfigError(file, f"assumed[{index}]", f"{key!r} is no key", "a dotted key")
+
+
+def _check_serial_numbers(file: str, config: RobotConfig) -> None:
+    seen: set[str] = set()
+    for index, module in enumerate(config.module):
+        where, serial = f"module[{index}].serial_number", module.serial_number.upper()
+        if not re.fullmatch(r"[0-9A-F]{12}", serial):
+            found = f"{module.serial_number!r} of {module.name}"
+            raise ConfigError(file, where, found, "12 hexadecimal digits, as `odrivetool` shows")
+        if serial in seen:
+            raise ConfigError(file, where, f"{serial} stands twice", "each drive once")
+        seen.add(serial)
 
 
 def _check_endpoints(file: str, endpoints: dict[str, str], services: Sequence[str]) -> None:
@@ -151,7 +165,10 @@ def _check_timing(file: str, config: RobotConfig) -> None:
         found = f"{service.state_rate_hz:g} Hz does not divide joint_service.rate_hz"
         right = f"{service.rate_hz:g} Hz divided by a whole number"
         raise ConfigError(file, "joint_service.state_rate_hz", found, right)
-    if config.drive.watchdog_timeout < 10e-3 * period_ms:
+    if service.loop == "onboard" and config.drive.watchdog_timeout > 0.0:
+        found = f"{config.drive.watchdog_timeout:g} s disarms what the onboard loop is to hold"
+        raise ConfigError(file, "drive.watchdog_timeout", found, "0 s: off")
+    if service.loop == "service" and config.drive.watchdog_timeout < 10e-3 * period_ms:
         found = f"{config.drive.watchdog_timeout:g} s is under ten control periods"
         right = f"at least {10e-3 * period_ms:g} s, or a hiccup disarms the drive"
         raise ConfigError(file, "drive.watchdog_timeout", found, right)

@@ -77,11 +77,13 @@ class LimitsConfig(Section, frozen=True):
 
 
 class ModuleConfig(Section, frozen=True):
-    """One module: which bus, which two CAN nodes."""
+    """One module: which bus and which two CAN nodes, or which ODrive on USB."""
 
     name: str
     bus: str
     node_ids: tuple[Annotated[int, Range(0, 62, "1")], Annotated[int, Range(0, 62, "1")]]
+    serial_number: str = ""
+    """12 hexadecimal digits, as USB shows them; for `joint_service.driver = "odrive_usb"`."""
 
 
 Stiffness6 = tuple[
@@ -163,7 +165,8 @@ class StandConfig(Section, frozen=True):
 class JointServiceConfig(Section, frozen=True):
     """Timing and limits of the joint service (design section 4)."""
 
-    driver: Literal["odrive_can"]
+    driver: Literal["odrive_can", "odrive_usb"]
+    loop: Literal["onboard", "service"]
     rate_hz: Rate
     state_rate_hz: Rate
     max_command_age_ms: Milliseconds
@@ -216,7 +219,7 @@ class DriveConfig(Section, frozen=True):
     torque_constant: Annotated[float, Range(0.001, 5.0, "N m/A")]
     current_lim: Annotated[float, Range(1.0, 200.0, "A")]
     vel_limit: Annotated[float, Range(0.1, 500.0, "turn/s")]
-    watchdog_timeout: Annotated[float, Range(0.005, 10.0, "s")]
+    watchdog_timeout: Annotated[float, Range(0.0, 10.0, "s")]
     encoder_period_ms: Annotated[int, Range(1, 100, "ms")]
     heartbeat_period_ms: Annotated[int, Range(1, 10_000, "ms")]
 

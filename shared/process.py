@@ -47,11 +47,14 @@ class StopFlag:
 
     def __init__(self) -> None:
         self.stopped = False
+        self.interrupted = False
+        """SIGINT has come: the fleet goes down, and not this process alone."""
         signal.signal(signal.SIGTERM, self._stop)
         signal.signal(signal.SIGINT, self._stop)
 
-    def _stop(self, _signal: int, _frame: FrameType | None) -> None:
+    def _stop(self, number: int, _frame: FrameType | None) -> None:
         self.stopped = True
+        self.interrupted |= number == signal.SIGINT
 
     def __bool__(self) -> bool:
         """Return True if the process is to stop."""

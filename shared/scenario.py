@@ -1,4 +1,4 @@
-"""What happens in a run: the operator's hand, pushes, kills and restarts.
+"""What happens in a run: the operator's hand, pushes, kills, restarts and drives' faults.
 
 A scenario is a TOML file (`deploy/scenarios/`); `xrl demo` adds to it from its flags.
 """
@@ -6,16 +6,17 @@ A scenario is a TOML file (`deploy/scenarios/`); `xrl demo` adds to it from its 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 import msgspec
 import tomli_w
 
 from shared.config import SERVICES
 from shared.exceptions import ConfigError
+from shared.joints import MODULES
 from shared.toml_file import Range, Section, check_ranges, read_toml
 
 Time = Annotated[float, Range(0.0, 86_400.0, "s")]
@@ -58,6 +59,58 @@ class Restart(Section, frozen=True):
     at: Time
 
 
+FaultKind = Literal[
+    "over_temperature",
+    "over_voltage",
+    "encoder",
+    "watchdog",
+    "link_lost",
+    "disarmed",
+    "overspeed",
+    "brown_out",
+]
+
+
+class FaultTraits(NamedTuple):
+    """What a kind of fault is like."""
+
+    about: str
+    duration: float | None
+    """s if the scenario gives none; None: it is of a moment."""
+    whole: bool
+    """It is of the whole ODrive, and not of one of its axes."""
+
+
+FAULT_KINDS: Final[Mapping[str, FaultTraits]] = {
+    "over_temperature": FaultTraits("an output stage too hot", 5.0, whole=False),
+    "over_voltage": FaultTraits("the supply too high", 0.1, whole=True),
+    "encoder": FaultTraits("an encoder lost, it reads 0", 5.0, whole=False),
+    "watchdog": FaultTraits("an axis's watchdog fires", None, whole=False),
+    "link_lost": FaultTraits("the cable out: nothing sent, nothing heard", 0.5, whole=True),
+    "disarmed": FaultTraits("an axis goes idle without an error", None, whole=False),
+    "overspeed": FaultTraits("an axis disarms for its speed", None, whole=False),
+    "brown_out": FaultTraits("no power, then a restart", 0.2, whole=True),
+}
+"""Faults by name. An axis that disarms floats; its sibling keeps its torque."""
+
+
+class Fault(Section, frozen=True):
+    """Something goes wrong in a module's ODrive."""
+
+    module: str
+    kind: FaultKind
+    at: Time
+    axis: int | None = None
+    """Which of its two axes; by default 0. Not for what is of the whole ODrive."""
+    duration: float | None = None
+    """s; by default `FAULT_KINDS`'s. Not for what is of a moment."""
+
+    @property
+    def lasts_s(self) -> float:
+        """How long it lasts, s; 0 for what is of a moment."""
+        return self.duration or FAULT_KINDS[self.kind].duration or 0.0
+
+
 class Scenario(Section, frozen=True):
     """The whole file."""
 
@@ -70,6 +123,7 @@ class Scenario(Section, frozen=True):
     push: tuple[Push, ...] = ()
     kill: tuple[Kill, ...] = ()
     restart: tuple[Restart, ...] = ()
+    fault: tuple[Fault, ...] = ()
 
 
 class Lead(NamedTuple):
@@ -150,10 +204,31 @@ def check(file: str, scenario: Scenario) -> None:
             _check_inside(file, f"{where}.at", row.at, scenario.duration)
     for index, push in enumerate(scenario.push):
         _check_inside(file, f"push[{index}].at", push.at, scenario.duration)
+    for index, fault in enumerate(scenario.fault):
+        _check_fault(file, f"fault[{index}]", fault)
+        _check_inside(file, f"fault[{index}].at", fault.at, scenario.duration)
     for index, restart in enumerate(scenario.restart):
         if not any(k.service == restart.service and k.at < restart.at for k in scenario.kill):
             found = f"{restart.service} is not killed before {restart.at:g} s"
             raise ConfigError(file, f"restart[{index}]", found, "kill it first")
+
+
+def _check_fault(file: str, where: str, fault: Fault) -> None:
+    if fault.module not in MODULES:
+        right = f"one of {', '.join(MODULES)}"
+        raise ConfigError(file, f"{where}.module", f"{fault.module!r}", right)
+    traits = FAULT_KINDS[fault.kind]
+    if fault.axis not in (None, 0, 1):
+        raise ConfigError(file, f"{where}.axis", f"{fault.axis}", "0 or 1")
+    if fault.axis is not None and traits.whole:
+        found = f"{fault.axis}, but {fault.kind} is of the whole ODrive"
+        raise ConfigError(file, f"{where}.axis", found, "leave it out")
+    if fault.duration is not None and traits.duration is None:
+        found = f"{fault.duration:g} s, but {fault.kind} is of a moment"
+        raise ConfigError(file, f"{where}.duration", found, "leave it out")
+    if fault.duration is not None and not 0.001 <= fault.duration <= 600.0:
+        found = f"{fault.duration!r} is out of range"
+        raise ConfigError(file, f"{where}.duration", found, "must be from 0.001 to 600 s")
 
 
 def _check_inside(file: str, key: str, at: float, duration: float) -> None:
@@ -164,4 +239,8 @@ def _check_inside(file: str, key: str, at: float, duration: float) -> None:
 
 def to_toml(scenario: Scenario) -> str:
     """Return the scenario as TOML that `load` reads back."""
-    return tomli_w.dumps(msgspec.to_builtins(scenario))
+    table = msgspec.to_builtins(scenario)
+    for row in table["fault"]:
+        for key in [key for key, value in row.items() if value is None]:
+            del row[key]  # TOML has no null
+    return tomli_w.dumps(table)

@@ -97,7 +97,7 @@ def make_driver(path: Path) -> OdriveCan:
 
 def arm(rig: Rig, driver: OdriveCan) -> None:
     """Arm and wait out the time in which heartbeats are not believed."""
-    driver.arm()
+    driver.arm(onboard=False)
     time.sleep((ARM_GRACE_MS + 5) * MS)
     reading = rig.cycle(driver)
     assert reading.status == DriveStatus.ARMED
@@ -257,7 +257,7 @@ def test_watchdog_does_not_run_out_between_arming_and_the_heartbeat_that_shows_i
 ) -> None:
     rig = Rig(path, watchdog=True)
     driver = connected(rig, path)
-    driver.arm()
+    driver.arm(onboard=False)
     # 300 ms of the drives' time without a heartbeat.
     rig.front.receive()
     for _ in range(300):
@@ -294,7 +294,7 @@ def test_driver_starts_without_a_bus_and_finds_it_later(path: Path) -> None:
     assert reading is not None
     assert reading.status == DriveStatus.LOST
     driver.write_torque((1.0, 1.0))
-    driver.arm()
+    driver.arm(onboard=False)
     driver.idle()
     assert driver.write_failures == 1
     rig = Rig(path)

@@ -4,8 +4,9 @@ import copy
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+import msgspec
 import numpy as np
 import pytest
 import tomli_w
@@ -13,7 +14,16 @@ import tomli_w
 from shared import scenario
 from shared.config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.scenario import Keyframe, Push, Scenario, lead, push_at
+from shared.scenario import (
+    FAULT_KINDS,
+    Fault,
+    FaultKind,
+    Keyframe,
+    Push,
+    Scenario,
+    lead,
+    push_at,
+)
 from tests.conftest import ROBOT_FILE
 
 SHIPPED = sorted((ROBOT_FILE.parent / "scenarios").glob("*.toml"))
@@ -29,6 +39,7 @@ RAW: Table = {
     "push": [{"at": 2.0, "duration": 0.3, "force": [40.0, 0.0, 0.0]}],
     "kill": [{"service": "planner", "at": 4.0}],
     "restart": [{"service": "planner", "at": 6.0}],
+    "fault": [{"module": "knee_left", "kind": "encoder", "at": 5.0, "axis": 1, "duration": 0.5}],
 }
 
 
@@ -72,6 +83,14 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (row("restart", at=11.0), "restart[0].at", "11 s is not inside", "longer duration"),
     (row("restart", at=4.0), "restart[0]", "not killed before 4 s", "kill it first"),
     (row("restart", service="recorder"), "restart[0]", "recorder is not killed", "kill it first"),
+    (row("fault", module="toe"), "fault[0].module", "'toe'", "ankle_right, knee_right"),
+    (row("fault", kind="fire"), "fault[0].kind", "'fire'", "one of over_temperature"),
+    (row("fault", at=10.0), "fault[0].at", "10 s is not inside", "longer duration"),
+    (row("fault", axis=2), "fault[0].axis", "2", "0"),
+    (row("fault", duration=0.0), "fault[0].duration", "0.0", "0.001 to 600 s"),
+    (row("fault", duration=math.nan), "fault[0].duration", "nan", "0.001 to 600 s"),
+    (row("fault", kind="disarmed"), "fault[0].duration", "of a moment", "leave it out"),
+    (row("fault", kind="brown_out"), "fault[0].axis", "the whole ODrive", "leave it out"),
 ]
 
 
@@ -100,6 +119,32 @@ def test_a_scenario_comes_back_from_its_own_toml(tmp_path: Path) -> None:
     path = tmp_path / "again.toml"
     path.write_text(scenario.to_toml(first), encoding="utf-8")
     assert scenario.load(path) == first
+
+
+# ---- faults
+
+
+def test_a_fault_is_of_the_first_axis_and_lasts_as_its_kind_does_unless_told() -> None:
+    for kind, traits in FAULT_KINDS.items():
+        plain = msgspec.convert({"module": "hip_left", "kind": kind, "at": 1.0}, Fault)
+        assert plain.axis is None
+        assert plain.lasts_s == (traits.duration or 0.0)
+    told = Fault(module="hip_left", kind="link_lost", at=1.0, duration=3.0)
+    assert told.lasts_s == 3.0
+
+
+def test_a_fault_that_leaves_things_out_comes_back_from_its_own_toml(tmp_path: Path) -> None:
+    plain = load_changed(
+        tmp_path,
+        lambda raw: raw.update(fault=[{"module": "hip_left", "kind": "watchdog", "at": 1}]),
+    )
+    path = tmp_path / "again.toml"
+    path.write_text(scenario.to_toml(plain), encoding="utf-8")
+    assert scenario.load(path) == plain
+
+
+def test_every_kind_in_the_type_is_in_the_table() -> None:
+    assert set(get_args(FaultKind)) == set(FAULT_KINDS)
 
 
 # ---- the hand

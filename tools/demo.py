@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
-import tempfile
 from pathlib import Path
 
 from rich.console import Console
 
-from shared.bus import open_session
+from shared.bus import Session
 from shared.config import SERVICES, RobotConfig
-from shared.robot_model import mjcf
 from shared.scenario import Scenario
 from tools.runs import experiment, figure, verdict, verdict_table
 from tools.runs.conductor import Conductor
+from tools.runs.live import run_live
 from tools.runs.live_view import LiveView
 from tools.runs.run_log import read_run
 from tools.supervision import procfs
@@ -63,75 +61,40 @@ def run(args: argparse.Namespace) -> int:
             f"`xrl down --run-dir {other}` stops it[/]"
         )
     try:
-        cpu_pct = run_live(args, robot, story, out, console)
+        cpu_pct = lead_run(args, robot, story, out, console)
     except KeyboardInterrupt:
         console.print(f"interrupted; what was recorded until then is in {out}")
         raise
     return judge(out, story, cpu_pct, console)
 
 
-def run_live(
+def lead_run(
     args: argparse.Namespace, robot: RobotConfig, story: Scenario, out: Path, console: Console
 ) -> float | None:
-    """Start the fleet in a run directory of its own, lead the run, stop the fleet.
+    """Run the scenario on a fleet of its own, and show it.
 
     Returns the CPU use of all processes together, %: 100 is one core; None if
     the scenario never began.
     """
-    robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, story)
-    model_path = out / "model.xml"
-    model_path.write_text(mjcf(robot), encoding="utf-8")
-    killed = {kill.service for kill in story.kill}
-    run_dir = Path(tempfile.mkdtemp(prefix="xrl-demo-", dir="/tmp"))
-    try:
-        console.print(
-            "starting ten services; modes below: right ankle, knee, hip, then left; "
-            "D disarmed, H hold, T track, F fault, - silent",
-            style="dim",
-        )
-        fleet = Fleet.start(
-            robot_path.absolute(),
-            run_dir,
-            overrides={
-                "recorder": _recorder_arguments(out, story, scenario_path, model_path),
-                "simulator": [
-                    "--scenario",
-                    str(scenario_path.absolute()),
-                    "--seed",
-                    str(args.seed),
-                ],
-            },
-            no_restart=frozenset(SERVICES if args.no_restart else killed),
-            leashed=True,
-        )
-        try:
-            with (
-                open_session(robot, "demo", run_dir) as session,
-                LiveView(console) as view,
-            ):
-                return Conductor(fleet, session, story, view.show).run()
-        finally:
-            fleet.stop(keep_logs=True)
-            logs = out / "logs"
-            shutil.rmtree(logs, ignore_errors=True)
-            shutil.copytree(fleet.run.logs, logs, dirs_exist_ok=True)
-    finally:
-        shutil.rmtree(run_dir, ignore_errors=True)
+    console.print(
+        "starting ten services; modes below: right ankle, knee, hip, then left; "
+        "D disarmed, H hold, T track, F fault, - silent",
+        style="dim",
+    )
 
+    def lead(fleet: Fleet, session: Session) -> float | None:
+        with LiveView(console) as view:
+            return Conductor(fleet, session, story, view.show).run()
 
-def _recorder_arguments(
-    out: Path, story: Scenario, scenario_path: Path, model_path: Path
-) -> list[str]:
-    return [
-        "--out",
-        str(out.absolute()),
-        "--scenario",
-        str(scenario_path.absolute()),
-        "--scenario-text",
-        story.name,
-        "--attach",
-        f"model.xml={model_path.absolute()}",
-    ]
+    return run_live(
+        out,
+        robot,
+        story,
+        lead,
+        verb="demo",
+        seed=args.seed,
+        no_restart=SERVICES if args.no_restart else {kill.service for kill in story.kill},
+    )
 
 
 def judge(out: Path, story: Scenario, cpu_pct: float | None, console: Console) -> int:

@@ -24,6 +24,7 @@ VERBS: Final = (
     Verb("demo", "tools.demo", "run the reference experiment, kill the planner, judge the outcome"),
     Verb("sim", "tools.sim", "run the same experiment in virtual time, with a modelled network"),
     Verb("sweep", "tools.sweep", "run many random cases in virtual time, and count the falls"),
+    Verb("crashtest", "tools.crashtest", "kill one thing after the other, live, and judge each"),
     Verb("up", "tools.up", "start the fleet"),
     Verb("status", "tools.status", "show every service and every module"),
     Verb("kill", "tools.kill", "send a signal to one service"),

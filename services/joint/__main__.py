@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from services.joint.controller import JointController
+from services.joint.drivers.base import Drive
 from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.loop import JointLoop, Ports
 from shared import config, log, topics
@@ -54,9 +55,14 @@ def main() -> int:
     return 0
 
 
-def open_drive(robot: RobotConfig, module: str, run_dir: Path) -> OdriveCan:
-    """Return the module's drive on its CAN bus."""
+def open_drive(robot: RobotConfig, module: str, run_dir: Path) -> Drive:
+    """Return the module's drive, on its CAN bus or on USB."""
     wiring = robot.module_named(module)
+    if robot.joint_service.driver == "odrive_usb":
+        # imported here: the package takes a second, and needs the system's libusb-1.0
+        from services.joint.drivers.odrive_usb import OdriveUsb  # noqa: PLC0415
+
+        return OdriveUsb(wiring.serial_number, robot.drive)
     bus = robot.can[wiring.bus]
     return OdriveCan(
         CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir)),

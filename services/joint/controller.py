@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from services.joint import law
-from services.joint.differential import joint_from_motor
+from services.joint.differential import joint_from_motor, joint_torque
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.gate import gate, limits_of
@@ -67,6 +67,8 @@ class JointController:
         self._changed_ns = 0
         self._last_cycle_ns = 0
         self._sampled_ns = 0
+        self._found_tau: Pair | None = None
+        """What a drive that was found armed carries, N m: it is taken over without a step."""
         self._cause = 0
         self.q: Pair = law.ZERO
         self.v: Pair = law.ZERO
@@ -100,6 +102,8 @@ class JointController:
             self._sampled_ns = reading.t_ns
             self.q = joint_from_motor(reading.pos_turns, self._gear_ratio)
             self.v = joint_from_motor(reading.vel_turns, self._gear_ratio)
+            if reading.torque is not None:
+                self._found_tau = joint_torque(reading.torque, self._gear_ratio)
         failsafe = self.failsafe
         if command is not None:
             failsafe.offer(command, now_ns, self.timing)
@@ -119,6 +123,16 @@ class JointController:
         if cause is not None:
             event = self._event(now_ns, before, cause, tau_before)
         return CycleResult(self.tau, event)
+
+    @property
+    def cause(self) -> Cause:
+        """Why the mode was last changed."""
+        return Cause(self._cause)
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """The local law of this cycle."""
+        return self._setpoint
 
     def state(self, now_ns: int) -> JointState:
         """Return the module's state message.
@@ -164,8 +178,12 @@ class JointController:
     def _enter(self, now_ns: int, before: Mode) -> None:
         """Take the anchor of the new mode: what was in force until now, frozen."""
         self._changed_ns = now_ns
-        if before is Mode.DISARMED:
-            self._anchor = law.stand(self.q, self._stand_k_p, self._stand_k_d)
+        k_p, k_d = self._stand_k_p, self._stand_k_d
+        if before is Mode.DISARMED and self._found_tau is not None:
+            self._anchor = law.taken_over(self.q, self.v, self._found_tau, k_p, k_d)
+            self.tau = self._found_tau  # what the gate takes for the last torque
+        elif before is Mode.DISARMED:
+            self._anchor = law.stand(self.q, k_p, k_d)
         elif self.failsafe.mode is Mode.DAMP:
             self._damp_stop = min(self._damp_stop, self.q[1])
             self._anchor = law.carrying(law.held(self._setpoint, 0.0), self._sinks, self.q)

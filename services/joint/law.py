@@ -69,6 +69,11 @@ def stand(q: Pair, k_p: Pair, k_d: Pair) -> Setpoint:
     return Setpoint(q, ZERO, ZERO, ZERO, k_p, k_d)
 
 
+def taken_over(q: Pair, v: Pair, tau: Pair, k_p: Pair, k_d: Pair) -> Setpoint:
+    """Return the law of a stand at q that at a rate v gives tau: frozen, v_ref will fade."""
+    return Setpoint(q, v, tau, ZERO, k_p, k_d)
+
+
 def held(setpoint: Setpoint, moving_share: float) -> Setpoint:
     """Return a setpoint frozen: q_ref, tau_ff and gains stay, the rest fades.
 

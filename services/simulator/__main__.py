@@ -7,6 +7,8 @@ from pathlib import Path
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.fibre_endpoints import Board
+from services.simulator.fibre_front import FibreFront, FibrePort
 from services.simulator.harness_front import HarnessFront
 from services.simulator.loop import Ports, SimulatorLoop
 from services.simulator.world import World
@@ -66,11 +68,12 @@ def main() -> int:
             list(drive_buses(robot).values()),
             heartbeat_period_ms=robot.drive.heartbeat_period_ms,
         )
+        usb = open_usb(robot, bank, arguments.run_dir, stack)
         harness = HarnessFront(robot, hubs[robot.harness.bus], arguments.seed)
         world = World(robot, story)
         logger.info("up, %s, scenario %s", granted, story.name)
         freeze_garbage()
-        loop = SimulatorLoop(robot, world, bank, front, harness, ports)
+        loop = SimulatorLoop(robot, world, bank, front, usb, harness, ports)
         loop.autostart_s = arguments.autostart
         loop.run(stop)
     logger.info("stopped")
@@ -95,6 +98,23 @@ def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, 
         name: stack.enter_context(UnixCanHub(Path(expand(robot.can[name].channel, run_dir))))
         for name in dict.fromkeys(names)
     }
+
+
+def open_usb(
+    robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack
+) -> list[FibrePort]:
+    """Return the drives' USB plugs, in {run}/usb, if the services use them."""
+    if robot.joint_service.driver != "odrive_usb":
+        return []
+    folder = run_dir / "usb"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    ports = []
+    for module in robot.module:
+        board = Board(bank, MODULE_INDEX[module.name], int(module.serial_number, 16))
+        port = FibrePort(FibreFront(board), folder / module.serial_number.upper())
+        stack.callback(port.close)
+        ports.append(port)
+    return ports
 
 
 if __name__ == "__main__":

@@ -1,122 +1,97 @@
-"""Twelve emulated ODrive axes as arrays: the firmware's law, limits and traps.
+"""Twelve emulated ODrive axes: state machine, watchdogs, checks and errors (design section 5).
 
-Firmware 0.5.6 as design section 5 has it; the traps are kept on purpose: OVERSPEED disarms
-in torque mode too, a disarmed axis floats while its sibling keeps its torque, the watchdog
-runs in IDLE as well, re-arming does not zero `input_torque`, and OVERSPEED leaves
-`axis_error` at 0 (it shows in the motor's and the controller's error).
+Firmware 0.5.6; the traps are kept on purpose: OVERSPEED disarms in torque mode too, a
+disarmed axis floats while its sibling keeps its torque, the watchdog runs in IDLE as well,
+re-arming does not zero `input_torque`, errors leave `axis_error` at 0, an encoder that is
+lost reads 0, and a restart brings back what was saved of the settings.
 
 Pure: no clock, no I/O. Axes 2i and 2i + 1 are axis0 and axis1 of module i, one ODrive.
-Units at the motor: turns, turn/s, N m, A. The firmware runs its loop at 8 kHz; here it is
-evaluated once a step, with filters discretised exactly for the step's length.
+Units at the motor: turns, turn/s, N m, A.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.simulator.axis_calibration import SEQUENCES, Calibration
+from services.simulator.axis_conditions import Conditions
+from services.simulator.axis_control import AxisControl
+from services.simulator.axis_faults import AXIS_NAMES, BUS_FAULTS, FAULTS, Fault
+from services.simulator.axis_settings import Settings, configured
+from services.simulator.dc_bus import DEAD_VOLTAGE, DcBus
 from shared.cansimple import (
     AxisError,
     AxisState,
     ControllerError,
     ControlMode,
-    EncoderError,
     Heartbeat,
     InputMode,
-    MotorError,
 )
 from shared.config_sections import DriveConfig
 from shared.exceptions import DriveError
-from shared.joints import MODULES, N_JOINTS
+from shared.joints import N_JOINTS
+
+__all__ = ["AXIS_NAMES", "FAULTS", "AxisBank", "Fault"]
 
 Vector = NDArray[np.float64]
-
-AXIS_NAMES: Final = tuple(f"{module}.axis{index}" for module in MODULES for index in (0, 1))
-"""The 12 axes by name, in order."""
-
-PLL_BANDWIDTH: Final = 1000.0
-"""rad/s, `encoder.config.bandwidth`."""
-VEL_LIMIT_TOLERANCE: Final = 1.2
-"""`controller.config.vel_limit_tolerance`: OVERSPEED beyond this many times vel_limit."""
-POS_GAIN: Final = 20.0
-VEL_GAIN: Final = 1.0 / 6.0
-VEL_INTEGRATOR_GAIN: Final = 1.0 / 3.0
-FIRMWARE_RATE_HZ: Final = 8000.0
-INTEGRATOR_DECAY: Final = 0.99
-"""Per firmware cycle in which the torque is limited."""
-
-
-class Fault(NamedTuple):
-    """What a fault leaves in the four error registers of an axis."""
-
-    axis: int = 0
-    motor: int = 0
-    encoder: int = 0
-    controller: int = 0
-
-
-FAULTS: Final = {
-    "DISARM": Fault(),
-    "OVERSPEED": Fault(motor=MotorError.CONTROLLER_FAILED, controller=ControllerError.OVERSPEED),
-    "SPINOUT": Fault(
-        motor=MotorError.CONTROLLER_FAILED, controller=ControllerError.SPINOUT_DETECTED
-    ),
-    "DRV_FAULT": Fault(AxisError.MOTOR_FAILED, motor=MotorError.DRV_FAULT),
-    "REGENERATION": Fault(AxisError.MOTOR_FAILED, motor=MotorError.I_BUS_OUT_OF_RANGE),
-    "ENCODER": Fault(AxisError.ENCODER_FAILED, encoder=EncoderError.NO_RESPONSE),
-    "OVER_TEMP": Fault(AxisError.OVER_TEMP),
-    "WATCHDOG": Fault(AxisError.WATCHDOG_TIMER_EXPIRED),
-    "ESTOP": Fault(AxisError.ESTOP_REQUESTED),
-}
-"""Faults by name, for `AxisBank.inject`. DISARM is the silent one: IDLE and no error at all."""
 
 
 class AxisBank:
     """State of all axes; every array is indexed by axis, shape (12,).
 
     The arrays without an underscore may be read at any time. `input_pos`, `input_vel`,
-    `input_torque`, the gains and the limits may also be written between steps; modes,
-    states and errors change by the methods only.
+    `input_torque`, the gains and the limits may also be written between steps; other settings
+    are set by name in `settings`; modes, states and errors change by the methods only.
     """
 
     def __init__(
-        self, drive: DriveConfig, *, encoder_counts_per_turn: int, watchdog: bool = True
+        self,
+        drive: DriveConfig,
+        *,
+        encoder_counts_per_turn: int,
+        watchdog: bool = True,
+        settings: Settings | None = None,
     ) -> None:
+        """Power the drives up, calibrated, in IDLE.
+
+        Args:
+            drive: the robot file's `[drive]`.
+            encoder_counts_per_turn: of the encoders themselves.
+            watchdog: whether the drives' watchdogs run.
+            settings: of the drives; None: as the services want them (`configured`).
+        """
+        self.settings = settings or configured(
+            drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
+        )
         n = N_JOINTS
+        self._control = control = AxisControl(self.settings, encoder_counts_per_turn)
+        self.bus = DcBus(self.settings)
         self.state = [AxisState.IDLE] * n
         self.faults = [Fault()] * n
-        self.control_mode = np.full(n, int(ControlMode.POSITION))
-        self.input_mode = np.full(n, int(InputMode.PASSTHROUGH))
-        self.input_pos = np.zeros(n)
-        self.input_vel = np.zeros(n)
-        self.input_torque = np.zeros(n)
-        self.pos_gain = np.full(n, POS_GAIN)
-        self.vel_gain = np.full(n, VEL_GAIN)
-        self.vel_integrator_gain = np.full(n, VEL_INTEGRATOR_GAIN)
-        self.vel_limit = np.full(n, drive.vel_limit)
-        self.current_lim = np.full(n, drive.current_lim)
-        self.enable_torque_mode_vel_limit = True
-        self.pos_estimate = np.zeros(n)
-        self.vel_estimate = np.zeros(n)
-        self.torque = np.zeros(n)
-        self.torque_constant = drive.torque_constant
-        self.encoder_counts_per_turn = encoder_counts_per_turn
-        self.watchdog_timeout_s = drive.watchdog_timeout if watchdog else math.inf
-        self._armed = np.zeros(n)  # 1.0 in closed loop: also the factor of the torque
-        self._integrator = np.zeros(n)
+        self.control_mode = control.control_mode
+        self.input_mode = self.settings.axis("controller.config.input_mode")
+        self.input_pos, self.input_vel = control.input_pos, control.input_vel
+        self.input_torque, self.torque = control.input_torque, control.torque
+        self.pos_gain, self.vel_gain = control.pos_gain, control.vel_gain
+        self.vel_integrator_gain = control.vel_integrator_gain
+        self.vel_limit, self.current_lim = control.vel_limit, control.current_lim
+        self.pos_estimate, self.vel_estimate = control.pos_estimate, control.vel_estimate
+        self.encoder_turns = control.turns
+        self.now_s = -math.inf
+        self.calibration = Calibration(self.settings)
+        self.conditions = Conditions(self.settings, control)
         self._fed_s = [0.0] * n
-        self._now_s = -math.inf
-        self._dt_s = 0.0
-        self._pll = np.eye(2)
-        self._pll_error = np.zeros((2, n))  # of position and velocity
-        self._slope = np.zeros(n)
-        self._regulates = np.ones(n)  # 1.0 in velocity and in position mode
-        self._positions = np.ones(n)  # 1.0 in position mode
-        self._any_regulates = True
-        self._any_in_torque_mode = False
+        self._timeouts_s = [math.inf] * n
+        self._shortest_s = math.inf
+        self._seen = -1
+
+    @property
+    def regulates(self) -> bool:
+        """True if any axis has a position or velocity loop: it wants every step of the world."""
+        return self._control.regulates()
 
     def step(self, now_s: float, pos_turns: Vector, vel_turns: Vector) -> Vector:
         """Advance to `now_s`: true motor position and velocity in, motor torque out.
@@ -124,134 +99,58 @@ class AxisBank:
         The first call sets the clock, feeds the watchdogs and starts the estimators at
         the true values. The array returned is overwritten by the next step.
         """
-        if self._now_s == -math.inf:
-            self._start(now_s, pos_turns, vel_turns)
+        control = self._control
+        if self.now_s == -math.inf:
+            self.now_s = now_s
+            self._fed_s = [now_s] * N_JOINTS
+            control.start(pos_turns, vel_turns)
         else:
-            dt_s = now_s - self._now_s
-            self._now_s = now_s
+            dt_s = now_s - self.now_s
+            self.now_s = now_s
             if dt_s > 0.0:
-                self._estimate(dt_s, pos_turns)
-        self._check()
-        self._control()
+                control.estimate(dt_s, pos_turns)
+        if self.calibration.running or not self.conditions.all_well:
+            self._live_with_conditions()
+        if control.too_fast():
+            for axis in control.overspeed():
+                self._fail(axis, FAULTS["OVERSPEED"])
+        self._check_watchdogs()
+        control.control()
+        for drive, why in self.bus.check(self.torque, self.vel_estimate).items():
+            for axis in _both(2 * drive):
+                self._fail(axis, BUS_FAULTS[why])
         return self.torque
 
-    def _start(self, now_s: float, pos_turns: Vector, vel_turns: Vector) -> None:
-        """Take over the true state, as after a long time at rest."""
-        self._now_s = now_s
-        self._fed_s = [now_s] * N_JOINTS
-        self._quantise(pos_turns)
-        self._slope[:] = vel_turns
-        self.vel_estimate[:] = vel_turns
-
-    def _quantise(self, pos_turns: Vector) -> None:
-        """Write the encoder's whole counts, in turns, to `pos_estimate`."""
-        counts = self.pos_estimate
-        np.multiply(pos_turns, self.encoder_counts_per_turn, out=counts)
-        np.floor(counts, out=counts)
-        counts /= self.encoder_counts_per_turn
-
-    def _estimate(self, dt_s: float, pos_turns: Vector) -> None:
-        """Run the encoder's PLL over the step, exactly for counts that ramp within it.
-
-        The errors e = (count - position, slope - velocity) follow
-        e' = [[-2w, 1], [-w^2, 0]] e, a double pole at the bandwidth w.
-        """
-        if dt_s != self._dt_s:
-            w = PLL_BANDWIDTH * dt_s
-            self._dt_s = dt_s
-            self._pll = math.exp(-w) * np.array([[1.0 - w, dt_s], [-w * PLL_BANDWIDTH, 1.0 + w]])
-        slope = self.pos_estimate.copy()
-        self._quantise(pos_turns)
-        np.subtract(self.pos_estimate, slope, out=slope)
-        slope /= dt_s
-        error = self._pll_error
-        error[1] += slope
-        error[1] -= self._slope
-        self._pll_error = error = self._pll @ error
-        self._slope = slope
-        np.subtract(slope, error[1], out=self.vel_estimate)
-
-    def _check(self) -> None:
-        """Disarm what has gone too fast or has not been fed."""
-        too_fast = np.abs(self.vel_estimate) > VEL_LIMIT_TOLERANCE * self.vel_limit
-        if too_fast.any():
-            for axis in np.flatnonzero(too_fast * self._armed).tolist():
-                self._fail(axis, FAULTS["OVERSPEED"])
-        starved_s = self._now_s - self.watchdog_timeout_s
-        if min(self._fed_s) < starved_s:
-            for axis, fed_s in enumerate(self._fed_s):
-                if fed_s < starved_s:
-                    self._fail(axis, FAULTS["WATCHDOG"])
-
-    def _control(self) -> None:
-        """Write the firmware's law to `torque`, zero where an axis is not in closed loop."""
-        torque = self.torque
-        torque[:] = self.input_torque
-        torque_lim = self.current_lim * self.torque_constant
-        if self._any_in_torque_mode and self.enable_torque_mode_vel_limit:
-            self._limit_torque_mode()
-        if self._any_regulates:
-            self._regulate(torque_lim)
-        np.minimum(torque, torque_lim, out=torque)
-        np.maximum(torque, -torque_lim, out=torque)
-        torque *= self._armed
-
-    def _limit_torque_mode(self) -> None:
-        """Let no axis in torque mode be driven beyond its velocity limit.
-
-        The firmware clamps to vel_gain * (+-vel_limit - vel); here both sides have
-        vel_gain * vel added, and it is taken off again.
-        """
-        at_limit = self.vel_gain * self.vel_limit
-        moving = self.vel_gain * self.vel_estimate
-        limited = self.torque + moving
-        np.minimum(limited, at_limit, out=limited)
-        np.maximum(limited, -at_limit, out=limited)
-        limited -= moving
-        if self._any_regulates:
-            np.copyto(self.torque, limited, where=self._regulates == 0.0)
-        else:
-            self.torque[:] = limited
-
-    def _regulate(self, torque_lim: Vector) -> None:
-        """Add the velocity loop, under it the position loop, where the mode has them."""
-        vel_des = self.input_pos - self.pos_estimate
-        vel_des *= self.pos_gain
-        vel_des *= self._positions
-        vel_des += self.input_vel
-        np.minimum(vel_des, self.vel_limit, out=vel_des)
-        np.maximum(vel_des, -self.vel_limit, out=vel_des)
-        v_err = vel_des
-        v_err -= self.vel_estimate
-        v_err *= self._regulates
-        self.torque += self.vel_gain * v_err
-        self.torque += self._integrator
-        limited = np.abs(self.torque) > torque_lim
-        v_err *= self.vel_integrator_gain
-        v_err *= self._dt_s
-        if limited.any():
-            decay = INTEGRATOR_DECAY ** (FIRMWARE_RATE_HZ * self._dt_s)
-            self._integrator[limited] *= decay
-            v_err[limited] = 0.0
-        self._integrator += v_err
+    # ---- what a front asks for
 
     def feed(self, axis: int) -> None:
         """Feed an axis's watchdog: any CAN frame to it does."""
-        self._fed_s[axis] = self._now_s
+        self._fed_s[axis] = self.now_s
 
     def request_state(self, axis: int, state: int) -> None:
-        """Ask for a state. The drive is calibrated, so only IDLE and CLOSED_LOOP_CONTROL exist.
+        """Ask for a state: IDLE, CLOSED_LOOP_CONTROL or a calibration.
 
-        Closed loop with any error present is refused: the axis stays IDLE. Anything else
-        is INVALID_STATE and leads to IDLE.
+        Closed loop with any error present is refused: the axis stays IDLE. Closed loop of an
+        axis that is not calibrated, an encoder's calibration before its motor's, and any
+        other state is INVALID_STATE and leads to IDLE.
         """
+        if axis >> 1 in self.conditions.down:
+            return
         fault = self.faults[axis]
         self.faults[axis] = fault = fault._replace(axis=fault.axis & ~AxisError.INVALID_STATE)
+        self.calibration.stop(axis)
         if state == AxisState.IDLE:
             self._disarm(axis)
         elif state == AxisState.CLOSED_LOOP_CONTROL:
-            if fault == Fault():
+            if not self.calibration.ready(axis):
+                self._fail(axis, Fault(AxisError.INVALID_STATE))
+            elif fault == Fault():
                 self._arm(axis)
+        elif state in SEQUENCES:
+            self._disarm(axis)
+            turns = float(self.encoder_turns[axis])
+            states = SEQUENCES[AxisState(state)]
+            self._become(axis, self.calibration.begin(axis, states, self.now_s, turns))
         elif state != AxisState.UNDEFINED:
             self._fail(axis, Fault(AxisError.INVALID_STATE))
 
@@ -260,16 +159,15 @@ class AxisBank:
         if input_mode != InputMode.PASSTHROUGH or control_mode not in (1, 2, 3):
             self._fail(axis, Fault(controller=ControllerError.INVALID_INPUT_MODE))
             return
-        self.control_mode[axis] = control_mode
-        self.input_mode[axis] = input_mode
-        self._regulates[axis] = control_mode >= ControlMode.VELOCITY
-        self._positions[axis] = control_mode >= ControlMode.POSITION
-        self._any_regulates = bool(self._regulates.any())
-        self._any_in_torque_mode = not self._regulates.all()
-        self._integrator[axis] = 0.0
+        below = f"axis{axis & 1}.controller.config"
+        self.settings.set(axis >> 1, f"{below}.control_mode", control_mode)
+        self.settings.set(axis >> 1, f"{below}.input_mode", input_mode)
 
     def clear_errors(self, axis: int) -> None:
-        """Clear all errors of the axis's ODrive: the firmware clears both axes."""
+        """Clear all errors of the axis's ODrive: the firmware clears both axes.
+
+        What is still so (heat, a lost encoder, the bus) is an error again at the next step.
+        """
         for each in _both(axis):
             self.faults[each] = Fault()
 
@@ -278,24 +176,25 @@ class AxisBank:
         self._fail(axis, FAULTS["ESTOP"])
 
     def reboot(self, axis: int) -> None:
-        """Restart the axis's ODrive: both axes IDLE, inputs zero, errors gone."""
+        """Restart the axis's ODrive.
+
+        Both axes float, inputs are zero, errors gone, settings as saved; it says nothing and
+        takes no request for `BOOT_S`, then it is IDLE.
+        """
+        drive = axis >> 1
         for each in _both(axis):
             self._disarm(each)
+            self.state[each] = AxisState.UNDEFINED
             self.faults[each] = Fault()
             self.input_pos[each] = self.input_vel[each] = self.input_torque[each] = 0.0
-            self.feed(each)
+        self.settings.restore(drive)
+        for each in _both(axis):
+            self.calibration.restart(each)
+        self.conditions.boot(drive, self.now_s)
 
-    def inject(self, axis: str, error: str) -> None:
-        """Fault an axis, by its name in `AXIS_NAMES` and the fault's name in `FAULTS`.
-
-        Raises:
-            DriveError: there is no such axis or fault.
-        """
-        if axis not in AXIS_NAMES:
-            raise DriveError(f"no axis {axis!r}; there are {', '.join(AXIS_NAMES)}")
-        if error not in FAULTS:
-            raise DriveError(f"no fault {error!r} for {axis}; there are {', '.join(FAULTS)}")
-        self._fail(AXIS_NAMES.index(axis), FAULTS[error])
+    def talks(self, axis: int) -> bool:
+        """Return True if the axis's ODrive can be heard and can hear: powered, up, plugged in."""
+        return axis not in self.conditions.silent
 
     def heartbeat(self, axis: int) -> Heartbeat:
         """Return what the axis reports of itself."""
@@ -309,25 +208,87 @@ class AxisBank:
             trajectory_done=True,
         )
 
+    # ---- what happens to the drives
+
+    def inject(self, axis: str, error: str) -> None:
+        """Fault an axis, by its name in `AXIS_NAMES` and the fault's name in `FAULTS`.
+
+        Raises:
+            DriveError: there is no such axis or fault.
+        """
+        if axis not in AXIS_NAMES:
+            raise DriveError(f"no axis {axis!r}; there are {', '.join(AXIS_NAMES)}")
+        if error not in FAULTS:
+            raise DriveError(f"no fault {error!r} for {axis}; there are {', '.join(FAULTS)}")
+        self._fail(AXIS_NAMES.index(axis), FAULTS[error])
+
+    def supply(self, drive: int, volts: float) -> None:
+        """Set the voltage of an ODrive's supply; below `DEAD_VOLTAGE` it is off, later boots."""
+        self.bus.supply[drive] = volts
+        self.bus.changed()
+        if volts < DEAD_VOLTAGE:
+            self.reboot(2 * drive)
+            self.conditions.power_off(drive)
+        elif self.conditions.is_off(drive):
+            self.conditions.boot(drive, self.now_s)
+
+    # ---- within a step
+
+    def _live_with_conditions(self) -> None:
+        """Do what is rare: drives that come up, conditions, calibrations."""
+        for drive in self.conditions.come_up(self.now_s):
+            for axis in _both(2 * drive):
+                self.state[axis] = AxisState.IDLE
+                self._fed_s[axis] = self.now_s
+        for axis, fault in self.conditions.failing():
+            self._fail(axis, fault)
+        for axis in list(self.calibration.running):
+            turns = float(self.encoder_turns[axis])
+            self._become(axis, self.calibration.advance(axis, self.now_s, turns))
+
+    def _check_watchdogs(self) -> None:
+        """Disarm what has not been fed."""
+        if self._seen != self.settings.version:
+            self._seen = self.settings.version
+            enabled = self.settings.axis("config.enable_watchdog") > 0.0
+            timeouts = self.settings.axis("config.watchdog_timeout")
+            self._timeouts_s = np.where(enabled, timeouts, math.inf).tolist()
+            self._shortest_s = min(self._timeouts_s)
+        if min(self._fed_s) < self.now_s - self._shortest_s:
+            for axis, (fed_s, timeout_s) in enumerate(
+                zip(self._fed_s, self._timeouts_s, strict=True)
+            ):
+                if fed_s < self.now_s - timeout_s:
+                    self._fail(axis, FAULTS["WATCHDOG"])
+
+    def _become(self, axis: int, outcome: AxisState | Fault) -> None:
+        """Take the state that a calibration is at, or the fault that it ended with."""
+        if isinstance(outcome, Fault):
+            self._fail(axis, outcome)
+        else:
+            self.state[axis] = outcome
+
     def _arm(self, axis: int) -> None:
         """Enter closed loop; `input_torque` is left as it stands, as the firmware does."""
         if self.control_mode[axis] >= ControlMode.POSITION:
             self.input_pos[axis] = self.pos_estimate[axis]
-        self._integrator[axis] = 0.0
+        self._control.integrator[axis] = 0.0
         self.state[axis] = AxisState.CLOSED_LOOP_CONTROL
-        self._armed[axis] = 1.0
+        self._control.armed[axis] = 1.0
         self.feed(axis)
 
     def _disarm(self, axis: int) -> None:
         """Let the phases float."""
         self.state[axis] = AxisState.IDLE
-        self._armed[axis] = 0.0
+        self._control.armed[axis] = 0.0
         self.torque[axis] = 0.0
 
     def _fail(self, axis: int, fault: Fault) -> None:
-        """Latch a fault and disarm this axis alone."""
-        had = self.faults[axis]
-        self.faults[axis] = Fault(*(old | new for old, new in zip(had, fault, strict=True)))
+        """Latch a fault and disarm this axis alone; a drive that is down has no registers."""
+        if axis >> 1 in self.conditions.down:
+            return
+        self.faults[axis] = self.faults[axis].with_(fault)
+        self.calibration.stop(axis)
         self._disarm(axis)
 
 

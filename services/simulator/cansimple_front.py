@@ -7,16 +7,22 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from services.simulator.axis_bank import AxisBank
+from services.simulator.axis_settings import N_DRIVES
+from services.simulator.cansimple_dialects import DIALECTS, DialectName
 from shared import cansimple
 from shared.cansimple import Command
+from shared.cansimple_06 import Command06
+from shared.joints import N_JOINTS
 from shared.unix_can import REMOTE_FLAG, pack_frames
 from shared.unix_can_hub import UnixCanHub
 
-BUS_VOLTAGE: Final = 48.0
-"""V, what the emulated drives report."""
-
 _DATA_BYTES = 8
+_SDO_BYTES = 4
+_EARLY_S = 1e-6  # a period that is over but for rounding is over
 _S_PER_MS = 1e-3
 _TORQUE = struct.Struct("<f").unpack_from
 _FLAGGED_ID = REMOTE_FLAG | cansimple.NODE_MASK << cansimple.COMMAND_BITS | cansimple.COMMAND_MASK
@@ -25,7 +31,9 @@ _FLAGGED_ID = REMOTE_FLAG | cansimple.NODE_MASK << cansimple.COMMAND_BITS | cans
 class CanSimpleFront:
     """Applies received frames to the bank and sends its estimates and heartbeats.
 
-    `nodes[i]` maps the CAN node ids on `hubs[i]` to axes of the bank.
+    `nodes[i]` maps the CAN node ids on `hubs[i]` to axes of the bank. A drive that does not
+    talk (no power, starting up, cable out) neither hears nor sends. How often an axis sends is
+    its settings' matter: `config.can.encoder_rate_ms`, `config.can.heartbeat_rate_ms`.
     """
 
     def __init__(
@@ -34,70 +42,128 @@ class CanSimpleFront:
         hubs: Sequence[UnixCanHub],
         nodes: Sequence[Mapping[int, int]],
         *,
-        heartbeat_period_ms: int,
+        heartbeat_period_ms: int | None = None,
+        dialect: DialectName = "0.5",
     ) -> None:
+        """Put the drives on their buses.
+
+        Args:
+            bank: the drives.
+            hubs: the buses.
+            nodes: for each bus, the axis (0 .. 11) of each node on it.
+            heartbeat_period_ms: of all axes, if their settings are to have another.
+            dialect: which firmware's CANSimple they speak.
+        """
         self._bank = bank
         self._buses = [_Bus(hub, node) for hub, node in zip(hubs, nodes, strict=True)]
-        self._heartbeat_period_s = heartbeat_period_ms * _S_PER_MS
-        self._next_heartbeat_s = -math.inf
+        self._dialect = DIALECTS[dialect]
+        self._next_heartbeat_s = [-math.inf] * N_JOINTS
+        self._next_encoder_s = [-math.inf] * N_JOINTS
+        self._heartbeat_from_s = -math.inf
+        self._seen = -1
+        if heartbeat_period_ms is not None:
+            bank.settings.fill("config.can.heartbeat_rate_ms", heartbeat_period_ms)
+        for node in nodes:
+            for number, axis in node.items():
+                bank.settings.set(axis >> 1, f"axis{axis & 1}.config.can.node_id", number)
+        for drive in range(N_DRIVES):
+            bank.settings.save(drive)
 
     def receive(self) -> None:
         """Apply all frames that have arrived; in each mailbox the newest wins."""
-        bank = self._bank
+        bank, silent = self._bank, self._bank.conditions.silent
         for bus in self._buses:
-            torque_axes = bus.torque_axes
+            mailboxes = bus.mailboxes
             for can_id, data in bus.hub.poll():
-                axis = torque_axes.get(can_id)
-                if axis is not None and len(data) >= 4:
+                mailbox = mailboxes.get(can_id)
+                if mailbox is None:
+                    self._answer(bus, can_id, data)
+                elif mailbox[0] not in silent:
+                    axis, setter = mailbox
                     bank.feed(axis)
-                    bank.input_torque[axis] = _TORQUE(data)[0]
-                else:
-                    self._apply(bus, can_id, data)
+                    # The firmware reads its eight-byte buffer whatever the frame's length.
+                    setter(bank, axis, data.ljust(_DATA_BYTES, b"\0"))
 
     def send_encoders(self) -> None:
-        """Send the encoder estimates of all axes, in one packet per bus."""
-        pos = self._bank.pos_estimate.tolist()
-        vel = self._bank.vel_estimate.tolist()
+        """Send the encoder estimates of all axes that are due, in one packet per bus."""
+        bank = self._bank
+        self._read_periods()
+        now_s, silent = bank.now_s, bank.conditions.silent
+        due_s, periods_s = self._next_encoder_s, self._encoder_periods_s
+        pos = bank.pos_estimate.tolist()
+        vel = bank.vel_estimate.tolist()
         for bus in self._buses:
             if not bus.hub.clients:
                 continue
             fields: list[float] = []
             for encoder_id, axis in bus.encoders:
-                fields += (encoder_id, _DATA_BYTES, pos[axis], vel[axis])
-            bus.hub.broadcast_packet(bus.encoder_packet(*fields))
+                due = due_s[axis]
+                if now_s >= due - _EARLY_S and axis not in silent:
+                    due_s[axis] = (due if due > now_s else now_s) + periods_s[axis]
+                    fields += (encoder_id, _DATA_BYTES, pos[axis], vel[axis])
+            if len(fields) == bus.encoder_fields:
+                bus.hub.broadcast_packet(bus.encoder_packet(*fields))
+            elif fields:
+                layout = struct.Struct("<" + "IB3xff" * (len(fields) // 4))
+                bus.hub.broadcast_packet(layout.pack(*fields))
 
     def send_heartbeats(self, now_s: float) -> None:
-        """Send every axis's heartbeat if its period has passed by `now_s`."""
-        if now_s < self._next_heartbeat_s:
+        """Send the heartbeat of each axis whose period has passed by `now_s`."""
+        if now_s < self._heartbeat_from_s:
             return
-        self._next_heartbeat_s = max(self._next_heartbeat_s, now_s) + self._heartbeat_period_s
+        bank, due_s = self._bank, self._next_heartbeat_s
+        self._read_periods()
         for bus in self._buses:
-            bus.hub.broadcast(
-                (
-                    cansimple.arbitration_id(node, Command.HEARTBEAT),
-                    cansimple.pack_heartbeat(self._bank.heartbeat(axis)),
-                )
-                for node, axis in bus.nodes.items()
-            )
+            frames = []
+            for node, axis in bus.nodes.items():
+                if now_s >= due_s[axis]:
+                    due_s[axis] = max(due_s[axis], now_s) + self._heartbeat_periods_s[axis]
+                    if bank.talks(axis):
+                        can_id = cansimple.arbitration_id(node, Command.HEARTBEAT)
+                        frames.append((can_id, self._dialect.heartbeat(bank, axis)))
+            if frames:
+                bus.hub.broadcast(frames)
+        heard = (due_s[axis] for bus in self._buses for axis in bus.axes)
+        self._heartbeat_from_s = min(heard, default=math.inf)
 
-    def _apply(self, bus: _Bus, can_id: int, data: bytes) -> None:
-        """Apply or answer one frame that is not an input torque."""
+    def _read_periods(self) -> None:
+        """Take the periods from the settings, if these have changed; 0 is never."""
+        settings = self._bank.settings
+        if self._seen == settings.version:
+            return
+        self._seen = settings.version
+        self._heartbeat_from_s = -math.inf
+        self._encoder_periods_s = _periods_s(settings.axis("config.can.encoder_rate_ms"))
+        self._heartbeat_periods_s = _periods_s(settings.axis("config.can.heartbeat_rate_ms"))
+        for due_s, periods_s in (
+            (self._next_encoder_s, self._encoder_periods_s),
+            (self._next_heartbeat_s, self._heartbeat_periods_s),
+        ):
+            for axis, period_s in enumerate(periods_s):
+                if period_s == math.inf or due_s[axis] == math.inf:
+                    due_s[axis] = period_s if period_s == math.inf else self._bank.now_s
+
+    def _answer(self, bus: _Bus, can_id: int, data: bytes) -> None:
+        """Answer a frame that sets nothing, if it is one that has an answer."""
         node, command = cansimple.split_id(can_id)
         axis = bus.nodes.get(node)
-        if axis is None or can_id & ~_FLAGGED_ID:
+        if axis is None or can_id & ~_FLAGGED_ID or not self._bank.talks(axis):
             return
         self._bank.feed(axis)
-        answer = _ANSWERS.get(command)
-        if answer is not None:
-            if can_id & REMOTE_FLAG or not data:
-                bus.hub.broadcast_packet(
-                    pack_frames([(can_id & ~REMOTE_FLAG, answer(self._bank, axis))])
-                )
-            return
-        setter = _SETTERS.get(command)
-        if setter is not None:
-            # The firmware reads its eight-byte buffer whatever the frame's length.
-            setter(self._bank, axis, data.ljust(_DATA_BYTES, b"\0"))
+        answer = self._dialect.answers.get(command)
+        reply: bytes | None = None
+        if answer is not None and (can_id & REMOTE_FLAG or not data):
+            reply_id, reply = can_id & ~REMOTE_FLAG, answer(self._bank, axis)
+        elif command == Command06.RX_SDO and self._dialect.sdo is not None:
+            reply_id = cansimple.arbitration_id(node, Command06.TX_SDO)
+            reply = self._dialect.sdo(self._bank, axis, data.ljust(_SDO_BYTES, b"\0"))
+        if reply is not None:
+            bus.hub.broadcast_packet(pack_frames([(reply_id, reply)]))
+
+
+def _periods_s(periods_ms: NDArray[np.float64]) -> list[float]:
+    """Return periods in s; 0 ms is never."""
+    return [ms * _S_PER_MS if ms > 0.0 else math.inf for ms in periods_ms.tolist()]
 
 
 class _Bus:
@@ -106,14 +172,17 @@ class _Bus:
     def __init__(self, hub: UnixCanHub, nodes: Mapping[int, int]) -> None:
         self.hub = hub
         self.nodes = dict(nodes)
-        self.torque_axes = {
-            cansimple.arbitration_id(node, Command.SET_INPUT_TORQUE): axis
+        self.axes = tuple(nodes.values())
+        self.mailboxes = {
+            cansimple.arbitration_id(node, command): (axis, setter)
             for node, axis in nodes.items()
+            for command, setter in _SETTERS.items()
         }
         self.encoders = [
             (cansimple.arbitration_id(node, Command.GET_ENCODER_ESTIMATES), axis)
             for node, axis in nodes.items()
         ]
+        self.encoder_fields = 4 * len(self.encoders)
         self.encoder_packet = struct.Struct("<" + "IB3xff" * len(self.encoders)).pack
 
 
@@ -137,7 +206,7 @@ def _set_input_vel(bank: AxisBank, axis: int, data: bytes) -> None:
 
 
 def _set_input_torque(bank: AxisBank, axis: int, data: bytes) -> None:
-    bank.input_torque[axis] = cansimple.unpack_float(data)
+    bank.input_torque[axis] = _TORQUE(data)[0]
 
 
 def _set_limits(bank: AxisBank, axis: int, data: bytes) -> None:
@@ -176,45 +245,4 @@ _SETTERS: Final[dict[int, Callable[[AxisBank, int, bytes], None]]] = {
     Command.CLEAR_ERRORS: _clear_errors,
     Command.SET_POS_GAIN: _set_pos_gain,
     Command.SET_VEL_GAINS: _set_vel_gains,
-}
-
-
-def _encoder_estimates(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_two_floats(bank.pos_estimate[axis], bank.vel_estimate[axis])
-
-
-def _encoder_count(bank: AxisBank, axis: int) -> bytes:
-    count = round(bank.pos_estimate[axis] * bank.encoder_counts_per_turn)
-    return cansimple.pack_two_ints(count, count % bank.encoder_counts_per_turn)
-
-
-def _iq(bank: AxisBank, axis: int) -> bytes:
-    iq = bank.torque[axis] / bank.torque_constant
-    return cansimple.pack_two_floats(iq, iq)
-
-
-def _vbus(_bank: AxisBank, _axis: int) -> bytes:
-    return cansimple.pack_two_floats(BUS_VOLTAGE, 0.0)
-
-
-def _motor_error(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_motor_error(bank.faults[axis].motor)
-
-
-def _encoder_error(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_u32(bank.faults[axis].encoder).ljust(_DATA_BYTES, b"\0")
-
-
-def _controller_error(bank: AxisBank, axis: int) -> bytes:
-    return cansimple.pack_u32(bank.faults[axis].controller).ljust(_DATA_BYTES, b"\0")
-
-
-_ANSWERS: Final[dict[int, Callable[[AxisBank, int], bytes]]] = {
-    Command.GET_MOTOR_ERROR: _motor_error,
-    Command.GET_ENCODER_ERROR: _encoder_error,
-    Command.GET_ENCODER_ESTIMATES: _encoder_estimates,
-    Command.GET_ENCODER_COUNT: _encoder_count,
-    Command.GET_IQ: _iq,
-    Command.GET_VBUS: _vbus,
-    Command.GET_CONTROLLER_ERROR: _controller_error,
 }

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.fault_injector import FaultInjector
+from services.simulator.fibre_front import FibrePort
 from services.simulator.harness_front import HarnessFront
 from services.simulator.world import World
 from shared.bus import Latest, Publisher
@@ -29,8 +33,8 @@ class Ports(msgspec.Struct, frozen=True):
 class SimulatorLoop:
     """Steps twelve emulated axes and the world, and paces them by the clock.
 
-    The drives step at the rate of their encoder frames and hold their torque between;
-    the world steps at its own.
+    The drives hear and are heard at the rate of their encoder frames. In torque mode they hold
+    their torque between; where one has its own loop they step with the world.
     """
 
     def __init__(
@@ -39,11 +43,14 @@ class SimulatorLoop:
         world: World,
         bank: AxisBank,
         front: CanSimpleFront,
+        usb: Sequence[FibrePort],
         harness: HarnessFront,
         ports: Ports,
     ) -> None:
         self._world, self._bank, self._front = world, bank, front
         self._harness, self._ports = harness, ports
+        self._usb = usb
+        self._faults = FaultInjector(world.scenario.fault, bank)
         simulation = config.simulation
         rate = 1.0 / simulation.timestep
         self._step_ns = round(simulation.timestep * NS_PER_S)
@@ -83,10 +90,15 @@ class SimulatorLoop:
         """Take the drives' frames, move the world on by one step, send what is due."""
         world, front, ports = self._world, self._front, self._ports
         if self._steps % self._encoder_every == 0:
+            self._faults.advance(world.scenario_s)
             front.receive()
             self._torque = self._bank.step(world.time, *world.motor_turns())
             front.send_encoders()
             front.send_heartbeats(world.time)
+        elif self._bank.regulates:
+            self._torque = self._bank.step(world.time, *world.motor_turns())
+        for plug in self._usb:
+            plug.poll()
         world.step(self._torque)
         self._steps += 1
         steps = self._steps

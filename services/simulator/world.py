@@ -125,6 +125,11 @@ class World:
         self._ankles = np.array([data.xpos[foot] for foot in self._feet])
 
     @property
+    def scenario(self) -> Scenario:
+        """What happens."""
+        return self._scenario
+
+    @property
     def scenario_s(self) -> float:
         """Scenario time in s; negative before it starts."""
         return self.time - self._start_time if math.isfinite(self._start_time) else -1.0

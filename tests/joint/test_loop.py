@@ -9,12 +9,12 @@ import pytest
 
 from services.joint import loop as joint_loop
 from services.joint.controller import JointController
-from services.joint.differential import motor_from_joint
-from services.joint.drivers.base import DriveReading, DriveStatus
-from services.joint.loop import ARM_EVERY_NS, ARM_TRIES, JointLoop, Ports
+from services.joint.differential import joint_torque, motor_from_joint
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.loop import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS, JointLoop, Ports
 from shared.config import RobotConfig
 from shared.messages import Estop, JointEvent, JointState, Mode, Pair
-from tests.joint.helpers import T0, command
+from tests.joint.helpers import T0, command, with_service
 
 M = TypeVar("M")
 
@@ -47,17 +47,25 @@ class FakeDrive:
         self.obeys = True
         self.armed = self.idled = 0
         self.torques: list[Pair] = []
+        self.targets: list[MotorTarget] = []
+        self.carries: Pair | None = None
+        """Motor torques that a drive which was found armed tells."""
 
     def read(self, _timeout_s: float) -> DriveReading | None:
         if self.silent:
             return None
         pos = motor_from_joint(self.q, self.rig.gear_ratio)
-        return DriveReading(self.rig.now_ns, pos, (0.0, 0.0), self.status, 0)
+        found = None if self.armed else self.carries
+        return DriveReading(self.rig.now_ns, pos, (0.0, 0.0), self.status, 0, found)
 
     def write_torque(self, torque: Pair) -> None:
         self.torques.append(torque)
 
-    def arm(self) -> None:
+    def write(self, target: MotorTarget) -> None:
+        self.targets.append(target)
+
+    def arm(self, *, onboard: bool) -> None:
+        assert onboard is self.rig.onboard
         self.armed += 1
         if self.obeys:
             self.status = DriveStatus.ARMED
@@ -72,6 +80,7 @@ class FakeDrive:
 class Rig:
     def __init__(self, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_ns = T0
+        self.onboard = robot.joint_service.loop == "onboard"
         self.gear_ratio = robot.joint.gear_ratio
         self.period_ns = round(1e9 / robot.joint_service.rate_hz)
         monkeypatch.setattr(joint_loop, "now_ns", lambda: self.now_ns)
@@ -97,9 +106,26 @@ class Rig:
         return self.controller.failsafe.mode
 
 
+@pytest.fixture(params=["onboard", "service"])
+def rig(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Rig:
+    return Rig(with_service(robot, loop=request.param), monkeypatch)
+
+
 @pytest.fixture
-def rig(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> Rig:
-    return Rig(robot, monkeypatch)
+def onboard(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    return Rig(with_service(robot, loop="onboard"), monkeypatch)
+
+
+class Stop:
+    """Told to stop after so many looks."""
+
+    def __init__(self, after: int, *, interrupted: bool) -> None:
+        self.left = after
+        self.interrupted = interrupted
+
+    def __bool__(self) -> bool:
+        self.left -= 1
+        return self.left < 0
 
 
 @pytest.mark.parametrize("status", [DriveStatus.IDLE, DriveStatus.ERROR])
@@ -112,7 +138,10 @@ def test_a_drive_that_answers_is_armed_with_its_latched_errors(
     assert rig.mode is Mode.HOLD
 
 
-def test_a_drive_that_somebody_else_armed_is_armed_by_us_before_it_is_held(rig: Rig) -> None:
+def test_a_torque_drive_that_somebody_else_armed_is_armed_by_us_before_it_is_held(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig(with_service(robot, loop="service"), monkeypatch)
     rig.drive.status = DriveStatus.ARMED
     rig.run(1)
     assert rig.mode is Mode.DISARMED
@@ -126,7 +155,8 @@ def test_a_joint_outside_its_limits_is_not_armed_until_it_is_inside(rig: Rig) ->
     rig.drive.q = (0.0, 0.0)
     rig.run(1000)
     assert rig.drive.armed == 0
-    assert set(rig.drive.torques) == {(0.0, 0.0)}
+    assert not rig.drive.targets
+    assert set(rig.drive.torques) <= {(0.0, 0.0)}
     rig.drive.q = (0.0, -1.0)
     rig.run(2 + ARM_EVERY_NS // rig.period_ns)
     assert rig.mode is Mode.HOLD
@@ -151,7 +181,54 @@ def test_both_axes_go_idle_once_one_disarms(rig: Rig) -> None:
     rig.run(50)
     assert rig.mode is Mode.FAULT
     assert rig.drive.idled == 1
+    rig.run(2 + IDLE_EVERY_NS // rig.period_ns)
+    assert rig.drive.idled == 2, "the frame may have been lost"
     assert rig.drive.armed == 1, "never again by itself"
+
+
+def test_a_lost_drive_that_holds_by_its_own_loop_is_left_alone(onboard: Rig) -> None:
+    """Should the link come back, it must find no torque of zero and no order to go idle."""
+    onboard.run(5)
+    onboard.drive.status = DriveStatus.LOST
+    onboard.run(5)
+    assert onboard.mode is Mode.FAULT
+    sent = len(onboard.drive.targets)
+    onboard.drive.status = DriveStatus.ARMED
+    onboard.run(1000)
+    assert onboard.mode is Mode.FAULT
+    assert len(onboard.drive.targets) == sent
+    assert (onboard.drive.torques, onboard.drive.idled) == ([], 0)
+
+
+def test_a_drive_that_holds_the_robot_is_taken_over_without_a_step(onboard: Rig) -> None:
+    """Its service has died: the next one carries on with what the motors' loops carry."""
+    drive = onboard.drive
+    drive.status, drive.q = DriveStatus.ARMED, (0.02, -1.1)
+    onboard.run(10)
+    assert (onboard.mode, drive.armed, drive.targets) == (Mode.DISARMED, 0, [])
+    drive.carries = (0.4, 1.6)
+    onboard.run(1)
+    assert onboard.mode is Mode.HOLD
+    assert drive.armed == 0
+    assert drive.targets[0].torque == pytest.approx((0.4, 1.6))
+    assert drive.targets[0].pos_turns == pytest.approx(
+        motor_from_joint((0.02, -1.1), onboard.gear_ratio)
+    )
+    assert joint_torque((0.4, 1.6), onboard.gear_ratio) == pytest.approx(onboard.controller.tau)
+
+
+def test_a_service_that_is_stopped_alone_leaves_its_drive_holding(onboard: Rig) -> None:
+    onboard.run(5)
+    onboard.loop.run(cast("Any", Stop(5, interrupted=False)))
+    assert onboard.drive.idled == 0
+
+
+@pytest.mark.parametrize("armed", [True, False])
+def test_a_fleet_that_goes_down_leaves_its_drives_idle(rig: Rig, armed: bool) -> None:
+    rig.drive.obeys = armed
+    rig.run(5)
+    rig.loop.run(cast("Any", Stop(5, interrupted=True)))
+    assert rig.drive.idled == 1
 
 
 def test_one_estop_message_is_for_good(rig: Rig) -> None:

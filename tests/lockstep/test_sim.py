@@ -57,7 +57,7 @@ def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
     [
         (("--loss", "1.5"), "from 0 to 1"),
         (("--delay", "-1"), "at least 0 ms"),
-        (("--kill", "knee_left@1"), "only the planner"),
+        (("--kill", "harness@1"), "only the planner"),
     ],
 )
 def test_bad_input_is_one_clear_line(

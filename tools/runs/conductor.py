@@ -6,6 +6,7 @@ on the bus as run events, so that the log alone tells the whole story.
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
@@ -55,6 +56,16 @@ class Snapshot(NamedTuple):
     note: str
 
 
+class Chase(NamedTuple):
+    """A kill at a moment that no clock tells: as modules track again after a drop-out."""
+
+    service: str
+    modules: int
+    """So many track again,"""
+    after_s: float
+    """since so long."""
+
+
 class CpuMeter:
     """CPU time of the fleet and of this process, summed over processes that come and go."""
 
@@ -87,10 +98,17 @@ class Conductor:
         session: Session,
         scenario: Scenario,
         show: Callable[[Snapshot], None],
+        chase: Chase | None = None,
     ) -> None:
+        """Take the scenario's kills, and perhaps one that follows what the modules do."""
         self._fleet = fleet
         self._scenario = scenario
         self._show = show
+        self._chase = chase
+        self._dropped_out = False
+        self._chase_at_s = math.inf
+        self.said: list[RunEvent] = []
+        """What was done to the run so far."""
         self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
         self._states = {
             module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
@@ -146,6 +164,7 @@ class Conductor:
             scenario_s = (now_ns() - self._start_ns) / NS_PER_S
             while todo and scenario_s >= todo[0].at:
                 self._act(todo.pop(0))
+            self._follow(scenario_s)
             time.sleep(POLL_S)
         meter.sample(self._pids.values())
         self._say(RunEventKind.FINISHED, self._scenario.name, "")
@@ -247,6 +266,19 @@ class Conductor:
             x, y, z = row.force
             self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
 
+    def _follow(self, scenario_s: float) -> None:
+        """Kill what is chased, once its moment has come."""
+        if self._chase is None:
+            return
+        now_s = time.monotonic()
+        tracking = list(self._modes.values()).count(Mode.TRACK)
+        self._dropped_out |= tracking == 0
+        if self._dropped_out and tracking >= self._chase.modules:
+            self._chase_at_s = min(self._chase_at_s, now_s + self._chase.after_s)
+        if now_s >= self._chase_at_s:
+            service, self._chase = self._chase.service, None
+            self._act(Kill(service=service, at=scenario_s))
+
     def _wait_until_ended(self, service: str) -> None:
         """Wait for a service that is still leaving after TERM or INT; one that is stopped stays."""
         pid = self._pids.get(service)
@@ -259,13 +291,13 @@ class Conductor:
     def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
         now = now_ns()
         self._said += 1
-        self._events.put(
-            RunEvent(
-                t_ns=now,
-                seq=self._said,
-                kind=int(kind),
-                subject=subject,
-                detail=detail,
-                scenario_s=(now - self._start_ns) / NS_PER_S,
-            )
+        event = RunEvent(
+            t_ns=now,
+            seq=self._said,
+            kind=int(kind),
+            subject=subject,
+            detail=detail,
+            scenario_s=(now - self._start_ns) / NS_PER_S,
         )
+        self.said.append(event)
+        self._events.put(event)

@@ -17,11 +17,12 @@ from shared import config, gain_schedule, scenario
 from shared.config import SERVICES, RobotConfig
 from shared.config_sections import LawConfig
 from shared.exceptions import FleetError, RunError
+from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
-from shared.scenario import SIGNALS, Kill, Push, Restart, Scenario
+from shared.scenario import FAULT_KINDS, SIGNALS, Fault, Kill, Push, Restart, Scenario
 from tools.verbs import add_config
 
-E = TypeVar("E", Kill, Restart, Push)
+E = TypeVar("E", Kill, Restart, Push, Fault)
 
 SCENARIOS = DEFAULT_CONFIG.parent / "scenarios"
 
@@ -69,6 +70,15 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         metavar="T:DUR:FX,FY,FZ",
         help="push the torso by a force in N from T for DUR s; replaces the scenario's "
         "pushes; may be repeated",
+    )
+    parser.add_argument(
+        "--fault",
+        action="append",
+        type=parse_fault,
+        metavar="MODULE:KIND@T",
+        help=f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
+        "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults; "
+        "may be repeated",
     )
     parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
     parser.add_argument(
@@ -120,6 +130,21 @@ def parse_push(text: str) -> Push:
     return Push(at=t, duration=duration, force=(x, y, z))
 
 
+def parse_fault(text: str) -> Fault:
+    """Read MODULE[.AXIS]:KIND@T[:DUR]."""
+    match = re.fullmatch(rf"(\w+)(?:\.([01]))?:(\w+)@({_NUMBER})(?::({_NUMBER}))?", text)
+    if match is None or match[1] not in MODULES or match[3] not in FAULT_KINDS:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; write MODULE:KIND@SECONDS, for example knee_left:encoder@8, or "
+            f"knee_left.1:encoder@8:0.5; modules: {', '.join(MODULES)}; "
+            f"kinds: {', '.join(FAULT_KINDS)}"
+        )
+    row = {"module": match[1], "kind": match[3], "at": float(match[4])}
+    axis = int(match[2]) if match[2] else None
+    duration = float(match[5]) if match[5] else None
+    return msgspec.convert({**row, "axis": axis, "duration": duration}, Fault)
+
+
 def scenario_file(name: str) -> Path:
     """Return the file of a scenario given by name or path, absolute.
 
@@ -150,9 +175,11 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
     kills = tuple(args.kill) if args.kill is not None else _inside(story.kill, duration)
     restarts = tuple(args.restart or ()) if args.kill or args.restart else story.restart
     pushes = tuple(args.push) if args.push is not None else _inside(story.push, duration)
+    faults = tuple(args.fault) if args.fault is not None else _inside(story.fault, duration)
     story = msgspec.structs.replace(
         story,
         duration=duration,
+        fault=faults,
         kill=kills,
         restart=_inside(restarts, duration) if not args.restart else restarts,
         push=pushes,
@@ -169,6 +196,7 @@ def in_words(story: Scenario) -> str:
     """Return what is done to the run, as a clause for its first line."""
     done = [f"{row.service} {row.signal} at {row.at:g} s" for row in story.kill]
     done += [f"{row.service} back at {row.at:g} s" for row in story.restart]
+    done += [f"{row.module} {row.kind} at {row.at:g} s" for row in story.fault]
     done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in story.push]
     return f"; {', '.join(done)}" if done else ""
 
@@ -179,7 +207,6 @@ def make_robot(args: argparse.Namespace) -> RobotConfig:
     Raises:
         ConfigError: the file cannot be used, or the gain split lacks its schedule.
     """
-    robot = config.load(args.config)
     changes = {
         key: value
         for key, value in (("split", args.split), ("jacobian", args.jacobian))
@@ -187,9 +214,22 @@ def make_robot(args: argparse.Namespace) -> RobotConfig:
     }
     if changes.get("jacobian") == "average" and "split" not in changes:
         changes["split"] = "diagonal"  # no local gains certify it: there is no schedule
-    law = msgspec.structs.replace(robot.law, **changes)
-    robot = msgspec.structs.replace(robot, law=law)
-    gain_schedule.require(robot, args.config)
+    return load_robot(args.config, **changes)
+
+
+def load_robot(path: Path, **law: str) -> RobotConfig:
+    """Return the robot of a file, ready to run.
+
+    Args:
+        path: the robot file.
+        law: keys of `[law]` to change, and their values.
+
+    Raises:
+        ConfigError: the file cannot be used, or the gain split lacks its schedule.
+    """
+    robot = config.load(path)
+    robot = msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **law))
+    gain_schedule.require(robot, path)
     return robot
 
 

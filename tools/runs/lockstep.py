@@ -12,21 +12,26 @@ from collections.abc import Callable, Iterator
 from services.joint.controller import JointController
 from services.joint.differential import motor_torque
 from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.odrive_can import LOST_MS
+from services.joint.onboard import OnboardLaw
 from services.planner.planner import Planner
 from services.simulator.axis_bank import AxisBank
+from services.simulator.fault_injector import FaultInjector
 from services.simulator.world import World
 from shared import topics
 from shared.cansimple import AxisState, ControlMode, InputMode
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import MODULES, N_JOINTS
+from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
 from shared.messages import (
+    Cause,
     JointCommand,
     JointEvent,
     JointState,
     Message,
     Mode,
+    Pair,
     PlannerStatus,
     RunEvent,
     RunEventKind,
@@ -67,7 +72,8 @@ class Lockstep:
 
         Args:
             config: the robot.
-            scenario: what happens; kills and restarts of the planner only.
+            scenario: what happens; kills and restarts of the planner and, with the onboard
+                loop, of joint services.
             network: what every link does, each way; None is 1 ms.
             seed: of the network and of the harness sensor's noise.
             record: takes every message.
@@ -75,12 +81,13 @@ class Lockstep:
         Raises:
             RunError: the scenario kills what has no process here.
         """
+        killable = ("planner", *(MODULES if config.joint_service.loop == "onboard" else ()))
         named = [(row.service, row.at) for row in scenario.kill]
         for service, at in named + [(row.service, row.at) for row in scenario.restart]:
-            if service != "planner":
+            if service not in killable:
                 raise RunError(
-                    f"{service}@{at:g}: in lockstep only the planner can be killed; "
-                    "use `xrl demo` for the others"
+                    f"{service}@{at:g}: in lockstep only the planner can be killed, and joint "
+                    "services with the onboard loop; use `xrl demo` for the others"
                 )
         self.config = config
         self.scenario = scenario
@@ -92,7 +99,11 @@ class Lockstep:
         """Set it to stop every module."""
         self.now_ns = NS_PER_S
         self._record = record
-        self._frozen = False
+        self._frozen: set[str] = set()
+        """Services that are stopped or dead."""
+        self._dead: set[str] = set()
+        self._found = [False] * len(MODULES)
+        """Modules whose new service has yet to take its drive over."""
         self._sessions = 1
         network = network or Impairment()
         self._states: list[Link[JointState]] = [
@@ -119,8 +130,20 @@ class Lockstep:
             config.drive, encoder_counts_per_turn=config.joint.encoder_counts_per_turn
         )
         self._torque = self.bank.torque
+        self._faults = FaultInjector(scenario.fault, self.bank)
+        self._sampled_ns = [self.now_ns] * len(MODULES)
+        self._lost_after_ns = round((config.drive.watchdog_timeout or LOST_MS * 1e-3) * NS_PER_S)
+        onboard = config.joint_service.loop == "onboard"
+        self._onboard = (
+            [OnboardLaw(config.joint.gear_ratio, config.drive.vel_limit) for _ in MODULES]
+            if onboard
+            else None
+        )
+        mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
         for axis in range(N_JOINTS):
-            self.bank.set_modes(axis, ControlMode.TORQUE, InputMode.PASSTHROUGH)
+            self.bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
+        if onboard:
+            self.bank.pos_gain[:] = self.bank.vel_gain[:] = 0.0
 
     def run(self) -> Iterator[SimTruth]:
         """Run to the scenario's end; yield the truth at its rate.
@@ -143,11 +166,14 @@ class Lockstep:
         """Move virtual time on by one step of the world."""
         now = self.now_ns
         if now % self._cycle_ns == 0:
+            self._faults.advance(self.world.scenario_s)
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
             self._cycle_joints(now)
+        elif self.bank.regulates:
+            self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
         if now % self._harness_ns == 0:
             self.harness.advance(self.world, now)
-        if self.planner is not None and not self._frozen:
+        if self.planner is not None and "planner" not in self._frozen:
             self._advance_planner(self.planner, now)
         self._begin_when_tracking(now)
         self.world.step(self._torque)
@@ -160,19 +186,28 @@ class Lockstep:
         """Do what the scenario asks for, and say so."""
         if isinstance(row, Kill):
             self._say(RunEventKind.KILLED, row.service, row.signal)
-            if row.signal == "STOP":
-                self._frozen = True
-            else:
-                self.planner = None
+            self._frozen.add(row.service)
+            if row.signal != "STOP":
+                self._dead.add(row.service)
         elif isinstance(row, Restart):
             self._say(RunEventKind.RESTARTED, row.service, "")
-            if self.planner is None:
-                self._sessions += 1
-                self.planner = Planner(self.config, self._sessions)
-            self._frozen = False
+            self._frozen.discard(row.service)
+            if row.service in self._dead:
+                self._dead.discard(row.service)
+                self._begin_anew(row.service)
         else:
             x, y, z = row.force
             self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
+
+    def _begin_anew(self, service: str) -> None:
+        """Start a service that was dead; a module's takes over what its drive carries."""
+        if service == "planner":
+            self._sessions += 1
+            self.planner = Planner(self.config, self._sessions)
+            return
+        index = MODULE_INDEX[service]
+        self.controllers[index] = JointController(self.config, service)
+        self._found[index] = True
 
     def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
         self._said += 1
@@ -188,24 +223,76 @@ class Lockstep:
 
     def _cycle_joints(self, now: int) -> None:
         bank = self.bank
-        pos, vel = bank.pos_estimate.tolist(), bank.vel_estimate.tolist()
         for index, (module, controller) in enumerate(zip(MODULES, self.controllers, strict=True)):
+            if module in self._frozen:
+                continue
             a, b = 2 * index, 2 * index + 1
-            armed = bank.state[a] == bank.state[b] == AxisState.CLOSED_LOOP_CONTROL
-            status = DriveStatus.ARMED if armed else DriveStatus.IDLE
-            reading = DriveReading(now, (pos[a], pos[b]), (vel[a], vel[b]), status, 0)
+            talks = bank.talks(a)
+            reading = self._read(index, now)
             command = self._commands[index].take(now)
             result = controller.step(now, reading, command, self.estop)
             if result.event is not None:
                 self.events.append((module, result.event))
                 self._record(topics.JOINT_EVENT, module, result.event)
-            bank.input_torque[a : b + 1] = motor_torque(result.tau, self.config.joint.gear_ratio)
-            bank.feed(a)
-            bank.feed(b)
+            fault = controller.failsafe.mode is Mode.FAULT
+            lost = fault and controller.cause is Cause.DRIVE_LOST
+            # a drive that was lost, and holds by its own loop, is left alone when it is back
+            if talks and not (lost and self._onboard is not None):
+                self._write(index, result.tau)
+                bank.feed(a)
+                bank.feed(b)
+                if fault:
+                    bank.request_state(a, AxisState.IDLE)  # one axis that disarms leaves its
+                    bank.request_state(b, AxisState.IDLE)  # sibling's torque on
             if now % self._state_ns == 0:
                 state = controller.state(now)
                 self._states[index].put(now, state)
                 self._record(topics.JOINT_STATE, module, state)
+
+    def _write(self, index: int, tau: Pair) -> None:
+        """Give a module's drive what its driver would."""
+        bank, module = self.bank, slice(2 * index, 2 * index + 2)
+        mode = self.controllers[index].failsafe.mode
+        if self._onboard is None or mode in (Mode.DISARMED, Mode.FAULT):
+            bank.input_torque[module] = motor_torque(tau, self.config.joint.gear_ratio)
+            return
+        pos = bank.pos_estimate[module].tolist()
+        vel = bank.vel_estimate[module].tolist()
+        setpoint = self.controllers[index].setpoint
+        target = self._onboard[index].target(setpoint, tau, (pos[0], pos[1]), (vel[0], vel[1]))
+        bank.input_pos[module] = target.pos_turns
+        bank.input_vel[module] = target.vel_turns
+        bank.input_torque[module] = target.torque
+        bank.pos_gain[module] = target.pos_gain
+        bank.vel_gain[module] = target.vel_gain
+
+    def _read(self, index: int, now: int) -> DriveReading | None:
+        """Return what a module's driver would: None while silence may pass, then LOST."""
+        bank, a, b = self.bank, 2 * index, 2 * index + 1
+        if bank.talks(a):
+            self._sampled_ns[index] = now
+        elif now - self._sampled_ns[index] <= self._lost_after_ns:
+            return None
+        armed = bank.state[a] == bank.state[b] == AxisState.CLOSED_LOOP_CONTROL
+        status = DriveStatus.ARMED if armed else DriveStatus.IDLE
+        if not bank.talks(a):
+            status = DriveStatus.LOST
+        errors = 0 if armed else bank.heartbeat(a).errors | bank.heartbeat(b).errors
+        pos, vel = bank.pos_estimate, bank.vel_estimate
+        return DriveReading(
+            self._sampled_ns[index],
+            (float(pos[a]), float(pos[b])),
+            (float(vel[a]), float(vel[b])),
+            status,
+            int(errors),
+            self._carried(index),
+        )
+
+    def _carried(self, index: int) -> Pair | None:
+        """Return the motors' torques of a drive that is found armed by a new service."""
+        found, self._found[index] = self._found[index], False
+        a, b = self.bank.torque[2 * index : 2 * index + 2].tolist()
+        return (a, b) if found else None
 
     def _advance_planner(self, planner: Planner, now: int) -> None:
         """Hand over what has arrived, and tick as the live loop does."""

@@ -6,6 +6,7 @@ Everything is read from the MCAP file, so that a run can be judged again at any 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -103,7 +104,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     kill_s = kills[0].scenario_s if kills else np.inf
     last = truth[-1]
     fallen = any(row.fallen for row in truth)
-    reached = began and t[-1] >= duration_s - 0.1
+    reached = began and bool(t[-1] >= duration_s - 0.1)
     summary: Summary = {
         "stood": reached and not fallen,
         "began": began,
@@ -224,14 +225,16 @@ def _hold_entries(log: RunLog, start_ns: int) -> int:
 
 
 def _late_share(log: RunLog, start_ns: int) -> float | None:
+    """Return the share of PD cycles that came late, %; a service that restarts counts anew."""
     late = cycles = 0
     for module in MODULES:
         states: list[JointState] = [
             row for row in log.messages(topics.JOINT_STATE, module) if row.t_ns >= start_ns
         ]
-        if len(states) > 1 and states[-1].cycle > states[0].cycle:
-            late += states[-1].late - states[0].late
-            cycles += states[-1].cycle - states[0].cycle
+        for before, after in pairwise(states):
+            if after.cycle > before.cycle:
+                late += after.late - before.late
+                cycles += after.cycle - before.cycle
     return 100.0 * late / cycles if cycles else None
 
 

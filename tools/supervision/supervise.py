@@ -165,8 +165,8 @@ class Fleet:
     def stop(self, *, keep_logs: bool = False) -> None:
         """Stop every service and the supervisor, and remove what they have made.
 
-        SIGTERM first, for suspended services too; SIGKILL for what does not end in its
-        time. Does nothing where no fleet is. Nothing is left in the run directory but the
+        Each by its own signal first, suspended ones too; SIGKILL for what does not end in
+        its time. Does nothing where no fleet is. Nothing is left in the run directory but the
         logs, if they are wanted, and files that are not the fleet's.
 
         Raises:
@@ -191,7 +191,8 @@ class Fleet:
             self._supervisor.call("shutdown")  # which by itself goes one by one
         except FleetError:
             # no supervisor, or none that answers: whatever is there is told directly
-            procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGTERM)
+            # (SIGINT: a joint service told so leaves its drive idle)
+            procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGINT)
         patience_s = (manifest.stop_s if manifest else 0.0) + 2.0
         left = procfs.wait_until_gone(self.run.path, patience_s)
         if left:

@@ -111,7 +111,7 @@ def _draw_pushes(axis: Any, rows: Sequence[Row], norm: BoundaryNorm) -> None:
             label="fell (on the edge), with its number",
         ),
     ]
-    axis.legend(handles=handles, loc="upper left", bbox_to_anchor=(-0.25, 1.12), fontsize=8)
+    axis.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.3, -0.12), fontsize=8)
 
 
 def _strongest_push(row: Row) -> float:

@@ -34,6 +34,26 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
     status: DriveStatus
     error: int
     """Error bits of both axes, or-ed."""
+    torque: Pair | None = None
+    """What the motors' own loops ask for, N m; known while a drive that was found armed is
+    waiting to be taken over."""
+
+
+class MotorTarget(msgspec.Struct, gc=False, frozen=True):
+    """What both motors' own loops are to do, axis0 and axis1 (design section 5).
+
+    torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel), no integrator.
+    """
+
+    pos_turns: Pair
+    vel_turns: Pair
+    """turn/s"""
+    torque: Pair
+    """Feedforward, N m at the motor."""
+    pos_gain: Pair
+    """1/s"""
+    vel_gain: Pair
+    """N m s/turn"""
 
 
 class Drive(Protocol):
@@ -49,8 +69,16 @@ class Drive(Protocol):
     def write_torque(self, torque: Pair) -> None:
         """Send motor torques in N m to axis0 and axis1, together; never blocks or raises."""
 
-    def arm(self) -> None:
-        """Ask for closed loop torque control on both axes; `status` tells when it is so."""
+    def write(self, target: MotorTarget) -> None:
+        """Send what both motors' own loops are to do, together; never blocks or raises."""
+
+    def arm(self, *, onboard: bool) -> None:
+        """Ask for closed loop control on both axes; `status` tells when it is so.
+
+        Args:
+            onboard: True for the motors' own position loop (`write`), with no gains at
+                first; False for torques only (`write_torque`).
+        """
 
     def idle(self) -> None:
         """Ask both axes to go idle."""

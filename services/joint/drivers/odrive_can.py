@@ -8,15 +8,26 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import isfinite
 from typing import Final
 
 import can
 
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers import odrive_frames
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.can_link import (
+    Receive,
+    Send,
+    drop,
+    message,
+    nothing,
+    receiver,
+    request_of,
+    sender,
+)
 from shared import cansimple
-from shared.cansimple import AxisError, AxisState, Command, ControlMode, InputMode
+from shared.cansimple import AxisError, AxisState, Command, ControlMode
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.config_sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
@@ -33,13 +44,16 @@ FEED_MS: Final = 1000
 """So long after `arm` reading feeds the watchdogs until the drive is ARMED: that shows
 only in the next heartbeat, and a watchdog may run out before it."""
 
+GAINS_MS: Final = 100
+"""Gains go to the drive when they change and this often: a frame may have been lost."""
+LOST_MS: Final = 100
+"""Silence of a drive without a watchdog after which it counts as lost."""
+
 _NMT_COMMAND = 0x000  # the firmware takes it as food for the watchdog and does nothing else
-_FRAMES_PER_READ = 512  # more than can wait in a socket; a flooded bus must not hold up the loop
 _BOTH = 0b11
 _unpack_estimates = struct.Struct("<ff").unpack_from
+_unpack_iq = struct.Struct("<ff").unpack_from
 _pack_torque = struct.Struct("<f").pack
-
-_Frame = tuple[int, bytes]
 
 
 class OdriveCan:
@@ -74,9 +88,10 @@ class OdriveCan:
         self._torque_max = drive.current_lim * drive.torque_constant
         # Not before its own watchdog has fired: until then a silent drive holds its last
         # torque and comes back as if nothing had been, while a FAULT is for good.
-        self._lost_after_ns = round(drive.watchdog_timeout * NS_PER_S)
-        self._torque_messages = [_message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in node_ids]
-        self._food = [_message(n, _NMT_COMMAND, b"") for n in node_ids]
+        lost_s = drive.watchdog_timeout or LOST_MS * 1e-3
+        self._lost_after_ns = round(lost_s * NS_PER_S)
+        self._torque_messages = [message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in node_ids]
+        self._food = [message(n, _NMT_COMMAND, b"") for n in node_ids]
         self._encoder_axis = {
             cansimple.arbitration_id(n, Command.GET_ENCODER_ESTIMATES): i
             for i, n in enumerate(node_ids)
@@ -84,9 +99,16 @@ class OdriveCan:
         self._heartbeat_axis = {
             cansimple.arbitration_id(n, Command.HEARTBEAT): i for i, n in enumerate(node_ids)
         }
+        self._iq_axis = {
+            cansimple.arbitration_id(n, Command.GET_IQ): i for i, n in enumerate(node_ids)
+        }
+        self._ask_iq = [request_of(n, Command.GET_IQ) for n in node_ids]
+        self._found: list[float | None] = [None, None]  # torques of a drive that was found armed
+        self._gains_sent: tuple[Pair, Pair] | None = None
+        self._gains_at_ns = 0
         self._bus: can.BusABC | None = None
-        self._receive: Callable[[float], Sequence[_Frame]] = _nothing
-        self._send: Callable[[Sequence[can.Message]], None] = _drop
+        self._receive: Receive = nothing
+        self._send: Send = drop
         self._retry_at_ns = 0
         self._believe_from_ns = 0
         self._feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
@@ -142,37 +164,47 @@ class OdriveCan:
         """Send both motor torques, N m, at most `current_lim`'s worth; not a number is zero."""
         messages = self._torque_messages
         limit = self._torque_max
-        for message, value in zip(messages, torque, strict=True):
+        for frame, value in zip(messages, torque, strict=True):
             if not -limit <= value <= limit:
                 value = limit if value > limit else -limit if value < -limit else 0.0  # noqa: PLW2901
-            message.data[:] = _pack_torque(value)
+            frame.data[:] = _pack_torque(value)
         if not self._transmit(messages):
             self.write_failures += 1
 
-    def arm(self) -> None:
-        """Ask for closed loop torque control on both axes.
+    def write(self, target: MotorTarget) -> None:
+        """Send what both motors' own loops are to do; gains before what they act on.
 
-        Errors are cleared and `input_torque` zeroed first: re-arming would otherwise
-        bring back the torque of before. `status` is IDLE until heartbeats tell more.
+        Over CAN velocity and torque travel in thousandths: 0.035 N m at the joint.
         """
-        limits = cansimple.pack_two_floats(self._drive.vel_limit, self._drive.current_lim)
-        modes = cansimple.pack_two_ints(ControlMode.TORQUE, InputMode.PASSTHROUGH)
-        closed_loop = cansimple.pack_u32(AxisState.CLOSED_LOOP_CONTROL)
-        self._request(
-            (Command.CLEAR_ERRORS, b""),
-            (Command.SET_CONTROLLER_MODE, modes),
-            (Command.SET_LIMITS, limits),
-            (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
-            (Command.SET_AXIS_STATE, closed_loop),
-        )
+        now = now_ns()
+        nodes = self._node_ids
+        messages: list[can.Message] = []
+        gains = (target.pos_gain, target.vel_gain)
+        if gains != self._gains_sent or now >= self._gains_at_ns:
+            if self._gains_sent is None:  # the first since connecting: taken over as it stands
+                messages += odrive_frames.modes(nodes, ControlMode.POSITION)
+            self._gains_sent, self._gains_at_ns = gains, now + GAINS_MS * NS_PER_MS
+            messages += odrive_frames.gains(nodes, target)
+        messages += odrive_frames.inputs(nodes, target)
+        if not self._transmit(messages):
+            self._gains_sent = None if self._bus is None else self._gains_sent
+            self._gains_at_ns = 0
+            self.write_failures += 1
+
+    def arm(self, *, onboard: bool) -> None:
+        """Ask for closed loop control on both axes; see `Drive.arm`.
+
+        Errors are cleared, and `input_torque` and the gains zeroed first: re-arming would
+        otherwise bring back the torque of before, and the gains the drive ships with have
+        an integrator. `status` is IDLE until heartbeats tell more.
+        """
+        self._request(*odrive_frames.arming(self._drive, onboard=onboard))
+        self._gains_sent = ((0.0, 0.0), (0.0, 0.0))
         self._feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
 
     def idle(self) -> None:
         """Ask both axes to go idle, with their input torque zeroed."""
-        self._request(
-            (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
-            (Command.SET_AXIS_STATE, cansimple.pack_u32(AxisState.IDLE)),
-        )
+        self._request(*odrive_frames.IDLING)
 
     def close(self) -> None:
         """Release the bus and stay away from it."""
@@ -186,9 +218,10 @@ class OdriveCan:
         self._was_armed = [False, False]
         self._status = DriveStatus.IDLE
         self._feed_until_ns = 0
+        self._found = [None, None]
         self._believe_from_ns = now_ns() + ARM_GRACE_MS * NS_PER_MS
         self._transmit(
-            [_message(node, command, data) for command, data in commands for node in self._node_ids]
+            [message(node, command, data) for command, data in commands for node in self._node_ids]
         )
 
     def _pump(self, timeout_s: float) -> None:
@@ -208,6 +241,8 @@ class OdriveCan:
                     self._fresh |= 1 << axis
             elif (axis := self._heartbeat_axis.get(can_id)) is not None and len(data) == 8:
                 self._hear(axis, data)
+            elif (axis := self._iq_axis.get(can_id)) is not None and len(data) == 8:
+                self._found[axis] = _unpack_iq(data)[0] * self._drive.torque_constant
 
     def _hear(self, axis: int, data: bytes) -> None:
         """Take in a heartbeat and work out the status."""
@@ -223,6 +258,8 @@ class OdriveCan:
         self._errors[axis] = errors
         self._was_armed[axis] |= closed_loop
         self._status = self._judge()
+        if self._status == DriveStatus.ARMED and self._gains_sent is None and None in self._found:
+            self._transmit(self._ask_iq)  # found armed: whoever takes it over asks for its torques
 
     def _judge(self) -> DriveStatus:
         """Return the status by the last heartbeats; axis_error 0 does not mean armed."""
@@ -251,7 +288,12 @@ class OdriveCan:
             (vel_0, vel_1),
             status,
             self._errors[0] | self._errors[1],
+            self._found_torque(),
         )
+
+    def _found_torque(self) -> Pair | None:
+        a, b = self._found
+        return (a, b) if a is not None and b is not None and self._gains_sent is None else None
 
     def _transmit(self, messages: Sequence[can.Message]) -> bool:
         """Hand messages to the bus; False if it did not take them all."""
@@ -284,10 +326,12 @@ class OdriveCan:
         self._bus = bus
         self.connections += 1
         self._fresh = 0
+        self._gains_sent = None
+        self._found = [None, None]
         if not self._has_sample or now - self._sample_ns > self._lost_after_ns:
             self._forget()
-        self._receive = getattr(bus, "recv_many", None) or _slow_receive(bus)
-        self._send = getattr(bus, "send_many", None) or _slow_send(bus)
+        self._receive = receiver(bus)
+        self._send = sender(bus)
         return True
 
     def _disconnect(self) -> None:
@@ -295,48 +339,5 @@ class OdriveCan:
         if self._bus is not None:
             self._bus.shutdown()
         self._bus = None
-        self._receive = _nothing
-        self._send = _drop
-
-
-def _message(node_id: int, command: int, data: bytes) -> can.Message:
-    """Return a frame to a node."""
-    return can.Message(
-        arbitration_id=cansimple.arbitration_id(node_id, command), data=data, is_extended_id=False
-    )
-
-
-def _nothing(_timeout_s: float) -> Sequence[_Frame]:
-    """Receive without a bus."""
-    return ()
-
-
-def _drop(_messages: Sequence[can.Message]) -> None:
-    """Send without a bus."""
-
-
-def _slow_receive(bus: can.BusABC) -> Callable[[float], Sequence[_Frame]]:
-    """Return `recv_many` for a bus that has none: one wait, then all that is there."""
-
-    def receive(timeout_s: float) -> Sequence[_Frame]:
-        frames: list[_Frame] = []
-        message = bus.recv(timeout_s)
-        while message is not None:
-            if not message.is_error_frame and not message.is_remote_frame:
-                frames.append((message.arbitration_id, bytes(message.data)))
-            if len(frames) >= _FRAMES_PER_READ:
-                break
-            message = bus.recv(0.0)
-        return frames
-
-    return receive
-
-
-def _slow_send(bus: can.BusABC) -> Callable[[Sequence[can.Message]], None]:
-    """Return `send_many` for a bus that has none."""
-
-    def send(messages: Sequence[can.Message]) -> None:
-        for message in messages:
-            bus.send(message, timeout=0.0)
-
-    return send
+        self._receive = nothing
+        self._send = drop

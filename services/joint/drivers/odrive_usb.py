@@ -1,0 +1,302 @@
+"""One ODrive v3 over USB and the `odrive` package, unmodified (design section 5).
+
+Threads. The rule is that a service has one; this driver is the exception. The package
+brings its own asyncio loop in a thread (and libodrive a second one under it), and a
+transfer may take 0.5 s to fail. So every transfer runs on the package's loop, and the
+control thread only swaps: it takes the newest sample and leaves the newest target. What
+crosses are references to frozen objects, each written by one side only.
+
+An exchange is one pipelined round trip, 200 times a second: a target waits up to 5 ms.
+That is for the drives' own loops; at 1 kHz use CAN.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable
+from concurrent.futures import CancelledError, Future
+from contextlib import suppress
+from math import isfinite
+from typing import Any, Final
+
+import msgspec
+from odrive.device_manager import DeviceManager, get_device_manager
+from odrive.runtime_device import RuntimeDevice
+
+from services.joint.drivers.axes_status import AxesStatus
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.odrive_v3 import ARM_SETTINGS, IDLE_SETTINGS, OdriveV3
+from shared.cansimple import AxisState, ControlMode, InputMode
+from shared.clock import NS_PER_MS, NS_PER_S, now_ns
+from shared.config_sections import DriveConfig
+from shared.exceptions import DriveError
+from shared.messages import Pair
+
+EXCHANGE_HZ: Final = 200
+"""More than a v3 board answers over USB helps nobody (design section 5)."""
+FEED_MS: Final = 1000
+"""So long after `arm` the watchdogs are fed without a target: the control loop waits."""
+LOST_S: Final = 0.1
+"""Silence of a drive without a watchdog after which it counts as lost."""
+RETRY_S: Final = 0.2
+"""Between two attempts to connect."""
+CLOSE_S: Final = 1.0
+"""So long `close` waits for a last request; it is not for the control path."""
+
+_ZERO = (0.0, 0.0)
+
+
+class _Request:
+    """What the control thread asks for; told apart from an earlier request by identity."""
+
+    def __init__(self, *, arm: bool) -> None:
+        self.arm = arm
+
+
+class OdriveUsb:
+    """Both axes of one ODrive; implements `services.joint.drivers.base.Drive`.
+
+    The drive is found by its serial number whenever it is plugged in; until then and
+    after it was pulled out the status is LOST. It is armed in position mode with the
+    gains at zero, so without a target there is no torque; `write_torque` is a target
+    with zero gains.
+
+    Watchdogs that the drive has on are fed with each new target, so a control loop that
+    hangs lets them fire.
+
+    Attributes:
+        write_failures: targets that were no numbers, or that no drive was there for.
+        connections: how often the drive was found and connected.
+        trouble: why the last connection failed or ended; "" at first.
+    """
+
+    def __init__(self, serial_number: str, drive: DriveConfig) -> None:
+        """Start to look for a drive by its serial number, 12 hexadecimal digits.
+
+        Raises:
+            DriveError: there is no libusb-1.0 on this system.
+        """
+        self.write_failures = 0
+        self.connections = 0
+        self.trouble = ""
+        self._drive = drive
+        self._serial_number = serial_number.upper()
+        self._torque_max = drive.current_lim * drive.torque_constant
+        # Not before its own watchdog has fired: until then a silent drive may come back as
+        # it was, while a FAULT is for good.
+        self._lost_after_ns = round((drive.watchdog_timeout or LOST_S) * NS_PER_S)
+        # Written by the control thread:
+        self._target: MotorTarget | None = None
+        self._request: _Request | None = None
+        self._closing = False
+        # Written by the package's loop:
+        self._sample = DriveReading(now_ns(), _ZERO, _ZERO, DriveStatus.LOST, 0)
+        self._fresh = threading.Event()
+        self._connected = False
+        self._carried_out: _Request | None = None
+        self._sent: MotorTarget | None = None
+        self._sent_gains: tuple[Pair, Pair] | None = None
+        self._axes = AxesStatus()
+        self._feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
+        try:
+            self._manager = get_device_manager(force_background_thread=True)
+        except OSError as error:
+            raise DriveError(
+                f"odrive: {error}; it needs the system's libusb-1.0: apt install libusb-1.0-0"
+            ) from error
+        self._task: Future[None] = asyncio.run_coroutine_threadsafe(
+            self._run(self._manager), self._manager.loop
+        )
+
+    # The control thread's side: nothing here waits for a transfer.
+
+    def read(self, timeout_s: float) -> DriveReading | None:
+        """Wait for the next sample of both axes; see `Drive.read`.
+
+        A reading with status LOST repeats the last sample and its time.
+        """
+        if self._fresh.wait(max(0.0, timeout_s)):
+            self._fresh.clear()
+            sample = self._sample
+            if self._request is not self._carried_out:  # it tells of the time before
+                return msgspec.structs.replace(sample, status=DriveStatus.IDLE, error=0)
+            return sample
+        sample = self._sample
+        if sample.status is not DriveStatus.LOST and (
+            now_ns() - sample.t_ns <= self._lost_after_ns
+        ):
+            return None
+        return msgspec.structs.replace(sample, status=DriveStatus.LOST, error=0)
+
+    def write_torque(self, torque: Pair) -> None:
+        """Leave both motor torques, N m, for the next exchange, with the gains at zero."""
+        self.write(MotorTarget(self._sample.pos_turns, _ZERO, torque, _ZERO, _ZERO))
+
+    def write(self, target: MotorTarget) -> None:
+        """Leave a target for the next exchange; the newest wins.
+
+        The feedforward is at most `current_lim`'s worth. A target that holds no number
+        is not sent: the drive goes on with the last.
+        """
+        fields = (*target.pos_turns, *target.vel_turns, *target.pos_gain, *target.vel_gain)
+        if not self._connected or not all(map(isfinite, (*fields, *target.torque))):
+            self.write_failures += 1
+            return
+        limit = self._torque_max
+        if max(map(abs, target.torque)) > limit:
+            first, second = (min(max(value, -limit), limit) for value in target.torque)
+            target = msgspec.structs.replace(target, torque=(first, second))
+        self._target = target
+
+    def arm(self, *, onboard: bool) -> None:  # noqa: ARG002 - see below
+        """Ask for closed loop on both axes; errors are cleared and the gains zeroed first.
+
+        It is position mode for `onboard` and for torques alike: with zero gains it asks for
+        the same torque, and torque mode would limit it by whatever vel_gain stands there.
+        Like `idle` it is forgotten if the drive is lost before: it is asked for again.
+        """
+        self._request = _Request(arm=True)
+
+    def idle(self) -> None:
+        """Ask both axes to go idle, with their input torque zeroed; see `arm`."""
+        self._request = _Request(arm=False)
+
+    def close(self) -> None:
+        """Carry out the last request if the drive is there, and release it."""
+        self._closing = True
+        try:
+            self._task.result(CLOSE_S)
+        except TimeoutError:
+            self._task.cancel()
+        except CancelledError:
+            return  # closed before
+
+    # The package's side: everything below runs on its loop.
+
+    async def _run(self, manager: DeviceManager) -> None:
+        """Connect, exchange, and begin again when the drive is gone; never raises."""
+        while not self._closing:
+            device: RuntimeDevice | None = None
+            try:
+                device = await self._find(manager)
+                if device is not None:
+                    board = OdriveV3(device)
+                    await board.find_watchdogs()
+                    # What was left for a drive that was not there is not for this one: it
+                    # may hold the robot by its own loop, and has no use for an old target.
+                    self._carried_out = self._request
+                    self._sent, self._sent_gains = self._target, None
+                    self._connected = True
+                    self.connections += 1
+                    await self._stay(board)
+            except Exception as error:  # noqa: BLE001 - the package raises bare Exceptions
+                self.trouble = f"{type(error).__name__}: {error}"
+                await asyncio.sleep(RETRY_S)
+            finally:
+                self._connected = False
+                if device is not None:
+                    with suppress(Exception):  # it may be gone already
+                        manager.release_connection(device)
+
+    async def _find(self, manager: DeviceManager) -> RuntimeDevice | None:
+        """Return the drive once it is plugged in and connected; None when closing."""
+        search = asyncio.ensure_future(
+            manager.wait_for(serial_number=self._serial_number, return_type=RuntimeDevice)
+        )
+        try:
+            while not self._closing:
+                await asyncio.wait((search,), timeout=RETRY_S)
+                if search.done():
+                    return search.result()
+        finally:
+            search.cancel()
+        return None
+
+    async def _stay(self, board: OdriveV3) -> None:
+        """Exchange at the rate until closing, or until a transfer fails."""
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        while not (self._closing and self._request is self._carried_out):
+            await self._exchange(board)
+            due = max(due + 1.0 / EXCHANGE_HZ, loop.time())
+            await asyncio.sleep(due - loop.time())
+
+    async def _exchange(self, board: OdriveV3) -> None:
+        """Carry out a request if there is one; then send the target and take a sample."""
+        request = self._request
+        if request is not None and request is not self._carried_out:
+            await self._carry_out(board, request)
+        operations: list[Awaitable[Any]] = [board.device.read_multiple(board.sample)]
+        found = self._request is None and self._target is None
+        target = self._target
+        if target is not None and target is not self._sent:
+            operations += self._send(board, target)
+        elif now_ns() < self._feed_until_ns:
+            operations += board.feed()
+        values = (await _together(operations))[0]
+        t_ns = now_ns()
+        states = values[2::3]
+        errors = 0
+        if any(state != AxisState.CLOSED_LOOP_CONTROL for state in states):
+            errors = self._axes.errors(
+                await board.device.read_multiple(board.errors),
+                wanted_armed=self._feed_until_ns != 0,
+            )
+        status = self._axes.judge(states, errors)
+        torque = None
+        if found and status is DriveStatus.ARMED:
+            first, second = await board.device.read_multiple(board.currents)
+            torque = (first * self._drive.torque_constant, second * self._drive.torque_constant)
+        pos, vel = values[0::3], values[1::3]
+        if all(map(isfinite, (*pos, *vel))):  # what is no number is no sample
+            self._sample = DriveReading(
+                t_ns, (pos[0], pos[1]), (vel[0], vel[1]), status, errors, torque
+            )
+            self._fresh.set()
+        self._carried_out = request  # not before there is a sample of the time after it
+
+    def _send(self, board: OdriveV3, target: MotorTarget) -> list[Awaitable[Any]]:
+        """Return the operations that send a target: inputs, gains if they changed, food."""
+        axes = zip(target.pos_turns, target.vel_turns, target.torque, strict=True)
+        values = [value for axis in axes for value in axis]
+        properties = board.inputs
+        gains = (target.pos_gain, target.vel_gain)
+        if gains != self._sent_gains:
+            properties = board.inputs + board.gains
+            values += [value for axis in zip(*gains, strict=True) for value in axis]
+            self._sent_gains = gains
+        self._sent = target
+        return [board.write(properties, values), *board.feed()]
+
+    async def _carry_out(self, board: OdriveV3, request: _Request) -> None:
+        """Arm or idle both axes; what they reported before is forgotten."""
+        if request.arm:
+            drive = self._drive
+            await board.device.call_function("clear_errors")
+            await board.write_both(
+                ARM_SETTINGS,
+                (
+                    *(ControlMode.POSITION, InputMode.PASSTHROUGH),
+                    *(drive.vel_limit, drive.current_lim),
+                    *(0.0, 0.0, 0.0, 0.0, 0.0),
+                ),
+            )
+            await _together(board.feed())
+            await board.write_both(("requested_state",), (AxisState.CLOSED_LOOP_CONTROL,))
+            self._feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
+            self._sent = self._target  # it was for the time before
+        else:
+            await board.write_both(IDLE_SETTINGS, (0.0, AxisState.IDLE))
+            self._feed_until_ns = 0
+        self._sent_gains = None
+        self._axes = AxesStatus()
+
+
+async def _together(operations: list[Awaitable[Any]]) -> list[Any]:
+    """Await all operations, in flight at once; then raise the first failure, if any."""
+    results = await asyncio.gather(*operations, return_exceptions=True)
+    for result in results:
+        if isinstance(result, BaseException):
+            raise result
+    return results

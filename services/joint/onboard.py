@@ -1,0 +1,75 @@
+"""The local law split once more, between joint service and drive (design section 5). Pure.
+
+Each motor's own loop holds a module's mean stiffness and damping about the references; the
+rest (the difference of the two axes, the feedforward, what the gate took off) goes in as
+torque, worked out for the sample at hand. So at every sample the drive gives the very torque
+that the service asks for, and between samples, and when the service has died, its own law
+
+    torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel)
+
+goes on. In motor space a module's stiffness is 1/4N^2 [[k1 + k2, k1 - k2], [k1 - k2, k1 + k2]]
+per rad, with k1 and k2 of theta and phi.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from services.joint.differential import motor_from_joint, motor_torque
+from services.joint.drivers.base import MotorTarget
+from services.joint.law import Setpoint
+from shared.messages import Pair
+
+GAIN_CHANGE: Final = 0.02
+"""Gains that have changed by less than this share are left as they are on the drive: what is
+missing goes in as torque, and the bus is spared."""
+POS_GAIN_MAX: Final = 400.0
+"""1/s; a stiffness with hardly a damping is given the damping that this asks for."""
+
+
+class OnboardLaw:
+    """Makes the drive's targets; remembers the gains that the drive has."""
+
+    def __init__(self, gear_ratio: float, vel_limit: float) -> None:
+        """Take the gear ratio N and the drive's velocity limit, turn/s."""
+        self._gear_ratio = gear_ratio
+        self._per_turn = 2.0 * math.pi / (4.0 * gear_ratio * gear_ratio)
+        self._vel_limit = vel_limit
+        self._stiffness = 0.0
+        self._vel_gain = 0.0
+
+    def target(self, setpoint: Setpoint, tau: Pair, pos: Pair, vel: Pair) -> MotorTarget:
+        """Return the target under which the motors give the joint torques tau at this sample.
+
+        Args:
+            setpoint: the local law of this instant.
+            tau: joint torques (phi, theta) that are to act now, N m, after the gate.
+            pos: motor positions of the sample, turns.
+            vel: motor velocities of the sample, turn/s.
+        """
+        s = setpoint
+        self._follow(self._per_turn * (s.k_p[0] + s.k_p[1]), self._per_turn * (s.k_d[0] + s.k_d[1]))
+        vel_gain = self._vel_gain
+        pos_gain = self._stiffness / vel_gain if vel_gain > 0.0 else 0.0
+        pos_ref = motor_from_joint(s.q_ref, self._gear_ratio)
+        vel_ref = motor_from_joint(s.v_ref, self._gear_ratio)
+        wanted = motor_torque(tau, self._gear_ratio)
+        limit = self._vel_limit
+        a = min(limit, max(-limit, vel_ref[0] + pos_gain * (pos_ref[0] - pos[0]))) - vel[0]
+        b = min(limit, max(-limit, vel_ref[1] + pos_gain * (pos_ref[1] - pos[1]))) - vel[1]
+        return MotorTarget(
+            pos_ref,
+            vel_ref,
+            (wanted[0] - vel_gain * a, wanted[1] - vel_gain * b),
+            (pos_gain, pos_gain),
+            (vel_gain, vel_gain),
+        )
+
+    def _follow(self, stiffness: float, damping: float) -> None:
+        """Take over gains that have changed by more than `GAIN_CHANGE`; N m and N m s a turn."""
+        damping = max(damping, stiffness / POS_GAIN_MAX)
+        if abs(stiffness - self._stiffness) > GAIN_CHANGE * self._stiffness:
+            self._stiffness = stiffness
+        if abs(damping - self._vel_gain) > GAIN_CHANGE * self._vel_gain:
+            self._vel_gain = damping

@@ -1,0 +1,125 @@
+"""The DC bus of each emulated ODrive: what its motors draw, and what they push back.
+
+A supply of constant voltage behind a resistance that takes current both ways, as a battery
+does. The current is that of the mechanical power and the copper losses:
+I_bus = sum(torque 2 pi vel + 1.5 R Iq^2) / V_bus, Iq = torque / torque_constant; the 1.5 is
+of the firmware's amplitude-invariant currents. A brake resistor takes what is pushed back
+beyond `max_regen_current`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.axis_settings import N_DRIVES, Settings
+from shared.joints import N_JOINTS
+
+Vector = NDArray[np.float64]
+
+SUPPLY_VOLTAGE: Final = 48.0
+SUPPLY_RESISTANCE: Final = 0.05
+"""ohm, of battery and cable; assumed."""
+DEAD_VOLTAGE: Final = 6.0
+"""V; below it the processor stops as well."""
+BRAKE_DUTY_MAX: Final = 0.95
+_TURN: Final = 2.0 * math.pi
+
+
+class DcBus:
+    """Voltages and currents of the six ODrives.
+
+    Attributes:
+        supply: voltage of each supply (6,), V.
+        resistance: of each supply (6,), ohm.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._seen = -1
+        self.supply = np.full(N_DRIVES, SUPPLY_VOLTAGE)
+        self.resistance = np.full(N_DRIVES, SUPPLY_RESISTANCE)
+        self._power = np.zeros(N_JOINTS)
+        self._mechanical = np.zeros(N_JOINTS)
+
+    def changed(self) -> None:
+        """Say that a supply has been changed."""
+        self._seen = -1
+
+    def check(self, torque: Vector, vel_turns: Vector) -> dict[int, str]:
+        """Take the motors' power of this instant; return the drives that trip, and why.
+
+        Args:
+            torque: of the motors (12,), N m; 0 where the phases float.
+            vel_turns: of the motors (12,), turn/s.
+
+        Returns:
+            For each drive (0 .. 5) that its limits disarm, a name in `BUS_FAULTS`.
+        """
+        if self._seen != self._settings.version:
+            self._derive()
+        power, mechanical = self._power, self._mechanical
+        np.multiply(vel_turns, _TURN, out=mechanical)
+        mechanical *= torque
+        np.multiply(torque, torque, out=power)
+        power *= self._copper
+        power += mechanical
+        near = np.count_nonzero(power < self._least) or np.count_nonzero(power > self._most)
+        return self._trips() if near or self._always else {}
+
+    def state(self, drive: int) -> tuple[float, float]:
+        """Return a drive's bus voltage in V and current in A, positive: drawn."""
+        voltage, current = self._solve()
+        return float(voltage[drive]), float(current[drive])
+
+    def powers(self, axis: int) -> tuple[float, float]:
+        """Return an axis's electrical and mechanical power in W, as the last check had them."""
+        return float(self._power[axis]), float(self._mechanical[axis])
+
+    def _derive(self) -> None:
+        """Work out constants, and the power below which no limit can be near."""
+        settings = self._settings
+        self._seen = settings.version
+        kt = settings.axis("motor.config.torque_constant")
+        self._copper = 1.5 * settings.axis("motor.config.phase_resistance") / kt**2
+        self._lowest = settings.drive("config.dc_bus_undervoltage_trip_level").copy()
+        self._highest = settings.drive("config.dc_bus_overvoltage_trip_level").copy()
+        self._negative = settings.drive("config.dc_max_negative_current").copy()
+        self._positive = settings.drive("config.dc_max_positive_current").copy()
+        braking = settings.drive("config.enable_brake_resistor") > 0.0
+        brake = settings.drive("config.brake_resistance")
+        self._brake_max = np.where(braking, BRAKE_DUTY_MAX / brake, 0.0)  # A per V
+        self._regen_free = settings.drive("config.max_regen_current").copy()
+        # Each axis may do half of what a drive may, less a half for the voltage's own change.
+        resistance = np.maximum(self.resistance, 1e-6)
+        push = np.minimum(-self._negative, (self._highest - self.supply) / resistance)
+        draw = np.minimum(self._positive, (self.supply - self._lowest) / resistance)
+        self._always = bool((push <= 0.0).any() or (draw <= 0.0).any())
+        self._least = -0.25 * float((push * self.supply).min())
+        self._most = 0.25 * float((draw * self.supply).min())
+
+    def _solve(self) -> tuple[Vector, Vector]:
+        """Return voltages and currents (6,) for the power of the last check."""
+        if self._seen != self._settings.version:
+            self._derive()
+        power = self._power[0::2] + self._power[1::2]
+        # V = supply - R I and V I = P: the higher root; beyond the supply's peak, half of it
+        root = np.maximum(self.supply**2 - 4.0 * self.resistance * power, 0.0)
+        voltage = 0.5 * (self.supply + np.sqrt(root))
+        current = np.divide(power, voltage, out=np.zeros(N_DRIVES), where=voltage > 1.0)
+        surplus = np.maximum(-current - self._regen_free, 0.0)
+        current += np.minimum(surplus, self._brake_max * voltage)
+        return self.supply - self.resistance * current, current
+
+    def _trips(self) -> dict[int, str]:
+        voltage, current = self._solve()
+        limits = (
+            ("OVER_CURRENT", current > self._positive),
+            ("OVER_REGEN_CURRENT", current < self._negative),
+            ("UNDER_VOLTAGE", voltage < self._lowest),
+            ("OVER_VOLTAGE", voltage > self._highest),
+        )
+        return {int(drive): name for name, beyond in limits for drive in np.flatnonzero(beyond)}

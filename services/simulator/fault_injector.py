@@ -1,0 +1,68 @@
+"""Acts on a scenario's faults: brings the emulated drives into what each kind is, and out again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from services.simulator.axis_bank import AxisBank
+from services.simulator.axis_conditions import OVER_TEMP_MARGIN, ROOM_TEMPERATURE
+from services.simulator.axis_faults import AXIS_NAMES
+from services.simulator.dc_bus import SUPPLY_VOLTAGE
+from shared.joints import MODULE_INDEX
+from shared.scenario import Fault
+
+_AT_ONCE: Final = {"watchdog": "WATCHDOG", "disarmed": "DISARM", "overspeed": "OVERSPEED"}
+"""Kinds that are of a moment, and the fault of the bank that each is."""
+_ABOVE: Final = 5.0
+"""V and C beyond the limit that is passed."""
+
+
+class FaultInjector:
+    """The faults of a run, and which of them have begun."""
+
+    def __init__(self, faults: Sequence[Fault], bank: AxisBank) -> None:
+        """Take the faults in any order."""
+        self._bank = bank
+        self._coming = sorted(faults, key=lambda fault: fault.at)
+        self._lasting: list[Fault] = []
+
+    def advance(self, scenario_s: float) -> list[Fault]:
+        """Begin what is due at scenario time, end what is over; return what has begun."""
+        if not self._coming and not self._lasting:
+            return []
+        for fault in [row for row in self._lasting if scenario_s >= row.at + row.lasts_s]:
+            self._lasting.remove(fault)
+            self._act(fault, begins=False)
+        begun = [fault for fault in self._coming if fault.at <= scenario_s]
+        for fault in begun:
+            self._coming.remove(fault)
+            if fault.kind in _AT_ONCE:
+                self._bank.inject(AXIS_NAMES[axis_of(fault)], _AT_ONCE[fault.kind])
+            else:
+                self._lasting.append(fault)
+                self._act(fault, begins=True)
+        return begun
+
+    def _act(self, fault: Fault, *, begins: bool) -> None:
+        """Bring a drive into a lasting fault, or out of it."""
+        bank, axis = self._bank, axis_of(fault)
+        drive = axis >> 1
+        if fault.kind == "over_temperature":
+            limit = bank.settings.axis("motor.fet_thermistor.config.temp_limit_upper")[axis]
+            hot = float(limit) + OVER_TEMP_MARGIN + _ABOVE
+            bank.conditions.heat(axis, hot if begins else ROOM_TEMPERATURE)
+        elif fault.kind == "encoder":
+            bank.conditions.lose_encoder(axis, lost=begins)
+        elif fault.kind == "link_lost":
+            bank.conditions.link(drive, up=not begins)
+        elif fault.kind == "over_voltage":
+            limit = bank.settings.drive("config.dc_bus_overvoltage_trip_level")[drive]
+            bank.supply(drive, float(limit) + _ABOVE if begins else SUPPLY_VOLTAGE)
+        else:
+            bank.supply(drive, 0.0 if begins else SUPPLY_VOLTAGE)
+
+
+def axis_of(fault: Fault) -> int:
+    """Return the axis (0 .. 11) that a fault is of; of the whole ODrive, its first."""
+    return 2 * MODULE_INDEX[fault.module] + (fault.axis or 0)

@@ -1,0 +1,110 @@
+"""The onboard loop: drive and service hold one law between them (design section 5)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.joint.differential import joint_torque, motor_from_joint
+from services.joint.drivers.base import MotorTarget
+from services.joint.law import ZERO, Setpoint
+from services.joint.onboard import GAIN_CHANGE, POS_GAIN_MAX, OnboardLaw
+from shared.messages import Pair
+
+N = 17.5
+VEL_LIMIT = 60.0
+
+angle = st.floats(-3.0, 3.0)
+rate = st.floats(-5.0, 5.0)
+gain = st.floats(0.0, 6000.0)
+damping = st.floats(0.0, 400.0)
+torque = st.floats(-115.0, 115.0)
+
+
+def pairs(values: st.SearchStrategy[float]) -> st.SearchStrategy[Pair]:
+    return st.tuples(values, values)
+
+
+setpoints = st.builds(
+    Setpoint, pairs(angle), pairs(rate), pairs(torque), pairs(torque), pairs(gain), pairs(damping)
+)
+
+
+def firmware(target: MotorTarget, pos: Pair, vel: Pair) -> Pair:
+    """Return the motors' torques by the firmware's law, as its documentation writes it, N m."""
+    torques = []
+    for i in range(2):
+        wanted = target.vel_turns[i] + target.pos_gain[i] * (target.pos_turns[i] - pos[i])
+        wanted = max(-VEL_LIMIT, min(VEL_LIMIT, wanted))
+        torques.append(target.torque[i] + target.vel_gain[i] * (wanted - vel[i]))
+    return torques[0], torques[1]
+
+
+@given(setpoints, pairs(angle), pairs(rate), pairs(torque))
+def test_the_drive_gives_the_torque_that_the_service_asks_for(
+    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
+) -> None:
+    """At the sample, for any gains, references and rates, whatever the clamp does."""
+    pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
+    target = OnboardLaw(N, VEL_LIMIT).target(setpoint, tau, pos, vel)
+    np.testing.assert_allclose(joint_torque(firmware(target, pos, vel), N), tau, atol=1e-7)
+
+
+@given(st.lists(setpoints, min_size=2, max_size=5), pairs(angle), pairs(torque))
+def test_it_does_so_with_the_gains_that_the_drive_happens_to_have(
+    course: list[Setpoint], q: Pair, tau: Pair
+) -> None:
+    law = OnboardLaw(N, VEL_LIMIT)
+    pos = motor_from_joint(q, N)
+    for setpoint in course:
+        target = law.target(setpoint, tau, pos, ZERO)
+        np.testing.assert_allclose(joint_torque(firmware(target, pos, ZERO), N), tau, atol=1e-7)
+
+
+@given(pairs(st.floats(1.0, 1500.0)), pairs(st.floats(8.0, 200.0)), pairs(torque))
+def test_with_the_service_gone_the_module_holds_with_the_mean_of_its_two_axes(
+    k_p: Pair, k_d: Pair, tau: Pair
+) -> None:
+    """And carries on with the last torque: the target stays, only the motors move."""
+    setpoint = Setpoint((0.1, -1.0), ZERO, ZERO, ZERO, k_p, k_d)
+    at = motor_from_joint(setpoint.q_ref, N)
+    target = OnboardLaw(N, VEL_LIMIT).target(setpoint, tau, at, ZERO)
+    mean_p, mean_d = sum(k_p) / 2.0, sum(k_d) / 2.0
+    for axis in range(2):
+        e = np.eye(2)[axis]
+        moved = motor_from_joint((0.1 + 1e-4 * e[0], -1.0 + 1e-4 * e[1]), N)
+        held = np.subtract(joint_torque(firmware(target, moved, ZERO), N), tau) / 1e-4
+        np.testing.assert_allclose(held, -mean_p * e, rtol=1e-4, atol=0.05)
+        turning = motor_from_joint((1e-3 * e[0], 1e-3 * e[1]), N)
+        damped = np.subtract(joint_torque(firmware(target, at, turning), N), tau) / 1e-3
+        np.testing.assert_allclose(damped, -mean_d * e, rtol=1e-4, atol=0.05)
+
+
+def test_small_changes_of_the_gains_are_not_sent_and_large_ones_are() -> None:
+    law = OnboardLaw(N, VEL_LIMIT)
+    sent = []
+    for share in (1.0, 1.0 + 0.9 * GAIN_CHANGE, 1.0 + 1.1 * GAIN_CHANGE):
+        k_p = (500.0 * share, 700.0 * share)
+        setpoint = Setpoint(ZERO, ZERO, ZERO, ZERO, k_p, (5.0, 7.0))
+        sent.append(law.target(setpoint, ZERO, ZERO, ZERO).pos_gain)
+    assert sent[0] == sent[1] != sent[2]
+
+
+@pytest.mark.parametrize("k_d", [0.0, 1e-6])
+def test_stiffness_without_damping_gets_a_little_and_no_endless_position_gain(k_d: float) -> None:
+    setpoint = Setpoint((0.0, 0.5), ZERO, ZERO, ZERO, (100.0, 50.0), (k_d, k_d))
+    target = OnboardLaw(N, VEL_LIMIT).target(setpoint, ZERO, ZERO, ZERO)
+    assert max(target.pos_gain) <= POS_GAIN_MAX + 1e-9
+    stiffness = target.pos_gain[0] * target.vel_gain[0] * (2 * N) ** 2 / (2 * math.pi)
+    assert stiffness == pytest.approx(150.0)
+
+
+def test_without_any_gains_only_torque_is_left() -> None:
+    setpoint = Setpoint((0.1, 0.2), (1.0, 1.0), ZERO, ZERO, ZERO, ZERO)
+    target = OnboardLaw(N, VEL_LIMIT).target(setpoint, (3.0, -4.0), (1.0, 2.0), (3.0, 4.0))
+    assert target.vel_gain == (0.0, 0.0)
+    assert joint_torque(target.torque, N) == pytest.approx((3.0, -4.0))

@@ -1,0 +1,49 @@
+"""An emulated bank of drives for tests, stepped at a millisecond."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.axis_bank import AxisBank
+from shared.cansimple import AxisState, ControlMode, InputMode
+from shared.config_sections import DriveConfig
+
+DRIVE = DriveConfig(
+    torque_constant=0.0827,
+    current_lim=60.0,
+    vel_limit=60.0,
+    watchdog_timeout=0.1,
+    encoder_period_ms=1,
+    heartbeat_period_ms=100,
+)
+CPR = 16384
+DT = 0.001
+ZERO = np.zeros(12)
+
+
+def make_bank(
+    mode: ControlMode = ControlMode.TORQUE, *, watchdog: bool = False, turns: float = 0.0
+) -> AxisBank:
+    """Return a bank with all axes in closed loop at a position, at time 0."""
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=watchdog)
+    bank.step(0.0, ZERO + turns, ZERO)
+    for axis in range(12):
+        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
+        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+    assert bank.state == [AxisState.CLOSED_LOOP_CONTROL] * 12
+    return bank
+
+
+def step_for(
+    bank: AxisBank,
+    seconds: float,
+    pos: NDArray[np.float64] = ZERO,
+    vel: NDArray[np.float64] = ZERO,
+) -> NDArray[np.float64]:
+    """Step the bank on, moving at `vel` from `pos`; return the last torque."""
+    start_s = bank.now_s
+    torque = ZERO
+    for k in range(1, round(seconds / DT) + 1):
+        torque = bank.step(start_s + k * DT, pos + vel * k * DT, vel).copy()
+    return torque

@@ -1,0 +1,260 @@
+"""The CAN front of the emulated drives: both dialects, silence, periods."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from services.simulator.axis_faults import BUS_FAULTS, FAULTS
+from services.simulator.cansimple_dialects import (
+    SDO_ENDPOINTS,
+    VERSION_06,
+    DialectName,
+    errors_06,
+)
+from services.simulator.cansimple_front import CanSimpleFront
+from shared import cansimple, cansimple_06
+from shared.cansimple import AxisState, Command, arbitration_id
+from shared.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode
+from shared.unix_can import REMOTE_FLAG, UnixCanBus
+from shared.unix_can_hub import UnixCanHub
+from tests.simulator.banks import DT, ZERO, make_bank
+
+NODE, AXIS = 5, 3  # axis1 of knee_right
+
+
+class Bench:
+    """Two axes of a bank on a bus, and a client on it."""
+
+    def __init__(self, path: Path, dialect: DialectName) -> None:
+        self.hub = UnixCanHub(path)
+        self.bank = make_bank()
+        self.front = CanSimpleFront(self.bank, [self.hub], [{4: 2, NODE: AXIS}], dialect=dialect)
+        self.client = UnixCanBus(str(path))
+        self.front.receive()  # admits the client
+
+    def send(self, command: int, data: bytes = b"", *, remote: bool = False) -> None:
+        self.client.send(
+            can.Message(
+                arbitration_id=arbitration_id(NODE, command),
+                data=data,
+                is_extended_id=False,
+                is_remote_frame=remote,
+            )
+        )
+        self.front.receive()
+
+    def heard(self) -> list[tuple[int, bytes]]:
+        return [(can_id & ~REMOTE_FLAG, data) for can_id, data in self.client.recv_many(0.0)]
+
+    def ask(self, command: int) -> bytes:
+        self.send(command, remote=True)
+        ((can_id, data),) = self.heard()
+        assert can_id == arbitration_id(NODE, command)
+        return data
+
+    def heartbeat(self) -> bytes:
+        self.front.send_heartbeats(self.bank.now_s)
+        return dict(self.heard())[arbitration_id(NODE, Command.HEARTBEAT)]
+
+    def step(self, seconds: float = DT) -> None:
+        self.bank.step(self.bank.now_s + seconds, ZERO, ZERO)
+
+
+@pytest.fixture
+def directory() -> Iterator[Path]:
+    directory = Path(tempfile.mkdtemp(dir="/tmp"))
+    yield directory
+    shutil.rmtree(directory)
+
+
+def bench(directory: Path, dialect: DialectName) -> Iterator[Bench]:
+    made = Bench(directory / "can.sock", dialect)
+    yield made
+    made.client.shutdown()
+    made.hub.close()
+
+
+@pytest.fixture
+def old(directory: Path) -> Iterator[Bench]:
+    yield from bench(directory, "0.5")
+
+
+@pytest.fixture
+def new(directory: Path) -> Iterator[Bench]:
+    yield from bench(directory, "0.6")
+
+
+# ---- dialects
+
+
+def test_a_drive_of_0_6_tells_its_version_and_one_of_0_5_says_nothing(
+    new: Bench, directory: Path
+) -> None:
+    assert cansimple_06.unpack_version(new.ask(Command06.GET_VERSION)) == VERSION_06
+    old = Bench(directory / "old.sock", "0.5")
+    old.send(Command06.GET_VERSION, remote=True)
+    assert old.heard() == []
+    old.client.shutdown()
+    old.hub.close()
+
+
+def test_the_same_fault_is_told_in_each_dialects_own_bits(old: Bench, directory: Path) -> None:
+    new = Bench(directory / "new.sock", "0.6")
+    for each in (old, new):
+        each.bank.inject("knee_right.axis1", "WATCHDOG")
+    said = cansimple.unpack_heartbeat(old.heartbeat())
+    assert (said.axis_error, said.axis_state) == (0x800, AxisState.IDLE)
+    said_06 = cansimple_06.unpack_heartbeat(new.heartbeat())
+    assert (said_06.axis_error, said_06.axis_state) == (0x0100_0000, AxisState.IDLE)
+    assert said_06.procedure_result == ProcedureResult.DISARMED
+    assert cansimple_06.unpack_error(new.ask(Command06.GET_ERROR)) == (0x0100_0000, 0x0100_0000)
+    new.client.shutdown()
+    new.hub.close()
+
+
+@pytest.mark.parametrize("name", [*FAULTS, *BUS_FAULTS])
+def test_every_fault_but_the_silent_one_has_a_bit_in_0_6(name: str) -> None:
+    errors = errors_06({**FAULTS, **BUS_FAULTS}[name])
+    assert (errors == DriveError06.NONE) == (name == "DISARM")
+
+
+def test_a_heartbeat_of_0_6_is_busy_in_closed_loop_and_a_success_in_idle(new: Bench) -> None:
+    assert cansimple_06.unpack_heartbeat(new.heartbeat()).procedure_result == ProcedureResult.BUSY
+    new.bank.request_state(AXIS, AxisState.IDLE)
+    new.step(0.2)
+    said = cansimple_06.unpack_heartbeat(new.heartbeat())
+    assert said.procedure_result == ProcedureResult.SUCCESS
+    assert said.trajectory_done
+
+
+def test_set_points_and_gains_are_taken_alike_in_both_dialects(old: Bench, directory: Path) -> None:
+    new = Bench(directory / "new.sock", "0.6")
+    for each in (old, new):
+        each.send(Command.SET_INPUT_POS, struct.pack("<fhh", 1.5, 250, -500))
+        each.send(Command.SET_VEL_GAINS, struct.pack("<ff", 0.5, 0.0))
+        each.send(Command.SET_LIMITS, struct.pack("<ff", 30.0, 20.0))
+        bank = each.bank
+        got = (bank.input_pos[AXIS], bank.input_vel[AXIS], bank.input_torque[AXIS])
+        assert got == (1.5, 0.25, -0.5)
+        assert (bank.vel_gain[AXIS], bank.vel_limit[AXIS]) == (0.5, 30.0)
+    new.client.shutdown()
+    new.hub.close()
+
+
+# ---- endpoints
+
+
+def endpoint(name: str) -> int:
+    return next(number for number, each in SDO_ENDPOINTS.items() if each == name)
+
+
+def read(bench: Bench, name: str) -> bytes:
+    bench.send(Command06.RX_SDO, cansimple_06.pack_sdo(SdoOpcode.READ, endpoint(name)))
+    ((can_id, data),) = bench.heard()
+    assert can_id == arbitration_id(NODE, Command06.TX_SDO)
+    _, number, value = cansimple_06.unpack_sdo(data)
+    assert number == endpoint(name)
+    return value
+
+
+def test_an_endpoint_is_written_for_the_axis_asked_and_read_back(new: Bench) -> None:
+    name = "controller.config.vel_limit"
+    written = cansimple_06.pack_sdo(SdoOpcode.WRITE, endpoint(name), struct.pack("<f", 7.5))
+    new.send(Command06.RX_SDO, written)
+    assert new.heard() == [], "a write has no answer"
+    assert new.bank.vel_limit[AXIS] == 7.5
+    assert new.bank.vel_limit[AXIS - 1] == 60.0
+    assert struct.unpack("<f", read(new, name)) == (7.5,)
+
+
+def test_endpoints_come_in_their_own_types(new: Bench) -> None:
+    assert read(new, "motor.config.pre_calibrated")[0] == 1
+    assert struct.unpack("<I", read(new, "encoder.config.cpr")) == (16384,)
+    assert struct.unpack("<f", read(new, "vbus_voltage")) == (48.0,)
+
+
+def test_an_endpoint_that_does_not_exist_and_a_value_that_is_no_number_change_nothing(
+    new: Bench,
+) -> None:
+    before = new.bank.settings.table(1)
+    new.send(Command06.RX_SDO, cansimple_06.pack_sdo(SdoOpcode.READ, 60_000))
+    nan = struct.pack("<f", float("nan"))
+    number = endpoint("controller.config.vel_limit")
+    new.send(Command06.RX_SDO, cansimple_06.pack_sdo(SdoOpcode.WRITE, number, nan))
+    new.send(Command06.RX_SDO, b"\x01")
+    assert new.heard() == []
+    assert new.bank.settings.table(1) == before
+
+
+def test_in_0_5_the_same_frame_asks_for_the_encoders_error(old: Bench) -> None:
+    old.bank.inject("knee_right.axis1", "ENCODER")
+    assert old.ask(Command.GET_ENCODER_ERROR) == struct.pack("<II", 4, 0)
+
+
+# ---- silence
+
+
+@pytest.mark.parametrize("why", ["link", "supply"])
+def test_a_drive_that_does_not_talk_neither_sends_nor_hears_nor_feeds(old: Bench, why: str) -> None:
+    if why == "link":
+        old.bank.conditions.link(AXIS // 2, up=False)
+    else:
+        old.bank.supply(AXIS // 2, 0.0)
+    old.step(0.5)
+    old.front.send_encoders()
+    old.front.send_heartbeats(old.bank.now_s)
+    old.send(Command.SET_INPUT_TORQUE, struct.pack("<f", 1.0))
+    old.send(Command.GET_IQ, remote=True)
+    assert old.heard() == []
+    assert old.bank.input_torque[AXIS] == 0.0
+
+
+def test_a_drive_sends_again_when_its_cable_is_back(old: Bench) -> None:
+    old.bank.conditions.link(AXIS // 2, up=False)
+    old.step()
+    old.front.send_encoders()
+    old.bank.conditions.link(AXIS // 2, up=True)
+    old.step()
+    old.front.send_encoders()
+    assert len(old.heard()) == 2
+
+
+# ---- periods
+
+
+def test_estimates_are_sent_as_often_as_each_axis_is_set_to(old: Bench) -> None:
+    old.bank.settings.set(1, "axis0.config.can.encoder_rate_ms", 10)
+    counts = {arbitration_id(node, Command.GET_ENCODER_ESTIMATES): 0 for node in (4, NODE)}
+    for _ in range(100):
+        old.step()
+        old.front.send_encoders()
+        for can_id, _ in old.heard():
+            counts[can_id] += 1
+    assert list(counts.values()) == [10, 100]
+
+
+def test_a_period_of_zero_is_never(old: Bench) -> None:
+    old.bank.settings.fill("config.can.encoder_rate_ms", 0)
+    old.bank.settings.fill("config.can.heartbeat_rate_ms", 0)
+    counted = 0
+    for _ in range(50):
+        old.step()
+        old.front.send_encoders()
+        old.front.send_heartbeats(old.bank.now_s)
+        counted += len(old.heard())
+    assert counted == 0
+    old.bank.settings.fill("config.can.encoder_rate_ms", 1)
+    old.step()
+    old.front.send_encoders()
+    assert len(old.heard()) == 2
+
+
+def test_the_node_ids_stand_in_the_settings(old: Bench) -> None:
+    assert old.bank.settings.get(1, "axis1.config.can.node_id") == NODE

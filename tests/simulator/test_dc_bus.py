@@ -1,0 +1,103 @@
+"""The DC bus: current by power, and what braking legs trip."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from services.simulator.axis_settings import PHASE_RESISTANCE
+from services.simulator.dc_bus import SUPPLY_RESISTANCE, SUPPLY_VOLTAGE
+from shared.cansimple import AxisState, MotorError, OdriveError
+from tests.simulator.banks import DT, make_bank, step_for
+
+KT = 0.0827
+FAST = np.zeros(12)
+FAST[4] = 20.0  # turn/s, axis0 of hip_right
+
+
+def braking(torque: float) -> tuple[float, float]:
+    """Return power and bus current of one axis at FAST, worked out from the equations."""
+    mechanical = torque * 2.0 * math.pi * FAST[4]
+    copper = 1.5 * PHASE_RESISTANCE * (torque / KT) ** 2
+    power = mechanical + copper
+    voltage = SUPPLY_VOLTAGE
+    for _ in range(50):  # V = supply - R P / V, by repetition
+        voltage = SUPPLY_VOLTAGE - SUPPLY_RESISTANCE * power / voltage
+    return power, power / voltage
+
+
+@pytest.mark.parametrize("torque", [1.0, -1.0, -3.0, 0.0])
+def test_the_bus_current_is_that_of_mechanical_power_and_copper_losses(torque: float) -> None:
+    bank = make_bank()
+    bank.input_torque[4] = torque
+    step_for(bank, 0.03, vel=FAST)
+    _, current = braking(torque)
+    voltage, got = bank.bus.state(2)
+    assert got == pytest.approx(current, abs=0.05)
+    assert voltage == pytest.approx(SUPPLY_VOLTAGE - SUPPLY_RESISTANCE * current, abs=0.01)
+    assert bank.bus.state(3) == (SUPPLY_VOLTAGE, 0.0)
+
+
+def test_with_the_limit_as_shipped_a_braking_leg_disarms_both_axes() -> None:
+    bank = make_bank()
+    bank.settings.set(2, "config.dc_max_negative_current", -0.01)
+    bank.input_torque[4:6] = -1.0, 0.5
+    step_for(bank, 0.03, vel=FAST)
+    for axis in (4, 5):
+        assert bank.state[axis] == AxisState.IDLE
+        assert bank.faults[axis].motor & MotorError.SYSTEM_LEVEL
+        assert bank.faults[axis].odrive == OdriveError.DC_BUS_OVER_REGEN_CURRENT
+        assert bank.heartbeat(axis).axis_error == 0, "the trap: only the motor's flag shows it"
+    assert bank.state[6] == AxisState.CLOSED_LOOP_CONTROL
+
+
+def test_as_configured_the_same_leg_may_brake() -> None:
+    bank = make_bank()
+    bank.input_torque[4] = -1.0
+    step_for(bank, 0.03, vel=FAST)
+    assert bank.state[4] == AxisState.CLOSED_LOOP_CONTROL
+
+
+def test_a_brake_resistor_takes_what_would_be_pushed_back() -> None:
+    bank = make_bank()
+    bank.settings.set(2, "config.dc_max_negative_current", -0.01)
+    bank.settings.set(2, "config.enable_brake_resistor", value=True)
+    bank.input_torque[4] = -1.0
+    step_for(bank, 0.03, vel=FAST)
+    assert bank.state[4] == AxisState.CLOSED_LOOP_CONTROL
+    assert bank.bus.state(2)[1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_supply_that_takes_no_current_lets_regeneration_raise_the_bus_until_it_trips() -> None:
+    bank = make_bank()
+    bank.bus.resistance[2] = 10.0
+    bank.bus.changed()
+    bank.input_torque[4] = -1.0
+    step_for(bank, 0.03, vel=FAST)
+    assert bank.state[4] == bank.state[5] == AxisState.IDLE
+    assert bank.faults[5].odrive == OdriveError.DC_BUS_OVER_VOLTAGE
+
+
+def test_a_limit_on_the_current_drawn_disarms_both_axes() -> None:
+    bank = make_bank()
+    bank.settings.set(2, "config.dc_max_positive_current", 5.0)
+    bank.input_torque[4] = 3.0
+    step_for(bank, 0.03, vel=FAST)
+    assert bank.faults[4].odrive == bank.faults[5].odrive == OdriveError.DC_BUS_OVER_CURRENT
+
+
+def test_a_sagging_supply_disarms_and_arms_again_only_when_it_is_back() -> None:
+    bank = make_bank()
+    bank.supply(2, 7.0)
+    step_for(bank, DT)
+    bank.clear_errors(4)
+    step_for(bank, DT)
+    assert bank.faults[4].odrive == OdriveError.DC_BUS_UNDER_VOLTAGE
+    bank.supply(2, 48.0)
+    bank.clear_errors(4)
+    bank.request_state(4, AxisState.CLOSED_LOOP_CONTROL)
+    step_for(bank, DT)
+    assert bank.state[4] == AxisState.CLOSED_LOOP_CONTROL
+    assert bank.talks(4), "it has not been off"

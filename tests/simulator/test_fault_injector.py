@@ -1,0 +1,190 @@
+"""Faults by name: every kind on every axis, its registers, its state, its sibling."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from services.simulator.axis_bank import AXIS_NAMES, AxisBank
+from services.simulator.axis_conditions import BOOT_S
+from services.simulator.axis_faults import Fault as Registers
+from services.simulator.fault_injector import FaultInjector
+from shared.cansimple import (
+    AxisError,
+    AxisState,
+    ControllerError,
+    EncoderError,
+    MotorError,
+    OdriveError,
+)
+from shared.joints import MODULES
+from shared.scenario import FAULT_KINDS, Fault
+from tests.simulator.banks import DT, ZERO, make_bank
+
+SYSTEM = MotorError.SYSTEM_LEVEL
+
+
+class Outcome(NamedTuple):
+    """What a kind leaves behind 20 ms after it began."""
+
+    state: AxisState
+    registers: Registers
+    sibling: AxisState = AxisState.CLOSED_LOOP_CONTROL
+    talks: bool = True
+
+
+OUTCOMES = {
+    "over_temperature": Outcome(
+        AxisState.IDLE, Registers(motor=MotorError.FET_THERMISTOR_OVER_TEMP)
+    ),
+    "over_voltage": Outcome(
+        AxisState.IDLE,
+        Registers(motor=SYSTEM, odrive=OdriveError.DC_BUS_OVER_VOLTAGE),
+        sibling=AxisState.IDLE,
+    ),
+    "encoder": Outcome(
+        AxisState.IDLE,
+        Registers(
+            AxisError.ENCODER_FAILED,
+            MotorError.UNKNOWN_PHASE_ESTIMATE,
+            EncoderError.NO_RESPONSE,
+            ControllerError.INVALID_ESTIMATE,
+        ),
+    ),
+    "watchdog": Outcome(AxisState.IDLE, Registers(AxisError.WATCHDOG_TIMER_EXPIRED)),
+    "link_lost": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers(), talks=False),
+    "disarmed": Outcome(AxisState.IDLE, Registers()),
+    "overspeed": Outcome(
+        AxisState.IDLE,
+        Registers(motor=MotorError.CONTROLLER_FAILED, controller=ControllerError.OVERSPEED),
+    ),
+    "brown_out": Outcome(
+        AxisState.UNDEFINED, Registers(), sibling=AxisState.UNDEFINED, talks=False
+    ),
+}
+
+
+class Scene:
+    """A bank with a fault to come; `run` steps it, feeding what hears."""
+
+    def __init__(self, fault: Fault, *, watchdog: bool = True) -> None:
+        self.bank: AxisBank = make_bank(watchdog=watchdog, turns=0.5)
+        self.bank.input_torque[:] = 1.0
+        self.injector = FaultInjector((fault,), self.bank)
+        self.steps = 0
+        self.torque = ZERO
+
+    def run(self, until_s: float) -> None:
+        while self.steps < round(until_s / DT):
+            self.steps += 1
+            for axis in range(12):
+                if self.bank.talks(axis):
+                    self.bank.feed(axis)
+            self.injector.advance(self.steps * DT)
+            self.torque = self.bank.step(self.steps * DT, np.full(12, 0.5), ZERO).copy()
+
+
+def make_fault(kind: str, axis: int, duration: float | None = None) -> Fault:
+    row = {"module": MODULES[axis // 2], "kind": kind, "at": 0.01, "duration": duration}
+    if not FAULT_KINDS[kind].whole:
+        row["axis"] = axis % 2
+    return Fault(**row)  # type: ignore[arg-type]
+
+
+def test_every_kind_of_a_scenario_has_its_outcome_here() -> None:
+    assert set(OUTCOMES) == set(FAULT_KINDS)
+
+
+@pytest.mark.parametrize("axis", range(12), ids=AXIS_NAMES)
+@pytest.mark.parametrize("kind", FAULT_KINDS)
+def test_a_fault_leaves_these_registers_this_state_and_this_sibling(kind: str, axis: int) -> None:
+    scene, outcome = Scene(make_fault(kind, axis)), OUTCOMES[kind]
+    scene.run(0.009)
+    assert scene.bank.state == [AxisState.CLOSED_LOOP_CONTROL] * 12, "not before its time"
+    scene.run(0.03)
+    bank, sibling = scene.bank, axis ^ 1
+    assert bank.state[axis] == outcome.state
+    assert bank.faults[axis] == outcome.registers
+    assert bank.talks(axis) == outcome.talks
+    assert bank.state[sibling] == outcome.sibling
+    assert (bank.faults[sibling] == outcome.registers) == (
+        FAULT_KINDS[kind].whole or outcome.registers == Registers()
+    )
+    closed = [state == AxisState.CLOSED_LOOP_CONTROL for state in bank.state]
+    assert scene.torque == pytest.approx(np.array(closed, float)), "what is not armed floats"
+    others = [each for each in range(12) if each // 2 != axis // 2]
+    assert all(closed[each] and bank.talks(each) for each in others)
+
+
+@pytest.mark.parametrize("kind", ["over_temperature", "over_voltage", "encoder"])
+def test_errors_cleared_while_the_fault_lasts_are_back_at_once(kind: str) -> None:
+    scene = Scene(make_fault(kind, 4, duration=0.2))
+    scene.run(0.1)
+    scene.bank.clear_errors(4)
+    scene.bank.request_state(4, AxisState.CLOSED_LOOP_CONTROL)
+    scene.run(0.102)
+    assert scene.bank.state[4] == AxisState.IDLE
+    assert scene.bank.faults[4] == OUTCOMES[kind].registers
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FAULT_KINDS if kind != "brown_out"])
+def test_after_it_an_axis_stays_as_it_is_until_it_is_cleared_and_asked_to_arm(kind: str) -> None:
+    lasts = None if FAULT_KINDS[kind].duration is None else 0.05
+    scene = Scene(make_fault(kind, 7, duration=lasts))
+    scene.run(0.2)
+    assert scene.bank.state[7] == OUTCOMES[kind].state, "it does not recover by itself"
+    scene.bank.clear_errors(7)
+    scene.bank.request_state(7, AxisState.CLOSED_LOOP_CONTROL)
+    scene.run(0.22)
+    assert scene.bank.state[7] == AxisState.CLOSED_LOOP_CONTROL
+    assert scene.bank.faults[7] == Registers()
+    assert scene.torque[7] == 1.0, "the trap: the input torque of before is in force again"
+
+
+def test_a_link_lost_for_longer_than_the_watchdog_leaves_both_axes_limp() -> None:
+    scene = Scene(make_fault("link_lost", 0, duration=0.3))
+    scene.run(0.1)
+    assert scene.bank.state[0] == AxisState.CLOSED_LOOP_CONTROL, "it holds its last torque"
+    scene.run(0.2)
+    assert scene.bank.state[:2] == [AxisState.IDLE] * 2
+    assert scene.bank.faults[1].axis == AxisError.WATCHDOG_TIMER_EXPIRED
+    assert not scene.bank.talks(0)
+    scene.run(0.32)
+    assert scene.bank.talks(0)
+
+
+def test_a_brown_out_ends_in_a_restart_in_idle_with_no_error_and_nothing_remembered() -> None:
+    scene = Scene(make_fault("brown_out", 2, duration=0.1))
+    scene.bank.vel_limit[2] = 3.0  # written, and never saved
+    scene.run(0.11 + BOOT_S - 0.01)
+    assert scene.bank.state[2] == AxisState.UNDEFINED
+    assert not scene.bank.talks(3)
+    scene.bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
+    scene.run(0.11 + BOOT_S + 0.01)
+    bank = scene.bank
+    assert bank.state[2:4] == [AxisState.IDLE] * 2
+    assert bank.talks(2)
+    assert bank.faults[2] == bank.faults[3] == Registers()
+    assert bank.input_torque[2] == bank.input_torque[3] == 0.0
+    assert bank.vel_limit[2] == 60.0
+
+
+def test_a_lost_encoder_reads_zero_and_afterwards_the_truth() -> None:
+    scene = Scene(make_fault("encoder", 5, duration=0.05))
+    scene.run(0.03)
+    assert (scene.bank.pos_estimate[5], scene.bank.vel_estimate[5]) == (0.0, 0.0)
+    assert scene.bank.pos_estimate[4] == pytest.approx(0.5, abs=1e-3)
+    scene.run(0.1)
+    assert scene.bank.pos_estimate[5] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_a_stage_near_its_limit_has_less_current() -> None:
+    bank = make_bank()
+    bank.vel_gain[:] = 10.0  # else the velocity limit of torque mode clamps first
+    bank.input_torque[:] = 99.0
+    bank.conditions.heat(3, 110.0)  # halfway from 100 to 120
+    torque = bank.step(DT, ZERO, ZERO)
+    assert torque[3] == pytest.approx(0.5 * 60.0 * 0.0827)
+    assert torque[2] == pytest.approx(60.0 * 0.0827)

@@ -1,0 +1,95 @@
+"""The simulator's loop: how often the drives step, and a scenario's faults."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.simulator.axis_bank import AxisBank
+from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.harness_front import HarnessFront
+from services.simulator.loop import Ports, SimulatorLoop
+from services.simulator.world import World
+from shared.cansimple import AxisState, ControlMode, InputMode
+from shared.config import RobotConfig
+from shared.scenario import Fault, Keyframe, Scenario
+
+
+class Silent:
+    """Every end of the bus, and the harness: takes anything, has nothing."""
+
+    def put(self, *_: object) -> None: ...
+
+    def send(self, *_: object) -> None: ...
+
+    def take(self) -> None:
+        return None
+
+
+def make_loop(robot: RobotConfig, *faults: Fault) -> tuple[SimulatorLoop, World, AxisBank]:
+    stand = Scenario(
+        name="stand",
+        about="",
+        duration=5.0,
+        keyframe=(Keyframe(at=0.0, height=robot.simulation.stand_height),),
+        fault=faults,
+    )
+    world = World(robot, stand)
+    bank = AxisBank(
+        robot.drive,
+        encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,
+        watchdog=False,
+    )
+    front = CanSimpleFront(bank, [], [])
+    ports = cast(
+        "Ports", msgspec.defstruct("Fake", ["truth", "intent", "control"])(*[Silent()] * 3)
+    )
+    harness = cast("HarnessFront", cast("Any", Silent()))
+    return SimulatorLoop(robot, world, bank, front, [], harness, ports), world, bank
+
+
+def count_steps(loop: SimulatorLoop, bank: AxisBank, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Return how often the drives step in 100 steps of the world."""
+    times = []
+    real = bank.step
+    monkeypatch.setattr(bank, "step", lambda *given: (times.append(given[0]), real(*given))[1])
+    for _ in range(100):
+        loop.step()
+    assert times == sorted(set(times))
+    return len(times)
+
+
+@pytest.mark.parametrize(
+    ("mode", "every"), [(ControlMode.TORQUE, False), (ControlMode.POSITION, True)]
+)
+def test_the_drives_step_with_the_world_only_where_they_have_their_own_loop(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, mode: ControlMode, every: bool
+) -> None:
+    loop, _, bank = make_loop(robot)
+    loop.step()
+    for axis in range(12):
+        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
+        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+    steps = count_steps(loop, bank, monkeypatch)
+    rates = robot.simulation.encoder_rate_hz * robot.simulation.timestep
+    assert steps == (100 if every else pytest.approx(100 * rates, abs=1))
+
+
+def test_a_fault_comes_at_its_time_in_the_scenario_and_not_before_that_begins(
+    robot: RobotConfig,
+) -> None:
+    loop, world, bank = make_loop(robot, Fault(module="knee_left", kind="over_voltage", at=0.1))
+    for _ in range(300):
+        loop.step()
+    for axis in range(12):
+        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+    world.start()
+    began = world.time
+    while bank.state[8] == AxisState.CLOSED_LOOP_CONTROL:
+        loop.step()
+        assert world.time < began + 0.2
+    assert world.time - began == pytest.approx(0.1, abs=0.005)
+    assert np.flatnonzero([s == AxisState.IDLE for s in bank.state]).tolist() == [8, 9]

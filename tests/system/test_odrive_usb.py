@@ -1,0 +1,264 @@
+"""The genuine `odrive` package and the driver on it, against emulated drives on a USB bus."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+import odrive
+import pytest
+
+from services.joint.drivers import odrive_usb
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.odrive_usb import EXCHANGE_HZ, OdriveUsb
+from shared.cansimple import AxisError, AxisState, ControlMode
+from shared.config import RobotConfig
+from shared.exceptions import DriveError
+from tests.usb import standin
+from tests.usb.standin import MODULE, Control, UsbRobot, eventually, serial_number
+
+pytest_plugins = ["tests.usb.fixtures"]
+pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
+
+AXES = slice(4, 6)
+HOLD = MotorTarget((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (20.0, 20.0), (0.05, 0.05))
+
+
+def test_the_genuine_package_reads_arms_streams_and_meets_a_disarm(usb: UsbRobot) -> None:
+    board = odrive.find_sync(serial_number(MODULE), timeout=10)
+    axes = (board.axis0, board.axis1)
+    assert board.serial_number == standin.FIRST_SERIAL + MODULE
+    assert board.vbus_voltage == pytest.approx(48.0, abs=0.1)
+
+    for axis in axes:
+        axis.config.enable_watchdog = False  # attributes one by one are slow on a busy machine
+        axis.controller.config.vel_gain = 0.2
+    board.clear_errors()
+    for axis in axes:
+        axis.requested_state = AxisState.CLOSED_LOOP_CONTROL
+    assert [axis.current_state for axis in axes] == [AxisState.CLOSED_LOOP_CONTROL] * 2
+
+    for set_point in np.linspace(0.0, 1.5, 100).tolist():
+        for axis in axes:
+            axis.controller.input_pos = set_point
+    assert eventually(
+        lambda: (
+            axes[0].encoder.pos_estimate == pytest.approx(1.5, abs=1e-3)
+            and axes[1].encoder.pos_estimate == pytest.approx(1.5, abs=1e-3)
+        )
+    )
+    with usb.lock:
+        assert usb.pos[AXES] == pytest.approx([1.5, 1.5], abs=1e-2)
+
+    with usb.lock:
+        usb.bank.inject(standin.axis_name(4), "OVERSPEED")
+    assert [axis.current_state for axis in axes] == [
+        AxisState.IDLE,
+        AxisState.CLOSED_LOOP_CONTROL,
+    ], "the sibling goes on"
+    assert board.axis0.error == 0
+    assert board.axis0.controller.error == 1
+    assert board.axis0.motor.error != 0
+
+
+def test_the_genuine_package_writes_a_setting_and_saves_it_over_a_restart(usb: UsbRobot) -> None:
+    board = odrive.find_sync(serial_number(MODULE), timeout=10)
+    board.axis1.config.can.encoder_rate_ms = 7
+    board.save_configuration()
+    assert eventually(lambda: not usb.bank.talks(5))
+    assert eventually(lambda: usb.bank.talks(5))
+    board = odrive.find_sync(serial_number(MODULE), timeout=10)
+    assert board.axis1.config.can.encoder_rate_ms == 7
+    assert board.axis0.config.can.encoder_rate_ms != 7
+
+
+def test_the_drive_is_found_by_its_serial_number_among_six(usb: UsbRobot, control: Control) -> None:
+    with usb.lock:
+        usb.pos[:] = np.arange(12) / 4
+    assert eventually(lambda: control.pos == (1.0, 1.25))
+
+
+def test_a_drive_that_is_not_there_is_lost_and_nothing_raises(
+    usb: UsbRobot, config: RobotConfig
+) -> None:
+    drive = OdriveUsb("000000000001", config.drive)
+    for _ in range(20):
+        reading = drive.read(0.01)
+        assert reading is not None
+        assert reading.status is DriveStatus.LOST
+        drive.write_torque((1.0, 1.0))
+    assert drive.write_failures == 20
+    drive.close()
+
+
+def test_an_armed_drive_has_no_torque_before_a_target(usb: UsbRobot, drive: OdriveUsb) -> None:
+    with usb.lock:
+        usb.pos[AXES] = (0.7, -0.3)
+    assert eventually(lambda: is_status(drive.read(0.01), DriveStatus.IDLE))
+    drive.arm(onboard=True)
+    assert eventually(lambda: is_status(drive.read(0.01), DriveStatus.ARMED))
+    with usb.lock:
+        assert usb.bank.torque[AXES].tolist() == [0.0, 0.0]
+        assert usb.pos[AXES].tolist() == [0.7, -0.3]
+
+
+def test_arming_writes_the_limits_and_takes_the_integrator_out(
+    usb: UsbRobot, armed: Control, config: RobotConfig
+) -> None:
+    with usb.lock:
+        assert usb.bank.vel_integrator_gain[AXES].tolist() == [0.0, 0.0]
+        assert usb.bank.vel_limit[AXES].tolist() == [config.drive.vel_limit] * 2
+        assert usb.bank.current_lim[AXES].tolist() == [config.drive.current_lim] * 2
+        assert usb.bank.control_mode[AXES].tolist() == [ControlMode.POSITION] * 2
+
+
+def test_a_target_is_what_the_drives_own_loop_does(usb: UsbRobot, armed: Control) -> None:
+    armed.target = MotorTarget((0.5, -0.25), (0.0, 0.0), (0.02, 0.03), (20.0, 10.0), (0.2, 0.1))
+    # At rest the feedforward is balanced by pos_gain vel_gain (input_pos - pos).
+    rest = (0.5 + 0.02 / (20.0 * 0.2), -0.25 + 0.03 / (10.0 * 0.1))
+    assert eventually(lambda: armed.pos == pytest.approx(rest, abs=1e-3))
+    with usb.lock:
+        assert usb.bank.input_torque[AXES] == pytest.approx([0.02, 0.03])
+        assert usb.bank.pos_gain[AXES] == pytest.approx([20.0, 10.0])
+        assert usb.bank.vel_gain[AXES] == pytest.approx([0.2, 0.1])
+
+
+def test_a_torque_is_sent_without_gains(usb: UsbRobot, armed: Control) -> None:
+    armed.target = HOLD
+    assert eventually(lambda: usb.bank.vel_gain[4] > 0)
+    armed.target = (0.01, -0.02)
+    assert eventually(lambda: usb.bank.vel_gain[AXES].tolist() == [0.0, 0.0])
+    wanted = pytest.approx([0.01, -0.02])
+    assert eventually(lambda: usb.bank.torque[AXES].tolist() == wanted)
+
+
+def test_a_torque_is_at_most_the_current_limits_worth(
+    usb: UsbRobot, armed: Control, config: RobotConfig
+) -> None:
+    limit = config.drive.current_lim * config.drive.torque_constant
+    armed.target = (1e3, -0.01)
+    wanted = pytest.approx([limit, -0.01])
+    assert eventually(lambda: usb.bank.input_torque[AXES].tolist() == wanted)
+
+
+@pytest.mark.parametrize("field", ["pos_turns", "vel_turns", "torque", "pos_gain", "vel_gain"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_target_that_is_no_number_is_not_sent(drive: OdriveUsb, field: str, value: float) -> None:
+    assert eventually(lambda: is_status(drive.read(0.01), DriveStatus.IDLE))
+    fields = {name: getattr(HOLD, name) for name in HOLD.__struct_fields__}
+    drive.write(MotorTarget(**{**fields, field: (0.0, value)}))
+    drive.write(HOLD)
+    assert drive.write_failures == 1
+
+
+def test_samples_come_at_the_exchange_rate_and_not_faster(control: Control) -> None:
+    before = control.samples
+    time.sleep(1.0)
+    assert 0.25 * EXCHANGE_HZ < control.samples - before < 1.1 * EXCHANGE_HZ
+
+
+@pytest.mark.parametrize("fault", ["DISARM", "OVERSPEED", "ENCODER", "OVER_TEMP"])
+def test_an_axis_that_disarms_is_an_error_with_or_without_an_error_bit(
+    usb: UsbRobot, armed: Control, fault: str
+) -> None:
+    armed.target = (0.001, 0.001)
+    with usb.lock:
+        usb.bank.inject(standin.axis_name(4), fault)
+    assert eventually(lambda: armed.status is DriveStatus.ERROR)
+    assert (armed.error == 0) == (fault == "DISARM")
+    with usb.lock:
+        assert usb.bank.state[4:6] == [AxisState.IDLE, AxisState.CLOSED_LOOP_CONTROL]
+
+
+def test_a_drive_found_armed_tells_its_torque_until_it_is_taken_over(
+    usb: UsbRobot, armed: Control, drive: OdriveUsb, config: RobotConfig
+) -> None:
+    armed.target = (0.02, -0.03)
+    assert eventually(lambda: usb.bank.torque[5] == pytest.approx(-0.03))
+    armed.stop()
+    with usb.lock:
+        usb.bank.settings.fill("config.enable_watchdog", value=False)
+    drive.close()
+    with Control(OdriveUsb(serial_number(MODULE), config.drive)).running() as heir:
+        heir.target = None
+        assert eventually(lambda: heir.status is DriveStatus.ARMED)
+        assert heir.torque == pytest.approx((0.02, -0.03))
+        heir.target = (0.01, 0.01)
+        assert eventually(lambda: usb.bank.torque[5] == pytest.approx(0.01))
+        assert eventually(lambda: heir.torque is None)
+    heir.drive.close()
+
+
+def test_idle_idles_both_axes(usb: UsbRobot, armed: Control) -> None:
+    with usb.lock:
+        usb.bank.inject(standin.axis_name(5), "DISARM")
+    armed.idle()
+    assert eventually(lambda: usb.bank.state[4:6] == [AxisState.IDLE] * 2)
+    assert eventually(lambda: armed.status is DriveStatus.IDLE)
+
+
+def test_a_drive_with_an_error_arms_again_when_asked(usb: UsbRobot, armed: Control) -> None:
+    with usb.lock:
+        usb.bank.inject(standin.axis_name(4), "OVERSPEED")
+    assert eventually(lambda: armed.status is DriveStatus.ERROR)
+    armed.arm()
+    assert eventually(lambda: armed.status is DriveStatus.ARMED)
+
+
+def test_no_reading_after_arm_is_called_tells_of_the_error_before(
+    usb: UsbRobot, armed: Control, drive: OdriveUsb, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    carry_out = drive._carry_out
+
+    async def carry_out_and_hang(*request: object) -> None:
+        await carry_out(*request)
+        usb.stalled.set()
+
+    with usb.lock:
+        usb.bank.inject(standin.axis_name(4), "OVERSPEED")
+    assert eventually(lambda: armed.status is DriveStatus.ERROR)
+    armed.stop()
+    assert eventually(drive._fresh.is_set), "a sample with the error waits"
+    monkeypatch.setattr(drive, "_carry_out", carry_out_and_hang)
+    drive.arm(onboard=True)
+    assert eventually(usb.stalled.is_set)
+    assert is_status(drive.read(0.0), DriveStatus.IDLE)
+    usb.stalled.clear()
+
+
+def test_a_control_loop_that_hangs_lets_the_watchdog_fire(usb: UsbRobot, armed: Control) -> None:
+    time.sleep(odrive_usb.FEED_MS * 1e-3)
+    assert armed.status is DriveStatus.ARMED
+    armed.hang.set()
+    assert eventually(lambda: usb.bank.state[4:6] == [AxisState.IDLE] * 2)
+    with usb.lock:
+        assert usb.bank.faults[4].axis & AxisError.WATCHDOG_TIMER_EXPIRED
+
+
+def test_without_libusb_the_fix_is_named(
+    config: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(**_: bool) -> None:
+        raise OSError("libusb-1.0.so.0: cannot open shared object file")
+
+    monkeypatch.setattr(odrive_usb, "get_device_manager", fail)
+    with pytest.raises(DriveError, match="apt install libusb"):
+        OdriveUsb(serial_number(0), config.drive)
+
+
+def test_close_carries_out_the_last_idle_and_leaves_no_task(
+    usb: UsbRobot, armed: Control, drive: OdriveUsb
+) -> None:
+    armed.stop()
+    drive.idle()
+    drive.close()
+    with usb.lock:
+        assert usb.bank.state[4:6] == [AxisState.IDLE] * 2
+    assert drive._task.done()
+    assert not drive._manager._device_metadata, "another program may have the drive"
+    drive.close()
+
+
+def is_status(reading: DriveReading | None, status: DriveStatus) -> bool:
+    return reading is not None and reading.status is status

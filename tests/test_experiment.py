@@ -1,0 +1,53 @@
+"""What flags make of a scenario: the drives' faults."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from shared.scenario import FAULT_KINDS, Fault
+from tools.runs import experiment
+
+
+def parse(*arguments: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    experiment.add_flags(parser)
+    return parser.parse_args(arguments)
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("knee_left:encoder@8", Fault(module="knee_left", kind="encoder", at=8.0)),
+        (
+            "knee_left.1:encoder@8.5:0.3",
+            Fault(module="knee_left", kind="encoder", at=8.5, axis=1, duration=0.3),
+        ),
+        ("hip_right:brown_out@2", Fault(module="hip_right", kind="brown_out", at=2.0)),
+    ],
+)
+def test_a_fault_is_read_from_its_flag(text: str, fault: Fault) -> None:
+    assert experiment.parse_fault(text) == fault
+
+
+@pytest.mark.parametrize("kind", FAULT_KINDS)
+def test_every_kind_of_fault_can_be_asked_for(kind: str) -> None:
+    story = experiment.make_scenario(parse("--fault", f"ankle_left:{kind}@1"))
+    assert [row.kind for row in story.fault] == [kind]
+    assert f"ankle_left {kind} at 1 s" in experiment.in_words(story)
+
+
+@pytest.mark.parametrize(
+    "text", ["toe:encoder@1", "knee_left:fire@1", "knee_left@1", "knee_left.2:encoder@1", "x"]
+)
+def test_a_fault_that_makes_no_sense_is_refused_with_modules_and_kinds(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match=r"ankle_right.*over_temperature"):
+        experiment.parse_fault(text)
+
+
+def test_several_faults_can_be_asked_for() -> None:
+    story = experiment.make_scenario(
+        parse("--fault", "knee_left:encoder@1", "--fault", "hip_left:watchdog@2")
+    )
+    assert [(row.module, row.at) for row in story.fault] == [("knee_left", 1.0), ("hip_left", 2.0)]

@@ -1,0 +1,185 @@
+"""A USB bus for tests: the stand-in libusb, built here, and drives that are plugged into it."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import select
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from services.joint.drivers.base import Drive, DriveStatus, MotorTarget
+from services.simulator.axis_bank import AxisBank
+from services.simulator.fibre_endpoints import Board
+from services.simulator.fibre_front import FibreFront, FibrePort
+from shared.config import RobotConfig
+from shared.joints import MODULES, N_JOINTS
+
+SOURCE = Path(__file__).with_name("libusb_standin.c")
+MODULE = 2
+"""The module that the driver under test is for."""
+SONAME = "libusb-1.0.so.0"
+FIRST_SERIAL = 0x365A335A3430
+READ_TIMEOUT_S = 0.005
+INERTIA = 1e-3
+"""kg m^2 of a motor that carries nothing."""
+
+
+def build(folder: Path) -> Path:
+    """Compile the stand-in; return the library."""
+    library = folder / SONAME
+    command = ["cc", "-shared", "-fPIC", "-O2", "-Wall", "-Werror", f"-Wl,-soname,{SONAME}"]
+    subprocess.run([*command, "-o", str(library), str(SOURCE), "-lpthread"], check=True)
+    return library
+
+
+def load(library: Path) -> None:
+    """Load the stand-in before libodrive does: a library of its name is then not looked for."""
+    ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+
+
+def serial_number(module: int) -> str:
+    """Return a module's serial number as USB shows it."""
+    return f"{FIRST_SERIAL + module:012X}"
+
+
+class UsbRobot:
+    """Emulated drives with free motors on the bus, run by a thread at about 1 kHz.
+
+    Hold `lock` to look into or change `bank` and `ports`.
+    """
+
+    def __init__(self, robot: RobotConfig, folder: Path, *, watchdog: bool = True) -> None:
+        counts = robot.joint.encoder_counts_per_turn
+        self.bank = AxisBank(robot.drive, encoder_counts_per_turn=counts, watchdog=watchdog)
+        self.ports = [
+            FibrePort(
+                FibreFront(Board(self.bank, module, FIRST_SERIAL + module)),
+                folder / serial_number(module),
+            )
+            for module in range(len(MODULES))
+        ]
+        self.lock = threading.Lock()
+        self.pos = np.zeros(N_JOINTS)
+        self.vel = np.zeros(N_JOINTS)
+        self._stop = threading.Event()
+        self.stalled = threading.Event()
+        """While set, the drives answer nothing, as a board that hangs."""
+        self._thread = threading.Thread(target=self._run)
+
+    @contextmanager
+    def running(self) -> Iterator[UsbRobot]:
+        """Run the thread within a with block."""
+        self._thread.start()
+        try:
+            yield self
+        finally:
+            self._stop.set()
+            self._thread.join()
+            for port in self.ports:
+                port.close()
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while not self._stop.is_set():
+            stalled = self.stalled.is_set()
+            select.select([] if stalled else self.ports, [], [], 1e-3)
+            with self.lock:
+                for port in () if stalled else self.ports:
+                    port.poll()
+                now = time.monotonic()
+                torque = self.bank.step(now, self.pos, self.vel)
+                self.vel += torque / (2 * np.pi * INERTIA) * (now - before)
+                self.pos += self.vel * (now - before)
+                before = now
+
+
+def eventually(claim: Callable[[], bool], within_s: float = 5.0) -> bool:
+    """Return whether a claim comes true in time."""
+    deadline = time.monotonic() + within_s
+    while time.monotonic() < deadline:
+        if claim():
+            return True
+        time.sleep(0.005)
+    return claim()
+
+
+def axis_name(axis: int) -> str:
+    """Return an axis's name as `AxisBank.inject` takes it."""
+    return f"{MODULES[axis // 2]}.axis{axis % 2}"
+
+
+class Control:
+    """A control loop on a drive, as the joint service runs it: read, then write the target."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.drive = drive
+        self.target: MotorTarget | tuple[float, float] | None = (0.0, 0.0)
+        self.status = DriveStatus.LOST
+        self.error = 0
+        self.pos = (math.nan, math.nan)
+        self.torque: tuple[float, float] | None = None
+        self.samples = 0
+        self.raised: BaseException | None = None
+        self.longest_s = 0.0
+        """Of one cycle beyond the time it was to wait."""
+        self.hang = threading.Event()
+        """While set, the loop does nothing."""
+        self._asked: list[Callable[[], None]] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def arm(self) -> None:
+        """Have the loop ask for arming."""
+        self._asked.append(lambda: self.drive.arm(onboard=True))
+
+    def idle(self) -> None:
+        """Have the loop ask for idle."""
+        self._asked.append(self.drive.idle)
+
+    def stop(self) -> None:
+        """End the loop."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    @contextmanager
+    def running(self) -> Iterator[Control]:
+        """Run the thread within a with block."""
+        self._thread.start()
+        try:
+            yield self
+        finally:
+            self.stop()
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                if self.hang.is_set():
+                    time.sleep(1e-3)
+                else:
+                    self._cycle()
+        except Exception as error:  # the claim is that there is none
+            self.raised = error
+            raise
+
+    def _cycle(self) -> None:
+        before = time.monotonic()
+        reading = self.drive.read(READ_TIMEOUT_S)
+        if reading is not None:
+            self.samples += reading.status is not DriveStatus.LOST
+            self.status, self.error, self.pos = reading.status, reading.error, reading.pos_turns
+            self.torque = reading.torque
+        while self._asked:
+            self._asked.pop(0)()
+        if isinstance(self.target, MotorTarget):
+            self.drive.write(self.target)
+        elif self.target is not None:
+            self.drive.write_torque(self.target)
+        self.longest_s = max(self.longest_s, time.monotonic() - before - READ_TIMEOUT_S)

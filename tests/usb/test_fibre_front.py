@@ -1,0 +1,235 @@
+"""The Fibre protocol of an emulated board: packets in, packets out."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.simulator.axis_bank import AxisBank
+from services.simulator.axis_settings import NAMES
+from services.simulator.fibre_endpoints import CODECS, Board
+from services.simulator.fibre_front import FibreFront, crc16
+from shared.cansimple import AxisError, AxisState
+from shared.config import RobotConfig
+
+MODULE = 1
+SERIAL = 0x365A335A3438
+ANSWER = 0x8000
+TIMEOUT_S = 0.1
+
+
+class Client:
+    """Speaks to a front as docs/protocol.rst of the ODrive repository has it."""
+
+    def __init__(self, front: FibreFront) -> None:
+        self.front = front
+        self.trailer = 1
+        text = b""
+        while part := self.operate(0, 32, struct.pack("<I", len(text))):
+            text += part
+        self.text = text
+        self.trailer = crc16(1, text)
+        self.endpoints = dict(flat("", json.loads(text)))
+
+    def operate(
+        self, number: int, size: int, payload: bytes = b"", *, sequence: int = 0x81
+    ) -> bytes:
+        """Return the payload of an operation's answer."""
+        trailer = self.trailer if number else 1
+        packet = struct.pack("<HHH", sequence, number | ANSWER, size) + payload
+        answer = self.front.answer(packet + struct.pack("<H", trailer))
+        assert answer is not None
+        assert struct.unpack_from("<H", answer) == (sequence | ANSWER,)
+        return answer[2:]
+
+    def exchange(self, name: str, *value: float) -> Any:
+        """Read an endpoint, with a value: write it too; return what it held."""
+        row = self.endpoints[name]
+        codec = struct.Struct("<" + CODECS[row["type"]])
+        payload = codec.pack(*value) if value else b""
+        return codec.unpack(self.operate(row["id"], codec.size, payload))[0]
+
+    def call(self, name: str) -> None:
+        """Call a function."""
+        row = self.endpoints[name]
+        assert row["type"] == "function"
+        assert self.operate(row["id"], 0) == b""
+
+
+def flat(prefix: str, members: list[dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
+    rows: list[tuple[str, dict[str, Any]]] = []
+    for member in members:
+        name = prefix + member["name"]
+        if member["type"] == "object":
+            rows += flat(name + ".", member["members"])
+        else:
+            rows.append((name, member))
+    return rows
+
+
+@pytest.fixture
+def bank(robot: RobotConfig) -> AxisBank:
+    drive = msgspec.structs.replace(robot.drive, watchdog_timeout=TIMEOUT_S)
+    bank = AxisBank(drive, encoder_counts_per_turn=8192)
+    step(bank, 0.0)
+    return bank
+
+
+@pytest.fixture
+def front(bank: AxisBank) -> FibreFront:
+    return FibreFront(Board(bank, MODULE, SERIAL))
+
+
+@pytest.fixture
+def client(front: FibreFront) -> Client:
+    return Client(front)
+
+
+def step(bank: AxisBank, now_s: float) -> None:
+    still = bank.pos_estimate * 0.0
+    bank.step(now_s, still, still)
+
+
+@pytest.mark.parametrize(
+    ("data", "crc"), [(b"\x01\x02\x03\x04", 0x672E), (b"\x05\x04\x03\x02\x01", 0xE251)]
+)
+def test_the_crc_is_that_of_the_protocols_examples(data: bytes, crc: int) -> None:
+    assert crc16(0x1337, data) == crc
+
+
+def test_the_descriptor_comes_in_parts_and_is_the_whole(client: Client) -> None:
+    assert client.text == client.front.descriptor
+    assert client.endpoints[""] == {"name": "", "id": 0, "type": "json", "access": "r"}
+
+
+def test_the_descriptors_id_holds_its_checksum(client: Client) -> None:
+    (version,) = struct.unpack("<I", client.operate(0, 4, b"\xff\xff\xff\xff"))
+    assert version >> 16 == crc16(1, client.text)
+    assert version & 0xFFFF == crc16(crc16(1, client.text), client.text)
+
+
+def test_every_endpoint_has_its_own_id_and_can_be_read(client: Client) -> None:
+    rows = [row for name, row in client.endpoints.items() if name]
+    assert sorted(row["id"] for row in rows) == list(range(1, len(rows) + 1))
+    for name, row in client.endpoints.items():
+        if row["type"] in CODECS:
+            client.exchange(name)
+
+
+def test_every_setting_of_the_bank_is_there_and_reads_as_the_bank_has_it(
+    client: Client, bank: AxisBank
+) -> None:
+    for name in NAMES:
+        assert client.endpoints[name]["access"] == "rw"
+        assert client.exchange(name) == pytest.approx(bank.settings.get(MODULE, name), rel=1e-6)
+
+
+def test_two_fronts_of_one_firmware_have_the_same_descriptor(bank: AxisBank) -> None:
+    first, second = (FibreFront(Board(bank, module, SERIAL + module)) for module in (0, 5))
+    assert first.descriptor == second.descriptor
+
+
+def test_an_exchange_returns_what_was_there_before(client: Client, bank: AxisBank) -> None:
+    assert client.exchange("axis1.controller.input_torque", 0.5) == 0.0
+    assert client.exchange("axis1.controller.input_torque") == 0.5
+    assert bank.input_torque[2 * MODULE : 2 * MODULE + 2].tolist() == [0.0, 0.5]
+
+
+def test_the_answer_is_no_longer_than_asked_for(client: Client) -> None:
+    number = client.endpoints["vbus_voltage"]["id"]
+    assert [len(client.operate(number, size)) for size in (0, 2, 4, 8)] == [0, 2, 4, 4]
+
+
+def test_a_request_that_wants_no_answer_is_carried_out(client: Client, bank: AxisBank) -> None:
+    number = client.endpoints["axis0.controller.input_vel"]["id"]
+    packet = struct.pack("<HHHfH", 0x81, number, 0, 1.5, client.trailer)
+    assert client.front.answer(packet) is None
+    assert bank.input_vel[2 * MODULE] == 1.5
+
+
+def test_a_request_made_for_another_descriptor_is_ignored(client: Client, bank: AxisBank) -> None:
+    number = client.endpoints["axis0.controller.input_vel"]["id"]
+    packet = struct.pack("<HHHfH", 0x81, number | ANSWER, 0, 1.5, client.trailer ^ 1)
+    assert client.front.answer(packet) is None
+    assert client.front.ignored == 1
+    assert bank.input_vel[2 * MODULE] == 0.0
+
+
+@given(packet=st.binary(max_size=80))
+def test_no_packet_makes_the_front_fail(robot: RobotConfig, packet: bytes) -> None:
+    bank = AxisBank(robot.drive, encoder_counts_per_turn=8192)
+    front = FibreFront(Board(bank, MODULE, SERIAL))
+    front.answer(packet)
+    (trailer,) = struct.unpack("<H", struct.pack("<H", crc16(1, front.descriptor)))
+    front.answer(packet + struct.pack("<H", trailer))
+
+
+def test_native_writes_feed_no_watchdog_but_its_function_does(
+    client: Client, bank: AxisBank
+) -> None:
+    axis = 2 * MODULE
+    step(bank, 0.9 * TIMEOUT_S)
+    client.call("axis0.watchdog_feed")
+    client.exchange("axis1.controller.input_torque", 0.0)
+    step(bank, 1.1 * TIMEOUT_S)
+    assert bank.faults[axis].axis == 0
+    assert bank.faults[axis + 1].axis == AxisError.WATCHDOG_TIMER_EXPIRED
+
+
+def test_the_watchdog_is_a_setting_of_each_axis(client: Client, bank: AxisBank) -> None:
+    client.exchange("axis0.config.enable_watchdog", False)
+    step(bank, 1e3)
+    assert client.exchange("axis0.error") == 0
+    assert client.exchange("axis1.error") == AxisError.WATCHDOG_TIMER_EXPIRED
+
+
+def test_a_state_is_asked_for_and_reported(client: Client, bank: AxisBank) -> None:
+    assert client.exchange("axis1.requested_state", AxisState.CLOSED_LOOP_CONTROL) == 0
+    assert client.exchange("axis1.current_state") == AxisState.CLOSED_LOOP_CONTROL
+    assert client.exchange("axis0.current_state") == AxisState.IDLE
+    assert client.exchange("axis1.motor.is_armed") is True
+
+
+def test_a_mode_that_is_not_there_is_an_error(client: Client, bank: AxisBank) -> None:
+    client.exchange("axis0.controller.config.control_mode", 1)
+    assert client.exchange("axis0.controller.config.control_mode") == 1
+    client.exchange("axis0.controller.config.input_mode", 5)
+    assert client.exchange("axis0.controller.error") == 2
+    assert client.exchange("axis0.controller.config.input_mode") == 1
+
+
+def test_a_setting_that_is_no_number_is_not_taken(client: Client, bank: AxisBank) -> None:
+    before = client.exchange("axis0.controller.config.vel_gain", math.nan)
+    assert client.exchange("axis0.controller.config.vel_gain") == before
+    assert client.front.ignored == 1
+
+
+def test_clearing_errors_clears_both_axes(client: Client, bank: AxisBank) -> None:
+    step(bank, 1e3)
+    assert client.exchange("axis0.error") != 0
+    client.call("clear_errors")
+    assert [client.exchange(f"axis{i}.error") for i in (0, 1)] == [0, 0]
+
+
+def test_the_configuration_is_saved_in_idle_only(client: Client, bank: AxisBank) -> None:
+    client.exchange("axis0.requested_state", AxisState.CLOSED_LOOP_CONTROL)
+    client.call("save_configuration")
+    assert bank.talks(2 * MODULE)
+    client.exchange("axis0.requested_state", AxisState.IDLE)
+    client.exchange("axis0.controller.config.vel_limit", 7.0)
+    client.call("save_configuration")
+    assert not bank.talks(2 * MODULE), "it restarts"
+    assert bank.settings.get(MODULE, "axis0.controller.config.vel_limit") == 7.0
+
+
+def test_a_restart_forgets_what_was_not_saved(client: Client, bank: AxisBank) -> None:
+    before = client.exchange("axis0.controller.config.vel_limit", 7.0)
+    client.call("reboot")
+    assert bank.settings.get(MODULE, "axis0.controller.config.vel_limit") == before

@@ -1,0 +1,324 @@
+"""The crash matrix as data: what dies, what has to be left of the robot, and why.
+
+In every case the operator leads a squat; the crash comes on the way down, at about 1.0 m.
+Two pushes follow, then what was lost is brought back by a request, and he leads on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Final
+
+import msgspec
+
+from shared.config import SERVICES
+from shared.joints import MODULES, kind_of
+from shared.scenario import FAULT_KINDS, Fault, FaultKind, Keyframe, Kill, Push, Restart, Scenario
+from tools.runs.conductor import Chase
+
+CRASH_S: Final = 2.4
+REQUEST_S: Final = 5.0
+"""Here somebody asks for what is in FAULT: its service is ended,"""
+BACK_S: Final = 5.2
+"""and here it is started again, as is every service that was killed or stopped."""
+FAULT_LASTS_S: Final = 2.0
+"""A cable is in again, a supply or an encoder is there again: well before the request."""
+DURATION_S: Final = 8.0
+
+HAND: Final = (
+    Keyframe(at=0.0, height=1.188),
+    Keyframe(at=3.5, height=0.948),
+    Keyframe(at=7.0, height=1.188),
+)
+PUSHES: Final = (
+    Push(at=3.4, duration=0.3, force=(30.0, 0.0, 0.0)),
+    Push(at=4.2, duration=0.3, force=(0.0, 30.0, 0.0)),
+)
+
+CRASHED: Final = tuple(service for service in SERVICES if service != "simulator")
+"""Services that are killed. The simulator is the world and the drives: no robot has it."""
+
+
+class Verdict(StrEnum):
+    """How a case came out."""
+
+    STOOD = "stood"
+    SANK = "sank"
+    """Not fallen, but lower than the hand ever was."""
+    FELL = "fell"
+    UNJUDGED = "unjudged"
+    """The run could not be carried out to where it can be judged."""
+
+    @property
+    def badness(self) -> int:
+        """0 is best."""
+        return list(Verdict).index(self)
+
+
+class Case(msgspec.Struct, frozen=True, kw_only=True):
+    """One row of the matrix."""
+
+    name: str
+    kind: str
+    """What sort of crash; `--quick` has at least one of each."""
+    crash: tuple[Kill | Fault, ...]
+    expected: Verdict
+    """The worst that is allowed."""
+    why: str
+    """Why no better is expected, or why so much is."""
+    before: tuple[Kill | Restart, ...] = ()
+    """What leads up to the crash."""
+    chase: Chase | None = None
+    """A crash that follows what the modules do."""
+    holds: bool = True
+    """The modules that are not hit go to HOLD; False: they go on tracking."""
+    quick: bool = False
+
+    @property
+    def hit(self) -> frozenset[str]:
+        """Services and modules that the crash is of."""
+        names = {row.service if isinstance(row, Kill) else row.module for row in self.crash}
+        return frozenset(names | ({self.chase.service} if self.chase else set()))
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Modules that are not hit: these have to be safe."""
+        return tuple(module for module in MODULES if module not in self.hit)
+
+
+def story_of(case: Case) -> Scenario:
+    """Return the case as a scenario, with the requests that bring back what was lost."""
+    kills = [row for row in (*case.before, *case.crash) if isinstance(row, Kill)]
+    down = [row.service for row in case.crash if isinstance(row, Kill)]
+    down += [case.chase.service] if case.chase else []
+    faulted = [row.module for row in case.crash if isinstance(row, Fault)]
+    kills += [Kill(service=name, at=REQUEST_S) for name in faulted if name not in down]
+    back = dict.fromkeys((*down, *faulted))
+    return Scenario(
+        name=case.name,
+        about=case.why,
+        duration=DURATION_S,
+        keyframe=HAND,
+        push=PUSHES,
+        kill=tuple(kills),
+        restart=(
+            *(row for row in case.before if isinstance(row, Restart)),
+            *(Restart(service=name, at=BACK_S) for name in back),
+        ),
+        fault=tuple(row for row in case.crash if isinstance(row, Fault)),
+    )
+
+
+def killed(*services: str, signal: str = "KILL") -> tuple[Kill, ...]:
+    """Return these services crashed at once."""
+    row = {"at": CRASH_S, "signal": signal}
+    return tuple(msgspec.convert({**row, "service": name}, Kill) for name in services)
+
+
+def fault(module: str, kind: FaultKind) -> Fault:
+    """Return a drive's fault at the time of the crash."""
+    lasts = FAULT_LASTS_S if kind in ("encoder", "link_lost", "over_temperature") else None
+    return Fault(module=module, kind=kind, at=CRASH_S, duration=lasts)
+
+
+def _of_service(service: str, signal: str) -> Case:
+    """Return the case of one service that dies, or is frozen."""
+    is_joint, is_planner = service in MODULES, service == "planner"
+    if is_joint:
+        why = "its drive holds the module by its own loop; the planner has the others hold"
+    elif is_planner:
+        why = "commands grow old, and all six modules hold on their own gains"
+    else:
+        why = "balance needs nothing from it"
+    how = "kill" if signal == "KILL" else "stop"
+    vital = is_joint or is_planner
+    return Case(
+        name=f"{how}-{service}",
+        kind=f"{how} {'joint service' if is_joint else service}" if vital else f"{service} lost",
+        crash=killed(service, signal=signal),
+        expected=Verdict.STOOD,
+        why=why,
+        holds=vital,
+        quick=service in ("knee_left", "planner") or (signal == "KILL" and not vital),
+    )
+
+
+LIMP: Final = {
+    "ankle": (Verdict.FELL, "nothing turns its sole against the floor: a push to its side tips it"),
+    "knee": (Verdict.FELL, "the leg folds, and the other cannot carry all of the weight"),
+    "hip": (Verdict.STOOD, "the other hip carries the torso's pitch alone"),
+}
+"""What a robot with one limp module may come to, by the kind of module, and why."""
+
+BELIEVED: Final = (
+    Verdict.FELL,
+    "limp, and its service and the planner push against a false pose until the heartbeat tells",
+)
+"""The same where it is an encoder that was lost."""
+
+
+def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = "") -> Case:
+    """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
+    if kind == "link_lost":
+        expected = Verdict.STOOD
+        why = "the drive holds what it was told last; its service does not know it any more"
+    elif kind == "encoder":
+        expected, why = BELIEVED
+    else:
+        expected, reason = LIMP[kind_of(module)]
+        why = f"limp ({FAULT_KINDS[kind].about}): {reason}"
+    name = "unplugged" if kind == "link_lost" else kind
+    return Case(
+        name=f"{name}-{module}",
+        kind=sort or name,
+        crash=(fault(module, kind),),
+        expected=expected,
+        why=why,
+        quick=quick,
+    )
+
+
+EACH_DRIVE: Final[tuple[tuple[FaultKind, str], ...]] = (
+    ("link_lost", "knee_left"),
+    ("disarmed", "hip_left"),
+    ("encoder", "ankle_left"),
+)
+"""Faults that every drive has, and the module of the short run."""
+
+LEFT_ONLY: Final[tuple[tuple[FaultKind, str], ...]] = (
+    ("brown_out", "hip_left"),
+    ("brown_out", "knee_left"),
+    ("brown_out", "ankle_left"),
+    ("over_voltage", "hip_left"),
+    ("over_voltage", "knee_left"),
+    ("over_voltage", "ankle_left"),
+    ("over_temperature", "hip_left"),
+    ("watchdog", "hip_left"),
+    ("overspeed", "hip_left"),
+)
+"""Faults that leave a module limp as `disarmed` does: left and right are mirrored, and one
+module is enough where only the error's name differs."""
+
+
+def _drives() -> list[Case]:
+    cases = [
+        _of_drive(module, kind, quick=module == quick)
+        for kind, quick in EACH_DRIVE
+        for module in MODULES
+    ]
+    for kind, module in LEFT_ONLY:
+        quick = module == "hip_left" and kind in ("brown_out", "over_voltage")
+        sort = "" if kind == "brown_out" else "drive trips"
+        cases.append(_of_drive(module, kind, quick=quick, sort=sort))
+    return cases
+
+
+def _reengaging() -> list[Case]:
+    """Return the planner killed again as it comes back."""
+    before = (Kill(service="planner", at=0.8), Restart(service="planner", at=0.9))
+    return [
+        Case(
+            name=f"reengaging-{name}",
+            kind="planner killed during re-engagement",
+            crash=(),
+            before=before,
+            chase=Chase("planner", modules=modules, after_s=after_s),
+            expected=Verdict.STOOD,
+            why=why,
+            quick=name == "blend",
+        )
+        for name, modules, after_s, why in (
+            ("first", 1, 0.0, "the first module tracks, and others may hold: all hold again"),
+            ("blend", 6, 0.15, "half way from HOLD to TRACK: the blend freezes where it is"),
+        )
+    ]
+
+
+_FREE: Final = "each drive holds by its own loop, and needs neither its service nor the others'"
+_UNNEEDED: Final = "balance needs neither"
+
+
+def _together() -> list[Case]:
+    """Return what happens to all joint services at once."""
+    rows: tuple[tuple[str, tuple[Kill | Fault, ...]], ...] = (
+        ("kill-all-joints", killed(*MODULES)),
+        ("stop-all-joints", killed(*MODULES, signal="STOP")),
+        ("kill-all-and-planner", killed("planner", *MODULES)),
+        ("unplugged-all", tuple(fault(module, "link_lost") for module in MODULES)),
+    )
+    return [
+        Case(
+            name=name,
+            kind="all joint services",
+            crash=crash,
+            expected=Verdict.STOOD,
+            why=_FREE,
+            quick=name == "kill-all-joints",
+        )
+        for name, crash in rows
+    ]
+
+
+def _pair(
+    name: str,
+    *crash: Kill | Fault,
+    expected: Verdict = Verdict.STOOD,
+    why: str = _FREE,
+    holds: bool = True,
+    quick: bool = False,
+) -> Case:
+    """Return the case of two things that are lost at once."""
+    return Case(
+        name=f"pair-{name}",
+        kind="pair",
+        crash=crash,
+        expected=expected,
+        why=why,
+        holds=holds,
+        quick=quick,
+    )
+
+
+def _pairs() -> list[Case]:
+    fell, knees = Verdict.FELL, ("knee_right", "knee_left")
+    limp_hip = fault("hip_left", "disarmed")
+    return [
+        _pair("knees", *killed(*knees)),
+        _pair("ankles", *killed("ankle_right", "ankle_left")),
+        _pair("hips", *killed("hip_right", "hip_left")),
+        _pair("ankle-knee", *killed("ankle_left", "knee_left")),
+        _pair("planner-knee", *killed("planner", "knee_left"), quick=True),
+        _pair("planner-harness", *killed("planner", "harness"), why="HOLD needs neither"),
+        _pair("planner-recorder", *killed("planner", "recorder"), why="HOLD needs neither"),
+        _pair("harness-recorder", *killed("harness", "recorder"), why=_UNNEEDED, holds=False),
+        _pair("stopped-planner-knee", *killed("planner", signal="STOP"), *killed("knee_left")),
+        _pair("knee-unplugged-hip", *killed("knee_left"), fault("hip_right", "link_lost")),
+        _pair("knee-and-its-link", *killed("knee_left"), fault("knee_left", "link_lost")),
+        _pair("unplugged-knees", *(fault(module, "link_lost") for module in knees)),
+        _pair("planner-limp-hip", *killed("planner"), limp_hip, why=LIMP["hip"][1]),
+        _pair(
+            "limp-hips",
+            fault("hip_right", "disarmed"),
+            limp_hip,
+            expected=fell,
+            why="nothing holds the torso's pitch any more but the hand",
+        ),
+        _pair(
+            "limp-knees",
+            *(fault(module, "disarmed") for module in knees),
+            expected=fell,
+            why="both legs fold",
+        ),
+    ]
+
+
+CASES: Final[Sequence[Case]] = (
+    *(_of_service(service, "KILL") for service in CRASHED),
+    *(_of_service(service, "STOP") for service in CRASHED),
+    *_drives(),
+    *_reengaging(),
+    *_together(),
+    *_pairs(),
+)
+"""The whole matrix, in the order in which it is run."""

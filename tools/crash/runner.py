@@ -1,0 +1,129 @@
+"""Runs one case of the crash matrix on a live fleet of its own."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from shared import topics
+from shared.bus import Session
+from shared.codec import Decoder
+from shared.config import RobotConfig
+from shared.exceptions import FleetError, RunError
+from shared.joints import MODULES
+from shared.messages import JointEvent, RunEvent, RunEventKind, SimTruth
+from tools.crash.cases import Case, Verdict, story_of
+from tools.crash.outcome import Heard, Outcome, as_expected, measure, unjudged
+from tools.runs.conductor import Conductor, Snapshot
+from tools.runs.live import run_live
+from tools.supervision.supervise import Fleet
+from tools.supervision.supervisor_client import ServiceInfo
+
+Show = Callable[[Snapshot], None]
+
+TRIES: Final = 2
+"""A run that was disturbed by the machine, or could not be carried out, is made again."""
+
+
+class Witness:
+    """Keeps what the verdict needs of what is on the bus, beside the recorder."""
+
+    def __init__(self, session: Session, show: Show) -> None:
+        self.truth: list[SimTruth] = []
+        self.events: list[tuple[str, JointEvent]] = []
+        self.modes: tuple[str, ...] = ("-",) * len(MODULES)
+        self._modules = {topics.JOINT_EVENT.key(session.robot, name): name for name in MODULES}
+        self._stream = session.stream([topics.JOINT_EVENT.key(session.robot, "*")])
+        self._decoder = Decoder(JointEvent)
+        self._show = show
+
+    def see(self, snapshot: Snapshot) -> None:
+        """Take in a moment of the run, and pass it on."""
+        if snapshot.truth is not None:
+            self.truth.append(snapshot.truth)
+        self.modes = snapshot.modes
+        self.listen()
+        self._show(snapshot)
+
+    def listen(self) -> None:
+        """Take in the changes of mode that have come."""
+        while (sample := self._stream.take()) is not None:
+            event = self._decoder.decode(sample[1])
+            if event is not None:
+                self.events.append((self._modules[sample[0]], event))
+
+
+def run_case(case: Case, robot: RobotConfig, out: Path, show: Show, *, seed: int = 0) -> Outcome:
+    """Run a case, a second time if the first was disturbed.
+
+    Args:
+        case: what dies.
+        robot: the robot.
+        out: the case's folder; made here.
+        show: sees the run as it goes on.
+        seed: of the sensors' noise.
+    """
+    begin_s = time.monotonic()
+    tries = 0
+    while tries < TRIES:
+        tries += 1
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir(parents=True)
+        outcome = _run_once(case, robot, out, show, seed)
+        if outcome.in_real_time and outcome.verdict is not Verdict.UNJUDGED:
+            break
+    wall_s = time.monotonic() - begin_s
+    outcome = msgspec.structs.replace(outcome, tries=tries, wall_s=wall_s)
+    if as_expected(case, outcome) and outcome.verdict is not Verdict.FELL:
+        for log in out.glob("*.mcap"):
+            log.unlink()  # 6 MB each, and there is nothing to look for in it
+    return outcome
+
+
+def _run_once(case: Case, robot: RobotConfig, out: Path, show: Show, seed: int) -> Outcome:
+    story = story_of(case)
+    down = {row.service for row in story.kill}
+
+    def lead(fleet: Fleet, session: Session) -> Heard:
+        witness = Witness(session, show)
+        conductor = Conductor(fleet, session, story, witness.see, case.chase)
+        conductor.run()
+        witness.listen()
+        died = died_of(fleet.info(), conductor.said)
+        return Heard(witness.truth, witness.events, conductor.said, witness.modes, died)
+
+    try:
+        heard = run_live(
+            out,
+            robot,
+            story,
+            lead,
+            verb="crash",
+            seed=seed,
+            no_restart=down,
+        )
+    except (RunError, FleetError) as error:
+        lines = str(error).splitlines()  # a service's log ends with what was wrong
+        return unjudged(": ".join(dict.fromkeys((lines[0], lines[-1].strip()))))
+    return measure(case, heard, robot)
+
+
+def died_of(services: Sequence[ServiceInfo], said: Sequence[RunEvent]) -> list[str]:
+    """Return the services that have ended, now or before, without being told to.
+
+    Args:
+        services: as they are at the end of the run.
+        said: what was done to them.
+    """
+    last = {row.subject: row.kind for row in said}
+    return [
+        service.name
+        for service in services
+        if (service.pid is None and last.get(service.name) != RunEventKind.KILLED)
+        or (service.restarts > 0 and service.name not in last)
+    ]

@@ -1,0 +1,86 @@
+"""A live run: a fleet in a run directory of its own, led by a tool and stopped again."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import TypeVar
+
+from shared.bus import Session, open_session
+from shared.config import RobotConfig
+from shared.robot_model import mjcf
+from shared.scenario import Scenario
+from tools.runs import experiment
+from tools.supervision.supervise import Fleet
+
+T = TypeVar("T")
+
+
+def run_live(
+    out: Path,
+    robot: RobotConfig,
+    story: Scenario,
+    lead: Callable[[Fleet, Session], T],
+    *,
+    verb: str,
+    seed: int,
+    no_restart: Collection[str],
+) -> T:
+    """Start a fleet, have it led, stop it; return what `lead` returns.
+
+    However it ends, no process and no run directory is left, and the logs are in `out`.
+
+    Args:
+        out: for the log of the run, what it is made from, and the services' logs.
+        robot: the robot.
+        story: what the simulated operator and the drives do; kills are for `lead` to do.
+        lead: leads the run; it is given the fleet and a session on its bus.
+        verb: of the command line; names the run directory and the session.
+        seed: of the sensors' noise.
+        no_restart: services that the supervisor leaves down when they end.
+
+    Raises:
+        FleetError: the fleet cannot be started or stopped.
+    """
+    robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, story)
+    model_path = out / "model.xml"
+    model_path.write_text(mjcf(robot), encoding="utf-8")
+    run_dir = Path(tempfile.mkdtemp(prefix=f"xrl-{verb}-", dir="/tmp"))
+    try:
+        fleet = Fleet.start(
+            robot_path.absolute(),
+            run_dir,
+            overrides={
+                "recorder": _recorder_arguments(out, story, scenario_path, model_path),
+                "simulator": ["--scenario", str(scenario_path.absolute()), "--seed", str(seed)],
+            },
+            no_restart=frozenset(no_restart),
+            leashed=True,
+        )
+        try:
+            with open_session(robot, verb, run_dir) as session:
+                return lead(fleet, session)
+        finally:
+            fleet.stop(keep_logs=True)
+            logs = out / "logs"
+            shutil.rmtree(logs, ignore_errors=True)
+            shutil.copytree(fleet.run.logs, logs, dirs_exist_ok=True)
+    finally:
+        shutil.rmtree(run_dir, ignore_errors=True)
+
+
+def _recorder_arguments(
+    out: Path, story: Scenario, scenario_path: Path, model_path: Path
+) -> list[str]:
+    return [
+        "--out",
+        str(out.absolute()),
+        "--scenario",
+        str(scenario_path.absolute()),
+        "--scenario-text",
+        story.name,
+        "--attach",
+        f"model.xml={model_path.absolute()}",
+    ]
