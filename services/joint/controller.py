@@ -216,7 +216,7 @@ class JointController:
 
         The ankles' and every phi's: with these as they were (design section 4), the
         operator's 60 N m of pitch moment in the crawl leaned the COM back by 42 mm and the
-        soles tipped, and pushes from the side tipped them in 8 of 230 random cases. Not the
+        soles tipped, and pushes from the side tipped them in 15 of 500 random cases. Not the
         theta of hips and knees: a torso that does not follow a hand that leads on hands all
         of its moment to the soles, and 6 of 300 fell.
         """

@@ -91,6 +91,8 @@ class OdriveCan:
         lost_s = drive.watchdog_timeout or LOST_MS * 1e-3
         self._lost_after_ns = round(lost_s * NS_PER_S)
         self._torque_messages = [message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in node_ids]
+        first, second = (message(n, Command.SET_INPUT_POS, bytes(8)) for n in node_ids)
+        self._input_messages = (first, second)
         self._food = [message(n, _NMT_COMMAND, b"") for n in node_ids]
         self._encoder_axis = {
             cansimple.arbitration_id(n, Command.GET_ENCODER_ESTIMATES): i
@@ -185,7 +187,8 @@ class OdriveCan:
                 messages += odrive_frames.modes(nodes, ControlMode.POSITION)
             self._gains_sent, self._gains_at_ns = gains, now + GAINS_MS * NS_PER_MS
             messages += odrive_frames.gains(nodes, target)
-        messages += odrive_frames.inputs(nodes, target)
+        odrive_frames.fill_inputs(self._input_messages, target)
+        messages += self._input_messages
         if not self._transmit(messages):
             self._gains_sent = None if self._bus is None else self._gains_sent
             self._gains_at_ns = 0

@@ -61,14 +61,12 @@ def gains(nodes: Nodes, target: MotorTarget) -> list[can.Message]:
     return frames
 
 
-def inputs(nodes: Nodes, target: MotorTarget) -> list[can.Message]:
-    """Return the frames of position, velocity and torque.
+def fill_inputs(frames: tuple[can.Message, can.Message], target: MotorTarget) -> None:
+    """Write position, velocity and torque into the two axes' frames, which are kept.
 
     Velocity and torque travel in thousandths: the torque to 0.035 N m at the joint.
     """
-    return [
-        message(node, Command.SET_INPUT_POS, cansimple.pack_input_pos(pos, vel, torque))
-        for node, pos, vel, torque in zip(
-            nodes, target.pos_turns, target.vel_turns, target.torque, strict=True
-        )
-    ]
+    for frame, pos, vel, torque in zip(
+        frames, target.pos_turns, target.vel_turns, target.torque, strict=True
+    ):
+        frame.data[:] = cansimple.pack_input_pos(pos, vel, torque)
