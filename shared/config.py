@@ -76,6 +76,10 @@ class RobotConfig(Section, frozen=True):
         """Return a module by its name."""
         return next(module for module in self.module if module.name == name)
 
+    def motor_signs(self) -> tuple[int, ...]:
+        """Return which way each of the 12 motors counts, axis0 and axis1 of each module."""
+        return tuple(s for name in MODULES for s in self.module_named(name).motor_signs)
+
     def joint_limits(self) -> tuple[tuple[float, float], ...]:
         """Return (low, high) in rad for each of the 12 joints, in `JOINTS` order."""
         rows = []

@@ -40,6 +40,23 @@ class Cause(IntEnum):
     ESTOP = 5
     DRIVE_LOST = 6
     DRIVE_DISARMED = 7
+    POSITION_LOST = 8
+    """The drive does not know where its joint is: unzeroed, or its samples jump."""
+
+
+class DriveStatus(IntEnum):
+    """What a module's two axes are, together."""
+
+    LOST = 0
+    """No frames, or the link is down."""
+    IDLE = 1
+    """Both axes answer; at least one is not in closed loop, and neither reports an error."""
+    ARMED = 2
+    """Both axes are in closed loop."""
+    ERROR = 3
+    """At least one axis reports an error or left closed loop by itself."""
+    UNZEROED = 4
+    """Both axes answer, but have not been told where they are since they got power."""
 
 
 class PlannerMode(IntEnum):
@@ -88,6 +105,8 @@ class RunEventKind(IntEnum):
     RESTARTED = 2
     PUSHED = 3
     FINISHED = 4
+    FAULTED = 5
+    """A drive's fault began; the subject is the module, the detail the kind."""
 
 
 class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -131,6 +150,8 @@ class JointState(Message, frozen=True):
     """Drop-outs remembered by the re-engagement hysteresis."""
     refused: int
     """Commands refused since the start: old, foreign, out of order or out of limits."""
+    drive: int
+    """`DriveStatus`."""
     drive_error: int
     """The drives' error bits, both axes or-ed; 0 if none."""
 

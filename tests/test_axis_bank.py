@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -55,6 +56,7 @@ gain = st.floats(0.0, 40.0)
 )
 def test_torque_equals_the_scalar_law_of_the_firmware(modes, inputs, gains, pos, vel) -> None:
     bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=False)
+    bank.settings.fill("controller.config.enable_torque_mode_vel_limit", value=True)
     lift_bus_limits(bank)
     bank.step(0.0, np.array(pos), np.array(vel))
     for axis in range(12):
@@ -247,3 +249,49 @@ def test_estimators_start_at_the_true_state() -> None:
     assert bank.vel_estimate == pytest.approx(3.0)
     bank.step(5.001, np.full(12, 2.003), np.full(12, 3.0))
     assert bank.vel_estimate == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_drive_that_was_zeroed_counts_from_its_mark() -> None:
+    drive = msgspec.structs.replace(DRIVE, zero_mark_turns=64.0)
+    bank = AxisBank(drive, encoder_counts_per_turn=CPR)
+    bank.step(0.0, np.full(12, -3.25), ZERO)
+    np.testing.assert_allclose(bank.pos_estimate, 64.0 - 3.25)
+
+
+def test_a_drive_that_got_power_knows_where_it_is_within_a_turn() -> None:
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, zeroed=False)
+    bank.step(0.0, np.linspace(-9.3, 9.2, 12), ZERO)
+    np.testing.assert_allclose(bank.pos_estimate, np.linspace(-9.3, 9.2, 12) % 1.0, atol=1e-4)
+
+
+def test_a_restart_loses_the_whole_turns_and_only_of_its_own_drive() -> None:
+    drive = msgspec.structs.replace(DRIVE, zero_mark_turns=64.0)
+    bank = AxisBank(drive, encoder_counts_per_turn=CPR)
+    bank.step(0.0, np.full(12, 5.75), ZERO)
+    bank.reboot(4)
+    bank.step(DT, np.full(12, 5.75), ZERO)
+    assert bank.pos_estimate[[4, 5]] == pytest.approx([0.75, 0.75])
+    assert np.delete(bank.pos_estimate, [4, 5]) == pytest.approx([69.75] * 10)
+
+
+def test_a_count_that_was_set_is_counted_on_from_without_a_jump_in_velocity() -> None:
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR)
+    bank.step(0.0, ZERO, ZERO)
+    bank.set_count(3, 64.5 * CPR)
+    for k in range(1, 200):
+        bank.step(k * DT, np.full(12, 1e-3 * k), ZERO)
+    assert bank.pos_estimate[3] == pytest.approx(64.5 + 0.199, abs=2e-3)
+    assert bank.vel_estimate[3] == pytest.approx(bank.vel_estimate[2])
+
+
+def test_an_encoder_that_was_lost_comes_back_where_it_was_told_to_be_since() -> None:
+    drive = msgspec.structs.replace(DRIVE, zero_mark_turns=64.0)
+    bank = AxisBank(drive, encoder_counts_per_turn=CPR)
+    bank.step(0.0, ZERO, ZERO)
+    bank.conditions.lose_encoder(2, lost=True)
+    bank.step(DT, ZERO, ZERO)
+    assert bank.pos_estimate[2] == 0.0
+    bank.set_count(2, 0.0)
+    bank.conditions.lose_encoder(2, lost=False)
+    bank.step(2 * DT, ZERO, ZERO)
+    assert bank.pos_estimate[2] == pytest.approx(0.0, abs=1e-3)

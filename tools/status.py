@@ -17,8 +17,9 @@ from rich.table import Table
 from shared.bus import Latest, Session, open_session
 from shared.clock import NS_PER_S, now_ns
 from shared.config import load
+from shared.fault_table import recovery_of
 from shared.joints import MODULES
-from shared.messages import Cause, JointState, Message, Mode
+from shared.messages import Cause, DriveStatus, JointState, Message, Mode, Pair
 from shared.topics import TOPICS
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
@@ -34,7 +35,8 @@ _WINDOW_S: Final = 0.5
 _FRESH_S: Final = 1.0
 """An older message is history: its sender is dead, suspended or cut off."""
 _POLL_S: Final = 0.002
-LEFT_BY_RESTART: Final = (Mode.FAULT.name, Mode.DAMP.name)
+RESTART: Final = "xrl kill MODULE"
+"""Its supervisor starts it again."""
 
 _WORDS: Final = ("state", "last exit")
 _GOOD: Final = ("running", "starting")
@@ -63,6 +65,12 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """See `TIERS`; None in every other mode."""
     cause: str | None
     """Name of the `Cause` of its last change of mode."""
+    drive: str | None
+    """Name of the `DriveStatus` of its drive."""
+    q: Pair | None
+    """(phi, theta), rad; None if its drive does not know."""
+    way_out: str
+    """What a person does to have it track again; empty if nothing has to be done."""
 
 
 class FleetStatus(msgspec.Struct, frozen=True):
@@ -190,9 +198,18 @@ def look(fleet: Fleet, ears: Mapping[str, Ear]) -> FleetStatus:
 def module_status(state: Message | None) -> ModuleStatus:
     """Return a module's mode and tier from the newest state of its joint service."""
     if not isinstance(state, JointState):
-        return ModuleStatus(None, None, None)
-    mode = Mode(state.mode)
-    return ModuleStatus(mode.name, TIERS.get(mode), Cause(state.cause).name)
+        return ModuleStatus(None, None, None, None, None, "")
+    mode, cause, drive = Mode(state.mode), Cause(state.cause), DriveStatus(state.drive)
+    way_out = ""
+    if mode is Mode.FAULT:
+        way_out = f"{recovery_of(cause)}; then {RESTART}"
+    elif mode is Mode.DAMP:
+        way_out = RESTART
+    elif drive is DriveStatus.UNZEROED:
+        way_out = "hang the robot, xrl zero"
+    knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
+    q = state.q if knows else None
+    return ModuleStatus(mode.name, TIERS.get(mode), cause.name, drive.name, q, way_out)
 
 
 def tables(status: FleetStatus) -> Group:
@@ -226,12 +243,21 @@ def tables(status: FleetStatus) -> Group:
             row.last_exit,
         )
     modules = Table(title="modules", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("module", "mode", "tier", "because", "to leave it"):
-        modules.add_column(heading)
+    for heading in ("module", "mode", "tier", "because", "drive", "phi", "theta", "way out"):
+        modules.add_column(heading, no_wrap=heading != "way out")
     for name, module in status.modules.items():
-        way_out = f"xrl kill {name} (a restart)" if module.mode in LEFT_BY_RESTART else ""
         mode = module.mode or "not heard"
-        modules.add_row(name, mode, str(module.tier or "-"), module.cause or "", way_out)
+        drive = module.drive or "-"
+        angles = ("-", "-") if module.q is None else (f"{a:+.3f}" for a in module.q)
+        modules.add_row(
+            name,
+            mode,
+            str(module.tier or "-"),
+            module.cause or "",
+            drive if drive == DriveStatus.ARMED.name else f"[bold red]{drive}[/]",
+            *angles,
+            module.way_out.replace("MODULE", name),
+        )
     return Group(services, modules)
 
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.joint.controller import JointController
 from services.joint.drivers.base import Drive
 from services.joint.drivers.odrive_can import OdriveCan
+from services.joint.drivers.readonly import ReadOnly
+from services.joint.drivers.signed import Signed
+from services.joint.drivers.zeroed import Zeroed
 from services.joint.loop import JointLoop, Ports
+from services.joint.module import Module
 from shared import config, log, topics
 from shared.bus import open_session
 from shared.config import RobotConfig, expand
@@ -32,6 +35,11 @@ def main() -> int:
         "Control one 2-DOF module.", "python -m services.joint ankle_right --run-dir /tmp/xrl"
     )
     parser.add_argument("module", choices=MODULES)
+    parser.add_argument(
+        "--readonly",
+        action="store_true",
+        help="listen to the drive and publish, and send it nothing: for bring-up",
+    )
     arguments = parser.parse_args()
     module: str = arguments.module
     logger = log.setup(module)
@@ -46,8 +54,10 @@ def main() -> int:
             events=session.publisher(topics.JOINT_EVENT, JointEvent, module),
         )
         drive = open_drive(robot, module, arguments.run_dir)
-        loop = JointLoop(robot, JointController(robot, module), drive, ports)
-        logger.info("up, %s", granted)
+        if arguments.readonly:
+            drive = ReadOnly(drive)
+        loop = JointLoop(robot, Module(robot, module), drive, ports)
+        logger.info("up, %s%s", granted, ", read-only" if arguments.readonly else "")
         freeze_garbage()
         loop.run(stop)
         drive.close()
@@ -56,7 +66,15 @@ def main() -> int:
 
 
 def open_drive(robot: RobotConfig, module: str, run_dir: Path) -> Drive:
-    """Return the module's drive, on its CAN bus or on USB."""
+    """Return the module's drive, on its CAN bus or on USB, counted from the joint's zero."""
+    drive = _open(robot, module, run_dir)
+    signs = robot.module_named(module).motor_signs
+    if signs != (1, 1):
+        drive = Signed(drive, signs)
+    return Zeroed(drive, robot.drive.zero_mark_turns)
+
+
+def _open(robot: RobotConfig, module: str, run_dir: Path) -> Drive:
     wiring = robot.module_named(module)
     if robot.joint_service.driver == "odrive_usb":
         # imported here: the package takes a second, and needs the system's libusb-1.0
@@ -68,6 +86,7 @@ def open_drive(robot: RobotConfig, module: str, run_dir: Path) -> Drive:
         CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir)),
         wiring.node_ids,
         robot.drive,
+        encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,
     )
 
 

@@ -10,22 +10,16 @@ import math
 from typing import NamedTuple
 
 from services.joint import law
-from services.joint.differential import joint_from_motor, joint_torque
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.differential import joint_torque
+from services.joint.drivers.base import DriveReading
 from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.gate import gate, limits_of
 from services.joint.law import Setpoint
+from services.joint.samples import Samples
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import kind_of
 from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Pair
-
-_DRIVE_EVENT = {
-    DriveStatus.LOST: Event.DRIVE_LOST,
-    DriveStatus.IDLE: Event.DRIVE_DISARMED,
-    DriveStatus.ARMED: Event.DRIVE_ARMED,
-    DriveStatus.ERROR: Event.DRIVE_DISARMED,
-}
 
 
 class CycleResult(NamedTuple):
@@ -66,16 +60,13 @@ class JointController:
         self._setpoint: Setpoint = self._anchor
         self._changed_ns = 0
         self._last_cycle_ns = 0
-        self._sampled_ns = 0
+        self._samples = Samples(config.joint.gear_ratio)
         self._found_tau: Pair | None = None
         """What a drive that was found armed carries, N m: it is taken over without a step."""
         self._cause = 0
-        self.q: Pair = law.ZERO
-        self.v: Pair = law.ZERO
         self.tau: Pair = law.ZERO
         self.cycle = 0
         self.late = 0
-        self.drive_error = 0
         self._events = 0
         self._states = 0
 
@@ -95,16 +86,12 @@ class JointController:
             estop: the emergency stop is engaged.
         """
         self._count(now_ns)
+        failsafe, samples = self.failsafe, self._samples
         drive = Event.NONE
         if reading is not None:
-            drive = _DRIVE_EVENT[reading.status]
-            self.drive_error = reading.error
-            self._sampled_ns = reading.t_ns
-            self.q = joint_from_motor(reading.pos_turns, self._gear_ratio)
-            self.v = joint_from_motor(reading.vel_turns, self._gear_ratio)
+            drive = samples.take(reading, armed=failsafe.mode is not Mode.DISARMED)
             if reading.torque is not None:
                 self._found_tau = joint_torque(reading.torque, self._gear_ratio)
-        failsafe = self.failsafe
         if command is not None:
             failsafe.offer(command, now_ns, self.timing)
         before = failsafe.mode
@@ -117,12 +104,17 @@ class JointController:
         if failsafe.mode in (Mode.DISARMED, Mode.FAULT):
             self.tau = law.ZERO
         else:
-            wanted = law.torque(self._setpoint, self.q, self.v)
-            self.tau = gate(wanted, self.q, tau_before, self._limits)
+            wanted = law.torque(self._setpoint, samples.q, samples.v)
+            self.tau = gate(wanted, samples.q, tau_before, self._limits)
         event = None
         if cause is not None:
             event = self._event(now_ns, before, cause, tau_before)
         return CycleResult(self.tau, event)
+
+    @property
+    def samples(self) -> Samples:
+        """What the drive's samples say of the joint."""
+        return self._samples
 
     @property
     def cause(self) -> Cause:
@@ -139,14 +131,14 @@ class JointController:
 
         Its stamp is when the drive's sample came: commands made from old samples are old.
         """
-        failsafe = self.failsafe
+        failsafe, samples = self.failsafe, self._samples
         command = failsafe.command
         self._states += 1
         return JointState(
-            t_ns=self._sampled_ns,
+            t_ns=samples.t_ns,
             seq=self._states,
-            q=self.q,
-            v=self.v,
+            q=samples.q,
+            v=samples.v,
             tau=self.tau,
             mode=int(failsafe.mode),
             cause=self._cause,
@@ -158,16 +150,14 @@ class JointController:
             late=self.late,
             dropouts=failsafe.dropouts,
             refused=failsafe.refused,
-            drive_error=self.drive_error,
+            drive=int(samples.status),
+            drive_error=samples.error,
         )
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""
-        limits = self._limits
-        return (
-            limits.phi[0] <= self.q[0] <= limits.phi[1]
-            and limits.theta[0] <= self.q[1] <= limits.theta[1]
-        )
+        limits, q = self._limits, self._samples.q
+        return limits.phi[0] <= q[0] <= limits.phi[1] and limits.theta[0] <= q[1] <= limits.theta[1]
 
     def _count(self, now_ns: int) -> None:
         self.cycle += 1
@@ -180,13 +170,15 @@ class JointController:
         self._changed_ns = now_ns
         k_p, k_d = self._stand_k_p, self._stand_k_d
         if before is Mode.DISARMED and self._found_tau is not None:
-            self._anchor = law.taken_over(self.q, self.v, self._found_tau, k_p, k_d)
+            q, v = self._samples.q, self._samples.v
+            self._anchor = law.taken_over(q, v, self._found_tau, k_p, k_d)
             self.tau = self._found_tau  # what the gate takes for the last torque
         elif before is Mode.DISARMED:
-            self._anchor = law.stand(self.q, k_p, k_d)
+            self._anchor = law.stand(self._samples.q, k_p, k_d)
         elif self.failsafe.mode is Mode.DAMP:
-            self._damp_stop = min(self._damp_stop, self.q[1])
-            self._anchor = law.carrying(law.held(self._setpoint, 0.0), self._sinks, self.q)
+            q = self._samples.q
+            self._damp_stop = min(self._damp_stop, q[1])
+            self._anchor = law.carrying(law.held(self._setpoint, 0.0), self._sinks, q)
         else:
             self._anchor = self._setpoint
 
@@ -206,7 +198,7 @@ class JointController:
             share = max(0.0, 1.0 - since_ns / self._damp_fade_ns)
             held = law.stiffened(self._anchor, self._stand_k_p, self._stand_k_d, 1.0 - share)
             sunk = law.damped(held, self._sinks, self._damp_k_d, share)
-            if self.q[1] < self._damp_stop:
+            if self._samples.q[1] < self._damp_stop:
                 return law.caught(sunk, self._damp_stop, self._stand_k_p[1], self._stand_k_d[1])
             return sunk
         return self._held(since_ns)

@@ -3,7 +3,8 @@
 Pure: state, now, inputs -> state. The transitions are one table; `tests/safety` sweeps
 every state against every event.
 
-    DISARMED -> HOLD <-> TRACK;  any of them -> DAMP (e-stop);  any armed -> FAULT (drive lost)
+    DISARMED -> HOLD <-> TRACK;  any of them -> DAMP (e-stop);  any armed -> FAULT (drive or
+    its position lost)
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ class Event(IntEnum):
     ESTOP = 0
     DRIVE_LOST = 1
     DRIVE_DISARMED = 2
-    DRIVE_ARMED = 3
-    COMMAND_STALE = 4
-    HOLD_ASKED = 5
-    READY = 6
-    NONE = 7
+    POSITION_LOST = 3
+    DRIVE_ARMED = 4
+    COMMAND_STALE = 5
+    HOLD_ASKED = 6
+    READY = 7
+    NONE = 8
 
 
 TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
@@ -41,18 +43,21 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
         Event.ESTOP: (Mode.DAMP, Cause.ESTOP),
         Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
         Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
+        Event.POSITION_LOST: (Mode.FAULT, Cause.POSITION_LOST),
         Event.READY: (Mode.TRACK, Cause.COMMANDS_FRESH),
     },
     Mode.TRACK: {
         Event.ESTOP: (Mode.DAMP, Cause.ESTOP),
         Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
         Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
+        Event.POSITION_LOST: (Mode.FAULT, Cause.POSITION_LOST),
         Event.COMMAND_STALE: (Mode.HOLD, Cause.COMMAND_STALE),
         Event.HOLD_ASKED: (Mode.HOLD, Cause.HOLD_ALL),
     },
     Mode.DAMP: {
         Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
         Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
+        Event.POSITION_LOST: (Mode.FAULT, Cause.POSITION_LOST),
     },
     Mode.FAULT: {},
 }
@@ -167,7 +172,7 @@ class Failsafe(msgspec.Struct):
         Args:
             now_ns: this module's clock.
             timing: times and limits.
-            drive: DRIVE_LOST, DRIVE_DISARMED, DRIVE_ARMED or NONE.
+            drive: DRIVE_LOST, DRIVE_DISARMED, POSITION_LOST, DRIVE_ARMED or NONE.
             estop: the emergency stop is engaged.
         """
         fresh = self.usable(now_ns, timing)

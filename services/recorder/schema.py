@@ -30,6 +30,7 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.Wrench, "tare"): messages.Tare,
     (messages.PlannerStatus, "mode"): messages.PlannerMode,
     (messages.PlannerStatus, "split"): messages.SplitSource,
+    (messages.JointState, "drive"): messages.DriveStatus,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }
 """Fields that are plain integers on the bus and enumerations in the mind."""

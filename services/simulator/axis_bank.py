@@ -12,6 +12,7 @@ Units at the motor: turns, turn/s, N m, A.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,8 @@ class AxisBank:
         encoder_counts_per_turn: int,
         watchdog: bool = True,
         settings: Settings | None = None,
+        zeroed: bool = True,
+        motor_signs: Sequence[int] = (1,) * N_JOINTS,
     ) -> None:
         """Power the drives up, calibrated, in IDLE.
 
@@ -62,12 +65,18 @@ class AxisBank:
             encoder_counts_per_turn: of the encoders themselves.
             watchdog: whether the drives' watchdogs run.
             settings: of the drives; None: as the services want them (`configured`).
+            zeroed: whether they have been told where their motors are (`drive.zero_mark_turns`);
+                else they know it within a turn, as after any loss of power.
+            motor_signs: which way each motor counts; so does its mark.
         """
         self.settings = settings or configured(
             drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
         )
         n = N_JOINTS
         self._control = control = AxisControl(self.settings, encoder_counts_per_turn)
+        self._zeroed = zeroed
+        mark = round(drive.zero_mark_turns * encoder_counts_per_turn)
+        control.counts_from[:] = mark * np.array(motor_signs)
         self.bus = DcBus(self.settings)
         self.state = [AxisState.IDLE] * n
         self.faults = [Fault()] * n
@@ -104,6 +113,9 @@ class AxisBank:
             self.now_s = now_s
             self._fed_s = [now_s] * N_JOINTS
             control.start(pos_turns, vel_turns)
+            if not self._zeroed:
+                for axis in range(N_JOINTS):
+                    control.lose_turns(axis)
         else:
             dt_s = now_s - self.now_s
             self.now_s = now_s
@@ -163,6 +175,10 @@ class AxisBank:
         self.settings.set(axis >> 1, f"{below}.control_mode", control_mode)
         self.settings.set(axis >> 1, f"{below}.input_mode", input_mode)
 
+    def set_count(self, axis: int, count: float) -> None:
+        """Tell an axis that its encoder reads so many counts here; `input_pos` stays."""
+        self._control.set_count(axis, count)
+
     def clear_errors(self, axis: int) -> None:
         """Clear all errors of the axis's ODrive: the firmware clears both axes.
 
@@ -190,6 +206,7 @@ class AxisBank:
         self.settings.restore(drive)
         for each in _both(axis):
             self.calibration.restart(each)
+            self._control.lose_turns(each)
         self.conditions.boot(drive, self.now_s)
 
     def talks(self, axis: int) -> bool:

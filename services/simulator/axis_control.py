@@ -52,6 +52,8 @@ class AxisControl:
         """What heat leaves of current_lim, where `derated`."""
         self.derated = False
         self.integrator = np.zeros(n)
+        self.counts_from = np.zeros(n)
+        """What each encoder's count says at the true zero: whole counts."""
         self._rows = np.zeros((4, n))  # estimates of position and velocity; turns before and now
         self._next = np.zeros((2, n))
         self.pos_estimate: Vector = self._rows[0]
@@ -59,6 +61,7 @@ class AxisControl:
         self.turns: Vector = self._rows[3]
         """The encoder's whole counts, in turns."""
         self._dt_s = 0.0
+        self._decay = 1.0
         self._work, self._high, self._low = np.zeros(n), np.zeros(n), np.zeros(n)
         self._speed = np.zeros(n)
 
@@ -68,6 +71,21 @@ class AxisControl:
         self._count(pos_turns)
         self._rows[0] = self._rows[2] = self._rows[3]
         self._rows[1] = vel_turns
+
+    def set_count(self, axis: int, count: float) -> None:
+        """Have an axis's encoder read so many counts here, as `set_linear_count` does."""
+        if self._seen != self._settings.version:
+            self._derive()
+        cpr = self._cpr[axis]
+        self.counts_from[axis] += round(count) - round(self._rows[3, axis] * cpr)
+        self._rows[2:, axis] = self._rows[0, axis] = round(count) / cpr
+
+    def lose_turns(self, axis: int) -> None:
+        """Have an axis's encoder know no more than where it is within a turn, as at power-up."""
+        if self._seen != self._settings.version:
+            self._derive()
+        count = round(self._rows[3, axis] * self._cpr[axis] - self.counts_from[axis])
+        self.set_count(axis, count % self._counts_per_turn)
 
     def blind(self, axis: int) -> None:
         """Take an axis's estimates away: the firmware then reports zeros."""
@@ -133,6 +151,7 @@ class AxisControl:
         counts = self._rows[3]
         np.multiply(pos_turns, self._counts_per_turn, out=counts)
         np.floor(counts, out=counts)
+        counts += self.counts_from
         counts /= self._cpr
 
     def _derive(self) -> None:

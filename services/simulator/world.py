@@ -52,7 +52,8 @@ class World:
         joints = [self.model.joint(name) for name in JOINTS]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])
         self._v_index = np.array([joint.dofadr[0] for joint in joints])
-        motor = _motor_from_joint(config.joint.gear_ratio)
+        signs = np.array(config.motor_signs())[:, None]
+        motor = signs * _motor_from_joint(config.joint.gear_ratio)
         self._motor_from_q: Array = np.zeros((len(JOINTS), self.model.nq))
         self._motor_from_q[:, self._q_index] = motor
         self._motor_from_v: Array = np.zeros((len(JOINTS), self.model.nv))

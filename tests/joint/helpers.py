@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import msgspec
@@ -89,6 +90,18 @@ class Bench:
     def run(self, cycles: int, *, fresh: bool = False, **changes: Any) -> list[CycleResult]:
         """Run cycles, with a fresh command in each or with none."""
         return [self.cycle(self.fresh(**changes) if fresh else None) for _ in range(cycles)]
+
+    def move(self, q: Pair) -> None:
+        """Move the joint as a joint may: 0.01 rad a cycle."""
+        steps = math.ceil(max(abs(b - a) for a, b in zip(self.q, q, strict=True)) / 0.01)
+        start = self.q
+        for step in range(1, steps + 1):
+            share = step / steps
+            self.q = (
+                start[0] + share * (q[0] - start[0]),
+                start[1] + share * (q[1] - start[1]),
+            )
+            self.cycle()
 
     def to_hold(self) -> None:
         """Arm the drive: HOLD at the measured pose."""

@@ -238,7 +238,7 @@ def test_a_stalled_drive_keeps_the_failsafe_going(bench: Bench) -> None:
     events = [bench.cycle(stalled=True).event for _ in range(26)]
     causes = [event.cause for event in events if event is not None]
     assert causes == [Cause.COMMAND_STALE]
-    assert bench.controller.q == pytest.approx(bench.q)
+    assert bench.controller.samples.q == pytest.approx(bench.q)
     event = bench.cycle(stalled=True, estop=True).event
     assert event is not None
     assert (event.mode_before, event.mode_after) == (Mode.HOLD, Mode.DAMP)

@@ -8,10 +8,10 @@ from typing import Any, Generic, TypeVar, cast
 import pytest
 
 from services.joint import loop as joint_loop
-from services.joint.controller import JointController
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.loop import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS, JointLoop, Ports
+from services.joint.loop import JointLoop, Ports
+from services.joint.module import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS, Module
 from shared.config import RobotConfig
 from shared.messages import Estop, JointEvent, JointState, Mode, Pair
 from tests.joint.helpers import T0, command, with_service
@@ -46,6 +46,8 @@ class FakeDrive:
         self.silent = False
         self.obeys = True
         self.armed = self.idled = 0
+        self.told: list[Pair] = []
+        """Where the motors were told that they are."""
         self.torques: list[Pair] = []
         self.targets: list[MotorTarget] = []
         self.carries: Pair | None = None
@@ -73,6 +75,9 @@ class FakeDrive:
     def idle(self) -> None:
         self.idled += 1
 
+    def set_position(self, turns: Pair) -> None:
+        self.told.append(turns)
+
     def close(self) -> None:
         pass
 
@@ -82,10 +87,12 @@ class Rig:
         self.now_ns = T0
         self.onboard = robot.joint_service.loop == "onboard"
         self.gear_ratio = robot.joint.gear_ratio
+        self.zero_mark_turns = robot.drive.zero_mark_turns
         self.period_ns = round(1e9 / robot.joint_service.rate_hz)
         monkeypatch.setattr(joint_loop, "now_ns", lambda: self.now_ns)
         self.drive = FakeDrive(self)
-        self.controller = JointController(robot, "knee_right")
+        module = Module(robot, "knee_right")
+        self.controller = module.controller
         self.commands, self.estops = Inbox[Any](), Inbox[Estop]()
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
         ports = Ports(
@@ -94,7 +101,7 @@ class Rig:
             states=cast("Any", self.states),
             events=cast("Any", self.events),
         )
-        self.loop = JointLoop(robot, self.controller, self.drive, ports)
+        self.loop = JointLoop(robot, module, self.drive, ports)
 
     def run(self, cycles: int) -> None:
         for _ in range(cycles):
@@ -256,3 +263,47 @@ def test_states_carry_the_stamp_of_the_drives_sample(rig: Rig) -> None:
         rig.run(2)
     assert rig.states.sent[-1].t_ns - sampled <= 2 * rig.period_ns
     assert rig.mode is Mode.HOLD
+
+
+def test_an_unzeroed_drive_is_never_armed_and_once_zeroed_it_is(rig: Rig) -> None:
+    rig.drive.status = DriveStatus.UNZEROED
+    rig.run(3 * round(ARM_EVERY_NS / rig.period_ns))
+    assert rig.mode is Mode.DISARMED
+    assert rig.drive.armed == 0
+    assert rig.states.sent[-1].drive == DriveStatus.UNZEROED
+    rig.drive.status = DriveStatus.IDLE
+    rig.run(round(ARM_EVERY_NS / rig.period_ns) + 2)
+    assert rig.mode is Mode.HOLD
+
+
+def test_a_position_that_is_lost_idles_the_drive_and_then_makes_it_forget_its_zero(
+    rig: Rig,
+) -> None:
+    rig.run(20)
+    assert rig.mode is Mode.HOLD
+    q = rig.drive.q
+    rig.drive.status = DriveStatus.UNZEROED
+    rig.run(1)
+    assert rig.mode is Mode.FAULT
+    assert rig.drive.idled == 1
+    assert rig.drive.told == []
+    rig.run(3 * round(IDLE_EVERY_NS / rig.period_ns))
+    assert rig.drive.told == [(-rig.zero_mark_turns,) * 2]
+    assert rig.states.sent[-1].q == pytest.approx(q)
+
+
+def test_a_drive_that_disarmed_keeps_its_zero(rig: Rig) -> None:
+    rig.run(20)
+    rig.drive.status = DriveStatus.ERROR
+    rig.run(3 * round(IDLE_EVERY_NS / rig.period_ns))
+    assert rig.mode is Mode.FAULT
+    assert rig.drive.told == []
+
+
+def test_a_service_that_ends_while_it_sinks_leaves_its_drive_damping(onboard: Rig) -> None:
+    onboard.run(20)
+    onboard.estops.waiting.append(Estop(t_ns=0, seq=1, source="test"))
+    onboard.run(5)
+    assert onboard.mode is Mode.DAMP
+    onboard.loop.run(cast("Any", Stop(3, interrupted=False)))
+    assert onboard.drive.idled == 0

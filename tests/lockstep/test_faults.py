@@ -1,4 +1,4 @@
-"""A drive's fault in virtual time: the module that has it, and the other five."""
+"""A drive's fault in virtual time: every row of the fault table, held to."""
 
 from __future__ import annotations
 
@@ -7,18 +7,32 @@ import pytest
 
 from shared.cansimple import AxisState
 from shared.config import RobotConfig
+from shared.fault_table import DRIVE_FAULTS
 from shared.joints import MODULE_INDEX
-from shared.messages import Cause, Mode
-from shared.scenario import FAULT_KINDS, Fault
+from shared.messages import Cause, DriveStatus, Mode
+from shared.scenario import FAULT_KINDS, Fault, FaultKind, Kill, Restart
 from tests.lockstep.runs import Run, run, still
 
 MODULE = "hip_left"
 AT = 0.5
+FIRST = 2 * MODULE_INDEX[MODULE]
+AXES = slice(FIRST, FIRST + 2)
 
 
-def run_with(robot: RobotConfig, kind: str, duration: float | None = None) -> Run:
-    fault = Fault(module=MODULE, kind=kind, at=AT, duration=duration)  # type: ignore[arg-type]
-    return run(robot, still(1.0, fault=(fault,)))
+def run_with(
+    robot: RobotConfig,
+    kind: FaultKind,
+    duration: float | None = None,
+    *,
+    module: str = MODULE,
+    run_s: float = 1.0,
+    restarted_at: float | None = None,
+) -> Run:
+    fault = Fault(module=module, kind=kind, at=AT, duration=duration)
+    at = restarted_at
+    kills = () if at is None else (Kill(service=module, at=at),)
+    restarts = () if at is None else (Restart(service=module, at=at + 0.02),)
+    return run(robot, still(run_s, fault=(fault,), kill=kills, restart=restarts))
 
 
 def into_fault(outcome: Run) -> list[tuple[str, int, float]]:
@@ -31,29 +45,76 @@ def into_fault(outcome: Run) -> list[tuple[str, int, float]]:
     ]
 
 
+def modes_of(outcome: Run) -> list[Mode]:
+    return [controller.failsafe.mode for controller in outcome.lockstep.controllers]
+
+
+def test_every_kind_of_fault_has_a_row() -> None:
+    assert set(DRIVE_FAULTS) == set(FAULT_KINDS)
+
+
 @pytest.mark.parametrize("kind", FAULT_KINDS)
-def test_a_faulted_module_goes_to_fault_and_the_other_five_hold(
-    robot: RobotConfig, kind: str
+def test_a_faulted_module_goes_to_fault_for_the_cause_in_its_row_and_the_other_five_hold(
+    robot: RobotConfig, kind: FaultKind
 ) -> None:
     outcome = run_with(robot, kind)
     ((module, cause, at),) = into_fault(outcome)
-    silent = kind in ("link_lost", "brown_out")
+    silent = DRIVE_FAULTS[kind].cause is Cause.DRIVE_LOST
     assert module == MODULE
-    assert cause == (Cause.DRIVE_LOST if silent else Cause.DRIVE_DISARMED)
+    assert cause == DRIVE_FAULTS[kind].cause
     assert AT <= at <= AT + (0.11 if silent else 0.005)
-    modes = [controller.failsafe.mode for controller in outcome.lockstep.controllers]
-    assert modes.count(Mode.HOLD) == 5
+    assert modes_of(outcome).count(Mode.HOLD) == 5
 
 
-@pytest.mark.parametrize("kind", [kind for kind in FAULT_KINDS if not FAULT_KINDS[kind].whole])
-def test_the_sibling_of_an_axis_that_disarms_is_idled_by_its_service(
-    robot: RobotConfig, kind: str
+@pytest.mark.parametrize("kind", FAULT_KINDS)
+def test_both_axes_of_a_module_are_limp_or_neither_is_as_its_row_says(
+    robot: RobotConfig, kind: FaultKind
 ) -> None:
     bank = run_with(robot, kind).lockstep.bank
-    first = 2 * MODULE_INDEX[MODULE]
-    assert bank.state[first : first + 2] == [AxisState.IDLE] * 2
-    others = np.delete(np.arange(12), [first, first + 1])
-    assert {bank.state[axis] for axis in others} == {AxisState.CLOSED_LOOP_CONTROL}
+    armed = [state == AxisState.CLOSED_LOOP_CONTROL for state in bank.state]
+    assert armed[AXES] == [not DRIVE_FAULTS[kind].limp] * 2
+    others = np.delete(np.arange(12), [FIRST, FIRST + 1])
+    assert all(armed[axis] for axis in others)
+
+
+@pytest.mark.parametrize("kind", FAULT_KINDS)
+def test_a_fault_that_is_over_is_not_left_without_a_request(
+    robot: RobotConfig, kind: FaultKind
+) -> None:
+    lasts = None if FAULT_KINDS[kind].duration is None else 0.2
+    outcome = run_with(robot, kind, lasts, run_s=4.0)
+    modes = modes_of(outcome)
+    assert modes[MODULE_INDEX[MODULE]] is Mode.FAULT
+    assert modes.count(Mode.HOLD) == 5
+    assert outcome.stood  # on one hip
+
+
+@pytest.mark.parametrize("kind", FAULT_KINDS)
+def test_a_restart_arms_again_unless_the_zero_is_lost(robot: RobotConfig, kind: FaultKind) -> None:
+    lasts = None if FAULT_KINDS[kind].duration is None else 0.2
+    outcome = run_with(robot, kind, lasts, run_s=5.5, restarted_at=3.0)
+    controller = outcome.lockstep.controllers[MODULE_INDEX[MODULE]]
+    if DRIVE_FAULTS[kind].zero_lost:
+        assert controller.failsafe.mode is Mode.DISARMED
+        assert controller.samples.status is DriveStatus.UNZEROED
+        assert not outcome.lockstep.bank.torque[AXES].any()
+    else:
+        assert modes_of(outcome) == [Mode.TRACK] * 6
+    assert outcome.stood
+
+
+def test_what_a_lost_encoder_reports_is_never_taken_for_the_joint(robot: RobotConfig) -> None:
+    outcome = run_with(robot, "encoder", module="knee_left", run_s=AT + 0.02)
+    lockstep = outcome.lockstep
+    theta = lockstep.controllers[MODULE_INDEX["knee_left"]].samples.q[1]
+    stand = run(robot, still(AT)).lockstep.controllers[MODULE_INDEX["knee_left"]].samples.q[1]
+    assert theta == pytest.approx(stand, abs=0.02)
+    steps = [
+        max(abs(b - a) for a, b in zip(event.tau_before, event.tau_after, strict=True))
+        for module, event in lockstep.events
+        if module != "knee_left" and event.mode_after == Mode.HOLD
+    ]
+    assert max(steps, default=0.0) < 1.0
 
 
 def test_a_cable_out_for_less_than_it_takes_to_be_lost_changes_nothing(robot: RobotConfig) -> None:
@@ -66,8 +127,7 @@ def test_a_drive_with_its_own_loop_holds_while_its_cable_is_out_and_after(
     robot: RobotConfig,
 ) -> None:
     assert robot.joint_service.loop == "onboard"
-    fault = Fault(module="knee_right", kind="link_lost", at=AT, duration=0.5)
-    outcome = run(robot, still(3.0, fault=(fault,)))
+    outcome = run_with(robot, "link_lost", 0.5, module="knee_right", run_s=3.0)
     assert outcome.stood
     assert set(outcome.lockstep.bank.state) == {AxisState.CLOSED_LOOP_CONTROL}
     assert outcome.lockstep.controllers[1].failsafe.mode is Mode.FAULT

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import msgspec
+import numpy as np
+
 from shared.config import RobotConfig
 from shared.messages import Mode, SimTruth
-from tests.lockstep.runs import push, still
+from tests.lockstep.runs import push, run, still
 from tools.runs.lockstep import Lockstep
 
 
@@ -27,3 +30,14 @@ def test_the_robot_stands_through_pushes_with_no_planner_at_all(robot: RobotConf
     assert truth.torso[2] > 1.1
     assert max(truth.foot_left_tilt, truth.foot_right_tilt) < 0.02
     assert all(controller.failsafe.mode is Mode.HOLD for controller in fleet.controllers)
+
+
+def test_which_way_a_motor_counts_is_not_seen_at_the_joint(robot: RobotConfig) -> None:
+    mirrored = tuple(
+        msgspec.structs.replace(module, motor_signs=(-1, 1 if "left" in module.name else -1))
+        for module in robot.module
+    )
+    other = msgspec.structs.replace(robot, module=mirrored)
+    plain, signed = (run(config, still(0.5)) for config in (robot, other))
+    assert signed.stood
+    np.testing.assert_allclose(signed.com_mm, plain.com_mm, atol=0.05)

@@ -13,6 +13,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import N_MODULES
 from shared.messages import (
+    DriveStatus,
     JointCommand,
     JointState,
     Mode,
@@ -55,6 +56,7 @@ def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
         "late": 0,
         "dropouts": 0,
         "refused": 0,
+        "drive": DriveStatus.ARMED,
         "drive_error": 0,
     }
     return JointState(**(fields | changes))  # type: ignore[arg-type]

@@ -124,7 +124,7 @@ def test_a_knee_is_caught_before_it_folds_so_far_that_the_robot_topples(
     bench.cycle(estop=True)
     bench.run(3000)
     stop = robot.joint_service.damp_knee_stop
-    bench.q = (bench.q[0], stop - 0.02)
+    bench.move((bench.q[0], stop - 0.02))
     caught = bench.run(5)[-1].tau[1]
     assert caught == pytest.approx(0.02 * robot.stand_gains("knee_left").k_p[1])
 

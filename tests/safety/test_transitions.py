@@ -30,7 +30,13 @@ class Situation(NamedTuple):
     """Commands have been fresh for long enough."""
 
 
-DRIVE_EVENTS = (Event.NONE, Event.DRIVE_ARMED, Event.DRIVE_DISARMED, Event.DRIVE_LOST)
+DRIVE_EVENTS = (
+    Event.NONE,
+    Event.DRIVE_ARMED,
+    Event.DRIVE_DISARMED,
+    Event.DRIVE_LOST,
+    Event.POSITION_LOST,
+)
 FLAGS = (False, True)
 SITUATIONS = [
     Situation(mode, drive, *flags)
@@ -49,7 +55,7 @@ def section_4(s: Situation) -> Mode:
         return Mode.FAULT
     if s.estop and s.mode is not Mode.DAMP:
         return Mode.DAMP
-    gone = s.drive in (Event.DRIVE_LOST, Event.DRIVE_DISARMED)
+    gone = s.drive in (Event.DRIVE_LOST, Event.DRIVE_DISARMED, Event.POSITION_LOST)
     if s.mode is Mode.DISARMED:  # a drive that was never armed cannot be lost
         return Mode.HOLD if s.drive is Event.DRIVE_ARMED else Mode.DISARMED
     if gone:
@@ -82,7 +88,7 @@ def test_the_sweep_knows_every_state_and_every_event() -> None:
         Event.HOLD_ASKED,
         Event.READY,
     } == set(Event)
-    assert len(SITUATIONS) == 5 * 4 * 2**4
+    assert len(SITUATIONS) == 5 * 5 * 2**4
 
 
 @pytest.mark.parametrize("mode", Mode)
@@ -124,7 +130,7 @@ def test_every_change_tells_a_cause_that_fits_it() -> None:
             if after is Mode.DAMP:
                 assert cause is Cause.ESTOP
             elif after is Mode.FAULT:
-                assert cause in (Cause.DRIVE_LOST, Cause.DRIVE_DISARMED)
+                assert cause in (Cause.DRIVE_LOST, Cause.DRIVE_DISARMED, Cause.POSITION_LOST)
             else:
                 assert cause in CAUSES[before, after]
 
@@ -146,7 +152,7 @@ def test_only_a_lost_drive_leaves_damp(timing: Timing) -> None:
         if failsafe.advance(T0, timing, situation.drive, situation.estop) is not None:
             assert failsafe.mode is Mode.FAULT
             left.add(situation.drive)
-    assert left == {Event.DRIVE_LOST, Event.DRIVE_DISARMED}
+    assert left == {Event.DRIVE_LOST, Event.DRIVE_DISARMED, Event.POSITION_LOST}
 
 
 def test_an_emergency_stop_that_is_released_again_stays_in_damp(timing: Timing) -> None:

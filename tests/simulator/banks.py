@@ -13,9 +13,11 @@ DRIVE = DriveConfig(
     torque_constant=0.0827,
     current_lim=60.0,
     vel_limit=60.0,
+    dc_max_negative_current=-30.0,
     watchdog_timeout=0.1,
     encoder_period_ms=1,
     heartbeat_period_ms=100,
+    zero_mark_turns=0.0,
 )
 CPR = 16384
 DT = 0.001

@@ -13,6 +13,7 @@ from typing import Final
 import msgspec
 
 from shared.config import SERVICES
+from shared.fault_table import DRIVE_FAULTS
 from shared.joints import MODULES, kind_of
 from shared.scenario import FAULT_KINDS, Fault, FaultKind, Keyframe, Kill, Push, Restart, Scenario
 from tools.runs.conductor import Chase
@@ -73,6 +74,8 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     """A crash that follows what the modules do."""
     holds: bool = True
     """The modules that are not hit go to HOLD; False: they go on tracking."""
+    leads_again: bool = True
+    """The request brings the module back; False: it would have to be zeroed first."""
     quick: bool = False
 
     @property
@@ -151,20 +154,11 @@ LIMP: Final = {
 }
 """What a robot with one limp module may come to, by the kind of module, and why."""
 
-BELIEVED: Final = (
-    Verdict.FELL,
-    "limp, and its service and the planner push against a false pose until the heartbeat tells",
-)
-"""The same where it is an encoder that was lost."""
-
-
 def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = "") -> Case:
     """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
     if kind == "link_lost":
         expected = Verdict.STOOD
         why = "the drive holds what it was told last; its service does not know it any more"
-    elif kind == "encoder":
-        expected, why = BELIEVED
     else:
         expected, reason = LIMP[kind_of(module)]
         why = f"limp ({FAULT_KINDS[kind].about}): {reason}"
@@ -175,6 +169,7 @@ def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = 
         crash=(fault(module, kind),),
         expected=expected,
         why=why,
+        leads_again=not DRIVE_FAULTS[kind].zero_lost,
         quick=quick,
     )
 

@@ -121,7 +121,7 @@ def measure(case: Case, heard: Heard, robot: RobotConfig) -> Outcome:
     remarks += _remarks(case, safe_ms, reaction)
     remarks += [f"{name} ended by itself" for name in heard.died]
     leads = all(mode == "T" for mode in heard.modes)
-    if verdict is not Verdict.FELL and not leads:
+    if verdict is not Verdict.FELL and not leads and case.leads_again:
         remarks.append(f"does not lead again: {''.join(heard.modes)}")
     tracks = [e.t_ns for _, e in later if e.mode_after == Mode.TRACK]
     backs = [row.t_ns for row in heard.said if _is(row, RunEventKind.RESTARTED, REQUEST_S)]

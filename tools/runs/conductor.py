@@ -26,7 +26,7 @@ from shared.messages import (
     SimControl,
     SimTruth,
 )
-from shared.scenario import Kill, Push, Restart, Scenario
+from shared.scenario import Fault, Kill, Push, Restart, Scenario
 from tools.supervision import procfs
 from tools.supervision.supervise import Fleet
 
@@ -139,10 +139,11 @@ class Conductor:
             time.sleep(LAST_WORDS_S)
             return None
         self._start()
-        todo: list[Kill | Restart | Push] = [
+        todo: list[Kill | Restart | Push | Fault] = [
             *self._scenario.kill,
             *self._scenario.restart,
             *self._scenario.push,
+            *self._scenario.fault,
         ]
         todo.sort(key=lambda row: row.at)
         fallen_at_s = None
@@ -246,7 +247,8 @@ class Conductor:
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
 
-    def _act(self, row: Kill | Restart | Push) -> None:
+    def _act(self, row: Kill | Restart | Push | Fault) -> None:
+        """Do what is due; pushes and faults are the simulator's doing, and only said."""
         if isinstance(row, Kill):
             self._say(RunEventKind.KILLED, row.service, row.signal)
             number = signal.Signals[f"SIG{row.signal}"]
@@ -262,6 +264,9 @@ class Conductor:
             self._fleet.start_service(row.service)
             self._next_pids_s = 0.0
             self._note = f"{row.service} back"
+        elif isinstance(row, Fault):
+            self._say(RunEventKind.FAULTED, row.module, row.kind)
+            self._note = f"{row.module}: {row.kind}"
         else:
             x, y, z = row.force
             self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")

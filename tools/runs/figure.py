@@ -31,6 +31,7 @@ EVENT_COLOURS: Final = {
     RunEventKind.KILLED: "#c0392b",
     RunEventKind.RESTARTED: "#2e7d32",
     RunEventKind.PUSHED: "#7f7f7f",
+    RunEventKind.FAULTED: "#b8590b",
 }
 
 
@@ -99,7 +100,7 @@ def _modes(axis: Any, log: RunLog, start_ns: int, end_s: float) -> None:
 
 
 def _events(axes: Any, events: list[RunEvent]) -> None:
-    """Mark kills, restarts and pushes in every panel, with their names above the first."""
+    """Mark kills, faults, restarts and pushes in every panel, with their names above the first."""
     for event in events:
         kind = RunEventKind(event.kind)
         colour = EVENT_COLOURS.get(kind)

@@ -10,28 +10,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from services.joint.controller import JointController
-from services.joint.differential import motor_torque
-from services.joint.drivers.base import DriveReading, DriveStatus
-from services.joint.drivers.odrive_can import LOST_MS
-from services.joint.onboard import OnboardLaw
+from services.joint.module import Module
 from services.planner.planner import Planner
 from services.simulator.axis_bank import AxisBank
 from services.simulator.fault_injector import FaultInjector
 from services.simulator.world import World
 from shared import topics
-from shared.cansimple import AxisState, ControlMode, InputMode
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
+from shared.joints import MODULE_INDEX, MODULES
 from shared.messages import (
-    Cause,
     JointCommand,
     JointEvent,
     JointState,
     Message,
     Mode,
-    Pair,
     PlannerStatus,
     RunEvent,
     RunEventKind,
@@ -41,6 +35,7 @@ from shared.messages import (
 from shared.scenario import Kill, Push, Restart, Scenario
 from shared.topics import Topic
 from tools.runs.network import Impairment, Link
+from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
 
 SETTLE_NS = NS_PER_S
@@ -92,7 +87,7 @@ class Lockstep:
         self.config = config
         self.scenario = scenario
         self.world = World(config, scenario)
-        self.controllers = [JointController(config, module) for module in MODULES]
+        self._modules = [Module(config, module) for module in MODULES]
         self.planner: Planner | None = Planner(config, session=1)
         self.events: list[tuple[str, JointEvent]] = []
         self.estop = False
@@ -102,8 +97,6 @@ class Lockstep:
         self._frozen: set[str] = set()
         """Services that are stopped or dead."""
         self._dead: set[str] = set()
-        self._found = [False] * len(MODULES)
-        """Modules whose new service has yet to take its drive over."""
         self._sessions = 1
         network = network or Impairment()
         self._states: list[Link[JointState]] = [
@@ -127,23 +120,23 @@ class Lockstep:
         )
         self._said = 0
         self.bank = AxisBank(
-            config.drive, encoder_counts_per_turn=config.joint.encoder_counts_per_turn
+            config.drive,
+            encoder_counts_per_turn=config.joint.encoder_counts_per_turn,
+            motor_signs=config.motor_signs(),
         )
         self._torque = self.bank.torque
         self._faults = FaultInjector(scenario.fault, self.bank)
-        self._sampled_ns = [self.now_ns] * len(MODULES)
-        self._lost_after_ns = round((config.drive.watchdog_timeout or LOST_MS * 1e-3) * NS_PER_S)
-        onboard = config.joint_service.loop == "onboard"
-        self._onboard = (
-            [OnboardLaw(config.joint.gear_ratio, config.drive.vel_limit) for _ in MODULES]
-            if onboard
-            else None
-        )
-        mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
-        for axis in range(N_JOINTS):
-            self.bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
-        if onboard:
-            self.bank.pos_gain[:] = self.bank.vel_gain[:] = 0.0
+        self._drives = [
+            VirtualDrive(
+                self.bank, index, config.drive, config.module_named(name).motor_signs, self.now_ns
+            )
+            for index, name in enumerate(MODULES)
+        ]
+
+    @property
+    def controllers(self) -> list[JointController]:
+        """Each module's control law."""
+        return [module.controller for module in self._modules]
 
     def run(self) -> Iterator[SimTruth]:
         """Run to the scenario's end; yield the truth at its rate.
@@ -166,7 +159,8 @@ class Lockstep:
         """Move virtual time on by one step of the world."""
         now = self.now_ns
         if now % self._cycle_ns == 0:
-            self._faults.advance(self.world.scenario_s)
+            for fault in self._faults.advance(self.world.scenario_s):
+                self._say(RunEventKind.FAULTED, fault.module, fault.kind)
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
             self._cycle_joints(now)
         elif self.bank.regulates:
@@ -177,9 +171,6 @@ class Lockstep:
             self._advance_planner(self.planner, now)
         self._begin_when_tracking(now)
         self.world.step(self._torque)
-        if self.now_ns == NS_PER_S:
-            for axis in range(N_JOINTS):
-                self.bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
         self.now_ns += self._step_ns
 
     def _act(self, row: Kill | Restart | Push) -> None:
@@ -206,8 +197,8 @@ class Lockstep:
             self.planner = Planner(self.config, self._sessions)
             return
         index = MODULE_INDEX[service]
-        self.controllers[index] = JointController(self.config, service)
-        self._found[index] = True
+        self._modules[index] = Module(self.config, service)
+        self._drives[index].serve_anew()
 
     def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
         self._said += 1
@@ -222,77 +213,19 @@ class Lockstep:
         self._record(topics.RUN_EVENT, "", event)
 
     def _cycle_joints(self, now: int) -> None:
-        bank = self.bank
-        for index, (module, controller) in enumerate(zip(MODULES, self.controllers, strict=True)):
-            if module in self._frozen:
+        for index, (name, module) in enumerate(zip(MODULES, self._modules, strict=True)):
+            if name in self._frozen:
                 continue
-            a, b = 2 * index, 2 * index + 1
-            talks = bank.talks(a)
-            reading = self._read(index, now)
-            command = self._commands[index].take(now)
-            result = controller.step(now, reading, command, self.estop)
-            if result.event is not None:
-                self.events.append((module, result.event))
-                self._record(topics.JOINT_EVENT, module, result.event)
-            fault = controller.failsafe.mode is Mode.FAULT
-            lost = fault and controller.cause is Cause.DRIVE_LOST
-            # a drive that was lost, and holds by its own loop, is left alone when it is back
-            if talks and not (lost and self._onboard is not None):
-                self._write(index, result.tau)
-                bank.feed(a)
-                bank.feed(b)
-                if fault:
-                    bank.request_state(a, AxisState.IDLE)  # one axis that disarms leaves its
-                    bank.request_state(b, AxisState.IDLE)  # sibling's torque on
+            drive = self._drives[index]
+            step = module.step(now, drive.read(now), self._commands[index].take(now), self.estop)
+            drive.carry_out(step, onboard=module.onboard)
+            if step.event is not None:
+                self.events.append((name, step.event))
+                self._record(topics.JOINT_EVENT, name, step.event)
             if now % self._state_ns == 0:
-                state = controller.state(now)
+                state = module.controller.state(now)
                 self._states[index].put(now, state)
-                self._record(topics.JOINT_STATE, module, state)
-
-    def _write(self, index: int, tau: Pair) -> None:
-        """Give a module's drive what its driver would."""
-        bank, module = self.bank, slice(2 * index, 2 * index + 2)
-        mode = self.controllers[index].failsafe.mode
-        if self._onboard is None or mode in (Mode.DISARMED, Mode.FAULT):
-            bank.input_torque[module] = motor_torque(tau, self.config.joint.gear_ratio)
-            return
-        pos = bank.pos_estimate[module].tolist()
-        vel = bank.vel_estimate[module].tolist()
-        setpoint = self.controllers[index].setpoint
-        target = self._onboard[index].target(setpoint, tau, (pos[0], pos[1]), (vel[0], vel[1]))
-        bank.input_pos[module] = target.pos_turns
-        bank.input_vel[module] = target.vel_turns
-        bank.input_torque[module] = target.torque
-        bank.pos_gain[module] = target.pos_gain
-        bank.vel_gain[module] = target.vel_gain
-
-    def _read(self, index: int, now: int) -> DriveReading | None:
-        """Return what a module's driver would: None while silence may pass, then LOST."""
-        bank, a, b = self.bank, 2 * index, 2 * index + 1
-        if bank.talks(a):
-            self._sampled_ns[index] = now
-        elif now - self._sampled_ns[index] <= self._lost_after_ns:
-            return None
-        armed = bank.state[a] == bank.state[b] == AxisState.CLOSED_LOOP_CONTROL
-        status = DriveStatus.ARMED if armed else DriveStatus.IDLE
-        if not bank.talks(a):
-            status = DriveStatus.LOST
-        errors = 0 if armed else bank.heartbeat(a).errors | bank.heartbeat(b).errors
-        pos, vel = bank.pos_estimate, bank.vel_estimate
-        return DriveReading(
-            self._sampled_ns[index],
-            (float(pos[a]), float(pos[b])),
-            (float(vel[a]), float(vel[b])),
-            status,
-            int(errors),
-            self._carried(index),
-        )
-
-    def _carried(self, index: int) -> Pair | None:
-        """Return the motors' torques of a drive that is found armed by a new service."""
-        found, self._found[index] = self._found[index], False
-        a, b = self.bank.torque[2 * index : 2 * index + 2].tolist()
-        return (a, b) if found else None
+                self._record(topics.JOINT_STATE, name, state)
 
     def _advance_planner(self, planner: Planner, now: int) -> None:
         """Hand over what has arrived, and tick as the live loop does."""
@@ -315,7 +248,7 @@ class Lockstep:
     def _begin_when_tracking(self, now: int) -> None:
         if self.world.scenario_s >= 0.0:
             return
-        modes = [controller.failsafe.mode for controller in self.controllers]
+        modes = [module.controller.failsafe.mode for module in self._modules]
         if Mode.DISARMED not in modes:
             self.world.release_hoist()
         if self.world.hoist > 0.0 or any(mode is not Mode.TRACK for mode in modes):

@@ -2,25 +2,13 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Protocol
 
 import msgspec
 
-from shared.messages import Pair
+from shared.messages import DriveStatus, Pair
 
-
-class DriveStatus(IntEnum):
-    """What the joint service needs to know of its two axes together."""
-
-    LOST = 0
-    """No frames, or the link is down."""
-    IDLE = 1
-    """Both axes answer; at least one is not in closed loop, and neither reports an error."""
-    ARMED = 2
-    """Both axes are in closed loop."""
-    ERROR = 3
-    """At least one axis reports an error or left closed loop by itself."""
+__all__ = ["Drive", "DriveReading", "DriveStatus", "MotorTarget"]
 
 
 class DriveReading(msgspec.Struct, gc=False, frozen=True):
@@ -82,6 +70,13 @@ class Drive(Protocol):
 
     def idle(self) -> None:
         """Ask both axes to go idle."""
+
+    def set_position(self, turns: Pair) -> None:
+        """Tell both motors where they are, turns; only while they are idle.
+
+        Raises:
+            DriveError: the drive cannot be told. Not for the control path.
+        """
 
     def close(self) -> None:
         """Release the link."""

@@ -1,0 +1,163 @@
+"""What one module's service does in a cycle, without any I/O: the controller, and its drive's care.
+
+Arming, taking over what a service before this one left holding, idling what has disarmed, and
+whether torques or the onboard loop's targets go out. The loop carries the orders out on a real
+drive, lockstep on an emulated one. Pure.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final, NamedTuple
+
+import msgspec
+
+from services.joint.controller import JointController
+from services.joint.differential import motor_torque
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.onboard import OnboardLaw
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.messages import Cause, JointCommand, JointEvent, Mode, Pair
+
+ARM_EVERY_NS: Final = 500 * NS_PER_MS
+"""Arming is asked for again after this long, while DISARMED."""
+IDLE_EVERY_NS: Final = 500 * NS_PER_MS
+"""A drive one of whose axes has disarmed is told to go idle this often: its sibling goes on."""
+ARM_TRIES: Final = 10
+"""A drive that has not armed by then needs a person."""
+
+
+class Order(Enum):
+    """What the drive is to be told in a cycle."""
+
+    NOTHING = 0
+    TORQUE = 1
+    TARGET = 2
+    IDLE = 3
+    ARM = 4
+    FORGET_ZERO = 5
+
+
+class Obstacle(Enum):
+    """Why a drive is not armed; the loop puts it into words."""
+
+    NONE = 0
+    UNZEROED = 1
+    OUTSIDE_LIMITS = 2
+    WILL_NOT = 3
+
+
+class Step(NamedTuple):
+    """What came of a cycle."""
+
+    event: JointEvent | None
+    order: Order
+    torque: Pair
+    """Motor torques of `Order.TORQUE`, N m."""
+    target: MotorTarget | None
+    """Of `Order.TARGET`."""
+    obstacle: Obstacle
+
+
+_NO_TORQUE: Pair = (0.0, 0.0)
+
+
+class Module:
+    """One module's service between its drive and the bus.
+
+    Attributes:
+        controller: the control law and its memory.
+        onboard: True if the motors' own loops hold the module.
+    """
+
+    def __init__(self, config: RobotConfig, name: str) -> None:
+        self.controller = JointController(config, name)
+        self.onboard = config.joint_service.loop == "onboard"
+        self._law = OnboardLaw(config.joint.gear_ratio, config.drive.vel_limit)
+        self._gear_ratio = config.joint.gear_ratio
+        self._estop = False
+        self._arm_at_ns = 0
+        self._idle_at_ns = 0
+        self._tries = 0
+        self._forgets = config.drive.zero_mark_turns > 0.0
+
+    @property
+    def leaves_holding(self) -> bool:
+        """True if the drive holds the robot by its own loop should the service end now."""
+        mode = self.controller.failsafe.mode
+        return self.onboard and mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP)
+
+    def step(
+        self,
+        now_ns: int,
+        reading: DriveReading | None,
+        command: JointCommand | None,
+        estop: bool,
+    ) -> Step:
+        """Run one cycle; arguments as for `JointController.step`, and `estop` is remembered."""
+        self._estop = self._estop or estop
+        if self._tries == 0 and reading is not None and reading.status is DriveStatus.ARMED:
+            reading = self._found_armed(now_ns, reading)
+        controller = self.controller
+        result = controller.step(now_ns, reading, command, self._estop)
+        mode = controller.failsafe.mode
+        if mode is Mode.DISARMED and now_ns >= self._arm_at_ns:
+            obstacle = self._obstacle(now_ns, reading)
+            if obstacle is not None:
+                order = Order.ARM if obstacle is Obstacle.NONE else Order.NOTHING
+                return Step(result.event, order, _NO_TORQUE, None, obstacle)
+        order, torque, target = Order.NOTHING, _NO_TORQUE, None
+        if mode is Mode.FAULT:
+            order = self._in_fault(now_ns)
+        elif not self.onboard:
+            order, torque = Order.TORQUE, motor_torque(result.tau, self._gear_ratio)
+        elif mode is not Mode.DISARMED:
+            samples = controller.samples
+            order = Order.TARGET
+            target = self._law.target(controller.setpoint, result.tau, samples.pos, samples.vel)
+        return Step(result.event, order, torque, target, Obstacle.NONE)
+
+    def _in_fault(self, now_ns: int) -> Order:
+        """Return what the drive of a module in FAULT is to be told.
+
+        A lost one that holds by its own loop is left alone: should the link come back, it
+        holds still. Any other is to be idle, and one that has lost its position is to know no
+        zero: an encoder that comes back may have missed turns.
+        """
+        if self.controller.cause is Cause.DRIVE_LOST and self.onboard:
+            return Order.NOTHING
+        if now_ns >= self._idle_at_ns:
+            self._idle_at_ns = now_ns + IDLE_EVERY_NS
+            return Order.IDLE
+        if self._forgets and self.controller.cause is Cause.POSITION_LOST:
+            self._forgets = False
+            return Order.FORGET_ZERO
+        return Order.NOTHING
+
+    def _found_armed(self, now_ns: int, reading: DriveReading) -> DriveReading:
+        """Return the reading of a drive that somebody else has armed.
+
+        One that holds the robot by its own loop, after the service before this one died, is
+        taken over as it is, once it has told its torques. Any other is not armed by us.
+        """
+        if self.onboard and reading.torque is not None:
+            self._tries = 1
+            return reading
+        if self.onboard:
+            self._arm_at_ns = now_ns + ARM_EVERY_NS  # and it is not armed anew meanwhile
+        return msgspec.structs.replace(reading, status=DriveStatus.IDLE)
+
+    def _obstacle(self, now_ns: int, reading: DriveReading | None) -> Obstacle | None:
+        """Return what keeps the drive from being armed now; None: nothing is known of it."""
+        if reading is None or reading.status is DriveStatus.LOST:
+            return None
+        self._arm_at_ns = now_ns + ARM_EVERY_NS
+        if reading.status is DriveStatus.UNZEROED:
+            return Obstacle.UNZEROED
+        if not self.controller.inside_limits():
+            return Obstacle.OUTSIDE_LIMITS
+        self._tries += 1
+        if self._tries <= ARM_TRIES:
+            return Obstacle.NONE
+        return Obstacle.WILL_NOT if self._tries == ARM_TRIES + 1 else None

@@ -1,0 +1,169 @@
+"""What goes wrong, and what then happens: one table (design sections 4 and 5).
+
+Each row is a claim. `tests/lockstep/test_faults.py` brings the robot into every drive's fault
+and holds module, others and drive to the row; `xrl crashtest` does so live, processes and
+recovery included. `xrl faults` prints it.
+
+The rule behind the last column: what has let go of the robot never takes hold of it again by
+itself. It is asked for, by a person, by starting the module's service again.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from shared.messages import Cause
+from shared.scenario import FaultKind
+
+
+class DriveFault(NamedTuple):
+    """What comes of a fault of a module's ODrive.
+
+    In every one the module's own mode is FAULT, and the planner has the other five go to HOLD:
+    no leg works against the other.
+    """
+
+    drive: str
+    """What the drive does by itself."""
+    limp: bool
+    """The module bears nothing any more; False: the drive goes on holding it."""
+    cause: Cause
+    """Why the module is in FAULT: `because` in `xrl status`, and in its service's log."""
+    zero_lost: bool
+    """Its joint has to be zeroed (`xrl zero`) before it can be armed again."""
+    recovery: str
+    """What a person does about it, before the service is started again."""
+
+
+_LIMP: Final = "that axis floats"
+_BOTH_LIMP: Final = "both axes float"
+_HANG: Final = "hang the robot"
+
+DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
+    "over_temperature": DriveFault(
+        f"less current near the limit, beyond it {_LIMP}",
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; let the drive cool, look at its airflow and at current_lim",
+    ),
+    "over_voltage": DriveFault(
+        _BOTH_LIMP,
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; see that the supply takes back what braking legs give",
+    ),
+    "encoder": DriveFault(
+        f"it reports zeros; {_LIMP}",
+        limp=True,
+        cause=Cause.POSITION_LOST,
+        zero_lost=True,
+        recovery=f"{_HANG}; repair the encoder or its cable, then `xrl zero`",
+    ),
+    "watchdog": DriveFault(
+        _LIMP,
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; with the onboard loop the watchdog has to be off: `xrl doctor`",
+    ),
+    "link_lost": DriveFault(
+        "it holds by its own loop what it was told last",
+        limp=False,
+        cause=Cause.DRIVE_LOST,
+        zero_lost=False,
+        recovery="mend the cable; the new service takes over what the drive holds, without a step",
+    ),
+    "disarmed": DriveFault(
+        _LIMP,
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; find out who asked it to go idle",
+    ),
+    "overspeed": DriveFault(
+        _LIMP,
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; compare vel_limit by `xrl doctor`, and look what moved so fast",
+    ),
+    "brown_out": DriveFault(
+        "no power, both axes float; then it starts up and knows no zero",
+        limp=True,
+        cause=Cause.DRIVE_LOST,
+        zero_lost=True,
+        recovery=f"{_HANG}; mend the supply, then `xrl zero`",
+    ),
+}
+"""By the names that scenarios and `--fault` use."""
+
+
+class Loss(NamedTuple):
+    """What comes of a process or a link that is lost, and of the emergency stop."""
+
+    module: str
+    """What the module does whose service it is, or all six."""
+    others: str
+    """What the rest does."""
+    told: str
+    """What the operator sees."""
+    recovery: str
+
+
+LOSSES: Final[dict[str, Loss]] = {
+    "joint service killed or hung": Loss(
+        "its drive holds by its own loop, the torques of the coupling frozen",
+        "HOLD: the planner asks for it once the module's state is stale",
+        "`xrl status`: not heard, restarts; planner/status: hold",
+        "by itself: the supervisor starts it, it takes the drive over, and all track again; a hung "
+        "one by `xrl kill`",
+    ),
+    "planner killed or hung": Loss(
+        "HOLD within max_command_age: local gains, references frozen",
+        "the same",
+        "`xrl status`: HOLD because COMMAND_STALE",
+        "by itself: a new planner starts from the measured pose and leads after a blend",
+    ),
+    "bus slow, lossy or cut": Loss(
+        "HOLD once its commands are too old",
+        "HOLD: the planner asks for it",
+        "`xrl status`: HOLD, ages, drop-outs",
+        "by itself, after a wait that each drop-out doubles",
+    ),
+    "harness lost": Loss(
+        "nothing",
+        "the planner leads on, without the closed assist force and without easing the lead",
+        "harness/wrench: not valid",
+        "by itself",
+    ),
+    "recorder lost": Loss(
+        "nothing",
+        "nothing",
+        "`xrl status`: restarts",
+        "by itself: a new file; the old one is read as far as it was flushed",
+    ),
+    "emergency stop": Loss(
+        "DAMP: knees and hips sink slowly, ankles and frontal axes hold",
+        "the same",
+        "`xrl status`: DAMP because ESTOP",
+        "by starting the joint services again",
+    ),
+    "overload at the harness": Loss(
+        "HOLD",
+        "HOLD",
+        "planner/status: OVERLOADED",
+        "by itself, once it has been let go for a while",
+    ),
+}
+"""By what is lost."""
+
+
+def recovery_of(cause: Cause) -> str:
+    """Return what a person does about a module that is in FAULT for this cause, in short."""
+    if cause is Cause.DRIVE_LOST:
+        return "mend power or cable (after a loss of power: xrl zero)"
+    if cause is Cause.POSITION_LOST:
+        return "hang the robot, mend the encoder, xrl zero"
+    return "hang the robot, find out why it disarmed"

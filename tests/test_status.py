@@ -1,0 +1,42 @@
+"""What `xrl status` makes of a module's state."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+
+from shared.messages import Cause, DriveStatus, JointState, Mode
+from tools.status import module_status
+
+
+def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:
+    zero = (0.0, 0.0)
+    return JointState(
+        t_ns=1, seq=1, q=(0.1, -0.5), v=zero, tau=zero, mode=mode, cause=cause, ready=False,
+        age_ns=-1, session=0, command_seq=-1, cycle=1, late=0, dropouts=0, refused=0,
+        drive=drive, drive_error=0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("mode", "cause", "drive"), list(product(Mode, Cause, DriveStatus)))
+def test_a_way_out_is_told_where_a_person_has_to_do_something_and_nowhere_else(
+    mode: Mode, cause: Cause, drive: DriveStatus
+) -> None:
+    status = module_status(state(mode, cause, drive))
+    helpless = mode in (Mode.FAULT, Mode.DAMP) or drive is DriveStatus.UNZEROED
+    assert bool(status.way_out) is helpless
+    if mode is Mode.FAULT:
+        assert "xrl kill" in status.way_out
+        assert ("xrl zero" in status.way_out) is (cause in (Cause.DRIVE_LOST, Cause.POSITION_LOST))
+
+
+@pytest.mark.parametrize("drive", DriveStatus)
+def test_angles_are_told_only_where_the_drive_knows_them(drive: DriveStatus) -> None:
+    status = module_status(state(Mode.DISARMED, Cause.NONE, drive))
+    assert (status.q is None) is (drive in (DriveStatus.LOST, DriveStatus.UNZEROED))
+
+
+def test_a_module_that_is_not_heard_is_not_guessed_at() -> None:
+    status = module_status(None)
+    assert (status.mode, status.tier, status.q, status.way_out) == (None, None, None, "")

@@ -1,0 +1,108 @@
+"""A module's drive in lockstep: what a driver and its bus do, on the emulated axes at once."""
+
+from __future__ import annotations
+
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.odrive_can import LOST_MS
+from services.joint.drivers.signed import Signs, signed_reading, signed_target
+from services.joint.drivers.zeroed import from_zero, to_drive
+from services.joint.module import Order, Step
+from services.simulator.axis_bank import AxisBank
+from shared.cansimple import AxisState, ControlMode, InputMode
+from shared.clock import NS_PER_S
+from shared.config_sections import DriveConfig
+from shared.messages import Pair
+
+
+class VirtualDrive:
+    """One ODrive of the bank."""
+
+    def __init__(
+        self, bank: AxisBank, index: int, drive: DriveConfig, signs: Signs, now_ns: int
+    ) -> None:
+        """Take the drives, which of them (0 .. 5), its motors' signs, and virtual time."""
+        self._bank = bank
+        self._axes = (2 * index, 2 * index + 1)
+        self._module = slice(2 * index, 2 * index + 2)
+        self._drive = drive
+        self._signs = signs
+        self._zero = drive.zero_mark_turns
+        self._lost_after_ns = round((drive.watchdog_timeout or LOST_MS * 1e-3) * NS_PER_S)
+        self._sampled_ns = now_ns
+        self._written = True
+        """False: the service is new, and asks for the torques of a drive that it finds armed."""
+
+    def serve_anew(self) -> None:
+        """Begin with a new service."""
+        self._written = False
+
+    def read(self, now_ns: int) -> DriveReading | None:
+        """Return what a driver would: None while silence may pass, then LOST."""
+        bank, (a, b) = self._bank, self._axes
+        talks = bank.talks(a)
+        if talks:
+            self._sampled_ns = now_ns
+        elif now_ns - self._sampled_ns <= self._lost_after_ns:
+            return None
+        armed = bank.state[a] == bank.state[b] == AxisState.CLOSED_LOOP_CONTROL
+        status = DriveStatus.LOST
+        if talks:
+            status = DriveStatus.ARMED if armed else DriveStatus.IDLE
+        errors = 0 if armed else bank.heartbeat(a).errors | bank.heartbeat(b).errors
+        pos, vel = bank.pos_estimate, bank.vel_estimate
+        reading = DriveReading(
+            self._sampled_ns,
+            (float(pos[a]), float(pos[b])),
+            (float(vel[a]), float(vel[b])),
+            status,
+            int(errors),
+            None if self._written else (float(bank.torque[a]), float(bank.torque[b])),
+        )
+        return from_zero(signed_reading(reading, self._signs), self._zero)
+
+    def carry_out(self, step: Step, *, onboard: bool) -> None:
+        """Do what a cycle asks for, if the drive can hear it; any word feeds its watchdog."""
+        bank, (a, b) = self._bank, self._axes
+        if step.order is Order.NOTHING or not bank.talks(a):
+            return
+        self._written = True
+        if step.target is not None:
+            self._aim(signed_target(to_drive(step.target, self._zero), self._signs))
+        elif step.order is Order.TORQUE:
+            (a_torque, b_torque), (a_sign, b_sign) = step.torque, self._signs
+            bank.input_torque[self._module] = (a_torque * a_sign, b_torque * b_sign)
+        elif step.order is Order.ARM:
+            self._arm(onboard=onboard)
+        elif step.order is Order.FORGET_ZERO:
+            for axis in self._axes:
+                bank.set_count(axis, 0.0)
+        else:
+            bank.input_torque[self._module] = 0.0
+            for axis in self._axes:
+                bank.request_state(axis, AxisState.IDLE)
+        bank.feed(a)
+        bank.feed(b)
+
+    def _aim(self, target: MotorTarget) -> None:
+        bank, module = self._bank, self._module
+        bank.input_pos[module] = target.pos_turns
+        bank.input_vel[module] = target.vel_turns
+        bank.input_torque[module] = target.torque
+        bank.pos_gain[module] = target.pos_gain
+        bank.vel_gain[module] = target.vel_gain
+
+    def _arm(self, *, onboard: bool) -> None:
+        """Do what the drivers' frames for arming do."""
+        bank, module = self._bank, self._module
+        for axis in self._axes:
+            bank.clear_errors(axis)
+            mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
+            bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
+        bank.vel_limit[module] = self._drive.vel_limit
+        bank.current_lim[module] = self._drive.current_lim
+        zero: Pair = (0.0, 0.0)
+        bank.input_torque[module] = zero
+        if onboard:
+            bank.pos_gain[module] = bank.vel_gain[module] = zero
+        for axis in self._axes:
+            bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
