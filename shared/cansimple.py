@@ -5,8 +5,8 @@ id is `node_id << 5 | command`; payloads are little-endian. Positions are in mot
 turns, velocities in turn/s, torques in N m, currents in A.
 
 Source: odriverobotics/ODrive, docs/can-protocol and
-Firmware/communication/can/can_simple.cpp. Firmware 0.6 differs in 0x003 to 0x005 and in
-heartbeat bytes 5 to 7: see `shared.cansimple_06`.
+Firmware/communication/can/can_simple.cpp. Firmware 0.6 differs in 0x003 to 0x005, 0x019
+and heartbeat bytes 5 to 7: see `shared.cansimple_06`.
 """
 
 from __future__ import annotations
@@ -184,6 +184,7 @@ class Heartbeat(NamedTuple):
 _HEARTBEAT = Struct("<IBBBB")
 _TRAJECTORY_DONE = 0x80
 _U32 = Struct("<I")
+_I32 = Struct("<i")
 _U64 = Struct("<Q")
 _TWO_I32 = Struct("<ii")
 _F32 = Struct("<f")
@@ -236,6 +237,11 @@ def unpack_u32(data: bytes) -> int:
     """Unpack one unsigned word: 0x004, 0x005, 0x006, 0x007 and 0x01D."""
     value: int = _U32.unpack_from(data)[0]
     return value
+
+
+def pack_i32(value: int) -> bytes:
+    """Pack one signed word: 0x019 encoder counts."""
+    return _I32.pack(value)
 
 
 def pack_motor_error(error: int) -> bytes:

@@ -1,8 +1,9 @@
 """What CANSimple of ODrive firmware 0.6 has otherwise than 0.5 (`shared.cansimple`).
 
 Heartbeat bytes 5 to 7, 0x000 (version), 0x003 (one pair of error words for the axis), 0x004 and
-0x005 (any endpoint, read and written), and the numbers of the errors: the watchdog's is
-0x0100_0000 where 0.5 has 0x800. Set-points, limits, gains and estimates are as in 0.5.
+0x005 (any endpoint, read and written), 0x019 (position in turns as a float, where 0.5 takes
+counts), a byte in 0x018 (to blink), and the numbers of the errors: the watchdog's is 0x0100_0000
+where 0.5 has 0x800. Set-points, limits, gains and estimates are as in 0.5.
 
 Source: docs.odriverobotics.com, manual/can-protocol, and the published 0.6.10 .dbc.
 """
@@ -23,6 +24,7 @@ class Command06(IntEnum):
     TX_SDO = 0x005
     ADDRESS = 0x006
     GET_TEMPERATURE = 0x015
+    SET_ABSOLUTE_POSITION = 0x019
     GET_TORQUES = 0x01C
     GET_POWERS = 0x01D
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from shared.can_load import check_buses
 from shared.exceptions import ConfigError
 from shared.joints import KINDS, MODULES
 
@@ -30,6 +31,7 @@ def check(file: str, config: RobotConfig, services: Sequence[str]) -> None:
     _check_names(file, config, services)
     _check_physics(file, config)
     _check_timing(file, config)
+    check_buses(file, config)
 
 
 def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> None:
@@ -55,8 +57,7 @@ def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> Non
             if other != module.name or len(set(module.node_ids)) < 2:
                 where = f"module[{index}].node_ids"
                 raise ConfigError(file, where, f"node {node} is taken on this bus", "a free node")
-    if config.joint_service.driver == "odrive_usb":
-        _check_serial_numbers(file, config)
+    _check_serial_numbers(file, config)
     if config.harness.bus not in config.can:
         buses = _words(config.can)
         raise ConfigError(file, "harness.bus", f"{config.harness.bus!r}", f"one of {buses}")
@@ -71,9 +72,13 @@ def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> Non
 
 
 def _check_serial_numbers(file: str, config: RobotConfig) -> None:
+    """Check what is given, whichever the driver: a drive has USB and CAN at the same time."""
+    wanted = config.joint_service.driver == "odrive_usb"
     seen: set[str] = set()
     for index, module in enumerate(config.module):
         where, serial = f"module[{index}].serial_number", module.serial_number.upper()
+        if not serial and not wanted:
+            continue
         if not re.fullmatch(r"[0-9A-F]{12}", serial):
             found = f"{module.serial_number!r} of {module.name}"
             raise ConfigError(file, where, found, "12 hexadecimal digits, as `odrivetool` shows")

@@ -54,6 +54,7 @@ def test_arbitration_id_is_node_times_32_plus_command() -> None:
         (cansimple.pack_u32(AxisState.CLOSED_LOOP_CONTROL), "08000000"),
         (cansimple.pack_two_floats(1.5, -2.0), "0000c03f 000000c0"),
         (cansimple.pack_float(-0.25), "000080be"),
+        (cansimple.pack_i32(-2), "feffffff"),
         (cansimple.pack_two_ints(1, -2), "01000000 feffffff"),
         (cansimple.pack_input_pos(1.5, 1.0, -0.5), "0000c03f e803 0cfe"),
         (cansimple.pack_motor_error(0x2_0000_0001), "01000000 02000000"),

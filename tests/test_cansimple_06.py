@@ -25,6 +25,7 @@ from shared.cansimple_06 import (
         ("TX_SDO", 0x005),
         ("ADDRESS", 0x006),
         ("GET_TEMPERATURE", 0x015),
+        ("SET_ABSOLUTE_POSITION", 0x019),
         ("GET_TORQUES", 0x01C),
         ("GET_POWERS", 0x01D),
     ],

@@ -17,6 +17,7 @@ import pytest
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, RETRY_MS, OdriveCan
 from services.simulator.axis_bank import AxisBank
+from services.simulator.cansimple_dialects import DialectName
 from services.simulator.cansimple_front import CanSimpleFront
 from shared.cansimple import AxisError, AxisState, Command, arbitration_id, pack_two_floats
 from shared.config_sections import CanConfig, DriveConfig
@@ -28,9 +29,11 @@ DRIVE = DriveConfig(
     torque_constant=0.0827,
     current_lim=60.0,
     vel_limit=60.0,
+    dc_max_negative_current=-30.0,
     watchdog_timeout=0.1,
     encoder_period_ms=1,
     heartbeat_period_ms=1,  # so that a state is known one step later
+    zero_mark_turns=0.0,
 )
 NODES = (4, 5)
 AXES = (4, 5)
@@ -40,11 +43,22 @@ MS = 1e-3
 class Rig:
     """An emulated ODrive, hip_right of the bank, on a hub; `step` is one millisecond of it."""
 
-    def __init__(self, path: Path, *, watchdog: bool = False) -> None:
-        self.hub = UnixCanHub(path)
+    def __init__(
+        self,
+        path: Path,
+        *,
+        watchdog: bool = False,
+        dialect: DialectName = "0.5",
+        hub: type[UnixCanHub] = UnixCanHub,
+    ) -> None:
+        self.hub = hub(path)
         self.bank = AxisBank(DRIVE, encoder_counts_per_turn=16384, watchdog=watchdog)
         self.front = CanSimpleFront(
-            self.bank, [self.hub], [dict(zip(NODES, AXES, strict=True))], heartbeat_period_ms=1
+            self.bank,
+            [self.hub],
+            [dict(zip(NODES, AXES, strict=True))],
+            heartbeat_period_ms=1,
+            dialect=dialect,
         )
         self.pos = np.zeros(12)
         self.vel = np.zeros(12)
@@ -92,7 +106,7 @@ def driver(path: Path) -> Iterator[OdriveCan]:
 
 def make_driver(path: Path) -> OdriveCan:
     config = CanConfig(interface="xrl_unix", channel=str(path))
-    return OdriveCan(config, NODES, DRIVE)
+    return OdriveCan(config, NODES, DRIVE, encoder_counts_per_turn=16384)
 
 
 def arm(rig: Rig, driver: OdriveCan) -> None:
@@ -386,10 +400,9 @@ def test_driver_runs_on_a_bus_with_nothing_but_the_api_of_python_can() -> None:
     assert reading is not None
     assert reading.status == DriveStatus.IDLE
     assert reading.pos_turns == (1.0, 2.0)
-    assert [message.arbitration_id for message in sent] == [0x08E, 0x0AE]
-    assert [bytes(message.data) for message in sent] == [
-        bytes.fromhex("0000003f"),
-        bytes.fromhex("000000bf"),
+    assert [message and (message.arbitration_id, bytes(message.data)) for message in sent] == [
+        (0x08E, bytes.fromhex("0000003f")),
+        (0x0AE, bytes.fromhex("000000bf")),
     ]
 
 

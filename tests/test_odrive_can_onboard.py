@@ -14,7 +14,7 @@ from services.joint.drivers.odrive_can import ARM_GRACE_MS, GAINS_MS, OdriveCan
 from services.joint.law import Setpoint
 from services.joint.onboard import OnboardLaw
 from shared.cansimple import ControlMode
-from tests.test_odrive_can import AXES, DRIVE, MS, Rig, connected, driver, path, rig
+from tests.test_odrive_can import AXES, DRIVE, MS, Rig, connected, driver, make_driver, path, rig
 
 __all__ = ["driver", "path", "rig"]  # fixtures
 
@@ -110,7 +110,7 @@ def test_a_drive_found_armed_tells_its_torques_until_it_is_taken_over(rig: Rig, 
     held = rig.step()[list(AXES)].copy()
     assert np.abs(held).min() > 0.1
     first.close()
-    second = OdriveCan(first._can_config, first._node_ids, DRIVE)
+    second = make_driver(path)
     for _ in range(10):
         reading = rig.cycle(second)
     assert reading.status is DriveStatus.ARMED

@@ -1,4 +1,4 @@
-"""The two dialects of CANSimple as the emulated drives speak them: what they report.
+"""The two dialects of CANSimple as the emulated drives speak them.
 
 Firmware 0.5 and 0.6 share set-points, limits, gains and estimates; `DIALECTS` holds what
 differs. Endpoint ids of 0.6 come with each firmware's `flat_endpoints.json`; the emulation's
@@ -7,6 +7,7 @@ are `SDO_ENDPOINTS`.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Mapping
 from typing import Final, Literal, NamedTuple
@@ -36,6 +37,7 @@ from shared.exceptions import DriveError
 
 DialectName = Literal["0.5", "0.6"]
 Answer = Callable[[AxisBank, int], bytes]
+Setter = Callable[[AxisBank, int, bytes], None]
 
 VERSION_06: Final = Version(protocol=2, hardware=(4, 4, 58), firmware=(0, 6, 10), unreleased=0)
 
@@ -67,13 +69,15 @@ _READINGS: Final = ("vbus_voltage", "ibus")
 
 
 class Dialect(NamedTuple):
-    """What a firmware reports in its own way."""
+    """What a firmware reports and takes in its own way."""
 
     heartbeat: Answer
     answers: Mapping[int, Answer]
     """By command, to a request for data."""
     sdo: Callable[[AxisBank, int, bytes], bytes | None] | None
     """Takes 0x004 and returns the payload of 0x005, if there is an answer."""
+    setters: Mapping[int, Setter]
+    """By command, in place of the front's own."""
 
 
 def errors_06(fault: Fault) -> DriveError06:
@@ -185,6 +189,12 @@ def _sdo(bank: AxisBank, axis: int, data: bytes) -> bytes | None:
     return None
 
 
+def _set_absolute_position(bank: AxisBank, axis: int, data: bytes) -> None:
+    turns = cansimple.unpack_float(data)
+    if math.isfinite(turns):
+        bank.set_count(axis, turns * bank.settings.axis("encoder.config.cpr")[axis])
+
+
 def _full(name: str, axis: int) -> str:
     return name if name in DRIVE_SETTINGS else f"axis{axis & 1}.{name}"
 
@@ -213,6 +223,7 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
             Command.GET_CONTROLLER_ERROR: _controller_error,
         },
         None,
+        {},
     ),
     "0.6": Dialect(
         _heartbeat_06,
@@ -225,5 +236,6 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
             Command06.GET_POWERS: _powers,
         },
         _sdo,
+        {Command06.SET_ABSOLUTE_POSITION: _set_absolute_position},
     ),
 }

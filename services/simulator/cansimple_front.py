@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_settings import N_DRIVES
-from services.simulator.cansimple_dialects import DIALECTS, DialectName
+from services.simulator.cansimple_dialects import DIALECTS, DialectName, Setter
 from shared import cansimple
 from shared.cansimple import Command
 from shared.cansimple_06 import Command06
@@ -55,8 +55,9 @@ class CanSimpleFront:
             dialect: which firmware's CANSimple they speak.
         """
         self._bank = bank
-        self._buses = [_Bus(hub, node) for hub, node in zip(hubs, nodes, strict=True)]
         self._dialect = DIALECTS[dialect]
+        setters = {**_SETTERS, **self._dialect.setters}
+        self._buses = [_Bus(hub, node, setters) for hub, node in zip(hubs, nodes, strict=True)]
         self._next_heartbeat_s = [-math.inf] * N_JOINTS
         self._next_encoder_s = [-math.inf] * N_JOINTS
         self._heartbeat_from_s = -math.inf
@@ -169,14 +170,16 @@ def _periods_s(periods_ms: NDArray[np.float64]) -> list[float]:
 class _Bus:
     """A hub with its axes, and what is worked out once."""
 
-    def __init__(self, hub: UnixCanHub, nodes: Mapping[int, int]) -> None:
+    def __init__(
+        self, hub: UnixCanHub, nodes: Mapping[int, int], setters: Mapping[int, Setter]
+    ) -> None:
         self.hub = hub
         self.nodes = dict(nodes)
         self.axes = tuple(nodes.values())
         self.mailboxes = {
             cansimple.arbitration_id(node, command): (axis, setter)
             for node, axis in nodes.items()
-            for command, setter in _SETTERS.items()
+            for command, setter in setters.items()
         }
         self.encoders = [
             (cansimple.arbitration_id(node, Command.GET_ENCODER_ESTIMATES), axis)
@@ -221,6 +224,10 @@ def _set_vel_gains(bank: AxisBank, axis: int, data: bytes) -> None:
     bank.vel_gain[axis], bank.vel_integrator_gain[axis] = cansimple.unpack_two_floats(data)
 
 
+def _set_count(bank: AxisBank, axis: int, data: bytes) -> None:
+    bank.set_count(axis, cansimple.unpack_two_ints(data)[0])
+
+
 def _estop(bank: AxisBank, axis: int, _data: bytes) -> None:
     bank.estop(axis)
 
@@ -233,7 +240,7 @@ def _reboot(bank: AxisBank, axis: int, _data: bytes) -> None:
     bank.reboot(axis)
 
 
-_SETTERS: Final[dict[int, Callable[[AxisBank, int, bytes], None]]] = {
+_SETTERS: Final[dict[int, Setter]] = {
     Command.ESTOP: _estop,
     Command.SET_AXIS_STATE: _set_state,
     Command.SET_CONTROLLER_MODE: _set_modes,
@@ -242,6 +249,7 @@ _SETTERS: Final[dict[int, Callable[[AxisBank, int, bytes], None]]] = {
     Command.SET_INPUT_TORQUE: _set_input_torque,
     Command.SET_LIMITS: _set_limits,
     Command.REBOOT: _reboot,
+    Command.SET_LINEAR_COUNT: _set_count,
     Command.CLEAR_ERRORS: _clear_errors,
     Command.SET_POS_GAIN: _set_pos_gain,
     Command.SET_VEL_GAINS: _set_vel_gains,

@@ -1,22 +1,37 @@
-"""A CAN link by python-can as the drivers use it: many frames at a call, or none."""
+"""A CAN link by python-can as the drivers use it: it never blocks, never raises, comes back."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final, TypeAlias
+from contextlib import suppress
+from typing import Any, Final, TypeAlias
 
 import can
 
 from shared import cansimple
+from shared.clock import NS_PER_MS, now_ns
+from shared.config_sections import CanConfig
+from shared.exceptions import DriveError
+from shared.unix_can import ERROR_FLAG, EXTENDED_FLAG
 
 FRAMES_PER_READ: Final = 512
 """More than can wait in a socket; a flooded bus must not hold up the loop."""
+RETRY_MS: Final = 200
+"""Between two attempts to open the bus: on socketcan an attempt may cost a millisecond."""
+ORDERS_MS: Final = 100
+"""An order that the bus has not taken by then is given up: it belongs to another moment."""
+KERNEL_FILTERS: Final = ("socketcan",)
+"""Interfaces that throw the other modules' frames away before a process is woken for them."""
+
+BUS_OFF: Final = 0x40
+"""Class of an error frame (linux/can/error.h): the controller has left the bus."""
 
 Frame: TypeAlias = tuple[int, bytes]
-"""Arbitration id and payload."""
+"""Arbitration id, with SocketCAN's flags, and payload."""
 Receive: TypeAlias = Callable[[float], Sequence[Frame]]
 """Waits for at most so many seconds and returns all that is there."""
-Send: TypeAlias = Callable[[Sequence[can.Message]], None]
+Send: TypeAlias = Callable[[Sequence[can.Message]], int]
+"""Returns how many of the messages, from the first, the bus has taken."""
 
 
 def message(node_id: int, command: int, data: bytes) -> can.Message:
@@ -36,13 +51,151 @@ def request_of(node_id: int, command: int) -> can.Message:
     )
 
 
-def nothing(_timeout_s: float) -> Sequence[Frame]:
-    """Receive without a bus."""
-    return ()
+class CanLink:
+    """A bus that may not be there: what goes wrong on it is counted, and reads as silence.
+
+    A bus that fails, or whose controller has gone off it (too many errors on the wire), is
+    closed, and opened again every `RETRY_MS`.
+
+    Attributes:
+        connections: how often the bus was opened.
+        bus_offs: how often the controller went off the bus.
+        error_frames: reports of any other trouble on the wire.
+    """
+
+    def __init__(self, config: CanConfig, node_ids: Sequence[int]) -> None:
+        """Take the channel with `{run}` already expanded, and the nodes to listen to."""
+        self.connections = 0
+        self.bus_offs = 0
+        self.error_frames = 0
+        self._config = config
+        self._options: dict[str, Any] = {}
+        if config.interface in KERNEL_FILTERS:
+            self._options["can_filters"] = filters(node_ids)
+        self._bus: can.BusABC | None = None
+        self._receive: Receive = _nothing
+        self._send: Send = _drop
+        self._retry_at_ns = 0
+        self._orders: Sequence[can.Message] = ()
+        self._orders_until_ns = 0
+
+    @property
+    def is_open(self) -> bool:
+        """True while there is a bus."""
+        return self._bus is not None
+
+    def connect(self) -> bool:
+        """Open the bus, not more often than every `RETRY_MS`; return True if it was.
+
+        Raises:
+            DriveError: python-can does not know the interface.
+        """
+        now = now_ns()
+        if now < self._retry_at_ns:
+            return False
+        self._retry_at_ns = now + RETRY_MS * NS_PER_MS
+        try:
+            self._bus = can.Bus(
+                interface=self._config.interface,
+                channel=self._config.channel,
+                ignore_config=True,  # python-can would read its own files at every attempt
+                **self._options,
+            )
+        except NotImplementedError as error:
+            raise DriveError(
+                f"CAN interface {self._config.interface!r}: {error}; "
+                "use one that python-can knows, such as socketcan or xrl_unix"
+            ) from error
+        except (can.CanError, OSError):
+            return False
+        self.connections += 1
+        self._receive = receiver(self._bus)
+        self._send = sender(self._bus)
+        return True
+
+    def receive(self, timeout_s: float) -> Sequence[Frame]:
+        """Return the frames of one wait; none, too, if the bus failed, which closes it.
+
+        Error frames are among them: they are for `error_frame`.
+        """
+        if self._orders:
+            self._send_orders()
+        try:
+            frames = self._receive(timeout_s)
+            off = not frames and self._bus is not None and self._bus.state is can.BusState.ERROR
+        except (can.CanError, OSError):
+            self._disconnect()
+            return ()
+        if off:
+            self._go_off()
+        return frames
+
+    def error_frame(self, can_id: int) -> None:
+        """Take in an error frame: a bus that is off is closed."""
+        if can_id & BUS_OFF:
+            self._go_off()
+        else:
+            self.error_frames += 1
+
+    def send(self, messages: Sequence[can.Message]) -> bool:
+        """Hand messages to the bus; False if it did not take them all.
+
+        What waits by `order` goes first; until it has gone, nothing else goes.
+        """
+        if self._orders and not self._send_orders():
+            return False
+        # A full queue comes here too. A dead link shows in receiving.
+        return self._send(messages) == len(messages)
+
+    def order(self, messages: Sequence[can.Message]) -> None:
+        """Send messages of which none may be missing, in this order.
+
+        A row of a dozen can be longer than the queue of the interface (ten frames, unless
+        set): the rest follows when there is room, within `ORDERS_MS`. They take the place
+        of an order that is still waiting.
+        """
+        if self._bus is None:
+            return
+        self._orders = messages
+        self._orders_until_ns = now_ns() + ORDERS_MS * NS_PER_MS
+        self._send_orders()
+
+    def close(self) -> None:
+        """Leave the bus for good."""
+        self._disconnect()
+        self._retry_at_ns = 1 << 63
+
+    def _send_orders(self) -> bool:
+        """Send what the bus has room for; True if nothing is left."""
+        if now_ns() > self._orders_until_ns:
+            self._orders = ()
+        else:
+            self._orders = self._orders[self._send(self._orders) :]
+        return not self._orders
+
+    def _go_off(self) -> None:
+        self.bus_offs += 1
+        self._disconnect()
+        self._retry_at_ns = now_ns() + RETRY_MS * NS_PER_MS
+
+    def _disconnect(self) -> None:
+        """Close the bus; what waited for it is not for the next one."""
+        if self._bus is not None:
+            with suppress(can.CanError, OSError):
+                self._bus.shutdown()
+        self._bus = None
+        self._receive = _nothing
+        self._send = _drop
+        self._orders = ()
 
 
-def drop(_messages: Sequence[can.Message]) -> None:
-    """Send without a bus."""
+def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
+    """Return python-can's filters for all frames of some nodes; error frames pass them."""
+    mask = cansimple.arbitration_id(cansimple.NODE_MASK, 0)
+    return [
+        {"can_id": cansimple.arbitration_id(node, 0), "can_mask": mask, "extended": False}
+        for node in node_ids
+    ]
 
 
 def receiver(bus: can.BusABC) -> Receive:
@@ -53,26 +206,51 @@ def receiver(bus: can.BusABC) -> Receive:
 
     def receive(timeout_s: float) -> Sequence[Frame]:
         frames: list[Frame] = []
-        message = bus.recv(timeout_s)
-        while message is not None:
-            if not message.is_error_frame and not message.is_remote_frame:
-                frames.append((message.arbitration_id, bytes(message.data)))
-            if len(frames) >= FRAMES_PER_READ:
+        for _ in range(FRAMES_PER_READ):
+            message = bus.recv(timeout_s)
+            if message is None:
                 break
-            message = bus.recv(0.0)
+            timeout_s = 0.0
+            if message.is_error_frame:
+                frames.append((message.arbitration_id | ERROR_FLAG, bytes(message.data)))
+            elif not message.is_remote_frame:
+                flag = EXTENDED_FLAG if message.is_extended_id else 0
+                frames.append((message.arbitration_id | flag, bytes(message.data)))
         return frames
 
     return receive
 
 
 def sender(bus: can.BusABC) -> Send:
-    """Return the bus's `send_many`, or one made for it."""
-    ready: Send | None = getattr(bus, "send_many", None)
-    if ready is not None:
-        return ready
+    """Return how to send several messages on a bus; one that it does not take ends the row."""
+    many: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_many", None)
+    if many is not None:
 
-    def send(messages: Sequence[can.Message]) -> None:
-        for message in messages:
-            bus.send(message, timeout=0.0)
+        def send_many(messages: Sequence[can.Message]) -> int:
+            try:
+                many(messages)
+            except (can.CanError, OSError):
+                return 0
+            return len(messages)
+
+        return send_many
+
+    def send(messages: Sequence[can.Message]) -> int:
+        for count, message in enumerate(messages):
+            try:
+                bus.send(message, timeout=0.0)
+            except (can.CanError, OSError):
+                return count
+        return len(messages)
 
     return send
+
+
+def _nothing(_timeout_s: float) -> Sequence[Frame]:
+    """Receive without a bus."""
+    return ()
+
+
+def _drop(_messages: Sequence[can.Message]) -> int:
+    """Send without a bus."""
+    return 0

@@ -1,59 +1,58 @@
 """One ODrive over CANSimple and python-can (design section 5).
 
 The same code on the robot (socketcan) and in the demo (`xrl_unix`): only the configured
-interface and channel differ.
+interface and channel differ. It speaks to firmware 0.5 and 0.6 (`odrive_dialects`).
 """
 
 from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from math import isfinite
 from typing import Final
 
-import can
-
 from services.joint.drivers import odrive_frames
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.can_link import (
-    Receive,
-    Send,
-    drop,
-    message,
-    nothing,
-    receiver,
-    request_of,
-    sender,
+from services.joint.drivers.can_link import RETRY_MS, CanLink, message, request_of
+from services.joint.drivers.odrive_dialects import (
+    HEARTBEAT_BYTES,
+    VERSION_BYTES,
+    AxesReport,
+    Dialect,
 )
+from services.joint.drivers.odrive_frames import Frames
 from shared import cansimple
-from shared.cansimple import AxisError, AxisState, Command, ControlMode
+from shared.cansimple import Command
+from shared.cansimple_06 import Command06
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.config_sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
 from shared.messages import Pair
+from shared.unix_can import ERROR_FLAG
+
+__all__ = ["RETRY_MS", "OdriveCan"]
 
 REBOOT_MS: Final = 500
 """After so long a silence the drive may have been switched off and on: what its
 heartbeats said before is forgotten."""
-RETRY_MS: Final = 200
-"""Between two attempts to open the bus: on socketcan an attempt may cost a millisecond."""
 ARM_GRACE_MS: Final = 10
 """Heartbeats this soon after `arm` may have been sent before it; they are not believed."""
 FEED_MS: Final = 1000
 """So long after `arm` reading feeds the watchdogs until the drive is ARMED: that shows
 only in the next heartbeat, and a watchdog may run out before it."""
-
+SETTLE_MS: Final = 1000
+"""So long after `arm`, or the first target, limits and modes are told again with what is
+written: nothing shows whether the drive has them, and 2 turn/s or torque mode would be felt."""
 GAINS_MS: Final = 100
 """Gains go to the drive when they change and this often: a frame may have been lost."""
 LOST_MS: Final = 100
 """Silence of a drive without a watchdog after which it counts as lost."""
+CLOSE_MS: Final = 20
+"""So long an order that the bus had no room for may hold up `close`."""
 
-_NMT_COMMAND = 0x000  # the firmware takes it as food for the watchdog and does nothing else
 _BOTH = 0b11
-_unpack_estimates = struct.Struct("<ff").unpack_from
-_unpack_iq = struct.Struct("<ff").unpack_from
-_pack_torque = struct.Struct("<f").pack
+_unpack_two_floats = struct.Struct("<ff").unpack_from
 
 
 class OdriveCan:
@@ -64,9 +63,11 @@ class OdriveCan:
     heartbeat, for only that tells their state. What is lost on the way to the drive is counted,
     not raised.
 
+    `DriveReading.error` holds `AxisError` bits whichever firmware speaks; 0.6's errors are
+    told by the bit of the same meaning, what has none by `odrive_dialects.OTHER_ERROR`.
+
     Attributes:
-        write_failures: torque pairs that could not be handed to the bus.
-        connections: how often the bus was opened.
+        write_failures: torque pairs and targets that were not handed to the bus.
     """
 
     def __init__(
@@ -74,55 +75,77 @@ class OdriveCan:
         can_config: CanConfig,
         node_ids: tuple[int, int],
         drive: DriveConfig,
+        *,
+        encoder_counts_per_turn: int | None = None,
     ) -> None:
         """Take the channel with `{run}` already expanded; open the bus if it is there.
+
+        Args:
+            can_config: the bus; other modules may be on it too.
+            node_ids: of axis0 and axis1.
+            drive: limits and timing.
+            encoder_counts_per_turn: for `set_position` on firmware 0.5, which takes counts.
 
         Raises:
             DriveError: python-can does not know the interface.
         """
         self.write_failures = 0
-        self.connections = 0
-        self._can_config = can_config
-        self._drive = drive
         self._node_ids = node_ids
-        self._torque_max = drive.current_lim * drive.torque_constant
+        self._drive = drive
+        self._counts_per_turn = encoder_counts_per_turn
         # Not before its own watchdog has fired: until then a silent drive holds its last
         # torque and comes back as if nothing had been, while a FAULT is for good.
         lost_s = drive.watchdog_timeout or LOST_MS * 1e-3
         self._lost_after_ns = round(lost_s * NS_PER_S)
-        self._torque_messages = [message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in node_ids]
-        first, second = (message(n, Command.SET_INPUT_POS, bytes(8)) for n in node_ids)
-        self._input_messages = (first, second)
-        self._food = [message(n, _NMT_COMMAND, b"") for n in node_ids]
-        self._encoder_axis = {
-            cansimple.arbitration_id(n, Command.GET_ENCODER_ESTIMATES): i
-            for i, n in enumerate(node_ids)
-        }
-        self._heartbeat_axis = {
-            cansimple.arbitration_id(n, Command.HEARTBEAT): i for i, n in enumerate(node_ids)
-        }
-        self._iq_axis = {
-            cansimple.arbitration_id(n, Command.GET_IQ): i for i, n in enumerate(node_ids)
-        }
+        self._frames = Frames(node_ids, drive)
+        # The firmware takes it as food for the watchdog, and 0.6 tells its version besides.
+        self._food = [message(n, Command06.GET_VERSION, b"") for n in node_ids]
+        self._ask_version = [request_of(n, Command06.GET_VERSION) for n in node_ids]
         self._ask_iq = [request_of(n, Command.GET_IQ) for n in node_ids]
+        take: dict[int, Callable[[int, bytes], None]] = {
+            Command.GET_ENCODER_ESTIMATES: self._take_estimates,
+            Command.HEARTBEAT: self._take_heartbeat,
+            Command.GET_IQ: self._take_iq,
+            Command06.GET_VERSION: self._take_version,
+        }
+        self._takers = {
+            cansimple.arbitration_id(node, command): (axis, taker)
+            for axis, node in enumerate(node_ids)
+            for command, taker in take.items()
+        }
+        self._link = CanLink(can_config, node_ids)
+        self._report = AxesReport()
         self._found: list[float | None] = [None, None]  # torques of a drive that was found armed
         self._gains_sent: tuple[Pair, Pair] | None = None
-        self._gains_at_ns = 0
-        self._bus: can.BusABC | None = None
-        self._receive: Receive = nothing
-        self._send: Send = drop
-        self._retry_at_ns = 0
+        self._again_at_ns = 0  # when gains, or limits and modes, are due once more
+        self._settle_until_ns = 0
         self._believe_from_ns = 0
-        self._feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
+        self._feed_until_ns = 0
         self._estimates: list[Pair] = [(0.0, 0.0), (0.0, 0.0)]
         self._fresh = 0  # bit i: axis i has a frame since the last sample
         self._sample_ns = now_ns()
         self._has_sample = False
-        self._states = [int(AxisState.UNDEFINED)] * 2
-        self._errors = [0, 0]
-        self._was_armed = [False, False]
-        self._status = DriveStatus.LOST
         self._connect()
+
+    @property
+    def dialect(self) -> Dialect:
+        """The firmware's generation, "0.5" or "0.6"; "" while it is not known."""
+        return self._report.dialect
+
+    @property
+    def firmware(self) -> tuple[int, int, int] | None:
+        """The firmware's version as 0.6 told it; None: not told."""
+        return self._report.firmware
+
+    @property
+    def connections(self) -> int:
+        """How often the bus was opened."""
+        return self._link.connections
+
+    @property
+    def bus_offs(self) -> int:
+        """How often the CAN controller went off the bus."""
+        return self._link.bus_offs
 
     def read(self, timeout_s: float) -> DriveReading | None:
         """Wait for the next encoder sample of both axes; see `Drive.read`.
@@ -132,7 +155,7 @@ class OdriveCan:
         """
         now = now_ns()
         deadline = now + int(timeout_s * NS_PER_S)
-        if self._bus is None and not self._connect():
+        if not self._link.is_open and not self._connect():
             time.sleep(max(0.0, timeout_s))
             return self._silence(now_ns())
         while True:
@@ -142,12 +165,136 @@ class OdriveCan:
                 self._fresh = 0
                 self._sample_ns = now
                 self._has_sample = True
-                if self._status != DriveStatus.ARMED and now < self._feed_until_ns:
-                    self._transmit(self._food)
-                return self._reading(self._status)
-            if now >= deadline or self._bus is None:
+                status = self._report.status
+                if status is not DriveStatus.ARMED and now < self._feed_until_ns:
+                    self._link.send(self._food)
+                return self._reading(status)
+            if now >= deadline or not self._link.is_open:
                 break
         return self._silence(now)
+
+    def write_torque(self, torque: Pair) -> None:
+        """Send both motor torques, N m, at most `current_lim`'s worth; not a number is zero."""
+        frames = self._frames
+        frames.fill_torques(torque)
+        messages = frames.torques
+        now = now_ns()
+        if self._again_at_ns <= now < self._settle_until_ns:
+            self._again_at_ns = now + GAINS_MS * NS_PER_MS
+            messages = frames.torques_anew
+        if not self._link.send(messages):
+            self._again_at_ns = 0
+            self.write_failures += 1
+
+    def write(self, target: MotorTarget) -> None:
+        """Send what both motors' own loops are to do; gains before what they act on.
+
+        A target that holds no number is not sent: the drive goes on with the last. Over CAN
+        velocity and torque travel in thousandths: 0.035 N m at the joint.
+        """
+        frames = self._frames
+        if not self._link.is_open or not odrive_frames.is_target(target):
+            self.write_failures += 1
+            return
+        frames.fill_inputs(target)
+        messages = frames.inputs
+        gains = (target.pos_gain, target.vel_gain)
+        now = now_ns()
+        if gains != self._gains_sent or now >= self._again_at_ns:
+            if self._gains_sent is None:  # the first since connecting: taken over as it stands
+                self._settle_until_ns = now + SETTLE_MS * NS_PER_MS
+            settled = now >= self._settle_until_ns
+            messages = frames.inputs_and_gains if settled else frames.inputs_anew
+            self._gains_sent, self._again_at_ns = gains, now + GAINS_MS * NS_PER_MS
+            frames.fill_gains(target)
+        if not self._link.send(messages):
+            self._again_at_ns = 0
+            self.write_failures += 1
+
+    def arm(self, *, onboard: bool) -> None:
+        """Ask for closed loop control on both axes; see `Drive.arm`.
+
+        Errors are cleared, and `input_torque` and the gains zeroed first: re-arming would
+        otherwise bring back the torque of before, and the gains the drive ships with have
+        an integrator. `status` is IDLE until heartbeats tell more.
+        """
+        self._order(odrive_frames.arming(self._drive, onboard=onboard), armed=True)
+        now = now_ns()
+        self._gains_sent = ((0.0, 0.0), (0.0, 0.0))
+        self._again_at_ns = 0
+        self._settle_until_ns = now + SETTLE_MS * NS_PER_MS
+        self._feed_until_ns = now + FEED_MS * NS_PER_MS
+
+    def idle(self) -> None:
+        """Ask both axes to go idle, with their input torque zeroed."""
+        self._order(odrive_frames.IDLING, armed=False)
+        self._settle_until_ns = 0
+        self._feed_until_ns = 0
+
+    def set_position(self, turns: Pair) -> None:
+        """Tell both motors where they are, turns; see `Drive.set_position`.
+
+        Raises:
+            DriveError: the drive has not shown which firmware it has, it takes counts and
+                their number was not given, or the bus takes nothing.
+        """
+        frames = odrive_frames.positions(self._node_ids, turns, self.dialect, self._counts_per_turn)
+        if not self._link.send(frames):
+            first, second = self._node_ids
+            raise DriveError(
+                f"CAN nodes {first} and {second}: the bus took no order; look at its wiring, and "
+                "whether its interface is up"
+            )
+
+    def close(self) -> None:
+        """Release the bus and stay away from it; an order that waits has `CLOSE_MS` to go."""
+        deadline = now_ns() + CLOSE_MS * NS_PER_MS
+        while not self._link.send(()) and self._link.is_open and now_ns() < deadline:
+            time.sleep(1e-3)
+        self._link.close()
+
+    def _order(self, commands: tuple[odrive_frames.Order, ...], *, armed: bool) -> None:
+        """Send commands to both axes and forget what the axes reported before."""
+        self._report.requested(armed=armed)
+        self._found = [None, None]
+        self._believe_from_ns = now_ns() + ARM_GRACE_MS * NS_PER_MS
+        self._link.order(odrive_frames.orders(self._node_ids, commands))
+
+    def _pump(self, timeout_s: float) -> None:
+        """Take in the frames of one wait; most of a shared bus's are other modules'."""
+        takers = self._takers
+        for can_id, data in self._link.receive(max(0.0, timeout_s)):
+            found = takers.get(can_id)
+            if found is not None:
+                axis, take = found
+                take(axis, data)
+            elif can_id & ERROR_FLAG:
+                self._link.error_frame(can_id)
+
+    def _take_estimates(self, axis: int, data: bytes) -> None:
+        if len(data) == 8:
+            pos, vel = estimates = _unpack_two_floats(data)
+            if isfinite(pos) and isfinite(vel):  # what is no number is no sample
+                self._estimates[axis] = estimates
+                self._fresh |= 1 << axis
+
+    def _take_heartbeat(self, axis: int, data: bytes) -> None:
+        if len(data) != HEARTBEAT_BYTES or now_ns() < self._believe_from_ns:
+            return
+        report = self._report
+        report.hear(axis, bytes(data))
+        if report.dialect == "":
+            self._link.send(self._ask_version)
+        if report.status is DriveStatus.ARMED and self._gains_sent is None and None in self._found:
+            self._link.send(self._ask_iq)  # whoever takes it over asks for its torques
+
+    def _take_iq(self, axis: int, data: bytes) -> None:
+        if len(data) == 8:
+            self._found[axis] = _unpack_two_floats(data)[0] * self._drive.torque_constant
+
+    def _take_version(self, _axis: int, data: bytes) -> None:
+        if len(data) == VERSION_BYTES:  # a request that we or others sent has none
+            self._report.hear_version(data)
 
     def _silence(self, now: int) -> DriveReading | None:
         """Return None while the drive may yet come back as it was, then LOST.
@@ -159,128 +306,8 @@ class OdriveCan:
         if self._has_sample and silent_ns <= self._lost_after_ns:
             return None
         if silent_ns > REBOOT_MS * NS_PER_MS:
-            self._forget()
+            self._report.forget()
         return self._reading(DriveStatus.LOST)
-
-    def write_torque(self, torque: Pair) -> None:
-        """Send both motor torques, N m, at most `current_lim`'s worth; not a number is zero."""
-        messages = self._torque_messages
-        limit = self._torque_max
-        for frame, value in zip(messages, torque, strict=True):
-            if not -limit <= value <= limit:
-                value = limit if value > limit else -limit if value < -limit else 0.0  # noqa: PLW2901
-            frame.data[:] = _pack_torque(value)
-        if not self._transmit(messages):
-            self.write_failures += 1
-
-    def write(self, target: MotorTarget) -> None:
-        """Send what both motors' own loops are to do; gains before what they act on.
-
-        Over CAN velocity and torque travel in thousandths: 0.035 N m at the joint.
-        """
-        now = now_ns()
-        nodes = self._node_ids
-        messages: list[can.Message] = []
-        gains = (target.pos_gain, target.vel_gain)
-        if gains != self._gains_sent or now >= self._gains_at_ns:
-            if self._gains_sent is None:  # the first since connecting: taken over as it stands
-                messages += odrive_frames.modes(nodes, ControlMode.POSITION)
-            self._gains_sent, self._gains_at_ns = gains, now + GAINS_MS * NS_PER_MS
-            messages += odrive_frames.gains(nodes, target)
-        odrive_frames.fill_inputs(self._input_messages, target)
-        messages += self._input_messages
-        if not self._transmit(messages):
-            self._gains_sent = None if self._bus is None else self._gains_sent
-            self._gains_at_ns = 0
-            self.write_failures += 1
-
-    def arm(self, *, onboard: bool) -> None:
-        """Ask for closed loop control on both axes; see `Drive.arm`.
-
-        Errors are cleared, and `input_torque` and the gains zeroed first: re-arming would
-        otherwise bring back the torque of before, and the gains the drive ships with have
-        an integrator. `status` is IDLE until heartbeats tell more.
-        """
-        self._request(*odrive_frames.arming(self._drive, onboard=onboard))
-        self._gains_sent = ((0.0, 0.0), (0.0, 0.0))
-        self._feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
-
-    def idle(self) -> None:
-        """Ask both axes to go idle, with their input torque zeroed."""
-        self._request(*odrive_frames.IDLING)
-
-    def close(self) -> None:
-        """Release the bus and stay away from it."""
-        self._disconnect()
-        self._retry_at_ns = 1 << 63
-
-    def _request(self, *commands: tuple[Command, bytes]) -> None:
-        """Send commands to both axes and forget what the axes reported before."""
-        self._states = [int(AxisState.UNDEFINED)] * 2
-        self._errors = [0, 0]
-        self._was_armed = [False, False]
-        self._status = DriveStatus.IDLE
-        self._feed_until_ns = 0
-        self._found = [None, None]
-        self._believe_from_ns = now_ns() + ARM_GRACE_MS * NS_PER_MS
-        self._transmit(
-            [message(node, command, data) for command, data in commands for node in self._node_ids]
-        )
-
-    def _pump(self, timeout_s: float) -> None:
-        """Take in the frames of one wait; a link that fails is closed."""
-        try:
-            frames = self._receive(max(0.0, timeout_s))
-        except (can.CanError, OSError):
-            self._disconnect()
-            return
-        encoder_axis = self._encoder_axis
-        for can_id, data in frames:
-            axis = encoder_axis.get(can_id)
-            if axis is not None and len(data) == 8:
-                pos, vel = estimates = _unpack_estimates(data)
-                if isfinite(pos) and isfinite(vel):  # what is no number is no sample
-                    self._estimates[axis] = estimates
-                    self._fresh |= 1 << axis
-            elif (axis := self._heartbeat_axis.get(can_id)) is not None and len(data) == 8:
-                self._hear(axis, data)
-            elif (axis := self._iq_axis.get(can_id)) is not None and len(data) == 8:
-                self._found[axis] = _unpack_iq(data)[0] * self._drive.torque_constant
-
-    def _hear(self, axis: int, data: bytes) -> None:
-        """Take in a heartbeat and work out the status."""
-        if now_ns() < self._believe_from_ns:
-            return
-        heartbeat = cansimple.unpack_heartbeat(data)
-        closed_loop = heartbeat.axis_state == AxisState.CLOSED_LOOP_CONTROL
-        errors = int(heartbeat.errors)
-        if not closed_loop and self._feed_until_ns == 0:
-            # The watchdog also runs in IDLE: there it only says that nobody has written yet.
-            errors &= ~AxisError.WATCHDOG_TIMER_EXPIRED
-        self._states[axis] = heartbeat.axis_state
-        self._errors[axis] = errors
-        self._was_armed[axis] |= closed_loop
-        self._status = self._judge()
-        if self._status == DriveStatus.ARMED and self._gains_sent is None and None in self._found:
-            self._transmit(self._ask_iq)  # found armed: whoever takes it over asks for its torques
-
-    def _judge(self) -> DriveStatus:
-        """Return the status by the last heartbeats; axis_error 0 does not mean armed."""
-        closed = [state == AxisState.CLOSED_LOOP_CONTROL for state in self._states]
-        left = any(
-            was and state not in (AxisState.CLOSED_LOOP_CONTROL, AxisState.UNDEFINED)
-            for was, state in zip(self._was_armed, self._states, strict=True)
-        )
-        if left or any(self._errors):
-            return DriveStatus.ERROR
-        if AxisState.UNDEFINED in self._states:
-            return self._status  # LOST after connecting, IDLE after a request
-        return DriveStatus.ARMED if all(closed) else DriveStatus.IDLE
-
-    def _forget(self) -> None:
-        """Believe nothing of the axes' states until both have sent a heartbeat."""
-        self._states = [int(AxisState.UNDEFINED)] * 2
-        self._status = DriveStatus.LOST
 
     def _reading(self, status: DriveStatus) -> DriveReading:
         """Return the newest estimates with a status."""
@@ -290,7 +317,7 @@ class OdriveCan:
             (pos_0, pos_1),
             (vel_0, vel_1),
             status,
-            self._errors[0] | self._errors[1],
+            self._report.errors,
             self._found_torque(),
         )
 
@@ -298,49 +325,15 @@ class OdriveCan:
         a, b = self._found
         return (a, b) if a is not None and b is not None and self._gains_sent is None else None
 
-    def _transmit(self, messages: Sequence[can.Message]) -> bool:
-        """Hand messages to the bus; False if it did not take them all."""
-        try:
-            self._send(messages)
-        except (can.CanError, OSError):
-            # A full queue of socketcan comes here too. A dead link shows in reading.
-            return False
-        return self._bus is not None
-
     def _connect(self) -> bool:
-        """Open the bus, not more often than every `RETRY_MS`."""
-        now = now_ns()
-        if now < self._retry_at_ns:
+        """Open the bus if it is time to; ask what firmware is there."""
+        if not self._link.connect():
             return False
-        self._retry_at_ns = now + RETRY_MS * NS_PER_MS
-        try:
-            bus = can.Bus(
-                interface=self._can_config.interface,
-                channel=self._can_config.channel,
-                ignore_config=True,  # python-can would read its own files at every attempt
-            )
-        except NotImplementedError as error:
-            raise DriveError(
-                f"CAN interface {self._can_config.interface!r}: {error}; "
-                "use one that python-can knows, such as socketcan or xrl_unix"
-            ) from error
-        except (can.CanError, OSError):
-            return False
-        self._bus = bus
-        self.connections += 1
         self._fresh = 0
         self._gains_sent = None
         self._found = [None, None]
-        if not self._has_sample or now - self._sample_ns > self._lost_after_ns:
-            self._forget()
-        self._receive = receiver(bus)
-        self._send = sender(bus)
+        if not self._has_sample or now_ns() - self._sample_ns > self._lost_after_ns:
+            self._report.forget()
+        if self._report.dialect == "":
+            self._link.send(self._ask_version)
         return True
-
-    def _disconnect(self) -> None:
-        """Close the bus."""
-        if self._bus is not None:
-            self._bus.shutdown()
-        self._bus = None
-        self._receive = nothing
-        self._send = drop

@@ -1,25 +1,43 @@
-"""The CANSimple frames that an ODrive's two axes are told with. Pure."""
+"""The CANSimple frames that an ODrive's two axes are told with. Pure.
+
+They are the same in both dialects (`odrive_dialects`), but for where a motor is said to be.
+"""
 
 from __future__ import annotations
 
+from struct import Struct
 from typing import Final
 
 import can
 
 from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.can_link import message
+from services.joint.drivers.odrive_dialects import Dialect
 from shared import cansimple
 from shared.cansimple import AxisState, Command, ControlMode, InputMode
 from shared.config_sections import DriveConfig
+from shared.exceptions import DriveError
+from shared.messages import Pair
 
 Nodes = tuple[int, int]
 Order = tuple[Command, bytes]
 """A command with its payload, for both axes."""
 
+LARGEST: Final = 1e9
+"""In any unit; more is no target, and no single float can hold what comes after."""
+
+_pack_float = Struct("<f").pack
+_pack_two_floats = Struct("<ff").pack
+
 IDLING: Final[tuple[Order, ...]] = (
     (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
     (Command.SET_AXIS_STATE, cansimple.pack_u32(AxisState.IDLE)),
 )
+
+
+def orders(nodes: Nodes, commands: tuple[Order, ...]) -> list[can.Message]:
+    """Return the frames of commands to both axes."""
+    return [message(node, command, data) for command, data in commands for node in nodes]
 
 
 def arming(drive: DriveConfig, *, onboard: bool) -> tuple[Order, ...]:
@@ -30,14 +48,14 @@ def arming(drive: DriveConfig, *, onboard: bool) -> tuple[Order, ...]:
     the gains it ships with have an integrator, so they are zeroed too. In torque mode they
     are left: by vel_gain the firmware limits the velocity, and with none all torque.
     """
-    mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
     no_gains = (
         (Command.SET_VEL_GAINS, cansimple.pack_two_floats(0.0, 0.0)),
         (Command.SET_POS_GAIN, cansimple.pack_float(0.0)),
     )
     return (
-        (Command.CLEAR_ERRORS, b""),
-        (Command.SET_CONTROLLER_MODE, cansimple.pack_two_ints(mode, InputMode.PASSTHROUGH)),
+        # 0.6 takes a byte (whether to blink), 0.5 looks at none
+        (Command.CLEAR_ERRORS, b"\0"),
+        (Command.SET_CONTROLLER_MODE, _modes(onboard=onboard)),
         (Command.SET_LIMITS, cansimple.pack_two_floats(drive.vel_limit, drive.current_lim)),
         *(no_gains if onboard else ()),
         (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
@@ -45,28 +63,107 @@ def arming(drive: DriveConfig, *, onboard: bool) -> tuple[Order, ...]:
     )
 
 
-def modes(nodes: Nodes, control_mode: ControlMode) -> list[can.Message]:
-    """Return the frames that choose the controller's mode."""
-    data = cansimple.pack_two_ints(control_mode, InputMode.PASSTHROUGH)
-    return [message(node, Command.SET_CONTROLLER_MODE, data) for node in nodes]
+class Frames:
+    """The frames that are sent in every cycle or often: made once, filled each time.
 
-
-def gains(nodes: Nodes, target: MotorTarget) -> list[can.Message]:
-    """Return the frames of both motors' gains, without an integrator."""
-    frames = []
-    for node, pos_gain, vel_gain in zip(nodes, target.pos_gain, target.vel_gain, strict=True):
-        velocity = cansimple.pack_two_floats(vel_gain, 0.0)
-        frames.append(message(node, Command.SET_VEL_GAINS, velocity))
-        frames.append(message(node, Command.SET_POS_GAIN, cansimple.pack_float(pos_gain)))
-    return frames
-
-
-def fill_inputs(frames: tuple[can.Message, can.Message], target: MotorTarget) -> None:
-    """Write position, velocity and torque into the two axes' frames, which are kept.
-
-    Velocity and torque travel in thousandths: the torque to 0.035 N m at the joint.
+    Attributes:
+        torques: both input torques.
+        torques_anew: with the limits and modes that arming has sent.
+        inputs: both targets.
+        inputs_and_gains: with the gains before them.
+        inputs_anew: with limits, gains and modes. A mode that is set puts a 0.5 drive's
+            input_pos to where the motor is: the axis's own target follows at once.
     """
-    for frame, pos, vel, torque in zip(
-        frames, target.pos_turns, target.vel_turns, target.torque, strict=True
+
+    def __init__(self, nodes: Nodes, drive: DriveConfig) -> None:
+        self._torque_max = drive.current_lim * drive.torque_constant
+        limits = cansimple.pack_two_floats(drive.vel_limit, drive.current_lim)
+        limit_frames = [message(n, Command.SET_LIMITS, limits) for n in nodes]
+        torque_mode, position_mode = (
+            [message(n, Command.SET_CONTROLLER_MODE, _modes(onboard=onboard)) for n in nodes]
+            for onboard in (False, True)
+        )
+        self.torques = [message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in nodes]
+        self.inputs = [message(n, Command.SET_INPUT_POS, bytes(8)) for n in nodes]
+        self._vel_gains = [message(n, Command.SET_VEL_GAINS, bytes(8)) for n in nodes]
+        self._pos_gains = [message(n, Command.SET_POS_GAIN, bytes(4)) for n in nodes]
+        gains = self._vel_gains + self._pos_gains
+        self.torques_anew = [*limit_frames, *torque_mode, *self.torques]
+        self.inputs_and_gains = [*gains, *self.inputs]
+        self.inputs_anew = [*limit_frames, *gains]
+        for mode, target in zip(position_mode, self.inputs, strict=True):
+            self.inputs_anew += (mode, target)
+
+    def fill_torques(self, torque: Pair) -> None:
+        """Write torques, N m, at most `current_lim`'s worth; what is no number is zero."""
+        limit = self._torque_max
+        for frame, value in zip(self.torques, torque, strict=True):
+            if not -limit <= value <= limit:
+                value = limit if value > limit else -limit if value < -limit else 0.0  # noqa: PLW2901
+            frame.data[:] = _pack_float(value)
+
+    def fill_inputs(self, target: MotorTarget) -> None:
+        """Write position, velocity and torque.
+
+        Velocity and torque travel in thousandths: the torque to 0.035 N m at the joint.
+        """
+        for frame, pos, vel, torque in zip(
+            self.inputs, target.pos_turns, target.vel_turns, target.torque, strict=True
+        ):
+            frame.data[:] = cansimple.pack_input_pos(pos, vel, torque)
+
+    def fill_gains(self, target: MotorTarget) -> None:
+        """Write the gains, without an integrator."""
+        for frame, gain in zip(self._vel_gains, target.vel_gain, strict=True):
+            frame.data[:] = _pack_two_floats(gain, 0.0)
+        for frame, gain in zip(self._pos_gains, target.pos_gain, strict=True):
+            frame.data[:] = _pack_float(gain)
+
+
+def positions(
+    nodes: Nodes, turns: Pair, dialect: Dialect, counts_per_turn: int | None
+) -> list[can.Message]:
+    """Return the frames that tell both motors where they are: turns to 0.6, counts to 0.5.
+
+    Raises:
+        DriveError: the dialect is not known, or the counts to a turn are not; or they are told
+            what is no position.
+    """
+    who = f"CAN nodes {nodes[0]} and {nodes[1]}"
+    if dialect == "":
+        raise DriveError(
+            f"{who}: no heartbeat has shown yet which firmware they have; "
+            "wait until the drive reports a state"
+        )
+    if dialect == "0.5" and counts_per_turn is None:
+        raise DriveError(f"{who}: firmware 0.5 is told counts; give the encoder's to a turn")
+    scale = counts_per_turn if dialect == "0.5" and counts_per_turn is not None else 1
+    if not all(abs(turn * scale) < (1 << 31) - 1 for turn in turns):
+        raise DriveError(f"{who}: {turns[0]:g} and {turns[1]:g} turns are more than 32 bits hold")
+    if dialect == "0.5":
+        payloads = [cansimple.pack_i32(round(turn * scale)) for turn in turns]
+    else:
+        payloads = [cansimple.pack_float(turn) for turn in turns]
+    return [
+        message(node, Command.SET_LINEAR_COUNT, data)
+        for node, data in zip(nodes, payloads, strict=True)
+    ]
+
+
+def is_target(target: MotorTarget) -> bool:
+    """Return True if every field is a number that a frame can hold."""
+    for first, second in (
+        target.pos_turns,
+        target.vel_turns,
+        target.torque,
+        target.pos_gain,
+        target.vel_gain,
     ):
-        frame.data[:] = cansimple.pack_input_pos(pos, vel, torque)
+        if not (-LARGEST < first < LARGEST and -LARGEST < second < LARGEST):
+            return False
+    return True
+
+
+def _modes(*, onboard: bool) -> bytes:
+    mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
+    return cansimple.pack_two_ints(mode, InputMode.PASSTHROUGH)

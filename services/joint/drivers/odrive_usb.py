@@ -6,7 +6,9 @@ transfer may take 0.5 s to fail. So every transfer runs on the package's loop, a
 control thread only swaps: it takes the newest sample and leaves the newest target. What
 crosses are references to frozen objects, each written by one side only.
 
-An exchange is one pipelined round trip, 200 times a second: a target waits up to 5 ms.
+An exchange is a sample, and at once the target that the control thread makes of it: a target
+that is a period late has let the robot shake. There are at most 200 a second. Every four
+endpoints cost a round trip, so only what is new is written, and the states are read less often.
 That is for the drives' own loops; at 1 kHz use CAN.
 """
 
@@ -14,11 +16,10 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Awaitable
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from math import isfinite
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 from odrive.device_manager import DeviceManager, get_device_manager
@@ -28,19 +29,25 @@ from services.joint.drivers.axes_status import AxesStatus
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_v3 import ARM_SETTINGS, IDLE_SETTINGS, OdriveV3
 from shared.cansimple import AxisState, ControlMode, InputMode
-from shared.clock import NS_PER_MS, NS_PER_S, now_ns
+from shared.clock import NS_PER_MS, now_ns
 from shared.config_sections import DriveConfig
 from shared.exceptions import DriveError
 from shared.messages import Pair
 
 EXCHANGE_HZ: Final = 200
-"""More than a v3 board answers over USB helps nobody (design section 5)."""
+"""At most; more than a v3 board answers over USB helps nobody (design section 5)."""
+PATIENCE: Final = 1.5
+"""Periods of the exchange for which `read` waits at least: one alone is often just missed."""
 FEED_MS: Final = 1000
 """So long after `arm` the watchdogs are fed without a target: the control loop waits."""
 LOST_S: Final = 0.1
 """Silence of a drive without a watchdog after which it counts as lost."""
 RETRY_S: Final = 0.2
 """Between two attempts to connect."""
+STATES_EVERY: Final = 4
+"""Exchanges of an armed drive from one look at its states to the next: 20 ms."""
+ANSWER_S: Final = 0.003
+"""So long an exchange waits for the control thread's target after its sample."""
 CLOSE_S: Final = 1.0
 """So long `close` waits for a last request; it is not for the control path."""
 
@@ -82,22 +89,28 @@ class OdriveUsb:
         self.trouble = ""
         self._drive = drive
         self._serial_number = serial_number.upper()
+        self._period_s = max(1.0 / EXCHANGE_HZ, drive.encoder_period_ms * 1e-3)
         self._torque_max = drive.current_lim * drive.torque_constant
         # Not before its own watchdog has fired: until then a silent drive may come back as
         # it was, while a FAULT is for good.
-        self._lost_after_ns = round((drive.watchdog_timeout or LOST_S) * NS_PER_S)
+        self._lost_after_s = drive.watchdog_timeout or LOST_S
         # Written by the control thread:
         self._target: MotorTarget | None = None
         self._request: _Request | None = None
+        self._position: Pair | None = None
         self._closing = False
+        self._silent_s = 0.0  # waited in vain: a process that was stopped has not waited
         # Written by the package's loop:
         self._sample = DriveReading(now_ns(), _ZERO, _ZERO, DriveStatus.LOST, 0)
         self._fresh = threading.Event()
         self._connected = False
         self._carried_out: _Request | None = None
         self._sent: MotorTarget | None = None
-        self._sent_gains: tuple[Pair, Pair] | None = None
         self._axes = AxesStatus()
+        self._status, self._errors = DriveStatus.LOST, 0
+        self._exchanges = 0
+        # Made by the package's loop, and resolved there once the control thread has written:
+        self._awaited: asyncio.Future[None] | None = None
         self._feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
         try:
             self._manager = get_device_manager(force_background_thread=True)
@@ -116,16 +129,17 @@ class OdriveUsb:
 
         A reading with status LOST repeats the last sample and its time.
         """
-        if self._fresh.wait(max(0.0, timeout_s)):
+        wait_s = max(timeout_s, PATIENCE * self._period_s) if timeout_s > 0.0 else 0.0
+        if self._fresh.wait(wait_s):
             self._fresh.clear()
+            self._silent_s = 0.0
             sample = self._sample
             if self._request is not self._carried_out:  # it tells of the time before
                 return msgspec.structs.replace(sample, status=DriveStatus.IDLE, error=0)
             return sample
         sample = self._sample
-        if sample.status is not DriveStatus.LOST and (
-            now_ns() - sample.t_ns <= self._lost_after_ns
-        ):
+        self._silent_s += wait_s
+        if sample.status is not DriveStatus.LOST and self._silent_s <= self._lost_after_s:
             return None
         return msgspec.structs.replace(sample, status=DriveStatus.LOST, error=0)
 
@@ -148,6 +162,10 @@ class OdriveUsb:
             first, second = (min(max(value, -limit), limit) for value in target.torque)
             target = msgspec.structs.replace(target, torque=(first, second))
         self._target = target
+        awaited = self._awaited
+        if awaited is not None:
+            self._awaited = None
+            self._manager.loop.call_soon_threadsafe(_resolve, awaited)
 
     def arm(self, *, onboard: bool) -> None:  # noqa: ARG002 - see below
         """Ask for closed loop on both axes; errors are cleared and the gains zeroed first.
@@ -161,6 +179,18 @@ class OdriveUsb:
     def idle(self) -> None:
         """Ask both axes to go idle, with their input torque zeroed; see `arm`."""
         self._request = _Request(arm=False)
+
+    def set_position(self, turns: Pair) -> None:
+        """Ask to tell both encoders where they are, turns; see `Drive.set_position`.
+
+        Forgotten if the drive is lost before.
+
+        Raises:
+            DriveError: it is lost now.
+        """
+        if not self._connected:
+            raise DriveError(f"ODrive {self._serial_number}: not there to be told its position")
+        self._position = turns
 
     def close(self) -> None:
         """Carry out the last request if the drive is there, and release it."""
@@ -185,8 +215,9 @@ class OdriveUsb:
                     await board.find_watchdogs()
                     # What was left for a drive that was not there is not for this one: it
                     # may hold the robot by its own loop, and has no use for an old target.
-                    self._carried_out = self._request
-                    self._sent, self._sent_gains = self._target, None
+                    self._carried_out, self._position = self._request, None
+                    self._sent = self._target
+                    self._status = DriveStatus.LOST
                     self._connected = True
                     self.connections += 1
                     await self._stay(board)
@@ -217,57 +248,73 @@ class OdriveUsb:
         """Exchange at the rate until closing, or until a transfer fails."""
         loop = asyncio.get_running_loop()
         due = loop.time()
-        while not (self._closing and self._request is self._carried_out):
+        while not (self._closing and self._is_carried_out()):
             await self._exchange(board)
-            due = max(due + 1.0 / EXCHANGE_HZ, loop.time())
+            due = max(due + self._period_s, loop.time())
             await asyncio.sleep(due - loop.time())
 
+    def _is_carried_out(self) -> bool:
+        return self._request is self._carried_out and self._position is None
+
     async def _exchange(self, board: OdriveV3) -> None:
-        """Carry out a request if there is one; then send the target and take a sample."""
-        request = self._request
+        """Carry out a request if there is one; then take a sample and send the target."""
+        request, position = self._request, self._position
+        if position is not None:
+            await board.set_position(position)
+            self._position = None
         if request is not None and request is not self._carried_out:
             await self._carry_out(board, request)
-        operations: list[Awaitable[Any]] = [board.device.read_multiple(board.sample)]
-        found = self._request is None and self._target is None
-        target = self._target
-        if target is not None and target is not self._sent:
-            operations += self._send(board, target)
-        elif now_ns() < self._feed_until_ns:
-            operations += board.feed()
-        values = (await _together(operations))[0]
-        t_ns = now_ns()
-        states = values[2::3]
-        errors = 0
-        if any(state != AxisState.CLOSED_LOOP_CONTROL for state in states):
-            errors = self._axes.errors(
-                await board.device.read_multiple(board.errors),
-                wanted_armed=self._feed_until_ns != 0,
-            )
-        status = self._axes.judge(states, errors)
-        torque = None
-        if found and status is DriveStatus.ARMED:
-            first, second = await board.device.read_multiple(board.currents)
-            torque = (first * self._drive.torque_constant, second * self._drive.torque_constant)
-        pos, vel = values[0::3], values[1::3]
-        if all(map(isfinite, (*pos, *vel))):  # what is no number is no sample
-            self._sample = DriveReading(
-                t_ns, (pos[0], pos[1]), (vel[0], vel[1]), status, errors, torque
-            )
-            self._fresh.set()
+        await self._take_sample(board)
         self._carried_out = request  # not before there is a sample of the time after it
+        await self._answer()
+        target = self._target
+        new = target if target is not self._sent else None
+        if new is not None:
+            self._sent = target
+            await board.target.write(new)
+        if board.hungry and (new is not None or now_ns() < self._feed_until_ns):
+            await board.feed()
 
-    def _send(self, board: OdriveV3, target: MotorTarget) -> list[Awaitable[Any]]:
-        """Return the operations that send a target: inputs, gains if they changed, food."""
-        axes = zip(target.pos_turns, target.vel_turns, target.torque, strict=True)
-        values = [value for axis in axes for value in axis]
-        properties = board.inputs
-        gains = (target.pos_gain, target.vel_gain)
-        if gains != self._sent_gains:
-            properties = board.inputs + board.gains
-            values += [value for axis in zip(*gains, strict=True) for value in axis]
-            self._sent_gains = gains
-        self._sent = target
-        return [board.write(properties, values), *board.feed()]
+    async def _answer(self) -> None:
+        """Wait until the control thread has written, but not for long."""
+        awaited = self._awaited
+        if awaited is not None:
+            timer = asyncio.get_running_loop().call_later(ANSWER_S, _resolve, awaited)
+            await awaited
+            timer.cancel()
+            self._awaited = None
+
+    async def _take_sample(self, board: OdriveV3) -> None:
+        """Take a sample of both axes, for the control thread."""
+        self._exchanges += 1
+        torque = None
+        if self._status is DriveStatus.ARMED and self._exchanges % STATES_EVERY:
+            values = await board.sample.read()
+            t_ns = now_ns()
+        else:
+            values = await board.sample_and_state.read()
+            t_ns = now_ns()
+            await self._judge(board, values[4:])
+            found = self._request is None and self._target is None
+            if found and self._status is DriveStatus.ARMED:
+                first, second = await board.currents.read()
+                per_ampere = self._drive.torque_constant
+                torque = (first * per_ampere, second * per_ampere)
+        if all(map(isfinite, values)):  # what is no number is no sample
+            pos, vel = (values[0], values[1]), (values[2], values[3])
+            self._sample = DriveReading(t_ns, pos, vel, self._status, self._errors, torque)
+            if self._target is not None:
+                self._awaited = asyncio.get_running_loop().create_future()
+            self._fresh.set()
+
+    async def _judge(self, board: OdriveV3, states: tuple[int, ...]) -> None:
+        """Make the status out of both axes' states."""
+        self._errors = 0
+        if any(state != AxisState.CLOSED_LOOP_CONTROL for state in states):
+            self._errors = self._axes.errors(
+                await board.errors.read(), wanted_armed=self._feed_until_ns != 0
+            )
+        self._status = self._axes.judge(states, self._errors)
 
     async def _carry_out(self, board: OdriveV3, request: _Request) -> None:
         """Arm or idle both axes; what they reported before is forgotten."""
@@ -282,21 +329,19 @@ class OdriveUsb:
                     *(0.0, 0.0, 0.0, 0.0, 0.0),
                 ),
             )
-            await _together(board.feed())
+            await board.feed()
             await board.write_both(("requested_state",), (AxisState.CLOSED_LOOP_CONTROL,))
             self._feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
             self._sent = self._target  # it was for the time before
         else:
             await board.write_both(IDLE_SETTINGS, (0.0, AxisState.IDLE))
             self._feed_until_ns = 0
-        self._sent_gains = None
+        board.target.forget()
         self._axes = AxesStatus()
+        self._status = DriveStatus.LOST  # it is looked at before it is told
 
 
-async def _together(operations: list[Awaitable[Any]]) -> list[Any]:
-    """Await all operations, in flight at once; then raise the first failure, if any."""
-    results = await asyncio.gather(*operations, return_exceptions=True)
-    for result in results:
-        if isinstance(result, BaseException):
-            raise result
-    return results
+def _resolve(future: asyncio.Future[None]) -> None:
+    """End the wait for it, if it has not ended."""
+    if not future.done():
+        future.set_result(None)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Awaitable, Sequence
+from collections.abc import Sequence
+from math import isclose
 from typing import Any, Final
 
+from services.joint.drivers.base import MotorTarget
 from shared.exceptions import DriveError
+from shared.messages import Pair
 
 ARM_SETTINGS: Final = (
     "controller.config.control_mode",
@@ -21,8 +24,97 @@ ARM_SETTINGS: Final = (
 )
 """Written to each axis before it is armed, in this order."""
 IDLE_SETTINGS: Final = ("controller.input_torque", "requested_state")
+N_INPUTS: Final = 4
+"""Of a target's values, the first are inputs and the rest gains."""
+GAIN_STEP: Final = 0.005
+"""A gain that differs by less than this share from what the drive has is not sent: they drift
+with the pose, and each costs a transfer."""
 
 _AXES = ("axis0", "axis1")
+
+
+class Batch:
+    """Endpoints of a drive that are read or written together, in order.
+
+    The package keeps four of its transfers in flight, so every four cost a round trip.
+    """
+
+    def __init__(self, device: Any, properties: Sequence[Any]) -> None:
+        self._device = device.device
+        self._ids = [each.endpoint_id for each in properties]
+        self._sizes = [each.codec.size for each in properties]
+        self._codec = struct.Struct("<" + "".join(each.codec.struct_format for each in properties))
+
+    async def read(self) -> tuple[Any, ...]:
+        """Return the values of all."""
+        buffer = await self._device.read_endpoints(self._ids, self._sizes, transient=False)
+        return self._codec.unpack(buffer)
+
+    async def write(self, values: Sequence[float]) -> None:
+        """Write a value to each."""
+        await self._device.write_endpoints(self._ids, self._sizes, self._codec.pack(*values))
+
+
+class TargetWriter:
+    """Writes what both motors' own loops are to do, as far as it is new to the drive.
+
+    Args:
+        device: the package's `RuntimeDevice`.
+        properties: position and torque of axis0, then of axis1; then position and velocity
+            gain of axis0, then of axis1.
+    """
+
+    def __init__(self, device: Any, properties: Sequence[Any]) -> None:
+        self._device = device
+        self._properties = properties
+        self._written: list[float] | None = None
+        self._batches: dict[tuple[int, ...], Batch] = {}
+
+    def forget(self) -> None:
+        """Write everything the next time: what the drive holds is not known."""
+        self._written = None
+
+    async def write(self, target: MotorTarget) -> None:
+        """Write the inputs, then the gains: an axis with new gains has its inputs already."""
+        values = values_of(target)
+        written = self._written
+        if written is None:
+            new = tuple(range(len(values)))
+            written = list(values)
+        else:
+            new = changed(values, written)
+        if not new:
+            return
+        batch = self._batches.get(new)
+        if batch is None:
+            properties = [self._properties[index] for index in new]
+            batch = self._batches[new] = Batch(self._device, properties)
+        self._written = None  # if it fails, nobody knows what came through
+        await batch.write([values[index] for index in new])
+        for index in new:
+            written[index] = values[index]
+        self._written = written
+
+
+def values_of(target: MotorTarget) -> tuple[float, ...]:
+    """Return a target's values in the order of `TargetWriter`.
+
+    The velocity goes with the torque, `torque + vel_gain vel_turns`, and `input_vel` stays at
+    zero: the firmware's law gives the same torque, also when nobody writes any more, and four
+    inputs are one round trip where six are two.
+    """
+    (pos_0, pos_1), (vel_0, vel_1), (b_0, b_1) = target.pos_turns, target.vel_turns, target.vel_gain
+    (torque_0, torque_1), (k_0, k_1) = target.torque, target.pos_gain
+    return pos_0, torque_0 + b_0 * vel_0, pos_1, torque_1 + b_1 * vel_1, k_0, b_0, k_1, b_1
+
+
+def changed(values: Sequence[float], written: Sequence[float]) -> tuple[int, ...]:
+    """Return the places of inputs that are new, and of gains that are noticeably new."""
+    return tuple(
+        index
+        for index, (value, before) in enumerate(zip(values, written, strict=True))
+        if value != before and (index < N_INPUTS or not isclose(value, before, rel_tol=GAIN_STEP))
+    )
 
 
 class OdriveV3:
@@ -31,11 +123,11 @@ class OdriveV3:
     `device` is the package's `RuntimeDevice`; only `odrive_usb` imports the package.
 
     Attributes:
-        sample: position, velocity and state of axis0, then of axis1.
+        sample: position of both axes, then velocity.
+        sample_and_state: the same, then the state of both axes.
         errors: the four error registers of axis0, then of axis1.
         currents: what each axis's own loop asks for.
-        inputs: position, velocity and torque of axis0, then of axis1.
-        gains: position and velocity gain of axis0, then of axis1.
+        target: the inputs and gains of both axes.
 
     Raises:
         DriveError: it is another drive or firmware than this driver knows.
@@ -43,42 +135,53 @@ class OdriveV3:
 
     def __init__(self, device: Any) -> None:
         self.device = device
-        self.sample = self._both(("encoder.pos_estimate", "encoder.vel_estimate", "current_state"))
-        self.errors = self._both(("error", "motor.error", "encoder.error", "controller.error"))
-        self.currents = self._both(("motor.current_control.Iq_setpoint",))
-        self.inputs = self._both(
-            ("controller.input_pos", "controller.input_vel", "controller.input_torque")
+        estimates = [
+            *self._both(("encoder.pos_estimate",)),
+            *self._both(("encoder.vel_estimate",)),
+        ]
+        self.sample = Batch(device, estimates)
+        self.sample_and_state = Batch(device, [*estimates, *self._both(("current_state",))])
+        self.errors = Batch(
+            device,
+            self._both(("error", "motor.error", "encoder.error", "controller.error")),
         )
-        self.gains = self._both(("controller.config.pos_gain", "controller.config.vel_gain"))
-        self._watchdogs = self._both(("config.enable_watchdog",))
+        self.currents = Batch(device, self._both(("motor.current_control.Iq_setpoint",)))
+        inputs = ("controller.input_pos", "controller.input_torque")
+        gains = ("controller.config.pos_gain", "controller.config.vel_gain")
+        self.target = TargetWriter(device, [*self._both(inputs), *self._both(gains)])
+        self._watchdogs = Batch(device, self._both(("config.enable_watchdog",)))
+        self._counts_per_turn = Batch(device, self._both(("encoder.config.cpr",)))
         self._food: list[Any] = []
 
     async def find_watchdogs(self) -> None:
         """Look which axes have a watchdog that runs; they are set and saved, not switched."""
-        enabled = await self.device.read_multiple(self._watchdogs)
+        enabled = await self._watchdogs.read()
         self._food = [
             self.device.functions[f"{axis}.watchdog_feed"]
             for axis, on in zip(_AXES, enabled, strict=True)
             if on
         ]
 
-    def feed(self) -> list[Awaitable[Any]]:
-        """Return the calls that feed the watchdogs that run: over USB nothing else does."""
-        return [self.device.call_function(food) for food in self._food]
+    @property
+    def hungry(self) -> bool:
+        """True if a watchdog runs: over USB nothing but `feed` feeds it."""
+        return bool(self._food)
 
-    async def write(self, properties: Sequence[Any], values: Sequence[float]) -> None:
-        """Write properties in order, in one pipelined round trip."""
-        codecs = [each.codec for each in properties]
-        wire = [codec.to_wire(value) for codec, value in zip(codecs, values, strict=True)]
-        await self.device.device.write_endpoints(
-            [each.endpoint_id for each in properties],
-            [codec.size for codec in codecs],
-            struct.pack("<" + "".join(codec.struct_format for codec in codecs), *wire),
-        )
+    async def feed(self) -> None:
+        """Feed the watchdogs that run."""
+        for food in self._food:
+            await self.device.call_function(food)
+
+    async def set_position(self, turns: Pair) -> None:
+        """Tell both encoders what they read here, turns at the motor."""
+        counts_per_turn = await self._counts_per_turn.read()
+        for axis, where, cpr in zip(_AXES, turns, counts_per_turn, strict=True):
+            name = f"{axis}.encoder.set_linear_count"
+            await self.device.call_function(self.device.functions[name], round(where * cpr))
 
     async def write_both(self, names: tuple[str, ...], values: tuple[float, ...]) -> None:
         """Write the same values to both axes, axis0 first."""
-        await self.write(self._both(names), [*values, *values])
+        await Batch(self.device, self._both(names)).write([*values, *values])
 
     def _both(self, names: tuple[str, ...]) -> list[Any]:
         """Return properties of axis0, then the same of axis1."""

@@ -1,0 +1,121 @@
+"""How much of a CAN bus the drives on it take, at 1 Mbit/s (design section 5). Pure.
+
+A standard data frame with n bytes is 47 + 8n bits long, the gap after it included. After five
+equal bits the sender stuffs one more; up to the end of the checksum, over 34 + 8n bits, that is
+at most one in four, and `STUFFING` as measured on this robot's frames.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from shared.exceptions import ConfigError
+
+if TYPE_CHECKING:
+    from shared.config import RobotConfig
+
+BITRATE: Final = 1_000_000
+"""bit/s"""
+LOAD_MAX: Final = 0.85
+"""Share of a bus that may be planned with: requests, arming and errors come on top, and a full
+bus delays a frame by as much as is queued before it. Torques for 12 axes at 333 Hz, with
+heartbeats at 10 Hz, are 82 %."""
+STUFFING: Final = 0.06
+"""Stuff bits for each bit that can be stuffed: 0.05 while the robot stands."""
+GAINS_HZ: Final = 10.0
+"""How often the onboard loop's gains go out even if they stand still."""
+LOADCELL_FRAMES: Final = 3
+"""To a sample of the harness sensor."""
+
+
+class BusLoad(NamedTuple):
+    """What the devices on a bus send and are sent, bit/s."""
+
+    cyclic: float
+    """By each axis for each Hz of the control rate: estimate and target, bit."""
+    steady: float
+    """By each axis: heartbeat and gains, bit/s."""
+    other: float
+    """By the harness sensor, bit/s."""
+    axes: int
+
+    def share(self, rate_hz: float) -> float:
+        """Return the load at a control rate, as a share of the bus."""
+        return (self.axes * (self.cyclic * rate_hz + self.steady) + self.other) / BITRATE
+
+    def rate_max_hz(self) -> float:
+        """Return the control rate at which the load is `LOAD_MAX`; 0 if there is none."""
+        left = LOAD_MAX * BITRATE - self.other - self.axes * self.steady
+        return max(0.0, left / (self.axes * self.cyclic))
+
+    def axes_max(self, rate_hz: float) -> int:
+        """Return how many axes the bus carries at a control rate."""
+        left = LOAD_MAX * BITRATE - self.other
+        return max(0, math.floor(left / (self.cyclic * rate_hz + self.steady)))
+
+
+def frame_bits(data_bytes: int) -> float:
+    """Return the usual length of a standard data frame, bits."""
+    return 47 + 8 * data_bytes + STUFFING * (34 + 8 * data_bytes)
+
+
+def bus_load(
+    axes: int,
+    *,
+    onboard: bool,
+    heartbeat_period_ms: float,
+    loadcell_rate_hz: float = 0.0,
+) -> BusLoad:
+    """Return the load of a bus: per cycle, an estimate from each axis and a target to it.
+
+    Args:
+        axes: on this bus.
+        onboard: targets of the motors' own loops, 8 bytes, and their gains; else torques, 4.
+        heartbeat_period_ms: of each axis.
+        loadcell_rate_hz: samples of a harness sensor on this bus.
+    """
+    full, half = frame_bits(8), frame_bits(4)
+    gains = GAINS_HZ * (full + half) if onboard else 0.0
+    return BusLoad(
+        cyclic=full + (full if onboard else half),
+        steady=1e3 / heartbeat_period_ms * full + gains,
+        other=LOADCELL_FRAMES * loadcell_rate_hz * full,
+        axes=axes,
+    )
+
+
+def check_buses(file: str, config: RobotConfig) -> None:
+    """Refuse a bus that cannot carry the modules on it.
+
+    Raises:
+        ConfigError: naming the bus, its load and what it would carry.
+    """
+    if config.joint_service.driver != "odrive_can":
+        return
+    modules: dict[str, int] = {}
+    names: dict[str, str] = {}
+    for module in config.module:
+        channel = config.can[module.bus].channel
+        modules[channel] = modules.get(channel, 0) + 1
+        names.setdefault(channel, module.bus)
+    service = config.joint_service
+    sensor = config.can[config.harness.bus].channel
+    for channel, count in modules.items():
+        load = bus_load(
+            2 * count,
+            onboard=service.loop == "onboard",
+            heartbeat_period_ms=config.drive.heartbeat_period_ms,
+            loadcell_rate_hz=config.harness.rate_hz if channel == sensor else 0.0,
+        )
+        share = load.share(service.rate_hz)
+        if share > LOAD_MAX:
+            carried = load.axes_max(service.rate_hz) // 2
+            raise ConfigError(
+                file,
+                f"can.{names[channel]}",
+                f"{count} module{'s' if count > 1 else ''} at {service.rate_hz:g} Hz would load "
+                f"it to {share:.0%} of 1 Mbit/s",
+                f"at most {LOAD_MAX:.0%}: {carried} module{'s' if carried != 1 else ''} on a bus "
+                f"at this rate, or joint_service.rate_hz of at most {load.rate_max_hz():.0f} Hz",
+            )

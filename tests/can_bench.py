@@ -1,0 +1,159 @@
+"""A CAN driver on buses whose every answer the test writes, in the test's own time."""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections import deque
+from collections.abc import Iterator
+
+import can
+import pytest
+
+from services.joint.drivers import can_link, odrive_can
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.can_link import BUS_OFF
+from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
+from shared.cansimple import (
+    AxisState,
+    Command,
+    Heartbeat,
+    arbitration_id,
+    pack_heartbeat,
+    pack_two_floats,
+    split_id,
+)
+from shared.config_sections import CanConfig
+from tests.test_odrive_can import DRIVE, NODES
+
+TARGET = MotorTarget((0.25, -0.5), (1.0, -2.0), (0.5, -0.25), (30.0, 40.0), (0.05, 0.06))
+FULL = can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
+
+
+class FakeBus(can.BusABC):
+    """A bus whose answers the test writes: messages, and exceptions to raise."""
+
+    def __init__(self, channel: str, **kwargs: object) -> None:
+        self.waiting: deque[can.Message | Exception] = deque()
+        self.sent: list[can.Message] = []
+        self.room = 1 << 30
+        """How many messages the queue still takes."""
+        self.when_full: Exception = FULL
+        self.shown = can.BusState.ACTIVE
+        self.closed = 0
+        self.options = kwargs
+        super().__init__(channel)
+
+    @property  # type: ignore[misc]
+    def state(self) -> can.BusState:
+        return self.shown
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        assert timeout == 0.0, "the loop must not wait"
+        if self.room == 0:
+            raise self.when_full
+        self.room -= 1
+        self.sent.append(
+            can.Message(
+                arbitration_id=msg.arbitration_id, data=bytes(msg.data), is_extended_id=False
+            )
+        )
+
+    def _recv_internal(
+        self,
+        timeout: float | None,  # noqa: ARG002 - python-can's signature
+    ) -> tuple[can.Message | None, bool]:
+        if not self.waiting:
+            return None, True
+        each = self.waiting.popleft()
+        if isinstance(each, Exception):
+            raise each
+        return each, True
+
+    def shutdown(self) -> None:
+        self.closed += 1
+        super().shutdown()
+        raise OSError(errno.EBADF, "closed twice")  # a broken adapter
+
+
+class Bench:
+    """A driver on fake buses, in the test's own time."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, interface: str = "fake") -> None:
+        self.now_ns = 1
+        self.buses: list[FakeBus] = []
+        self.refuses: Exception | None = None
+        for module in (odrive_can, can_link):
+            monkeypatch.setattr(module, "now_ns", lambda: self.now_ns)
+        monkeypatch.setattr(time, "sleep", self.wait)
+        monkeypatch.setattr(can, "Bus", self.open)
+        self.driver = OdriveCan(CanConfig(interface=interface, channel="can7"), NODES, DRIVE)
+
+    @property
+    def bus(self) -> FakeBus:
+        return self.buses[-1]
+
+    def open(self, channel: str, interface: str, ignore_config: bool, **kwargs: object) -> FakeBus:
+        assert ignore_config
+        assert interface
+        if self.refuses is not None:
+            raise self.refuses
+        self.buses.append(FakeBus(channel, **kwargs))
+        return self.bus
+
+    def wait(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
+
+    def after(self, ms: float) -> DriveReading | None:
+        """Read so much later what there is."""
+        self.wait(ms * 1e-3)
+        return self.driver.read(0.0)
+
+    def hear(self, state: int | None = AxisState.IDLE, error: int = 0) -> DriveReading | None:
+        """Have both axes send an estimate, and a heartbeat if there is a state, and read them."""
+        for node in NODES:
+            if state is not None:
+                said = Heartbeat(error, state, False, False, False, trajectory_done=True)
+                self.bus.waiting.append(frame(node, Command.HEARTBEAT, pack_heartbeat(said)))
+            self.bus.waiting.append(
+                frame(node, Command.GET_ENCODER_ESTIMATES, pack_two_floats(node, 0.0))
+            )
+        return self.after(1)
+
+    def armed(self, *, onboard: bool = True) -> None:
+        self.hear()
+        self.driver.arm(onboard=onboard)
+        self.wait(2e-3 * ARM_GRACE_MS)
+        reading = self.hear(AxisState.CLOSED_LOOP_CONTROL)
+        assert reading is not None
+        assert reading.status is DriveStatus.ARMED
+        self.bus.sent.clear()
+
+    def commands(self) -> list[int]:
+        """Return the commands that the bus has taken since the last look."""
+        commands = [split_id(message.arbitration_id)[1] for message in self.bus.sent]
+        self.bus.sent.clear()
+        return commands
+
+
+def frame(node: int, command: int, data: bytes = b"", **kwargs: bool) -> can.Message:
+    kwargs.setdefault("is_extended_id", False)
+    return can.Message(arbitration_id=arbitration_id(node, command), data=data, **kwargs)
+
+
+def error_frame(error_class: int, data: bytes = bytes(8)) -> can.Message:
+    return can.Message(
+        arbitration_id=error_class, data=data, is_error_frame=True, is_extended_id=False
+    )
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    bench = Bench(monkeypatch)
+    yield bench
+    bench.driver.close()
+    assert all(bus.closed == 1 for bus in bench.buses)
+
+
+def error_on_the_wire(bench: Bench) -> None:
+    bench.bus.waiting.append(error_frame(BUS_OFF))

@@ -1,0 +1,164 @@
+"""What a CAN bus carries: the estimate against real bits, and what a robot file is refused for."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from shared.can_load import LOAD_MAX, BusLoad, bus_load, frame_bits
+from shared.cansimple import Command, arbitration_id, pack_input_pos, pack_two_floats
+from shared.config import RobotConfig
+from shared.exceptions import ConfigError
+from tests.test_config import Table, load_changed, setting
+
+
+def bits_on_the_wire(can_id: int, data: bytes) -> int:
+    """Return the length of a standard data frame with its stuff bits and the gap after it."""
+    bits = [0, *_bits(can_id, 11), 0, 0, 0, *_bits(len(data), 4)]
+    bits += [bit for byte in data for bit in _bits(byte, 8)]
+    checksum = 0
+    for bit in bits:
+        invert = bit ^ (checksum >> 14)
+        checksum = (checksum << 1 & 0x7FFF) ^ (0x4599 if invert else 0)
+    stuffed, run, last = 0, 0, -1
+    for bit in [*bits, *_bits(checksum, 15)]:
+        run, last = (run + 1, last) if bit == last else (1, bit)
+        if run == 5:
+            stuffed, run, last = stuffed + 1, 1, 1 - bit
+    return len(bits) + 15 + stuffed + 13
+
+
+def _bits(value: int, count: int) -> list[int]:
+    return [value >> at & 1 for at in reversed(range(count))]
+
+
+def standing(seed: int = 1) -> list[tuple[int, bytes]]:
+    """Return frames as two axes and their service send them while the robot stands."""
+    dice = random.Random(seed)
+    frames = []
+    for _ in range(500):
+        for node in (4, 5):
+            pos = 64.0 + dice.gauss(2.0, 0.01)
+            estimate = pack_two_floats(pos, dice.gauss(0.0, 0.02))
+            target = pack_input_pos(pos, dice.gauss(0.0, 0.02), dice.gauss(0.4, 0.05))
+            frames.append((arbitration_id(node, Command.GET_ENCODER_ESTIMATES), estimate))
+            frames.append((arbitration_id(node, Command.SET_INPUT_POS), target))
+    return frames
+
+
+def test_a_frame_without_stuffing_is_as_long_as_the_standard_says() -> None:
+    alternating = bytes([0x55] * 8)
+    assert 111 <= bits_on_the_wire(0x2AA, alternating) <= 114
+    assert bits_on_the_wire(0, bytes(8)) > 111 + 14
+
+
+def test_the_usual_length_is_that_of_the_robots_own_frames() -> None:
+    frames = standing()
+    real = sum(bits_on_the_wire(*each) for each in frames) / len(frames)
+    assert frame_bits(8) == pytest.approx(real, rel=0.03)
+
+
+@pytest.mark.parametrize("count", range(9))
+def test_the_usual_length_lies_between_the_shortest_and_the_longest_frame(count: int) -> None:
+    shortest = 47 + 8 * count
+    longest = shortest + (34 + 8 * count - 1) // 4
+    assert shortest < frame_bits(count) < longest
+
+
+def design(axes: int) -> BusLoad:
+    """Return the load of torques alone, with heartbeats as the drives are shipped."""
+    return bus_load(axes, onboard=False, heartbeat_period_ms=100)
+
+
+def test_the_loads_are_those_of_the_design() -> None:
+    assert design(2).share(1000.0) == pytest.approx(0.40, abs=0.02)
+    assert design(12).share(1000.0 / 3.0) == pytest.approx(0.8, abs=0.03)
+    assert design(12).share(1000.0 / 3.0) < LOAD_MAX < design(12).share(500.0)
+
+
+def test_what_a_bus_is_said_to_carry_loads_it_to_the_limit() -> None:
+    for axes in (2, 6, 12):
+        load = bus_load(axes, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=250.0)
+        assert load.share(load.rate_max_hz()) == pytest.approx(LOAD_MAX)
+        most = load.axes_max(500.0)
+        assert load._replace(axes=most).share(500.0) <= LOAD_MAX
+        assert load._replace(axes=most + 1).share(500.0) > LOAD_MAX
+
+
+def test_a_bus_that_the_sensor_has_filled_carries_nothing() -> None:
+    load = bus_load(2, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=5000.0)
+    assert load.rate_max_hz() == 0.0
+    assert load.axes_max(500.0) == 0
+
+
+# ---- in a robot file
+
+
+def on_buses(*names: str) -> Callable[[Table], None]:
+    """Return a change that puts the six modules on these buses in turn."""
+
+    def change(raw: Table) -> None:
+        for module, name in zip(raw["module"], names, strict=True):
+            module["bus"] = name
+
+    return change
+
+
+RIGHT, LEFT = "hip_right", "hip_left"
+
+
+def test_a_bus_for_each_leg_carries_three_modules_at_500_hz(tmp_path: Path) -> None:
+    robot = load_changed(tmp_path, on_buses(*[RIGHT] * 3, *[LEFT] * 3))
+    assert robot.module_named("knee_left").bus == LEFT
+
+
+def test_one_bus_for_all_six_is_refused_with_what_it_would_carry(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_changed(tmp_path, on_buses(*[RIGHT] * 6))
+    message = str(refused.value)
+    assert "can.hip_right" in message
+    assert "6 modules at 500 Hz would load it to 150% of 1 Mbit/s" in message
+    assert "at most 85%: 3 modules on a bus at this rate" in message
+
+
+def test_the_rate_that_the_refusal_names_is_accepted(tmp_path: Path) -> None:
+    def change(raw: Table) -> None:
+        on_buses(*[RIGHT] * 6)(raw)
+        raw["joint_service"].update(rate_hz=250.0, state_rate_hz=250.0)
+        raw["simulation"]["encoder_rate_hz"] = 250.0
+        raw["drive"]["encoder_period_ms"] = 4
+
+    assert load_changed(tmp_path, change).joint_service.rate_hz == 250.0
+
+
+def test_the_sensor_counts_on_the_bus_that_it_is_on(tmp_path: Path) -> None:
+    def change(raw: Table) -> None:
+        on_buses(*[RIGHT] * 3, *[LEFT] * 3)(raw)
+        raw["harness"]["bus"] = RIGHT
+        raw["harness"]["rate_hz"] = 500.0
+
+    with pytest.raises(ConfigError, match=r"can\.hip_right"):
+        load_changed(tmp_path, change)
+
+
+def test_over_usb_the_buses_carry_nothing(tmp_path: Path) -> None:
+    def change(raw: Table) -> None:
+        on_buses(*[RIGHT] * 6)(raw)
+        raw["joint_service"]["driver"] = "odrive_usb"
+        for index, module in enumerate(raw["module"]):
+            module["serial_number"] = f"3A000000000{index}"
+
+    load_changed(tmp_path, change)
+
+
+def test_the_emulated_drives_speak_0_5_unless_told_otherwise(
+    tmp_path: Path, robot: RobotConfig
+) -> None:
+    assert robot.simulation.can_dialect == "0.5"
+    told = load_changed(tmp_path, setting("simulation.can_dialect", "0.6"))
+    assert told.simulation.can_dialect == "0.6"
+    with pytest.raises(ConfigError, match="can_dialect"):
+        load_changed(tmp_path, setting("simulation.can_dialect", "0.7"))

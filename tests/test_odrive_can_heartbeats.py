@@ -1,0 +1,193 @@
+"""What a heartbeat says in either dialect of CANSimple, and which dialect it is in."""
+
+from __future__ import annotations
+
+import pytest
+
+from services.joint.drivers.base import DriveStatus
+from services.joint.drivers.odrive_dialects import (
+    OTHER_ERROR,
+    UNANSWERED,
+    AxesReport,
+    Dialect,
+    dialect_of,
+    errors_from_06,
+    judged,
+)
+from services.simulator.cansimple_dialects import VERSION_06
+from shared import cansimple, cansimple_06
+from shared.cansimple import AxisError, AxisState, Heartbeat
+from shared.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult
+
+CLOSED, IDLE = AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE
+VERSION = cansimple_06.pack_version(VERSION_06)
+
+
+def old(state: int, error: int = 0, *, motor: bool = False, done: bool = True) -> bytes:
+    """Return a heartbeat of 0.5."""
+    heartbeat = Heartbeat(error, state, motor, False, False, trajectory_done=done)
+    return cansimple.pack_heartbeat(heartbeat)
+
+
+def new(
+    state: int, error: int = 0, result: int = ProcedureResult.SUCCESS, *, done: bool = True
+) -> bytes:
+    """Return a heartbeat of 0.6."""
+    return cansimple_06.pack_heartbeat(Heartbeat06(error, state, result, trajectory_done=done))
+
+
+def heard(*pairs: tuple[int, bytes], armed: bool = False) -> AxesReport:
+    report = AxesReport()
+    report.requested(armed=armed)
+    for axis, heartbeat in pairs:
+        report.hear(axis, heartbeat)
+    return report
+
+
+# ---- which dialect
+
+
+@pytest.mark.parametrize(
+    ("heartbeat", "dialect"),
+    [
+        (old(IDLE), "0.5"),
+        (old(CLOSED), "0.5"),
+        (old(IDLE, motor=True), "0.5"),
+        (old(IDLE, done=False), ""),
+        (old(IDLE, motor=True, done=False), ""),
+        (new(IDLE), ""),
+        (new(CLOSED, result=ProcedureResult.BUSY), ""),
+        (new(IDLE, result=ProcedureResult.DISARMED), "0.6"),
+        (new(IDLE, result=ProcedureResult.NOT_CALIBRATED, done=False), "0.6"),
+    ],
+)
+def test_a_heartbeat_shows_its_dialect_only_where_the_other_could_not_have_sent_it(
+    heartbeat: bytes, dialect: Dialect
+) -> None:
+    assert dialect_of(heartbeat) == dialect
+
+
+def test_a_version_is_an_answer_of_0_6_and_tells_the_firmware() -> None:
+    report = heard((0, new(IDLE)))
+    assert (report.dialect, report.firmware) == ("", None)
+    report.hear_version(VERSION)
+    assert (report.dialect, report.firmware) == ("0.6", (0, 6, 10))
+
+
+def test_a_drive_that_never_answers_is_taken_for_0_5_after_many_requests() -> None:
+    report = AxesReport()
+    for _ in range(UNANSWERED):
+        report.hear(0, old(IDLE, done=False))
+        assert report.dialect == ""
+    report.hear(1, old(IDLE, done=False))
+    assert report.dialect == "0.5"
+
+
+def test_0_6_taken_for_0_5_looks_like_an_error_until_its_answer_comes() -> None:
+    report = AxesReport()
+    busy = new(CLOSED, result=ProcedureResult.BUSY)
+    for _ in range(UNANSWERED):
+        for axis in (0, 1):
+            report.hear(axis, busy)
+    assert (report.dialect, report.status) == ("0.5", DriveStatus.ERROR)
+    report.hear_version(VERSION)  # and what was heard is judged again
+    assert (report.dialect, report.status) == ("0.6", DriveStatus.ARMED)
+
+
+def test_what_is_forgotten_is_found_out_anew() -> None:
+    report = heard((0, old(IDLE)), (1, old(IDLE)))
+    report.forget()
+    assert (report.dialect, report.status) == ("", DriveStatus.LOST)
+    for axis in (0, 1):
+        report.hear(axis, new(IDLE, DriveError06.DRV_FAULT, ProcedureResult.DISARMED))
+    assert (report.dialect, report.status) == ("0.6", DriveStatus.ERROR)
+
+
+# ---- what an error is
+
+
+@pytest.mark.parametrize("bit", range(32))
+def test_no_error_of_0_6_looks_like_none(bit: int) -> None:
+    assert errors_from_06(1 << bit) != 0
+    report = heard((0, new(IDLE, 1 << bit, ProcedureResult.DISARMED)), (1, new(IDLE)), armed=True)
+    assert report.dialect == "0.6"
+    assert report.status is DriveStatus.ERROR
+    assert report.errors != 0
+
+
+def test_no_error_of_0_6_is_none_of_ours() -> None:
+    assert errors_from_06(0) == 0
+
+
+def test_every_error_of_0_6_that_has_a_name_is_told_by_one_of_0_5() -> None:
+    for error in DriveError06:
+        assert errors_from_06(error) < OTHER_ERROR
+    assert errors_from_06(0x8000_0000) == OTHER_ERROR
+
+
+def test_the_watchdog_has_its_own_bit_in_each_dialect_and_the_other_one_is_something_else() -> None:
+    watchdog = AxisError.WATCHDOG_TIMER_EXPIRED
+    wanted = {"wanted_armed": True}
+    assert judged("0.5", old(IDLE, 0x800), **wanted) == (IDLE, watchdog)
+    assert judged("0.6", new(IDLE, 0x0100_0000), **wanted) == (IDLE, watchdog)
+    assert judged("0.6", new(IDLE, 0x800), **wanted) == (IDLE, AxisError.MOTOR_FAILED)
+    assert judged("0.5", old(IDLE, 0x0100_0000), **wanted)[1] != watchdog
+
+
+@pytest.mark.parametrize(
+    ("dialect", "heartbeat"),
+    [("0.5", old(IDLE, 0x800)), ("0.6", new(IDLE, 0x0100_0000, ProcedureResult.DISARMED))],
+)
+def test_a_watchdog_that_ran_out_before_anybody_wrote_is_no_error(
+    dialect: Dialect, heartbeat: bytes
+) -> None:
+    assert judged(dialect, heartbeat, wanted_armed=False) == (IDLE, 0)
+    assert judged(dialect, heartbeat, wanted_armed=True)[1] != 0
+
+
+@pytest.mark.parametrize("error", [0x800, 0x0100_0000, 0x40, 1 << 31])
+def test_while_the_dialect_is_not_known_any_error_is_one_and_has_no_name(error: int) -> None:
+    for state in (IDLE, CLOSED):
+        heartbeat = new(state, error)
+        assert dialect_of(heartbeat) == ""
+        assert judged("", heartbeat, wanted_armed=False) == (state, OTHER_ERROR)
+
+
+def test_while_the_dialect_is_not_known_the_state_is_believed() -> None:
+    busy = new(CLOSED, result=ProcedureResult.BUSY)
+    report = heard((0, busy), (1, busy))
+    assert (report.dialect, report.status, report.errors) == ("", DriveStatus.ARMED, 0)
+
+
+def test_a_failed_motor_of_0_5_is_an_error_even_before_its_dialect_is_known() -> None:
+    failed = old(IDLE, motor=True, done=False)
+    assert dialect_of(failed) == ""
+    assert heard((0, failed), (1, old(IDLE, done=False))).status is DriveStatus.ERROR
+
+
+@pytest.mark.parametrize("result", [ProcedureResult.NOT_CALIBRATED, ProcedureResult.INVALID_STATE])
+def test_closed_loop_that_0_6_refuses_is_an_error_only_if_it_was_asked_for(
+    result: ProcedureResult,
+) -> None:
+    refused = new(IDLE, result=result)
+    assert judged("0.6", refused, wanted_armed=True) == (IDLE, AxisError.INVALID_STATE)
+    assert judged("0.6", refused, wanted_armed=False) == (IDLE, 0)
+
+
+@pytest.mark.parametrize(
+    ("closed", "left"),
+    [
+        (old(CLOSED), old(IDLE)),
+        (old(CLOSED), old(AxisState.UNDEFINED)),
+        (new(CLOSED, result=ProcedureResult.BUSY), new(IDLE)),
+        (new(CLOSED, result=ProcedureResult.BUSY), new(AxisState.UNDEFINED)),
+    ],
+)
+def test_an_axis_that_left_closed_loop_without_an_error_bit_is_an_error(
+    closed: bytes, left: bytes
+) -> None:
+    report = heard((0, closed), (1, closed))
+    statuses = [report.status]
+    report.hear(1, left)
+    statuses.append(report.status)
+    assert statuses == [DriveStatus.ARMED, DriveStatus.ERROR]

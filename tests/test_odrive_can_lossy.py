@@ -1,0 +1,171 @@
+"""The CAN driver on a bus that loses frames both ways: the drive ends up as it was told to be."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.joint.drivers import can_link, odrive_can
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.odrive_can import OdriveCan
+from services.simulator.cansimple_dialects import DialectName
+from shared.cansimple import AxisState, ControlMode
+from shared.clock import NS_PER_MS
+from shared.unix_can import Frame
+from shared.unix_can_hub import UnixCanHub
+from tests.test_odrive_can import AXES, DRIVE, MS, Rig, make_driver, path
+
+__all__ = ["path"]  # fixtures
+
+LOSS = 0.3
+STEP_MS = 4
+ASK_EVERY_MS = 500
+"""How often a joint service repeats a request that has shown no effect."""
+TARGET = MotorTarget((0.25, -0.5), (1.0, -2.0), (0.5, -0.25), (30.0, 40.0), (0.05, 0.06))
+
+
+class LossyHub(UnixCanHub):
+    """A bus on which every frame to a drive, and every packet of the drives, may be lost."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.dice = random.Random(0)
+        self.loss = LOSS
+        self.lost = 0
+
+    def poll(self) -> list[Frame]:
+        return [frame for frame in super().poll() if not self._loses()]
+
+    def broadcast_packet(self, packet: bytes) -> None:
+        for at in range(0, len(packet), 16):
+            if not self._loses():
+                super().broadcast_packet(packet[at : at + 16])
+
+    def _loses(self) -> bool:
+        loses = self.dice.random() < self.loss
+        self.lost += loses
+        return loses
+
+
+class Bench:
+    """A drive on a lossy bus, in its own time, and what a joint service does about it."""
+
+    def __init__(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch, seed: int, dialect: DialectName
+    ) -> None:
+        self.rig = Rig(path, dialect=dialect, hub=LossyHub)
+        assert isinstance(self.rig.hub, LossyHub)
+        self.hub = self.rig.hub
+        self.hub.dice.seed(seed)
+        for module in (odrive_can, can_link):
+            monkeypatch.setattr(module, "now_ns", lambda: round(self.rig.now_s * 1e9) + NS_PER_MS)
+        self.driver: OdriveCan = make_driver(path)
+        self.status = DriveStatus.LOST
+
+    def cycle(self) -> DriveReading | None:
+        self.rig.step()
+        self.rig.now_s += (STEP_MS - 1) * MS
+        reading = self.driver.read(0.0)
+        if reading is not None:
+            self.status = reading.status
+        return reading
+
+    def run(self, ms: int, target: MotorTarget | None = None) -> None:
+        for _ in range(ms // STEP_MS):
+            self.cycle()
+            if target is not None:
+                self.driver.write(target)
+
+    def until_armed(self, *, onboard: bool) -> int:
+        """Ask until the drive is armed; return how often it was asked."""
+        for asked in range(1, 20):
+            self.driver.arm(onboard=onboard)
+            for _ in range(ASK_EVERY_MS // STEP_MS):
+                self.cycle()
+                if not onboard:
+                    self.driver.write_torque((0.0, 0.0))
+                if self.status is DriveStatus.ARMED:
+                    return asked
+        return 0
+
+
+@pytest.fixture(params=range(3))
+def seed(request: pytest.FixtureRequest) -> int:
+    return int(request.param)
+
+
+@pytest.fixture(params=["0.5", "0.6"])
+def bench(
+    request: pytest.FixtureRequest, path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> Iterator[Bench]:
+    bench = Bench(path, monkeypatch, seed, request.param)
+    bank = bench.rig.bank
+    bank.vel_limit[:], bank.current_lim[:] = 2.0, 10.0  # as shipped
+    bank.pos_gain[:], bank.vel_gain[:], bank.vel_integrator_gain[:] = 20.0, 1 / 6, 1 / 3
+    yield bench
+    bench.driver.close()
+    assert bench.hub.lost > 10
+    bench.hub.close()
+
+
+def test_the_drive_is_armed_with_the_modes_limits_gains_and_targets_that_it_was_told(
+    bench: Bench,
+) -> None:
+    bench.run(100)
+    assert bench.until_armed(onboard=True)
+    bench.run(1200, TARGET)
+    bank, axes = bench.rig.bank, list(AXES)
+    assert [bank.state[axis] for axis in axes] == [AxisState.CLOSED_LOOP_CONTROL] * 2
+    assert list(bank.control_mode[axes]) == [ControlMode.POSITION] * 2
+    np.testing.assert_allclose(bank.vel_limit[axes], DRIVE.vel_limit)
+    np.testing.assert_allclose(bank.current_lim[axes], DRIVE.current_lim)
+    np.testing.assert_allclose(bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
+    np.testing.assert_allclose(bank.vel_gain[axes], TARGET.vel_gain, rtol=1e-6)
+    assert not bank.vel_integrator_gain[axes].any()
+    np.testing.assert_allclose(bank.input_pos[axes], TARGET.pos_turns)
+    assert bench.status is DriveStatus.ARMED
+
+
+def test_with_torques_too_modes_and_limits_arrive(bench: Bench) -> None:
+    bench.rig.bank.control_mode[:] = ControlMode.POSITION
+    bench.run(100)
+    assert bench.until_armed(onboard=False)
+    for _ in range(1200 // STEP_MS):
+        bench.cycle()
+        bench.driver.write_torque((0.25, -0.5))
+    bank, axes = bench.rig.bank, list(AXES)
+    assert list(bank.control_mode[axes]) == [ControlMode.TORQUE] * 2
+    np.testing.assert_allclose(bank.vel_limit[axes], DRIVE.vel_limit)
+    assert list(bank.input_torque[axes]) == [0.25, -0.5]
+
+
+def test_a_drive_that_is_told_to_go_idle_until_it_is_goes_idle(bench: Bench) -> None:
+    bench.run(100)
+    bench.until_armed(onboard=True)
+    bench.run(300, TARGET)
+    bank = bench.rig.bank
+    for _ in range(12):
+        bench.driver.idle()
+        bench.run(100)
+    assert [bank.state[axis] for axis in AXES] == [AxisState.IDLE] * 2
+
+
+def test_the_dialect_is_found_and_never_the_wrong_one(bench: Bench) -> None:
+    truth = "0.6" if bench.rig.front._dialect.sdo is not None else "0.5"
+    for _ in range(200):
+        bench.cycle()
+        assert bench.driver.dialect in ("", truth)
+        assert bench.status is not DriveStatus.ERROR or bench.driver.dialect == ""
+    assert bench.driver.dialect == truth
+
+
+def test_an_axis_that_disarms_shows_though_heartbeats_are_lost(bench: Bench) -> None:
+    bench.run(100)
+    bench.until_armed(onboard=True)
+    bench.rig.bank.inject("hip_right.axis1", "DISARM")
+    bench.run(100, TARGET)
+    assert bench.status is DriveStatus.ERROR
