@@ -8,6 +8,7 @@ from pathlib import Path
 
 from shared import config, gain_schedule
 from shared.exceptions import FleetError
+from shared.joints import MODULES
 from tools.runs.experiment import make_out, scenario_file
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
@@ -25,6 +26,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl up
         xrl up --scenario crawl --out out/crawl
         xrl up --config lab.toml --no-sim
+        xrl up --config lab.toml --no-sim --readonly   # move the joints by hand, and look
         """,
     )
     add_config(parser)
@@ -46,6 +48,16 @@ def add_parser(subparsers: Subparsers) -> None:
         action="store_true",
         help="start no simulator: the drives are real, or come later",
     )
+    parser.add_argument(
+        "--no-planner",
+        action="store_true",
+        help="six modules that HOLD by themselves; `xrl start planner` lets it lead",
+    )
+    parser.add_argument(
+        "--readonly",
+        action="store_true",
+        help="the joint services listen to their drives and publish, and send them nothing",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,15 +66,24 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
     make_out(out, "up")
     overrides = {"recorder": ["--out", str(out.absolute())]}
+    if args.readonly:
+        overrides |= {module: ["--readonly"] for module in MODULES}
     if args.scenario is not None:
         if args.no_sim:
             raise FleetError("--scenario is for the simulator, and --no-sim starts none; leave one")
         path = str(scenario_file(args.scenario))
         overrides["simulator"] = ["--scenario", path, "--autostart", str(SETTLE_S)]
         overrides["recorder"] += ["--scenario", path, "--scenario-text", args.scenario]
-    fleet = Fleet.start(args.config, args.run_dir, overrides=overrides, simulation=not args.no_sim)
+    fleet = Fleet.start(
+        args.config,
+        args.run_dir,
+        overrides=overrides,
+        asleep=("planner",) if args.no_planner else (),
+        simulation=not args.no_sim,
+    )
+    up = len(fleet.manifest.services) - args.no_planner
     print(
-        f"{len(fleet.manifest.services)} services are up in {fleet.run.path} "
+        f"{up} services are up in {fleet.run.path} "
         f"(logs: {fleet.run.logs}, record: {out}); `xrl status` shows them, `xrl down` stops them"
     )
     return 0

@@ -6,16 +6,19 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from services.simulator.axis_bank import AxisBank
+from services.simulator.axis_settings import plant
 from services.simulator.cansimple_front import CanSimpleFront
 from services.simulator.fibre_endpoints import Board
-from services.simulator.fibre_front import FibreFront, FibrePort
+from services.simulator.fibre_front import FibreFront
+from services.simulator.fibre_port import FibreHub, FibrePort
 from services.simulator.harness_front import HarnessFront
 from services.simulator.loop import Ports, SimulatorLoop
+from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
 from shared import config, log, scenario, topics
 from shared.bus import open_session
 from shared.config import RobotConfig, expand
-from shared.joints import MODULE_INDEX
+from shared.joints import MODULE_INDEX, N_JOINTS
 from shared.messages import OperatorIntent, SimControl, SimTruth
 from shared.priority import raise_priority
 from shared.process import (
@@ -46,6 +49,14 @@ def main() -> int:
         metavar="S",
         help="start the scenario so long after the hoist is down (default: when told on the bus)",
     )
+    parser.add_argument(
+        "--drive-setting",
+        action="append",
+        default=[],
+        metavar="MODULE.NAME=VALUE",
+        help="a setting that a drive has kept, as knee_left.axis0.controller.config.vel_limit=2; "
+        "may be given several times",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
     arguments = parser.parse_args()
     logger = log.setup("simulator")
@@ -61,13 +72,22 @@ def main() -> int:
             control=session.latest(topics.SIM_CONTROL, SimControl),
         )
         hubs = open_hubs(robot, arguments.run_dir, stack)
-        bank = AxisBank(robot.drive, encoder_counts_per_turn=robot.joint.encoder_counts_per_turn)
+        bank = AxisBank(
+            robot.drive,
+            encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,
+            motor_signs=robot.motor_signs(),
+        )
         front = CanSimpleFront(
             bank,
             [hubs[name] for name in drive_buses(robot)],
             list(drive_buses(robot).values()),
             heartbeat_period_ms=robot.drive.heartbeat_period_ms,
+            dialect=robot.simulation.can_dialect,
         )
+        for words in arguments.drive_setting:
+            plant(bank.settings, words)
+        for axis in range(N_JOINTS if arguments.drive_setting else 0):
+            bank.calibration.restart(axis)
         usb = open_usb(robot, bank, arguments.run_dir, stack)
         harness = HarnessFront(robot, hubs[robot.harness.bus], arguments.seed)
         world = World(robot, story)
@@ -100,21 +120,24 @@ def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, 
     }
 
 
-def open_usb(
-    robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack
-) -> list[FibrePort]:
-    """Return the drives' USB plugs, in {run}/usb, if the services use them."""
-    if robot.joint_service.driver != "odrive_usb":
-        return []
-    folder = run_dir / "usb"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    ports = []
+def open_usb(robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack) -> list[FibreHub]:
+    """Return the drives' USB plugs, in {run}/usb, for the modules that have serial numbers.
+
+    An ODrive v3 has USB beside CAN, so they are there whichever the services use.
+    """
+    folder = run_dir / FOLDER
+    ports: list[FibrePort] = []
     for module in robot.module:
-        board = Board(bank, MODULE_INDEX[module.name], int(module.serial_number, 16))
-        port = FibrePort(FibreFront(board), folder / module.serial_number.upper())
-        stack.callback(port.close)
-        ports.append(port)
-    return ports
+        if module.serial_number:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            board = Board(bank, MODULE_INDEX[module.name], int(module.serial_number, 16))
+            ports.append(FibrePort(FibreFront(board), folder / module.serial_number.upper()))
+            stack.callback(ports[-1].unplug)
+    if not ports:
+        return []
+    hub = FibreHub(ports)
+    stack.callback(hub.close)
+    return [hub]
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """Settings of the emulated drives by the firmware's names: a plain table {name: value}.
 
-What ODrive ships with firmware 0.5.6, and what this robot wants instead (design section 5).
-One column for each name, for all drives at once: the emulation reads its limits from the
-columns, a front reads and writes single values by name.
+What ODrive ships with firmware 0.5.6; what this robot wants instead is in
+`shared.drive_settings`. One column for each name, for all drives at once: the emulation reads
+its limits from the columns, a front reads and writes single values by name.
 
 Source: the configuration structs of firmware 0.5.6 (odriverobotics/ODrive). The over-voltage
 level is that of the 56 V board.
@@ -18,12 +18,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from shared import drive_settings
 from shared.config_sections import DriveConfig
+from shared.drive_settings import Need, Value
 from shared.exceptions import DriveError
-from shared.joints import MODULES, N_JOINTS
+from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
+
+__all__ = [
+    "AXIS_SETTINGS", "DRIVE_SETTINGS", "NAMES", "N_DRIVES", "PHASE_RESISTANCE", "Settings", "Value",
+    "configured", "plant",
+]  # fmt: skip
 
 Vector = NDArray[np.float64]
-Value = bool | int | float
 
 N_DRIVES: Final = len(MODULES)
 
@@ -80,11 +86,10 @@ NAMES: Final = (
 )
 """Every setting of one ODrive."""
 
-DC_MAX_NEGATIVE_CURRENT: Final = -30.0
-"""A; assumed: a battery takes what braking legs push back. The default trips at once."""
 PHASE_RESISTANCE: Final = 0.1
-"""ohm; assumed, of a motor with this torque constant."""
-CAN_BAUD_RATE: Final = 1_000_000
+"""ohm; assumed, of a motor with this torque constant. Calibration finds it, nobody sets it."""
+
+_TRUTH: Final = {"true": True, "false": False}
 
 
 class Settings:
@@ -176,24 +181,38 @@ def configured(
         watchdog: whether the drives' watchdogs run, if they have a timeout.
     """
     settings = Settings()
-    wanted: dict[str, Value] = {
-        "config.enable_watchdog": watchdog and drive.watchdog_timeout > 0.0,
-        "config.watchdog_timeout": drive.watchdog_timeout,
-        "config.can.heartbeat_rate_ms": drive.heartbeat_period_ms,
-        "config.can.encoder_rate_ms": drive.encoder_period_ms,
-        "controller.config.vel_integrator_gain": 0.0,
-        "controller.config.vel_limit": drive.vel_limit,
-        "motor.config.pre_calibrated": True,
-        "motor.config.torque_constant": drive.torque_constant,
-        "motor.config.current_lim": drive.current_lim,
-        "motor.config.phase_resistance": PHASE_RESISTANCE,
-        "encoder.config.cpr": encoder_counts_per_turn,
-        "encoder.config.pre_calibrated": True,
-        "config.dc_max_negative_current": DC_MAX_NEGATIVE_CURRENT,
-        "can.config.baud_rate": CAN_BAUD_RATE,
-    }
-    for name, value in wanted.items():
+    need = Need(drive, encoder_counts_per_turn, watchdog)
+    for name, value in drive_settings.of_every_drive(need).items():
         settings.fill(name, value)
+    settings.fill("motor.config.phase_resistance", PHASE_RESISTANCE)
     for index in range(N_DRIVES):
         settings.save(index)
     return settings
+
+
+def plant(settings: Settings, words: str) -> None:
+    """Set and save one setting of one drive, as somebody may have left it.
+
+    Args:
+        settings: of all drives.
+        words: MODULE.NAME=VALUE, as "knee_left.axis0.controller.config.vel_limit=2".
+
+    Raises:
+        DriveError: there is no such module or setting, or it cannot have that value.
+    """
+    target, _, text = words.partition("=")
+    module, _, name = target.strip().partition(".")
+    if module not in MODULE_INDEX:
+        near = difflib.get_close_matches(module, MODULES, n=1)
+        hint = f"; the nearest is {near[0]}" if near else f"; one of {', '.join(MODULES)}"
+        raise DriveError(f"{words!r}: no module {module!r}{hint}")
+    drive = MODULE_INDEX[module]
+    default = settings.get(drive, name)
+    text = text.strip().lower()
+    try:
+        value = _TRUTH[text] if isinstance(default, bool) else float(text)
+    except (KeyError, ValueError):
+        kind = "true or false" if isinstance(default, bool) else "a number"
+        raise DriveError(f"{words!r}: {name} = {text!r}; it wants {kind}") from None
+    settings.set(drive, name, value)
+    settings.save(drive)

@@ -77,14 +77,23 @@ class Property(NamedTuple):
     write: Callable[[Board, Value], None] | None = None
 
 
-class Function(NamedTuple):
-    """A function without arguments or results."""
+class Argument(NamedTuple):
+    """An argument of a function: an endpoint of its own, which a client writes before it calls."""
 
     name: str
-    call: Callable[[Board], None]
+    type: str
 
 
-Endpoint = Property | Function
+class Function(NamedTuple):
+    """A function without results; the endpoints of its arguments follow it."""
+
+    name: str
+    call: Callable[..., None]
+    """Of the board and the arguments."""
+    arguments: tuple[Argument, ...] = ()
+
+
+Endpoint = Property | Function | Argument
 
 
 def endpoints() -> list[Endpoint]:
@@ -103,12 +112,14 @@ def endpoints() -> list[Endpoint]:
         Function("reboot", lambda b: b.bank.reboot(b.axis(0))),
     ]
     for i in AXES:
-        rows += [row._replace(name=f"axis{i}.{row.name}") for row in _axis(i)]
+        for row in _axis(i):
+            rows.append(row._replace(name=f"axis{i}.{row.name}"))
+            rows += row.arguments if isinstance(row, Function) else ()
         rows += [_setting(f"axis{i}.{name}", default) for name, default in AXIS_SETTINGS.items()]
     return rows
 
 
-def _axis(i: int) -> list[Endpoint]:
+def _axis(i: int) -> list[Property | Function]:
     """Return the endpoints of one axis but for its settings."""
     return [
         _fault("error", "uint32", i, "axis"),
@@ -138,6 +149,11 @@ def _axis(i: int) -> list[Endpoint]:
         Property("encoder.is_ready", "bool", lambda b: b.bank.calibration.encoder[b.axis(i)]),
         Property("encoder.pos_estimate", "float", lambda b: float(b.bank.pos_estimate[b.axis(i)])),
         Property("encoder.vel_estimate", "float", lambda b: float(b.bank.vel_estimate[b.axis(i)])),
+        Function(
+            "encoder.set_linear_count",
+            lambda b, count: b.bank.set_count(b.axis(i), count),
+            (Argument("count", "int32"),),
+        ),
         _fault("controller.error", "uint8", i, "controller"),
         *(_input(name, i) for name in ("input_pos", "input_vel", "input_torque")),
     ]

@@ -1,7 +1,6 @@
 """The native (Fibre, legacy packet format) side of the emulated drives (design section 5).
 
-`FibreFront` is the protocol of one board, bytes in and bytes out; `FibrePort` is its USB
-plug: a UNIX socket, one packet per bulk transfer. Little-endian throughout.
+`FibreFront` is the protocol of one board, bytes in and bytes out; little-endian throughout.
 
 Request: sequence number, endpoint id (bit 15: an answer is wanted), size of the answer,
 payload, and a trailer that says which table of endpoints the client means. Answer: the
@@ -12,27 +11,22 @@ Source: odriverobotics/ODrive, docs/protocol.rst and Firmware/fibre-cpp.
 
 from __future__ import annotations
 
-import errno
 import json
-import select
-import socket
 import struct
-from pathlib import Path
 from typing import Any, Final
 
 from services.simulator.fibre_endpoints import (
     CODECS,
+    Argument,
     Board,
     Endpoint,
     Function,
     Property,
     endpoints,
 )
-from shared.exceptions import DriveError, FleetError
+from shared.exceptions import DriveError
 
 PROTOCOL_VERSION: Final = 1
-PACKET_BYTES: Final = 64
-"""A full-speed bulk transfer."""
 
 _CRC16_POLYNOMIAL = 0x3D65
 _ANSWER = 0x8000
@@ -40,8 +34,7 @@ _VERSION_ID = 0xFFFF_FFFF  # this "offset" into the JSON asks for its id instead
 _HEADER = struct.Struct("<HHH")
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<I")
-_BACKLOG = 16
-_ROUNDS = 64  # a client that floods the link must not hold up the simulator
+_CODECS = {name: struct.Struct("<" + letter) for name, letter in CODECS.items()}
 
 
 def crc16(initial: int, data: bytes) -> int:
@@ -67,6 +60,9 @@ class FibreFront:
         self.board = board
         self.ignored = 0
         self._rows = endpoints()
+        self._arguments: dict[int, float] = {
+            number: 0 for number, row in enumerate(self._rows) if isinstance(row, Argument)
+        }
         self.descriptor = json.dumps(_tree(self._rows), separators=(",", ":")).encode()
         self._crc = crc16(PROTOCOL_VERSION, self.descriptor)
         self._version_id = self._crc << 16 | crc16(self._crc, self.descriptor)
@@ -99,9 +95,16 @@ class FibreFront:
             return self._describe(payload)
         row = self._rows[number - 1]
         if isinstance(row, Function):
-            row.call(self.board)
+            first = number  # the index of its first argument: ids count from 1
+            values = [self._arguments[first + i] for i in range(len(row.arguments))]
+            row.call(self.board, *values)
             return b""
-        codec = struct.Struct("<" + CODECS[row.type])
+        codec = _CODECS[row.type]
+        if isinstance(row, Argument):
+            held = codec.pack(self._arguments[number - 1])
+            if len(payload) >= codec.size:
+                self._arguments[number - 1] = codec.unpack_from(payload)[0]
+            return held
         held = codec.pack(row.read(self.board))
         if row.write is not None and len(payload) >= codec.size:
             try:
@@ -120,125 +123,12 @@ class FibreFront:
         return self.descriptor[offset:]
 
 
-class FibrePort:
-    """The USB plug of one board: a listening socket whose file name is the serial number.
-
-    While the board does not talk (`AxisBank.talks`: no power, booting, cable pulled) the plug
-    is out: every client loses the drive at once, and finds it again when it is back.
-
-    Raises:
-        FleetError: the path cannot be listened on.
-    """
-
-    def __init__(self, front: FibreFront, path: Path) -> None:
-        self.path = path
-        self.front = front
-        self._clients: dict[int, socket.socket] = {}
-        self._listener: socket.socket | None = None
-        self._epoll = select.epoll()
-        self._plug()
-
-    @property
-    def clients(self) -> int:
-        """How many processes see this drive."""
-        return len(self._clients)
-
-    def fileno(self) -> int:
-        """Return the descriptor that is readable when there is something for `poll`."""
-        return self._epoll.fileno()
-
-    def poll(self) -> None:
-        """Answer all requests that have come; admit new clients. Never waits."""
-        if self.front.board.talks != (self._listener is not None):
-            (self._plug if self._listener is None else self._unplug)()
-        for _ in range(_ROUNDS):
-            ready = self._epoll.poll(0)
-            if not ready:
-                break
-            for descriptor, _event in ready:
-                client = self._clients.get(descriptor)
-                if client is None:
-                    self._admit()
-                else:
-                    self._serve(client)
-
-    def close(self) -> None:
-        """Pull the plug for good."""
-        self._unplug()
-        self._epoll.close()
-
-    def _plug(self) -> None:
-        """Put the plug in; clients find the drive when they next look."""
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        listener.setblocking(False)
-        try:
-            self._clear_stale()
-            listener.bind(str(self.path))
-            listener.listen(_BACKLOG)
-        except OSError as error:
-            listener.close()
-            raise FleetError(
-                f"USB port: cannot listen on {self.path}: {error}; its directory must exist, be "
-                "writable and short enough, and no other simulator may hold it"
-            ) from error
-        self._listener = listener
-        self._epoll.register(listener, select.EPOLLIN)
-
-    def _unplug(self) -> None:
-        """Pull the plug."""
-        if self._listener is None:
-            return
-        self.path.unlink(missing_ok=True)
-        self._epoll.unregister(self._listener)
-        self._listener.close()
-        self._listener = None
-        for client in tuple(self._clients.values()):
-            self._part(client)
-
-    def _clear_stale(self) -> None:
-        """Remove a socket file that nobody listens on."""
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-            probe.setblocking(False)
-            if probe.connect_ex(str(self.path)) == errno.ECONNREFUSED:
-                self.path.unlink(missing_ok=True)
-
-    def _admit(self) -> None:
-        """Take one client from the queue, if it is still there."""
-        if self._listener is None:
-            return
-        try:
-            client, _ = self._listener.accept()
-        except OSError:
-            return
-        client.setblocking(False)
-        self._clients[client.fileno()] = client
-        self._epoll.register(client, select.EPOLLIN)
-
-    def _serve(self, client: socket.socket) -> None:
-        """Answer one packet of a ready client; part with a client that has gone."""
-        try:
-            packet = client.recv(PACKET_BYTES)
-            answer = self.front.answer(packet) if packet else None
-            if answer is not None:
-                client.send(answer)
-        except BlockingIOError:
-            return  # a client that does not read loses its answers, as on a real bus
-        except OSError:
-            packet = b""
-        if not packet:
-            self._part(client)
-
-    def _part(self, client: socket.socket) -> None:
-        """Close a client's side."""
-        if self._clients.pop(client.fileno(), None) is not None:
-            self._epoll.unregister(client)
-            client.close()
-
-
 def _tree(rows: list[Endpoint]) -> list[dict[str, Any]]:
     """Return the JSON descriptor of endpoints with dotted names; ids count from 1."""
     root: list[dict[str, Any]] = [{"name": "", "id": 0, "type": "json", "access": "r"}]
     for number, row in enumerate(rows, start=1):
+        if isinstance(row, Argument):
+            continue
         members = root
         *path, leaf = row.name.split(".")
         for name in path:
@@ -258,8 +148,12 @@ def _object(members: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
     return added
 
 
-def _entry(name: str, number: int, row: Endpoint) -> dict[str, Any]:
+def _entry(name: str, number: int, row: Property | Function) -> dict[str, Any]:
     if isinstance(row, Property):
         access = "r" if row.write is None else "rw"
         return {"name": name, "id": number, "type": row.type, "access": access}
-    return {"name": name, "id": number, "type": "function", "inputs": [], "outputs": []}
+    inputs = [
+        {"name": each.name, "id": number + 1 + i, "type": each.type, "access": "rw"}
+        for i, each in enumerate(row.arguments)
+    ]
+    return {"name": name, "id": number, "type": "function", "inputs": inputs, "outputs": []}

@@ -9,7 +9,7 @@ import msgspec
 from services.simulator.axis_bank import AxisBank
 from services.simulator.cansimple_front import CanSimpleFront
 from services.simulator.fault_injector import FaultInjector
-from services.simulator.fibre_front import FibrePort
+from services.simulator.fibre_port import FibreHub
 from services.simulator.harness_front import HarnessFront
 from services.simulator.world import World
 from shared.bus import Latest, Publisher
@@ -43,7 +43,7 @@ class SimulatorLoop:
         world: World,
         bank: AxisBank,
         front: CanSimpleFront,
-        usb: Sequence[FibrePort],
+        usb: Sequence[FibreHub],
         harness: HarnessFront,
         ports: Ports,
     ) -> None:
@@ -97,8 +97,8 @@ class SimulatorLoop:
             front.send_heartbeats(world.time)
         elif self._bank.regulates:
             self._torque = self._bank.step(world.time, *world.motor_turns())
-        for plug in self._usb:
-            plug.poll()
+        for hub in self._usb:
+            hub.poll()
         world.step(self._torque)
         self._steps += 1
         steps = self._steps

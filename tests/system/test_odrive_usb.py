@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
 
@@ -214,6 +215,7 @@ def test_no_reading_after_arm_is_called_tells_of_the_error_before(
     async def carry_out_and_hang(*request: object) -> None:
         await carry_out(*request)
         usb.stalled.set()
+        await asyncio.sleep(0.05)  # until the board sees it
 
     with usb.lock:
         usb.bank.inject(standin.axis_name(4), "OVERSPEED")
@@ -225,6 +227,13 @@ def test_no_reading_after_arm_is_called_tells_of_the_error_before(
     assert eventually(usb.stalled.is_set)
     assert is_status(drive.read(0.0), DriveStatus.IDLE)
     usb.stalled.clear()
+
+
+def test_the_drive_takes_a_position_that_it_is_told(usb: UsbRobot, control: Control) -> None:
+    control.drive.set_position((64.25, -3.5))
+    assert eventually(lambda: control.pos == (64.25, -3.5))
+    with usb.lock:
+        assert usb.pos[AXES].tolist() == [0.0, 0.0]
 
 
 def test_a_control_loop_that_hangs_lets_the_watchdog_fire(usb: UsbRobot, armed: Control) -> None:

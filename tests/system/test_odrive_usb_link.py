@@ -135,6 +135,24 @@ def test_a_drive_without_a_watchdog_is_not_lost_at_the_first_silence(
     assert all(answer is None or answer.status == LOST for answer in silence)
 
 
+def test_silence_while_nobody_waited_is_not_held_against_the_drive(
+    usb: UsbRobot, config: RobotConfig
+) -> None:
+    """As when the service is stopped and continued: it has heard nothing because it slept."""
+    off = msgspec.structs.replace(config.drive, watchdog_timeout=0.0)
+    drive = OdriveUsb(serial_number(MODULE), off)
+    assert eventually(lambda: (reading := drive.read(0.01)) is not None and reading.status != LOST)
+    usb.stalled.set()
+    time.sleep(0.25)
+    heard = drive.read(0.01)
+    assert heard is None or heard.status is not LOST, "of before the silence"
+    assert drive.read(0.01) is None
+    usb.stalled.clear()
+    assert eventually(lambda: (reading := drive.read(0.01)) is not None and reading.status != LOST)
+    assert drive.connections == 1
+    drive.close()
+
+
 def test_a_board_that_is_no_v3_is_named_in_trouble(
     libusb: None, config: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

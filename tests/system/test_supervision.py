@@ -40,7 +40,7 @@ with open_session(load(Path(sys.argv[1])), "ankle_right", Path(sys.argv[2])) as 
         publisher.put(JointState(
             t_ns=time.monotonic_ns(), seq=seq, q=zero, v=zero, tau=zero, mode=Mode.HOLD,
             cause=0, ready=False, age_ns=-1, session=0, command_seq=-1, cycle=seq, late=0,
-            dropouts=0, refused=0, drive_error=0))
+            dropouts=0, refused=0, drive=2, drive_error=0))
         time.sleep(0.01)
 """
 
@@ -140,6 +140,17 @@ def test_a_service_that_is_not_to_restart_stays_down_until_it_is_started(start: 
     time.sleep(1.0)
     assert service(fleet, "planner").pid is None
     fleet.start_service("planner")
+    assert wait_for(lambda: service(fleet, "planner").state == "running")
+
+
+@pytest.mark.usefixtures("signal_handlers")
+def test_a_service_that_is_asleep_waits_until_it_is_started(
+    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet = start(asleep=("planner",))
+    assert [service(fleet, name).state for name in ("planner", "harness")] == ["stopped", "running"]
+    assert cli.main(["start", "planner", "--run-dir", str(run_dir)]) == 0
+    assert "planner: started" in capsys.readouterr().out
     assert wait_for(lambda: service(fleet, "planner").state == "running")
 
 
@@ -292,7 +303,9 @@ def test_status_shows_mode_tier_age_and_rate(
     assert ankle["state"] == "running"
     assert 20 < ankle["rate_hz"] < 150
     assert 0 <= ankle["age_s"] < 1
-    assert status["modules"] == {"ankle_right": {"mode": "HOLD", "tier": 2, "cause": "NONE"}}
+    assert status["modules"]["ankle_right"] == {
+        "mode": "HOLD", "tier": 2, "cause": "NONE", "drive": "ARMED", "q": [0.0, 0.0], "way_out": ""
+    }  # fmt: skip
     assert status["services"]["planner"]["rate_hz"] is None
     assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
     assert "ankle_right" in capsys.readouterr().out

@@ -28,7 +28,7 @@ def libusb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def config(robot: RobotConfig) -> RobotConfig:
     """Return the shipped robot with the drives' watchdogs on."""
-    drive = msgspec.structs.replace(robot.drive, watchdog_timeout=0.1)
+    drive = msgspec.structs.replace(robot.drive, watchdog_timeout=0.1, zero_mark_turns=0.0)
     return msgspec.structs.replace(robot, drive=drive)
 
 

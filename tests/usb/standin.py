@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import select
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,31 +15,20 @@ import numpy as np
 from services.joint.drivers.base import Drive, DriveStatus, MotorTarget
 from services.simulator.axis_bank import AxisBank
 from services.simulator.fibre_endpoints import Board
-from services.simulator.fibre_front import FibreFront, FibrePort
+from services.simulator.fibre_front import FibreFront
+from services.simulator.fibre_port import FibreHub, FibrePort
+from services.simulator.usb_standin import build, load
 from shared.config import RobotConfig
 from shared.joints import MODULES, N_JOINTS
 
-SOURCE = Path(__file__).with_name("libusb_standin.c")
+__all__ = ["Control", "UsbRobot", "build", "load"]
+
 MODULE = 2
 """The module that the driver under test is for."""
-SONAME = "libusb-1.0.so.0"
 FIRST_SERIAL = 0x365A335A3430
 READ_TIMEOUT_S = 0.005
 INERTIA = 1e-3
 """kg m^2 of a motor that carries nothing."""
-
-
-def build(folder: Path) -> Path:
-    """Compile the stand-in; return the library."""
-    library = folder / SONAME
-    command = ["cc", "-shared", "-fPIC", "-O2", "-Wall", "-Werror", f"-Wl,-soname,{SONAME}"]
-    subprocess.run([*command, "-o", str(library), str(SOURCE), "-lpthread"], check=True)
-    return library
-
-
-def load(library: Path) -> None:
-    """Load the stand-in before libodrive does: a library of its name is then not looked for."""
-    ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
 
 
 def serial_number(module: int) -> str:
@@ -65,6 +52,7 @@ class UsbRobot:
             )
             for module in range(len(MODULES))
         ]
+        self.hub = FibreHub(self.ports)
         self.lock = threading.Lock()
         self.pos = np.zeros(N_JOINTS)
         self.vel = np.zeros(N_JOINTS)
@@ -82,17 +70,16 @@ class UsbRobot:
         finally:
             self._stop.set()
             self._thread.join()
-            for port in self.ports:
-                port.close()
+            self.hub.close()
 
     def _run(self) -> None:
         before = time.monotonic()
         while not self._stop.is_set():
             stalled = self.stalled.is_set()
-            select.select([] if stalled else self.ports, [], [], 1e-3)
+            select.select([] if stalled else [self.hub], [], [], 1e-3)
             with self.lock:
-                for port in () if stalled else self.ports:
-                    port.poll()
+                if not stalled:
+                    self.hub.poll()
                 now = time.monotonic()
                 torque = self.bank.step(now, self.pos, self.vel)
                 self.vel += torque / (2 * np.pi * INERTIA) * (now - before)

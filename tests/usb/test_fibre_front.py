@@ -71,12 +71,13 @@ def flat(prefix: str, members: list[dict[str, Any]]) -> list[tuple[str, dict[str
             rows += flat(name + ".", member["members"])
         else:
             rows.append((name, member))
+            rows += flat(name + ".", member.get("inputs", []))
     return rows
 
 
 @pytest.fixture
 def bank(robot: RobotConfig) -> AxisBank:
-    drive = msgspec.structs.replace(robot.drive, watchdog_timeout=TIMEOUT_S)
+    drive = msgspec.structs.replace(robot.drive, watchdog_timeout=TIMEOUT_S, zero_mark_turns=0.0)
     bank = AxisBank(drive, encoder_counts_per_turn=8192)
     step(bank, 0.0)
     return bank
@@ -209,6 +210,17 @@ def test_a_setting_that_is_no_number_is_not_taken(client: Client, bank: AxisBank
     before = client.exchange("axis0.controller.config.vel_gain", math.nan)
     assert client.exchange("axis0.controller.config.vel_gain") == before
     assert client.front.ignored == 1
+
+
+def test_a_function_is_called_with_the_argument_written_before(
+    client: Client, bank: AxisBank
+) -> None:
+    counts = client.exchange("axis1.encoder.config.cpr")
+    client.exchange("axis1.encoder.set_linear_count.count", 3 * counts)
+    assert client.exchange("axis1.encoder.pos_estimate") == 0.0
+    client.call("axis1.encoder.set_linear_count")
+    assert client.exchange("axis1.encoder.pos_estimate") == 3.0
+    assert client.exchange("axis0.encoder.pos_estimate") == 0.0
 
 
 def test_clearing_errors_clears_both_axes(client: Client, bank: AxisBank) -> None:

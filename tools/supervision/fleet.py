@@ -86,6 +86,8 @@ class Plan(NamedTuple):
     """Arguments of each service, placeholders filled in."""
     listeners: tuple[Listener, ...]
     environment: dict[str, str]
+    emulated_usb: bool = False
+    """The services look for their drives on USB, and find emulated ones there."""
 
 
 def make_plan(
@@ -94,6 +96,7 @@ def make_plan(
     *,
     overrides: Mapping[str, Sequence[str]],
     services: Collection[str] | None,
+    asleep: Collection[str] = (),
     simulation: bool,
     table_path: Path,
 ) -> Plan:
@@ -106,14 +109,20 @@ def make_plan(
     path = Path(os.path.abspath(config_path))  # noqa: PTH100 - symlinks stay as they were given
     config = load(path)
     table = load_table(table_path)
-    rows = select(table, simulation=simulation and is_simulated(config), services=services)
-    check_known(overrides, [row.name for row in rows])
+    emulated = simulation and is_simulated(config)
+    rows = select(table, simulation=emulated, services=services)
+    check_known([*overrides, *asleep], [row.name for row in rows])
+    rows = tuple(
+        msgspec.structs.replace(row, autostart=row.autostart and row.name not in asleep)
+        for row in rows
+    )
     check_run_dir(run_dir, config)
     commands = {
         row.name: [*command_of(row, path, run_dir), *overrides.get(row.name, ())] for row in rows
     }
     listeners = listeners_of(rows, config, run_dir)
-    return Plan(path, rows, commands, listeners, table.environment)
+    usb = emulated and config.joint_service.driver == "odrive_usb"
+    return Plan(path, rows, commands, listeners, table.environment, emulated_usb=usb)
 
 
 def load_table(path: Path = TABLE) -> Table:
@@ -140,7 +149,11 @@ def load_table(path: Path = TABLE) -> Table:
 
 
 def is_simulated(config: RobotConfig) -> bool:
-    """Return True if any drive of this robot file is an emulated one."""
+    """Return True if any drive of this robot file is an emulated one.
+
+    The CAN buses say so, also of drives on USB: all of a real robot's are real ones, or it is
+    started with `simulation=False` (`xrl up --no-sim`). Then a service looks on the real USB.
+    """
     return any(bus.interface == SIMULATED_CAN for bus in config.can.values())
 
 

@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
+from services.simulator import usb_standin
 from shared.exceptions import FleetError
 from tools.supervision import fleet, procfs
 from tools.supervision.run_dir import Manifest, RunDir, supervisor_config
@@ -45,6 +46,7 @@ class Fleet:
         overrides: Mapping[str, Sequence[str]] | None = None,
         no_restart: frozenset[str] = frozenset(),
         services: Collection[str] | None = None,
+        asleep: Collection[str] = (),
         simulation: bool = True,
         leashed: bool = False,
         table_path: Path = fleet.TABLE,
@@ -60,6 +62,7 @@ class Fleet:
             overrides: further arguments for some services.
             no_restart: services that stay down when they end.
             services: which to start; None for all that the table starts by itself.
+            asleep: of these, which wait for `start_service`.
             simulation: False leaves the simulator out; where all drives are real it always is.
             leashed: stop the fleet if this process dies.
             table_path: the process table.
@@ -68,7 +71,8 @@ class Fleet:
         Raises:
             ConfigError: the robot file or the table cannot be used.
             FleetError: the run directory or an endpoint is in use, a service is unknown,
-                ends at once or is not up in time.
+                ends at once or is not up in time; or drives are to be emulated on USB and
+                there is no C compiler.
         """
         started = cls(run_dir)
         plan = fleet.make_plan(
@@ -76,6 +80,7 @@ class Fleet:
             started.run.path,
             overrides=overrides or {},
             services=services,
+            asleep=asleep,
             simulation=simulation,
             table_path=table_path,
         )
@@ -86,12 +91,15 @@ class Fleet:
             started.run.prepare(plan)
             text = supervisor_config(started.run, plan, no_restart)
             started.run.supervisor_config.write_text(text, encoding="utf-8")
-            started._launch(plan.environment, lock, leashed=leashed)
+            environment = dict(plan.environment)
+            if plan.emulated_usb:
+                environment |= usb_standin.prepare(started.run.path)
+            started._launch(environment, lock, leashed=leashed)
             started._wait_until_up(plan, timeout_s)
         except BaseException as error:
             with _uninterrupted():
                 started._end()
-                started.run.clear(keep_logs=isinstance(error, FleetError))
+                started._clear(keep_logs=isinstance(error, FleetError))
             raise
         finally:
             os.close(lock)
@@ -178,9 +186,14 @@ class Fleet:
         except FleetError:
             return  # the next fleet is starting here already, and has cleared up
         try:
-            self.run.clear(keep_logs=keep_logs)
+            self._clear(keep_logs=keep_logs)
         finally:
             os.close(lock)
+
+    def _clear(self, *, keep_logs: bool) -> None:
+        """Remove what the fleet has made in the run directory."""
+        usb_standin.clear(self.run.path)
+        self.run.clear(keep_logs=keep_logs)
 
     def _end(self) -> None:
         """End every process of the fleet."""

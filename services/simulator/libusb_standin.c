@@ -7,7 +7,8 @@
  * Only what libodrive (odrive 0.6.11) calls is here, with the layouts of libusb 1.0.
  * Everything happens inside libusb_handle_events_timeout, on one file descriptor: an
  * epoll set of the sockets, a timer and a wake-up. Devices are never freed: few come
- * and go in a test.
+ * and go. System calls are the cost of it all, some hundred exchanges a second in each
+ * of six processes: there are none that the next packet does not need.
  *
  * libusb calls back with its locks released; so does this.
  */
@@ -64,7 +65,7 @@ typedef struct pending { /* hidden in front of every transfer */
 struct device {
     char serial[256];
     int fd; /* -1 once pulled out */
-    int address, listening, claimed, announced_left;
+    int address, claimed, hung_up, announced_left;
     handle handle;
 };
 
@@ -135,6 +136,9 @@ static context the_context = {-1, -1, -1, NULL, NULL};
 static device *devices[DEVICES];
 static int n_devices;
 static pending *queue; /* submitted transfers, oldest first */
+static int64_t armed_ms; /* when the timer fires next */
+static int woken;        /* the wake-up is set and was not heard yet */
+static int finishing;    /* the event loop looks at the whole queue again before it ends */
 
 static int64_t now_ms(void)
 {
@@ -151,8 +155,18 @@ static pending *of(transfer *t)
 static void wake(void)
 {
     uint64_t one = 1;
-    if (write(the_context.wake_fd, &one, sizeof one) < 0) {
-    }
+    if (!woken && !finishing && write(the_context.wake_fd, &one, sizeof one) == sizeof one)
+        woken = 1;
+}
+
+/* Have the timer fire no later than then. */
+static void fire_by(int64_t ms)
+{
+    if (armed_ms && armed_ms <= ms)
+        return;
+    armed_ms = ms;
+    struct itimerspec at = {.it_value = {ms / 1000, ms % 1000 * 1000000}};
+    timerfd_settime(the_context.timer_fd, TFD_TIMER_ABSTIME, &at, NULL);
 }
 
 /* Have the timer fire at the next deadline, or in time for the next look at the folder. */
@@ -162,23 +176,7 @@ static void set_timer(void)
     for (pending *p = queue; p; p = p->next)
         if (p->deadline_ms && p->deadline_ms < next)
             next = p->deadline_ms;
-    if (next <= now)
-        next = now + 1;
-    struct itimerspec at = {.it_value = {next / 1000, next % 1000 * 1000000}};
-    timerfd_settime(the_context.timer_fd, TFD_TIMER_ABSTIME, &at, NULL);
-}
-
-/* Listen to a device only while a transfer waits for it; a hang-up is always heard. */
-static void listen_to(device *d)
-{
-    int wanted = 0;
-    for (pending *p = queue; p; p = p->next)
-        wanted |= p->public.dev_handle->dev == d && p->public.endpoint & 0x80;
-    if (d->fd >= 0 && wanted != d->listening) {
-        struct epoll_event e = {.events = wanted ? EPOLLIN : 0, .data.ptr = d};
-        epoll_ctl(the_context.epoll_fd, EPOLL_CTL_MOD, d->fd, &e);
-        d->listening = wanted;
-    }
+    fire_by(next > now ? next : now + 1);
 }
 
 static void plug_in(const char *folder, const char *serial)
@@ -200,7 +198,8 @@ static void plug_in(const char *folder, const char *serial)
     d->fd = fd;
     d->address = 1 + n_devices % 120;
     d->handle.dev = d;
-    struct epoll_event e = {.events = 0, .data.ptr = d};
+    /* on edges: what nobody waits for yet is found when a transfer is submitted */
+    struct epoll_event e = {.events = EPOLLIN | EPOLLET, .data.ptr = d};
     epoll_ctl(the_context.epoll_fd, EPOLL_CTL_ADD, fd, &e);
     devices[n_devices++] = d;
 }
@@ -225,7 +224,17 @@ static void pull_out(device *d)
     }
 }
 
-/* Try to finish a transfer: 1 if it is done, with its status set. */
+/* The oldest transfer that is not done at an endpoint of a device. */
+static pending *oldest(device *d, unsigned char endpoint)
+{
+    for (pending *p = queue; p; p = p->next)
+        if (p->public.dev_handle->dev == d && p->public.endpoint == endpoint && !p->done)
+            return p;
+    return NULL;
+}
+
+/* Try to finish a transfer: 1 if it is done, with its status set. Packets go in order, so
+ * only the oldest at its endpoint may send or receive. */
 static int advance(pending *p)
 {
     transfer *t = &p->public;
@@ -241,7 +250,7 @@ static int advance(pending *p)
         t->status = COMPLETED;
         return 1;
     }
-    if (d->fd >= 0) {
+    if (d->fd >= 0 && oldest(d, t->endpoint) == p) {
         if (t->endpoint & 0x80)
             n = recv(d->fd, t->buffer, t->length, MSG_DONTWAIT);
         else
@@ -283,8 +292,8 @@ int libusb_init(context **ctx)
     the_context.timer_fd = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC | TFD_NONBLOCK);
     the_context.wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     int own[] = {the_context.timer_fd, the_context.wake_fd};
-    for (int i = 0; i < 2; i++) {
-        struct epoll_event e = {.events = EPOLLIN, .data.ptr = NULL};
+    for (int i = 0; i < 2; i++) { /* on edges: they need not be read */
+        struct epoll_event e = {.events = EPOLLIN | EPOLLET, .data.ptr = NULL};
         epoll_ctl(the_context.epoll_fd, EPOLL_CTL_ADD, own[i], &e);
     }
     *ctx = &the_context;
@@ -302,23 +311,22 @@ void libusb_exit(context *ctx)
     close(ctx->wake_fd);
     close(ctx->epoll_fd);
     ctx->hotplug = NULL;
+    armed_ms = woken = 0;
 }
 
 int libusb_handle_events_timeout(context *ctx, struct timeval *timeout)
 {
     struct epoll_event ready[32];
     int wait_ms = timeout ? timeout->tv_sec * 1000 + timeout->tv_usec / 1000 : -1;
-    int n = epoll_wait(ctx->epoll_fd, ready, 32, wait_ms), tick = 0;
+    int n = epoll_wait(ctx->epoll_fd, ready, 32, wait_ms);
     pthread_mutex_lock(&lock);
+    woken = 0;
     for (int i = 0; i < n; i++) {
         device *d = ready[i].data.ptr;
-        if (d && ready[i].events & (EPOLLHUP | EPOLLERR) && !(ready[i].events & EPOLLIN))
-            pull_out(d);
+        if (d && ready[i].events & (EPOLLHUP | EPOLLERR))
+            d->hung_up = 1;
     }
-    uint64_t count;
-    if (read(ctx->wake_fd, &count, sizeof count) < 0) {
-    }
-    tick = read(ctx->timer_fd, &count, sizeof count) > 0;
+    finishing = 1;
     for (pending *p; (p = take_finished());) {
         pthread_mutex_unlock(&lock);
         int free_it = p->public.flags & FREE_TRANSFER;
@@ -327,24 +335,25 @@ int libusb_handle_events_timeout(context *ctx, struct timeval *timeout)
             free(p);
         pthread_mutex_lock(&lock);
     }
+    finishing = 0;
     int before = n_devices;
-    if (tick)
+    if (armed_ms <= now_ms()) {
+        armed_ms = 0;
         rescan();
+        set_timer();
+    }
     for (int i = 0; i < n_devices; i++) {
         device *d = devices[i];
+        if (d->hung_up && !oldest(d, IN_ENDPOINT)) /* else that transfer finds it out */
+            pull_out(d);
         int left = d->fd < 0 && !d->announced_left;
         d->announced_left |= left;
         if (ctx->hotplug && (left || i >= before)) {
             pthread_mutex_unlock(&lock);
             ctx->hotplug(ctx, d, left ? LEFT : ARRIVED, ctx->hotplug_data);
             pthread_mutex_lock(&lock);
-        } else {
-            listen_to(d);
         }
     }
-    for (int i = 0; i < n_devices; i++)
-        listen_to(devices[i]);
-    set_timer();
     pthread_mutex_unlock(&lock);
     return 0;
 }
@@ -517,16 +526,15 @@ int libusb_submit_transfer(transfer *t)
         p->next = NULL;
         p->cancelled = p->done = t->actual_length = 0;
         p->deadline_ms = t->timeout ? now_ms() + t->timeout : 0;
-        if (!(t->endpoint & 0x80)) /* out: hand it on now, report it in the event loop */
-            p->done = advance(p);
         while (*end)
             end = &(*end)->next;
         *end = p;
+        /* hand it on now, or take what is there: it is reported in the event loop */
+        p->done = advance(p);
         if (p->done)
             wake();
-        else
-            listen_to(t->dev_handle->dev);
-        set_timer();
+        else if (p->deadline_ms)
+            fire_by(p->deadline_ms);
     }
     pthread_mutex_unlock(&lock);
     return result;

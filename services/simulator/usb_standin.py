@@ -1,0 +1,121 @@
+"""The USB bus of the emulated drives: a stand-in for libusb-1.0, built and loaded.
+
+The genuine `odrive` package finds the emulated drives when the stand-in takes the place of
+the system's libusb-1.0 and `XRL_USB` names the folder of the plugs (`FOLDER` in the run
+directory): in another process by its environment (`prepare`), in this one by `load`.
+`libusb_standin.c` says what the stand-in does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import subprocess
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from shared.exceptions import FleetError
+
+SOURCE: Final = Path(__file__).with_name("libusb_standin.c")
+SONAME: Final = "libusb-1.0.so.0"
+"""As libodrive asks for it."""
+FOLDER: Final = "usb"
+"""Of the plugs, in the run directory; a plug's file name is the drive's serial number."""
+VARIABLE: Final = "XRL_USB"
+"""Environment variable in which the stand-in looks for the folder of the plugs."""
+
+_BUILT = "usb_standin"  # in the run directory: library and cache
+_COMPILER = "cc"
+_COMPILE_S = 60.0
+
+
+def build(folder: Path) -> Path:
+    """Return the stand-in in this folder, compiled if it is not there or older than its source.
+
+    Several processes may do so at once: the library is put in its place in one step.
+
+    Raises:
+        FleetError: there is no C compiler, it fails, or the folder cannot be written.
+    """
+    library = folder / SONAME
+    with suppress(OSError):  # it is not there
+        if library.stat().st_mtime >= SOURCE.stat().st_mtime:
+            return library
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            made = Path(scratch) / SONAME
+            _compile(made)
+            made.replace(library)
+    except OSError as error:
+        raise FleetError(
+            f"emulated USB: {folder}: {error.strerror or error}; a folder that can be written"
+        ) from error
+    return library
+
+
+def load(library: Path) -> None:
+    """Load the stand-in into this process, before anything imports `odrive`.
+
+    The package's own library then finds a libusb-1.0 there, and looks for no other. `XRL_USB`
+    has to name the folder of the plugs by the time the package is first used.
+    """
+    ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+
+
+def prepare(run_dir: Path) -> dict[str, str]:
+    """Return what lets the `odrive` package of another process find the emulated drives.
+
+    Environment variables; the stand-in is built in the run directory of the fleet whose
+    simulator has the drives.
+
+    Raises:
+        FleetError: see `build`.
+    """
+    library = build(run_dir / _BUILT)
+    paths = [str(library.parent), os.environ.get("LD_LIBRARY_PATH", "")]
+    return {
+        "LD_LIBRARY_PATH": os.pathsep.join(filter(None, paths)),
+        VARIABLE: str(run_dir / FOLDER),
+        # where the package keeps drives' descriptors: not those of emulated ones at home
+        "XDG_CACHE_HOME": str(library.parent / "cache"),
+    }
+
+
+def clear(run_dir: Path) -> None:
+    """Remove what `prepare` has built, and plugs that a killed simulator has left."""
+    shutil.rmtree(run_dir / _BUILT, ignore_errors=True)
+    folder = run_dir / FOLDER
+    for plug in folder.glob("*"):
+        if plug.is_socket():
+            plug.unlink(missing_ok=True)
+    with suppress(OSError):  # none there, or it holds files of others
+        folder.rmdir()
+
+
+def _compile(library: Path) -> None:
+    """Compile the stand-in to this file."""
+    command = [_COMPILER, "-shared", "-fPIC", "-O2", "-Wall", f"-Wl,-soname,{SONAME}"]
+    command += ["-o", str(library), str(SOURCE), "-lpthread"]
+    try:
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=_COMPILE_S, check=False
+        )
+    except FileNotFoundError:
+        raise FleetError(
+            f"emulated USB: no C compiler `{_COMPILER}` is on PATH; install one "
+            '(Debian, Ubuntu: apt install gcc libc6-dev), or use driver = "odrive_can"'
+        ) from None
+    except subprocess.TimeoutExpired:
+        raise FleetError(
+            f"emulated USB: the C compiler `{_COMPILER}` was not done with {SOURCE.name} in "
+            f"{_COMPILE_S:g} s"
+        ) from None
+    if result.returncode:
+        raise FleetError(
+            f"emulated USB: the C compiler `{_COMPILER}` failed on {SOURCE}; a working one for C11 "
+            f"with the C library's headers is wanted:\n{result.stderr.strip()}"
+        )

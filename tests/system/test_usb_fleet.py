@@ -1,0 +1,62 @@
+"""The whole fleet with its drives on USB, live, as `test_demo.py` has it on CAN. Outcomes only."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared.joints import MODULES
+from tests.usb import robot_file
+from tools.supervision import procfs
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def robot_path(tmp_path: Path) -> Path:
+    return robot_file.write(tmp_path)
+
+
+def xrl(*arguments: str | Path) -> str:
+    """Run a verb that has to end well; return what it printed."""
+    before, folders = procfs.fleets(), set(Path("/tmp").glob("xrl-*-*"))
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.cli", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=220,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert procfs.fleets() <= before
+    left = set(Path("/tmp").glob("xrl-*-*")) - folders
+    assert not [path for path in left if path.name.startswith(("xrl-demo-", "xrl-crash-"))]
+    return done.stdout
+
+
+def test_it_stands_when_the_planner_is_killed(tmp_path: Path, robot_path: Path) -> None:
+    out = tmp_path / "out"
+    flags = ("--duration", "7", "--kill", "planner@3", "--push", "4:0.3:30,0,0")
+    assert "STOOD" in xrl("demo", "--config", robot_path, "--out", out, *flags)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["stood"] is True
+    assert set(summary["handover_ms"]) == set(MODULES)
+    assert all(value is not None for value in summary["handover_ms"].values())
+
+
+def test_a_killed_services_successor_takes_over_and_an_unplugged_drive_holds(
+    tmp_path: Path, robot_path: Path
+) -> None:
+    out = tmp_path / "out"
+    cases = ("--only", "kill-knee_left", "--only", "unplugged-knee_left")
+    xrl("crashtest", "--config", robot_path, "--out", out, *cases)
+    rows = {row["name"]: row for row in json.loads((out / "results.json").read_text())["cases"]}
+    assert [row["verdict"] for row in rows.values()] == ["stood", "stood"]
+    assert rows["kill-knee_left"]["leads_again_s"] is not None

@@ -1,0 +1,59 @@
+"""A robot file with drives on USB, and the fleet that is planned for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shared import config
+from shared.config import RobotConfig
+from shared.exceptions import ConfigError
+from tests.usb import robot_file
+from tools.supervision import fleet
+
+
+def plan(path: Path, *, simulation: bool) -> fleet.Plan:
+    return fleet.make_plan(
+        path,
+        Path("/tmp/xrl-t"),
+        overrides={},
+        services=None,
+        simulation=simulation,
+        table_path=fleet.TABLE,
+    )
+
+
+def test_the_shipped_robot_names_six_emulated_drives(robot: RobotConfig) -> None:
+    assert len({module.serial_number for module in robot.module}) == 6
+
+
+@pytest.mark.parametrize("driver", ["odrive_can", "odrive_usb"])
+@pytest.mark.parametrize(
+    ("serial", "words"),
+    [("3A00000001", "12 hexadecimal digits"), ("3A0000000002", "each drive once")],
+)
+def test_a_wrong_serial_number_is_refused_whichever_the_driver(
+    tmp_path: Path, driver: str, serial: str, words: str
+) -> None:
+    path = robot_file.write(tmp_path)
+    text = path.read_text().replace("odrive_usb", driver, 1).replace("3A0000000001", serial)
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=words):
+        config.load(path)
+
+
+def test_a_missing_serial_number_is_refused_on_usb_only(tmp_path: Path) -> None:
+    path = robot_file.write(tmp_path)
+    path.write_text(path.read_text().replace('serial_number = "3A0000000004"\n', ""))
+    with pytest.raises(ConfigError, match="ankle_left"):
+        config.load(path)
+    path.write_text(path.read_text().replace('"odrive_usb"', '"odrive_can"', 1))
+    assert config.load(path).module_named("ankle_left").serial_number == ""
+
+
+def test_only_an_emulated_robot_on_usb_has_the_stand_in(tmp_path: Path) -> None:
+    path = robot_file.write(tmp_path)
+    assert plan(path, simulation=True).emulated_usb
+    assert not plan(path, simulation=False).emulated_usb
+    assert not plan(fleet.DEFAULT_CONFIG, simulation=True).emulated_usb
