@@ -82,6 +82,8 @@ class ModuleConfig(Section, frozen=True):
     name: str
     bus: str
     node_ids: tuple[Annotated[int, Range(0, 62, "1")], Annotated[int, Range(0, 62, "1")]]
+    motor_signs: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, 1)
+    """-1: that motor counts down where the differential's equations have it count up."""
     serial_number: str = ""
     """12 hexadecimal digits, as USB shows them; for `joint_service.driver = "odrive_usb"`."""
 
@@ -219,9 +221,11 @@ class DriveConfig(Section, frozen=True):
     torque_constant: Annotated[float, Range(0.001, 5.0, "N m/A")]
     current_lim: Annotated[float, Range(1.0, 200.0, "A")]
     vel_limit: Annotated[float, Range(0.1, 500.0, "turn/s")]
+    dc_max_negative_current: Annotated[float, Range(-200.0, -0.001, "A")]
     watchdog_timeout: Annotated[float, Range(0.0, 10.0, "s")]
     encoder_period_ms: Annotated[int, Range(1, 100, "ms")]
     heartbeat_period_ms: Annotated[int, Range(1, 10_000, "ms")]
+    zero_mark_turns: Annotated[float, Range(0.0, 4096.0, "turns")]
 
 
 class CanConfig(Section, frozen=True):
@@ -244,6 +248,14 @@ class RecorderConfig(Section, frozen=True):
     chunk_kib: Annotated[int, Range(1, 65_536, "KiB")]
     flush_ms: Milliseconds
     fsync_s: Seconds
+    split_s: Annotated[float, Range(0.0, 86_400.0, "s")] = 0.0
+    """The next file begins after so long; 0: never."""
+    split_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 1024
+    """The next file begins at this size; 0: never."""
+    free_min_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 256
+    """Recording stops while less of the disk is free; 0: only when it is full."""
+    snapshot_mib: Annotated[int, Range(1, 1 << 16, "MiB")] = 256
+    """Memory of `--snapshot`; 3 MiB hold a second of the fleet."""
 
 
 class OperatorConfig(Section, frozen=True):
@@ -268,3 +280,5 @@ class SimulationConfig(Section, frozen=True):
     harness_noise: Annotated[float, Range(0.0, 100.0, "N")]
     late_slip_ms: Milliseconds
     operator: OperatorConfig
+    can_dialect: Literal["0.5", "0.6"] = "0.5"
+    """Firmware whose CANSimple the emulated drives speak; the services find out by themselves."""

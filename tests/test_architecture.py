@@ -53,7 +53,7 @@ VENDORS = {
     "pinocchio": ["services/planner/model.py"],
     "cvxpy": ["services/planner/split_program.py"],
     "casadi": ["services/planner/symbolic.py", "services/planner/kinematics.py"],
-    "odrive": ["services/joint/drivers/odrive_usb.py"],
+    "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
     "mcap": ["services/recorder/mcap_log.py", "tools/runs/run_log.py"],
     "supervisor": ["tools/supervision/*.py"],
     "can": [
@@ -62,10 +62,11 @@ VENDORS = {
         "services/joint/drivers/odrive_frames.py",
         "services/joint/drivers/can_link.py",
         "services/harness/sensor.py",
+        "tools/bringup/can_ear.py",
     ],
 }
 """Who may import a vendor's package: one owner each; MCAP is written and read in two places,
-and python-can is the wire itself to the two that speak on it."""
+and python-can is the wire itself to those that speak on it."""
 
 LAWS = [
     "services/joint/law.py",
@@ -74,7 +75,16 @@ LAWS = [
     "services/joint/failsafe.py",
     "services/joint/controller.py",
     "services/joint/onboard.py",
+    "services/joint/samples.py",
+    "services/joint/module.py",
     "services/joint/drivers/axes_status.py",
+    "services/joint/drivers/odrive_dialects.py",
+    "services/joint/drivers/readonly.py",
+    "services/joint/drivers/signed.py",
+    "services/joint/drivers/zeroed.py",
+    "shared/can_load.py",
+    "shared/fault_table.py",
+    "tools/bringup/jogging.py",
     "services/planner/assist.py",
     "services/planner/account.py",
     "services/planner/certificate.py",

@@ -1,0 +1,160 @@
+"""What the doctor says of the CAN buses, by what came on them."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from shared.cansimple import AxisState, Heartbeat
+from shared.cansimple_06 import Version
+from shared.config import RobotConfig
+from shared.config_sections import CanConfig
+from tools.bringup import check_can
+from tools.bringup.can_ear import BusHeard, NodeHeard, long_enough, period_ms
+from tools.bringup.rows import Row, Verdict
+
+MODULE = "knee_left"
+NODES = (8, 9)
+IDLE = Heartbeat(0, AxisState.IDLE, False, False, False, True)
+
+
+def times(period_s: float, n: int = 40) -> list[float]:
+    return [period_s * i for i in range(n)]
+
+
+def axis(
+    heartbeat: Heartbeat = IDLE, heartbeat_s: float = 0.02, encoder_s: float = 0.002
+) -> NodeHeard:
+    return NodeHeard(heartbeat, times(heartbeat_s, 10), times(encoder_s), pos_turns=64.0)
+
+
+def healthy() -> BusHeard:
+    return BusHeard(seconds=0.5, frames=600, nodes={node: axis() for node in NODES})
+
+
+def rows_of(robot: RobotConfig, heard: BusHeard) -> list[Row]:
+    return check_can.drive_rows(robot, MODULE, heard, services_up=False)
+
+
+def bad(rows: list[Row]) -> list[tuple[str, str, Verdict]]:
+    return [(row.subject, row.what, row.verdict) for row in rows if row.verdict != Verdict.OK]
+
+
+def test_a_bus_that_carries_both_axes_at_their_periods_is_ok(robot: RobotConfig) -> None:
+    rows = rows_of(robot, healthy())
+    assert bad(rows) == []
+    assert len(rows) == 8
+
+
+def test_an_encoder_at_its_factory_period_is_a_warning_with_the_setting(robot: RobotConfig) -> None:
+    heard = healthy()
+    heard.nodes[8] = axis(encoder_s=0.01)
+    rows = rows_of(robot, heard)
+    assert bad(rows) == [(f"{MODULE}.axis0", "encoder frames", Verdict.WARNING)]
+    row = next(row for row in rows if row.verdict != Verdict.OK)
+    assert (row.found, row.wanted) == ("10.0 ms", "2 ms")
+    assert "encoder_rate_ms" in row.fix
+
+
+def test_an_axis_without_encoder_frames_is_wrong(robot: RobotConfig) -> None:
+    heard = healthy()
+    heard.nodes[9].estimates_s = []
+    assert bad(rows_of(robot, heard)) == [(f"{MODULE}.axis1", "encoder frames", Verdict.WRONG)]
+
+
+def test_an_axis_that_sends_no_heartbeat_is_wrong(robot: RobotConfig) -> None:
+    heard = healthy()
+    heard.nodes[9] = NodeHeard()
+    assert bad(rows_of(robot, heard)) == [(f"{MODULE}.axis1", "heartbeat", Verdict.WRONG)]
+
+
+def test_other_nodes_on_a_silent_bus_are_named(robot: RobotConfig) -> None:
+    heard = BusHeard(nodes={8: NodeHeard(), 9: NodeHeard(), 0: axis(), 1: axis()})
+    (row,) = rows_of(robot, heard)
+    assert row.verdict is Verdict.WRONG
+    assert "nodes 0, 1 are heard" in row.fix
+
+
+def test_a_failed_motor_shows_though_the_axis_error_is_0(robot: RobotConfig) -> None:
+    heard = healthy()
+    heard.nodes[8] = axis(IDLE._replace(motor_failed=True))
+    rows = rows_of(robot, heard)
+    assert bad(rows) == [(f"{MODULE}.axis0", "errors", Verdict.WRONG)]
+    assert "MOTOR_FAILED" in next(row.found for row in rows if row.verdict != Verdict.OK)
+
+
+def test_firmware_0_6_is_named_and_its_heartbeats_are_not_taken_for_errors(
+    robot: RobotConfig,
+) -> None:
+    heard = healthy()
+    heard.nodes[8] = axis(IDLE._replace(motor_failed=True))
+    heard.nodes[8].version = Version(2, (4, 4, 58), (0, 6, 10), 0)
+    rows = rows_of(robot, heard)
+    assert bad(rows) == [(f"{MODULE}.axis0", "firmware", Verdict.WARNING)]
+
+
+@pytest.mark.parametrize(
+    ("interface", "words"), [("xrl_unix", "simulator"), ("socketcan", "ip link set can7 up")]
+)
+def test_a_bus_that_cannot_be_opened_says_how_to_open_it(
+    robot: RobotConfig, interface: str, words: str
+) -> None:
+    can = {name: CanConfig(interface=interface, channel="can7") for name in robot.can}
+    other = msgspec.structs.replace(robot, can=can)
+    (row,) = rows_of(other, BusHeard(trouble="no such device"))
+    assert row.verdict is Verdict.WRONG
+    assert words in row.fix
+
+
+def cells(rate_hz: float = 250.0, force: float = 20.0) -> BusHeard:
+    n = 50
+    sample = (force, 0.0, 0.0, 0.0, 0.0, -force)
+    return BusHeard(seconds=n / rate_hz, samples=[sample] * n, samples_s=times(1.0 / rate_hz, n))
+
+
+@pytest.mark.parametrize(
+    ("heard", "expected"),
+    [
+        (cells(), []),
+        (cells(rate_hz=100.0), [("load cells", Verdict.WARNING)]),
+        (cells(force=1500.0), [("largest force", Verdict.WRONG)]),
+        (cells(force=float("nan")), [("largest force", Verdict.WRONG)]),
+        (BusHeard(seconds=0.5, frames=3), [("load cells", Verdict.WRONG)]),
+        (BusHeard(trouble="gone"), [("CAN bus", Verdict.WRONG)]),
+    ],
+)
+def test_the_load_cells_are_judged_by_rate_and_range(
+    robot: RobotConfig, heard: BusHeard, expected: list[tuple[str, Verdict]]
+) -> None:
+    rows = check_can.harness_rows(robot, heard)
+    assert [(row.what, row.verdict) for row in rows if row.verdict != Verdict.OK] == expected
+
+
+def test_frames_of_load_cells_out_of_order_are_counted(robot: RobotConfig) -> None:
+    heard = cells()
+    heard.malformed = 3
+    assert [row.found for row in check_can.harness_rows(robot, heard)][-1] == "3"
+
+
+def test_the_period_stands_a_reader_that_stalls_and_a_sender_that_catches_up() -> None:
+    stalled = [0.002 * i + (0.3 if i > 20 else 0.0) for i in range(40)]
+    assert period_ms(stalled, 2.0) == pytest.approx(2.0)
+    bursts = [0.002 * i if i % 2 else 0.002 * (i - 1) + 0.0001 for i in range(40)]
+    assert period_ms(bursts, 2.0) == pytest.approx(2.0, rel=0.1)
+
+
+def test_another_period_is_seen_as_what_it_is() -> None:
+    assert period_ms(times(0.01), 2.0) == pytest.approx(10.0)
+    assert period_ms(times(0.002, 3), 2.0) is None
+
+
+@pytest.mark.parametrize(("period", "seconds"), [(20, 0.5), (500, 1.5), (10_000, 3.0)])
+def test_it_listens_for_some_heartbeats_but_not_for_ever(period: int, seconds: float) -> None:
+    assert long_enough(period) == pytest.approx(seconds)
+
+
+def test_every_bus_of_the_robot_is_listened_to(robot: RobotConfig) -> None:
+    nodes = check_can.bus_nodes(robot)
+    assert sorted(nodes) == sorted(robot.can)
+    assert nodes[MODULE] == NODES
+    assert nodes[robot.harness.bus] == ()

@@ -1,0 +1,146 @@
+"""What the doctor says of the computer, by a file system that the test writes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from shared import priority
+from shared.config import RobotConfig
+from shared.config_sections import CanConfig
+from tools.bringup import check_machine
+from tools.bringup.rows import Row, Verdict
+
+
+@pytest.fixture
+def real(robot: RobotConfig) -> RobotConfig:
+    """Return the shipped robot on real buses."""
+    can = {
+        name: CanConfig(interface="socketcan", channel=f"can{i}")
+        for i, name in enumerate(robot.can)
+    }
+    return msgspec.structs.replace(robot, can=can)
+
+
+def write(root: Path, path: str, text: str) -> None:
+    file = root / path
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text + "\n", encoding="utf-8")
+
+
+def row_of(rows: list[Row], what: str) -> Row:
+    return next(row for row in rows if row.what == what)
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "what"),
+    [
+        (
+            "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor",
+            "powersave",
+            "frequency governor",
+        ),
+        ("sys/devices/system/clocksource/clocksource0/current_clocksource", "hpet", "clock source"),
+        ("proc/swaps", "Filename Type\n/swapfile file", "swap"),
+    ],
+)
+def test_what_slows_a_loop_is_a_warning_on_a_real_robot_and_said_on_an_emulated_one(
+    robot: RobotConfig, real: RobotConfig, tmp_path: Path, path: str, text: str, what: str
+) -> None:
+    write(tmp_path, path, text)
+    for config, verdict in ((real, Verdict.WARNING), (robot, Verdict.OK)):
+        row = row_of(check_machine.machine_rows(config, tmp_path), what)
+        assert row.verdict is verdict
+        assert row.found != row.wanted
+
+
+def test_a_kernel_that_tells_nothing_is_ok(robot: RobotConfig, tmp_path: Path) -> None:
+    rows = check_machine.machine_rows(robot, tmp_path)
+    assert row_of(rows, "frequency governor").found == "not told here"
+    assert {row.verdict for row in rows} == {Verdict.OK}
+
+
+@pytest.mark.parametrize(
+    ("granted", "emulated", "verdict"),
+    [
+        ("slice 100000 ns", True, Verdict.OK),
+        ("slice 100000 ns", False, Verdict.WARNING),
+        ("normal priority", True, Verdict.WARNING),
+    ],
+)
+def test_without_real_time_permission_the_services_fallback_is_named(
+    robot: RobotConfig,
+    real: RobotConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    granted: str,
+    emulated: bool,
+    verdict: Verdict,
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(priority, "short_slice", lambda: granted)
+    rows = check_machine.machine_rows(robot if emulated else real, tmp_path)
+    row = row_of(rows, "real-time priority")
+    assert row.verdict is verdict
+    assert "refused" in row.found
+    if verdict is Verdict.OK:
+        assert granted in row.found
+
+
+def test_real_time_is_tried_and_not_kept(robot: RobotConfig, tmp_path: Path) -> None:
+    before = os.sched_getscheduler(0)
+    check_machine.machine_rows(robot, tmp_path)
+    assert os.sched_getscheduler(0) == before
+
+
+def test_can_interfaces_are_there_and_up(real: RobotConfig, tmp_path: Path) -> None:
+    write(tmp_path, "sys/class/net/can0/flags", "0x40081")
+    write(tmp_path, "sys/class/net/can1/flags", "0x40080")
+    rows = check_machine.socketcan_rows(real, tmp_path)
+    assert {row.subject: row.found for row in rows}["can0"] == "up"
+    assert {row.subject: row.found for row in rows}["can1"] == "down"
+    assert {row.subject: row.found for row in rows}["can2"] == "not there"
+    assert "ip link set can1 up" in next(row.fix for row in rows if row.subject == "can1")
+
+
+def plug_in(root: Path, product: str = "0d32") -> Path:
+    for name, text in (
+        ("idVendor", "1209"),
+        ("idProduct", product),
+        ("busnum", "1"),
+        ("devnum", "7"),
+    ):
+        write(root, f"sys/bus/usb/devices/1-2/{name}", text)
+    node = root / "dev/bus/usb/001/007"
+    node.parent.mkdir(parents=True)
+    node.touch()
+    return node
+
+
+def test_an_odrive_that_may_not_be_opened_wants_its_udev_rule(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = plug_in(tmp_path)
+    (row,) = check_machine.usb_node_rows(tmp_path)
+    assert row.verdict is Verdict.OK
+    real_access: Callable[..., bool] = os.access
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: Path(path) != node and real_access(path, mode)
+    )
+    (row,) = check_machine.usb_node_rows(tmp_path)
+    assert row.verdict is Verdict.WRONG
+    assert 'ATTR{idVendor}=="1209"' in row.fix
+
+
+def test_other_usb_devices_are_not_taken_for_odrives(tmp_path: Path) -> None:
+    plug_in(tmp_path, product="beef")
+    (row,) = check_machine.usb_node_rows(tmp_path)
+    assert row.verdict is Verdict.WARNING
+    assert "none plugged in" in row.found

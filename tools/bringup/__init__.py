@@ -1,0 +1,1 @@
+"""Bringing a real robot up: boards, settings, zeros, single joints."""

@@ -1,0 +1,93 @@
+"""What boards had been told to keep, in a file: written before anything is changed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from shared.exceptions import DriveError
+from tools.bringup.boards import Value
+
+VERSION: Final = 1
+_NOT_JSON: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+"""Numbers that JSON does not have, as they stand in the file."""
+
+
+class BoardBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All settings of one board."""
+
+    module: str
+    serial_number: str
+    firmware: str
+    settings: dict[str, Value]
+    """By the firmware's names; inf, -inf and nan as text."""
+
+
+class Backup(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The file."""
+
+    version: int = VERSION
+    time: str
+    """When it was made, ISO 8601, local time with its offset."""
+    robot_file: str
+    boards: tuple[BoardBackup, ...]
+
+
+def of_board(
+    module: str, serial_number: str, firmware: str, settings: dict[str, Value]
+) -> BoardBackup:
+    """Return a board's backup, with its numbers as JSON can have them."""
+    plain = {name: _to_json(value) for name, value in settings.items()}
+    return BoardBackup(module, serial_number, firmware, plain)
+
+
+def settings_of(backup: BoardBackup) -> dict[str, Value]:
+    """Return a backup's settings with their numbers as they were."""
+    return {
+        name: _NOT_JSON.get(value, value) if isinstance(value, str) else value
+        for name, value in backup.settings.items()
+    }
+
+
+def write(path: Path, boards: Sequence[BoardBackup], *, time: str, robot_file: str) -> None:
+    """Write a backup; the file is whole or not there, and none is ever overwritten.
+
+    Raises:
+        DriveError: it cannot be written.
+    """
+    backup = Backup(time=time, robot_file=robot_file, boards=tuple(boards))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("xb") as file:
+            file.write(msgspec.json.format(msgspec.json.encode(backup)) + b"\n")
+    except OSError as error:
+        raise DriveError(
+            f"{path}: the backup cannot be written: {error.strerror}; nothing was changed"
+        ) from None
+
+
+def read(path: Path) -> Backup:
+    """Read a backup.
+
+    Raises:
+        DriveError: it cannot be read, or is none.
+    """
+    try:
+        backup = msgspec.json.decode(path.read_bytes(), type=Backup)
+    except OSError as error:
+        raise DriveError(f"{path}: cannot be read: {error.strerror}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise DriveError(f"{path}: no backup of `xrl configure`: {error}") from None
+    if backup.version != VERSION:
+        raise DriveError(f"{path}: a backup of version {backup.version}, not {VERSION}")
+    return backup
+
+
+def _to_json(value: Value) -> Value:
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value

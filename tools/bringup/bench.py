@@ -1,0 +1,121 @@
+"""Whose a module's drive is now, and what else the verbs for single drives share.
+
+A drive has one master. Before a verb writes to one it asks whether a joint service has it; while
+it works, no fleet can be started in the same run directory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from shared import config
+from shared.config import RobotConfig, expand
+from shared.exceptions import FleetError, XrlError
+from shared.joints import MODULES
+from shared.process import DEFAULT_CONFIG
+from tools.bringup import reach
+from tools.supervision import fleet, procfs
+from tools.supervision.run_dir import RunDir
+from tools.supervision.supervise import Fleet
+
+SETTLE_S: Final = 1.5
+"""Until an emulated robot hangs still in its hoist."""
+
+
+def robot_file(args: Namespace) -> Path:
+    """Return the robot file: of the fleet that is up in `--run-dir`, else `--config`.
+
+    Raises:
+        FleetError: both are given and differ.
+    """
+    run = RunDir(args.run_dir)
+    manifest = run.read_manifest()
+    given = Path(os.path.abspath(args.config))  # noqa: PTH100 - as the manifest has it
+    if manifest is None or not reach.is_up(run.path):
+        return given
+    if given not in (DEFAULT_CONFIG, Path(manifest.config)):
+        raise FleetError(
+            f"the fleet in {run.path} runs with {manifest.config}, not with {given}; "
+            "leave --config out, or name another fleet with --run-dir"
+        )
+    return Path(manifest.config)
+
+
+def service_on(robot: RobotConfig, module: str, run_dir: Path) -> Fleet | None:
+    """Return the fleet of this user's that has a joint service on a module's drive, or None.
+
+    In whatever run directory: two fleets may mean the same drive.
+    """
+    drive = _drive_of(robot, module, RunDir(run_dir).path)
+    for path in sorted(map(Path, procfs.fleets())):
+        manifest = RunDir(path).read_manifest()
+        if manifest is None:
+            continue
+        with contextlib.suppress(XrlError):  # a file that has been broken since tells nothing
+            other = config.load_without_schedule(Path(manifest.config))
+            services = [name for name in manifest.services if name in MODULES]
+            if any(_drive_of(other, name, path) == drive for name in services):
+                return Fleet(path)
+    return None
+
+
+@contextlib.contextmanager
+def drives_to_ourselves(
+    robot: RobotConfig, config_path: Path, run_dir: Path, say: Callable[[str], None]
+) -> Iterator[bool]:
+    """Have the drives within reach, and no new fleet on them, for a while.
+
+    A fleet that is up is left as it is. If none is and the robot is an emulated one, its
+    simulator runs for the while; if the drives are real the run directory is held, so that
+    none is started meanwhile.
+
+    Yields:
+        True if the simulator was started.
+
+    Raises:
+        FleetError: the simulator cannot be started, or a fleet is being started.
+    """
+    run = RunDir(run_dir)
+    with contextlib.ExitStack() as stack:
+        if not fleet.is_simulated(robot) and not reach.is_up(run_dir):
+            lock = run.claim()
+            stack.callback(os.close, lock)
+            stack.callback(run.clear, keep_logs=True)
+        started = stack.enter_context(reach.drives_within_reach(robot, config_path, run_dir))
+        if started:
+            say("no fleet is up and the drives are emulated: their simulator runs for the while")
+            time.sleep(SETTLE_S)
+        if fleet.is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
+            stack.enter_context(reach.emulated_usb(run_dir))
+        yield started
+
+
+def confirm(question: str, *, yes: bool) -> bool:
+    """Ask on the terminal; True at once if it was answered by `--yes`.
+
+    Raises:
+        FleetError: there is no terminal to ask on.
+    """
+    if yes:
+        return True
+    if not sys.stdin.isatty():
+        raise FleetError("no terminal to ask on; give --yes if the robot may be touched unasked")
+    return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
+
+
+def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]:
+    """Return what tells a drive from all others; an emulated one by its run directory too."""
+    wiring = robot.module_named(module)
+    place = str(run_dir) if fleet.is_simulated(robot) else ""
+    if robot.joint_service.driver == "odrive_usb":
+        return (place, wiring.serial_number.upper())
+    bus = robot.can[wiring.bus]
+    channel = expand(bus.channel, run_dir)
+    return (place, bus.interface, channel, *map(str, wiring.node_ids))

@@ -1,0 +1,103 @@
+"""What bring-up needs of an ODrive: settings by name, read and written; no matter over what."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Final, NamedTuple, Protocol
+
+from shared.drive_settings import AXES
+from shared.exceptions import DriveError
+
+Value = bool | int | float | str | None
+"""A value of any endpoint; text: the name of another endpoint, or none at all."""
+
+FIRMWARE: Final = (0, 5, 6)
+"""What the settings' names and the drivers are made for."""
+
+AXIS_ERRORS: Final = ("error", "motor.error", "encoder.error", "controller.error")
+"""An axis's error registers; any may be set while the others are 0."""
+_AXIS_STATUS: Final = (
+    *AXIS_ERRORS,
+    "current_state",
+    "motor.is_calibrated",
+    "encoder.is_ready",
+    "encoder.pos_estimate",
+)
+STATUS: Final = (
+    "error",
+    "vbus_voltage",
+    *(f"{axis}.{name}" for axis in AXES for name in _AXIS_STATUS),
+)
+"""What a board shows of how it is, besides its settings."""
+
+
+class Board(Protocol):
+    """One ODrive. Every method may take seconds, and fails with one clear sentence.
+
+    Raises:
+        DriveError: from every method: the board does not answer any more, or not in time.
+    """
+
+    @property
+    def serial_number(self) -> str:
+        """12 hexadecimal digits."""
+
+    @property
+    def firmware(self) -> tuple[int, int, int]:
+        """As 0, 5, 6."""
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Names of everything that this board can be told to keep."""
+
+    def read(self, names: Iterable[str]) -> dict[str, Value]:
+        """Return the values of these endpoints; those that the board does not have are left out."""
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        """Write these endpoints in order; they are lost at the next restart unless saved."""
+
+    def save(self) -> None:
+        """Save the configuration, which restarts the board, and wait until it is back."""
+
+    def states(self) -> tuple[int, int]:
+        """Return `AxisState` of both axes."""
+
+
+class Found(NamedTuple):
+    """What is on a way to the boards."""
+
+    boards: dict[str, Board]
+    """By serial number; those that were asked for and answered."""
+    troubles: dict[str, str]
+    """By serial number: why one that was asked for is not among them."""
+    strangers: tuple[str, ...]
+    """Serial numbers that are there and were not asked for."""
+
+
+def equal(one: Value, other: Value) -> bool:
+    """Return True if two values are the same to a board, which keeps single floats."""
+    if isinstance(one, float) and isinstance(other, int | float):
+        if math.isnan(one) and math.isnan(other):
+            return True
+        return math.isclose(one, other, rel_tol=1e-6)
+    if isinstance(other, float) and isinstance(one, int):
+        return equal(other, one)
+    return one == other
+
+
+def firmware_in_words(firmware: tuple[int, int, int]) -> str:
+    """Return "0.5.6"."""
+    return ".".join(map(str, firmware))
+
+
+def number(values: Mapping[str, Value], name: str) -> float:
+    """Return a value that must be a number.
+
+    Raises:
+        DriveError: the board does not have it.
+    """
+    value = values.get(name)
+    if not isinstance(value, int | float):
+        raise DriveError(f"no number at {name}; is this an ODrive v3 with firmware 0.5.x?")
+    return value

@@ -1,0 +1,168 @@
+"""What a CAN bus of the robot says of itself in a moment: drives' heartbeats, load cells.
+
+Nothing is sent to a bus whose services are up: any frame feeds a drive's watchdog, and would
+hide that its service is dead. Else two questions are asked of each axis: its version, which only
+firmware 0.6 answers, and the voltage of its supply.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from statistics import fmean, median
+from typing import Final
+
+import can
+import msgspec
+
+from shared import cansimple
+from shared.cansimple import Command, Heartbeat
+from shared.cansimple_06 import Command06, Version, unpack_version
+from shared.config_sections import CanConfig
+from shared.loadcell_can import FRAME_IDS, SampleAssembler
+from shared.messages import Vector6
+
+LISTEN_S: Final = 0.5
+LISTEN_MAX_S: Final = 3.0
+HEARTBEATS: Final = 3.0
+"""Periods of the heartbeat that are listened for, at least."""
+
+_WAIT_S = 0.05
+_FRAME_BYTES = 8
+_GAPS_MIN = 3
+
+
+class NodeHeard(msgspec.Struct):
+    """What one axis said."""
+
+    heartbeat: Heartbeat | None = None
+    """The newest, as firmware 0.5 means it."""
+    heartbeats_s: list[float] = []
+    """When they came."""
+    estimates_s: list[float] = []
+    pos_turns: float | None = None
+    """The newest estimate."""
+    version: Version | None = None
+    """The answer of firmware 0.6; 0.5 gives none."""
+    vbus_voltage: float | None = None
+
+
+class BusHeard(msgspec.Struct):
+    """What one bus said."""
+
+    trouble: str = ""
+    """Why it could not be listened to."""
+    seconds: float = 0.0
+    frames: int = 0
+    error_frames: int = 0
+    nodes: dict[int, NodeHeard] = {}
+    """By node id: those that should be there, and whoever else sends heartbeats."""
+    samples: list[Vector6] = []
+    """Of the load cells."""
+    samples_s: list[float] = []
+    """When they came."""
+    malformed: int = 0
+    """Load-cell frames that were out of order or too short."""
+
+
+def listen(
+    config: CanConfig,
+    nodes: Sequence[int],
+    *,
+    ask: bool,
+    cells: bool = False,
+    seconds: float = LISTEN_S,
+) -> BusHeard:
+    """Listen to a bus for a while.
+
+    Args:
+        config: of the bus, `{run}` in its channel expanded.
+        nodes: of the axes that should be on it.
+        ask: whether to ask them; not where services are up.
+        cells: whether the load cells are on it.
+        seconds: how long.
+    """
+    heard = BusHeard(nodes={node: NodeHeard() for node in nodes})
+    try:
+        with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
+            if ask:
+                for message in _questions(nodes):
+                    bus.send(message, timeout=_WAIT_S)
+            _take_in(bus, heard, seconds, cells=cells)
+    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
+        heard.trouble = str(error) or type(error).__name__
+    return heard
+
+
+def long_enough(heartbeat_period_ms: int) -> float:
+    """Return how long to listen for heartbeats of this period, s."""
+    return min(LISTEN_MAX_S, max(LISTEN_S, HEARTBEATS * 1e-3 * heartbeat_period_ms))
+
+
+def period_ms(times_s: Sequence[float], wanted_ms: float) -> float | None:
+    """Return the period at which frames came, ms; None if there are too few.
+
+    The median gap or the mean, whichever is nearer to what is wanted: a reader that stalls shifts
+    the mean, a sender that catches up the median, another setting both.
+    """
+    gaps = [after - before for before, after in pairwise(times_s)]
+    if len(gaps) < _GAPS_MIN:
+        return None
+    return min((1e3 * median(gaps), 1e3 * fmean(gaps)), key=lambda ms: abs(ms - wanted_ms))
+
+
+def _questions(nodes: Iterable[int]) -> list[can.Message]:
+    return [
+        can.Message(
+            arbitration_id=cansimple.arbitration_id(node, command),
+            is_remote_frame=True,
+            dlc=_FRAME_BYTES,
+            is_extended_id=False,
+        )
+        for node in nodes
+        for command in (Command06.GET_VERSION, Command.GET_VBUS)
+    ]
+
+
+def _take_in(bus: can.BusABC, heard: BusHeard, seconds: float, *, cells: bool) -> None:
+    assembler = SampleAssembler()
+    begun = time.monotonic()
+    while (left := begun + seconds - time.monotonic()) > 0.0:
+        message = bus.recv(min(left, _WAIT_S))
+        if message is None:
+            continue
+        if message.is_error_frame:
+            heard.error_frames += 1
+        elif not message.is_remote_frame and not message.is_extended_id:
+            heard.frames += 1
+            if cells and message.arbitration_id in FRAME_IDS:
+                sample = assembler.add(message.arbitration_id, message.data)
+                if sample is not None:
+                    heard.samples.append(sample)
+                    heard.samples_s.append(message.timestamp)
+            elif len(message.data) == _FRAME_BYTES:
+                _of_node(message, heard.nodes)
+    heard.seconds = time.monotonic() - begun
+    heard.malformed = assembler.malformed
+
+
+def _of_node(message: can.Message, nodes: dict[int, NodeHeard]) -> None:
+    """Take in a frame as an axis sends it; a heartbeat makes a node known that was not."""
+    node, command = cansimple.split_id(message.arbitration_id)
+    data = bytes(message.data)
+    if command == Command.HEARTBEAT:
+        axis = nodes.setdefault(node, NodeHeard())
+        axis.heartbeat = cansimple.unpack_heartbeat(data)
+        axis.heartbeats_s.append(message.timestamp)
+        return
+    known = nodes.get(node)
+    if known is None:
+        return
+    if command == Command.GET_ENCODER_ESTIMATES:
+        known.pos_turns = cansimple.unpack_two_floats(data)[0]
+        known.estimates_s.append(message.timestamp)
+    elif command == Command.GET_VBUS:
+        known.vbus_voltage = cansimple.unpack_two_floats(data)[0]
+    elif command == Command06.GET_VERSION:
+        known.version = unpack_version(data)

@@ -1,0 +1,142 @@
+"""The difference between what a board keeps and what it should keep, and how it is closed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from shared.cansimple import AxisState
+from shared.drive_settings import AXES, Wanted, value_in_words
+from shared.exceptions import DriveError
+from tools.bringup.boards import Board, Value, equal
+from tools.bringup.check_board import CALIBRATE
+
+_CALIBRATED = {"motor.config.pre_calibrated": "motor.is_calibrated",
+               "encoder.config.pre_calibrated": "encoder.is_ready"}  # fmt: skip
+"""Settings that a drive takes only once it is calibrated."""
+
+
+class Change(NamedTuple):
+    """One setting that is not as it should be."""
+
+    module: str
+    name: str
+    before: Value
+    after: Value
+    """As it should be written."""
+    why: str
+    obstacle: str = ""
+    """Why it cannot be written; "" if it can."""
+    fits: Callable[[Value], bool] = bool
+    """Whether a value that is read back is as it should be."""
+
+
+class Outcome(NamedTuple):
+    """What came of a change."""
+
+    change: Change
+    now: Value
+    """Read back after the restart."""
+    good: bool
+
+
+def against_wanted(module: str, wanted: Iterable[Wanted], board: Board) -> list[Change]:
+    """Return what of a board is not as the robot wants it.
+
+    Raises:
+        DriveError: the board does not answer.
+    """
+    settings = board.read(board.settings)
+    calibrated = board.read([f"{axis}.{name}" for axis in AXES for name in _CALIBRATED.values()])
+    changes = []
+    for row in wanted:
+        before = settings.get(row.name)
+        if row.name not in settings:
+            obstacle = "not there in this firmware; 0.5.6 has it"
+        elif _fits(row, before):
+            continue
+        else:
+            obstacle = _uncalibrated(row.name, calibrated)
+        changes.append(Change(module, row.name, before, row.value, row.why, obstacle, _fitter(row)))
+    return changes
+
+
+def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> list[Change]:
+    """Return what of a board is not as a backup has it.
+
+    Raises:
+        DriveError: the board does not answer.
+    """
+    settings = board.read(board.settings)
+    changes = []
+    for name, value in saved.items():
+        if name not in settings:
+            obstacle = "not there in this board's firmware"
+        elif equal(settings[name], value):
+            continue
+        else:
+            obstacle = ""
+        changes.append(
+            Change(module, name, settings.get(name), value, "", obstacle,
+                   _equal_to(value))
+        )  # fmt: skip
+    return changes
+
+
+def refuse_armed(module: str, board: Board) -> None:
+    """Refuse a board one of whose axes is not idle: saving restarts it, and it lets go.
+
+    Raises:
+        DriveError: naming the axis.
+    """
+    for axis, state in zip(AXES, board.states(), strict=True):
+        if state != AxisState.IDLE:
+            known = state in AxisState.__members__.values()
+            words = AxisState(state).name if known else str(state)
+            raise DriveError(
+                f"{module}.{axis} is in {words}, not idle: saving restarts the board, which lets "
+                "the module go. Hang the robot; `xrl down`, or switch its supply off and on"
+            )
+
+
+def apply(board: Board, changes: Sequence[Change]) -> list[Outcome]:
+    """Write a board's changes, save them, and read them back after the restart.
+
+    Raises:
+        DriveError: the board does not answer, or does not restart.
+    """
+    to_write = [change for change in changes if not change.obstacle]
+    if to_write:
+        board.write({change.name: change.after for change in to_write})
+        board.save()
+    now = board.read([change.name for change in changes])
+    return [
+        Outcome(change, now.get(change.name), change.name in now and change.fits(now[change.name]))
+        for change in changes
+    ]
+
+
+def in_words(value: Value) -> str:
+    """Return a setting's value as a person would write it."""
+    return "-" if value is None else value_in_words(value)
+
+
+def _fits(row: Wanted, value: Value) -> bool:
+    return isinstance(value, bool | int | float) and row.fits(value)
+
+
+def _fitter(row: Wanted) -> Callable[[Value], bool]:
+    return lambda value: _fits(row, value)
+
+
+def _equal_to(wanted: Value) -> Callable[[Value], bool]:
+    return lambda value: equal(value, wanted)
+
+
+def _uncalibrated(name: str, calibrated: Mapping[str, Value]) -> str:
+    """Return why a setting cannot be written yet: the drive takes it only when calibrated."""
+    axis, _, below = name.partition(".")
+    status = _CALIBRATED.get(below)
+    if status is None or calibrated.get(f"{axis}.{status}"):
+        return ""
+    return f"not calibrated: {CALIBRATE}"

@@ -1,0 +1,207 @@
+"""Checks of one module's ODrive, by what its board says of itself. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntFlag
+from typing import Final
+
+from services.joint.differential import joint_from_motor
+from shared.cansimple import (
+    AxisError,
+    AxisState,
+    ControllerError,
+    EncoderError,
+    MotorError,
+    OdriveError,
+)
+from shared.config import RobotConfig
+from shared.drive_settings import AXES, Wanted, value_in_words
+from shared.exceptions import DriveError
+from shared.joints import AXES as JOINT_AXES
+from shared.joints import MODULE_INDEX
+from tools.bringup.boards import FIRMWARE, Value, firmware_in_words, number
+from tools.bringup.rows import Row, Verdict, judged, ok, warning, wrong
+
+Values = Mapping[str, Value]
+
+REGISTERS: Final[tuple[tuple[str, type[IntFlag]], ...]] = (
+    ("error", AxisError),
+    ("motor.error", MotorError),
+    ("encoder.error", EncoderError),
+    ("controller.error", ControllerError),
+)
+"""An axis's error registers, in the order of `boards.AXIS_ERRORS`."""
+
+OVERVOLTAGE_SHARE: Final = 0.95
+"""Of the trip level; a supply nearer to it leaves braking legs no room."""
+
+CALIBRATE: Final = (
+    "unload the joint, `odrivetool`: requested_state = AXIS_STATE_FULL_CALIBRATION_SEQUENCE, "
+    "then pre_calibrated = True on motor and encoder"
+)
+
+
+def firmware_row(module: str, firmware: tuple[int, int, int]) -> Row:
+    """Judge a board's firmware."""
+    wanted = firmware_in_words(FIRMWARE)
+    found = firmware_in_words(firmware)
+    fix = f"flash {wanted}: `odrivetool dfu`; then `xrl configure --apply --module {module}`"
+    if firmware[:2] == FIRMWARE[:2]:
+        why = "settings may have other names or defaults"
+        good = firmware == FIRMWARE
+        return judged(good, module, "firmware", found, wanted, fix, why, otherwise=Verdict.WARNING)
+    why = "other settings, other error words: see design section 5"
+    return wrong(module, "firmware", found, wanted, fix, why)
+
+
+def settings_rows(module: str, wanted: tuple[Wanted, ...], values: Values) -> list[Row]:
+    """Compare a board's settings with what is wanted of them; all that fit are one row."""
+    rows = []
+    fix = f"`xrl configure --apply --module {module}`"
+    for setting in wanted:
+        subject, name = _subject(module, setting.name)
+        value = values.get(setting.name)
+        words = setting.in_words()
+        if not isinstance(value, bool | int | float):
+            rows.append(warning(subject, name, "not there", words, "firmware 0.5.6", setting.why))
+        elif not setting.fits(value):
+            by_hand = CALIBRATE if name.endswith("pre_calibrated") else fix
+            rows.append(wrong(subject, name, value_in_words(value), words, by_hand, setting.why))
+    fitting = f"{len(wanted) - len(rows)} as wanted"
+    return [ok(module, "other settings" if rows else "settings", fitting), *rows]
+
+
+def error_rows(module: str, values: Values) -> list[Row]:
+    """Return what the board's error registers hold; one row if nothing.
+
+    Arming clears them all, so a watchdog that ran out while nobody wrote is no fault.
+    """
+    fix = "find what caused it; `xrl up` clears it at arming, power off and on does too"
+    rows = []
+    error = int(number(values, "error"))
+    if error:
+        found = flags_in_words(OdriveError, error)
+        rows.append(wrong(module, "error", found, "none", fix, "both axes disarm"))
+    for axis in AXES:
+        for name, kind in REGISTERS:
+            bits = int(number(values, f"{axis}.{name}"))
+            benign = kind is AxisError and bits == AxisError.WATCHDOG_TIMER_EXPIRED
+            if bits and not benign:
+                found = flags_in_words(kind, bits)
+                rows.append(wrong(f"{module}.{axis}", name, found, "none", fix))
+    return rows or [ok(module, "errors", "none", "none")]
+
+
+def condition_rows(
+    module: str, values: Values, trip_levels: tuple[float, float], *, services_up: bool
+) -> list[Row]:
+    """Judge calibration, supply and state.
+
+    Args:
+        module: whose board it is.
+        values: of `boards.STATUS`.
+        trip_levels: the board's own under- and over-voltage levels, V.
+        services_up: whether a joint service has the drive.
+    """
+    rows = [_voltage(module, number(values, "vbus_voltage"), trip_levels)]
+    for axis in AXES:
+        lacking = [
+            part
+            for part, name in (("motor", "motor.is_calibrated"), ("encoder", "encoder.is_ready"))
+            if not values.get(f"{axis}.{name}")
+        ]
+        found = f"{' and '.join(lacking)} not" if lacking else "yes"
+        subject = f"{module}.{axis}"
+        rows.append(
+            judged(not lacking, subject, "calibrated", found, "yes", CALIBRATE, "it does not arm")
+        )
+        state = int(number(values, f"{axis}.current_state"))
+        rows.append(state_row(f"{module}.{axis}", state, services_up=services_up))
+    return rows
+
+
+def state_row(subject: str, state: int, *, services_up: bool) -> Row:
+    """Judge an axis's state: idle, or in closed loop where a joint service has it."""
+    known = state in AxisState.__members__.values()
+    found = AxisState(state).name.lower().replace("_", " ") if known else str(state)
+    if state == AxisState.IDLE:
+        return ok(subject, "state", found, "idle")
+    if state == AxisState.CLOSED_LOOP_CONTROL and services_up:
+        return ok(subject, "state", found, "armed by its service")
+    fix = "hang the robot; `xrl up` takes it over, power off lets it go"
+    return warning(subject, "state", found, "idle", fix, "it moves or holds with nobody at it")
+
+
+def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -> list[Row]:
+    """Judge where a module's joint is, by its motors' positions as the drive counts them."""
+    mark = robot.drive.zero_mark_turns
+    a, b = turns[0] - mark, turns[1] - mark
+    if mark > 0.0 and max(abs(a), abs(b)) > 0.5 * mark:
+        return [
+            wrong(
+                module,
+                "zero",
+                f"motors at {turns[0]:.1f}, {turns[1]:.1f} turns",
+                f"about {mark:g}",
+                f"`xrl zero {module} --at PHI,THETA`",
+                "it lost its zero with the power, and is not armed without one",
+            )
+        ]
+    q = joint_from_motor((a, b), robot.joint.gear_ratio)
+    rows = [ok(module, "zero", "known", "known")]
+    limits = robot.joint_limits()[2 * MODULE_INDEX[module] :][:2]
+    for name, angle, (low, high) in zip(JOINT_AXES, q, limits, strict=True):
+        rows.append(
+            judged(
+                low <= angle <= high,
+                f"{module}.{name}",
+                "angle",
+                f"{angle:.2f} rad",
+                f"{low:g} to {high:g}",
+                f"move it there by hand; if it is there, `xrl zero {module} --at PHI,THETA`",
+                "it is not armed outside of its limits",
+            )
+        )
+    return rows
+
+
+def flags_in_words(kind: type[IntFlag], bits: int) -> str:
+    """Return an error register as its firmware names it, unknown bits in hex."""
+    names = [flag.name or "" for flag in kind if flag and bits & flag == flag]
+    rest = bits & ~sum(flag for flag in kind if flag)
+    return " ".join([*names, *([hex(rest)] if rest else [])])
+
+
+def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Row:
+    low, high = trip_levels
+    wanted = f"{low:g} to {high:g} V"
+    found = f"{volts:.1f} V"
+    if volts <= low:
+        return wrong(module, "supply", found, wanted, "switch the supply on; look at its fuse")
+    if volts >= high:
+        return wrong(module, "supply", found, wanted, "a lower supply, or another board")
+    if volts > OVERVOLTAGE_SHARE * high:
+        fix = "a lower supply: braking legs raise it"
+        return warning(module, "supply", found, f"< {OVERVOLTAGE_SHARE * high:.1f} V", fix)
+    return ok(module, "supply", found, wanted)
+
+
+def trip_levels_of(values: Values) -> tuple[float, float]:
+    """Return a board's own under- and over-voltage levels, V.
+
+    Raises:
+        DriveError: it does not have them.
+    """
+    low, high = (
+        number(values, f"config.dc_bus_{name}voltage_trip_level") for name in ("under", "over")
+    )
+    if low >= high:
+        raise DriveError(f"its voltage trip levels are crossed: {low:g} V and {high:g} V")
+    return low, high
+
+
+def _subject(module: str, name: str) -> tuple[str, str]:
+    """Return "knee_left.axis0" and the setting's name below it."""
+    axis, _, rest = name.partition(".")
+    return (f"{module}.{axis}", rest) if axis in AXES else (module, name)

@@ -1,0 +1,148 @@
+"""Checks of what the CAN buses carry: both axes of each module, and the load cells. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from shared.cansimple import AxisError
+from shared.config import RobotConfig
+from shared.config_sections import CanConfig
+from shared.drive_settings import AXES
+from tools.bringup.boards import firmware_in_words
+from tools.bringup.can_ear import BusHeard, NodeHeard, period_ms
+from tools.bringup.check_board import flags_in_words, state_row
+from tools.bringup.rows import Row, Verdict, judged, ok, warning, wrong
+from tools.supervision.fleet import SIMULATED_CAN
+
+PERIOD_SHARE: Final = 0.2
+"""A measured period may differ by this much: more is a setting, and not a busy machine."""
+RATE_SHARE: Final = 0.2
+
+
+def drive_rows(robot: RobotConfig, module: str, heard: BusHeard, *, services_up: bool) -> list[Row]:
+    """Judge a module's two axes by what came on its bus."""
+    bus = robot.can[robot.module_named(module).bus]
+    if heard.trouble:
+        return [wrong(module, "CAN bus", heard.trouble, "open", _how_to_open(bus))]
+    node_ids = robot.module_named(module).node_ids
+    rows = []
+    for axis, node in zip(AXES, node_ids, strict=True):
+        known = heard.nodes.get(node, NodeHeard())
+        rows += _axis_rows(robot, f"{module}.{axis}", node, known, services_up=services_up)
+    if not any(heard.nodes[node].heartbeat for node in node_ids if node in heard.nodes):
+        strangers = sorted(
+            node for node, other in heard.nodes.items() if other.heartbeat and node not in node_ids
+        )
+        fix = (
+            f"nodes {', '.join(map(str, strangers))} are heard: set `node_ids`, or the drive's"
+            if strangers
+            else "supply, wires, 120 ohm at both ends; the drive's baud rate must be 1000000"
+        )
+        found = f"{heard.frames} frames, {heard.error_frames} errors"
+        return [wrong(module, "heartbeats", found, f"nodes {node_ids[0]}, {node_ids[1]}", fix)]
+    if heard.error_frames:
+        fix = "wires, 120 ohm at both ends, one baud rate"
+        found = f"{heard.error_frames} in {heard.seconds:.1f} s"
+        rows.append(warning(module, "CAN error frames", found, "none", fix))
+    return rows
+
+
+def harness_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
+    """Judge the load cells by what came on their bus."""
+    subject, harness = "harness", robot.harness
+    wanted = f"{harness.rate_hz:g} Hz"
+    if heard.trouble:
+        fix = _how_to_open(robot.can[harness.bus])
+        return [wrong(subject, "CAN bus", heard.trouble, "open", fix)]
+    if not heard.samples:
+        fix = "the amplifier's supply and wires; its frames are in shared/loadcell_can.py"
+        why = "no assist force, no easing, no stop at overload"
+        return [wrong(subject, "load cells", f"{heard.frames} other frames", wanted, fix, why)]
+    period = period_ms(heard.samples_s, 1e3 / harness.rate_hz)
+    rate_hz = 1e3 / period if period else 0.0
+    near = abs(rate_hz / harness.rate_hz - 1.0) <= RATE_SHARE
+    fix = "the amplifier's rate, or `harness.rate_hz`"
+    rows = [
+        judged(
+            near, subject, "load cells", f"{rate_hz:.0f} Hz", wanted, fix, otherwise=Verdict.WARNING
+        )
+    ]
+    largest = max(abs(force) for sample in heard.samples for force in sample)
+    good = largest < harness.leg_force_max  # NaN is not
+    fix = "unload the harness; a cell that stays there is broken, or its wire"
+    found, limit = f"{largest:.0f} N", f"< {harness.leg_force_max:g} N"
+    rows.append(judged(good, subject, "largest force", found, limit, fix, "saturated, not valid"))
+    if heard.malformed:
+        fix = "frames are lost: wires, 120 ohm at both ends"
+        rows.append(warning(subject, "frames out of order", str(heard.malformed), "none", fix))
+    return rows
+
+
+def positions(robot: RobotConfig, module: str, heard: BusHeard) -> tuple[float, float] | None:
+    """Return both motors' positions in turns, as the drive counts them; None if not heard."""
+    first, second = (
+        heard.nodes.get(node, NodeHeard()).pos_turns for node in robot.module_named(module).node_ids
+    )
+    return None if first is None or second is None else (first, second)
+
+
+def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
+    """Return the nodes that should be on each bus, also where there are none."""
+    nodes: dict[str, tuple[int, ...]] = {robot.harness.bus: ()}
+    for module in robot.module:
+        nodes[module.bus] = (*nodes.get(module.bus, ()), *module.node_ids)
+    return nodes
+
+
+def _how_to_open(bus: CanConfig) -> str:
+    """Return what to do about a bus that cannot be listened to."""
+    if bus.interface == SIMULATED_CAN:
+        return "the simulator of this fleet is not there: `xrl status`, or `xrl down`, `xrl up`"
+    if bus.interface == "socketcan":
+        return f"`ip link set {bus.channel} up type can bitrate 1000000`"
+    return f"python-can's {bus.interface} on {bus.channel}: its adapter, its driver"
+
+
+def _axis_rows(
+    robot: RobotConfig, subject: str, node: int, heard: NodeHeard, *, services_up: bool
+) -> list[Row]:
+    if heard.heartbeat is None:
+        fix = f"node {node} in `node_ids`, or the drive's config.can.node_id and heartbeat_rate_ms"
+        return [wrong(subject, "heartbeat", f"node {node} silent", "heard", fix)]
+    if heard.version is not None:
+        found = firmware_in_words(heard.version.firmware)
+        fix = "the settings of firmware 0.6 are not read back yet: check them in its web GUI"
+        return [warning(subject, "firmware", found, "0.5.6", fix, "other settings, other errors")]
+    drive = robot.drive
+    # Errors by the flags too: `axis_error` alone can stay 0.
+    errors = heard.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED
+    words = flags_in_words(AxisError, errors) if errors else "none"
+    fix = "find what caused it; `xrl up` clears it at arming, power off and on does too"
+    return [
+        _period(
+            subject, "heartbeat", heard.heartbeats_s, drive.heartbeat_period_ms, "heartbeat_rate_ms"
+        ),
+        _period(
+            subject, "encoder frames", heard.estimates_s, drive.encoder_period_ms, "encoder_rate_ms"
+        ),
+        judged(not errors, subject, "errors", words, "none", fix),
+        state_row(subject, heard.heartbeat.axis_state, services_up=services_up),
+    ]
+
+
+def _period(subject: str, what: str, times_s: list[float], wanted_ms: float, setting: str) -> Row:
+    module = subject.partition(".")[0]
+    measured = period_ms(times_s, wanted_ms)
+    wanted = f"{wanted_ms:g} ms"
+    fix = f"config.can.{setting}: `xrl configure --apply --module {module}`"
+    if measured is None:
+        found = f"{len(times_s)} heard"
+        return (
+            warning(subject, what, found, wanted, fix)
+            if times_s
+            else wrong(subject, what, "none", wanted, fix, "they are the joint service's clock")
+        )
+    if abs(measured / wanted_ms - 1.0) <= PERIOD_SHARE:
+        return ok(subject, what, f"{measured:.1f} ms", wanted)
+    return warning(subject, what, f"{measured:.1f} ms", wanted, fix, "or this machine is too busy")

@@ -1,0 +1,185 @@
+"""Checks of the computer: processors, clock, real-time permission, USB, CAN interfaces.
+
+Where the robot is emulated, what a sandbox or a laptop cannot give is ok as long as the services
+have their documented way to do without (`shared.priority`); the row says so.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+from pathlib import Path
+from typing import Final
+
+from shared import priority
+from shared.config import RobotConfig
+from tools.bringup.rows import Row, Verdict, judged, ok, warning, wrong
+from tools.supervision.fleet import is_simulated
+
+SUBJECT: Final = "machine"
+CPUS_MIN: Final = 2
+CPUS_FOR_1_KHZ: Final = 4
+"""Two carry the fleet at 500 Hz (CHANGELOG.md)."""
+CLOCKS: Final = ("tsc", "arch_sys_counter", "kvm-clock")
+"""Clock sources that are read without a system call."""
+FIFO_PRIORITY: Final = 20
+"""Of the joint services."""
+
+ODRIVE_VENDOR: Final = "1209"
+ODRIVE_PRODUCTS: Final = ("0d31", "0d32", "0d33")
+UDEV_RULE: Final = (
+    'SUBSYSTEM=="usb", ATTR{idVendor}=="1209", ATTR{idProduct}=="0d3[0-9]", MODE="0666"'
+)
+RTPRIO_FIX: Final = "`@xrl - rtprio 40` in /etc/security/limits.conf, or systemd's LimitRTPRIO=40"
+_IFF_UP = 1
+
+
+def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Row]:
+    """Check the computer.
+
+    Args:
+        robot: says whether its drives are emulated ones, and which interfaces it needs.
+        root: of the file system; another one for tests.
+    """
+    emulated = is_simulated(robot)
+    rows = [
+        _cpus(),
+        _governor(root, emulated=emulated),
+        _clock(root, emulated=emulated),
+        _real_time(emulated=emulated),
+        _swap(root, emulated=emulated),
+    ]
+    if emulated:
+        return rows
+    if any(module.serial_number for module in robot.module):
+        rows += [_libusb(), *usb_node_rows(root)]
+    return rows + socketcan_rows(robot, root)
+
+
+def usb_node_rows(root: Path) -> list[Row]:
+    """Check that the ODrives on USB may be opened by this user."""
+    nodes = []
+    for device in sorted((root / "sys/bus/usb/devices").glob("*")):
+        vendor, product = _text(device / "idVendor"), _text(device / "idProduct")
+        if vendor == ODRIVE_VENDOR and product in ODRIVE_PRODUCTS:
+            bus, number = _text(device / "busnum"), _text(device / "devnum")
+            nodes.append(root / f"dev/bus/usb/{int(bus):03d}/{int(number):03d}")
+    if not nodes:
+        fix = "plug the USB cables in; settings are read over USB"
+        return [warning("USB", "ODrives", "none plugged in", "one for each module", fix)]
+    closed = [str(node) for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
+    found = f"{len(closed)} closed" if closed else f"{len(nodes)} open"
+    fix = f"the line {UDEV_RULE} in /etc/udev/rules.d/91-odrive.rules, then plug in again"
+    return [judged(not closed, "USB", "permission", found, "read and write", fix)]
+
+
+def socketcan_rows(robot: RobotConfig, root: Path) -> list[Row]:
+    """Check that the CAN interfaces are there and up."""
+    rows = []
+    names = {bus.channel for bus in robot.can.values() if bus.interface == "socketcan"}
+    for name in sorted(names):
+        fix = f"`ip link set {name} up type can bitrate 1000000`"
+        flags = _text(root / "sys/class/net" / name / "flags")
+        if not flags:
+            fix = "plug the adapter in; `ip link` lists what is there"
+            rows.append(wrong(name, "interface", "not there", "up", fix))
+        else:
+            up = bool(int(flags, 16) & _IFF_UP)
+            rows.append(judged(up, name, "interface", "up" if up else "down", "up", fix))
+    return rows
+
+
+def _cpus() -> Row:
+    count = len(os.sched_getaffinity(0))
+    if count < CPUS_MIN:
+        fix = "another computer, or more of this one's processors (taskset, container)"
+        return warning(SUBJECT, "processors", str(count), f">= {CPUS_MIN}", fix)
+    wanted = f">= {CPUS_MIN}; {CPUS_FOR_1_KHZ} for 1 kHz"
+    return ok(SUBJECT, "processors", str(count), wanted)
+
+
+def _governor(root: Path, *, emulated: bool) -> Row:
+    found = _text(root / "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    if not found:
+        return ok(SUBJECT, "frequency governor", "not told here", "performance")
+    return judged(
+        found == "performance" or emulated,
+        SUBJECT,
+        "frequency governor",
+        found,
+        "performance",
+        "`cpupower frequency-set -g performance`",
+        "a processor that sleeps is late",
+        otherwise=Verdict.WARNING,
+    )
+
+
+def _clock(root: Path, *, emulated: bool) -> Row:
+    found = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
+    return judged(
+        found in CLOCKS or not found or emulated,
+        SUBJECT,
+        "clock source",
+        found or "not told here",
+        f"{CLOCKS[0]} or alike",
+        "look in the kernel's log why it was given up",
+        "every look at the clock costs a system call",
+        otherwise=Verdict.WARNING,
+    )
+
+
+def _real_time(*, emulated: bool) -> Row:
+    what, wanted = "real-time priority", "SCHED_FIFO"
+    if _may_be_fifo():
+        return ok(SUBJECT, what, "SCHED_FIFO allowed", wanted)
+    fallback = priority.short_slice()
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    if fallback == "normal priority":
+        why = "the loops come late when the machine is busy"
+        return warning(SUBJECT, what, f"refused, RTPRIO {limit}", wanted, RTPRIO_FIX, why)
+    if emulated:
+        return ok(SUBJECT, what, f"refused; instead: {fallback}", wanted)
+    why = f"the services take {fallback} instead: late when the machine is busy"
+    return warning(SUBJECT, what, f"refused, RTPRIO {limit}", wanted, RTPRIO_FIX, why)
+
+
+def _may_be_fifo() -> bool:
+    """Try it and go back: limits, capabilities and control groups all have their say."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+    except OSError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
+def _swap(root: Path, *, emulated: bool) -> Row:
+    areas = len(_text(root / "proc/swaps").splitlines()) - 1
+    return judged(
+        areas <= 0 or emulated,
+        SUBJECT,
+        "swap",
+        "none" if areas <= 0 else f"{areas} in use",
+        "none",
+        "`swapoff -a`",
+        "the services lock no memory: a page that was swapped out stops a loop",
+        otherwise=Verdict.WARNING,
+    )
+
+
+def _libusb() -> Row:
+    try:
+        ctypes.CDLL("libusb-1.0.so.0")
+    except OSError:
+        fix = "`apt install libusb-1.0-0`"
+        return wrong("USB", "libusb-1.0", "not found", "installed", fix, "no ODrive over USB")
+    return ok("USB", "libusb-1.0", "installed", "installed")
+
+
+def _text(path: Path) -> str:
+    """Return what a small file of the kernel says; "" if it is not there."""
+    try:
+        return path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""

@@ -1,0 +1,300 @@
+"""Moving one axis of one module a little and back, by the drive's own loop: law and judgement.
+
+The law, the gate and the drive's targets are the joint service's, so a sign that is right here
+is right there. What differs is the force: the drive's own current limit is set so that no motor
+gives more than the torque asked for allows, whatever happens to this process. Pure; `jog_drive`
+has the clock and the drive.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import msgspec
+
+from services.joint import law
+from services.joint.differential import joint_from_motor
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.gate import GateLimits, gate, limits_of
+from services.joint.onboard import OnboardLaw
+from shared.clock import NS_PER_S
+from shared.config import RobotConfig
+from shared.exceptions import DriveError
+from shared.joints import AXES, kind_of
+from shared.messages import Pair
+
+SETTLE_S: Final = 0.7
+"""Held where it is before it moves, and again afterwards."""
+VEL_LIMIT: Final = 3.0
+"""turn/s at the motor, at least; a drive that is faster disarms by itself (OVERSPEED)."""
+VEL_FACTOR: Final = 5.0
+"""Of the fastest that is asked for, where that is more."""
+APART_MAX: Final = 0.15
+"""rad between reference and joint: no friction explains it."""
+OVER_TORQUE: Final = 0.98
+"""Of the torque limit, in the sum of both axes, is at the limit."""
+OVER_TORQUE_S: Final = 0.2
+SILENT_S: Final = 0.2
+"""Without a sample for so long, nobody knows where the joint is."""
+STRAYED_MAX: Final = 0.05
+"""rad that a limp joint may have moved between the look and the arming."""
+TRAVEL_SHARE: Final = 0.25
+"""Of what was asked, the travel may be more or less."""
+LAG_MAX: Final = 0.02
+"""rad between reference and joint, beyond what its load bends it at rest."""
+SIBLING_MAX: Final = 0.02
+"""rad that the other axis may move."""
+
+
+class Plan(NamedTuple):
+    """What is to be done."""
+
+    axis: int
+    """0: phi, 1: theta."""
+    by: float
+    """rad, there and back."""
+    period_s: float
+    """Of one there and back."""
+    cycles: int
+    torque_limit: float
+    """N m at the joint: |tau_phi| + |tau_theta|."""
+
+
+class Sample(NamedTuple):
+    """One cycle."""
+
+    t_s: float
+    """Since the drive was armed."""
+    q_ref: Pair
+    q: Pair
+    tau: Pair
+    """What the drive was asked for at this sample, N m at the joint."""
+
+
+class Row(NamedTuple):
+    """One line of the verdict."""
+
+    what: str
+    value: str
+    wanted: str
+    """"" if it is told only."""
+    good: bool
+
+
+def gentle(robot: RobotConfig, plan: Plan) -> RobotConfig:
+    """Return the robot with its drives limited to the plan's torque and speed.
+
+    A motor's torque is at most T / 2N, so that |tau_phi| + |tau_theta| <= T in the drive.
+
+    Raises:
+        DriveError: the torque limit is beyond the robot's, or too small to be set.
+    """
+    drive, joint = robot.drive, robot.joint
+    per_ampere = 2.0 * joint.gear_ratio * drive.torque_constant
+    most = min(joint.tau_module_max, drive.current_lim * per_ampere)
+    if not per_ampere <= plan.torque_limit <= most:
+        raise DriveError(
+            f"--torque-limit {plan.torque_limit:g}: {per_ampere:.1f} .. {most:.1f} N m are right "
+            "(one ampere, and what the robot file allows)"
+        )
+    asked = math.pi * abs(plan.by) / plan.period_s * joint.gear_ratio / (2.0 * math.pi)
+    speed = min(drive.vel_limit, max(VEL_LIMIT, VEL_FACTOR * asked))
+    limited = msgspec.structs.replace(
+        drive, current_lim=plan.torque_limit / per_ampere, vel_limit=speed
+    )
+    return msgspec.structs.replace(robot, drive=limited)
+
+
+def outside(robot: RobotConfig, module: str, plan: Plan, q: Pair) -> str:
+    """Return why the joint may not go where the plan leads it from q, rad; "" if it may."""
+    limits = limits_of(robot, module)
+    for axis, (low, high) in enumerate((limits.phi, limits.theta)):
+        to = q[axis] + (plan.by if axis == plan.axis else 0.0)
+        if not low <= q[axis] <= high:
+            return (
+                f"{AXES[axis]} is at {q[axis]:.3f} rad, outside of {low:g} .. {high:g} rad; bring "
+                "it inside by hand, or correct its zero (`xrl zero`)"
+            )
+        if not low <= to <= high:
+            return (
+                f"{AXES[axis]} is at {q[axis]:.3f} rad and would go to {to:.3f}, outside of "
+                f"{low:g} .. {high:g} rad; jog the other way (--by {-plan.by:g})"
+            )
+    return ""
+
+
+def what_to_see(module: str, axis: int, by: float) -> str:
+    """Return what a person sees if the joint turns the right way.
+
+    A positive angle leans the part above the joint forward (theta) or to the right (phi)
+    against the part below; below a torso that hangs, the lower part swings the same way.
+    """
+    kind, positive = kind_of(module), by > 0.0
+    upper = {"ankle": "shin", "knee": "thigh", "hip": "torso"}[kind]
+    if axis == 1:
+        way = "forward" if positive else "back"
+        foot = "the toes point up" if positive else "the toes point down"
+    else:
+        way = "to its right" if positive else "to its left"
+        foot = f"the sole turns its {'right' if positive else 'left'} edge up"
+    lower = {"ankle": foot, "knee": f"the shin swings {way}", "hip": f"the thigh swings {way}"}
+    return f"the {upper} leans {way}; where the torso hangs, {lower[kind]}"
+
+
+class Jog:
+    """The law of one jog and its memory, cycle by cycle.
+
+    Attributes:
+        trouble: why it was stopped; "" while all is well.
+        done: the motion is over.
+        samples: what has been.
+    """
+
+    def __init__(self, robot: RobotConfig, module: str, plan: Plan, q: Pair, now_ns: int) -> None:
+        """Begin at q, rad, with a drive that has just been armed.
+
+        Args:
+            robot: as `gentle` made it.
+            module: which.
+            plan: what to do.
+            q: where the joint was found.
+            now_ns: monotonic time.
+        """
+        stand = robot.stand_gains(module)
+        self._k_p, self._k_d = stand.k_p, stand.k_d
+        limits = limits_of(robot, module)
+        self._limits: GateLimits = msgspec.structs.replace(
+            limits, tau_module_max=min(plan.torque_limit, limits.tau_module_max)
+        )
+        self._gear_ratio = robot.joint.gear_ratio
+        self._onboard = OnboardLaw(robot.joint.gear_ratio, robot.drive.vel_limit)
+        self._plan, self._q_start = plan, q
+        self._start_ns = self._heard_ns = now_ns
+        self._at_limit_s: float | None = None
+        self._tau: Pair = law.ZERO
+        self.trouble = ""
+        self.done = False
+        self.samples: list[Sample] = []
+
+    def step(self, now_ns: int, reading: DriveReading | None) -> MotorTarget | None:
+        """Return what the drive is to do now; None where it is left as it is, or to be idled.
+
+        Args:
+            now_ns: monotonic time.
+            reading: the newest sample, counted from the joint's zero; None if none came.
+        """
+        t_s = (now_ns - self._start_ns) / NS_PER_S
+        if reading is None:
+            if now_ns - self._heard_ns > SILENT_S * NS_PER_S:
+                self.trouble = f"no sample of the drive for {SILENT_S:g} s"
+            return None
+        self._heard_ns = now_ns
+        if reading.status is not DriveStatus.ARMED:
+            self.trouble = f"the drive is {reading.status.name}, error 0x{reading.error:x}"
+            return None
+        q = joint_from_motor(reading.pos_turns, self._gear_ratio)
+        v = joint_from_motor(reading.vel_turns, self._gear_ratio)
+        q_ref, v_ref = reference(self._plan, self._q_start, t_s)
+        setpoint = law.Setpoint(q_ref, v_ref, law.ZERO, law.ZERO, self._k_p, self._k_d)
+        self._tau = gate(law.torque(setpoint, q, v), q, self._tau, self._limits)
+        self.samples.append(Sample(t_s, q_ref, q, self._tau))
+        self.trouble = self._watch(t_s, q_ref, q)
+        self.done = t_s > duration_s(self._plan)
+        if self.trouble:
+            return None
+        return self._onboard.target(setpoint, self._tau, reading.pos_turns, reading.vel_turns)
+
+    def _watch(self, t_s: float, q_ref: Pair, q: Pair) -> str:
+        """Return what speaks against going on; "" if nothing does."""
+        for axis in (0, 1):
+            if not abs(q[axis] - q_ref[axis]) <= APART_MAX:
+                return (
+                    f"{AXES[axis]} is at {q[axis]:.3f} rad where {q_ref[axis]:.3f} was asked: "
+                    f"more than {APART_MAX:g} rad apart"
+                )
+        limit = self._limits.tau_module_max
+        if abs(self._tau[0]) + abs(self._tau[1]) < OVER_TORQUE * limit:
+            self._at_limit_s = None
+        elif self._at_limit_s is None:
+            self._at_limit_s = t_s
+        elif t_s - self._at_limit_s > OVER_TORQUE_S:
+            return (
+                f"at the torque limit of {limit:g} N m for {OVER_TORQUE_S:g} s: something is in "
+                "the way, or the load needs more (--torque-limit)"
+            )
+        return ""
+
+
+def duration_s(plan: Plan) -> float:
+    """Return how long the whole takes."""
+    return SETTLE_S + plan.cycles * plan.period_s + SETTLE_S
+
+
+def reference(plan: Plan, q_start: Pair, t_s: float) -> tuple[Pair, Pair]:
+    """Return q_ref, rad, and v_ref, rad/s: q + by/2 (1 - cos) along the axis, between two rests."""
+    moving_s = t_s - SETTLE_S
+    if not 0.0 <= moving_s <= plan.cycles * plan.period_s:
+        return q_start, law.ZERO
+    omega = 2.0 * math.pi / plan.period_s
+    way = 0.5 * plan.by * (1.0 - math.cos(omega * moving_s))
+    rate = 0.5 * plan.by * omega * math.sin(omega * moving_s)
+    phi, theta = q_start
+    if plan.axis == 0:
+        return (phi + way, theta), (rate, 0.0)
+    return (phi, theta + way), (0.0, rate)
+
+
+def judge(samples: list[Sample], plan: Plan) -> list[Row]:
+    """Return the verdict on a jog that came to its end."""
+    axis, other = plan.axis, 1 - plan.axis
+    rest = [s for s in samples if s.t_s < SETTLE_S][-20:]
+    moving = [s for s in samples if SETTLE_S <= s.t_s <= duration_s(plan) - SETTLE_S]
+    if not rest or not moving:
+        return [Row("samples", f"{len(rest)} at rest, {len(moving)} moving", "some of both", False)]
+    q_rest = _mean([s.q[axis] for s in rest])
+    sag = q_rest - rest[-1].q_ref[axis]
+    sign = math.copysign(1.0, plan.by)
+    travel = sign * max(sign * (s.q[axis] - q_rest) for s in moving)
+    lag = max(abs(s.q[axis] - s.q_ref[axis] - sag) for s in moving)
+    still = _mean([s.q[other] for s in rest])
+    strayed = max(abs(s.q[other] - still) for s in moving)
+    peak = max(abs(s.tau[0]) + abs(s.tau[1]) for s in samples)
+    return [
+        Row(
+            f"{AXES[axis]} went",
+            f"{travel:+.4f} rad",
+            f"{plan.by:+.4f} within {TRAVEL_SHARE:.0%}",
+            abs(travel - plan.by) <= TRAVEL_SHARE * abs(plan.by),
+        ),
+        Row("largest lag", f"{lag:.4f} rad", f"<= {LAG_MAX:g}", lag <= LAG_MAX),
+        Row(
+            f"{AXES[other]} strayed",
+            f"{strayed:.4f} rad",
+            f"<= {SIBLING_MAX:g}",
+            strayed <= SIBLING_MAX,
+        ),
+        Row("torque at rest", f"{_mean([s.tau[axis] for s in rest]):+.2f} N m", "", True),
+        Row("largest torque, both axes", f"{peak:.2f} N m", f"< {plan.torque_limit:g}", True),
+        Row("friction, dry and viscous", f"{friction(moving, plan):.2f} N m", "", True),
+    ]
+
+
+def friction(moving: list[Sample], plan: Plan) -> float:
+    """Return half of what the way there takes more than the way back, N m.
+
+    Where it is fast; gravity and springs, the same on both ways, cancel.
+    """
+    omega = 2.0 * math.pi / plan.period_s
+    sign = math.copysign(1.0, plan.by)
+    there: list[float] = []
+    back: list[float] = []
+    for s in moving:
+        sine = math.sin(omega * (s.t_s - SETTLE_S))
+        if abs(sine) > 0.5:
+            (there if sine > 0.0 else back).append(sign * s.tau[plan.axis])
+    return 0.5 * (_mean(there) - _mean(back)) if there and back else math.nan
+
+
+def _mean(values: list[float]) -> float:
+    return math.fsum(values) / len(values)

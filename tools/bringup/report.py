@@ -1,0 +1,116 @@
+"""The doctor's findings for the terminal and for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import chain
+from typing import Final
+
+import msgspec
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.markup import escape
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from tools.bringup.rows import Row, Verdict, count, merged
+from tools.bringup.survey import Groups
+
+WIDE: Final = 110
+"""Columns from which what to do stands beside a finding; else it stands below its table."""
+COLOURS: Final = {Verdict.OK: "green", Verdict.WARNING: "yellow", Verdict.WRONG: "bold red"}
+NAME_MAX: Final = 22
+"""Longest name on one line."""
+NAMED_MAX: Final = 6
+"""Findings that the last line names."""
+
+
+class Report(msgspec.Struct, frozen=True):
+    """What `xrl doctor --json` prints."""
+
+    ok: bool
+    """Nothing is wrong; there may be warnings."""
+    wrong: int
+    warnings: int
+    groups: dict[str, list[Row]]
+
+
+def report_of(groups: Groups) -> Report:
+    """Return the findings with their counts."""
+    rows = list(chain(*groups.values()))
+    wrong = count(rows, Verdict.WRONG)
+    return Report(wrong == 0, wrong, count(rows, Verdict.WARNING), groups)
+
+
+def show(console: Console, groups: Groups, *, verbose: bool) -> None:
+    """Print the findings, and one line for all of them."""
+    for title, rows in groups.items():
+        console.print(_group(title, rows if verbose else merged(rows), console.width))
+    console.print(Text(verdict_line(groups), style=COLOURS[_worst(chain(*groups.values()))]))
+
+
+def verdict_line(groups: Groups) -> str:
+    """Return "all ok", or how much is wrong and what: the command's answer in a line."""
+    rows = list(chain(*groups.values()))
+    wrong = [row for row in rows if row.verdict is Verdict.WRONG]
+    warnings = [row for row in rows if row.verdict is Verdict.WARNING]
+    noted = f"{len(warnings)} warning{'s' * (len(warnings) != 1)}: {_names(warnings)}"
+    if wrong:
+        said = f"{len(wrong)} wrong: {_names(wrong)}"
+        return f"{said}; {noted}" if warnings else said
+    return f"nothing wrong; {noted}" if warnings else "all ok"
+
+
+def _group(title: str, rows: list[Row], width: int) -> RenderableType:
+    wide = width >= WIDE
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    names = {row.what: _broken(row.what) for row in rows}
+    table.add_column("part", no_wrap=True, min_width=12)
+    table.add_column("what", no_wrap=True, min_width=16)
+    table.add_column("found", overflow="fold")
+    table.add_column("wanted", overflow="fold")
+    table.add_column("", no_wrap=True, min_width=max(len(row.verdict) for row in rows))
+    wide = wide and any(row.fix for row in rows)
+    if wide:
+        table.add_column("what to do", overflow="fold")
+    for row in rows:
+        cells = [escape(cell) for cell in (row.subject, names[row.what], row.found, row.wanted)]
+        cells.append(f"[{COLOURS[row.verdict]}]{row.verdict}[/]")
+        table.add_row(*cells, *([escape(row.fix)] if wide else []))
+    notes = [f"{row.subject} {row.what}: {note}" for row in rows if (note := _note(row, wide=wide))]
+    below = [Padding(Text(note), (0, 1, 0, 2)) for note in notes]
+    return Group(table, *below, *([Text("")] if below else []))
+
+
+def _broken(name: str) -> str:
+    """Return a setting's name on two lines: it is too long for a column."""
+    if len(name) <= NAME_MAX or "." not in name:
+        return name
+    head, _, tail = name.rpartition(".")
+    return f"{head}.\n{tail}"
+
+
+def _note(row: Row, *, wide: bool) -> str:
+    """Return what is said of a row below the table: why, and what to do if it has no column."""
+    fix = "" if wide else row.fix
+    return f"{fix} ({row.why})" if fix and row.why else fix or row.why
+
+
+def _names(rows: list[Row]) -> str:
+    named = [f"{row.subject} {_short(row.what)}" for row in rows[:NAMED_MAX]]
+    more = len(rows) - len(named)
+    return ", ".join(named) + (f" and {more} more" if more else "")
+
+
+def _short(name: str) -> str:
+    """Return a setting's own name, without what it is below; any other name as it is."""
+    return name.rpartition(".")[2] if "config." in name else name
+
+
+def _worst(rows: Iterable[Row]) -> Verdict:
+    verdicts = {row.verdict for row in rows}
+    for verdict in (Verdict.WRONG, Verdict.WARNING):
+        if verdict in verdicts:
+            return verdict
+    return Verdict.OK

@@ -1,0 +1,67 @@
+"""Joint angles of a robot that stands, or hangs, as it stands: for zeroing all at once."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from services.planner.inverse_kinematics import InverseKinematics, in_words
+from services.planner.kinematics import Kinematics
+from shared.config import RobotConfig
+from shared.exceptions import RunError
+from shared.joints import MODULE_INDEX, MODULES
+from shared.messages import Pair
+from shared.robot_model import stand_pose
+
+HEIGHT_TOLERANCE: Final = 1e-7
+"""m of torso height"""
+ROUNDS: Final = 20
+"""Of the search for the COM height that goes with a torso height; three are usual."""
+
+
+class Standing(NamedTuple):
+    """An upright stand, soles flat, COM over the ankles."""
+
+    q: dict[str, Pair]
+    """(phi, theta) of each module, rad."""
+    hips_forward: float
+    """Of the ankles, m: where the hips are when the COM is over the ankles."""
+
+
+def standing(robot: RobotConfig, height: float) -> Standing:
+    """Return the stand with the torso level at a height.
+
+    Args:
+        robot: the robot.
+        height: of the torso's origin (midway between the hips) above the ankles, m.
+
+    Raises:
+        RunError: the legs do not reach there within their limits.
+    """
+    longest = robot.geometry.l1 + robot.geometry.l2
+    if not 0.0 < height < longest:
+        raise RunError(
+            f"--standing {height:g}: the hips are between 0 and {longest:g} m above the ankles"
+        )
+    limits = np.array(robot.joint_limits())
+    kinematics = Kinematics(robot)
+    ik = InverseKinematics(kinematics, limits)
+    ik.q[:] = stand_pose(robot, height)
+    kinematics.update(ik.q)
+    p_ref = np.array([0.0, 0.0, kinematics.p[2], 0.0, 0.0, 0.0])
+    slope, before = 1.0, None  # d COM height / d torso height, by the last two rounds
+    for _ in range(ROUNDS):
+        reach = ik.solve_from_anywhere(p_ref)
+        if not reach.converged:
+            raise RunError(f"--standing {height:g}: {in_words(reach, p_ref, limits)}")
+        z, z_com = float(kinematics.r_torso[2]), float(p_ref[2])
+        if abs(height - z) <= HEIGHT_TOLERANCE:
+            angles = ik.q.reshape(len(MODULES), 2).tolist()
+            q = {module: (angles[i][0], angles[i][1]) for module, i in MODULE_INDEX.items()}
+            return Standing(q, float(kinematics.r_torso[0]))
+        if before is not None and z != before[0]:
+            slope = (z_com - before[1]) / (z - before[0])
+        before = (z, z_com)
+        p_ref[2] += slope * (height - z)
+    raise RunError(f"--standing {height:g}: no stand found at this height")

@@ -1,0 +1,183 @@
+"""The doctor's round: every check, in groups; nothing is moved and nothing is changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from shared import drive_settings
+from shared.config import RobotConfig, expand
+from shared.config_sections import CanConfig
+from shared.exceptions import DriveError, FleetError
+from shared.joints import MODULES
+from tools.bringup import check_board, check_can, check_machine, check_robot
+from tools.bringup.boards import FIRMWARE, STATUS, Board, Found, number
+from tools.bringup.can_ear import BusHeard, listen, long_enough
+from tools.bringup.reach import boards_on_usb, drives_within_reach, is_up
+from tools.bringup.rows import Row, Verdict, judged, ok
+from tools.supervision.fleet import is_simulated
+
+Groups = dict[str, list[Row]]
+"""Rows by the heading that they stand under."""
+Say = Callable[[str], None]
+
+COMPUTER: Final = "this computer"
+ROBOT: Final = "robot file and bus"
+CAN: Final = "CAN"
+DRIVES: Final = "drives, over USB"
+HARNESS: Final = "harness"
+GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS)
+
+
+def survey(
+    robot: RobotConfig, config_path: Path, run_dir: Path, plants: Sequence[str], say: Say
+) -> Groups:
+    """Check everything and return what was found.
+
+    Args:
+        robot: what stands in the robot file.
+        config_path: the robot file.
+        run_dir: of the fleet; if none is up, an emulated robot's simulator runs there meanwhile.
+        plants: settings that the emulated drives have kept.
+        say: is told what is being looked at.
+
+    Raises:
+        FleetError: the simulator cannot be started.
+    """
+    fleet_is_up = is_up(run_dir)
+    say("this computer, the robot file, the bus")
+    groups: Groups = {
+        COMPUTER: check_machine.machine_rows(robot),
+        ROBOT: [
+            *check_robot.robot_rows(robot, config_path),
+            *check_robot.endpoint_rows(robot, run_dir, fleet_is_up=fleet_is_up),
+        ],
+    }
+    services_up = bool(check_robot.joint_services(check_robot.services_up(robot, run_dir)))
+    if is_simulated(robot) and not fleet_is_up:
+        say("starting the simulator: the drives are emulated, and no fleet is up")
+    with drives_within_reach(robot, config_path, run_dir, plants):
+        heard = _listen(robot, run_dir, services_up=services_up, say=say)
+        say("the drives over USB")
+        groups[DRIVES] = _usb(robot, run_dir, heard, services_up=services_up)
+    if robot.joint_service.driver == "odrive_can":
+        groups[CAN] = [
+            row
+            for module in MODULES
+            for row in check_can.drive_rows(
+                robot,
+                module,
+                heard[robot.module_named(module).bus],
+                services_up=services_up,
+            )
+        ]
+    groups[HARNESS] = check_can.harness_rows(robot, heard[robot.harness.bus])
+    return {name: groups[name] for name in GROUPS if name in groups}
+
+
+def _listen(
+    robot: RobotConfig, run_dir: Path, *, services_up: bool, say: Say
+) -> dict[str, BusHeard]:
+    """Listen to every bus of the robot, one after the other."""
+    heard = {}
+    on_usb = robot.joint_service.driver == "odrive_usb"
+    for name, nodes in check_can.bus_nodes(robot).items():
+        if on_usb and name != robot.harness.bus:
+            continue
+        say(f"CAN bus {name}")
+        bus = robot.can[name]
+        heard[name] = listen(
+            CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir)),
+            nodes,
+            ask=not services_up,
+            cells=name == robot.harness.bus,
+            seconds=long_enough(robot.drive.heartbeat_period_ms if nodes else 0),
+        )
+    return heard
+
+
+def _usb(
+    robot: RobotConfig, run_dir: Path, heard: dict[str, BusHeard], *, services_up: bool
+) -> list[Row]:
+    """Check every module's board; what of it cannot be reached over USB is a row too."""
+    rows: list[Row] = []
+    try:
+        with boards_on_usb(robot, run_dir, MODULES) as found:
+            for module in MODULES:
+                rows += _module(robot, module, found, services_up=services_up)
+                rows += _position(robot, module, found, heard)
+    except (DriveError, FleetError) as error:
+        found_out, _, fix = str(error).removeprefix("USB: ").partition("; ")
+        rows.append(_unreached(robot, "all drives", found_out, fix or "see there"))
+    return rows
+
+
+def _module(robot: RobotConfig, module: str, found: Found, *, services_up: bool) -> list[Row]:
+    serial = robot.module_named(module).serial_number.upper()
+    board = found.boards.get(serial)
+    if board is None:
+        return [_unreached(robot, module, *_why_not(robot, serial, found, services_up=services_up))]
+    try:
+        return _board(robot, module, board, services_up=services_up)
+    except DriveError as error:
+        return [_unreached(robot, module, str(error), "plug it in again; look at its cable")]
+
+
+def _board(robot: RobotConfig, module: str, board: Board, *, services_up: bool) -> list[Row]:
+    """Check a board that is connected."""
+    rows = [
+        ok(module, "USB", board.serial_number, "there"),
+        check_board.firmware_row(module, board.firmware),
+    ]
+    if board.firmware[:2] != FIRMWARE[:2]:
+        return rows
+    settings = board.read(board.settings)
+    status = board.read(STATUS)
+    wanted = drive_settings.of_module(robot, module)
+    levels = check_board.trip_levels_of(settings)
+    return [
+        *rows,
+        *check_board.settings_rows(module, wanted, settings),
+        *check_board.error_rows(module, status),
+        *check_board.condition_rows(module, status, levels, services_up=services_up),
+    ]
+
+
+def _position(
+    robot: RobotConfig, module: str, found: Found, heard: dict[str, BusHeard]
+) -> list[Row]:
+    """Judge where a module is, by its bus if it is on one, else by its board."""
+    bus = heard.get(robot.module_named(module).bus)
+    turns = check_can.positions(robot, module, bus) if bus else None
+    board = found.boards.get(robot.module_named(module).serial_number.upper())
+    if turns is None and board is not None:
+        try:
+            names = [f"{axis}.encoder.pos_estimate" for axis in drive_settings.AXES]
+            values = board.read(names)
+            turns = (number(values, names[0]), number(values, names[1]))
+        except DriveError:
+            return []  # its own row says so
+    return [] if turns is None else check_board.position_rows(module, turns, robot)
+
+
+def _why_not(
+    robot: RobotConfig, serial: str, found: Found, *, services_up: bool
+) -> tuple[str, str]:
+    """Return why a module's board was not reached, and what to do."""
+    strangers = ", ".join(found.strangers)
+    there = f"; plugged in and in no [[module]]: {strangers}" if strangers else ""
+    if not serial:
+        return f"no serial_number{there}", "`serial_number` in its [[module]], by `odrivetool`"
+    trouble = f"{serial}: {found.troubles.get(serial, 'not there')}{there}"
+    if services_up and robot.joint_service.driver == "odrive_usb":
+        return trouble, "its joint service has the USB: `xrl down` first"
+    return trouble, "plug its USB cable in; supply on; libusb-1.0 and the udev rule are there"
+
+
+def _unreached(robot: RobotConfig, subject: str, found: str, fix: str) -> Row:
+    """Return the row of a board that USB does not reach: its settings stay unknown."""
+    on_usb = robot.joint_service.driver == "odrive_usb"
+    verdict = Verdict.WRONG if on_usb else Verdict.WARNING
+    why = "its settings are not read back" + ("" if on_usb else ": CAN of firmware 0.5 cannot")
+    return judged(False, subject, "USB", found, "there", fix, why, otherwise=verdict)

@@ -1,0 +1,269 @@
+"""ODrives over USB, by the genuine `odrive` package, for callers that may wait.
+
+The package lives on an asyncio loop in its own thread; here every call is handed to it and
+waited for, with a time limit. Who imports this file needs a libusb-1.0 (`UsbBus`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Coroutine, Iterable, Mapping
+from concurrent.futures import CancelledError
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from typing import Any, Final, TypeVar
+
+from odrive.async_tree import AsyncProperty
+from odrive.device_manager import (
+    DeviceManagerDelegate,
+    FilterSpec,
+    Subscription,
+    get_device_manager,
+)
+from odrive.libodrive import DeviceType
+from odrive.runtime_device import RuntimeDevice
+
+from shared.drive_settings import AXES
+from shared.exceptions import DriveError
+from tools.bringup.boards import Board, Found, Value, firmware_in_words, number
+
+LIBUSB_FIX: Final = "apt install libusb-1.0-0"
+
+FIND_S: Final = 3.0
+"""Longest wait for boards to show up: discovery itself takes a few tenths."""
+CONNECT_S: Final = 15.0
+"""A board that was never seen sends its whole table of endpoints first."""
+TRANSFER_S: Final = 5.0
+LEAVE_S: Final = 5.0
+"""From `save_configuration` until the board is gone: it writes its flash first."""
+RETURN_S: Final = 15.0
+"""Until it is back."""
+
+_POLL_S = 0.02
+_ENDPOINT = "endpoint_ref"
+
+T = TypeVar("T")
+
+
+class UsbBus:
+    """The ODrives on this machine's USB.
+
+    Raises:
+        DriveError: there is no libusb-1.0.
+    """
+
+    def __init__(self) -> None:
+        try:
+            self._manager = get_device_manager(force_background_thread=True)
+        except OSError as error:
+            raise DriveError(
+                f"USB: {error}; the odrive package needs the system's libusb-1.0: {LIBUSB_FIX}"
+            ) from error
+        self._present: dict[str, Any] = {}
+        """What is plugged in now, by serial number; written by the package's loop."""
+        self._boards: list[UsbBoard] = []
+        self._subscription: Subscription = self.run(self._watch(), TRANSFER_S)
+
+    def open(self, serial_numbers: Iterable[str], timeout_s: float = FIND_S) -> Found:
+        """Connect to boards by their serial numbers, to all at once.
+
+        Args:
+            serial_numbers: 12 hexadecimal digits each.
+            timeout_s: longest wait until all are plugged in.
+        """
+        wanted = [serial.upper() for serial in serial_numbers]
+        results = self.run(self._connect_all(wanted, timeout_s), timeout_s + CONNECT_S + TRANSFER_S)
+        boards: dict[str, Board] = {}
+        troubles: dict[str, str] = {}
+        for serial, result in zip(wanted, results, strict=True):
+            if isinstance(result, RuntimeDevice):
+                board = UsbBoard(self, result)
+                self._boards.append(board)
+                boards[serial] = board
+            else:
+                troubles[serial] = result
+        return Found(boards, troubles, tuple(sorted(set(self._present) - set(wanted))))
+
+    def close(self) -> None:
+        """Release every board; a later call on one fails."""
+        with contextlib.suppress(DriveError):
+            self.run(self._leave(), TRANSFER_S)
+
+    def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float) -> T:
+        """Return what a coroutine on the package's loop returns.
+
+        Raises:
+            DriveError: it fails, or not in this time.
+        """
+        task = asyncio.run_coroutine_threadsafe(coroutine, self._manager.loop)
+        try:
+            return task.result(timeout_s)
+        except (FutureTimeoutError, CancelledError):
+            raise DriveError(f"USB: no answer within {timeout_s:g} s") from None
+        except DriveError:
+            raise
+        except Exception as error:
+            raise DriveError(f"USB: {in_words(error)}") from error
+        finally:
+            task.cancel()
+
+    async def connect_again(self, before: RuntimeDevice) -> RuntimeDevice:
+        """Wait until a board that is restarting has gone and come back, and connect to it."""
+        serial = before.serial_number
+        if not await self._until(lambda: self._present.get(serial) is not before.device, LEAVE_S):
+            raise DriveError(
+                f"ODrive {serial} did not restart {LEAVE_S:g} s after save_configuration: "
+                "nothing may be saved; is one of its axes armed?"
+            )
+        if not await self._until(lambda: serial in self._present, RETURN_S):
+            raise DriveError(f"ODrive {serial} did not come back {RETURN_S:g} s after its restart")
+        result = await self._connect(serial)
+        if isinstance(result, str):
+            raise DriveError(f"ODrive {serial} restarted, and then: {result}")
+        return result
+
+    async def _watch(self) -> Subscription:
+        """Keep `_present` up to date from now on."""
+        delegate: Any = DeviceManagerDelegate()
+        delegate.on_found_device = self._on_found
+        delegate.on_lost_device = self._on_lost
+        spec = FilterSpec(device_types=[DeviceType.RUNTIME])
+        return self._manager.subscribe(spec, delegate, debug_name="xrl")
+
+    def _on_found(self, device: Any) -> None:
+        self._present[device.info.serial_number] = device
+
+    def _on_lost(self, device: Any) -> None:
+        serial = device.info.serial_number
+        if self._present.get(serial) is device:
+            del self._present[serial]
+
+    async def _until(self, claim: Callable[[], bool], timeout_s: float) -> bool:
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        while not claim():
+            if loop.time() > deadline:
+                return False
+            await asyncio.sleep(_POLL_S)
+        return True
+
+    async def _connect_all(
+        self, serials: Iterable[str], timeout_s: float
+    ) -> list[RuntimeDevice | str]:
+        wanted = set(serials)
+        await self._until(lambda: wanted <= set(self._present), timeout_s)
+        return await asyncio.gather(*(self._connect(serial) for serial in serials))
+
+    async def _connect(self, serial: str) -> RuntimeDevice | str:
+        """Return a board, or why there is none."""
+        device = self._present.get(serial)
+        if device is None:
+            return "not plugged in"
+        try:
+            connected = await asyncio.wait_for(self._manager.use_connection(device), CONNECT_S)
+        except TimeoutError:
+            return f"plugged in, but silent for {CONNECT_S:g} s"
+        except Exception as error:  # noqa: BLE001 - the package raises bare Exceptions
+            return f"plugged in, but: {in_words(error)}"
+        return connected if isinstance(connected, RuntimeDevice) else "no ODrive that runs"
+
+    async def _leave(self) -> None:
+        for board in self._boards:
+            with contextlib.suppress(Exception):  # it may be gone already
+                self._manager.release_connection(board.device)
+        self._boards.clear()
+        self._manager.unsubscribe(self._subscription)
+
+
+class UsbBoard:
+    """One ODrive on USB; implements `tools.bringup.boards.Board`."""
+
+    def __init__(self, bus: UsbBus, device: RuntimeDevice) -> None:
+        self._bus = bus
+        self.device = device
+
+    @property
+    def serial_number(self) -> str:
+        """See `Board`."""
+        return str(self.device.serial_number)
+
+    @property
+    def firmware(self) -> tuple[int, int, int]:
+        """See `Board`; 0.0.0 if it does not tell."""
+        major, minor, revision = self.device.fw_version or (0, 0, 0)
+        return int(major), int(minor), int(revision)
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """See `Board`."""
+        return tuple(
+            name
+            for name, entry in self.device.properties.items()
+            if entry.writable and ".config." in f".{name}."
+        )
+
+    def read(self, names: Iterable[str]) -> dict[str, Value]:
+        """See `Board`."""
+        present = [name for name in names if name in self.device.properties]
+        values = self._run(self.device.read_multiple(present), "read")
+        return {name: self._named(value) for name, value in zip(present, values, strict=True)}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        """See `Board`.
+
+        Raises:
+            DriveError: also if the board does not have one of them; nothing is written then.
+        """
+        missing = [name for name in values if name not in self.device.properties]
+        if missing:
+            raise DriveError(
+                f"ODrive {self.serial_number}, firmware {firmware_in_words(self.firmware)}: "
+                f"it has no {missing[0]}"
+            )
+        self._run(self._write(values), "write")
+
+    def save(self) -> None:
+        """See `Board`."""
+        self.device = self._run(self._save(), "save_configuration", LEAVE_S + RETURN_S + CONNECT_S)
+
+    def states(self) -> tuple[int, int]:
+        """See `Board`."""
+        names = [f"{axis}.current_state" for axis in AXES]
+        values = self.read(names)
+        first, second = (int(number(values, name)) for name in names)
+        return first, second
+
+    def _run(
+        self, coroutine: Coroutine[Any, Any, T], what: str, timeout_s: float = TRANSFER_S
+    ) -> T:
+        try:
+            return self._bus.run(coroutine, timeout_s)
+        except DriveError as error:
+            raise DriveError(f"ODrive {self.serial_number}: {what}: {error}") from error
+
+    async def _write(self, values: Mapping[str, Value]) -> None:
+        for name, value in values.items():
+            entry = self.device.properties[name]
+            if entry.codec_name == _ENDPOINT and isinstance(value, str):
+                await self.device.write(entry, self.device.get_async_property(value))
+            else:
+                await self.device.write(entry, value)
+
+    async def _save(self) -> RuntimeDevice:
+        # The board restarts before it has answered.
+        with contextlib.suppress(Exception):
+            await asyncio.wait_for(self.device.call_function("save_configuration"), LEAVE_S)
+        return await self._bus.connect_again(self.device)
+
+    def _named(self, value: Any) -> Value:
+        """Return a value as `Value` has it: an endpoint by its name."""
+        if isinstance(value, AsyncProperty):
+            return str(self.device.path_of(value._info))  # noqa: SLF001 - no public way
+        plain: Value = value
+        return plain
+
+
+def in_words(error: BaseException) -> str:
+    """Return one line of what the package raised."""
+    said = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {said[0]}" if said else type(error).__name__

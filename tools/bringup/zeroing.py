@@ -1,0 +1,174 @@
+"""Telling a drive where its joint is: look, judge, set, read back.
+
+Positions here are as the drive itself counts them; `services.joint.drivers.zeroed` says why
+a motor at q = 0 is told a mark and not 0. The functions take a `Drive` that is not wrapped:
+behind the mark an armed drive that has lost its zero would only look unzeroed.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Final, NamedTuple
+
+from services.joint.differential import joint_from_motor, motor_from_joint
+from services.joint.drivers.base import Drive, DriveReading, DriveStatus
+from services.joint.drivers.zeroed import from_zero
+from shared.cansimple import AxisError
+from shared.clock import NS_PER_S, now_ns
+from shared.config import RobotConfig
+from shared.joints import kind_of
+from shared.messages import Pair
+
+LOOK_S: Final = 0.3
+"""A joint is watched for so long before it is taken to be still."""
+ANSWER_S: Final = 3.0
+"""Longest wait for a drive's first words: its link, and a heartbeat of both axes."""
+STILL: Final = 0.05
+"""rad/s; an encoder count in a millisecond is 0.02 rad/s at the joint."""
+MOVED_MAX: Final = 0.005
+"""rad in `LOOK_S`."""
+WITHIN: Final = 0.002
+"""rad; what is read back may differ by this from what was told."""
+HELD_WITHIN: Final = 0.03
+"""rad; the same where its joint service has armed it meanwhile: the joint sags a little."""
+TAKEN_S: Final = 0.1
+"""Samples this soon after a drive was told may be of the time before."""
+SET_S: Final = 0.5
+"""Time for one attempt to read back right; frames may get lost, so there are some."""
+ATTEMPTS: Final = 4
+_READ_S: Final = 0.05
+
+
+class Back(NamedTuple):
+    """What was read back."""
+
+    q: Pair
+    """(phi, theta), rad."""
+    armed: bool
+    """Its joint service has armed it: it is not told again."""
+
+
+class Look(NamedTuple):
+    """What a drive says of itself, over a moment."""
+
+    status: DriveStatus
+    """As the drive is, its zero not considered: ARMED if it is in closed loop."""
+    zeroed: bool
+    q: Pair
+    """(phi, theta) by the zero it has, rad; means nothing if it has none."""
+    speed: float
+    """Largest of the joint, rad/s."""
+    moved: float
+    """Largest way from the first sample to another, rad."""
+    error: int
+    """`AxisError` bits of both axes."""
+
+
+def look(drive: Drive, mark_turns: float, gear_ratio: float) -> Look:
+    """Watch a drive for `LOOK_S`, once it answers.
+
+    Args:
+        drive: as it counts itself.
+        mark_turns: what a motor reads at q = 0.
+        gear_ratio: N of the differential.
+    """
+    answer_by = time.monotonic() + ANSWER_S
+    reading = drive.read(_READ_S)
+    while reading is None or reading.status is DriveStatus.LOST:
+        if time.monotonic() > answer_by:
+            return Look(DriveStatus.LOST, zeroed=False, q=(0.0, 0.0), speed=0.0, moved=0.0, error=0)
+        reading = drive.read(_READ_S)
+    first = newest = reading
+    speed = moved = 0.0
+    errors = reading.error
+    until = time.monotonic() + LOOK_S
+    while time.monotonic() < until:
+        reading = drive.read(_READ_S)
+        if reading is None:
+            continue
+        newest = reading
+        errors |= reading.error
+        rates = joint_from_motor(reading.vel_turns, gear_ratio)
+        speed = max(speed, *map(abs, rates))
+        moved = max(moved, _apart(reading, first, gear_ratio))
+    counted = from_zero(newest, mark_turns)
+    return Look(
+        newest.status,
+        counted.status is not DriveStatus.UNZEROED,
+        joint_from_motor(counted.pos_turns, gear_ratio),
+        speed,
+        moved,
+        errors,
+    )
+
+
+def refusal(seen: Look) -> str:
+    """Return why a drive cannot be zeroed now; "" if it can."""
+    if seen.status is DriveStatus.LOST:
+        return "its drive does not answer; look at its power and its bus (`xrl doctor`)"
+    if seen.status is DriveStatus.ARMED:
+        return "its drive is armed (closed loop); make it idle first"
+    if seen.error & AxisError.ENCODER_FAILED:
+        return "its drive reports an encoder error; repair that first (`xrl doctor`)"
+    if seen.speed > STILL or seen.moved > MOVED_MAX:
+        return (
+            f"it moves: {seen.speed:.2f} rad/s, {seen.moved:.3f} rad in {LOOK_S:g} s; "
+            "hold it still, and again"
+        )
+    return ""
+
+
+def outside(robot: RobotConfig, module: str, q: Pair) -> str:
+    """Return which angle of (phi, theta), rad, is outside of a module's limits; "" if none."""
+    limit = getattr(robot.limits, kind_of(module))
+    for axis, angle, (low, high) in zip(("phi", "theta"), q, (limit.phi, limit.theta), strict=True):
+        if not low <= angle <= high:  # so that a NaN is outside
+            return f"{axis} {angle:g} rad is outside of {low:g} .. {high:g} rad: {limit.why}"
+    return ""
+
+
+def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
+    """Tell both motors where they are; return what the drive then says.
+
+    Args:
+        drive: idle, and as it counts itself.
+        q: where the joint is, (phi, theta), rad.
+        robot: its mark and gear ratio.
+
+    Returns:
+        What was read back, whether it is right or not (`is_right`); None if nothing was.
+
+    Raises:
+        DriveError: the drive cannot be told.
+    """
+    mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
+    m1, m2 = motor_from_joint(q, gear_ratio)
+    back: Back | None = None
+    for _ in range(ATTEMPTS):
+        drive.set_position((m1 + mark, m2 + mark))
+        taken_ns = now_ns() + round(TAKEN_S * NS_PER_S)
+        until = time.monotonic() + SET_S
+        while time.monotonic() < until:
+            reading = drive.read(_READ_S)
+            if reading is None or reading.status is DriveStatus.LOST or reading.t_ns < taken_ns:
+                continue
+            a, b = reading.pos_turns
+            armed = reading.status is DriveStatus.ARMED
+            back = Back(joint_from_motor((a - mark, b - mark), gear_ratio), armed)
+            if armed or is_right(back, q):
+                return back
+    return back
+
+
+def is_right(back: Back | None, q: Pair) -> bool:
+    """Return True if what was read back is what was told."""
+    if back is None:
+        return False
+    within = HELD_WITHIN if back.armed else WITHIN
+    return all(abs(a - b) <= within for a, b in zip(back.q, q, strict=True))
+
+
+def _apart(a: DriveReading, b: DriveReading, gear_ratio: float) -> float:
+    """Return the larger angle between two samples, rad."""
+    (a1, a2), (b1, b2) = a.pos_turns, b.pos_turns
+    return max(map(abs, joint_from_motor((a1 - b1, a2 - b2), gear_ratio)))

@@ -1,0 +1,196 @@
+"""`xrl jog`: move one joint a little and back, on the bench, and judge it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Final
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from services.joint.__main__ import open_drive
+from services.joint.differential import joint_from_motor
+from shared import config
+from shared.config import RobotConfig
+from shared.exceptions import DriveError, FleetError
+from shared.joints import AXES, MODULES
+from tools.bringup import bench
+from tools.bringup.jog_drive import NOT_IDLE, Interrupts, Outcome, first_words, jog_drive
+from tools.bringup.jogging import Plan, Sample, gentle, judge, outside, what_to_see
+from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
+
+BY: Final = 0.05
+PERIOD_S: Final = 2.0
+CYCLES: Final = 2
+TORQUE_LIMIT: Final = 10.0
+EMULATED: Final = 40.0
+"""N m that bend a leg of the emulated robot, which hangs with its soles on the floor."""
+BY_MAX: Final = 0.5
+PERIOD_MIN_S: Final = 0.5
+CYCLES_MAX: Final = 100
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "jog",
+        """
+        xrl jog knee_left
+        xrl jog hip_right --axis phi --by -0.1 --period 4
+        xrl jog knee_left --torque-limit 30     # where its load needs more
+        """,
+    )
+    parser.add_argument("module", choices=MODULES, metavar="MODULE", help="which module")
+    parser.add_argument("--axis", choices=AXES, default="theta", help="default: %(default)s")
+    parser.add_argument(
+        "--by",
+        type=float,
+        default=BY,
+        metavar="RAD",
+        help="how far, and back; positive theta leans forward (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--period",
+        type=float,
+        default=PERIOD_S,
+        metavar="S",
+        help="time of one there and back (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--cycles", type=int, default=CYCLES, metavar="N", help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--torque-limit",
+        type=float,
+        default=TORQUE_LIMIT,
+        metavar="NM",
+        help="of both axes together at the joint; the drive's own current limit is set to it "
+        "(default: %(default)s)",
+    )
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    add_config(parser)
+    add_run_dir(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look, ask, move, idle, judge."""
+    console = Console()
+    plan = plan_of(args)
+    path = bench.robot_file(args)
+    module: str = args.module
+    robot = gentle(config.load_without_schedule(path), plan)
+    refuse_service(robot, args)
+    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
+        if started:
+            console.print(f"its soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
+        drive = open_drive(robot, module, args.run_dir)
+        try:
+            try:
+                reading = first_words(drive)
+            except DriveError as error:
+                raise DriveError(f"{module}: {error}") from None
+            q = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)
+            if why := outside(robot, module, plan, q):
+                raise DriveError(f"{module}: {why}")
+            _introduce(robot, module, plan, console)
+            if not bench.confirm("Is the joint free, and the power switch at hand?", yes=args.yes):
+                console.print("nothing was moved")
+                return 2
+            refuse_service(robot, args)  # a person may take minutes to answer
+            interrupts = Interrupts()
+            with interrupts.kept():
+                outcome = jog_drive(
+                    drive,
+                    robot,
+                    module,
+                    plan,
+                    q_seen=q,
+                    interrupts=interrupts,
+                    progress=lambda sample: console.print(progress(sample, plan)),
+                )
+        finally:
+            drive.close()
+    code = report(outcome, module, plan, console)
+    if interrupts.number:
+        sys.exit(128 + interrupts.number)
+    return code
+
+
+def plan_of(args: argparse.Namespace) -> Plan:
+    """Return what is asked for.
+
+    Raises:
+        DriveError: it is out of range.
+    """
+    if not 0.0 < abs(args.by) <= BY_MAX:
+        raise DriveError(f"--by {args.by:g}: up to {BY_MAX:g} rad either way, and not 0, is right")
+    if not PERIOD_MIN_S <= args.period <= 60.0:
+        raise DriveError(f"--period {args.period:g}: {PERIOD_MIN_S:g} .. 60 s is right")
+    if not 1 <= args.cycles <= CYCLES_MAX:
+        raise DriveError(f"--cycles {args.cycles}: 1 .. {CYCLES_MAX} is right")
+    return Plan(AXES.index(args.axis), args.by, args.period, args.cycles, args.torque_limit)
+
+
+def refuse_service(robot: RobotConfig, args: argparse.Namespace) -> None:
+    """Refuse a module whose joint service is up: a drive has one master.
+
+    Raises:
+        FleetError: it is.
+    """
+    fleet = bench.service_on(robot, args.module, args.run_dir)
+    if fleet is not None:
+        raise FleetError(
+            f"{args.module}: its joint service in {fleet.run.path} has the drive; hang the robot "
+            f"and `xrl down --run-dir {fleet.run.path}` first"
+        )
+
+
+def progress(sample: Sample, plan: Plan) -> str:
+    """Return a line on a sample."""
+    axis = plan.axis
+    return (
+        f"{sample.t_s:6.2f} s  {AXES[axis]} asked {sample.q_ref[axis]:+.4f}, "
+        f"is {sample.q[axis]:+.4f} rad, torque {sample.tau[axis]:+6.2f} N m"
+    )
+
+
+def report(outcome: Outcome, module: str, plan: Plan, console: Console) -> int:
+    """Print how it went; return 0 if the joint followed, else 1."""
+    code = 1
+    if outcome.trouble:
+        console.print(f"[bold red]STOPPED[/]: {escape(outcome.trouble)}")
+    else:
+        rows = judge(outcome.samples, plan)
+        table = Table(box=box.SIMPLE_HEAD)
+        for heading in ("", "measured", "wanted", ""):
+            table.add_column(heading)
+        for row in rows:
+            verdict = "" if not row.wanted else "ok" if row.good else "[bold red]not good[/]"
+            table.add_row(row.what, row.value, row.wanted, verdict)
+        console.print(table)
+        code = 0 if all(row.good for row in rows) else 1
+        words = "[bold green]FOLLOWED[/]" if code == 0 else "[bold red]DID NOT FOLLOW[/]"
+        console.print(f"{words}: {module} {AXES[plan.axis]}")
+        console.print(
+            f"right only if you saw this: {what_to_see(module, plan.axis, plan.by)}; "
+            "an encoder on the motor cannot tell"
+        )
+    if outcome.is_idle:
+        console.print("both axes are idle")
+        return code
+    console.print(f"[bold red]{NOT_IDLE}[/]")
+    return 1
+
+
+def _introduce(robot: RobotConfig, module: str, plan: Plan, console: Console) -> None:
+    """Say what is going to happen."""
+    console.print(
+        f"{module} {AXES[plan.axis]}: {plan.by:+g} rad and back, {plan.cycles} times in "
+        f"{plan.period_s:g} s each, with at most {plan.torque_limit:g} N m "
+        f"({robot.drive.current_lim:.1f} A a motor, {robot.drive.vel_limit:.1f} turn/s)"
+    )
+    console.print(f"to see: {what_to_see(module, plan.axis, plan.by)}")
