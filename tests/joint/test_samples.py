@@ -99,9 +99,7 @@ def test_a_position_that_is_old_or_means_nothing_is_not_taken(
     assert samples.status is status
 
 
-@given(
-    speed=st.floats(-40.0, 40.0), gained=st.floats(-8.0, 8.0), gap_ms=st.integers(1, 100)
-)
+@given(speed=st.floats(-40.0, 40.0), gained=st.floats(-8.0, 8.0), gap_ms=st.integers(1, 100))
 def test_no_joint_that_moves_as_legs_do_is_disbelieved(
     speed: float, gained: float, gap_ms: int
 ) -> None:

@@ -58,9 +58,7 @@ def test_positions_are_counted_from_the_mark_both_ways(inner: Recorder) -> None:
     drive: Drive = Zeroed(inner, MARK)
     inner.reading = at((MARK + 3.0, MARK - 4.0))
     reading = drive.read(0.0)
-    assert reading == DriveReading(
-        7, (3.0, -4.0), (0.5, -0.5), DriveStatus.ARMED, 0x40, (0.1, 0.2)
-    )
+    assert reading == DriveReading(7, (3.0, -4.0), (0.5, -0.5), DriveStatus.ARMED, 0x40, (0.1, 0.2))
     drive.write(TARGET)
     drive.set_position((3.0, -4.0))
     sent = inner.sent[0]
