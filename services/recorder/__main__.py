@@ -1,23 +1,33 @@
 """Recorder: `python -m services.recorder --out DIR` writes DIR/run.mcap until stopped.
 
-An existing file is never touched: the new one is then run-1.mcap, run-2.mcap, ...
-SIGTERM and SIGINT finish the file; after SIGKILL what was flushed is readable.
+An existing file is never replaced by a new run: that is then run-1.mcap, run-2.mcap, ...
+A long run is split into run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says.
+What an earlier recorder did not finish in DIR is recovered meanwhile. With --snapshot
+nothing is written until there is a fault. SIGTERM and SIGINT finish the file; after
+SIGKILL what was flushed is recovered by the next recorder, or by `xrl recover`.
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
+import signal
 import time
 from datetime import UTC, datetime
 from pathlib import Path
+from types import FrameType
 from typing import Final
 
 from services.recorder import provenance
-from services.recorder.mcap_log import FILE_NAME, SCHEMA_VERSION, RunWriter, Source
+from services.recorder.files import FIRST
+from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter, Source
+from services.recorder.recording import CAPACITY, Recording, free_bytes_at, summary
+from services.recorder.rescue import Rescue
+from services.recorder.snapshot import Snapshot
+from services.recorder.space import MIB
 from shared import gain_schedule, log, topics
 from shared.bus import open_session
-from shared.clock import NS_PER_MS, NS_PER_S, now_ns
+from shared.clock import now_ns
 from shared.config import load
 from shared.config_sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
@@ -28,90 +38,46 @@ FIFO_PRIORITY: Final = 5
 """Below every control service, above what has no such priority: a starved recorder's
 messages are dropped by their senders before they reach its queue."""
 
-CAPACITY: Final = 65_536
-"""Messages that may wait while the disk is slow: 13 s of the fleet."""
-
 DRAIN_PERIOD_S: Final = 0.02
 """Bounds how late `log_time` is. 5, 10 and 20 ms cost the same CPU at 5000 messages/s."""
 
 LAST_WORDS_S: Final = 0.1
 """After a stop, for what other stopping services still have to say."""
 
-REPORT_PERIOD_S: Final = 10.0
+SNAPSHOT_MAX_S: Final = 3600.0
 
 
-class Deadline:
-    """True once per period."""
+class Asked:
+    """True once after each SIGUSR1: write the snapshot."""
 
-    def __init__(self, period_ns: int) -> None:
-        self._period_ns = period_ns
-        self._due_ns = now_ns() + period_ns
+    def __init__(self) -> None:
+        self._asked = False
+        signal.signal(signal.SIGUSR1, self._ask)
 
-    def passed(self, now: int) -> bool:
-        """Return True, and begin the next period, if this one is over."""
-        if now < self._due_ns:
-            return False
-        self._due_ns = now + self._period_ns
-        return True
+    def _ask(self, _number: int, _frame: FrameType | None) -> None:
+        self._asked = True
 
-
-def record(
-    source: Source,
-    writer: RunWriter,
-    config: RecorderConfig,
-    stop: StopFlag,
-    logger: logging.Logger,
-) -> None:
-    """Write what comes until `stop`, then what is left.
-
-    Raises:
-        RunError: the file cannot be written.
-    """
-    flush = Deadline(int(config.flush_ms * NS_PER_MS))
-    sync = Deadline(int(config.fsync_s * NS_PER_S))
-    report = Deadline(int(REPORT_PERIOD_S * NS_PER_S))
-    while not stop:
-        writer.take_from(source, CAPACITY)
-        now = now_ns()
-        if sync.passed(now):
-            writer.sync()
-        elif flush.passed(now):
-            writer.flush()
-        if report.passed(now):
-            logger.info("%s", summary(writer))
-        time.sleep(DRAIN_PERIOD_S)
-    writer.take_from(source, CAPACITY)
-    time.sleep(LAST_WORDS_S)
-    writer.take_from(source, CAPACITY)
-
-
-def summary(writer: RunWriter) -> str:
-    """Return the counts in one line."""
-    counts = writer.counts.values()
-    line = (
-        f"{writer.messages} messages on {sum(1 for c in counts if c.count)} keys, "
-        f"{sum(c.missing for c in counts)} missing in {sum(c.gaps for c in counts)} gaps, "
-        f"{sum(c.restarts for c in counts)} restarts"
-    )
-    for what, keys in (("unknown keys", writer.unknown), ("malformed", writer.malformed)):
-        if keys:
-            line += f"; {sum(keys.values())} left out, {what}: {', '.join(sorted(keys))}"
-    return line
+    def take(self) -> bool:
+        """Return True if it was asked for since the last call."""
+        asked, self._asked = self._asked, False
+        return asked
 
 
 def main() -> int:
     """Run the recorder; return the exit code."""
-    stop = StopFlag()
+    stop, asked = StopFlag(), Asked()
     logger = log.setup("recorder")
     arguments = _arguments()
     config = load(arguments.config)
     attachments = _attachments(arguments)
-    metadata = _metadata(config.name, arguments)
+    metadata = _metadata(config.name, arguments, config.recorder)
     recorded = {key: t for key, t in topics.all_keys(config.name).items() if t.recorded}
+    snapshot = _snapshot(arguments.snapshot, config.recorder, recorded)
     granted = raise_priority(FIFO_PRIORITY)
     # The bus before the file: an endpoint that is taken leaves no empty file behind.
     with open_session(config, "recorder", arguments.run_dir) as session:
         stream = session.stream([f"xrl/{config.name}/**"], capacity=CAPACITY)
+        rescue = Rescue(arguments.out, config.recorder.free_min_mib * MIB, logger)
         try:
             with RunWriter(
                 arguments.out,
@@ -120,24 +86,84 @@ def main() -> int:
                 metadata=metadata,
                 attachments=attachments,
                 chunk_kib=config.recorder.chunk_kib,
+                begin=False,
             ) as writer:
-                if writer.path.name != FILE_NAME:
-                    logger.warning("%s exists and is left alone", arguments.out / FILE_NAME)
-                what = (len(recorded), writer.path, granted)
-                logger.info("recording %d keys to %s, priority %s", *what)
-                record(stream, writer, config.recorder, stop, logger)
+                recording = _recording(
+                    stream, writer, config.recorder, logger, arguments.out, snapshot
+                )
+                logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
+                rescue.start()
+                _record(recording, stop, asked)
         except RunError as error:
             logger.error("%s", error)
             return 1
-    logger.info("finished %s: %s", writer.path, summary(writer))
+        finally:
+            rescue.halt()
+    what = f"finished {writer.path}" if writer.begun else "nothing written"
+    logger.info("%s: %s", what, summary(writer, snapshot))
     return 0
+
+
+def _record(recording: Recording, stop: StopFlag, asked: Asked) -> None:
+    """Record until `stop`, then what is left.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+    while not stop:
+        if asked.take():
+            recording.trigger("asked for by SIGUSR1", now_ns())
+        recording.cycle(now_ns())
+        time.sleep(DRAIN_PERIOD_S)
+    recording.close()
+    time.sleep(LAST_WORDS_S)
+    recording.close()
+
+
+def _recording(
+    source: Source,
+    writer: RunWriter,
+    config: RecorderConfig,
+    logger: logging.Logger,
+    out: Path,
+    snapshot: Snapshot | None,
+) -> Recording:
+    return Recording(
+        source,
+        writer,
+        config,
+        logger,
+        free_bytes=lambda: free_bytes_at(out),
+        now_ns=now_ns(),
+        snapshot=snapshot,
+    )
+
+
+def _about(writer: RunWriter, snapshot: Snapshot | None, keys: int) -> str:
+    if snapshot is not None:
+        return f"keeping {keys} keys in memory until there is a fault"
+    if not writer.recording:
+        return f"waiting for space to record {keys} keys"
+    beside = "" if writer.path.name == FIRST else f" ({FIRST} is there already and stays)"
+    return f"recording {keys} keys to {writer.path}{beside}"
+
+
+def _snapshot(
+    seconds: float | None, config: RecorderConfig, recorded: dict[str, topics.Topic]
+) -> Snapshot | None:
+    if seconds is None:
+        return None
+    if not 0.0 < seconds <= SNAPSHOT_MAX_S:
+        right = f"more than 0 and at most {SNAPSHOT_MAX_S:g} s"
+        raise ConfigError("--snapshot", "SECONDS", f"{seconds:g}", right)
+    return Snapshot(seconds, config.snapshot_mib * MIB, recorded)
 
 
 def _arguments() -> argparse.Namespace:
     parser = service_parser(
         "Record the bus into one MCAP file.", "python -m services.recorder --out out/run"
     )
-    parser.add_argument("--out", type=Path, required=True, help=f"directory for {FILE_NAME}")
+    parser.add_argument("--out", type=Path, required=True, help=f"directory for {FIRST}")
     parser.add_argument("--scenario", type=Path, help="scenario file, attached as scenario.toml")
     parser.add_argument("--scenario-text", default="", help="what this run is, in words")
     parser.add_argument(
@@ -146,6 +172,13 @@ def _arguments() -> argparse.Namespace:
         default=[],
         metavar="NAME=FILE",
         help="attach a file under a name, for example the generated model (repeatable)",
+    )
+    parser.add_argument(
+        "--snapshot",
+        type=float,
+        metavar="SECONDS",
+        help="write nothing until a module goes to FAULT or DAMP, a steady sender falls silent, "
+        "an emergency stop or SIGUSR1; then so much before and after it",
     )
     return parser.parse_args()
 
@@ -174,7 +207,9 @@ def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
     return contents
 
 
-def _metadata(robot: str, arguments: argparse.Namespace) -> dict[str, dict[str, str]]:
+def _metadata(
+    robot: str, arguments: argparse.Namespace, config: RecorderConfig
+) -> dict[str, dict[str, str]]:
     root = Path(__file__).resolve().parents[2]
     run = {
         "schema_version": SCHEMA_VERSION,
@@ -186,6 +221,11 @@ def _metadata(robot: str, arguments: argparse.Namespace) -> dict[str, dict[str, 
     return {
         "run": run | provenance.code(root) | provenance.machine(),
         "packages": provenance.packages(),
+        "recorder": {
+            "flush_ms": f"{config.flush_ms:g}",
+            "fsync_s": f"{config.fsync_s:g}",
+            "snapshot_s": "" if arguments.snapshot is None else f"{arguments.snapshot:g}",
+        },
     }
 
 

@@ -1,7 +1,10 @@
-"""The run's MCAP file: the one place of the services that writes this format.
+"""The run's MCAP files: the one place of the services that writes this format.
 
-Layout: metadata `run`, `clock` and `packages`, then the attachments, then zstd chunks
-with the messages as they came (JSON), at the end metadata `counts` and the summary.
+A run is `run.mcap`, and `run_1.mcap`, `run_2.mcap`, ... if it is split; each stands for
+itself. Layout of each: metadata `run`, `clock`, `packages` and `split`, the attachments,
+all schemas and channels, then zstd chunks with the messages as they came (JSON), at the
+end metadata `counts` (of this file) and the summary. The first chunk holds schemas and
+channels again, as the mcap package writes them: damage to one leaves the other.
 
 Time: `log_time` is when the recorder took a message off its queue (at most one drain
 period after it came), `publish_time` the message's own `t_ns`. Both are monotonic
@@ -9,31 +12,36 @@ clocks; one offset, taken at the start and written as `offset_ns` into metadata 
 maps them to ns since 1970 so that viewers show dates: wall = monotonic + offset_ns.
 `publish_time` therefore means something only for senders on the recorder's host.
 
-A file whose writer was killed has no summary: read it with `tools/runs/run_log.py`.
+A file whose writer was killed has no summary: `services/recorder/recovery.py` gives it
+one, and `tools/runs/run_log.py` reads it as it is. While it is written it is locked.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
+import copy
+import secrets
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, BinaryIO, Final, Protocol
 
 import msgspec
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
-from services.recorder import schema
+from services.recorder import files, schema
 from services.recorder.gaps import KeyCount
+from services.recorder.syncer import Syncer
 from shared.exceptions import RunError
 from shared.topics import Topic
 
-SCHEMA_VERSION: Final = "1"
+SCHEMA_VERSION: Final = "2"
 """Of the layout above and of the messages in `shared/messages.py`."""
 
-FILE_NAME: Final = "run.mcap"
+FILE_NAME: Final = files.FIRST
 PROFILE: Final = "xrl"
 
 _MEDIA_TYPES: Final = {
@@ -62,7 +70,7 @@ class _Head(msgspec.Struct, gc=False):
 
 
 class RunWriter:
-    """One file being written; leaving the `with` block finishes it.
+    """One run being written; leaving the `with` block finishes its file.
 
     If the block is left by an exception the file is closed as it is: a readable
     file without a summary.
@@ -77,44 +85,47 @@ class RunWriter:
         metadata: Mapping[str, Mapping[str, str]],
         attachments: Mapping[str, bytes],
         chunk_kib: int,
+        begin: bool = True,
     ) -> None:
-        """Create `run.mcap` in `directory`, or `run-1.mcap`, ... if there is one already.
+        """Create `run.mcap` in `directory`, or `run-1.mcap`, ... if there is a run already.
 
         Args:
             directory: made if absent.
             topics: topic of every key to record; each gets a channel.
             offset_ns: wall minus monotonic clock.
-            metadata: records for the start of the file, by name.
+            metadata: records for the start of each file, by name.
             attachments: contents by file name.
             chunk_kib: size of a chunk before compression.
+            begin: False leaves the first file to `begin`.
 
         Raises:
             RunError: the file cannot be created or written.
         """
         self.path = directory / FILE_NAME
-        self.counts: dict[str, KeyCount] = {}
+        """The file being written, or the last one."""
+        self.begun = 0
+        """Files begun so far."""
+        self.counts: dict[str, KeyCount] = {key: KeyCount() for key in topics}
+        """Of the whole run."""
         self.unknown: dict[str, int] = {}
         """Messages on keys that have no row in the table of topics; not written."""
         self.malformed: dict[str, int] = {}
         """Messages without a readable `t_ns` and `seq`; not written."""
-        self._offset_ns = offset_ns
+        self.left_out = 0
+        """Messages that came while no file was open; not written."""
+        self._directory, self._topics = directory, topics
+        self._offset_ns, self._chunk_size = offset_ns, chunk_kib * 1024
+        self._metadata, self._attachments = metadata, attachments
+        self._run_id = secrets.token_hex(8)
+        self._stem = ""
         self._channels: dict[str, tuple[int, KeyCount]] = {}
+        self._before: dict[str, KeyCount] = {}
+        """Counts when the file was begun."""
         self._decode = msgspec.json.Decoder(_Head).decode
-        with self._as_run_error("cannot be created"):
-            directory.mkdir(parents=True, exist_ok=True)
-            self.path, self._file = _create(directory)
-        self._writer = Writer(
-            self._file, chunk_size=chunk_kib * 1024, compression=CompressionType.ZSTD
-        )
-        # mcap leaves these two without annotations
-        self._flush_writer: Callable[[], None] = self._writer.flush
-        self._finish_writer: Callable[[], None] = self._writer.finish
-        try:
-            with self._as_run_error("cannot be written"):
-                self._start(topics, metadata, attachments)
-        except RunError:
-            self._close_as_it_is()
-            raise
+        self._file: BinaryIO | None = None
+        self._syncer = Syncer()
+        if begin:
+            self.begin()
 
     def __enter__(self) -> RunWriter:
         """Return the writer itself."""
@@ -133,21 +144,66 @@ class RunWriter:
         """
         try:
             if kind is None:
-                self._finish()
+                self.finish()
+                with self._as_run_error("cannot be written"):
+                    self._syncer.settle()
         finally:
             self._close_as_it_is()
+            self._syncer.close()
 
     @property
     def messages(self) -> int:
-        """Messages written so far."""
+        """Messages written so far, in all files."""
         return sum(count.count for count in self.counts.values())
+
+    @property
+    def recording(self) -> bool:
+        """True if a file is open."""
+        return self._file is not None
+
+    @property
+    def size(self) -> int:
+        """Bytes of the open file up to its last whole chunk; 0 if none is open."""
+        return self._file.tell() if self._file is not None else 0
+
+    def begin(self, note: Mapping[str, str] | None = None) -> None:
+        """Begin the run's next file, with all metadata and attachments.
+
+        Args:
+            note: what else its metadata `split` is to say: why it was begun.
+
+        Raises:
+            RunError: the file cannot be created or written.
+        """
+        with self._as_run_error("cannot be created"):
+            self._directory.mkdir(parents=True, exist_ok=True)
+            self._stem = self._stem or files.free_stem(self._directory)
+            self.path, self._file = files.create(self._directory, self._stem, self.begun)
+        self._writer = Writer(
+            self._file, chunk_size=self._chunk_size, compression=CompressionType.ZSTD
+        )
+        # mcap leaves these two without annotations
+        self._flush_writer: Callable[[], None] = self._writer.flush
+        self._finish_writer: Callable[[], None] = self._writer.finish
+        try:
+            with self._as_run_error("cannot be written"):
+                self._start(self._file, note or {})
+        except RunError:
+            self._close_as_it_is()
+            raise
+        self.begun += 1
+        self._before = copy.deepcopy(self.counts)
 
     def take_from(self, source: Source, at_most: int) -> int:
         """Write what has come, until the source is empty; return the number taken.
 
+        While no file is open, messages are only counted as left out.
+
         Raises:
             RunError: the file cannot be written.
         """
+        if self._file is None:
+            return self._leave_out(source, at_most)
         taken = 0
         channels, decode, offset_ns = self._channels, self._decode, self._offset_ns
         add_message = self._writer.add_message
@@ -181,62 +237,88 @@ class RunWriter:
         Raises:
             RunError: the file cannot be written.
         """
-        with self._as_run_error("cannot be written"):
-            self._flush_writer()
+        if self._file is not None:
+            with self._as_run_error("cannot be written"):
+                self._flush_writer()
 
     def sync(self) -> None:
-        """Flush, and wait for the disk: it then survives a loss of power.
+        """Flush, and have it brought to the disk: it then survives a loss of power.
+
+        Returns without waiting for the disk.
 
         Raises:
-            RunError: the file cannot be written.
+            RunError: the file cannot be written, or the last sync failed.
         """
-        with self._as_run_error("cannot be written"):
-            self._flush_writer()
-            os.fsync(self._file.fileno())
+        if self._file is not None:
+            with self._as_run_error("cannot be written"):
+                self._flush_writer()
+                self._syncer.request(self._file.fileno())
 
-    def _start(
-        self,
-        topics: Mapping[str, Topic],
-        metadata: Mapping[str, Mapping[str, str]],
-        attachments: Mapping[str, bytes],
-    ) -> None:
-        self._writer.start(profile=PROFILE)
-        clock = {"offset_ns": str(self._offset_ns), "rule": "wall_ns = monotonic_ns + offset_ns"}
-        for name, entries in {**metadata, "clock": clock}.items():
-            self._writer.add_metadata(name, dict(entries))
-        for name, content in attachments.items():
-            media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
-            self._writer.add_attachment(0, 0, name, media_type, content)
-        schemas: dict[str, int] = {}
-        for key, topic in topics.items():
-            name = schema.name_of(topic.type)
-            if name not in schemas:
-                schemas[name] = self._writer.register_schema(
-                    name, schema.ENCODING, schema.encoded(topic.type)
-                )
-            about = {"rate_hz": f"{topic.rate_hz:g}", "why": topic.why}
-            channel_id = self._writer.register_channel(
-                key, MessageEncoding.JSON, schemas[name], about
-            )
-            self.counts[key] = KeyCount()
-            self._channels[key] = (channel_id, self.counts[key])
-        self._flush_writer()
-        os.fsync(self._file.fileno())
+    def finish(self) -> None:
+        """Finish the open file, if there is one; `begin` begins the next.
 
-    def _finish(self) -> None:
+        Raises:
+            RunError: the end of the file cannot be written.
+        """
+        if self._file is None:
+            return
         with self._as_run_error("cannot be finished"):
             self._flush_writer()  # the counts go behind the last messages
             counts = {
-                key: msgspec.json.encode(count).decode() for key, count in self.counts.items()
+                key: msgspec.json.encode(_since(self._before[key], count)).decode()
+                for key, count in self.counts.items()
             }
             self._writer.add_metadata("counts", counts)
             self._finish_writer()
             self._file.flush()  # finish() leaves the end of a stream that was passed in unwritten
-            os.fsync(self._file.fileno())
+            self._syncer.request(self._file.fileno(), last=True)
+        self._close_as_it_is()
+
+    def _start(self, file: BinaryIO, note: Mapping[str, str]) -> None:
+        self._writer.start(profile=PROFILE)
+        clock = {"offset_ns": str(self._offset_ns), "rule": "wall_ns = monotonic_ns + offset_ns"}
+        split = {"run": self._run_id, "number": str(self.begun), "first": self._stem + ".mcap"}
+        records = {**self._metadata, "clock": clock, "split": split | dict(note)}
+        for name, entries in records.items():
+            self._writer.add_metadata(name, dict(entries))
+        for name, content in self._attachments.items():
+            media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+            self._writer.add_attachment(0, 0, name, media_type, content)
+        self._register(file)
+        self._flush_writer()
+        file.flush()
+        self._syncer.request(file.fileno())
+
+    def _register(self, file: BinaryIO) -> None:
+        """Give every key a channel; the writer holds them back until the first chunk."""
+        early = RecordBuilder()
+        schemas: dict[str, int] = {}
+        for key, topic in self._topics.items():
+            name = schema.name_of(topic.type)
+            if name not in schemas:
+                content = schema.encoded(topic.type)
+                schemas[name] = self._writer.register_schema(name, schema.ENCODING, content)
+                Schema(schemas[name], content, schema.ENCODING, name).write(early)
+            about = {"rate_hz": f"{topic.rate_hz:g}", "why": topic.why}
+            encoding = MessageEncoding.JSON
+            channel_id = self._writer.register_channel(key, encoding, schemas[name], about)
+            Channel(channel_id, key, encoding, about, schemas[name]).write(early)
+            self._channels[key] = (channel_id, self.counts[key])
+        records: Callable[[], bytes] = early.end
+        file.write(records())
+
+    def _leave_out(self, source: Source, at_most: int) -> int:
+        taken = 0
+        while taken < at_most and source.take() is not None:
+            taken += 1
+        self.left_out += taken
+        return taken
 
     def _close_as_it_is(self) -> None:
-        with contextlib.suppress(OSError):  # what could not be written was reported already
-            self._file.close()
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # what could not be written was reported already
+                self._file.close()
+            self._file = None
 
     @contextlib.contextmanager
     def _as_run_error(self, what: str) -> Iterator[None]:
@@ -249,13 +331,11 @@ class RunWriter:
             ) from None
 
 
-def _create(directory: Path) -> tuple[Path, BinaryIO]:
-    """Create the first file of run.mcap, run-1.mcap, ... that does not exist yet."""
-    stem, suffix = Path(FILE_NAME).stem, Path(FILE_NAME).suffix
-    path, number = directory / FILE_NAME, 0
-    while True:
-        try:
-            return path, path.open("xb")
-        except FileExistsError:
-            number += 1
-            path = directory / f"{stem}-{number}{suffix}"
+def _since(before: KeyCount, now: KeyCount) -> KeyCount:
+    return KeyCount(
+        count=now.count - before.count,
+        gaps=now.gaps - before.gaps,
+        missing=now.missing - before.missing,
+        restarts=now.restarts - before.restarts,
+        last_seq=now.last_seq,
+    )

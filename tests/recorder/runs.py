@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import inspect
 
-from services.recorder.mcap_log import RunWriter
+from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
 from shared import codec, topics
 from shared.messages import JointState, Message
 from shared.topics import Topic
 
 ROBOT = "lab"
 OFFSET_NS = 1_700_000_000_000_000_000
-METADATA = {"run": {"robot": ROBOT, "schema_version": "1"}, "packages": {"xrl": "0"}}
+METADATA = {"run": {"robot": ROBOT, "schema_version": SCHEMA_VERSION}, "packages": {"xrl": "0"}}
 ATTACHMENTS = {"robot.toml": b'name = "lab"\n', "model.xml": b"<mujoco/>"}
 STATE_KEY = topics.JOINT_STATE.key(ROBOT, "knee_right")
 
@@ -45,21 +46,35 @@ def sample(message_type: type[Message], **fields: Any) -> Any:
 
 
 def state(seq: int) -> JointState:
-    return sample(JointState, seq=seq, t_ns=1_000_000 * seq, q=(seq * 0.001, -0.37))
+    return msgspec.structs.replace(
+        _sample_state(), seq=seq, t_ns=1_000_000 * seq, q=(seq * 0.001, -0.37)
+    )
+
+
+@functools.cache
+def _sample_state() -> Any:
+    return sample(JointState)
 
 
 def item(seq: int, key: str = STATE_KEY) -> tuple[str, bytes, int]:
     return key, codec.encode(state(seq)), 1_000_000 * seq + 500
 
 
-def writer(directory: Path, chunk_kib: int = 16) -> RunWriter:
+def writer(
+    directory: Path,
+    chunk_kib: int = 16,
+    *,
+    keys: Mapping[str, Topic] | None = None,
+    begin: bool = True,
+) -> RunWriter:
     return RunWriter(
         directory,
-        recorded_topics(),
+        recorded_topics() if keys is None else keys,
         offset_ns=OFFSET_NS,
         metadata=METADATA,
         attachments=ATTACHMENTS,
         chunk_kib=chunk_kib,
+        begin=begin,
     )
 
 
@@ -70,9 +85,49 @@ def write(directory: Path, items: Iterable[tuple[str, bytes, int]]) -> Path:
     return run.path
 
 
+class Killed(NamedTuple):
+    """A file as a kill leaves it."""
+
+    path: Path
+    flushed: list[tuple[int, int]]
+    """(size of the file, messages in it) after each flush."""
+
+    def at_least(self, size: int) -> int:
+        """Return how many messages were flushed when the file had some size."""
+        return max((count for flushed, count in self.flushed if flushed <= size), default=0)
+
+
+def killed_file(
+    directory: Path,
+    batches: int = 12,
+    size: int = 100,
+    *,
+    keys: Mapping[str, Topic] | None = None,
+) -> Killed:
+    """Write messages in batches, each flushed, and keep the file as it is before its end."""
+    path = directory / "killed.mcap"
+    with writer(directory / "written", keys=keys) as run:
+        flushed = [(run.path.stat().st_size, 0)]
+        for batch in range(batches):
+            run.take_from(Queue(item(batch * size + n) for n in range(size)), size)
+            run.flush()
+            flushed.append((run.path.stat().st_size, (batch + 1) * size))
+        path.write_bytes(run.path.read_bytes())
+    return Killed(path, flushed)
+
+
+def few_topics() -> dict[str, Topic]:
+    """Return a small table, for small files."""
+    return {STATE_KEY: topics.JOINT_STATE, topics.WRENCH.key(ROBOT): topics.WRENCH}
+
+
 def _value(info: inspect.Type) -> Any:
     if isinstance(info, inspect.TupleType):
         return [_value(member) for member in info.item_types]
+    if isinstance(info, inspect.VarTupleType):
+        return [_value(info.item_type)]
+    if isinstance(info, inspect.StructType):
+        return {field.name: _value(field.type) for field in info.fields}
     values = {
         inspect.BoolType: True,
         inspect.IntType: 1,

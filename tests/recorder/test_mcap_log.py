@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Attachment, Chunk, Header, Metadata
+from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
 from services.recorder import mcap_log
@@ -38,8 +39,11 @@ def test_metadata_and_attachments_come_before_the_first_chunk(tmp_path: Path) ->
     first_chunk = next(i for i, record in enumerate(records) if isinstance(record, Chunk))
     head = records[1:first_chunk]
     names = [r.name for r in head if isinstance(r, Metadata | Attachment)]
-    assert names == ["run", "packages", "clock", *ATTACHMENTS]
-    assert len(names) == len(head)
+    assert names == ["run", "packages", "clock", "split", *ATTACHMENTS]
+    described = [r for r in head if isinstance(r, Schema | Channel)]
+    assert len(names) + len(described) == len(head)
+    topics_described = {r.topic for r in described if isinstance(r, Channel)}
+    assert topics_described == set(runs.recorded_topics())
 
 
 def test_a_finished_file_is_readable_by_the_ordinary_reader(tmp_path: Path) -> None:
@@ -97,11 +101,11 @@ def test_a_full_disk_is_one_run_error(tmp_path: Path, monkeypatch: pytest.Monkey
     full = Path("/dev/full")
     opened = []
 
-    def create(_directory: Path) -> tuple[Path, object]:
+    def create(_directory: Path, _stem: str, _number: int) -> tuple[Path, object]:
         opened.append(full.open("wb"))
         return full, opened[-1]
 
-    monkeypatch.setattr(mcap_log, "_create", create)
+    monkeypatch.setattr(mcap_log.files, "create", create)
     with pytest.raises(RunError, match=r"^/dev/full: cannot be written: No space left"):
         runs.writer(tmp_path)
     assert opened[0].closed
@@ -127,3 +131,75 @@ def test_a_block_left_by_an_exception_leaves_a_readable_file_without_summary(
         broken_off(tmp_path)
     log = read_run(tmp_path / "run.mcap")
     assert (log.complete, log.count(STATE_KEY)) == (False, 1)
+
+
+def read_by_the_package(path: Path) -> list[bytes]:
+    with path.open("rb") as file:
+        return [m.data for _, _, m in make_reader(file, validate_crcs=True).iter_messages()]
+
+
+def test_a_split_run_is_one_file_after_the_other_and_each_stands_for_itself(tmp_path: Path) -> None:
+    items = [item(seq) for seq in range(30)]
+    with runs.writer(tmp_path) as run:
+        for number in range(3):
+            if number:
+                run.finish()
+                run.begin({"why": "size"})
+            run.take_from(Queue(items[number * 10 : number * 10 + 10]), 100)
+    paths = [tmp_path / name for name in ("run.mcap", "run_1.mcap", "run_2.mcap")]
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    payloads = [read_by_the_package(path) for path in paths]
+    assert [len(found) for found in payloads] == [10, 10, 10]
+    assert list(itertools.chain(*payloads)) == [payload for _, payload, _ in items]
+    logs = [read_run(path) for path in paths]
+    assert all(log.complete and log.attachments == ATTACHMENTS for log in logs)
+    assert len({log.metadata["split"]["run"] for log in logs}) == 1
+    assert [log.metadata["split"]["number"] for log in logs] == ["0", "1", "2"]
+    assert all(log.metadata["split"]["first"] == "run.mcap" for log in logs)
+    assert logs[1].metadata["split"]["why"] == "size"
+    assert all(log.metadata["run"]["robot"] == runs.ROBOT for log in logs)
+
+
+def test_what_is_lost_between_two_files_is_counted_in_the_second(tmp_path: Path) -> None:
+    with runs.writer(tmp_path) as run:
+        run.take_from(Queue([item(0), item(1)]), 10)
+        run.finish()
+        run.begin()
+        run.take_from(Queue([item(5)]), 10)
+        assert run.counts[STATE_KEY].count == 3
+    counts = [
+        json.loads(read_run(tmp_path / name).metadata["counts"][STATE_KEY])
+        for name in ("run.mcap", "run_1.mcap")
+    ]
+    assert [c["count"] for c in counts] == [2, 1]
+    assert [c["missing"] for c in counts] == [0, 3]
+
+
+def test_a_second_run_keeps_away_from_the_files_of_the_first(tmp_path: Path) -> None:
+    (tmp_path / "run_3.mcap").write_bytes(b"all that is left of an older run")
+    (tmp_path / "run-1.recovered.mcap").write_bytes(b"")
+    assert runs.write(tmp_path, [item(0)]).name == "run-2.mcap"
+
+
+def test_while_no_file_is_open_messages_are_counted_as_left_out(tmp_path: Path) -> None:
+    with runs.writer(tmp_path / "out", begin=False) as run:
+        run.take_from(Queue(item(seq) for seq in range(7)), 100)
+        assert (run.recording, run.left_out, run.messages) == (False, 7, 0)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_is_locked_while_it_is_written(tmp_path: Path) -> None:
+    with runs.writer(tmp_path) as run:
+        assert mcap_log.files.in_use(run.path)
+    assert not mcap_log.files.in_use(run.path)
+
+
+def test_a_sync_that_fails_is_one_run_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_descriptor: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr("services.recorder.syncer.os.fsync", fail)
+    with pytest.raises(RunError, match=r"run\.mcap: cannot be .*Input/output error"):
+        runs.write(tmp_path, [item(0)])

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from services.recorder.mcap_log import SCHEMA_VERSION
 from shared import codec, topics
 from shared.exceptions import RunError
 from shared.messages import Wrench
@@ -35,7 +36,7 @@ def test_metadata_and_attachments_are_read(tmp_path: Path) -> None:
     log = read_run(runs.write(tmp_path, [item(0)]))
     assert log.attachments == ATTACHMENTS
     assert log.metadata["run"]["robot"] == ROBOT
-    assert set(log.metadata) == {"run", "packages", "clock", "counts"}
+    assert set(log.metadata) == {"run", "packages", "clock", "split", "counts"}
 
 
 def test_gaps_are_those_the_recorder_counted(tmp_path: Path) -> None:
@@ -47,21 +48,8 @@ def test_gaps_are_those_the_recorder_counted(tmp_path: Path) -> None:
     assert (gaps[WRENCH_KEY].missing, gaps[WRENCH_KEY].restarts) == (2, 1)
 
 
-def killed_file(tmp_path: Path) -> tuple[Path, list[tuple[int, int]]]:
-    """Return a file as a kill leaves it, and (size, messages) after each flush."""
-    killed = tmp_path / "killed.mcap"
-    with runs.writer(tmp_path) as run:
-        flushed = [(run.path.stat().st_size, 0)]
-        for batch in range(12):
-            run.take_from(Queue(item(batch * 100 + n) for n in range(100)), 100)
-            run.flush()
-            flushed.append((run.path.stat().st_size, (batch + 1) * 100))
-        killed.write_bytes(run.path.read_bytes())
-    return killed, flushed
-
-
 def test_a_file_cut_anywhere_is_read_up_to_the_last_flush(tmp_path: Path) -> None:
-    path, flushed = killed_file(tmp_path)
+    path, flushed = runs.killed_file(tmp_path)
     data = path.read_bytes()
     assert len(data) == flushed[-1][0]
     dice = random.Random(7)
@@ -79,7 +67,7 @@ def test_a_file_cut_anywhere_is_read_up_to_the_last_flush(tmp_path: Path) -> Non
 
 
 def test_a_file_cut_before_its_first_messages_is_read_or_one_run_error(tmp_path: Path) -> None:
-    path, flushed = killed_file(tmp_path)
+    path, flushed = runs.killed_file(tmp_path)
     data = path.read_bytes()
     cut_path = tmp_path / "cut.mcap"
     outcomes = []
@@ -95,22 +83,36 @@ def test_a_file_cut_before_its_first_messages_is_read_or_one_run_error(tmp_path:
 
 
 def test_zeros_after_a_power_cut_are_the_end(tmp_path: Path) -> None:
-    path, flushed = killed_file(tmp_path)
+    path, flushed = runs.killed_file(tmp_path)
     with path.open("ab") as file:
         file.write(bytes(10_000))
     assert read_run(path).count(STATE_KEY) == flushed[-1][1]
 
 
-def test_a_damaged_chunk_is_counted_and_the_others_are_read(tmp_path: Path) -> None:
-    path, flushed = killed_file(tmp_path)
+@pytest.mark.parametrize("batch", [0, 3])
+def test_a_damaged_chunk_is_counted_and_the_others_are_read(tmp_path: Path, batch: int) -> None:
+    """Also the first, which alone holds schemas and channels in a file of the mcap package."""
+    path, flushed = runs.killed_file(tmp_path)
     data = bytearray(path.read_bytes())
-    position = flushed[3][0] + 200  # inside the first chunk of the fourth batch
+    position = data.index(b"zstd", flushed[batch][0]) + 200  # in the batch's first chunk
     data[position : position + 50] = bytes(50)
     path.write_bytes(data)
     log = read_run(path)
     assert log.damaged == 1
     assert 0 < log.count(STATE_KEY) < flushed[-1][1]
     assert log.messages(topics.JOINT_STATE, "knee_right")[-1] == runs.state(1199)
+
+
+def test_a_wrong_length_costs_its_own_chunk_only(tmp_path: Path) -> None:
+    path, flushed = runs.killed_file(tmp_path)
+    data = bytearray(path.read_bytes())
+    data[flushed[3][0] + 1 : flushed[3][0] + 9] = (2**62).to_bytes(8, "little")
+    path.write_bytes(data)
+    log = read_run(path)
+    assert (log.damaged, log.cut) == (1, None)
+    assert [m.seq for m in log.messages(topics.JOINT_STATE, "knee_right")[:300]] == list(range(300))
+    assert log.messages(topics.JOINT_STATE, "knee_right")[-1] == runs.state(1199)
+    assert log.count(STATE_KEY) > 1000
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89", b"no mcap file at all", bytes(100)])
@@ -132,7 +134,7 @@ def test_messages_of_another_version_are_refused_with_the_key(tmp_path: Path) ->
     old = (STATE_KEY, b'{"t_ns":1,"seq":1,"angle":3.0}', 1)
     log = read_run(runs.write(tmp_path, [old]))
     assert log.count(STATE_KEY) == 1
-    with pytest.raises(RunError, match=f"{STATE_KEY}.*JointState.*schema version 1"):
+    with pytest.raises(RunError, match=f"{STATE_KEY}.*JointState.*schema version {SCHEMA_VERSION}"):
         log.messages(topics.JOINT_STATE, "knee_right")
 
 

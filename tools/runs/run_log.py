@@ -1,34 +1,25 @@
-"""Reads a run's MCAP file, finished or killed.
+"""Reads a run's MCAP file into memory, finished or killed.
 
 A killed file has no summary, and may end in the middle of a record; the readers of
 the mcap package find nothing in the first and may stumble over the second (design
-section 10). This one walks the records from the start and keeps every whole one.
+section 10). `services.recorder.salvage` walks the records from the start and keeps every
+whole one; here they are sorted by key.
 """
 
 from __future__ import annotations
 
-import io
-import struct
-from collections.abc import Iterator
+import contextlib
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any
 
 import msgspec
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata
-from mcap.stream_reader import get_chunk_data_stream
-from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError
 
+from services.recorder import mcap_records as mcap
 from services.recorder.gaps import KeyCount
+from services.recorder.mcap_records import Malformed
+from services.recorder.salvage import Loss, Piece, opened
 from shared.exceptions import RunError
 from shared.topics import Topic
-
-_RECORD: Final = struct.Struct("<BQ")  # opcode, length of what follows
-_MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_DAMAGED: Final = (struct.error, ValueError, McapError, ZstdError)
 
 
 class Series:
@@ -60,15 +51,17 @@ class RunLog:
         self.attachments: dict[str, bytes] = {}
         self.complete = False
         """True if the recorder finished the file; False if it was killed."""
-        self.damaged = 0
-        """Whole records that could not be read: their contents are left out."""
+        self.damage: list[Loss] = []
+        """Places that could not be read: their contents are left out."""
+        self.cut: Loss | None = None
+        """What follows the last whole record of a file that was cut off."""
         self._series: dict[str, Series] = {}
         self._by_channel: dict[int, Series] = {}
-        try:
-            with path.open("rb") as file:
-                self._read(file)
-        except OSError as error:
-            raise RunError(f"{path}: cannot be read: {error.strerror}; give an MCAP file") from None
+        with opened(path) as salvage:
+            for piece in salvage:
+                with contextlib.suppress(Malformed):
+                    self._take(piece)
+            self.complete, self.damage, self.cut = salvage.finished, salvage.damage, salvage.cut
         self.robot = self._required("run", "robot")
         offset = self._required("clock", "offset_ns")
         if not offset.lstrip("-").isdecimal():
@@ -77,6 +70,11 @@ class RunLog:
         """wall clock in ns since 1970 = `t_ns` of a message + `offset_ns`."""
         for series in self._series.values():
             series.received_ns = [t - self.offset_ns for t in series.received_ns]
+
+    @property
+    def damaged(self) -> int:
+        """Number of places in the middle of the file that could not be read."""
+        return len(self.damage)
 
     def keys(self) -> list[str]:
         """Return every key that has at least one message."""
@@ -110,6 +108,16 @@ class RunLog:
                     f"the file has schema version {version}: read it with the code that wrote it"
                 ) from None
         return series.decoded
+
+    def raw(self, key: str) -> list[tuple[int, bytes, int]]:
+        """Return (monotonic reception, payload, number) of every message of a key."""
+        series = self._of(key)
+        return list(zip(series.received_ns, series.payloads, series.seq, strict=True))
+
+    def began_ns(self) -> int:
+        """Return when the first message reached the recorder, monotonic clock; 0 if none did."""
+        begun = [one.received_ns[0] for one in self._series.values() if one.received_ns]
+        return min(begun, default=0)
 
     def received_ns(self, topic: Topic, module: str = "") -> list[int]:
         """Return when each of `messages(topic, module)` reached the recorder.
@@ -145,53 +153,32 @@ class RunLog:
             )
         return value
 
-    def _read(self, file: BinaryIO) -> None:
-        magic = file.read(len(MCAP0_MAGIC))
-        if not magic:
-            raise RunError(f"{self.path}: is empty; an MCAP file is right")
-        if magic != MCAP0_MAGIC:
-            raise RunError(f"{self.path}: is no MCAP file (wrong first bytes)")
-        for opcode, body in _whole_records(file):
-            try:
-                self._take(opcode, body)
-            except _DAMAGED:
-                self.damaged += 1
-
-    def _take(self, opcode: int, body: bytes) -> None:
-        if opcode == Opcode.CHUNK:
-            chunk = Chunk.read(_stream(body))
-            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-            self._take_chunk(stream.read(length))
-        elif opcode == Opcode.METADATA:
-            record = Metadata.read(_stream(body))
-            self.metadata[record.name] = record.metadata
-        elif opcode == Opcode.ATTACHMENT:
-            attachment = Attachment.read(_stream(body))
+    def _take(self, piece: Piece) -> None:
+        if piece.opcode == mcap.METADATA:
+            name, entries = mcap.metadata(piece.body)
+            self.metadata[name] = entries
+        elif piece.opcode == mcap.ATTACHMENT:
+            attachment = mcap.attachment(piece.body)
             self.attachments[attachment.name] = attachment.data
-        elif opcode == Opcode.CHANNEL:
-            self._take_channel(body)
-        elif opcode == Opcode.FOOTER:
-            self.complete = True
+        elif piece.opcode == mcap.CHANNEL:
+            self._take_channel(piece.body)
+        for opcode, body in piece.others:
+            if opcode == mcap.CHANNEL:
+                self._take_channel(body)
+        self._take_messages(piece)
 
-    def _take_chunk(self, data: bytes) -> None:
-        """Sort a chunk's messages by channel; the hot loop of reading."""
-        position, end = 0, len(data)
-        header, message_header = _RECORD.size, _MESSAGE.size
-        while position < end:
-            opcode, length = _RECORD.unpack_from(data, position)
-            start = position + header
-            position = start + length
-            if opcode == Opcode.MESSAGE:
-                channel, seq, log_time, _ = _MESSAGE.unpack_from(data, start)
-                series = self._by_channel[channel]
-                series.payloads.append(data[start + message_header : position])
-                series.received_ns.append(log_time)
+    def _take_messages(self, piece: Piece) -> None:
+        """Sort messages by channel; the hot loop of reading."""
+        body, by_channel = piece.body, self._by_channel
+        for channel, seq, log_ns, _, start, end in piece.rows:
+            series = by_channel.get(channel)
+            if series is not None:
+                series.payloads.append(body[start:end])
+                series.received_ns.append(log_ns)
                 series.seq.append(seq)
-            elif opcode == Opcode.CHANNEL:
-                self._take_channel(data[start:position])
 
     def _take_channel(self, body: bytes) -> None:
-        channel = Channel.read(_stream(body))
+        channel = mcap.channel(body)
         self._by_channel[channel.id] = self._series.setdefault(channel.topic, Series())
 
 
@@ -202,18 +189,3 @@ def read_run(path: Path) -> RunLog:
         RunError: the file is missing, empty, no MCAP file or no run.
     """
     return RunLog(path)
-
-
-def _whole_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield (opcode, content) of each record; end silently where the file was cut."""
-    size = Path(file.name).stat().st_size
-    while len(header := file.read(_RECORD.size)) == _RECORD.size:
-        opcode, length = _RECORD.unpack(header)
-        # 0 is no opcode: a power cut can leave zeros where the data never got to.
-        if opcode == 0 or length > size - file.tell():
-            return
-        yield opcode, file.read(length)
-
-
-def _stream(body: bytes) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(body))

@@ -1,0 +1,215 @@
+"""What the recorder does from cycle to cycle: write, flush, sync, split, watch the disk."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from services.recorder.mcap_log import RunWriter, Source
+from services.recorder.snapshot import Snapshot
+from services.recorder.space import MIB, Change, SpaceGuard
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config_sections import RecorderConfig
+
+CAPACITY: Final = 65_536
+"""Messages that may wait while the disk is slow: 13 s of the fleet."""
+
+SLICE: Final = 8_192
+"""Messages of a snapshot written in one cycle; the bus is emptied in between."""
+
+REPORT_PERIOD_S: Final = 10.0
+
+FreeBytes = Callable[[], int]
+
+
+class Deadline:
+    """True once per period."""
+
+    def __init__(self, period_ns: int, now: int) -> None:
+        self._period_ns = period_ns
+        self._due_ns = now + period_ns
+
+    def passed(self, now: int) -> bool:
+        """Return True, and begin the next period, if this one is over."""
+        if now < self._due_ns:
+            return False
+        self._due_ns = now + self._period_ns
+        return True
+
+
+class Recording:
+    """Moves messages from the bus into files, in cycles of a few milliseconds."""
+
+    def __init__(
+        self,
+        source: Source,
+        writer: RunWriter,
+        config: RecorderConfig,
+        logger: logging.Logger,
+        *,
+        free_bytes: FreeBytes,
+        now_ns: int,
+        snapshot: Snapshot | None = None,
+    ) -> None:
+        """Begin with a look at the disk, and the first file unless there is a snapshot.
+
+        Args:
+            source: the bus.
+            writer: of the run, with no file begun.
+            config: periods and limits.
+            logger: for what is worth a line.
+            free_bytes: tells the free space where the run is written.
+            now_ns: monotonic.
+            snapshot: write only what belongs to a fault.
+
+        Raises:
+            RunError: the first file cannot be written.
+        """
+        self._source, self._writer, self._snapshot = source, writer, snapshot
+        self._logger, self._free_bytes = logger, free_bytes
+        self._config = config
+        self._guard = SpaceGuard(config.free_min_mib)
+        self._flush = Deadline(int(config.flush_ms * NS_PER_MS), now_ns)
+        self._sync = Deadline(int(config.fsync_s * NS_PER_S), now_ns)
+        self._report = Deadline(int(REPORT_PERIOD_S * NS_PER_S), now_ns)
+        self._begun_ns = now_ns
+        self._watch_space(now_ns)
+        if snapshot is None:
+            self._begin(now_ns, {})
+
+    def cycle(self, now_ns: int) -> None:
+        """Take what has come, and do what is due.
+
+        Raises:
+            RunError: the file cannot be written.
+        """
+        if self._snapshot is None:
+            self._writer.take_from(self._source, CAPACITY)
+        else:
+            self._follow(self._snapshot, now_ns)
+        flush = self._flush.passed(now_ns)
+        if self._sync.passed(now_ns):  # flushes as well
+            self._writer.sync()
+            self._watch_space(now_ns)
+        elif flush:
+            self._writer.flush()
+        if flush:
+            self._split_if_due(now_ns)
+        if self._report.passed(now_ns):
+            self._logger.info("%s", summary(self._writer, self._snapshot))
+
+    def trigger(self, reason: str, now_ns: int) -> None:
+        """Have the snapshot written."""
+        if self._snapshot is not None:
+            self._snapshot.trigger(reason, now_ns)
+
+    def _follow(self, snapshot: Snapshot, now_ns: int) -> None:
+        """Keep the ring, and write it while a fault asks for it."""
+        snapshot.take_from(self._source, CAPACITY)
+        snapshot.pass_time(now_ns)
+        if not snapshot.writing:
+            if self._writer.recording:
+                self._writer.finish()
+                self._logger.info("snapshot finished: %s", self._writer.path)
+        elif self._guard.enough:
+            if not self._writer.recording:
+                self._begin(now_ns, {"snapshot": snapshot.reason})
+                what = (snapshot.reason, len(snapshot), self._writer.path)
+                self._logger.warning("%s: snapshot of %d messages to %s", *what)
+            self._writer.take_from(snapshot, SLICE)
+
+    def _begin(self, now_ns: int, note: dict[str, str]) -> None:
+        if self._guard.enough:
+            self._begun_ns = now_ns
+            self._writer.begin(note)
+
+    def _split_if_due(self, now_ns: int) -> None:
+        if not self._writer.recording:
+            return
+        seconds, size = self._config.split_s, self._config.split_mib * MIB
+        old = seconds and now_ns - self._begun_ns >= seconds * NS_PER_S
+        if old or (size and self._writer.size >= size):
+            before = self._writer.path
+            self._writer.finish()
+            self._begin(now_ns, {"why": "time" if old else "size"})
+            self._logger.info("%s is finished; going on in %s", before, self._writer.path)
+
+    def _watch_space(self, now_ns: int) -> None:
+        """Stop before the disk is full, and go on when it no longer is."""
+        try:
+            free = self._free_bytes()
+        except OSError:  # writing will tell
+            return
+        where, least = self._writer.path.parent, self._config.free_min_mib
+        match self._guard.feed(free):
+            case Change.LOW:
+                self._logger.warning(
+                    "%s: %d MiB free; recording stops below %d MiB (recorder.free_min_mib)",
+                    where, free // MIB, least,
+                )  # fmt: skip
+            case Change.FULL:
+                self._writer.finish()
+                self._logger.error(
+                    "%s: %d MiB free, less than recorder.free_min_mib = %d: recording has stopped, "
+                    "what there is is finished; it goes on when there is space again",
+                    where, free // MIB, least,
+                )  # fmt: skip
+            case Change.BACK:
+                if self._snapshot is None:
+                    self._begin(now_ns, {"why": "space again"})
+                self._logger.warning(
+                    "%s: %d MiB free: recording goes on; %d messages were left out",
+                    where, free // MIB, self._writer.left_out,
+                )  # fmt: skip
+            case Change.NONE:
+                pass
+
+    def close(self) -> None:
+        """Take what is left; the writer finishes the file.
+
+        Raises:
+            RunError: the file cannot be written.
+        """
+        if self._snapshot is None:
+            self._writer.take_from(self._source, CAPACITY)
+            return
+        self._snapshot.take_from(self._source, CAPACITY)
+        while self._writer.recording and self._writer.take_from(self._snapshot, SLICE):
+            pass
+
+
+def free_bytes_at(directory: Path) -> int:
+    """Return the free space where a directory is or will be.
+
+    Raises:
+        OSError: it cannot be told.
+    """
+    while not directory.exists() and directory != directory.parent:
+        directory = directory.parent
+    found = os.statvfs(directory)
+    return found.f_bavail * found.f_frsize
+
+
+def summary(writer: RunWriter, snapshot: Snapshot | None = None) -> str:
+    """Return the counts in one line."""
+    counts = writer.counts.values()
+    line = (
+        f"{writer.messages} messages on {sum(1 for c in counts if c.count)} keys, "
+        f"{sum(c.missing for c in counts)} missing in {sum(c.gaps for c in counts)} gaps, "
+        f"{sum(c.restarts for c in counts)} restarts"
+    )
+    if writer.begun > 1:
+        line += f", {writer.begun} files"
+    for what, keys in (("unknown keys", writer.unknown), ("malformed", writer.malformed)):
+        if keys:
+            line += f"; {sum(keys.values())} left out, {what}: {', '.join(sorted(keys))}"
+    if writer.left_out:
+        line += f"; {writer.left_out} left out while the disk was full"
+    if snapshot is not None:
+        line += f"; {len(snapshot)} in memory, {snapshot.memory // MIB} MiB"
+        if snapshot.dropped:
+            line += f", {snapshot.dropped} dropped: recorder.snapshot_mib is too small for them"
+    return line

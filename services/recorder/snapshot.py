@@ -1,0 +1,151 @@
+"""`--snapshot SECONDS`: the last seconds in memory, written only when there is a fault.
+
+A fault is: a module goes to FAULT or DAMP, an emergency stop, a steady sender that falls
+silent (a service that died says nothing), or a word from outside (SIGUSR1). What came up
+to SECONDS before it and for SECONDS after it is written; another fault meanwhile makes
+it longer. Memory is bounded: what does not fit is dropped from the old end.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Final
+
+import msgspec
+
+from services.recorder.mcap_log import Source
+from shared import topics
+from shared.clock import NS_PER_S
+from shared.messages import Mode
+from shared.topics import Topic
+
+FAULTS: Final = frozenset((Mode.FAULT, Mode.DAMP))
+"""Modes of a joint service that are worth a file."""
+
+STEADY: Final = (topics.JOINT_STATE, topics.PLANNER_STATUS, topics.WRENCH)
+"""Senders that are missed when they fall silent, once they were heard."""
+
+SILENT_NS: Final = NS_PER_S
+"""At their rates, 250 messages."""
+
+OVERHEAD: Final = 200
+"""Bytes of memory of a message beside its payload: tuple, number, headers."""
+
+
+class _Event(msgspec.Struct, gc=False):
+    mode_after: int
+
+
+class Snapshot:
+    """A ring of messages, and whether it is to be written; a `Source` of what is."""
+
+    def __init__(self, seconds: float, most_bytes: int, keys: Mapping[str, Topic]) -> None:
+        """Keep the messages of some keys.
+
+        Args:
+            seconds: so long before a fault, and after it.
+            most_bytes: of memory.
+            keys: topic of every key to record.
+        """
+        self.dropped = 0
+        """Messages younger than `seconds` that memory had no room for."""
+        self.reason = ""
+        """What the newest fault was."""
+        self._ring: deque[tuple[str, bytes, int]] = deque()
+        self._bytes = 0
+        self._most = most_bytes
+        self._span_ns = round(seconds * NS_PER_S)
+        self._until_ns: int | None = None
+        self._rows = {key: (key, topic) for key, topic in keys.items()}
+        self._special = {
+            key
+            for key, topic in keys.items()
+            if topic in (topics.JOINT_EVENT, topics.ESTOP, *STEADY)
+        }
+        self._heard: dict[str, int] = {}
+        self._decode = msgspec.json.Decoder(_Event).decode
+
+    def __len__(self) -> int:
+        """Return the number of messages in the ring."""
+        return len(self._ring)
+
+    @property
+    def memory(self) -> int:
+        """Bytes of memory in use, about."""
+        return self._bytes
+
+    @property
+    def writing(self) -> bool:
+        """True from a fault on until all that belongs to it was taken."""
+        return self._until_ns is not None
+
+    def take_from(self, source: Source, at_most: int) -> int:
+        """Keep what has come; return the number of messages."""
+        taken = 0
+        ring, special = self._ring, self._special
+        while taken < at_most and (item := source.take()) is not None:
+            taken += 1
+            key, payload, received_ns = item
+            row = self._rows.get(key)
+            if row is not None:
+                item = (row[0], payload, received_ns)  # one string for all messages of a key
+                if key in special:
+                    self._look(row[1], item)
+            ring.append(item)
+            self._bytes += len(payload) + OVERHEAD
+        self._drop_what_does_not_fit()
+        return taken
+
+    def trigger(self, reason: str, now_ns: int) -> bool:
+        """Have the ring written; return True if it was not being written already."""
+        news = self._until_ns is None
+        if news:
+            self._forget_before(now_ns - self._span_ns)
+        self._until_ns = now_ns + self._span_ns
+        self.reason = reason
+        return news
+
+    def pass_time(self, now_ns: int) -> None:
+        """Look for who fell silent, and forget what is older than the ring is long."""
+        for key, heard_ns in list(self._heard.items()):
+            if now_ns - heard_ns > SILENT_NS:
+                del self._heard[key]  # until it is heard again
+                self.trigger(f"{key} is silent", now_ns)
+        if self._until_ns is None:
+            self._forget_before(now_ns - self._span_ns)
+        elif now_ns > self._until_ns and not (self._ring and self._ring[0][2] <= self._until_ns):
+            self._until_ns = None
+
+    def take(self) -> tuple[str, bytes, int] | None:
+        """Return the oldest message that is to be written, or None."""
+        ring = self._ring
+        if self._until_ns is None or not ring or ring[0][2] > self._until_ns:
+            return None
+        item = ring.popleft()
+        self._bytes -= len(item[1]) + OVERHEAD
+        return item
+
+    def _look(self, topic: Topic, item: tuple[str, bytes, int]) -> None:
+        key, payload, received_ns = item
+        if topic is topics.ESTOP:
+            self.trigger("emergency stop", received_ns)
+        elif topic is topics.JOINT_EVENT:
+            try:
+                mode = self._decode(payload).mode_after
+            except (msgspec.DecodeError, UnicodeDecodeError):
+                return
+            if mode in FAULTS:
+                self.trigger(f"{key}: {Mode(mode).name}", received_ns)
+        else:
+            self._heard[key] = received_ns
+
+    def _forget_before(self, oldest_ns: int) -> None:
+        ring = self._ring
+        while ring and ring[0][2] < oldest_ns:
+            self._bytes -= len(ring.popleft()[1]) + OVERHEAD
+
+    def _drop_what_does_not_fit(self) -> None:
+        while self._bytes > self._most and self._ring:
+            self._bytes -= len(self._ring.popleft()[1]) + OVERHEAD
+            self.dropped += 1

@@ -1,0 +1,231 @@
+"""Cut, flipped, foreign, old, empty: one clear line or a good recovery, by every reader."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from services.recorder import recovery
+from shared import topics
+from shared.exceptions import RunError
+from tests.recorder import runs
+from tests.recorder.runs import STATE_KEY, Killed
+from tools import cli
+from tools.info import as_json
+from tools.logs.survey import Survey
+from tools.runs.run_log import read_run
+
+CUTS = 1000
+CUTS_BY_VERB = 40
+SENT = [runs.state(seq) for seq in range(120)]
+
+
+@pytest.fixture(autouse=True)
+def no_wait_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.fsync", lambda _descriptor: None)
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Killed:
+    """A small log as a kill leaves it: 12 chunks of ten messages."""
+    directory = tmp_path_factory.mktemp("small")
+    return runs.killed_file(directory, batches=12, size=10, keys=runs.few_topics())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    directory = tmp_path_factory.mktemp("small")
+    runs.killed_file(directory, batches=12, size=10, keys=runs.few_topics())
+    return (directory / "written" / "run.mcap").read_bytes()
+
+
+def in_one_line(error: RunError) -> None:
+    assert "\n" not in str(error)
+
+
+def counted(path: Path) -> int | None:
+    """Return the messages that `xrl info` counts, or None for one clear line."""
+    survey = Survey()
+    try:
+        survey.add(path)
+    except RunError as error:
+        return in_one_line(error)
+    assert as_json(survey, [path])["messages"] == survey.messages
+    return survey.messages
+
+
+def recovered(path: Path) -> int | None:
+    """Return the messages that recovery gives back to the mcap package, or None for a line."""
+    try:
+        outcome = recovery.recover(path, path.with_name("recovered.mcap"))
+    except RunError as error:
+        return in_one_line(error)
+    assert all("\n" not in line for line in recovery.in_words(outcome))
+    with outcome.out.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = [message for _, _, message in reader.iter_messages()]
+        list(reader.iter_attachments())
+        list(reader.iter_metadata())
+    assert len(found) == outcome.messages
+    return len(found)
+
+
+def read(path: Path) -> int | None:
+    """Return the messages that the reader of runs finds, or None for one clear line."""
+    try:
+        log = read_run(path)
+    except RunError as error:
+        return in_one_line(error)
+    found = log.messages(topics.JOINT_STATE, "knee_right")
+    assert all(message in SENT for message in found), "a message that was never sent"
+    return sum(log.count(key) for key in log.keys())  # noqa: SIM118 - not a dict
+
+
+def test_cut_at_a_thousand_bytes_what_was_flushed_is_read_by_all_three(
+    tmp_path: Path, killed: Killed
+) -> None:
+    data = killed.path.read_bytes()
+    dice = random.Random(5)
+    path = tmp_path / "cut.mcap"
+    for size in sorted(dice.randrange(len(data) + 1) for _ in range(CUTS)):
+        path.write_bytes(data[:size])
+        counts = (counted(path), recovered(path))
+        if size >= killed.flushed[0][0]:
+            counts = (*counts, read(path))
+            assert None not in counts
+            assert all(n is not None and n >= killed.at_least(size) for n in counts)
+        assert len(set(counts)) == 1, f"cut at {size}: {counts}"
+
+
+def test_a_cut_in_the_end_of_a_finished_file_loses_no_message(
+    tmp_path: Path, finished: bytes
+) -> None:
+    path = tmp_path / "cut.mcap"
+    end = finished.rindex(b"zstd")  # of the last chunk's index
+    for size in range(end, len(finished), 7):
+        path.write_bytes(finished[:size])
+        assert (counted(path), recovered(path), read(path)) == (120, 120, 120)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_whatever_bytes_are_flipped_nothing_breaks_and_nothing_false_is_read(
+    tmp_path: Path, finished: bytes, data: st.DataObject
+) -> None:
+    content = bytearray(finished)
+    places = st.tuples(st.integers(0, len(content) - 1), st.integers(1, 255))
+    for place, flip in data.draw(st.lists(places, min_size=1, max_size=8)):
+        content[place] ^= flip
+    keep = data.draw(st.one_of(st.just(len(content)), st.integers(0, len(content))))
+    path = tmp_path / "flipped.mcap"
+    path.write_bytes(content[:keep])
+    counts = counted(path), recovered(path)
+    assert counts[0] is None or counts[0] <= 120
+    assert counts[0] == counts[1]
+    with contextlib.suppress(RunError):  # a flipped name of a field, caught by the decoder
+        read(path)
+
+
+def test_a_flip_in_one_chunk_costs_no_other(tmp_path: Path, killed: Killed) -> None:
+    data = killed.path.read_bytes()
+    dice = random.Random(11)
+    path = tmp_path / "flipped.mcap"
+    for _ in range(200):
+        content = bytearray(data)
+        place = dice.randrange(killed.flushed[0][0], len(content))
+        content[place] ^= dice.randrange(1, 256)
+        path.write_bytes(content)
+        found = recovered(path)
+        assert found is not None
+        assert found >= 110
+
+
+def sizes(data: bytes) -> list[int]:
+    dice = random.Random(3)
+    return sorted(dice.randrange(len(data) + 1) for _ in range(CUTS_BY_VERB))
+
+
+def test_the_verbs_answer_a_cut_file_with_a_good_end_or_one_line(
+    tmp_path: Path, killed: Killed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = killed.path.read_bytes()
+    path = tmp_path / "cut.mcap"
+    for size in [0, 1, 8, 9, *sizes(data)]:
+        path.write_bytes(data[:size])
+        for verb in ("info", "recover"):
+            flags = ["--force"] if verb == "recover" else []
+            code = cli.main([verb, str(path), *flags])
+            said = capsys.readouterr()
+            assert code in (0, 2)
+            assert len(said.err.splitlines()) == (1 if code else 0)
+            assert "Traceback" not in said.err + said.out
+
+
+def old_version(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("xrl")
+        writer.add_metadata("run", {"robot": runs.ROBOT, "schema_version": "0"})
+        writer.add_metadata("clock", {"offset_ns": "0"})
+        channel = writer.register_channel(STATE_KEY, "json", 0)
+        writer.add_message(channel, 1, b'{"t_ns":1,"seq":1,"angle":3.0}', 1, 1)
+        writer.finish()
+
+
+def foreign(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        channel = writer.register_channel("/odom\x1b[31m[bold]", "cdr", 0)
+        writer.add_message(channel, 10**18, b"\0\1", 10**18, 1)
+        writer.add_message(channel, 2**64 - 1, b"\0\1", 0, 2)
+        writer.finish()
+
+
+@pytest.mark.parametrize("make", [old_version, foreign])
+def test_another_version_and_a_foreign_file_are_shown_recovered_and_refused_in_one_line(
+    tmp_path: Path, make: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.mcap"
+    assert callable(make)
+    make(path)
+    assert cli.main(["info", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert ("0; this code writes" in said) == (make is old_version)
+    assert ("foreign" in said) == (make is foreign)
+    assert "\x1b" not in said
+    assert cli.main(["recover", str(path), "-o", str(tmp_path / "y.mcap")]) == 0
+    with pytest.raises(RunError) as caught:
+        read_run(path).messages(topics.JOINT_STATE, "knee_right")
+    assert "\n" not in str(caught.value)
+    assert ("schema version 0" in str(caught.value)) == (make is old_version)
+
+
+@pytest.mark.parametrize("verb", ["info", "recover"])
+@pytest.mark.parametrize("kind", ["absent", "directory", "empty", "text", "device", "pipe"])
+def test_what_is_no_log_is_one_line_and_exit_code_2(
+    tmp_path: Path, kind: str, verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.mcap"
+    if kind == "directory":
+        path.mkdir()
+    elif kind in ("empty", "text"):
+        path.write_bytes(b"no mcap file at all" if kind == "text" else b"")
+    elif kind == "device":
+        path = Path("/dev/zero")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    there = sorted(tmp_path.iterdir())
+    assert cli.main([verb, str(path)]) == 2
+    said = capsys.readouterr()
+    assert len(said.err.splitlines()) == 1
+    assert str(path) in said.err
+    assert sorted(tmp_path.iterdir()) == there

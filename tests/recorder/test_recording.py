@@ -1,0 +1,206 @@
+"""The recorder's cycle, with a clock and a disk that the test turns."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import random
+from pathlib import Path
+
+import pytest
+
+from services.recorder.mcap_log import RunWriter
+from services.recorder.recording import Recording, free_bytes_at
+from services.recorder.snapshot import Snapshot
+from services.recorder.space import MIB
+from shared import codec, topics
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config_sections import RecorderConfig
+from shared.messages import JointEvent, Mode
+from tests.recorder import runs
+from tests.recorder.runs import ROBOT, STATE_KEY, Queue, item
+from tools.runs.run_log import read_run
+
+CYCLE_NS = 20 * NS_PER_MS
+EVENT_KEY = topics.JOINT_EVENT.key(ROBOT, "knee_right")
+
+
+class Rig:
+    """A recording of ten messages a cycle; each is stamped when it comes."""
+
+    def __init__(self, out: Path, config: RecorderConfig, snapshot: Snapshot | None) -> None:
+        self.now_ns = 0
+        self.free = 10_000 * MIB
+        self.sent = 0
+        self.queue = Queue()
+        self.writer: RunWriter = runs.writer(out, begin=False)
+        self.recording = Recording(
+            self.queue,
+            self.writer,
+            config,
+            logging.getLogger("test"),
+            free_bytes=lambda: self.free,
+            now_ns=0,
+            snapshot=snapshot,
+        )
+
+    def run(self, seconds: float) -> None:
+        end_ns = self.now_ns + round(seconds * NS_PER_S)
+        while self.now_ns < end_ns:
+            for _ in range(10):
+                key, payload, _ = item(self.sent)
+                self.queue.items.append((key, payload, self.now_ns))
+                self.sent += 1
+            self.recording.cycle(self.now_ns)
+            self.now_ns += CYCLE_NS
+
+    def finish(self) -> None:
+        self.recording.close()
+        self.writer.__exit__(None, None, None)
+
+
+def rig(out: Path, *, snapshot: Snapshot | None = None, **changes: float) -> Rig:
+    settings = {"chunk_kib": 64, "flush_ms": 250.0, "fsync_s": 1.0, "free_min_mib": 100}
+    return Rig(out, RecorderConfig(**settings | changes), snapshot)  # type: ignore[arg-type]
+
+
+def seqs(path: Path) -> list[int]:
+    log = read_run(path)
+    assert log.complete
+    return [m.seq for m in log.messages(topics.JOINT_STATE, "knee_right")]
+
+
+def test_what_came_is_in_the_file_within_the_flush_period(tmp_path: Path) -> None:
+    run = rig(tmp_path)
+    for _ in range(40):
+        run.run(0.1)
+        there = read_run(tmp_path / "run.mcap").count(STATE_KEY)
+        assert there >= run.sent - 10 * (250 // 20 + 2), "a killed recorder loses so much at most"
+    run.finish()
+    assert seqs(tmp_path / "run.mcap") == list(range(run.sent))
+
+
+def test_it_splits_by_time_and_loses_nothing(tmp_path: Path) -> None:
+    run = rig(tmp_path, split_s=2.0)
+    run.run(7.0)
+    run.finish()
+    paths = [tmp_path / name for name in ("run.mcap", *(f"run_{n}.mcap" for n in (1, 2, 3)))]
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    parts = [seqs(path) for path in paths]
+    assert list(itertools.chain(*parts)) == list(range(run.sent))
+    assert all(900 <= len(part) <= 1200 for part in parts[:3])
+
+
+def test_it_splits_by_size(tmp_path: Path) -> None:
+    run = rig(tmp_path, split_mib=1)
+    dice = random.Random(1)
+    seq = 0
+    while run.writer.begun < 3:
+        noise = dice.randbytes(50_000).hex().encode()  # zstd halves it
+        run.queue.items.append((STATE_KEY, b'{"t_ns":1,"seq":%d,"x":"%s"}' % (seq, noise), seq))
+        seq += 1
+        run.recording.cycle(run.now_ns)
+        run.now_ns += CYCLE_NS
+    run.finish()
+    logs = [read_run(tmp_path / name) for name in ("run.mcap", "run_1.mcap", "run_2.mcap")]
+    assert all(MIB < log.path.stat().st_size < 2 * MIB for log in logs[:2])
+    assert all(log.metadata["split"]["why"] == "size" for log in logs[1:])
+    assert sum(log.count(STATE_KEY) for log in logs) == seq
+    assert [log.gaps()[STATE_KEY].missing for log in logs[:2]] == [0, 0]
+
+
+def test_short_of_space_it_warns_stops_with_a_finished_file_and_goes_on_later(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = rig(tmp_path)
+    run.run(1.5)
+    run.free = 190 * MIB
+    run.run(1.5)
+    assert "recording stops below 100 MiB" in caplog.text
+    run.free = 90 * MIB
+    run.run(2.0)
+    errors = [r.getMessage() for r in caplog.records if r.levelno == logging.ERROR]
+    assert len(errors) == 1
+    assert "recorder.free_min_mib = 100" in errors[0]
+    first = seqs(tmp_path / "run.mcap")
+    assert first == list(range(len(first)))
+    run.run(2.0)
+    assert list(tmp_path.iterdir()) == [tmp_path / "run.mcap"], "nothing written, nothing deleted"
+    run.free = 1000 * MIB
+    run.run(2.0)
+    run.finish()
+    second = seqs(tmp_path / "run_1.mcap")
+    assert second == list(range(second[0], run.sent))
+    left_out = second[0] - first[-1] - 1
+    assert left_out > 0
+    assert f"{left_out} messages were left out" in caplog.text
+    assert read_run(tmp_path / "run_1.mcap").metadata["split"]["why"] == "space again"
+
+
+def test_a_full_disk_at_the_start_is_waited_for(tmp_path: Path) -> None:
+    settings = RecorderConfig(chunk_kib=64, flush_ms=250.0, fsync_s=1.0, free_min_mib=100)
+    queue, free = Queue(), [10 * MIB]
+    with runs.writer(tmp_path, begin=False) as writer:
+        recording = Recording(
+            queue, writer, settings, logging.getLogger("test"),
+            free_bytes=lambda: free[0], now_ns=0,
+        )  # fmt: skip
+        recording.cycle(2 * NS_PER_S)
+        assert list(tmp_path.iterdir()) == []
+        free[0] = 1000 * MIB
+        recording.cycle(4 * NS_PER_S)
+        queue.items.append(item(0))
+        recording.cycle(5 * NS_PER_S)
+    assert seqs(tmp_path / "run.mcap") == [0]
+
+
+def fault(now_ns: int) -> tuple[str, bytes, int]:
+    payload = codec.encode(runs.sample(JointEvent, mode_after=Mode.FAULT, t_ns=now_ns))
+    return EVENT_KEY, payload, now_ns
+
+
+def test_a_snapshot_writes_nothing_until_a_fault_and_then_before_and_after(tmp_path: Path) -> None:
+    run = rig(tmp_path, snapshot=Snapshot(2.0, 1 << 28, runs.recorded_topics()))
+    run.run(10.0)
+    assert list(tmp_path.iterdir()) == []
+    run.queue.items.append(fault(run.now_ns))
+    run.run(10.0)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+    found = seqs(tmp_path / "run.mcap")
+    assert found == list(range(found[0], found[-1] + 1))
+    assert found[0] == pytest.approx(5000 - 1000, abs=20)
+    assert found[-1] == pytest.approx(5000 + 1000, abs=20)
+    log = read_run(tmp_path / "run.mcap")
+    assert log.metadata["split"]["snapshot"] == f"{EVENT_KEY}: FAULT"
+    assert log.received_ns(topics.JOINT_STATE, "knee_right")[0] == pytest.approx(
+        8 * NS_PER_S, abs=NS_PER_S // 20
+    )
+    run.queue.items.append(fault(run.now_ns))
+    run.run(1.0)
+    run.finish()
+    assert seqs(tmp_path / "run_1.mcap")[-1] == run.sent - 1, "a stop finishes it"
+
+
+def test_a_snapshot_without_a_fault_leaves_no_file(tmp_path: Path) -> None:
+    run = rig(tmp_path / "out", snapshot=Snapshot(2.0, 1 << 28, runs.recorded_topics()))
+    run.run(3.0)
+    run.finish()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_long_snapshot_is_written_in_slices(tmp_path: Path) -> None:
+    """So that the bus is emptied in between; its queue holds 13 s."""
+    run = rig(tmp_path, snapshot=Snapshot(600.0, 1 << 28, runs.recorded_topics()))
+    run.run(50.0)
+    run.recording.trigger("asked", run.now_ns)
+    run.run(0.02)
+    assert 0 < run.writer.messages < 10_000
+    run.run(0.1)
+    assert run.writer.messages > 25_000
+    run.finish()
+
+
+def test_free_space_is_that_of_the_nearest_directory_that_exists(tmp_path: Path) -> None:
+    here = free_bytes_at(tmp_path)
+    assert here > 0
+    assert free_bytes_at(tmp_path / "not" / "yet") == pytest.approx(here, rel=0.5)

@@ -1,0 +1,164 @@
+"""`xrl info` on files whose contents are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared import codec, topics
+from shared.messages import JointState, Wrench
+from tests.recorder import runs
+from tests.recorder.runs import OFFSET_NS, ROBOT, STATE_KEY, Queue
+from tools import cli
+
+WRENCH_KEY = topics.WRENCH.key(ROBOT)
+MS = 1_000_000
+
+
+def state(seq: int, t_ms: int) -> tuple[str, bytes, int]:
+    payload = codec.encode(runs.sample(JointState, seq=seq, t_ns=t_ms * MS))
+    return STATE_KEY, payload, t_ms * MS + 20 * MS
+
+
+def wrench(seq: int, t_ms: int) -> tuple[str, bytes, int]:
+    payload = codec.encode(runs.sample(Wrench, seq=seq, t_ns=t_ms * MS))
+    return WRENCH_KEY, payload, t_ms * MS
+
+
+def as_json(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
+    assert cli.main(["info", *map(str, words), "--json"]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def as_text(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    assert cli.main(["info", *map(str, words)]) == 0
+    return capsys.readouterr().out
+
+
+def test_counts_rates_gaps_losses_and_restarts_are_those_of_the_messages(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """250 Hz with three lost at 100 ms, and a sender that is away from 200 to 500 ms."""
+    before = [state(seq, 4 * seq) for seq in range(51) if seq not in (25, 26, 27)]
+    after = [state(seq, 500 + 4 * seq) for seq in range(51)]
+    found = as_json(capsys, runs.write(tmp_path, [*before, *after]))
+    topic = found["topics"][STATE_KEY]
+    assert (topic["count"], topic["lost"], topic["gaps"], topic["restarts"]) == (99, 3, 1, 1)
+    assert topic["longest_gap_s"] == pytest.approx(0.3)
+    assert topic["rate_hz"] == pytest.approx(98 / 0.7)
+    assert topic["nominal_hz"] == topics.JOINT_STATE.rate_hz
+    assert topic["schema"] == "xrl.JointState"
+    assert found["start_ns"] == OFFSET_NS + 20 * MS
+    assert found["duration_s"] == pytest.approx(0.7)
+    assert (found["robot"], found["messages"]) == (ROBOT, 99)
+    assert found["files"][0]["finished"]
+
+
+def test_every_number_of_the_recorder_s_own_count_is_found_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    items = [state(seq, seq) for seq in (0, 1, 5, 6, 2, 3, 9)]
+    with runs.writer(tmp_path) as run:
+        run.take_from(Queue(items), 100)
+    count = run.counts[STATE_KEY]
+    topic = as_json(capsys, run.path)["topics"][STATE_KEY]
+    assert (topic["count"], topic["lost"], topic["gaps"], topic["restarts"]) == (
+        count.count, count.missing, count.gaps, count.restarts,
+    )  # fmt: skip
+
+
+def test_an_unfinished_file_is_counted_and_says_how_to_recover(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    killed = runs.killed_file(tmp_path)
+    said = as_text(capsys, killed.path)
+    assert "not finished" in said
+    assert f"xrl recover {killed.path}" in said
+    found = as_json(capsys, killed.path)
+    assert found["messages"] == 1200
+    assert not found["files"][0]["finished"]
+
+
+def test_a_file_that_is_being_written_is_called_that(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with runs.writer(tmp_path) as run:
+        run.take_from(Queue([state(0, 0)]), 1)
+        run.flush()
+        said = as_text(capsys, run.path)
+    assert "being written" in said
+    assert "xrl recover" not in said
+
+
+def test_a_cut_tells_how_much_and_until_when(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    killed = runs.killed_file(tmp_path)
+    data = killed.path.read_bytes()
+    size = data.index(b"zstd", killed.flushed[-2][0]) + 100
+    killed.path.write_bytes(data[:size])
+    lost = size - killed.flushed[-2][0]
+    assert f"lost: the last {lost} bytes, cut off: 0." in as_text(capsys, killed.path)
+    cut = as_json(capsys, killed.path)["files"][0]["cut"]
+    # of the last hundred messages, 1 ms apart
+    assert OFFSET_NS + 1100 * MS <= cut["first_ns"] < cut["last_ns"] <= OFFSET_NS + 1200 * MS
+
+
+@pytest.fixture
+def split_run(tmp_path: Path) -> list[Path]:
+    paths = []
+    with runs.writer(tmp_path) as run:
+        for number in range(12):
+            if number:
+                run.finish()
+                run.begin({"why": "time"})
+            start = number * 11  # one is lost between two files
+            run.take_from(Queue(state(seq, seq) for seq in range(start, start + 10)), 100)
+            paths.append(run.path)
+    runs.write(tmp_path, [state(0, 0)])  # another run in the same directory
+    return paths
+
+
+def test_the_other_files_of_the_run_are_named_in_order(
+    split_run: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = as_json(capsys, split_run[1])
+    assert found["run_files"] == [str(path) for path in split_run]
+    assert found["messages"] == 10
+    assert "run_2.mcap, run_3.mcap" in as_text(capsys, split_run[1])
+
+
+def test_a_run_is_counted_over_all_its_files(
+    split_run: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = as_json(capsys, split_run[3], "--run")
+    topic = found["topics"][STATE_KEY]
+    assert [file["path"] for file in found["files"]] == [str(path) for path in split_run]
+    assert (topic["count"], topic["lost"], topic["gaps"]) == (120, 11, 11)
+
+
+def test_a_slow_topic_stands_beside_its_rate_and_an_event_has_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    event = topics.RUN_EVENT
+    items = [wrench(seq, 10 * seq) for seq in range(11)]
+    for seq in range(3):
+        payload = codec.encode(runs.sample(event.type, seq=seq, t_ns=seq * MS))
+        items.append((event.key(ROBOT), payload, seq * MS))
+    said = as_text(capsys, runs.write(tmp_path, items))
+    (row,) = [line.split() for line in said.splitlines() if "harness/wrench" in line]
+    assert row == ["harness/wrench", "11", "100.0", "250", "10.0", "0", "0"]
+    (row,) = [line.split() for line in said.splitlines() if "run/event" in line]
+    assert row == ["run/event", "3", "0", "0"]
+
+
+def test_a_file_without_a_message_is_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = as_json(capsys, runs.write(tmp_path, []))
+    assert (found["messages"], found["duration_s"], found["start_ns"]) == (0, None, None)
+    assert all(topic["rate_hz"] is None for topic in found["topics"].values())
