@@ -256,6 +256,8 @@ class PlannerStatus(Message, frozen=True):
     state_seq: Modules
     """Sequence number of the state consumed from each module."""
     wrench_seq: int
+    assist_wanted_n: float
+    """Assist that the operator asked for, N, as this tick took it."""
     state_age_ns: Modules
     """Time since each module's newest state arrived, by the planner's clock; -1 if none yet."""
 

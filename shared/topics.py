@@ -7,7 +7,7 @@ from typing import Final
 
 import msgspec
 
-from shared import messages
+from shared import messages, traces
 from shared.joints import MODULES
 
 
@@ -64,6 +64,22 @@ JOINT_EVENT: Final = Topic(
     priority=Priority.DATA,
     recorded=True,
     why="every change of state, with its cause and torque step",
+)
+JOINT_TRACE: Final = Topic(
+    name="joint/*/trace",
+    type=traces.JointTrace,
+    rate_hz=50.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    why="every cycle's inputs: a joint service is executed again from them, bit for bit",
+)
+PLANNER_MEMORY: Final = Topic(
+    name="planner/memory",
+    type=traces.PlannerMemory,
+    rate_hz=1.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    why="where the planner can be executed again from",
 )
 WRENCH: Final = Topic(
     name="harness/wrench",
@@ -134,9 +150,11 @@ TOPICS: Final = (
     JOINT_STATE,
     JOINT_COMMAND,
     JOINT_EVENT,
+    JOINT_TRACE,
     WRENCH,
     HARNESS_TARE,
     PLANNER_STATUS,
+    PLANNER_MEMORY,
     OPERATOR_INTENT,
     ESTOP,
     SIM_TRUTH,

@@ -49,6 +49,12 @@ def add_parser(subparsers: Subparsers) -> None:
         help="start no simulator: the drives are real, or come later",
     )
     parser.add_argument(
+        "--snapshot",
+        type=float,
+        metavar="SECONDS",
+        help="record nothing until something goes wrong, then so much before and after it",
+    )
+    parser.add_argument(
         "--no-planner",
         action="store_true",
         help="six modules that HOLD by themselves; `xrl start planner` lets it lead",
@@ -66,6 +72,8 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
     make_out(out, "up")
     overrides = {"recorder": ["--out", str(out.absolute())]}
+    if args.snapshot is not None:
+        overrides["recorder"] += ["--snapshot", f"{args.snapshot:g}"]
     if args.readonly:
         overrides |= {module: ["--readonly"] for module in MODULES}
     if args.scenario is not None:

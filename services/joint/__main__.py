@@ -24,6 +24,7 @@ from shared.process import (
     run_service,
     service_parser,
 )
+from shared.traces import JointTrace
 
 FIFO_PRIORITY = 20
 """Above the planner: this tier stands when the others do not get the processor."""
@@ -52,6 +53,7 @@ def main() -> int:
             estops=session.latest(topics.ESTOP, Estop),
             states=session.publisher(topics.JOINT_STATE, JointState, module),
             events=session.publisher(topics.JOINT_EVENT, JointEvent, module),
+            traces=session.publisher(topics.JOINT_TRACE, JointTrace, module),
         )
         drive = open_drive(robot, module, arguments.run_dir)
         if arguments.readonly:

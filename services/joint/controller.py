@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import msgspec
+
 from services.joint import law
 from services.joint.differential import joint_torque
 from services.joint.drivers.base import DriveReading
@@ -29,6 +31,26 @@ class CycleResult(NamedTuple):
     """Joint torque for the drive, N m, after the gate."""
     event: JointEvent | None
     """The change of state of this cycle, if there was one."""
+
+
+class ControllerMemory(msgspec.Struct, frozen=True):
+    """All that a controller knows beyond its configuration: it goes on from here bit for bit."""
+
+    failsafe: Failsafe
+    samples: Samples
+    anchor: Setpoint
+    setpoint: Setpoint
+    changed_ns: int
+    last_cycle_ns: int
+    found_tau: Pair | None
+    damp_stop: float | None
+    """None: there is no stop (JSON has no infinity)."""
+    cause: int
+    tau: Pair
+    cycle: int
+    late: int
+    events: int
+    states: int
 
 
 class JointController:
@@ -153,6 +175,35 @@ class JointController:
             drive=int(samples.status),
             drive_error=samples.error,
         )
+
+    def remember(self) -> ControllerMemory:
+        """Return the memory as it is now; `recall` goes on from there."""
+        return ControllerMemory(
+            self.failsafe,
+            self._samples,
+            self._anchor,
+            self._setpoint,
+            self._changed_ns,
+            self._last_cycle_ns,
+            self._found_tau,
+            self._damp_stop if math.isfinite(self._damp_stop) else None,
+            self._cause,
+            self.tau,
+            self.cycle,
+            self.late,
+            self._events,
+            self._states,
+        )
+
+    def recall(self, memory: ControllerMemory) -> None:
+        """Go on from a memory."""
+        m = memory
+        self.failsafe, self._samples = m.failsafe, m.samples
+        self._anchor, self._setpoint = m.anchor, m.setpoint
+        self._changed_ns, self._last_cycle_ns = m.changed_ns, m.last_cycle_ns
+        self._found_tau, self._cause, self.tau = m.found_tau, m.cause, m.tau
+        self._damp_stop = -math.inf if m.damp_stop is None else m.damp_stop
+        self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""

@@ -9,16 +9,21 @@ import msgspec
 
 from services.joint.drivers.base import Drive
 from services.joint.module import ARM_TRIES, Module, Obstacle, Order, Step
+from services.joint.tracer import Tracer
 from shared import log
 from shared.bus import Latest, Publisher
-from shared.clock import now_ns
+from shared.clock import NS_PER_S, now_ns
 from shared.config import RobotConfig
 from shared.exceptions import DriveError
 from shared.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode
 from shared.process import StopFlag
+from shared.traces import JointTrace
 
 READ_TIMEOUT_S: Final = 0.005
 """A cycle without an encoder sample runs all the same: ages and the failsafe go on."""
+
+TELL_EVERY_NS: Final = 10 * NS_PER_S
+"""What keeps a drive from being armed is said so often."""
 
 _WHY_NOT: Final = {
     Obstacle.UNZEROED: "the drive has had no power since it was zeroed, or never was, or its "
@@ -36,6 +41,7 @@ class Ports(msgspec.Struct, frozen=True):
     estops: Latest[Estop]
     states: Publisher[JointState]
     events: Publisher[JointEvent]
+    traces: Publisher[JointTrace]
 
 
 class JointLoop:
@@ -46,6 +52,9 @@ class JointLoop:
         self._module = module
         self._drive = drive
         self._ports = ports
+        self._tracer = Tracer(module)
+        self._told = Obstacle.NONE
+        self._tell_at_ns = 0
         self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._nowhere = (-config.drive.zero_mark_turns,) * 2
 
@@ -58,24 +67,31 @@ class JointLoop:
         """
         while not stop:
             self.cycle()
+        rest = self._tracer.take()
+        if rest is not None:
+            self._ports.traces.put(rest)
         if stop.interrupted or not self._module.leaves_holding:
             self._drive.idle()
 
     def cycle(self) -> None:
         """Run one cycle."""
-        module, ports = self._module, self._ports
+        module, ports, tracer = self._module, self._ports, self._tracer
         reading = self._drive.read(READ_TIMEOUT_S)
         now = now_ns()
         estop = ports.estops.take() is not None
-        step = module.step(now, reading, ports.commands.take(), estop)
+        command = ports.commands.take()
+        step = module.step(now, reading, command, estop)
         self._write(step)
         controller = module.controller
         if controller.cycle % self._state_every == 0:
             ports.states.put(controller.state(now))
         if step.event is not None:
             ports.events.put(step.event)
+        trace = tracer.after(now, reading, command, estop, step)
+        if trace is not None:
+            ports.traces.put(trace)
         if step.event is not None or step.obstacle is not Obstacle.NONE:
-            self._tell(step)
+            self._tell(now, step)
 
     def _write(self, step: Step) -> None:
         """Carry out the order of this cycle."""
@@ -92,7 +108,7 @@ class JointLoop:
             with suppress(DriveError):  # it is gone: no zero is left to be forgotten
                 drive.set_position(self._nowhere)
 
-    def _tell(self, step: Step) -> None:
+    def _tell(self, now: int, step: Step) -> None:
         """Log what a person has to know; nothing is controlled then, and a line does no harm."""
         samples = self._module.controller.samples
         if step.event is not None and step.event.mode_after == Mode.FAULT:
@@ -101,6 +117,8 @@ class JointLoop:
                 Cause(step.event.cause).name,
                 samples.error,
             )
-        if step.obstacle is not Obstacle.NONE:
+        told = step.obstacle is self._told and now < self._tell_at_ns
+        if step.obstacle is not Obstacle.NONE and not told:
+            self._told, self._tell_at_ns = step.obstacle, now + TELL_EVERY_NS
             why = _WHY_NOT[step.obstacle].format(q=samples.q, error=samples.error)
             log.get("xrl").error("not armed: %s", why)

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from services.joint.controller import JointController
+from services.joint.controller import ControllerMemory, JointController
 from services.joint.differential import motor_torque
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.onboard import OnboardLaw
@@ -58,6 +58,19 @@ class Step(NamedTuple):
     target: MotorTarget | None
     """Of `Order.TARGET`."""
     obstacle: Obstacle
+
+
+class ModuleMemory(msgspec.Struct, frozen=True):
+    """All that a module's service knows beyond its configuration."""
+
+    controller: ControllerMemory
+    gains: Pair
+    """Of the onboard law, `OnboardLaw.gains`."""
+    estop: bool
+    arm_at_ns: int
+    idle_at_ns: int
+    tries: int
+    forgets: bool
 
 
 _NO_TORQUE: Pair = (0.0, 0.0)
@@ -117,6 +130,26 @@ class Module:
             order = Order.TARGET
             target = self._law.target(controller.setpoint, result.tau, samples.pos, samples.vel)
         return Step(result.event, order, torque, target, Obstacle.NONE)
+
+    def remember(self) -> ModuleMemory:
+        """Return the memory as it is now; it shares what still changes, so use it at once."""
+        return ModuleMemory(
+            self.controller.remember(),
+            self._law.gains,
+            self._estop,
+            self._arm_at_ns,
+            self._idle_at_ns,
+            self._tries,
+            self._forgets,
+        )
+
+    def recall(self, memory: ModuleMemory) -> None:
+        """Go on from a memory, bit for bit."""
+        m = memory
+        self.controller.recall(m.controller)
+        self._law.gains = m.gains
+        self._estop, self._arm_at_ns, self._idle_at_ns = m.estop, m.arm_at_ns, m.idle_at_ns
+        self._tries, self._forgets = m.tries, m.forgets
 
     def _in_fault(self, now_ns: int) -> Order:
         """Return what the drive of a module in FAULT is to be told.

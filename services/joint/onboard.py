@@ -39,6 +39,15 @@ class OnboardLaw:
         self._stiffness = 0.0
         self._vel_gain = 0.0
 
+    @property
+    def gains(self) -> Pair:
+        """Stiffness and damping that the drive has, N m and N m s a turn."""
+        return (self._stiffness, self._vel_gain)
+
+    @gains.setter
+    def gains(self, gains: Pair) -> None:
+        self._stiffness, self._vel_gain = gains
+
     def target(self, setpoint: Setpoint, tau: Pair, pos: Pair, vel: Pair) -> MotorTarget:
         """Return the target under which the motors give the joint torques tau at this sample.
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import Final
 
+import msgspec
+
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
@@ -32,30 +34,27 @@ _EVENT: Final = {
 }
 
 
-class Samples:
-    """The newest believed sample of a module, at the joint.
+class Samples(msgspec.Struct):
+    """The newest believed sample of a module, at the joint."""
 
-    Attributes:
-        q: angles (phi, theta), rad.
-        v: rates, rad/s.
-        pos: of the motors, turns.
-        vel: of the motors, turn/s.
-        t_ns: when the drive's newest sample came, believed or not; 0 before the first.
-        status: of the drive.
-        error: its error bits.
-    """
-
-    def __init__(self, gear_ratio: float) -> None:
-        self._gear_ratio = gear_ratio
-        self.q: Pair = (0.0, 0.0)
-        self.v: Pair = (0.0, 0.0)
-        self.t_ns = 0
-        self.status = DriveStatus.LOST
-        self.error = 0
-        self.pos: Pair = (0.0, 0.0)
-        self.vel: Pair = (0.0, 0.0)
-        self._believed_ns = 0
-        self._odd = 0
+    gear_ratio: float
+    q: Pair = (0.0, 0.0)
+    """Angles (phi, theta), rad."""
+    v: Pair = (0.0, 0.0)
+    """rad/s"""
+    pos: Pair = (0.0, 0.0)
+    """Of the motors, turns."""
+    vel: Pair = (0.0, 0.0)
+    """turn/s"""
+    t_ns: int = 0
+    """When the drive's newest sample came, believed or not; 0 before the first."""
+    status: DriveStatus = DriveStatus.LOST
+    error: int = 0
+    """The drive's error bits."""
+    believed_ns: int = 0
+    """When the newest believed sample came."""
+    odd: int = 0
+    """Samples since then that were not believed."""
 
     def take(self, reading: DriveReading, *, armed: bool) -> Event:
         """Take in a sample; return what it means for the failsafe.
@@ -69,18 +68,18 @@ class Samples:
         if event is Event.DRIVE_LOST or event is Event.POSITION_LOST:
             return event  # with positions that are old, or mean nothing
         if armed and not self._is_believable(reading):
-            self._odd += 1
+            self.odd += 1
             if event is not Event.DRIVE_ARMED:
                 return event
-            return Event.POSITION_LOST if self._odd >= ODD_MAX else Event.NONE
-        self._odd = 0
-        self.pos, self.vel, self._believed_ns = reading.pos_turns, reading.vel_turns, self.t_ns
-        self.q = joint_from_motor(reading.pos_turns, self._gear_ratio)
-        self.v = joint_from_motor(reading.vel_turns, self._gear_ratio)
+            return Event.POSITION_LOST if self.odd >= ODD_MAX else Event.NONE
+        self.odd = 0
+        self.pos, self.vel, self.believed_ns = reading.pos_turns, reading.vel_turns, self.t_ns
+        self.q = joint_from_motor(reading.pos_turns, self.gear_ratio)
+        self.v = joint_from_motor(reading.vel_turns, self.gear_ratio)
         return event
 
     def _is_believable(self, reading: DriveReading) -> bool:
-        dt_s = (reading.t_ns - self._believed_ns) / NS_PER_S
+        dt_s = (reading.t_ns - self.believed_ns) / NS_PER_S
         (a, b), (was_a, was_b), (vel_a, vel_b) = reading.pos_turns, self.pos, self.vel
         free = JUMP_TURNS + JUMP_SPEED * dt_s
         return abs(a - was_a) <= free + abs(vel_a) * dt_s and (

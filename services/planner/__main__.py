@@ -17,6 +17,7 @@ from shared.process import (
     run_service,
     service_parser,
 )
+from shared.traces import PlannerMemory
 
 FIFO_PRIORITY = 15
 """Below the joint services: the failsafe outranks the law."""
@@ -40,6 +41,7 @@ def main() -> int:
             intent=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
             commands=[session.publisher(topics.JOINT_COMMAND, JointCommand, m) for m in MODULES],
             status=session.publisher(topics.PLANNER_STATUS, PlannerStatus),
+            memory=session.publisher(topics.PLANNER_MEMORY, PlannerMemory),
         )
         session_id = secrets.randbelow(1 << 53) + 1  # JSON readers keep 53 bits
         loop = PlannerLoop(robot, Planner(robot, session_id), ports)

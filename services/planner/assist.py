@@ -13,6 +13,7 @@ from typing import Final
 
 import msgspec
 
+from services.planner.memory import AssistMemory, EasingMemory, OverloadMemory
 from shared.messages import Vector3, Wrench
 
 ERROR_MIN: Final = 5.0
@@ -90,6 +91,17 @@ class AssistLaw:
         self.integral = 0.0
         """N"""
 
+    def remember(self) -> AssistMemory:
+        """Return the memory as it is now."""
+        return AssistMemory(self._ramp, self._wanted, self._still_s, self.integral)
+
+    def recall(self, memory: AssistMemory) -> None:
+        """Go on from a memory."""
+        m = memory
+        self._ramp, self._wanted, self._still_s, self.integral = (
+            m.ramp, m.wanted, m.still_s, m.integral
+        )  # fmt: skip
+
     @property
     def assist(self) -> float:
         """What the feedforward carries, N."""
@@ -143,6 +155,14 @@ class LeadEasing:
         self._lead = (0.0, 0.0)
         self._left = 0.0
 
+    def remember(self) -> EasingMemory:
+        """Return the memory as it is now."""
+        return EasingMemory(self._lead, self._left)
+
+    def recall(self, memory: EasingMemory) -> None:
+        """Go on from a memory."""
+        self._lead, self._left = memory.lead, memory.left
+
     def ease(
         self, up: float | None, moment_pitch: float, assist: float, dt: float
     ) -> tuple[float, float]:
@@ -185,6 +205,16 @@ class Overload:
         self._below_since_ns: int | None = None
         self.hold = False
         """True while it lasts."""
+
+    def remember(self) -> OverloadMemory:
+        """Return the memory as it is now."""
+        return OverloadMemory(self._beyond_since_ns, self._below_since_ns, self.hold)
+
+    def recall(self, memory: OverloadMemory) -> None:
+        """Go on from a memory."""
+        m = memory
+        self._beyond_since_ns, self._below_since_ns = m.beyond_since_ns, m.below_since_ns
+        self.hold = m.hold
 
     def hear(self, wrench: Wrench, now_ns: int) -> None:
         """Take a wrench that arrived now."""

@@ -27,6 +27,7 @@ from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still
 from services.planner.gains import GainLaw
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
+from services.planner.memory import LawMemory
 from services.planner.split import GainSplit, LocalGains
 from shared.config import GRAVITY, RobotConfig
 from shared.messages import Wrench
@@ -154,6 +155,25 @@ class Hocca:
             result.iterations,
             result.residual,
         )
+
+    def remember(self) -> LawMemory:
+        """Return the memory as it is now."""
+        return LawMemory(
+            tuple(self._p_C0.tolist()),
+            self._since_align_s,
+            self._aligned,
+            tuple(self._ik.q.tolist()),
+            self._assist.remember(),
+            self._easing.remember(),
+        )
+
+    def recall(self, memory: LawMemory) -> None:
+        """Go on from a memory."""
+        self._p_C0 = np.array(memory.p_C0)
+        self._since_align_s, self._aligned = memory.since_align_s, memory.aligned
+        self._ik.q[:] = memory.q
+        self._assist.recall(memory.assist)
+        self._easing.recall(memory.easing)
 
     def _align(self, q: Array) -> None:
         self._aligned = True

@@ -7,11 +7,13 @@ from collections.abc import Sequence
 import msgspec
 
 from services.planner.planner import Planner
+from services.planner.remembrance import Remembrance
 from shared.bus import Latest, Publisher
 from shared.clock import NS_PER_S, NS_PER_US, now_ns, sleep_until
 from shared.config import RobotConfig
 from shared.messages import JointCommand, JointState, OperatorIntent, PlannerStatus, Wrench
 from shared.process import StopFlag
+from shared.traces import PlannerMemory
 
 
 class Ports(msgspec.Struct, frozen=True):
@@ -22,6 +24,7 @@ class Ports(msgspec.Struct, frozen=True):
     intent: Latest[OperatorIntent]
     commands: Sequence[Publisher[JointCommand]]
     status: Publisher[PlannerStatus]
+    memory: Publisher[PlannerMemory]
 
 
 POLL_NS = 400 * NS_PER_US
@@ -37,6 +40,7 @@ class PlannerLoop:
         self._planner = planner
         self._ports = ports
         self._rest_ns = round(REST_SHARE * NS_PER_S / config.planner.rate_hz)
+        self._remembrance = Remembrance(config.planner.rate_hz)
 
     def run(self, stop: StopFlag) -> None:
         """Run until told to stop."""
@@ -69,3 +73,6 @@ class PlannerLoop:
         for publisher, command in zip(ports.commands, planner.tick(now), strict=False):
             publisher.put(command)
         ports.status.put(planner.status(now, (now_ns() - now) / NS_PER_US))
+        memory = self._remembrance.after(planner, now)
+        if memory is not None:
+            ports.memory.put(memory)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ from services.planner.assist import Overload
 from services.planner.certificate import Margins
 from services.planner.engagement import Engagement
 from services.planner.hocca import Hocca, LawOutput
+from services.planner.memory import TickMemory
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import N_JOINTS, N_MODULES
@@ -76,6 +78,8 @@ class Planner:
         self._new = 0  # bit i: module i has a state that no tick has used
         self._seq = 0
         self._output: LawOutput | None = None
+        self._source: SplitSource | None = None
+        """Where the gains of the last tick came from."""
 
     def hear_state(self, module: int, state: JointState, now_ns: int) -> None:
         """Take a module's newest state."""
@@ -140,8 +144,39 @@ class Planner:
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
         )
+        self._source = self._output.local.source
         self._seq += 1
         return self._commands(now_ns, states, self._output)
+
+    def remember(self) -> TickMemory:
+        """Return the memory as it is between two ticks; `recall` goes on from there."""
+        return TickMemory(
+            tuple(self._states),
+            tuple(self._arrived_ns),
+            self._assist_wanted,
+            self._wrench,
+            self._wrench_ns,
+            self._wrench_seq,
+            self._last_ns,
+            self._seq,
+            self._source,
+            msgspec.structs.replace(self._engagement),
+            self._overload.remember(),
+            self._law.remember(),
+        )
+
+    def recall(self, memory: TickMemory) -> None:
+        """Go on from a memory, bit for bit."""
+        m = memory
+        for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
+            if state is not None:
+                self.hear_state(module, state, arrived_ns)
+        self._assist_wanted = m.assist_wanted
+        self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
+        self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
+        self._engagement = msgspec.structs.replace(m.engagement)
+        self._overload.recall(m.overload)
+        self._law.recall(m.law)
 
     def _usable_wrench(self, now_ns: int) -> Wrench | None:
         """Return the newest wrench, or None if it is not valid or has come too long ago."""
@@ -154,8 +189,7 @@ class Planner:
         """Return why the planner may not lead, by what the last tick found; None if it may."""
         if self._overload.hold:
             return PlannerMode.OVERLOADED
-        output = self._output
-        if output is not None and output.local.source is SplitSource.UNCERTIFIED:
+        if self._source is SplitSource.UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
         return None
 
@@ -217,6 +251,7 @@ class Planner:
             tick_us=tick_us,
             state_seq=(seqs[0], seqs[1], seqs[2], seqs[3], seqs[4], seqs[5]),
             wrench_seq=self._wrench_seq,
+            assist_wanted_n=self._assist_wanted,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
         )
 

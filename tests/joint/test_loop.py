@@ -14,6 +14,7 @@ from services.joint.loop import JointLoop, Ports
 from services.joint.module import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS, Module
 from shared.config import RobotConfig
 from shared.messages import Estop, JointEvent, JointState, Mode, Pair
+from shared.traces import JointTrace
 from tests.joint.helpers import T0, command, with_service
 
 M = TypeVar("M")
@@ -95,11 +96,13 @@ class Rig:
         self.controller = module.controller
         self.commands, self.estops = Inbox[Any](), Inbox[Estop]()
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
+        self.traces = Outbox[JointTrace]()
         ports = Ports(
             commands=cast("Any", self.commands),
             estops=cast("Any", self.estops),
             states=cast("Any", self.states),
             events=cast("Any", self.events),
+            traces=cast("Any", self.traces),
         )
         self.loop = JointLoop(robot, module, self.drive, ports)
 
@@ -307,3 +310,12 @@ def test_a_service_that_ends_while_it_sinks_leaves_its_drive_damping(onboard: Ri
     assert onboard.mode is Mode.DAMP
     onboard.loop.run(cast("Any", Stop(3, interrupted=False)))
     assert onboard.drive.idled == 0
+
+
+def test_every_cycle_is_traced_and_the_rest_when_the_service_ends(rig: Rig) -> None:
+    rig.run(25)
+    assert [len(trace.cycles) for trace in rig.traces.sent] == [10, 10]
+    rig.loop.run(cast("Any", Stop(3, interrupted=False)))
+    assert [len(trace.cycles) for trace in rig.traces.sent] == [10, 10, 8]
+    assert [bool(trace.memory) for trace in rig.traces.sent] == [True, False, False]
+    assert [trace.seq for trace in rig.traces.sent] == [1, 2, 3]

@@ -11,7 +11,9 @@ from collections.abc import Callable, Iterator
 
 from services.joint.controller import JointController
 from services.joint.module import Module
+from services.joint.tracer import Tracer
 from services.planner.planner import Planner
+from services.planner.remembrance import Remembrance
 from services.simulator.axis_bank import AxisBank
 from services.simulator.fault_injector import FaultInjector
 from services.simulator.world import World
@@ -88,6 +90,9 @@ class Lockstep:
         self.scenario = scenario
         self.world = World(config, scenario)
         self._modules = [Module(config, module) for module in MODULES]
+        self._traces = record is not _forget
+        self._tracers = [Tracer(module) for module in self._modules]
+        self._remembrance = Remembrance(config.planner.rate_hz)
         self.planner: Planner | None = Planner(config, session=1)
         self.events: list[tuple[str, JointEvent]] = []
         self.estop = False
@@ -111,7 +116,8 @@ class Lockstep:
         )
         self._harness_ns = round(NS_PER_S / config.harness.rate_hz)
         self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
-        self._state_ns = round(NS_PER_S / config.joint_service.state_rate_hz)
+        joint = config.joint_service
+        self._state_every = round(joint.rate_hz / joint.state_rate_hz)
         self._step_ns = round(config.simulation.timestep * NS_PER_S)
         self._truth_ns = round(NS_PER_S / config.simulation.truth_rate_hz)
         self._tracked_since_ns = 0
@@ -195,9 +201,11 @@ class Lockstep:
         if service == "planner":
             self._sessions += 1
             self.planner = Planner(self.config, self._sessions)
+            self._remembrance = Remembrance(self.config.planner.rate_hz)
             return
         index = MODULE_INDEX[service]
         self._modules[index] = Module(self.config, service)
+        self._tracers[index] = Tracer(self._modules[index])
         self._drives[index].serve_anew()
 
     def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
@@ -217,15 +225,20 @@ class Lockstep:
             if name in self._frozen:
                 continue
             drive = self._drives[index]
-            step = module.step(now, drive.read(now), self._commands[index].take(now), self.estop)
+            reading, command = drive.read(now), self._commands[index].take(now)
+            step = module.step(now, reading, command, self.estop)
             drive.carry_out(step, onboard=module.onboard)
             if step.event is not None:
                 self.events.append((name, step.event))
                 self._record(topics.JOINT_EVENT, name, step.event)
-            if now % self._state_ns == 0:
+            if module.controller.cycle % self._state_every == 0:
                 state = module.controller.state(now)
                 self._states[index].put(now, state)
                 self._record(topics.JOINT_STATE, name, state)
+            if self._traces:
+                trace = self._tracers[index].after(now, reading, command, self.estop, step)
+                if trace is not None:
+                    self._record(topics.JOINT_TRACE, name, trace)
 
     def _advance_planner(self, planner: Planner, now: int) -> None:
         """Hand over what has arrived, and tick as the live loop does."""
@@ -244,6 +257,9 @@ class Lockstep:
             self._record(topics.JOINT_COMMAND, MODULES[index], command)
         status: PlannerStatus = planner.status(now, 0.0)
         self._record(topics.PLANNER_STATUS, "", status)
+        memory = self._remembrance.after(planner, now) if self._traces else None
+        if memory is not None:
+            self._record(topics.PLANNER_MEMORY, "", memory)
 
     def _begin_when_tracking(self, now: int) -> None:
         if self.world.scenario_s >= 0.0:

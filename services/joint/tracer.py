@@ -1,0 +1,86 @@
+"""Writes down what each cycle was given and decided, so that it can be executed again. Pure.
+
+The order in which a service took its inputs is nowhere else: in the log's order 22 to 97 % of the
+ticks came out wrong (design section 10).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+from services.joint.drivers.base import DriveReading
+from services.joint.module import Module, Step
+from shared.messages import JointCommand
+from shared.traces import CycleTrace, JointTrace
+
+CYCLES: Final = 10
+"""In a message; so much is lost with a killed service."""
+MEMORY_EVERY: Final = 50
+"""Messages from one with the service's memory to the next: 1 s."""
+
+_NOTHING: Final = (0.0, 0.0)
+
+
+class Tracer:
+    """Gathers the cycles of one module's service."""
+
+    def __init__(self, module: Module) -> None:
+        """Begin before the first cycle."""
+        self._module = module
+        self._encode = msgspec.json.Encoder().encode
+        self._cycles: list[CycleTrace] = []
+        self._seq = 0
+        self._memory = ""
+        self._remember()
+
+    def after(
+        self,
+        now_ns: int,
+        reading: DriveReading | None,
+        command: JointCommand | None,
+        estop: bool,
+        step: Step,
+    ) -> JointTrace | None:
+        """Take down a cycle; return a message when it is full."""
+        r = reading
+        torque = None if r is None else r.torque
+        self._cycles.append(
+            CycleTrace(
+                now_ns,
+                -1 if r is None else r.t_ns,
+                _NOTHING if r is None else r.pos_turns,
+                _NOTHING if r is None else r.vel_turns,
+                0 if r is None else int(r.status),
+                0 if r is None else r.error,
+                torque or _NOTHING,
+                torque is not None,
+                0 if command is None else command.session,
+                -1 if command is None else command.seq,
+                estop,
+                step.order.value,
+                self._module.controller.tau,
+            )
+        )
+        return self.take() if len(self._cycles) == CYCLES else None
+
+    def take(self) -> JointTrace | None:
+        """Return what has been gathered, if there is anything."""
+        if not self._cycles:
+            return None
+        self._seq += 1
+        trace = JointTrace(
+            t_ns=self._cycles[-1].now_ns,
+            seq=self._seq,
+            memory=self._memory,
+            cycles=tuple(self._cycles),
+        )
+        self._cycles.clear()
+        self._remember()
+        return trace
+
+    def _remember(self) -> None:
+        """Take down the memory if the next message is to have it."""
+        due = self._seq % MEMORY_EVERY == 0
+        self._memory = self._encode(self._module.remember()).decode() if due else ""

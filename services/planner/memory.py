@@ -1,0 +1,61 @@
+"""What the planner knows beyond its configuration, as data: it goes on from there bit for bit."""
+
+from __future__ import annotations
+
+import msgspec
+
+from services.planner.engagement import Engagement
+from shared.messages import JointState, Pair, SplitSource, Wrench
+
+
+class AssistMemory(msgspec.Struct, frozen=True):
+    """Of `AssistLaw`."""
+
+    ramp: float | None
+    wanted: float
+    still_s: float
+    integral: float
+
+
+class EasingMemory(msgspec.Struct, frozen=True):
+    """Of `LeadEasing`."""
+
+    lead: Pair
+    left: float
+
+
+class OverloadMemory(msgspec.Struct, frozen=True):
+    """Of `Overload`."""
+
+    beyond_since_ns: int | None
+    below_since_ns: int | None
+    hold: bool
+
+
+class LawMemory(msgspec.Struct, frozen=True):
+    """Of `Hocca`."""
+
+    p_C0: tuple[float, ...]
+    since_align_s: float
+    aligned: bool
+    q: tuple[float, ...]
+    """Where the inverse kinematics starts from, rad."""
+    assist: AssistMemory
+    easing: EasingMemory
+
+
+class TickMemory(msgspec.Struct, frozen=True):
+    """Of `Planner`, before a tick."""
+
+    states: tuple[JointState | None, ...]
+    arrived_ns: tuple[int, ...]
+    assist_wanted: float
+    wrench: Wrench | None
+    wrench_ns: int
+    wrench_seq: int
+    last_ns: int
+    seq: int
+    source: SplitSource | None
+    engagement: Engagement
+    overload: OverloadMemory
+    law: LawMemory

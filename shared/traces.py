@@ -1,0 +1,55 @@
+"""Messages from which a service is executed again: what each of its cycles was given.
+
+On the bus like all others; nobody but the recorder listens.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from shared.messages import Message, Pair
+
+
+class CycleTrace(msgspec.Struct, gc=False, frozen=True):
+    """All that one cycle of a joint service was given, and what it decided."""
+
+    now_ns: int
+    sampled_ns: int
+    """When the drive's sample came; -1: none came, and the next six fields say nothing."""
+    pos: Pair
+    """Motor positions from the joint's zero, turns."""
+    vel: Pair
+    """turn/s"""
+    status: int
+    """`DriveStatus`."""
+    error: int
+    carried: Pair
+    """Motor torques that a drive told which was found armed, N m,"""
+    carries: bool
+    """if this says so."""
+    session: int
+    """Of the command that came in this cycle,"""
+    command_seq: int
+    """and its number; -1: none came."""
+    estop: bool
+    order: int
+    """What the drive was told: 0 nothing, 1 torques, 2 a target, 3 idle, 4 to arm, 5 no zero."""
+    tau: Pair
+    """Joint torques of this cycle, N m, after the gate."""
+
+
+class JointTrace(Message, frozen=True):
+    """Cycles of a joint service, one after the other: from these it is executed again."""
+
+    memory: str
+    """Once in a while, what the service knew before the first of these cycles, as JSON; else
+    empty."""
+    cycles: tuple[CycleTrace, ...]
+
+
+class PlannerMemory(Message, frozen=True):
+    """What the planner knew before a tick: from here it is executed again."""
+
+    session: int
+    memory: str
+    """JSON."""

@@ -1,0 +1,1 @@
+"""Executes a run's services again from its log, through the very same objects."""

@@ -1,0 +1,148 @@
+"""Recorded outputs against recomputed ones, bit for bit."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from typing import Any, Final
+
+import msgspec
+
+from shared.messages import Message
+
+_F64: Final = struct.Struct("<d")
+_I64: Final = struct.Struct("<q")
+_SIGN: Final = 1 << 63
+SHOWN: Final = 60
+"""Characters of a value."""
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """One value that came out otherwise."""
+
+    t_ns: int
+    """When, by the service's clock."""
+    tick: int
+    """Its cycle, or its tick."""
+    key: str
+    """Topic below `xrl/<robot>/`."""
+    field: str
+    recorded: Any
+    recomputed: Any
+
+    @property
+    def ulp(self) -> int | None:
+        """Distance in units in the last place; None where that means nothing."""
+        return ulp(self.recorded, self.recomputed)
+
+    def in_words(self) -> str:
+        """Return it in a line."""
+        distance = f", {self.ulp} ULP apart" if self.ulp is not None else ""
+        recorded, recomputed = (_short(value) for value in (self.recorded, self.recomputed))
+        return (
+            f"tick {self.tick}: {self.key} {self.field}: recorded {recorded}, "
+            f"recomputed {recomputed}{distance}"
+        )
+
+
+class Comparison:
+    """Compares messages, and keeps what is first and largest of what differs.
+
+    Attributes:
+        compared: messages that were compared.
+        differing: of these, how many differ.
+        first: the first difference; None if there is none.
+        largest: the largest change of each number that changes, by key and field.
+    """
+
+    def __init__(self, tolerance: float = 0.0) -> None:
+        """Take how much numbers may differ; 0: not in one bit."""
+        self._tolerance = tolerance
+        self._encode = msgspec.json.Encoder().encode
+        self.compared = 0
+        self.differing = 0
+        self.first: Difference | None = None
+        self.largest: dict[tuple[str, str], Difference] = {}
+
+    def take(self, key: str, tick: int, recorded: Message, recomputed: Message) -> bool:
+        """Compare two messages; return True if they agree.
+
+        Args:
+            key: their topic below `xrl/<robot>/`.
+            tick: the cycle or tick that they come from.
+            recorded: as the log has it.
+            recomputed: as it came out now.
+        """
+        self.compared += 1
+        if self._encode(recorded) == self._encode(recomputed):
+            return True
+        pairs = _apart(recorded, recomputed)
+        rows = [
+            Difference(recorded.t_ns, tick, key, field, a, b)
+            for field, a, b in pairs
+            if not _near(a, b, self._tolerance)
+        ]
+        if not rows:
+            return True
+        self.differing += 1
+        self.first = self.first or rows[0]
+        for row in rows:
+            before = self.largest.get((key, row.field))
+            if before is None or size(row) > size(before):
+                self.largest[key, row.field] = row
+        return False
+
+
+def size(row: Difference) -> float:
+    """Return how far apart the two values are; infinite where they are no numbers."""
+    a, b = row.recorded, row.recomputed
+    return abs(b - a) if _is_number(a) and _is_number(b) else math.inf
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+
+
+def ulp(a: Any, b: Any) -> int | None:
+    """Return how many floating-point numbers lie from a to b; None if one is no float."""
+    if not (isinstance(a, float) and isinstance(b, float)):
+        return None
+    return abs(_ordered(a) - _ordered(b))
+
+
+def _ordered(value: float) -> int:
+    """Return a float's place in the order of all floats."""
+    bits = int(_I64.unpack(_F64.pack(value))[0])
+    return bits if bits >= 0 else -(bits + _SIGN)
+
+
+def _near(a: Any, b: Any, tolerance: float) -> bool:
+    if _is_number(a) and _is_number(b) and tolerance > 0.0:
+        return bool(abs(b - a) <= tolerance)
+    if isinstance(a, float) and isinstance(b, float):
+        return a == b and math.copysign(1.0, a) == math.copysign(1.0, b)
+    return bool(a == b)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _apart(a: Message, b: Message) -> Iterator[tuple[str, Any, Any]]:
+    """Yield every plain value of two messages of one type, with its name."""
+    yield from _walk("", msgspec.to_builtins(a), msgspec.to_builtins(b))
+
+
+def _walk(name: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
+    if name == "memory" and isinstance(a, str) and isinstance(b, str) and a and b:
+        a, b = msgspec.json.decode(a), msgspec.json.decode(b)
+    if isinstance(a, dict) and isinstance(b, dict):
+        for field, value in a.items():
+            yield from _walk(f"{name}.{field}" if name else field, value, b.get(field))
+    elif isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
+        for index, (one, other) in enumerate(zip(a, b, strict=True)):
+            yield from _walk(f"{name}[{index}]", one, other)
+    else:
+        yield name, a, b

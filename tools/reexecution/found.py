@@ -1,0 +1,33 @@
+"""Messages of a log, found again by what a service noted of them."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from typing import Generic, TypeVar
+
+from shared.messages import Message
+
+M = TypeVar("M", bound=Message)
+
+
+class BySeq(Generic[M]):
+    """Finds a sender's message by its number; a sender that was started anew counts anew."""
+
+    def __init__(self, messages: Iterable[M]) -> None:
+        """Take the messages of one key, in the order of the log."""
+        self._rows: dict[int, list[M]] = {}
+        for message in messages:
+            self._rows.setdefault(message.seq, []).append(message)
+
+    def at(self, seq: int, by_ns: int) -> M | None:
+        """Return the newest message of this number that was made by a time; None if none was.
+
+        Args:
+            seq: the number.
+            by_ns: monotonic clock of the host that sender and service share.
+        """
+        rows = self._rows.get(seq)
+        if not rows:
+            return None
+        return rows[max(0, bisect_right(rows, by_ns, key=lambda row: row.t_ns) - 1)]
