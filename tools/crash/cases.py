@@ -154,6 +154,7 @@ LIMP: Final = {
 }
 """What a robot with one limp module may come to, by the kind of module, and why."""
 
+
 def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = "") -> Case:
     """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
     if kind == "link_lost":
