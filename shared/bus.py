@@ -111,6 +111,32 @@ class Publisher(Generic[M]):
         return True
 
 
+class RawPublisher:
+    """Puts payloads on one key as they are: for a player of logs, never for a service."""
+
+    def __init__(self, publisher: zenoh.Publisher) -> None:
+        self._publisher = publisher
+        self.failed = 0
+        """Payloads that were not sent: the session is closed."""
+
+    @property
+    def matched(self) -> bool:
+        """True if somebody subscribes to the key; for display."""
+        try:
+            return bool(self._publisher.matching_status.matching)  # type: ignore[attr-defined]  # zenoh's stub
+        except zenoh.ZError:
+            return False
+
+    def put(self, payload: bytes) -> bool:
+        """Send a payload; return False and count it if it cannot be sent; never raises."""
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError:
+            self.failed += 1
+            return False
+        return True
+
+
 class Latest(Generic[M]):
     """Holds the newest message of one key."""
 
@@ -207,6 +233,29 @@ class Session:
         )
         return Publisher(publisher)
 
+    def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
+        """Declare a publisher of ready payloads on any key.
+
+        All of them have one priority: what is put first arrives first, on all keys together.
+
+        Args:
+            key: a full key, without wildcards.
+            patient: `put` waits for a slow subscriber, up to `wait_before_close` (5 s) and then
+                drops the link, in place of dropping the message. Only where nothing waits for
+                the caller.
+
+        Raises:
+            BusError: it is no key.
+        """
+        control = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
+        try:
+            publisher = self._session.declare_publisher(
+                key, congestion_control=control, priority=_PRIORITIES[Priority.DATA], express=False
+            )
+        except zenoh.ZError as error:
+            raise BusError(f"{key}: {_reason(error)}; a key of the bus is right") from None
+        return RawPublisher(publisher)
+
     def latest(self, topic: Topic, message_type: type[M], module: str = "") -> Latest[M]:
         """Declare a subscriber that keeps the newest message only; arguments as `publisher`.
 
@@ -257,7 +306,14 @@ class Session:
         return topic.key(self.robot, module)
 
 
-def open_session(config: RobotConfig, name: str, run_dir: Path) -> Session:
+def open_session(
+    config: RobotConfig,
+    name: str,
+    run_dir: Path,
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+) -> Session:
     """Join the bus and return without waiting for anybody; links form as peers come up.
 
     Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the
@@ -268,6 +324,8 @@ def open_session(config: RobotConfig, name: str, run_dir: Path) -> Session:
         name: a service of `shared.config.SERVICES`, which listens on its endpoint, or any
             other name (letters, digits, _ and -) for a tool, which listens nowhere.
         run_dir: replaces `{run}` in endpoints; made if it is not there.
+        listen: further endpoints to listen on: with them a tool serves other tools.
+        connect: further endpoints to dial: those of such a tool.
 
     Raises:
         BusError: the name cannot be used, or the endpoint is taken, too long or not
@@ -275,28 +333,30 @@ def open_session(config: RobotConfig, name: str, run_dir: Path) -> Session:
     """
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
-    listen = [_endpoint(config, name, run_dir)] if name in SERVICES else []
-    connect = [_endpoint(config, peer, run_dir) for peer in peers_of(name)]
+    own = [config.bus.endpoints[name]] if name in SERVICES else []
+    peers = [config.bus.endpoints[peer] for peer in peers_of(name)]
+    listening = [_endpoint(text, run_dir) for text in (*own, *listen)]
+    dialling = [_endpoint(text, run_dir) for text in (*peers, *connect)]
     settings = {
         **_SETTINGS,
         "transport/link/tx/lease": config.bus.lease_ms,
         # A stopped process takes a call but never answers; close() waits for that answer.
         "transport/unicast/open_timeout": config.bus.lease_ms,
         "transport/unicast/accept_timeout": config.bus.lease_ms,
-        "listen/endpoints": listen,
-        "connect/endpoints": connect,
+        "listen/endpoints": listening,
+        "connect/endpoints": dialling,
     }
     os.environ.setdefault("ZENOH_RUNTIME", _ONE_RUNTIME)  # read when the first session opens
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh's stub
     try:
-        for endpoint in listen:
+        for endpoint in listening:
             _make_directory(endpoint)
         zenoh_config = zenoh.Config()
         for key, value in settings.items():
             zenoh_config.insert_json5(key, json.dumps(value))
         return Session(zenoh.open(zenoh_config), config.name, name)
     except (zenoh.ZError, OSError) as error:
-        raise _open_error(name, listen, error) from None
+        raise _open_error(name, listening, error) from None
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
@@ -304,9 +364,9 @@ def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
     return session.declare_subscriber(key, zenoh.handlers.RingChannel(capacity))
 
 
-def _endpoint(config: RobotConfig, service: str, run_dir: Path) -> str:
-    """Return a service's endpoint, checked for what a UNIX socket can take."""
-    endpoint = expand(config.bus.endpoints[service], run_dir)
+def _endpoint(text: str, run_dir: Path) -> str:
+    """Return an endpoint with `{run}` filled in, checked for what a UNIX socket can take."""
+    endpoint = expand(text, run_dir)
     length = len(os.fsencode(endpoint.removeprefix(_UNIX)))
     if endpoint.startswith(_UNIX) and length > SOCKET_PATH_MAX:
         raise BusError(

@@ -129,6 +129,14 @@ SIM_TRUTH: Final = Topic(
     recorded=True,
     why="the verdict is judged on it; no controller reads it",
 )
+SIM_STATE: Final = Topic(
+    name="sim/state",
+    type=traces.SimState,
+    rate_hz=10.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    why="the simulated world, complete: `xrl whatif` goes on from it",
+)
 SIM_CONTROL: Final = Topic(
     name="sim/control",
     type=messages.SimControl,
@@ -158,6 +166,7 @@ TOPICS: Final = (
     OPERATOR_INTENT,
     ESTOP,
     SIM_TRUTH,
+    SIM_STATE,
     SIM_CONTROL,
     RUN_EVENT,
 )

@@ -53,3 +53,32 @@ class PlannerMemory(Message, frozen=True):
     session: int
     memory: str
     """JSON."""
+
+
+class SimState(Message, frozen=True):
+    """The simulated world and its drives, complete: a run can be gone on with from here."""
+
+    scenario_s: float
+    """Scenario time; negative until the scenario starts."""
+    qpos: tuple[float, ...]
+    """MuJoCo's position, m, quaternion, rad."""
+    qvel: tuple[float, ...]
+    """m/s, rad/s"""
+    warmstart: tuple[float, ...]
+    """MuJoCo's qacc_warmstart."""
+    hoist: float
+    """Share of the hoist's support: 1 hanging, 0 free."""
+    armed: tuple[int, ...]
+    """1 for each axis in closed loop; 12 of each from here on."""
+    input_pos: tuple[float, ...]
+    """Turns, as the drive counts them."""
+    input_vel: tuple[float, ...]
+    """turn/s"""
+    input_torque: tuple[float, ...]
+    """N m"""
+    pos_gain: tuple[float, ...]
+    """1/s"""
+    vel_gain: tuple[float, ...]
+    """N m s/turn"""
+    counts_from: tuple[float, ...]
+    """What each encoder counts at the true zero."""

@@ -198,7 +198,8 @@ class JointController:
     def recall(self, memory: ControllerMemory) -> None:
         """Go on from a memory."""
         m = memory
-        self.failsafe, self._samples = m.failsafe, m.samples
+        self.failsafe = msgspec.structs.replace(m.failsafe)  # copies: these go on changing
+        self._samples = msgspec.structs.replace(m.samples)
         self._anchor, self._setpoint = m.anchor, m.setpoint
         self._changed_ns, self._last_cycle_ns = m.changed_ns, m.last_cycle_ns
         self._found_tau, self._cause, self.tau = m.found_tau, m.cause, m.tau

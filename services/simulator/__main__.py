@@ -28,6 +28,7 @@ from shared.process import (
     run_service,
     service_parser,
 )
+from shared.traces import SimState
 from shared.unix_can_hub import UnixCanHub
 
 FIFO_PRIORITY = 25
@@ -70,6 +71,7 @@ def main() -> int:
             truth=session.publisher(topics.SIM_TRUTH, SimTruth),
             intent=session.publisher(topics.OPERATOR_INTENT, OperatorIntent),
             control=session.latest(topics.SIM_CONTROL, SimControl),
+            state=session.publisher(topics.SIM_STATE, SimState),
         )
         hubs = open_hubs(robot, arguments.run_dir, stack)
         bank = AxisBank(

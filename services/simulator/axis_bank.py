@@ -76,7 +76,8 @@ class AxisBank:
         self._control = control = AxisControl(self.settings, encoder_counts_per_turn)
         self._zeroed = zeroed
         mark = round(drive.zero_mark_turns * encoder_counts_per_turn)
-        control.counts_from[:] = mark * np.array(motor_signs)
+        self.counts_from = control.counts_from
+        self.counts_from[:] = mark * np.array(motor_signs)
         self.bus = DcBus(self.settings)
         self.state = [AxisState.IDLE] * n
         self.faults = [Fault()] * n

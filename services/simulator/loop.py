@@ -11,6 +11,7 @@ from services.simulator.cansimple_front import CanSimpleFront
 from services.simulator.fault_injector import FaultInjector
 from services.simulator.fibre_port import FibreHub
 from services.simulator.harness_front import HarnessFront
+from services.simulator.state import taken
 from services.simulator.world import World
 from shared.bus import Latest, Publisher
 from shared.cansimple import AxisState
@@ -18,8 +19,11 @@ from shared.clock import NS_PER_MS, NS_PER_S, now_ns, sleep_until
 from shared.config import RobotConfig
 from shared.messages import OperatorIntent, SimControl, SimTruth
 from shared.process import StopFlag
+from shared.topics import SIM_STATE
+from shared.traces import SimState
 
 INTENT_RATE_HZ = 50.0
+STATE_RATE_HZ = SIM_STATE.rate_hz
 
 
 class Ports(msgspec.Struct, frozen=True):
@@ -28,6 +32,7 @@ class Ports(msgspec.Struct, frozen=True):
     truth: Publisher[SimTruth]
     intent: Publisher[OperatorIntent]
     control: Latest[SimControl]
+    state: Publisher[SimState]
 
 
 class SimulatorLoop:
@@ -58,6 +63,8 @@ class SimulatorLoop:
         self._harness_every = max(1, round(rate / config.harness.rate_hz))
         self._truth_every = max(1, round(rate / simulation.truth_rate_hz))
         self._intent_every = max(1, round(rate / INTENT_RATE_HZ))
+        self._state_every = max(1, round(rate / STATE_RATE_HZ))
+        self._states = 0
         self._slip_ns = round(simulation.late_slip_ms * NS_PER_MS)
         self.autostart_s: float | None = None
         """Start the scenario by itself, so long after the hoist is down."""
@@ -106,6 +113,9 @@ class SimulatorLoop:
             self._harness.send(world.harness_force, world.harness_moment)
         if steps % self._truth_every == 0:
             self._publish_truth()
+        if steps % self._state_every == 0:
+            self._states += 1
+            ports.state.put(taken(world, self._bank, now_ns(), self._states))
         if steps % self._intent_every == 0:
             self._intents += 1
             intent = OperatorIntent(t_ns=now_ns(), seq=self._intents, assist_n=world.lead().assist)

@@ -7,6 +7,7 @@ on by one time step.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import mujoco
@@ -106,6 +107,33 @@ class World:
         data.qvel[:] = 0.0
         self._flatten_soles()
         self.hoist = 0.0
+
+    def go_on(
+        self,
+        qpos: Sequence[float],
+        qvel: Sequence[float],
+        warmstart: Sequence[float],
+        scenario_s: float,
+        hoist: float,
+    ) -> None:
+        """Go on from the state of another world of the same robot and scenario.
+
+        Args:
+            qpos: MuJoCo's position.
+            qvel: its velocity.
+            warmstart: its qacc_warmstart.
+            scenario_s: scenario time; negative: it has not begun.
+            hoist: share of its support.
+        """
+        data = self.data
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, qvel, warmstart
+        if scenario_s >= 0.0:
+            self._start_time = self.time - scenario_s
+        self.hoist = hoist
+        self._releasing = hoist < 1.0
+        kept = data.qacc_warmstart.copy()
+        mujoco.mj_forward(self.model, data)
+        data.qacc_warmstart[:] = kept
 
     def _flatten_soles(self) -> None:
         """Move the legs until both ankles are in their places, soles flat."""

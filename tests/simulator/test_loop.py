@@ -45,7 +45,7 @@ def make_loop(robot: RobotConfig, *faults: Fault) -> tuple[SimulatorLoop, World,
     )
     front = CanSimpleFront(bank, [], [])
     ports = cast(
-        "Ports", msgspec.defstruct("Fake", ["truth", "intent", "control"])(*[Silent()] * 3)
+        "Ports", msgspec.defstruct("Fake", ["truth", "intent", "control", "state"])(*[Silent()] * 4)
     )
     harness = cast("HarnessFront", cast("Any", Silent()))
     return SimulatorLoop(robot, world, bank, front, [], harness, ports), world, bank

@@ -53,6 +53,10 @@ class JointExecution:
                 else:
                     yield from self._cycle(self._module, cycle)
 
+    def memory(self) -> ModuleMemory | None:
+        """Return what the service knows now; None while it cannot be executed."""
+        return None if self._module is None else self._module.remember()
+
     def _remember(self, trace: JointTrace) -> None:
         """Go on from a recorded memory, or hold ours to it."""
         if self._module is None:

@@ -56,6 +56,11 @@ class PlannerExecution:
                 continue
             yield from self._tick(self._planner, status)
 
+    def memory(self) -> tuple[int, TickMemory] | None:
+        """Return session and what the planner knows now; None while it cannot be executed."""
+        planner = self._planner
+        return None if planner is None else (planner.session, planner.remember())
+
     def _begin(self, status: PlannerStatus) -> None:
         """Go on from the memory after this tick, if the log has it."""
         memory = self._memories.get((status.session, status.t_ns))

@@ -7,15 +7,17 @@ bit-identical from run to run with the same seed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from services.joint.controller import JointController
-from services.joint.module import Module
+from services.joint.module import Module, ModuleMemory
 from services.joint.tracer import Tracer
+from services.planner.memory import TickMemory
 from services.planner.planner import Planner
 from services.planner.remembrance import Remembrance
 from services.simulator.axis_bank import AxisBank
 from services.simulator.fault_injector import FaultInjector
+from services.simulator.state import restored, taken
 from services.simulator.world import World
 from shared import topics
 from shared.clock import NS_PER_S
@@ -36,6 +38,7 @@ from shared.messages import (
 )
 from shared.scenario import Kill, Push, Restart, Scenario
 from shared.topics import Topic
+from shared.traces import SimState
 from tools.runs.network import Impairment, Link
 from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
@@ -120,6 +123,8 @@ class Lockstep:
         self._state_every = round(joint.rate_hz / joint.state_rate_hz)
         self._step_ns = round(config.simulation.timestep * NS_PER_S)
         self._truth_ns = round(NS_PER_S / config.simulation.truth_rate_hz)
+        self._sim_state_ns = round(NS_PER_S / topics.SIM_STATE.rate_hz)
+        self._sim_states = 0
         self._tracked_since_ns = 0
         self._todo: list[Kill | Restart | Push] = sorted(
             (*scenario.kill, *scenario.restart, *scenario.push), key=lambda row: row.at
@@ -144,6 +149,37 @@ class Lockstep:
         """Each module's control law."""
         return [module.controller for module in self._modules]
 
+    def go_on(
+        self,
+        state: SimState,
+        modules: Mapping[str, ModuleMemory],
+        planner: tuple[int, TickMemory] | None,
+    ) -> None:
+        """Go on from a moment of another run, before the first step; links are empty then.
+
+        Args:
+            state: world and drives.
+            modules: what each joint service knew; one that is not named is dead.
+            planner: session and what the planner knew; None: it is dead.
+        """
+        self.now_ns = -(-state.t_ns // self._step_ns) * self._step_ns
+        restored(self.world, self.bank, state)
+        for index, name in enumerate(MODULES):
+            if name in modules:
+                self._modules[index].recall(modules[name])
+            else:
+                self._frozen.add(name)
+                self._dead.add(name)
+        if planner is None:
+            self.planner = None
+        else:
+            self._sessions = planner[0]
+            self.planner = Planner(self.config, planner[0])
+            self.planner.recall(planner[1])
+        for drive in self._drives:
+            drive.heard(self.now_ns)
+        self._todo = [row for row in self._todo if row.at >= self.world.scenario_s]
+
     def run(self) -> Iterator[SimTruth]:
         """Run to the scenario's end; yield the truth at its rate.
 
@@ -154,6 +190,10 @@ class Lockstep:
             while self._todo and self.world.scenario_s >= self._todo[0].at:
                 self._act(self._todo.pop(0))
             self.advance()
+            if self._traces and self.now_ns % self._sim_state_ns == 0:
+                self._sim_states += 1
+                state = taken(self.world, self.bank, self.now_ns, self._sim_states)
+                self._record(topics.SIM_STATE, "", state)
             if self.now_ns % self._truth_ns == 0:
                 truth = self.world.truth(self.now_ns, 1.0, 0.0)
                 self._record(topics.SIM_TRUTH, "", truth)

@@ -32,6 +32,10 @@ class VirtualDrive:
         self._written = True
         """False: the service is new, and asks for the torques of a drive that it finds armed."""
 
+    def heard(self, now_ns: int) -> None:
+        """Take it that the drive was heard just now."""
+        self._sampled_ns = now_ns
+
     def serve_anew(self) -> None:
         """Begin with a new service."""
         self._written = False

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.reports.pages import unpacked
+from tools.reports.signals import BINS, Span, packed, seconds, segments
+
+VALUES = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=300)
+
+
+@given(VALUES, st.floats(0.001, 0.09))
+def test_every_signal_keeps_its_extremes_and_its_order(values: list[float], step: float) -> None:
+    t = np.arange(len(values)) * step
+    span = Span(0.0, max(float(t[-1]), 1.0))
+    found = packed(t, np.array(values), span)
+    assert found is not None
+    assert (found["lo"], found["hi"]) == (min(values), max(values))
+    seen_t, seen = unpacked(found)
+    resolution = found["step"] + 1e-9
+    assert abs(seen.min() - min(values)) <= resolution
+    assert abs(seen.max() - max(values)) <= resolution
+    assert (np.diff(seen_t) > 0.0).all()
+    for where, value in zip(seen_t, seen, strict=True):  # each is a sample of its own bin
+        near = np.abs(t - where) <= span.bin_s
+        assert np.abs(np.array(values)[near] - value).min() <= resolution
+
+
+def test_one_sample_in_a_long_run_is_not_lost() -> None:
+    t = np.arange(0.0, 600.0, 0.004)
+    values = np.sin(t)
+    values[77_777] = 40.0
+    found = packed(t, values, Span(0.0, 600.0))
+    assert found is not None
+    where, seen = unpacked(found)
+    assert len(seen) <= 2 * BINS
+    assert abs(seen.max() - 40.0) < 1e-3
+    assert abs(where[seen.argmax()] - t[77_777]) <= 600.0 / BINS
+
+
+def test_silence_breaks_a_line_and_a_missing_sample_does_not() -> None:
+    t = np.concatenate((np.arange(0.0, 1.0, 0.004), np.arange(1.5, 2.0, 0.004)))
+    t = np.delete(t, [50, 51])
+    found = packed(t, np.ones(len(t)), Span(0.0, 2.0))
+    assert found is not None
+    where, seen = unpacked(found)
+    gone = where[np.isnan(seen)]
+    assert len(gone)
+    assert ((gone > 0.99) & (gone < 1.5)).all()
+
+
+def test_numbers_that_are_none_are_left_out() -> None:
+    assert packed(np.array([0.0, 1.0]), np.array([np.nan, np.inf]), Span(0.0, 1.0)) is None
+    assert packed(np.zeros(0), np.zeros(0), Span(0.0, 1.0)) is None
+    found = packed(np.array([0.0, 1.0]), np.array([np.nan, 3.0]), Span(0.0, 1.0))
+    assert found is not None
+    assert (found["lo"], found["hi"], found["step"]) == (3.0, 3.0, 0.0)
+
+
+def test_a_stamp_said_again_is_spread_over_the_time_until_the_next() -> None:
+    stamps = [*range(0, 100, 4), *[100] * 50, 300, 304]
+    t = seconds([stamp * 1_000_000 for stamp in stamps], 0)
+    assert (np.diff(t) > 0.0).all()
+    assert t[-2:].tolist() == [0.3, 0.304]
+    assert np.diff(t).max() <= 0.008 + 1e-9
+
+
+def test_stretches_end_where_nothing_was_said() -> None:
+    t = np.array([0.0, 0.01, 0.02, 0.03, 1.0, 1.01])
+    found = segments(t, np.array([1, 1, 2, 2, 2, 2]))
+    assert found == [[0.0, 0.02, 1], [0.02, 0.03, 2], [1.0, 1.01, 2]]

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from services.recorder.mcap_log import SCHEMA_VERSION
+from tests.recorder import runs
+from tools import cli
+
+
+@pytest.fixture
+def record(tmp_path: Path) -> Path:
+    return runs.write(tmp_path, [runs.item(seq) for seq in range(200)])
+
+
+def report(*arguments: object) -> int:
+    return cli.main(["report", *map(str, arguments)])
+
+
+def test_the_page_goes_beside_the_record(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert report(record) == 0
+    page = record.with_suffix(".html")
+    assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert "one file" in capsys.readouterr().out
+    assert SCHEMA_VERSION in page.read_text(encoding="utf-8")
+
+
+def test_a_page_is_replaced_and_nothing_is_left_behind(record: Path, tmp_path: Path) -> None:
+    out = tmp_path / "report.html"
+    out.write_text("old", encoding="utf-8")
+    assert report(record, "-o", out, "--open", "no") == 0
+    assert out.stat().st_size > 10_000
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "run.mcap"]
+
+
+def test_the_record_is_never_written_over(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = record.read_bytes()
+    assert report(record, "-o", record) == 2
+    assert record.read_bytes() == before
+    assert "is the record itself" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("out", ["", "absent/report.html"])
+def test_an_output_that_cannot_be_is_one_line(
+    record: Path, tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert report(record, "-o", tmp_path / out) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no record", bytes(200)])
+def test_what_is_no_record_is_one_line(
+    tmp_path: Path, content: bytes | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    assert report(path) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not path.with_suffix(".html").exists()
+
+
+def test_a_browser_is_opened_when_asked_for(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert report(record, "--open", "no") == 0
+    assert report(record) == 0
+    assert opened == [], "no terminal here"
+    assert report(record, "--open", "yes") == 0
+    assert opened == [record.with_suffix(".html").as_uri()]

@@ -1,0 +1,1 @@
+"""What would have come of a recorded run, had something died in it."""

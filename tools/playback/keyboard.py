@@ -1,0 +1,107 @@
+"""The keys of a terminal while something plays; nothing where there is no terminal."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import time
+import tty
+from enum import Enum
+from types import TracebackType
+from typing import Any, Final, Self
+
+
+class Press(Enum):
+    """A key that means something."""
+
+    PAUSE = "space"
+    STEP = "right"
+    FASTER = "up"
+    SLOWER = "down"
+    QUIT = "q"
+
+
+_PRESSES: Final = {
+    b" ": Press.PAUSE,
+    b"q": Press.QUIT,
+    b"\x1b[C": Press.STEP,
+    b"\x1bOC": Press.STEP,
+    b"\x1b[A": Press.FASTER,
+    b"\x1bOA": Press.FASTER,
+    b"\x1b[B": Press.SLOWER,
+    b"\x1bOB": Press.SLOWER,
+}
+_READ_MAX: Final = 256
+
+
+class Keyboard:
+    """Waits, and returns early when a key is pressed; gives the terminal back at the end."""
+
+    def __init__(self) -> None:
+        self._descriptor = -1
+        self._before: list[Any] = []
+        self._rest = b""
+
+    @property
+    def present(self) -> bool:
+        """True if keys are read."""
+        return self._descriptor >= 0
+
+    def __enter__(self) -> Self:
+        """Read keys one by one, if this is a terminal's foreground."""
+        try:
+            descriptor = sys.stdin.fileno()
+            # A job in the background would be stopped for touching the terminal.
+            if os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp():
+                self._before = termios.tcgetattr(descriptor)
+                tty.setcbreak(descriptor)
+                self._descriptor = descriptor
+        except (OSError, ValueError, AttributeError, termios.error):
+            pass  # no stdin, or none that is a terminal
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Give the terminal back as it was."""
+        if self.present:
+            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
+            self._descriptor = -1
+
+    def wait(self, timeout_s: float) -> list[Press]:
+        """Return what was pressed, at the latest after so long."""
+        if not self.present:
+            time.sleep(timeout_s)
+            return []
+        ready, _, _ = select.select([self._descriptor], [], [], timeout_s)
+        if not ready:
+            return []
+        try:
+            text = os.read(self._descriptor, _READ_MAX)
+        except OSError:
+            text = b""
+        if not text:  # the terminal is gone
+            self._descriptor = -1
+        presses, self._rest = understood(self._rest + text)
+        return presses
+
+
+def understood(text: bytes) -> tuple[list[Press], bytes]:
+    """Return the keys in what a terminal sent, and the start of one that is not yet whole."""
+    presses = []
+    while text:
+        for code, press in _PRESSES.items():
+            if text.startswith(code):
+                presses.append(press)
+                text = text[len(code) :]
+                break
+        else:
+            if any(code.startswith(text) for code in _PRESSES):
+                return presses, text
+            text = text[1:]
+    return presses, b""

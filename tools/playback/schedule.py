@@ -1,0 +1,165 @@
+"""When which message goes out. Pure: moments in, messages out.
+
+Two times: the clock's (monotonic, ns) and the position in the log (ns since the start of
+what is played, counted on from pass to pass when it loops). A `Playhead` maps one to the
+other by a line that is laid anew only when somebody pauses, steps or changes the rate: no
+error adds up. A `Schedule` says at which position which message goes.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from shared.clock import NS_PER_MS
+
+PASS_MIN_NS: Final = 100 * NS_PER_MS
+"""Shortest pass of a loop: a log of one message is not played without a pause."""
+
+RATE_MIN: Final = 0.001
+RATE_MAX: Final = 1000.0
+
+
+class Entry(NamedTuple):
+    """A recorded message."""
+
+    time_ns: int
+    """When it reached the recorder, on the recorder's clock."""
+    key: int
+    """Index of its key."""
+    payload: bytes
+
+
+class Window(NamedTuple):
+    """The part of a log that is played: `start_ns` belongs to it, `end_ns` does not."""
+
+    start_ns: int
+    end_ns: int
+
+
+def window(began_ns: int, ended_ns: int, offset_ns: int, duration_ns: int | None) -> Window:
+    """Return the part of a log that begins `offset_ns` after its start and lasts so long.
+
+    Parts that follow one another hold every message once. An end beyond the log's is the
+    log's.
+
+    Args:
+        began_ns: of its first message.
+        ended_ns: of its last.
+        offset_ns: not negative.
+        duration_ns: None: to the end.
+    """
+    start_ns = began_ns + offset_ns
+    end_ns = ended_ns + 1
+    if duration_ns is not None:
+        end_ns = min(end_ns, start_ns + duration_ns)
+    return Window(start_ns, end_ns)
+
+
+class Playhead:
+    """The position in the log as a function of the clock."""
+
+    def __init__(self, now_ns: int, rate: float, *, paused: bool = False) -> None:
+        """Begin at position 0.
+
+        Args:
+            now_ns: clock.
+            rate: recorded seconds for each second.
+            paused: stand still until `resume`.
+        """
+        self.rate = rate
+        self.paused = paused
+        self._since_ns, self._from_ns = now_ns, 0
+
+    def position(self, now_ns: int) -> int:
+        """Return where in the log the playing is."""
+        if self.paused:
+            return self._from_ns
+        return self._from_ns + math.floor((now_ns - self._since_ns) * self.rate)
+
+    def due_ns(self, position_ns: int) -> int | None:
+        """Return the clock at which a position is reached; None while paused."""
+        if self.paused:
+            return None
+        return self._since_ns + math.ceil((position_ns - self._from_ns) / self.rate)
+
+    def pause(self, now_ns: int) -> None:
+        """Stand still from now on."""
+        self._lay(now_ns, self.position(now_ns))
+        self.paused = True
+
+    def resume(self, now_ns: int) -> None:
+        """Go on from where it stands."""
+        self._lay(now_ns, self.position(now_ns))
+        self.paused = False
+
+    def step(self, position_ns: int) -> None:
+        """Stand at a later position; for a paused one."""
+        self._from_ns = max(self._from_ns, position_ns)
+
+    def change_rate(self, now_ns: int, rate: float) -> None:
+        """Go on faster or slower, within `RATE_MIN` .. `RATE_MAX`."""
+        self._lay(now_ns, self.position(now_ns))
+        self.rate = min(max(rate, RATE_MIN), RATE_MAX)
+
+    def _lay(self, now_ns: int, position_ns: int) -> None:
+        self._since_ns, self._from_ns = now_ns, position_ns
+
+
+class Schedule:
+    """The messages of a window in order, once or for ever."""
+
+    def __init__(self, entries: Sequence[Entry], part: Window, *, loop: bool) -> None:
+        """Take messages in the order in which they are to go.
+
+        Args:
+            entries: sorted by time; those outside of the window are left out.
+            part: the window.
+            loop: begin anew at its end.
+        """
+        self._entries = entries
+        self._first = bisect_left(entries, part.start_ns, key=_time)
+        self._end = bisect_left(entries, part.end_ns, key=_time)
+        self._next = self._first
+        self._start_ns = part.start_ns
+        self.length_ns = max(0, part.end_ns - part.start_ns)
+        """Of one pass."""
+        self._loop = loop and self._end > self._first
+        self._period_ns = max(self.length_ns, PASS_MIN_NS)
+        self.passes = 0
+        """Passes that are over."""
+
+    def __len__(self) -> int:
+        """Return the number of messages in one pass."""
+        return max(0, self._end - self._first)
+
+    def next_ns(self) -> int | None:
+        """Return the position of the next message; None behind the last."""
+        if self._next >= self._end:
+            if not self._loop:
+                return None
+            self._next = self._first
+            self.passes += 1
+        return self.passes * self._period_ns + self._entries[self._next].time_ns - self._start_ns
+
+    def pop(self) -> Entry:
+        """Return the next message, whose position `next_ns` has just told."""
+        entry = self._entries[self._next]
+        self._next += 1
+        return entry
+
+    def recorded_ns(self, position_ns: int) -> int:
+        """Return the recorder's clock at a position, within the window."""
+        return self._start_ns + self.elapsed_ns(position_ns)
+
+    def elapsed_ns(self, position_ns: int) -> int:
+        """Return the time since the start of the pass that a position belongs to."""
+        if self._loop:
+            position_ns %= self._period_ns
+        return min(position_ns, self.length_ns)
+
+
+def _time(entry: Entry) -> int:
+    return entry.time_ns

@@ -1,0 +1,177 @@
+"""Which topics of a log are played, and onto which keys. Pure.
+
+A name is what follows `xrl/<robot>/` in a key, or the whole key. In a name `*` stands for
+any part of one section (`joint/*/state`), `**` for any number of sections.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Collection, Iterable, Sequence
+from typing import Final
+
+from shared.exceptions import RunError
+from shared.topics import TOPICS
+
+LIVE: Final = "xrl"
+"""First section of every key that a robot's services use."""
+
+CLOCK: Final = "clock"
+
+_SECTION: Final = re.compile(r"[^/*$?#\s]+")
+_PARTS: Final = {"**": "(.*)", "*": "([^/]*)"}
+
+
+def short(key: str) -> str:
+    """Return a key without the `xrl/<robot>/` before it; another key as it is."""
+    parts = key.split("/", 2)
+    return parts[2] if len(parts) == 3 and parts[0] == LIVE else key
+
+
+def choose(
+    present: Sequence[str], wanted: Iterable[str], unwanted: Iterable[str]
+) -> tuple[str, ...]:
+    """Return the keys to play, in the order given.
+
+    Args:
+        present: full keys of the log.
+        wanted: names or globs; none for all.
+        unwanted: names or globs.
+
+    Raises:
+        RunError: a name is no topic, or nothing is left.
+    """
+    wanted, unwanted = tuple(wanted), tuple(unwanted)
+    for flag, names in (("--topics", wanted), ("--exclude", unwanted)):
+        for name in names:
+            _check_known(flag, name, present)
+    chosen = tuple(
+        key
+        for key in present
+        if (not wanted or any(_fits(name, key) for name in wanted))
+        and not any(_fits(name, key) for name in unwanted)
+    )
+    if not chosen:
+        heard = ", ".join(sorted({_row_of(short(key)) for key in present})) or "nothing"
+        raise RunError(f"nothing is left to play; the log holds {heard}")
+    return chosen
+
+
+def check_prefix(prefix: str) -> str:
+    """Return a prefix that can stand before a key, without slashes at its ends.
+
+    Raises:
+        RunError: it is no section of a key, or lies where live keys are.
+    """
+    stripped = prefix.strip("/")
+    sections = stripped.split("/") if stripped else []
+    if not all(_SECTION.fullmatch(section) for section in sections):
+        right = "letters and digits, with slashes between, are right"
+        raise RunError(f"--prefix {prefix!r}: cannot stand before a key; {right}")
+    if sections and (sections[0] == LIVE or sections[0].startswith("@")):
+        raise RunError(
+            f"--prefix {prefix!r}: keys that begin with {sections[0]}/ are not a player's; take "
+            'another word, or --prefix "" for the live keys themselves'
+        )
+    return stripped
+
+
+def targets(
+    chosen: Sequence[str], prefix: str, remaps: Iterable[str], robot: str
+) -> dict[str, str]:
+    """Return the key onto which each key is played.
+
+    Args:
+        chosen: full keys of the log.
+        prefix: from `check_prefix`; empty: the live keys.
+        remaps: as `harness/wrench=harness/before` or `joint/*/state=was/*/state`.
+        robot: of the log.
+
+    Raises:
+        RunError: a remap cannot be understood or fits nothing, or two keys become one.
+    """
+    names = {key: short(key) for key in chosen}
+    done: dict[str, str] = {}
+    for remap in remaps:
+        old, equals, new = remap.partition("=")
+        if not (old and equals and new):
+            raise RunError(f"--remap {remap!r}: OLD=NEW is right, as harness/wrench=harness/was")
+        _check_known("--remap", old, chosen)
+        fitting = [key for key in chosen if _fits(old, key)]
+        if not fitting:
+            raise RunError(f"--remap {remap!r}: {old} is not among what is played")
+        for key in fitting:
+            if key in done:
+                raise RunError(
+                    f"--remap {remap!r}: {names[key]} has been given another name before"
+                )
+            done[key] = _renamed(remap, old, new, key)
+    lead = f"{prefix}/" if prefix else ""
+    found = {}
+    for key in chosen:
+        if key in done:
+            found[key] = f"{lead}{LIVE}/{robot}/{done[key]}"
+        else:
+            found[key] = f"{lead}{key}"
+    _check_apart(found)
+    return found
+
+
+def clock_key(prefix: str) -> str:
+    """Return the key of the recorded time."""
+    return f"{prefix}/{CLOCK}" if prefix else CLOCK
+
+
+def _renamed(remap: str, old: str, new: str, key: str) -> str:
+    new = short(new)
+    match = _pattern(old).fullmatch(_subject(old, key))
+    parts = list(match.groups()) if match else []
+    if new.count("*") not in (0, len(parts)) or "**" in new:
+        raise RunError(f"--remap {remap!r}: as many * on the right as on the left are right")
+    if new.count("*"):
+        for part in parts:
+            new = new.replace("*", part, 1)
+    if not all(_SECTION.fullmatch(section) for section in new.split("/")):
+        raise RunError(f"--remap {remap!r}: {new!r} is no name; as harness/was is right")
+    return new
+
+
+def _check_apart(found: dict[str, str]) -> None:
+    sources: dict[str, str] = {}
+    for key, target in found.items():
+        if target in sources:
+            both = f"{short(sources[target])} and {short(key)}"
+            raise RunError(f"{both} would both become {target}; --remap one, or --exclude it")
+        sources[target] = key
+
+
+def _check_known(flag: str, name: str, present: Collection[str]) -> None:
+    """Refuse a name that is neither in the log nor in the table of topics."""
+    tables = [topic.name for topic in TOPICS]
+    if any(_fits(name, key) for key in present):
+        return
+    if any(_pattern(short(name)).fullmatch(row) or _fits(row, short(name)) for row in tables):
+        return
+    known = sorted({*tables, *(short(key) for key in present)})
+    near = difflib.get_close_matches(short(name), known, n=1, cutoff=0.0)
+    raise RunError(f"{flag} {name}: no such topic; the nearest is {near[0]}")
+
+
+def _row_of(name: str) -> str:
+    """Return the row of the table of topics that a name belongs to; else the name."""
+    return next((topic.name for topic in TOPICS if _fits(topic.name, name)), name)
+
+
+def _fits(name: str, key: str) -> bool:
+    return _pattern(name).fullmatch(_subject(name, key)) is not None
+
+
+def _subject(name: str, key: str) -> str:
+    """Return what a name is held against: the whole key if it is a whole key."""
+    return key if name.partition("/")[0] == LIVE else short(key)
+
+
+def _pattern(name: str) -> re.Pattern[str]:
+    parts = re.split(r"(\*\*|\*)", name.strip("/"))
+    return re.compile("".join(_PARTS.get(part) or re.escape(part) for part in parts))

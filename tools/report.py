@@ -1,0 +1,85 @@
+"""`xrl report`: a run as one page that opens in any browser, without a network."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+from rich.markup import escape
+
+from shared.exceptions import RunError
+from tools.reports.page import render
+from tools.runs.run_log import read_run
+from tools.verbs import Subparsers, add_verb
+
+MIB: Final = 1 << 20
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "report",
+        """
+        xrl report out/a/run.mcap
+        xrl report out/a/run.mcap -o report.html --open no
+        """,
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="a run's record, finished or not")
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        metavar="OUT",
+        help="where the page goes (default: NAME.html beside the record); replaced if it exists",
+    )
+    parser.add_argument(
+        "--open",
+        choices=("yes", "no", "auto"),
+        default="auto",
+        help="show it in a browser; auto (default): at a terminal with a screen",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the page."""
+    path: Path = args.file
+    out: Path = args.out or path.with_suffix(".html")
+    if out.is_dir():
+        raise RunError(f"{out}: is a directory; give a file's name with -o")
+    if out.exists() and path.exists() and out.samefile(path):
+        raise RunError(f"{out}: is the record itself, which stays as it is; give another -o")
+    page = render(read_run(path)).encode()
+    write(out, page)
+    name = escape(str(out))
+    Console().print(f"[bold]{name}[/]: {len(page) / MIB:.2f} MiB, one file", soft_wrap=True)
+    if args.open == "yes" or (args.open == "auto" and _at_a_screen()):
+        webbrowser.open(out.resolve().as_uri())
+    return 0
+
+
+def write(out: Path, content: bytes) -> None:
+    """Write a file whole, or not at all.
+
+    Raises:
+        RunError: it cannot be written.
+    """
+    part = out.with_name(f".{out.name}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(out)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise RunError(f"{out}: cannot be written: {error.strerror}; give another -o") from None
+
+
+def _at_a_screen() -> bool:
+    screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.stdout.isatty() and screen

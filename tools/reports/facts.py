@@ -1,0 +1,165 @@
+"""The head and the foot of a page: verdict, where the run comes from, what was lost."""
+
+from __future__ import annotations
+
+import io
+import tomllib
+from typing import Any, Final, NamedTuple
+
+from rich.console import Console
+
+from services.recorder.recovery import lost_in_words
+from shared import topics
+from shared.clock import NS_PER_S
+from shared.exceptions import XrlError
+from tools.reports.source import Source
+from tools.runs import verdict, verdict_table
+from tools.runs.verdict import LIMITS, Summary
+
+REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
+"""Figures that mean nothing in virtual time."""
+
+MACHINE: Final = {
+    "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
+    "thread_env": "threads",
+}  # fmt: skip
+
+
+class Verdict(NamedTuple):
+    """What a run was worth."""
+
+    sentence: str
+    good: bool | None
+    """None: there is nothing to judge."""
+    rows: list[tuple[str, str, str, str]]
+    """(what, measured, limit, `ok` or `over`)."""
+
+
+class Lost(NamedTuple):
+    """One topic, as the recorder heard it."""
+
+    name: str
+    messages: int
+    rate_hz: float | None
+    """Mean from the first to the last message."""
+    nominal_hz: float
+    lost: int
+    gaps: int
+    restarts: int
+
+
+def judge(source: Source) -> Verdict:
+    """Return the verdict as the verbs that made the run print it."""
+    log = source.log
+    if source.course is None:
+        return Verdict(f"No verdict: {source.without_course}", None, [])
+    try:
+        summary = verdict.summarise(log, _duration_s(source))
+    except XrlError as error:
+        return Verdict(f"No verdict: {error}", None, [])
+    if log.metadata["run"].get("lockstep"):
+        summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+    return Verdict(_sentence(summary), bool(summary["stood"]), _rows(summary))
+
+
+def _duration_s(source: Source) -> float:
+    """Return how long the scenario was to be; without one, as long as it was."""
+    raw = source.log.attachments.get("scenario.toml", b"")
+    try:
+        return float(tomllib.loads(raw.decode())["duration"])
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
+        assert source.course is not None  # noqa: S101 - asked for with a course only
+        return float(source.course.t[-1])
+
+
+def _sentence(summary: Summary) -> str:
+    """Return the last line of the verdict as the other verbs print it."""
+    text = io.StringIO()
+    verdict_table.show(summary, Console(file=text, width=200, color_system=None))
+    return text.getvalue().strip().splitlines()[-1].strip()
+
+
+def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for limit in LIMITS:
+        value = summary.get(limit.key)
+        if value is None:
+            continue
+        unit = f" {limit.unit}" if limit.unit else ""
+        mark = "ok" if value <= limit.limit else "over"
+        rows.append((limit.what, f"{value:.3g}{unit}", f"{limit.limit:g}{unit}", mark))
+    return rows
+
+
+def head(source: Source) -> list[tuple[str, str]]:
+    """Return (name, value) of what a reader needs to know first."""
+    log, about = source.log, source.log.metadata["run"]
+    begin, end = source.span
+    rows = [
+        ("robot", log.robot),
+        ("scenario", _scenario(source)),
+        ("virtual time", about.get("lockstep", "")),
+        ("started", about.get("started", "")),
+        ("length", f"{end - begin:.1f} s"),
+        ("file", log.path.name),
+        ("recording", "finished" if log.complete else "not finished: the recorder did not end it"),
+        ("git commit", _commit(about)),
+        ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
+        ("log version", about.get("schema_version", "")),
+    ]
+    rows += [(name, about.get(key, "")) for key, name in MACHINE.items()]
+    return [(name, value) for name, value in rows if value and value != "{}"]
+
+
+def _scenario(source: Source) -> str:
+    name = source.log.metadata["run"].get("scenario", "")
+    raw = source.log.attachments.get("scenario.toml", b"")
+    try:
+        about = str(tomllib.loads(raw.decode()).get("about", ""))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        about = ""
+    return ": ".join(part for part in (name, about) if part)
+
+
+def _commit(about: dict[str, str]) -> str:
+    commit = about.get("git_commit", "")
+    return f"{commit} with changes" if about.get("git_dirty") == "true" else commit
+
+
+def lost(source: Source) -> list[Lost]:
+    """Return what was recorded of each key, and what is missing, by sequence numbers."""
+    log, rows = source.log, []
+    known = topics.all_keys(log.robot)
+    for key, count in sorted(log.gaps().items()):
+        received = [row[0] for row in log.raw(key)]
+        span_s = (max(received) - min(received)) / NS_PER_S
+        nominal_hz = known[key].rate_hz if key in known else 0.0
+        rate = (len(received) - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
+        name = key.removeprefix(f"xrl/{log.robot}/")
+        rows.append(
+            Lost(name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts)
+        )
+    return rows
+
+
+def damage(source: Source) -> list[str]:
+    """Return what of the file cannot be read, a line for each place."""
+    log = source.log
+    if log.complete and not log.damage:
+        return []
+    return lost_in_words(log.cut, log.damage, finished=log.complete)
+
+
+def files(source: Source) -> list[tuple[str, str]]:
+    """Return (name, text) of the files that the run was made from, as they are in its log."""
+    found = []
+    for name, raw in sorted(source.log.attachments.items()):
+        if name.endswith(".toml"):
+            found.append((name, raw.decode(errors="replace")))
+    return found
+
+
+def packages(source: Source) -> list[tuple[str, str]]:
+    """Return (name, version) of all packages that were installed."""
+    found: dict[str, Any] = source.log.metadata.get("packages", {})
+    return sorted(found.items(), key=lambda row: row[0].lower())

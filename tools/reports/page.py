@@ -1,0 +1,200 @@
+"""The page: one HTML file with everything in it, that asks no network for anything."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Final
+
+from tools.reports import facts, panels, timeline, torques
+from tools.reports.facts import Verdict
+from tools.reports.sheet import Happening, Sheet
+from tools.reports.source import Source
+from tools.runs.run_log import RunLog
+
+HERE: Final = Path(__file__).parent
+STYLE: Final = "page.css"
+SCRIPTS: Final = ("draw.js", "plot.js", "page.js")
+
+POLICY: Final = (
+    "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
+)
+"""The browser itself refuses whatever would leave the page."""
+
+
+def render(log: RunLog) -> str:
+    """Return the page of a run.
+
+    Raises:
+        RunError: a message is not of this version.
+    """
+    source = Source(log)
+    sheet = fill(source)
+    events = timeline.happenings(source)
+    judged = facts.judge(source)
+    name = log.metadata["run"].get("scenario") or log.path.name
+    parts = (
+        _head(source, judged, name),
+        _tools(source),
+        '<main id="panels"></main>',
+        _left_out(sheet),
+        _timeline(events),
+        _lost(source),
+        _folded(source),
+    )
+    data = json.dumps(sheet.as_data(events), separators=(",", ":"), allow_nan=False)
+    return _document(f"{log.robot}: {name}", "\n".join(parts), data)
+
+
+def fill(source: Source) -> Sheet:
+    """Return all panels of a run, in the order of the page."""
+    sheet = Sheet(source.span)
+    panels.add_body(source, sheet)
+    panels.add_states(source, sheet)
+    panels.add_certificate(source, sheet)
+    torques.add_joints(source, sheet)
+    panels.add_harness(source, sheet)
+    panels.add_times(source, sheet)
+    return sheet
+
+
+def _document(title: str, body: str, data: str) -> str:
+    style = (HERE / STYLE).read_text(encoding="utf-8")
+    script = "\n".join((HERE / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    safe = data.replace("<", "\\u003c")  # no end tag within
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{POLICY}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>{escape(title)}</title>
+<style>
+{style}</style>
+</head>
+<body>
+{body}
+<script type="application/json" id="data">{safe}</script>
+<script>
+{script}</script>
+</body>
+</html>
+"""
+
+
+def _head(source: Source, judged: Verdict, name: str) -> str:
+    word = {True: "good", False: "bad", None: "none"}[judged.good]
+    rows = "".join(
+        f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>"
+        for key, value in facts.head(source)
+    )
+    table = ""
+    if judged.rows:
+        cells = [(what, value, limit, mark) for what, value, limit, mark in judged.rows]
+        table = _details("Figures against their limits", _table(
+            ("what", "measured", "limit", ""), cells, numbers=(1, 2)
+        ), opened=True)  # fmt: skip
+    return (
+        f"<header><h1>{escape(source.log.robot)}: {escape(name)}</h1>"
+        f'<p class="verdict {word}" id="verdict">{escape(judged.sentence)}</p>'
+        f"<dl>{rows}</dl>{table}</header>"
+    )
+
+
+def _tools(source: Source) -> str:
+    begin, end = source.span
+    buttons = "".join(
+        f'<button type="button" data-do="{do}" title="{title}" aria-label="{title}">{text}</button>'
+        for do, text, title in (
+            ("left", "&larr;", "earlier"), ("right", "&rarr;", "later"),
+            ("in", "+", "zoom in"), ("out", "&minus;", "zoom out"), ("all", "all", "whole run"),
+        )
+    )  # fmt: skip
+    field = '<input type="number" step="any" min="{0:.3f}" max="{1:.3f}" value="{2:.3f}" id="{3}">'
+    fields = (
+        f"<label>from {field.format(begin, end, begin, 'from')}</label>"
+        f"<label>to {field.format(begin, end, end, 'to')} s</label>"
+    )
+    return (
+        f'<nav class="tools" aria-label="time shown">{buttons}{fields}'
+        f'<output id="cursor"></output></nav>'
+        f'<p class="hint">{escape(source.axis[0].upper() + source.axis[1:])}. Drag to zoom, '
+        "double-click for the whole run, Ctrl and wheel to zoom at the cursor; with the keyboard "
+        "in a plot: arrows move the cursor, with Shift the time shown, + and &minus; zoom, 0 "
+        "shows the whole run. A click on a name in a legend hides its line.</p>"
+        "<noscript><p>The plots need JavaScript; verdict, timeline and tables do not.</p>"
+        "</noscript>"
+    )
+
+
+def _left_out(sheet: Sheet) -> str:
+    if not sheet.left_out:
+        return ""
+    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in sheet.left_out)
+    return f'<section id="left-out"><h2>Left out</h2><ul>{rows}</ul></section>'
+
+
+def _timeline(events: Sequence[Happening]) -> str:
+    rows = "".join(
+        f'<li class="{escape(row.kind)}"><button type="button" data-t="{row.t:.4f}">'
+        f"<time>{row.t:.3f} s</time> <span>{escape(row.text)}</span></button></li>"
+        for row in events
+    )
+    rows = rows or "<li>nothing</li>"
+    return (
+        '<section id="timeline"><h2>What happened</h2>'
+        f'<p class="hint">A click shows that moment in the plots.</p><ol>{rows}</ol></section>'
+    )
+
+
+def _lost(source: Source) -> str:
+    rows = facts.lost(source)
+    missing = sum(row.lost for row in rows)
+    cells = [
+        (
+            row.name, str(row.messages), f"{row.rate_hz:.1f}" if row.rate_hz is not None else "",
+            f"{row.nominal_hz:g}" if row.nominal_hz else "", str(row.lost), str(row.gaps),
+            str(row.restarts),
+        )
+        for row in rows
+    ]  # fmt: skip
+    title = f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
+    names = ("topic", "messages", "Hz", "of Hz", "lost", "gaps", "restarts")
+    damage = "".join(f"<li>{escape(line)}</li>" for line in facts.damage(source))
+    body = (f"<ul>{damage}</ul>" if damage else "") + _table(names, cells, numbers=range(1, 7))
+    return f'<section id="lost">{_details(title, body, opened=bool(missing or damage))}</section>'
+
+
+def _folded(source: Source) -> str:
+    parts = [_details(name, f"<pre>{escape(text)}</pre>") for name, text in facts.files(source)]
+    installed = facts.packages(source)
+    if installed:
+        table = _table(("package", "version"), installed, numbers=())
+        parts.append(_details(f"{len(installed)} packages", table))
+    return f'<section id="made-from"><h2>Made from</h2>{"".join(parts)}</section>'
+
+
+def _details(title: str, body: str, *, opened: bool = False) -> str:
+    flag = " open" if opened else ""
+    return f"<details{flag}><summary>{escape(title)}</summary>{body}</details>"
+
+
+def _table(names: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[int]) -> str:
+    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
+    body = ""
+    for row in rows:
+        cells = "".join(
+            f"<td{_class(value, number=column in numbers)}>{escape(value)}</td>"
+            for column, value in enumerate(row)
+        )
+        body += f"<tr>{cells}</tr>"
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return f'<div class="wide">{table}</div>'
+
+
+def _class(value: str, *, number: bool) -> str:
+    kind = "n" if number else value if value in ("ok", "over") else ""
+    return f' class="{kind}"' if kind else ""

@@ -1,0 +1,257 @@
+"""The panels of a page: body, hand, harness, certificate, times and rates."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from shared import topics
+from shared.clock import NS_PER_MS
+from shared.joints import MODULES
+from shared.messages import DriveStatus, Mode, PlannerMode, SplitSource
+from shared.topics import Topic
+from tools.reports.sheet import Limit, Line, Row, Sheet
+from tools.reports.signals import Array, seconds
+from tools.reports.source import Source, module_of
+
+NO_WORLD: Final = "no sim/truth in this log"
+NO_PLANNER: Final = "no planner/status in this log"
+NO_HARNESS: Final = "no harness/wrench in this log"
+NO_STATES: Final = "no joint/*/state in this log"
+
+RATE_WINDOW_S: Final = 0.25
+AGE_REACH: Final = 4.0
+"""Times the greatest usable age: ages of seconds, in HOLD, would flatten all others."""
+
+MODE_COLOURS: Final[dict[int, str]] = {
+    Mode.DISARMED: "idle", Mode.HOLD: "warn", Mode.TRACK: "good",
+    Mode.DAMP: "odd", Mode.FAULT: "bad",
+}  # fmt: skip
+DRIVE_COLOURS: Final[dict[int, str]] = {
+    DriveStatus.LOST: "bad", DriveStatus.IDLE: "idle", DriveStatus.ARMED: "good",
+    DriveStatus.ERROR: "odd", DriveStatus.UNZEROED: "warn",
+}  # fmt: skip
+PLANNER_COLOURS: Final[dict[int, str]] = {
+    PlannerMode.WAITING: "idle", PlannerMode.ALIGNING: "warn", PlannerMode.LEADING: "good",
+    PlannerMode.OVERLOADED: "odd", PlannerMode.UNCERTIFIED: "bad",
+}  # fmt: skip
+SPLIT_COLOURS: Final[dict[int, str]] = {
+    SplitSource.DIAGONAL: "idle", SplitSource.SCHEDULE: "good", SplitSource.STIFFENED: "warn",
+    SplitSource.UNCERTIFIED: "bad",
+}  # fmt: skip
+
+
+class Sense(IntEnum):
+    """Whether the harness's wrench can be used."""
+
+    VALID = 0
+    NOT_VALID = 1
+    SATURATED = 2
+
+
+SENSE_COLOURS: Final[dict[int, str]] = {
+    Sense.VALID: "good", Sense.NOT_VALID: "warn", Sense.SATURATED: "bad",
+}  # fmt: skip
+
+
+def add_body(source: Source, sheet: Sheet) -> None:
+    """Add the paper's Fig. 7: COM, height, torso angles, and the operator's hand."""
+    com, torso, angles = _truth(source, "com", "torso", "angles")
+    p, p_ref = _planner(source)
+    t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
+    real = bool(len(t))
+
+    def both(label: str, truth: Array, seen: Array, colour: int) -> list[Line]:
+        """The world where there is one, with the planner's view at call; else the planner's."""
+        lines = [Line(label, t, truth, colour)] if real else []
+        view = f"{label}, planner's view" if real else label
+        return [*lines, Line(view, t_p, seen, colour, hidden=real, dashed=real)]
+
+    neither = f"{NO_WORLD}, and {NO_PLANNER}"
+    sheet.plot(
+        "COM", "mm",
+        [*both("x", com[:, 0] * 1e3, p[:, 0] * 1e3, 0),
+         *both("y", com[:, 1] * 1e3, p[:, 1] * 1e3, 1)],
+        otherwise=neither,
+    )  # fmt: skip
+    sheet.plot(
+        "Height", "m",
+        [Line("torso", t, torso[:, 2], 0), *both("COM", com[:, 2], p[:, 2], 1),
+         Line("COM asked for", t_p, p_ref[:, 2], 2, hidden=True, dashed=True)],
+        otherwise=neither,
+    )  # fmt: skip
+    sheet.plot(
+        "Torso angles", "rad",
+        [line for number, name in enumerate(("roll", "pitch", "yaw"))
+         for line in both(name, angles[:, number], p[:, 3 + number], number)],
+        otherwise=neither,
+    )  # fmt: skip
+    _add_hand(source, sheet)
+
+
+def _add_hand(source: Source, sheet: Sheet) -> None:
+    hand, load, given, push, right, left = _truth(
+        source, "operator_force", "load_n", "harness_force_z", "push",
+        "foot_right_tilt", "foot_left_tilt",
+    )  # fmt: skip
+    t = source.times(topics.SIM_TRUTH)
+    rests, pushed = bool(load.any()), bool(push.any())
+    lines = [Line("hand, z", t, hand[:, 2], 0)]
+    if rests:
+        lines += [Line("weight on the harness", t, load, 1), Line("carried", t, given, 2)]
+    if pushed:
+        lines += [
+            Line(f"push, {axis}", t, push[:, number], 3 + number, hidden=True)
+            for number, axis in enumerate("xyz")
+            if push[:, number].any()
+        ]
+    sheet.plot("Operator's force", "N", lines, otherwise=NO_WORLD)
+    sheet.plot(
+        "Tilt of the soles", "rad", [Line("right", t, right, 0), Line("left", t, left, 1)],
+        otherwise=NO_WORLD,
+    )  # fmt: skip
+
+
+def add_states(source: Source, sheet: Sheet) -> None:
+    """Add the bars: services, drives, planner, gains, harness."""
+    modes, drives = [], []
+    for module in MODULES:
+        t = source.times(topics.JOINT_STATE, module)
+        mode, drive = source.columns(topics.JOINT_STATE, module, "mode", "drive")
+        modes.append(Row(module, t, mode))
+        drives.append(Row(module, t, drive))
+    sheet.bars("Modes of the six services", modes, Mode, MODE_COLOURS, otherwise=NO_STATES)
+    sheet.bars("Drives", drives, DriveStatus, DRIVE_COLOURS, otherwise=NO_STATES)
+    t = source.times(topics.PLANNER_STATUS)
+    mode, split = source.columns(topics.PLANNER_STATUS, "", "mode", "split")
+    sheet.bars(
+        "Planner", [Row("planner", t, mode)], PlannerMode, PLANNER_COLOURS, otherwise=NO_PLANNER
+    )
+    sheet.bars(
+        "Where the local gains come from", [Row("gains", t, split)], SplitSource, SPLIT_COLOURS,
+        otherwise=NO_PLANNER,
+    )  # fmt: skip
+    valid, saturated = source.columns(topics.WRENCH, "", "valid", "saturated")
+    sense = np.where(saturated > 0.0, Sense.SATURATED, np.where(valid > 0.0, 0.0, 1.0))
+    row = Row("harness", source.times(topics.WRENCH), sense)
+    sheet.bars("Harness sensor", [row], Sense, SENSE_COLOURS, otherwise=NO_HARNESS)
+
+
+def add_harness(source: Source, sheet: Sheet) -> None:
+    """Add the operator's wrench on the torso, as measured."""
+    t = source.times(topics.WRENCH)
+    force, moment = source.columns(topics.WRENCH, "", "force", "moment")
+    force, moment = _wide(force, 3), _wide(moment, 3)
+    for title, unit, values in (("force", "N", force), ("moment", "N m", moment)):
+        lines = [Line(axis, t, values[:, number], number) for number, axis in enumerate("xyz")]
+        note = "Operator on torso, at the harness point, torso axes."
+        sheet.plot(f"Harness {title}", unit, lines, note=note, otherwise=NO_HARNESS)
+
+
+def add_certificate(source: Source, sheet: Sheet) -> None:
+    """Add the margins of the gains in force, and the least allowed."""
+    t = source.times(topics.PLANNER_STATUS)
+    mode, service, onboard = source.columns(
+        topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
+    )
+    for values in (service, onboard):
+        values[mode == PlannerMode.WAITING] = np.nan
+    limits = [Limit(0.0, "a fall")]
+    if source.robot is not None:
+        asked = source.robot.certificate
+        limits += [
+            Limit(asked.margin_min, "least, services"),
+            Limit(asked.onboard_margin_min, "least, drives"),
+        ]
+    sheet.plot(
+        "Certificate margin", "",
+        [Line("joint services alone", t, service, 0), Line("drives alone", t, onboard, 1)],
+        limits=limits,
+        note="What stands if the planner is gone: 1 is the stiffness required, 0 is a fall.",
+        otherwise=NO_PLANNER,
+    )  # fmt: skip
+
+
+def add_times(source: Source, sheet: Sheet) -> None:
+    """Add command ages, message rates and the planner's tick."""
+    lines = []
+    for number, module in enumerate(MODULES):
+        (age,) = source.columns(topics.JOINT_STATE, module, "age_ns")
+        age[age < 0.0] = np.nan
+        lines.append(
+            Line(module, source.times(topics.JOINT_STATE, module), age / NS_PER_MS, number)
+        )
+    limits, reach = [], None
+    note = "Age of the newest command in use, by each joint service's own clock."
+    if source.robot is not None:
+        most_ms = source.robot.joint_service.max_command_age_ms
+        limits, reach = [Limit(most_ms, "HOLD")], AGE_REACH * most_ms
+        note += f" The axis ends at {reach:g} ms."
+    sheet.plot(
+        "Command age", "ms", lines, limits=limits, reach=reach, note=note,
+        otherwise="no command was ever in use",
+    )  # fmt: skip
+    _add_rates(source, sheet)
+    t = source.times(topics.PLANNER_STATUS)
+    (tick,) = source.columns(topics.PLANNER_STATUS, "", "tick_us")
+    if tick.any():
+        sheet.plot("Planner tick", "us", [Line("tick", t, tick, 0)])
+    else:
+        sheet.left_out.append(("Planner tick", "no real time in this log"))
+
+
+def _add_rates(source: Source, sheet: Sheet) -> None:
+    lines = []
+    for number, topic in enumerate(row for row in topics.TOPICS if row.rate_hz >= 10.0):
+        t, rate = _rate(source, topic)
+        name = topic.name.replace("/*/", "/") if topic.per_module else topic.name
+        label = f"{name}, slowest module" if topic.per_module else name
+        lines.append(Line(label, t, rate, number, hidden=topic is topics.JOINT_TRACE))
+    sheet.plot(
+        "Messages recorded", "Hz", lines,
+        note=f"Mean over {RATE_WINDOW_S:g} s, by the recorder's clock.",
+        otherwise="no messages",
+    )  # fmt: skip
+
+
+def _rate(source: Source, topic: Topic) -> tuple[Array, Array]:
+    """Return messages per second in windows; of the slowest module that is there."""
+    begin, end = source.span
+    edges = np.arange(begin, end, RATE_WINDOW_S)
+    if len(edges) < 2:
+        return np.zeros(0), np.zeros(0)
+    counts = []
+    for key in topics.keys(topic, source.log.robot):
+        received = source.log.received_ns(topic, module_of(topic, key))
+        if received:
+            t = seconds(received, source.zero_ns)
+            counts.append(np.histogram(t, edges)[0])
+    if not counts:
+        return np.zeros(0), np.zeros(0)
+    rate = np.min(counts, axis=0) / RATE_WINDOW_S
+    return edges[:-1] + RATE_WINDOW_S / 2, rate.astype(np.float64)
+
+
+def _truth(source: Source, *names: str) -> list[Array]:
+    widths = {"com": 3, "torso": 3, "angles": 3, "operator_force": 3, "push": 3}
+    found = source.columns(topics.SIM_TRUTH, "", *names)
+    return [
+        _wide(values, widths[name]) if name in widths else values
+        for name, values in zip(names, found, strict=True)
+    ]
+
+
+def _planner(source: Source) -> tuple[Array, Array]:
+    """Return p and p_ref as the planner had them; NaN while it waited."""
+    mode, p, p_ref = source.columns(topics.PLANNER_STATUS, "", "mode", "p", "p_ref")
+    p, p_ref = _wide(p, 6), _wide(p_ref, 6)
+    for values in (p, p_ref):
+        values[mode == PlannerMode.WAITING] = np.nan
+    return p, p_ref
+
+
+def _wide(values: Array, columns: int) -> Array:
+    """Return an array with its columns, also of no messages."""
+    return values if values.ndim == 2 else np.zeros((0, columns))

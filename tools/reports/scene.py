@@ -1,0 +1,286 @@
+"""The robot as a 3-D scene: a frame for each module, a body for each link, COM and forces.
+
+Frames (design section 2): `world`; `torso`; from it down each leg `hip_*` (it carries the
+thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso; `com` with the
+world's axes. The links are those of `shared.robot_model`.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Iterator
+from typing import Any, Final, NamedTuple
+
+import msgspec
+import numpy as np
+
+from services.planner.kinematics import Kinematics
+from services.recorder.scene import NewChannel, NewMessage
+from shared import topics
+from shared.clock import NS_PER_S
+from shared.config import RobotConfig
+from shared.exceptions import RunError
+from shared.joints import MODULES, SIDES
+from shared.messages import JointState, Mode, SimTruth, Vector3, Wrench
+from shared.robot_model import MODULE_RADIUS, side_sign
+from tools.reports import foxglove
+from tools.reports.foxglove import Colour, Json
+from tools.runs.run_log import RunLog
+
+RATE_HZ: Final = 30.0
+LINKS_EVERY_S: Final = 1.0
+"""The links stay; they are said again for a viewer that begins in the middle."""
+METRES_PER_NEWTON: Final = 0.005
+FORCE_MIN_N: Final = 2.0
+"""Smaller forces have no arrow: the sensor's noise would make it jump about."""
+
+FRAMES, LINKS, STATE = range(3)
+LINK: Final[Colour] = (0.62, 0.66, 0.70, 1.0)
+BODY: Final[Colour] = (0.45, 0.52, 0.60, 0.55)
+COM: Final[Colour] = (0.05, 0.37, 0.65, 1.0)
+HAND: Final[Colour] = (0.77, 0.31, 0.11, 1.0)
+PUSH: Final[Colour] = (0.55, 0.20, 0.60, 1.0)
+UNKNOWN: Final[Colour] = (0.4, 0.4, 0.4, 1.0)
+MODES: Final[dict[int, Colour]] = {
+    Mode.DISARMED: (0.70, 0.74, 0.77, 1.0),
+    Mode.HOLD: (0.85, 0.56, 0.12, 1.0),
+    Mode.TRACK: (0.18, 0.54, 0.36, 1.0),
+    Mode.DAMP: (0.51, 0.33, 0.72, 1.0),
+    Mode.FAULT: (0.75, 0.22, 0.17, 1.0),
+}
+
+Quaternion = tuple[float, float, float, float]
+
+
+class Pose(NamedTuple):
+    """The robot at one moment."""
+
+    t_ns: int
+    """Monotonic."""
+    torso: Vector3
+    """Origin, m, world."""
+    angles: Vector3
+    """Roll, pitch, yaw (3-1-2), rad."""
+    com: Vector3
+    """m, world."""
+    q: tuple[float, ...]
+    """Joint angles (12,), rad."""
+    modes: tuple[int, ...]
+    force: Vector3
+    """Operator on torso, N, torso axes."""
+    push: Vector3
+    """N, world."""
+
+
+class Placed(NamedTuple):
+    """A frame in its parent."""
+
+    parent: str
+    child: str
+    at: Vector3
+    turn: Quaternion
+    """(x, y, z, w)."""
+
+
+def channels(robot: str) -> list[NewChannel]:
+    """Return the channels of a scene, `FRAMES`, `LINKS` and `STATE`."""
+    rows = (
+        ("scene/frames", foxglove.TRANSFORMS, RATE_HZ, "where each module is"),
+        ("scene/links", foxglove.SCENE, 1.0 / LINKS_EVERY_S, "the robot's bodies"),
+        ("scene/state", foxglove.SCENE, RATE_HZ, "modes by colour, COM, forces"),
+    )
+    return [
+        NewChannel(
+            f"xrl/{robot}/{name}",
+            schema,
+            foxglove.SCHEMAS[schema],
+            {"rate_hz": f"{rate:g}", "why": why},
+        )
+        for name, schema, rate, why in rows
+    ]
+
+
+def messages(log: RunLog, robot: RobotConfig) -> Iterator[NewMessage]:
+    """Yield the messages of a run's scene, in the order of time.
+
+    Raises:
+        RunError: the log does not hold the states of all six modules.
+    """
+    encode = msgspec.json.encode
+    links_ns: int | None = None
+    for pose in poses(log, robot):
+        ns = pose.t_ns + log.offset_ns
+        transforms = [foxglove.transform(ns, *placed) for placed in frames(robot, pose)]
+        yield NewMessage(FRAMES, ns, encode({"transforms": transforms}))
+        if links_ns is None or ns - links_ns >= LINKS_EVERY_S * NS_PER_S:
+            links_ns = ns
+            yield NewMessage(LINKS, ns, encode({"deletions": [], "entities": links(robot, ns)}))
+        yield NewMessage(STATE, ns, encode({"deletions": [], "entities": state(ns, pose)}))
+
+
+def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
+    """Yield the robot at the scene's rate, each time as it was known then.
+
+    The torso is where the simulated world says; in a log without one, where the legs say,
+    the feet standing side by side.
+
+    Raises:
+        RunError: the log does not hold the states of all six modules.
+    """
+    states: list[list[JointState]] = [log.messages(topics.JOINT_STATE, name) for name in MODULES]
+    if not all(states):
+        missing = ", ".join(name for name, rows in zip(MODULES, states, strict=True) if not rows)
+        raise RunError(f"{log.path}: no states of {missing}; a scene needs those of all six")
+    truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
+    wrenches: list[Wrench] = log.messages(topics.WRENCH)
+    newest = [Newest(rows) for rows in states]
+    wrench = Newest(wrenches)
+    kinematics = None if truth else Kinematics(robot)
+    # a service that has not heard its drive yet says 0
+    first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
+    for row in _thinned(truth or states[0], first_ns):
+        now = [one.at(row.t_ns) for one in newest]
+        q = tuple(angle for state_now in now for angle in state_now.q)
+        felt = wrench.at(row.t_ns) if wrenches and wrenches[0].t_ns <= row.t_ns else None
+        force = felt.force if felt is not None and felt.valid else (0.0, 0.0, 0.0)
+        modes = tuple(state_now.mode for state_now in now)
+        if kinematics is None:
+            yield Pose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
+            continue
+        kinematics.update(np.array(q))
+        torso, com, angles = kinematics.r_torso, kinematics.p[:3], kinematics.p[3:]
+        yield Pose(
+            row.t_ns, _vector(torso), _vector(angles), _vector(com), q, modes, force,
+            (0.0, 0.0, 0.0),
+        )  # fmt: skip
+
+
+class Newest:
+    """The newest message of a key at a time."""
+
+    def __init__(self, rows: list[Any]) -> None:
+        self._rows = rows
+        self._stamps = [row.t_ns for row in rows]
+
+    def at(self, t_ns: int) -> Any:
+        """Return the newest message at or before a time; there must be one."""
+        return self._rows[bisect.bisect_right(self._stamps, t_ns) - 1]
+
+
+def _thinned(rows: list[Any], first_ns: int) -> Iterator[Any]:
+    """Yield rows at the scene's rate, at stamps that they really have."""
+    period_ns = round(NS_PER_S / RATE_HZ)
+    due_ns = first_ns
+    for row in rows:
+        if row.t_ns >= due_ns:
+            due_ns += period_ns * (1 + (row.t_ns - due_ns) // period_ns)
+            yield row
+
+
+def frames(robot: RobotConfig, pose: Pose) -> list[Placed]:
+    """Return every frame at a moment."""
+    geometry = robot.geometry
+    upright = foxglove.UPRIGHT
+    found = [
+        Placed("world", "torso", pose.torso, torso_turn(pose.angles)),
+        Placed("world", "com", pose.com, upright),
+        Placed("torso", "harness", geometry.harness_point, upright),
+    ]
+    for side in SIDES:
+        sign = side_sign(side)
+        parent = "torso"
+        for kind, at in (
+            ("hip", (0.0, sign * geometry.w_hip / 2, 0.0)),
+            ("knee", (0.0, 0.0, -geometry.l1)),
+            ("ankle", (0.0, 0.0, -geometry.l2)),
+        ):
+            module = f"{kind}_{side}"
+            number = 2 * MODULES.index(module)
+            phi, theta = pose.q[number], pose.q[number + 1]
+            found.append(Placed(parent, module, at, module_turn(phi, theta)))
+            parent = module
+    return found
+
+
+def torso_turn(angles: Vector3) -> Quaternion:
+    """Return Rz(yaw) Rx(roll) Ry(pitch)."""
+    roll, pitch, yaw = angles
+    return product(product(_about(2, yaw), _about(0, roll)), _about(1, pitch))
+
+
+def module_turn(phi: float, theta: float) -> Quaternion:
+    """Return how what hangs below a module is turned in what is above it.
+
+    From the foot up a module is Rx(phi) Ry(theta); from the torso down, its inverse.
+    """
+    return product(_about(1, -theta), _about(0, -phi))
+
+
+def _about(axis: int, angle: float) -> Quaternion:
+    values = [0.0, 0.0, 0.0, math.cos(angle / 2)]
+    values[axis] = math.sin(angle / 2)
+    return values[0], values[1], values[2], values[3]
+
+
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Return the turn b followed by the turn a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def along(direction: Vector3) -> Quaternion:
+    """Return the turn that takes x to a direction, which is not zero."""
+    x, y, z = (part / math.hypot(*direction) for part in direction)
+    if x < -1.0 + 1e-12:
+        return 0.0, 0.0, 1.0, 0.0
+    w = math.sqrt((1.0 + x) / 2)
+    return 0.0, -z / (2 * w), y / (2 * w), w
+
+
+def links(robot: RobotConfig, ns: int) -> list[Json]:
+    """Return the bodies, each in its module's frame."""
+    geometry = robot.geometry
+    found = [
+        foxglove.entity(ns, "torso", "torso", cubes=[foxglove.solid(geometry.torso_size, BODY)])
+    ]
+    for side in SIDES:
+        for kind, name, length in (("hip", "thigh", geometry.l1), ("knee", "shin", geometry.l2)):
+            shape = foxglove.cylinder((0.06, 0.06, length), LINK, (0.0, 0.0, -length / 2))
+            found.append(foxglove.entity(ns, f"{kind}_{side}", f"{name}_{side}", cylinders=[shape]))
+        size = (geometry.l_foot, geometry.w_foot, geometry.foot_height / 2)
+        sole = foxglove.solid(size, LINK, (0.0, 0.0, -0.75 * geometry.foot_height))
+        found.append(foxglove.entity(ns, f"ankle_{side}", f"sole_{side}", cubes=[sole]))
+    return found
+
+
+def state(ns: int, pose: Pose) -> list[Json]:
+    """Return what changes: the modules in their modes' colours, the COM, the forces."""
+    size = (MODULE_RADIUS,) * 3
+    found = []
+    for module, mode in zip(MODULES, pose.modes, strict=True):
+        ball = foxglove.solid(size, MODES.get(mode, UNKNOWN))
+        found.append(foxglove.entity(ns, module, f"module_{module}", spheres=[ball]))
+    ball = foxglove.solid((0.06, 0.06, 0.06), COM)
+    found.append(foxglove.entity(ns, "com", "com", spheres=[ball]))
+    found.append(foxglove.entity(ns, "harness", "operator", arrows=_arrows(pose.force, HAND)))
+    at = pose.torso
+    found.append(foxglove.entity(ns, "world", "push", arrows=_arrows(pose.push, PUSH, at)))
+    return found
+
+
+def _arrows(force: Vector3, colour: Colour, at: Vector3 = (0.0, 0.0, 0.0)) -> list[Json]:
+    size = math.hypot(*force)
+    if size < FORCE_MIN_N:
+        return []
+    return [foxglove.arrow(at, along(force), METRES_PER_NEWTON * size, 0.02, colour)]
+
+
+def _vector(values: Any) -> Vector3:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -1,0 +1,134 @@
+"""The panels of the joints: torques against their limit and by origin, angles."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from shared import topics
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig
+from shared.joints import AXES, MODULES
+from shared.messages import JointCommand, JointState, Mode
+from tools.reports.sheet import Limit, Line, Sheet
+from tools.reports.signals import Array
+from tools.reports.source import Source
+
+NO_STATES: Final = "no joint/*/state in this log"
+
+
+class Origins(msgspec.Struct):
+    """Torques of one module by where they come from, (n, 2): phi, theta; N m."""
+
+    feedforward: Array
+    coupled: Array
+    local: Array
+    """k_p (q_ref - q) + k_d (v_ref - v)."""
+
+
+def add_joints(source: Source, sheet: Sheet) -> None:
+    """Add the joints' panels."""
+    robot = source.robot
+    most = robot.joint.tau_module_max if robot is not None else None
+    sums, torques, angles, peaks = [], {}, {}, {}
+    for number, module in enumerate(MODULES):
+        t = source.times(topics.JOINT_STATE, module)
+        if not len(t):
+            continue
+        tau, q = source.columns(topics.JOINT_STATE, module, "tau", "q")
+        sums.append(Line(module, t, np.abs(tau).sum(axis=1), number))
+        found = origins(source, robot, module) if robot is not None else None
+        q_ref = _references(source, module)
+        for axis, name in enumerate(AXES):
+            joint = f"{module}_{name}"
+            peaks[joint] = float(np.abs(tau[:, axis]).max())
+            torques[joint] = (_torques(t, tau, found, axis), _torque_limits(most))
+            angles[joint] = _angles(source, module, axis, Line("q", t, q[:, axis], 0), q_ref)
+    sheet.plot(
+        "Torque of each module against its limit", "N m", sums,
+        limits=[Limit(most, "limit")] if most is not None else [],
+        note="|tau_phi| + |tau_theta|: both motors of a module add up along one axis.",
+        otherwise=NO_STATES,
+    )  # fmt: skip
+    note = (
+        "The origins are those of the command in use, while the service tracks it. In HOLD the "
+        "service goes on with what it froze, and only the total is in the log."
+    )
+    if robot is None:
+        note = f"Without origins: {source.without_robot}."
+    hardest = max(peaks, key=lambda joint: peaks[joint], default="")
+    sheet.choice("Torque of one joint, by origin", "N m", "joint", torques, initial=hardest,
+                 note=note, otherwise=NO_STATES)  # fmt: skip
+    sheet.choice("Angle of one joint", "rad", "joint", angles, initial=hardest, otherwise=NO_STATES)
+
+
+def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
+    """Return the law's terms at each state of a module; NaN where the log does not tell.
+
+    They are those of the command that the state names, aged as the service ages it, and
+    only while it tracks, once it has blended over to the commands.
+    """
+    states: list[JointState] = source.log.messages(topics.JOINT_STATE, module)
+    commands: list[JointCommand] = source.log.messages(topics.JOINT_COMMAND, module)
+    known = {(command.session, command.seq): command for command in commands}
+    shape = (len(states), 2)
+    found = Origins(*(np.full(shape, np.nan) for _ in range(3)))
+    blend_ns = robot.joint_service.blend_ms * NS_PER_MS
+    aging_max_s = robot.joint_service.command_aging_max_ms / 1e3
+    tracking_since_ns: int | None = None
+    for index, state in enumerate(states):
+        if state.mode != Mode.TRACK:
+            tracking_since_ns = None
+            continue
+        if tracking_since_ns is None:
+            tracking_since_ns = state.t_ns
+        command = known.get((state.session, state.command_seq))
+        if command is None or state.t_ns - tracking_since_ns < blend_ns or state.age_ns < 0:
+            continue
+        age_s = min(state.age_ns / NS_PER_S, aging_max_s)
+        for axis in (0, 1):
+            v_ref = command.v_ref[axis]
+            q_ref = command.q_ref[axis] + v_ref * age_s
+            found.feedforward[index, axis] = command.tau_ff[axis] + command.dtau_ff[axis] * age_s
+            found.coupled[index, axis] = command.tau_coupled[axis]
+            found.local[index, axis] = command.k_p[axis] * (q_ref - state.q[axis]) + command.k_d[
+                axis
+            ] * (v_ref - state.v[axis])
+    return found
+
+
+def _torques(t: Array, tau: Array, found: Origins | None, axis: int) -> list[Line]:
+    lines = [Line("total, after the gate", t, tau[:, axis], 0)]
+    if found is not None:
+        lines += [
+            Line("tau_ff", t, found.feedforward[:, axis], 1),
+            Line("tau_coupled", t, found.coupled[:, axis], 2),
+            Line("local PD", t, found.local[:, axis], 3),
+        ]
+    sibling = np.abs(tau[:, 1 - axis])
+    return [*lines, Line(f"|tau_{AXES[1 - axis]}|", t, sibling, 4, hidden=True, dashed=True)]
+
+
+def _torque_limits(most: float | None) -> list[Limit]:
+    if most is None:
+        return []
+    return [Limit(most, "limit", shown=False), Limit(-most, "limit", shown=False)]
+
+
+def _references(source: Source, module: str) -> tuple[Array, Array]:
+    t = source.times(topics.JOINT_COMMAND, module)
+    (q_ref,) = source.columns(topics.JOINT_COMMAND, module, "q_ref")
+    return t, q_ref if q_ref.ndim == 2 else np.zeros((0, 2))
+
+
+def _angles(
+    source: Source, module: str, axis: int, measured: Line, references: tuple[Array, Array]
+) -> tuple[list[Line], list[Limit]]:
+    t, q_ref = references
+    limits = []
+    if source.robot is not None:
+        low, high = source.robot.joint_limits()[2 * MODULES.index(module) + axis]
+        limits = [Limit(low, "soft stop", shown=False), Limit(high, "soft stop", shown=False)]
+    return [measured, Line("q_ref", t, q_ref[:, axis], 1)], limits
