@@ -82,12 +82,8 @@ def drives_to_ourselves(
     Raises:
         FleetError: the simulator cannot be started, or a fleet is being started.
     """
-    run = RunDir(run_dir)
     with contextlib.ExitStack() as stack:
-        if not fleet.is_simulated(robot) and not reach.is_up(run_dir):
-            lock = run.claim()
-            stack.callback(os.close, lock)
-            stack.callback(run.clear, keep_logs=True)
+        stack.enter_context(reach.no_fleet_meanwhile(robot, run_dir))
         started = stack.enter_context(reach.drives_within_reach(robot, config_path, run_dir))
         if started:
             say("no fleet is up and the drives are emulated: their simulator runs for the while")
