@@ -22,11 +22,20 @@ WORDS = st.text(alphabet=st.characters(categories=["L", "N", "Zs"]))
 def strategy(hint: Any) -> st.SearchStrategy[Any]:
     """Return a strategy for one field of a message."""
     if get_origin(hint) is tuple:
-        return st.tuples(*(strategy(item) for item in get_args(hint)))
+        items = get_args(hint)
+        if items[-1] is Ellipsis:
+            return st.lists(strategy(items[0]), max_size=3).map(tuple)
+        return st.tuples(*(strategy(item) for item in items))
+    if is_struct(hint):
+        return messages_of(hint)
     return {float: FINITE, int: INT64, bool: st.booleans(), str: WORDS}[hint]
 
 
-def messages_of(message_type: type[Message]) -> st.SearchStrategy[Message]:
+def is_struct(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, msgspec.Struct)
+
+
+def messages_of(message_type: type[msgspec.Struct]) -> st.SearchStrategy[Any]:
     """Return a strategy for messages whose numbers are all finite."""
     hints = get_type_hints(message_type)
     return st.builds(
@@ -35,12 +44,15 @@ def messages_of(message_type: type[Message]) -> st.SearchStrategy[Message]:
     )
 
 
-def plain(message_type: type[Message], number: float = 1.5) -> Message:
+def plain(message_type: type[Any], number: float = 1.5) -> Any:
     """Return a message of a type with every float the same."""
 
     def fill(hint: Any) -> Any:
         if get_origin(hint) is tuple:
-            return tuple(fill(item) for item in get_args(hint))
+            items = get_args(hint)
+            return tuple(fill(item) for item in (items[:1] if items[-1] is Ellipsis else items))
+        if is_struct(hint):
+            return plain(hint, number)
         return {float: number, int: 7, bool: True, str: "a null word"}[hint]
 
     hints = get_type_hints(message_type)
@@ -48,10 +60,14 @@ def plain(message_type: type[Message], number: float = 1.5) -> Message:
 
 
 def floats_of(message: Message) -> list[float]:
-    values: list[Any] = []
-    for value in msgspec.structs.astuple(message):
-        values += value if isinstance(value, tuple) else (value,)
-    return [value for value in values if isinstance(value, float)]
+    def within(value: Any) -> list[float]:
+        if isinstance(value, msgspec.Struct):
+            value = msgspec.structs.astuple(value)
+        if isinstance(value, tuple):
+            return [number for item in value for number in within(item)]
+        return [value] if isinstance(value, float) else []
+
+    return within(message)
 
 
 def with_float(message: Message, place: int, number: float) -> Message:
@@ -62,13 +78,15 @@ def with_float(message: Message, place: int, number: float) -> Message:
         nonlocal count
         if isinstance(value, tuple):
             return tuple(swap(item) for item in value)
+        if isinstance(value, msgspec.Struct):
+            fields = msgspec.structs.asdict(value)
+            return type(value)(**{name: swap(item) for name, item in fields.items()})
         if not isinstance(value, float):
             return value
         count += 1
         return number if count == place + 1 else value
 
-    fields = msgspec.structs.asdict(message)
-    return type(message)(**{name: swap(value) for name, value in fields.items()})
+    return swap(message)
 
 
 def bits(message: Message) -> bytes:

@@ -64,12 +64,12 @@ def test_live_and_lockstep_agree_on_a_kill_a_restart_and_two_pushes(tmp_path: Pa
     for attempt in range(3):
         exit_live, live = summary_of("demo", tmp_path / f"live{attempt}", *EXPERIMENT)
         assert exit_live == 0
-        assert live["reengage_s"] is not None
-        assert all(value is not None for value in live["handover_ms"].values())
         if undisturbed(live, lockstep):
             break
     else:
         pytest.skip("this machine stalled in each of three live runs: no figures to compare")
+    assert live["reengage_s"] is not None
+    assert all(value is not None for value in live["handover_ms"].values())
     apart = {
         key: (live[key], lockstep[key])
         for key, band in BANDS.items()
