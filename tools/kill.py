@@ -26,7 +26,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl kill planner                        # dead at once; the supervisor starts it again
         xrl kill planner --signal STOP          # frozen, as a hung process is
         xrl kill planner --signal CONT          # and on again
-        xrl kill knee_left                      # its drive disarms; the restart arms it anew
+        xrl kill knee_left                      # its drive holds; the next service takes it over
         """,
     )
     parser.add_argument("service", metavar="SERVICE", help="a name that `xrl status` shows")
