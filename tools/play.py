@@ -31,6 +31,8 @@ from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_verb
 
 _POLL_S: Final = 0.01
+_FLUSH_S: Final = 1.0
+"""A session that closes gives what is still queued a quarter of a second, then drops it."""
 
 
 class Bus(NamedTuple):
@@ -202,7 +204,9 @@ def _play(
         return INTERRUPTED
     finally:
         display.clear()
-        print(summary(player, (now_ns() - began_ns) / NS_PER_S, heard=display.heard))
+        print(summary(player, (now_ns() - began_ns) / NS_PER_S, heard=display.heard), flush=True)
+    if patient and display.heard:
+        time.sleep(_FLUSH_S)
     return 1 if player.tally.failed else 0
 
 

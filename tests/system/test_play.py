@@ -9,9 +9,11 @@ import os
 import pty
 import select
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -66,6 +68,43 @@ def test_nothing_is_lost_to_a_subscriber_when_it_plays_as_fast_as_it_can(
     words = (str(log / "run.mcap"), "--rate", "1000", "--wait", "60")
     with listening(run_dir) as ear, playing(run_dir, *words) as process:
         assert [payload for _, payload in ear.all(process)] == [row[1] for row in rows]
+
+
+STANDS_STILL = """
+import os, signal, sys, time
+from pathlib import Path
+from shared.bus import open_session
+from tests.playback.bench import LISTEN, ROBOT
+with open_session(ROBOT, "ear", Path(sys.argv[1]), connect=[LISTEN]) as session:
+    stream = session.stream(["replay/**"], capacity=1_000_000)
+    while stream.take() is None:
+        pass
+    os.kill(os.getpid(), signal.SIGSTOP)
+    heard, deadline = 1, time.monotonic() + 10.0
+    while heard < int(sys.argv[2]) and time.monotonic() < deadline:
+        heard += stream.take() is not None
+    print(heard)
+"""
+
+
+def test_the_end_is_not_lost_to_a_subscriber_that_stands_still_for_half_a_second(
+    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = items(3.0)  # more than a socket takes, less than the player's queue besides
+    log = write(tmp_path, rows, monkeypatch)
+    words = (str(log / "run.mcap"), "--rate", "1000", "--wait", "60")
+    with playing(run_dir, *words) as process:
+        command = [sys.executable, "-c", STANDS_STILL, str(run_dir), str(len(rows))]
+        ear = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        try:
+            os.waitpid(ear.pid, os.WUNTRACED)
+            time.sleep(0.5)
+            ear.send_signal(signal.SIGCONT)
+            assert ended(process).code == 0
+            assert ear.communicate(timeout=30)[0] == f"{len(rows)}\n"
+        finally:
+            ear.kill()
+            ear.communicate()
 
 
 def test_chosen_topics_of_a_part_go_under_other_names_with_the_recorded_time_beside(
