@@ -29,7 +29,7 @@ from shared.messages import JointCommand, JointState, Mode, PlannerMode, Planner
 from shared.robot_model import stand_pose
 from tools.runs import verdict
 from tools.runs.run_log import RunLog, read_run
-from tools.verbs import Subparsers, add_config, add_verb
+from tools.verbs import RUN_HELP, Subparsers, add_config, add_verb
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl explain --p 0,0,0.75,0,0.6,0
         """,
     )
-    parser.add_argument("log", nargs="?", type=Path, metavar="RUN.mcap", help="a run's record")
+    parser.add_argument("log", nargs="?", type=Path, metavar="RUN", help=RUN_HELP)
     parser.add_argument("--at", type=float, metavar="T", help="scenario time, s (default: the end)")
     parser.add_argument(
         "--q",

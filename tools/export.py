@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.scene and args.layout is None:
         raise RunError("say what to write: --scene, --layout FILE, or both")
     path: Path = args.file
+    if path.is_dir():
+        raise RunError(f"{path}: is a directory; give one of its files")
     log = read_run(path)
     console = Console()
     if args.scene:

@@ -17,7 +17,8 @@ from services.recorder.mcap_log import SCHEMA_VERSION
 from services.recorder.recovery import clock_time, lost_in_words
 from services.recorder.salvage import Loss
 from shared.clock import NS_PER_S
-from tools.logs.survey import FileFacts, Survey, TopicFacts, files_of_run
+from tools.logs.files import files_of_run
+from tools.logs.survey import FileFacts, Survey, TopicFacts
 from tools.verbs import Subparsers, add_verb
 
 SLOW: Final = 0.9

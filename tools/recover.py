@@ -12,7 +12,7 @@ from services.recorder.files import in_use, recovered_name
 from services.recorder.salvage import opened
 from shared.exceptions import RunError
 from tools.info import plain
-from tools.logs.survey import Metadata, head_of
+from tools.logs.files import Metadata, head_of
 from tools.verbs import Subparsers, add_verb
 
 

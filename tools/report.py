@@ -16,7 +16,7 @@ from rich.markup import escape
 from shared.exceptions import RunError
 from tools.reports.page import render
 from tools.runs.run_log import read_run
-from tools.verbs import Subparsers, add_verb
+from tools.verbs import RUN_HELP, Subparsers, add_verb
 
 MIB: Final = 1 << 20
 
@@ -31,7 +31,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl report out/a/run.mcap -o report.html --open no
         """,
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="a run's record, finished or not")
+    parser.add_argument("file", type=Path, metavar="RUN", help=RUN_HELP)
     parser.add_argument(
         "-o",
         "--out",
@@ -50,12 +50,13 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the page."""
     path: Path = args.file
-    out: Path = args.out or path.with_suffix(".html")
+    log = read_run(path)
+    out: Path = args.out or log.files[0].with_suffix(".html")
     if out.is_dir():
         raise RunError(f"{out}: is a directory; give a file's name with -o")
     if out.exists() and path.exists() and out.samefile(path):
         raise RunError(f"{out}: is the record itself, which stays as it is; give another -o")
-    page = render(read_run(path)).encode()
+    page = render(log).encode()
     write(out, page)
     name = escape(str(out))
     Console().print(f"[bold]{name}[/]: {len(page) / MIB:.2f} MiB, one file", soft_wrap=True)

@@ -26,7 +26,7 @@ from tools.reexecution.outcome import Outcome
 from tools.reexecution.params import with_params
 from tools.reexecution.planner import PlannerExecution
 from tools.runs.run_log import RunLog, read_run
-from tools.verbs import Subparsers, add_verb
+from tools.verbs import RUN_HELP, Subparsers, add_verb
 
 SERVICES: Final = ("planner", *MODULES)
 SHOWN: Final = 12
@@ -43,9 +43,10 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl resim out/a/run.mcap --service knee_left --until-first-difference
         xrl resim out/a/run.mcap --service planner --param law.K_p.x=2000
         xrl resim out/a/run.mcap --tolerance 1e-9             # of another machine class
+        xrl resim out/a                                       # a split run, all of its files
         """,
     )
-    parser.add_argument("log", type=Path, metavar="RUN.mcap", help="a run's record")
+    parser.add_argument("log", type=Path, metavar="RUN", help=RUN_HELP)
     parser.add_argument(
         "--service",
         action="append",
@@ -91,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         robot = with_params(robot, args.param, str(args.log))
     chosen = set(args.service or ("all",))
     names = SERVICES if "all" in chosen else tuple(name for name in SERVICES if name in chosen)
-    path = args.out or args.log.with_suffix(".resim.mcap")
+    path = args.out or log.files[0].with_suffix(".resim.mcap")
     if args.param and path.exists():
         raise RunError(f"{path}: is there already; remove it, or name another with --out")
     outcomes, recomputed = [], dict[str, list[Message]]()

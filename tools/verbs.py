@@ -11,6 +11,8 @@ from shared.process import DEFAULT_CONFIG, RUN_DIR_VARIABLE, default_run_dir
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
 """What `add_parser` is given."""
 
+RUN_HELP: Final = "a run's record, finished or not; or its directory: all files of a split run"
+
 
 class Verb(NamedTuple):
     """One row: `module` has `add_parser(subparsers)` and `run(args) -> int`."""

@@ -22,7 +22,7 @@ from tools.counterfactual.run import Fate, Task, fate_of
 from tools.explain import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.sweeps.pool import cores, results
-from tools.verbs import Subparsers, add_verb
+from tools.verbs import RUN_HELP, Subparsers, add_verb
 
 KILLABLE: Final = ("planner", *MODULES)
 WIDTH: Final = 72
@@ -39,7 +39,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
         """,
     )
-    parser.add_argument("log", type=Path, metavar="RUN.mcap", help="record of a simulated run")
+    parser.add_argument("log", type=Path, metavar="RUN", help=f"{RUN_HELP}; of a simulated robot")
     parser.add_argument(
         "--kill",
         action="append",
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
             fell = sum(not one.stood for one in fates)
             progress.update(shown, advance=1, fell=f"{fell} fell")
     fates.sort(key=lambda one: one.at_s)
-    out = args.out or args.log.parent
+    out = args.out or log.files[0].parent
     out.mkdir(parents=True, exist_ok=True)
     names = " and ".join(kill)
     (out / "whatif.json").write_bytes(

@@ -11,8 +11,9 @@ from shared import codec, topics
 from shared.exceptions import RunError
 from tests.recorder import runs
 from tests.recorder.runs import STATE_KEY, Queue, item, killed_file, write, writer
+from tools.logs.files import further_files
 from tools.playback import reading
-from tools.playback.reading import files_named, further_files, read
+from tools.playback.reading import files_named, read
 
 WRENCH_KEY = topics.WRENCH.key(runs.ROBOT)
 

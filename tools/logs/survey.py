@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from services.recorder import mcap_records as mcap
-from services.recorder.files import SUFFIX, in_use
+from services.recorder.files import in_use
 from services.recorder.gaps import KeyCount
 from services.recorder.mcap_log import PROFILE
 from services.recorder.mcap_records import Channel, Malformed
 from services.recorder.salvage import Loss, Piece, Salvage, opened
 from shared.clock import NS_PER_S
-from shared.exceptions import RunError
-
-Metadata = dict[str, dict[str, str]]
+from tools.logs.files import Metadata
 
 _NEVER: Final = -1
 
@@ -175,56 +172,6 @@ class _Reading:
             elif gap_ns > topic.longest_gap_ns:
                 topic.longest_gap_ns, topic.gap_at_ns = gap_ns, topic.last_ns
             topic.last_ns = time_ns
-
-
-def head_of(path: Path) -> Metadata:
-    """Return the metadata at the start of a file, up to its first messages.
-
-    Raises:
-        RunError: it is missing, empty, or no MCAP file.
-    """
-    found: Metadata = {}
-    with opened(path) as salvage:
-        for piece in salvage:
-            if piece.rows:
-                break
-            if piece.opcode == mcap.METADATA:
-                name, entries = mcap.metadata(piece.body)
-                found[name] = entries
-    return found
-
-
-def files_of_run(path: Path, metadata: Metadata) -> list[Path]:
-    """Return the files of the run that one of them belongs to, in order; that one at least.
-
-    A recovered copy stands in for nothing: only if the original is gone it is taken.
-
-    Args:
-        path: the file.
-        metadata: its metadata.
-    """
-    run = metadata.get("split", {}).get("run")
-    if not run:
-        return [path]
-    numbers = {path: _number(metadata)}
-    for other in _names(path.parent):
-        if other.resolve() == path.resolve():
-            continue
-        with contextlib.suppress(RunError):
-            head = head_of(other)
-            number = _number(head)
-            if head.get("split", {}).get("run") == run and number not in numbers.values():
-                numbers[other] = number
-    return sorted(numbers, key=lambda file: numbers[file])
-
-
-def _names(directory: Path) -> Iterable[Path]:
-    return sorted(directory.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
-
-
-def _number(metadata: Metadata) -> int:
-    text = metadata.get("split", {}).get("number", "")
-    return int(text) if text.isdecimal() and text.isascii() and len(text) < 10 else 0
 
 
 def _in_use(path: Path) -> bool:

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from shared.bus import RawPublisher
 from shared.clock import NS_PER_MS, NS_PER_S
-from tools.playback import reading
+from tools.logs.files import further_files
 from tools.playback.player import Player
 from tools.playback.reading import Recording
 from tools.playback.schedule import Window
@@ -27,7 +27,7 @@ def introduce(recording: Recording, paths: list[Path], note: str, console: Conso
     for path in recording.damaged:
         words = f"{path}: parts of it cannot be read and are left out; see `xrl info`"
         console.print(escape(words), style="yellow", soft_wrap=True)
-    if len(paths) == 1 and (others := reading.further_files(paths[0])):
+    if len(paths) == 1 and (others := further_files(paths[0])):
         names = ", ".join(path.name for path in others)
         words = f"further files of this run: {names}; give the directory to play all"
         console.print(escape(words), style="dim", soft_wrap=True)

@@ -11,12 +11,11 @@ from typing import Final
 import msgspec
 
 from services.recorder import mcap_records as mcap
-from services.recorder.files import SUFFIX
 from services.recorder.mcap_records import Malformed
 from services.recorder.salvage import Piece, Salvage, opened
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tools.logs.survey import Metadata, files_of_run, head_of
+from tools.logs.files import Metadata, files_in
 from tools.playback.schedule import Entry
 
 ROBOT_FILE: Final = "robot.toml"
@@ -89,37 +88,10 @@ def files_named(given: Iterable[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in given:
-        found += _run_in(path) if path.is_dir() else [path]
+        found += files_in(path) if path.is_dir() else [path]
     if not found:
         raise RunError("no FILE; write it first: xrl play FILE --topics 'joint/*/state'")
     return found
-
-
-def further_files(path: Path) -> list[Path]:
-    """Return the other files of the run that a file belongs to."""
-    own = path.resolve()
-    return [file for file in files_of_run(path, head_of(path)) if file.resolve() != own]
-
-
-def _run_in(directory: Path) -> list[Path]:
-    """Return the files of the one run in a directory."""
-    names = sorted(directory.glob(f"*{SUFFIX}"), key=lambda file: (len(file.name), file.name))
-    plain = [path for path in names if "." not in path.stem]  # not recovered or executed again
-    runs: list[list[Path]] = []
-    unreadable: RunError | None = None
-    for path in plain or names:
-        if any(path in run for run in runs):
-            continue
-        try:
-            runs.append(files_of_run(path, head_of(path)))
-        except RunError as error:
-            unreadable = error
-    if not runs:
-        raise unreadable or RunError(f"{directory}: holds no {SUFFIX} file; give a run's directory")
-    if len(runs) > 1:
-        first = ", ".join(run[0].name for run in runs)
-        raise RunError(f"{directory}: holds {len(runs)} runs ({first}); give the files of one")
-    return runs[0]
 
 
 def _join(recording: Recording, file: _File) -> None:

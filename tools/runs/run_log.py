@@ -1,4 +1,4 @@
-"""Reads a run's MCAP file into memory, finished or killed.
+"""Reads a run's MCAP file, or all of its files, into memory: finished or killed.
 
 A killed file has no summary, and may end in the middle of a record; the readers of
 the mcap package find nothing in the first and may stumble over the second (design
@@ -20,6 +20,7 @@ from services.recorder.mcap_records import Malformed
 from services.recorder.salvage import Loss, Piece, opened
 from shared.exceptions import RunError
 from shared.topics import Topic
+from tools.logs.files import files_in
 
 
 class Series:
@@ -40,28 +41,28 @@ class RunLog:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read a file; `read_run` is the name to use.
+        """Read a file, or the run in a directory; `read_run` is the name to use.
 
         Raises:
-            RunError: the file is missing, empty, no MCAP file or no run.
+            RunError: a file is missing, empty, no MCAP file or no run; or the directory holds
+                no run, or several.
         """
         self.path = path
+        self.files = files_in(path) if path.is_dir() else [path]
+        """What was read, in order: several if the run was split."""
         self.metadata: dict[str, dict[str, str]] = {}
         """Metadata records by name: `run`, `clock`, `packages`, at the end `counts`."""
         self.attachments: dict[str, bytes] = {}
-        self.complete = False
-        """True if the recorder finished the file; False if it was killed."""
+        self.complete = True
+        """True if the recorder finished every file; False if it was killed."""
         self.damage: list[Loss] = []
         """Places that could not be read: their contents are left out."""
         self.cut: Loss | None = None
         """What follows the last whole record of a file that was cut off."""
         self._series: dict[str, Series] = {}
         self._by_channel: dict[int, Series] = {}
-        with opened(path) as salvage:
-            for piece in salvage:
-                with contextlib.suppress(Malformed):
-                    self._take(piece)
-            self.complete, self.damage, self.cut = salvage.finished, salvage.damage, salvage.cut
+        for file in self.files:
+            self._read(file)
         self.robot = self._required("run", "robot")
         offset = self._required("clock", "offset_ns")
         if not offset.lstrip("-").isdecimal():
@@ -135,6 +136,16 @@ class RunLog:
                 found[key].feed(seq)
         return found
 
+    def _read(self, file: Path) -> None:
+        self._by_channel = {}
+        with opened(file) as salvage:
+            for piece in salvage:
+                with contextlib.suppress(Malformed):
+                    self._take(piece)
+            self.complete = self.complete and salvage.finished
+            self.damage += salvage.damage
+            self.cut = salvage.cut or self.cut
+
     def _key(self, topic: Topic, module: str) -> str:
         if topic.per_module != bool(module):
             right = "name a module" if topic.per_module else "name none"
@@ -183,9 +194,13 @@ class RunLog:
 
 
 def read_run(path: Path) -> RunLog:
-    """Read a run's file, finished or killed.
+    """Read a run, finished or killed.
+
+    Args:
+        path: a file; or a directory: all files of the run in it.
 
     Raises:
-        RunError: the file is missing, empty, no MCAP file or no run.
+        RunError: a file is missing, empty, no MCAP file or no run; or the directory holds no
+            run, or several.
     """
     return RunLog(path)

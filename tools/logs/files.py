@@ -1,0 +1,95 @@
+"""Which files belong to one run: a split run is several, in one directory."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from services.recorder import mcap_records as mcap
+from services.recorder.files import SUFFIX
+from services.recorder.salvage import opened
+from shared.exceptions import RunError
+
+Metadata = dict[str, dict[str, str]]
+
+
+def head_of(path: Path) -> Metadata:
+    """Return the metadata at the start of a file, up to its first messages.
+
+    Raises:
+        RunError: it is missing, empty, or no MCAP file.
+    """
+    found: Metadata = {}
+    with opened(path) as salvage:
+        for piece in salvage:
+            if piece.rows:
+                break
+            if piece.opcode == mcap.METADATA:
+                name, entries = mcap.metadata(piece.body)
+                found[name] = entries
+    return found
+
+
+def files_of_run(path: Path, metadata: Metadata) -> list[Path]:
+    """Return the files of the run that one of them belongs to, in order; that one at least.
+
+    A recovered copy stands in for nothing: only if the original is gone it is taken.
+
+    Args:
+        path: the file.
+        metadata: its metadata.
+    """
+    run = metadata.get("split", {}).get("run")
+    if not run:
+        return [path]
+    numbers = {path: _number(metadata)}
+    for other in _names(path.parent):
+        if other.resolve() == path.resolve():
+            continue
+        with contextlib.suppress(RunError):
+            head = head_of(other)
+            number = _number(head)
+            if head.get("split", {}).get("run") == run and number not in numbers.values():
+                numbers[other] = number
+    return sorted(numbers, key=lambda file: numbers[file])
+
+
+def further_files(path: Path) -> list[Path]:
+    """Return the other files of the run that a file belongs to."""
+    own = path.resolve()
+    return [file for file in files_of_run(path, head_of(path)) if file.resolve() != own]
+
+
+def files_in(directory: Path) -> list[Path]:
+    """Return the files of the one run in a directory, in order.
+
+    Raises:
+        RunError: it holds no run, or several.
+    """
+    names = sorted(directory.glob(f"*{SUFFIX}"), key=lambda file: (len(file.name), file.name))
+    plain = [path for path in names if "." not in path.stem]  # not recovered or executed again
+    runs: list[list[Path]] = []
+    unreadable: RunError | None = None
+    for path in plain or names:
+        if any(path in run for run in runs):
+            continue
+        try:
+            runs.append(files_of_run(path, head_of(path)))
+        except RunError as error:
+            unreadable = error
+    if not runs:
+        raise unreadable or RunError(f"{directory}: holds no {SUFFIX} file; give a run's directory")
+    if len(runs) > 1:
+        first = ", ".join(run[0].name for run in runs)
+        raise RunError(f"{directory}: holds {len(runs)} runs ({first}); give the files of one")
+    return runs[0]
+
+
+def _names(directory: Path) -> Iterable[Path]:
+    return sorted(directory.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
+
+
+def _number(metadata: Metadata) -> int:
+    text = metadata.get("split", {}).get("number", "")
+    return int(text) if text.isdecimal() and text.isascii() and len(text) < 10 else 0
