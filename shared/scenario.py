@@ -16,7 +16,9 @@ import tomli_w
 
 from shared.config import SERVICES
 from shared.exceptions import ConfigError
+from shared.impairment import Impairment
 from shared.joints import MODULES
+from shared.links import directions_of
 from shared.toml_file import Range, Section, check_ranges, read_toml
 
 Time = Annotated[float, Range(0.0, 86_400.0, "s")]
@@ -111,6 +113,21 @@ class Fault(Section, frozen=True):
         return self.duration or FAULT_KINDS[self.kind].duration or 0.0
 
 
+class Inject(Impairment, frozen=True, kw_only=True):
+    """The network does something to a link for a while."""
+
+    link: str
+    """One or several directions (`shared.links`), such as `planner->joints`."""
+    at: Time
+    duration: Annotated[float, Range(0.001, 86_400.0, "s")] | None = None
+    """s; None: to the end of the run."""
+
+    @property
+    def until(self) -> float:
+        """When it ends, s; infinite if it does not."""
+        return math.inf if self.duration is None else self.at + self.duration
+
+
 class Scenario(Section, frozen=True):
     """The whole file."""
 
@@ -124,6 +141,7 @@ class Scenario(Section, frozen=True):
     kill: tuple[Kill, ...] = ()
     restart: tuple[Restart, ...] = ()
     fault: tuple[Fault, ...] = ()
+    inject: tuple[Inject, ...] = ()
 
 
 class Lead(NamedTuple):
@@ -207,6 +225,12 @@ def check(file: str, scenario: Scenario) -> None:
     for index, fault in enumerate(scenario.fault):
         _check_fault(file, f"fault[{index}]", fault)
         _check_inside(file, f"fault[{index}].at", fault.at, scenario.duration)
+    for index, inject in enumerate(scenario.inject):
+        directions_of(inject.link, file, f"inject[{index}].link")
+        if amiss := inject.fault():
+            found, _, right = amiss.partition("; ")
+            raise ConfigError(file, f"inject[{index}]", found, right)
+        _check_inside(file, f"inject[{index}].at", inject.at, scenario.duration)
     for index, restart in enumerate(scenario.restart):
         if not any(k.service == restart.service and k.at < restart.at for k in scenario.kill):
             found = f"{restart.service} is not killed before {restart.at:g} s"
@@ -240,7 +264,7 @@ def _check_inside(file: str, key: str, at: float, duration: float) -> None:
 def to_toml(scenario: Scenario) -> str:
     """Return the scenario as TOML that `load` reads back."""
     table = msgspec.to_builtins(scenario)
-    for row in table["fault"]:
+    for row in (*table["fault"], *table["inject"]):
         for key in [key for key, value in row.items() if value is None]:
             del row[key]  # TOML has no null
     return tomli_w.dumps(table)

@@ -9,12 +9,14 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
+from types import UnionType
 from typing import (
     Annotated,
     Any,
     Literal,
     NamedTuple,
     TypeVar,
+    Union,
     get_args,
     get_origin,
     get_type_hints,
@@ -142,7 +144,10 @@ def _check_ranges(file: str, key: str, value: Any, hint: Any) -> None:
                 allowed = f"must be from {note.low:g} to {note.high:g} {note.unit}"
                 raise ConfigError(file, key, f"{value!r} is out of range", allowed)
         return
-    if isinstance(value, msgspec.Struct):
+    if origin in (Union, UnionType):
+        if value is not None:
+            _check_ranges(file, key, value, next(one for one in get_args(hint) if one is not None))
+    elif isinstance(value, msgspec.Struct):
         hints = get_type_hints(type(value), include_extras=True)
         for name in value.__struct_fields__:
             _check_ranges(file, f"{key}.{name}".lstrip("."), getattr(value, name), hints[name])

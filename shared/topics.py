@@ -153,6 +153,14 @@ RUN_EVENT: Final = Topic(
     recorded=True,
     why="kills, restarts and pushes, for the verdict",
 )
+LINK_EVENT: Final = Topic(
+    name="link/event",
+    type=messages.LinkEvent,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="what is done to the network on purpose: an experiment without it is no evidence",
+)
 
 TOPICS: Final = (
     JOINT_STATE,
@@ -169,6 +177,7 @@ TOPICS: Final = (
     SIM_STATE,
     SIM_CONTROL,
     RUN_EVENT,
+    LINK_EVENT,
 )
 
 

@@ -474,6 +474,7 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.SIM_TRUTH: (("simulator",), ("recorder", TOOL)),
     topics.SIM_CONTROL: ((TOOL,), ("simulator", "recorder")),
     topics.RUN_EVENT: ((TOOL,), ("recorder",)),
+    topics.LINK_EVENT: ((TOOL,), ("recorder",)),
 }
 """Who puts each topic on the bus, and who takes it."""
 

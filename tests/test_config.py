@@ -6,8 +6,8 @@ import shutil
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 import pytest
@@ -254,6 +254,9 @@ def numbers_without_a_range(hint: Any, where: str, in_range: bool = False) -> It
         for index, item in enumerate(get_args(hint)):
             if item is not Ellipsis:
                 yield from numbers_without_a_range(item, f"{where}[{index}]")
+    elif origin in (Union, UnionType) and Annotated in map(get_origin, get_args(hint)):
+        for item in get_args(hint):
+            yield from numbers_without_a_range(item, where)
     elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         for name, field in get_type_hints(hint, include_extras=True).items():
             if name not in BESIDE or (hint is not Fault and name != BESIDE[0]):

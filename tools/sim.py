@@ -18,13 +18,13 @@ from shared import topics
 from shared.codec import encode
 from shared.config import RobotConfig
 from shared.exceptions import RunError
+from shared.impairment import Impairment
 from shared.messages import Message
 from shared.robot_model import mjcf
 from shared.scenario import Scenario
 from shared.topics import Topic
 from tools.runs import experiment, figure, verdict, verdict_table
 from tools.runs.lockstep import Lockstep
-from tools.runs.network import Impairment
 from tools.runs.run_log import read_run
 from tools.verbs import Subparsers, add_verb
 
@@ -64,6 +64,8 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl sim --delay 10 --out out/slow
         xrl sim --delay 5 --jitter 5 --loss 0.1 --seed 3
         xrl sim --scenario crawl --kill planner@8
+        xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
+        xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
         """,
     )
     experiment.add_flags(parser)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from shared import scenario
 from shared.config import RobotConfig
+from shared.impairment import Impairment
 from shared.messages import SimTruth
 from shared.scenario import Keyframe, Kill, Push, Restart, Scenario
 from tools.runs.lockstep import Lockstep
-from tools.runs.network import Impairment
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 

@@ -8,12 +8,12 @@ import pytest
 
 from shared import topics
 from shared.config import RobotConfig
+from shared.impairment import Impairment
 from shared.messages import Message, PlannerStatus, SimTruth, Tare, TareRequest, Wrench
 from shared.scenario import Keyframe, Scenario
 from shared.topics import Topic
 from tests.lockstep.runs import still, story
 from tools.runs.lockstep import Lockstep
-from tools.runs.network import Impairment
 
 
 def leaning(assist: float) -> Scenario:

@@ -12,13 +12,13 @@ from rich.console import Console
 
 from shared import topics
 from shared.config import RobotConfig
+from shared.impairment import Impairment
 from shared.joints import MODULES
 from shared.scenario import Fault, Kill, Restart
 from tests.lockstep.runs import still
 from tools import resim, sim
 from tools.explain import robot_of
 from tools.reexecution.outcome import Outcome
-from tools.runs.network import Impairment
 from tools.runs.run_log import RunLog, read_run
 
 
@@ -33,7 +33,9 @@ def recorded(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Pa
         fault=(Fault(module="hip_right", kind="link_lost", at=4.3),),
     )
     folder = tmp_path_factory.mktemp("resim")
-    sim.simulate(robot, story, Impairment(jitter_ms=0.5), 3, folder, Console(quiet=True))
+    sim.simulate(
+        robot, story, Impairment(delay_ms=1.0, jitter_ms=0.5), 3, folder, Console(quiet=True)
+    )
     return folder / "run.mcap"
 
 

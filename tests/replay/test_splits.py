@@ -18,7 +18,7 @@ from tests.recorder.runs import Queue
 from tools import cli, resim, sim
 from tools.explain import robot_of
 from tools.reexecution.outcome import Outcome
-from tools.runs.network import Impairment
+from tools.runs.network import BASE
 from tools.runs.run_log import RunLog, read_run
 
 
@@ -31,7 +31,7 @@ def whole(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> RunLo
         restart=(Restart(service="planner", at=0.8),),
     )
     folder = tmp_path_factory.mktemp("whole")
-    sim.simulate(robot, story, Impairment(), 3, folder, Console(quiet=True))
+    sim.simulate(robot, story, BASE, 3, folder, Console(quiet=True))
     return read_run(folder / "run.mcap")
 
 

@@ -18,7 +18,7 @@ from tools import sim, whatif
 from tools.counterfactual.moments import Moment, moments_of
 from tools.counterfactual.run import Task, fate_of
 from tools.explain import robot_of
-from tools.runs.network import Impairment
+from tools.runs.network import BASE
 from tools.runs.run_log import RunLog, read_run
 
 HARD = push(2.6, 150.0, 0.0, 0.0)
@@ -26,7 +26,7 @@ HARD = push(2.6, 150.0, 0.0, 0.0)
 
 
 def record(robot: RobotConfig, story: Scenario, folder: Path) -> RunLog:
-    sim.simulate(robot, story, Impairment(), 0, folder, Console(quiet=True))
+    sim.simulate(robot, story, BASE, 0, folder, Console(quiet=True))
     return read_run(folder / "run.mcap")
 
 

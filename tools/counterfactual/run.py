@@ -11,7 +11,7 @@ from shared.messages import SimTruth
 from shared.scenario import Kill, Scenario
 from tools.counterfactual.moments import Moment
 from tools.runs.lockstep import Lockstep
-from tools.runs.network import Impairment
+from tools.runs.network import BASE
 
 KILL_AFTER_S: Final = 1e-3
 
@@ -58,7 +58,7 @@ def fate_of(task: Task) -> Fate:
     """Go on from the moment, and judge."""
     moment = task.moment
     story = story_from(task.story, moment.at_s, task.kill, task.for_s)
-    fleet = Lockstep(task.robot, story, Impairment())
+    fleet = Lockstep(task.robot, story, BASE)
     fleet.go_on(moment.state, moment.modules, moment.planner)
     fell_at_s = None
     rows: list[SimTruth] = []

@@ -19,10 +19,11 @@ from shared.config_sections import LawConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
-from shared.scenario import FAULT_KINDS, SIGNALS, Fault, Kill, Push, Restart, Scenario
+from shared.scenario import FAULT_KINDS, SIGNALS, Fault, Inject, Kill, Push, Restart, Scenario
+from tools.runs.injection import in_words_of, parse_inject
 from tools.verbs import add_config
 
-E = TypeVar("E", Kill, Restart, Push, Fault)
+E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
 
 SCENARIOS = DEFAULT_CONFIG.parent / "scenarios"
 
@@ -79,6 +80,15 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         help=f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
         "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults; "
         "may be repeated",
+    )
+    parser.add_argument(
+        "--inject",
+        action="append",
+        type=parse_inject,
+        metavar="'LINK KEY=VALUE ...'",
+        help="what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 "
+        "for=4' (ms and s), 'all loss=0.2 burst=5', 'planner->left partition at=3'; `xrl inject "
+        "--help` explains each word; replaces the scenario's; may be repeated",
     )
     parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
     parser.add_argument(
@@ -176,10 +186,12 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
     restarts = tuple(args.restart or ()) if args.kill or args.restart else story.restart
     pushes = tuple(args.push) if args.push is not None else _inside(story.push, duration)
     faults = tuple(args.fault) if args.fault is not None else _inside(story.fault, duration)
+    injects = tuple(args.inject) if args.inject is not None else _inside(story.inject, duration)
     story = msgspec.structs.replace(
         story,
         duration=duration,
         fault=faults,
+        inject=injects,
         kill=kills,
         restart=_inside(restarts, duration) if not args.restart else restarts,
         push=pushes,
@@ -197,6 +209,7 @@ def in_words(story: Scenario) -> str:
     done = [f"{row.service} {row.signal} at {row.at:g} s" for row in story.kill]
     done += [f"{row.service} back at {row.at:g} s" for row in story.restart]
     done += [f"{row.module} {row.kind} at {row.at:g} s" for row in story.fault]
+    done += [in_words_of(row) for row in story.inject]
     done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in story.push]
     return f"; {', '.join(done)}" if done else ""
 

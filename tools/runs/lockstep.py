@@ -23,25 +23,25 @@ from shared import topics
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.exceptions import RunError
+from shared.impairment import Impairment
 from shared.joints import MODULE_INDEX, MODULES
 from shared.messages import (
-    JointCommand,
     JointEvent,
-    JointState,
+    LinkEvent,
     Message,
     Mode,
     PlannerStatus,
     RunEvent,
     RunEventKind,
     SimTruth,
-    Wrench,
 )
 from shared.scenario import Kill, Push, Restart, Scenario
 from shared.topics import Topic
 from shared.traces import SimState
-from tools.runs.network import Impairment, Link
+from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
+from tools.runs.virtual_network import VirtualNetwork
 
 SETTLE_NS = NS_PER_S
 """The scenario starts this long after all six modules track."""
@@ -74,7 +74,8 @@ class Lockstep:
             config: the robot.
             scenario: what happens; kills and restarts of the planner and, with the onboard
                 loop, of joint services.
-            network: what every link does, each way; None is 1 ms.
+            network: what every link does by itself, each way; None is 1 ms. What the
+                scenario injects comes on top.
             seed: of the network and of the harness sensor's noise.
             record: takes every message.
 
@@ -106,14 +107,14 @@ class Lockstep:
         """Services that are stopped or dead."""
         self._dead: set[str] = set()
         self._sessions = 1
-        network = network or Impairment()
-        self._states: list[Link[JointState]] = [
-            Link(network, f"{seed} {module} state") for module in MODULES
-        ]
-        self._commands: list[Link[JointCommand]] = [
-            Link(network, f"{seed} {module} command") for module in MODULES
-        ]
-        self._wrenches: Link[Wrench] = Link(network, f"{seed} harness wrench")
+        self.network = VirtualNetwork(
+            network or BASE,
+            scenario.inject,
+            seed,
+            lambda event: record(topics.LINK_EVENT, "", event),
+        )
+        self._states, self._commands = self.network.states(), self.network.commands()
+        self._wrenches = self.network.wrenches()
         self.harness = VirtualHarness(
             config, self._wrenches, lambda wrench: record(topics.WRENCH, "", wrench), seed
         )
@@ -204,6 +205,7 @@ class Lockstep:
     def advance(self) -> None:
         """Move virtual time on by one step of the world."""
         now = self.now_ns
+        self.network.advance(self.world.scenario_s, now)
         if now % self._cycle_ns == 0:
             for fault in self._faults.advance(self.world.scenario_s):
                 self._say(RunEventKind.FAULTED, fault.module, fault.kind)
@@ -247,6 +249,9 @@ class Lockstep:
         self._modules[index] = Module(self.config, service)
         self._tracers[index] = Tracer(self._modules[index])
         self._drives[index].serve_anew()
+
+    def _tell_link(self, event: LinkEvent) -> None:
+        self._record(topics.LINK_EVENT, "", event)
 
     def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
         self._said += 1

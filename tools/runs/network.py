@@ -1,52 +1,83 @@
-"""A modelled network link: delay, jitter and loss, seeded (design section 7). Pure."""
+"""A modelled network link, seeded (design section 7). Pure.
+
+What a link does by itself, and what is done to it meanwhile (`xrl sim --inject`), are both
+`shared.impairment`: the injector of a live fleet decides with the same objects.
+"""
 
 from __future__ import annotations
 
 import heapq
-import random
-from typing import Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
-import msgspec
+from shared.codec import encode
+from shared.impairment import HELD, Direction, Impairer, Impairment
+from shared.messages import Message
 
-from shared.clock import NS_PER_MS
+M = TypeVar("M", bound=Message)
 
-T = TypeVar("T")
-
-
-class Impairment(msgspec.Struct, frozen=True, kw_only=True):
-    """What every link does to what passes it, each way."""
-
-    delay_ms: float = 1.0
-    jitter_ms: float = 0.0
-    """Uniform: a message takes delay +- jitter, at least nothing."""
-    loss: float = 0.0
-    """Probability that a message never comes."""
+BASE: Final = Impairment(delay_ms=1.0)
+"""What every link does by itself, each way, unless something else is asked for."""
+OVERHEAD_BYTES: Final = 40
+"""Key and header that travel with a payload."""
 
 
-class Link(Generic[T]):
-    """One direction between two processes; the receiver keeps the newest arrival only."""
+class Link(Generic[M]):
+    """One direction between two processes; the receiver keeps the newest arrival only.
 
-    def __init__(self, impairment: Impairment, seed: str) -> None:
-        self._impairment = impairment
-        self._random = random.Random(seed)
-        self._queue: list[tuple[int, int, T]] = []  # by arrival
-        self._sent = 0
+    What comes behind a message that was sent later is dropped, as Zenoh does by its own
+    sequence numbers.
+    """
 
-    def put(self, now_ns: int, message: T) -> None:
+    def __init__(self, base: Impairment, name: str, seed: int) -> None:
+        """Begin.
+
+        Args:
+            base: what it does by itself.
+            name: of `shared.links`.
+            seed: of all that is decided here.
+        """
+        self.direction = Direction(name, seed)
+        self.overtaken = 0
+        """Messages that came too late, or twice, and were dropped."""
+        self._base = Impairer(base, f"{seed} {name} base")
+        self._queue: list[tuple[int, int, M]] = []  # by arrival
+        self._held: list[tuple[int, M]] = []
+        self._sent = self._newest = 0
+
+    def put(self, now_ns: int, message: M) -> None:
         """Send."""
-        what = self._impairment
         self._sent += 1
-        if what.loss and self._random.random() < what.loss:
-            return
-        delay_ms = what.delay_ms
-        if what.jitter_ms:
-            delay_ms = max(0.0, delay_ms + self._random.uniform(-what.jitter_ms, what.jitter_ms))
-        arrival_ns = now_ns + round(delay_ms * NS_PER_MS)
-        heapq.heappush(self._queue, (arrival_ns, self._sent, message))
+        for release_ns in self.direction.passes(now_ns, self._size(message)):
+            if release_ns == HELD:
+                self._held.append((self._sent, message))
+            else:
+                self._enter(release_ns, self._sent, message)
 
-    def take(self, now_ns: int) -> T | None:
-        """Return the last message to have arrived, as a ring of depth 1 does; None if none."""
+    def take(self, now_ns: int) -> M | None:
+        """Return the newest that has arrived, as a ring of depth 1 does; None if none has."""
         newest = None
         while self._queue and self._queue[0][0] <= now_ns:
-            newest = heapq.heappop(self._queue)[2]
+            _, number, message = heapq.heappop(self._queue)
+            if number > self._newest:
+                self._newest, newest = number, message
+            else:
+                self.overtaken += 1
         return newest
+
+    def release(self, now_ns: int) -> None:
+        """Let out what a partition has held back, if it is over."""
+        impairer = self.direction.in_force
+        if impairer is None or not impairer.what.partition:
+            held, self._held = self._held, []
+            for number, message in held:
+                self._enter(now_ns, number, message)
+
+    def _enter(self, now_ns: int, number: int, message: M) -> None:
+        for arrival_ns in self._base.passes(now_ns, 0):
+            heapq.heappush(self._queue, (arrival_ns, number, message))
+
+    def _size(self, message: M) -> int:
+        impairer = self.direction.in_force
+        if impairer is None or not impairer.what.rate:
+            return 0
+        return len(encode(message)) + OVERHEAD_BYTES

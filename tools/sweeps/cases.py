@@ -9,9 +9,9 @@ from typing import Final
 import msgspec
 
 from shared.config import RobotConfig
+from shared.impairment import Impairment
 from shared.robot_model import stand_pose
 from shared.scenario import Keyframe, Kill, Push, Scenario
-from tools.runs.network import Impairment
 
 PAYLOADS: Final = 5
 """Evenly spaced from none to `mass.payload_max`: each needs a gain schedule of its own."""

@@ -1,0 +1,189 @@
+"""What is done to messages: as often, as late and as often twice as asked."""
+
+from __future__ import annotations
+
+import statistics
+from itertools import pairwise
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.exceptions import ConfigError
+from shared.impairment import HELD, QUEUE_MAX, Direction, Impairer, Impairment
+from shared.links import DIRECTIONS, GROUPS, PAIRS, directions_of
+
+EVERY_NS = 4 * NS_PER_MS
+SIZE = 200
+
+
+def delays_ms(what: Impairment, count: int = 4000, seed: str = "a") -> list[float]:
+    """Return the delay of each message that comes out, in the order in which they went in."""
+    impairer = Impairer(what, seed)
+    found = []
+    for number in range(count):
+        now_ns = number * EVERY_NS
+        found += [(t - now_ns) / NS_PER_MS for t in impairer.passes(now_ns, SIZE)]
+    return found
+
+
+def test_nothing_is_done_unless_asked() -> None:
+    assert delays_ms(Impairment()) == [0.0] * 4000
+    assert Impairment().in_words() == "nothing"
+
+
+def test_uniform_jitter_stays_in_its_bounds_and_fills_them() -> None:
+    found = delays_ms(Impairment(delay_ms=20.0, jitter_ms=10.0))
+    assert 10.0 <= min(found) < 10.1
+    assert 29.9 < max(found) <= 30.0
+    assert statistics.mean(found) == pytest.approx(20.0, abs=0.3)
+
+
+@pytest.mark.parametrize("distribution", ["normal", "pareto"])
+def test_other_jitter_has_the_mean_and_the_deviation_asked_for(distribution: str) -> None:
+    what = Impairment(delay_ms=100.0, jitter_ms=10.0, distribution=distribution)
+    found = delays_ms(what, 40_000)
+    assert statistics.mean(found) == pytest.approx(100.0, abs=0.5)
+    assert statistics.stdev(found) == pytest.approx(10.0, rel=0.15)
+
+
+def test_the_tail_of_pareto_is_heavier_than_that_of_normal() -> None:
+    far = {
+        kind: sum(
+            d > 140.0
+            for d in delays_ms(
+                Impairment(delay_ms=100.0, jitter_ms=10.0, distribution=kind), 40_000
+            )
+        )
+        for kind in ("normal", "pareto")
+    }
+    assert far["normal"] < 10 < far["pareto"]
+
+
+def test_nothing_comes_before_it_was_sent() -> None:
+    assert min(delays_ms(Impairment(delay_ms=1.0, jitter_ms=30.0, distribution="normal"))) == 0.0
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.5, 1.0])
+@pytest.mark.parametrize("burst", [1.0, 3.0, 20.0])
+def test_as_many_are_lost_as_asked_with_bursts_or_without(loss: float, burst: float) -> None:
+    if loss in (0.0, 1.0):
+        burst = 1.0
+    came = len(delays_ms(Impairment(loss=loss, burst=burst), 60_000))
+    assert came / 60_000 == pytest.approx(1.0 - loss, abs=0.03)
+
+
+def test_rows_of_losses_are_as_long_as_asked() -> None:
+    impairer = Impairer(Impairment(loss=0.2, burst=8.0), "a")
+    rows, row = [], 0
+    for number in range(100_000):
+        if impairer.passes(number, SIZE):
+            rows += [row] if row else []
+            row = 0
+        else:
+            row += 1
+    assert statistics.mean(rows) == pytest.approx(8.0, rel=0.1)
+
+
+def test_as_many_come_twice_as_asked() -> None:
+    assert len(delays_ms(Impairment(duplicate=0.3), 10_000)) == pytest.approx(13_000, abs=200)
+
+
+def test_a_share_overtakes_the_others() -> None:
+    found = delays_ms(Impairment(delay_ms=30.0, reorder=0.25), 10_000)
+    assert set(found) == {0.0, 30.0}
+    assert found.count(0.0) / 10_000 == pytest.approx(0.25, abs=0.02)
+
+
+def test_ordered_messages_never_overtake() -> None:
+    impairer = Impairer(Impairment(delay_ms=20.0, jitter_ms=20.0, ordered=True), "a")
+    releases = [impairer.passes(n * NS_PER_MS, SIZE)[0] for n in range(1000)]
+    assert all(a <= b for a, b in pairwise(releases))
+    assert all(t >= n * NS_PER_MS for n, t in enumerate(releases))
+
+
+def test_a_slow_line_takes_its_time_for_each_byte_and_drops_what_it_cannot_queue() -> None:
+    impairer = Impairer(Impairment(rate=1000.0), "a")
+    taken = [impairer.passes(0, 100) for _ in range(QUEUE_MAX + 10)]
+    assert [t[0] for t in taken[:3]] == [NS_PER_S // 10, NS_PER_S // 5, 3 * NS_PER_S // 10]
+    assert taken[-1] == ()
+    assert QUEUE_MAX <= impairer.passed <= QUEUE_MAX + 1
+    assert impairer.passed + impairer.lost == QUEUE_MAX + 10
+
+
+def test_a_partition_loses_datagrams_and_holds_a_stream_back() -> None:
+    assert Impairer(Impairment(partition=True), "a").passes(5, SIZE) == ()
+    assert Impairer(Impairment(partition=True, ordered=True), "a").passes(5, SIZE) == (HELD,)
+
+
+@given(
+    st.builds(
+        Impairment,
+        delay_ms=st.floats(0, 500),
+        jitter_ms=st.floats(0, 500),
+        distribution=st.sampled_from(["uniform", "normal", "pareto"]),
+        loss=st.floats(0, 1),
+        duplicate=st.floats(0, 1),
+        rate=st.floats(1e3, 1e9),
+        ordered=st.booleans(),
+    ),
+    st.text(max_size=5),
+)
+def test_the_same_seed_decides_the_same_and_every_message_is_counted(
+    what: Impairment, seed: str
+) -> None:
+    a, b = Impairer(what, seed), Impairer(what, seed)
+    for number in range(50):
+        now_ns = number * EVERY_NS
+        out = a.passes(now_ns, SIZE)
+        assert out == b.passes(now_ns, SIZE)
+        assert all(t >= now_ns for t in out)
+    assert a.passed + a.lost == 50
+
+
+def test_another_seed_decides_otherwise() -> None:
+    what = Impairment(loss=0.5)
+    assert len({len(delays_ms(what, 1000, seed)) for seed in "abcdef"}) > 1
+
+
+def test_what_began_last_is_in_force_and_what_it_hid_comes_back() -> None:
+    direction = Direction("planner->knee_left", 0)
+    assert direction.passes(7, SIZE) == (7,)
+    direction.begin(1, Impairment(delay_ms=1.0))
+    direction.begin(2, Impairment(delay_ms=2.0))
+    assert direction.passes(0, SIZE) == (2 * NS_PER_MS,)
+    ended = direction.end(2)
+    assert ended is not None
+    assert (ended.passed, ended.lost) == (1, 0)
+    assert direction.passes(0, SIZE) == (NS_PER_MS,)
+    assert direction.end(1) is not None
+    assert direction.end(1) is None
+    assert direction.passes(7, SIZE) == (7,)
+
+
+@pytest.mark.parametrize(
+    ("changes", "right"),
+    [
+        ({"ordered": True, "reorder": 0.1}, "leave one out"),
+        ({"burst": 3.0}, "loss between 0 and 1"),
+        ({"burst": 2.0, "loss": 0.9}, "bursts of 9 on"),
+    ],
+)
+def test_what_does_not_go_together_is_told(changes: dict[str, float], right: str) -> None:
+    assert right in msgspec.structs.replace(Impairment(), **changes).fault()
+
+
+def test_every_link_has_both_of_its_directions_but_nobody_speaks_to_the_harness() -> None:
+    named = {name for pair in PAIRS for name in (pair.there, pair.back)}
+    assert named - set(DIRECTIONS) == {"planner->harness"}
+    assert all(set(names) <= set(DIRECTIONS) for names in GROUPS.values())
+    assert len(GROUPS["planner->left"]) == len(GROUPS["right->planner"]) == 3
+    assert set(directions_of("all")) == set(DIRECTIONS)
+    assert directions_of("planner->knee_left") == ("planner->knee_left",)
+
+
+def test_an_unknown_link_is_refused_with_those_there_are() -> None:
+    with pytest.raises(ConfigError, match="planner->joints"):
+        directions_of("planner->elbow")
