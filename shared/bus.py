@@ -28,6 +28,7 @@ from shared.codec import Decoder, encode
 from shared.config import SERVICES, RobotConfig, expand
 from shared.exceptions import BusError, NonFiniteError
 from shared.joints import MODULES
+from shared.links import PAIRS, Pair, endpoint_through
 from shared.messages import Message
 from shared.process import SOCKET_PATH_MAX
 from shared.topics import Priority, Topic
@@ -313,6 +314,7 @@ def open_session(
     *,
     listen: Sequence[str] = (),
     connect: Sequence[str] = (),
+    injected: bool = False,
 ) -> Session:
     """Join the bus and return without waiting for anybody; links form as peers come up.
 
@@ -326,6 +328,7 @@ def open_session(
         run_dir: replaces `{run}` in endpoints; made if it is not there.
         listen: further endpoints to listen on: with them a tool serves other tools.
         connect: further endpoints to dial: those of such a tool.
+        injected: dial through the injector where it stands (`shared.links.PAIRS`).
 
     Raises:
         BusError: the name cannot be used, or the endpoint is taken, too long or not
@@ -334,7 +337,12 @@ def open_session(
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
     own = [config.bus.endpoints[name]] if name in SERVICES else []
-    peers = [config.bus.endpoints[peer] for peer in peers_of(name)]
+    peers = [
+        endpoint_through(Pair(name, peer))
+        if injected and Pair(name, peer) in PAIRS
+        else config.bus.endpoints[peer]
+        for peer in peers_of(name)
+    ]
     listening = [_endpoint(text, run_dir) for text in (*own, *listen)]
     dialling = [_endpoint(text, run_dir) for text in (*peers, *connect)]
     settings = {

@@ -109,6 +109,18 @@ class Impairer:
         self.passed += 1
         return tuple(self._release_ns(now_ns, size) for _ in range(copies))
 
+    def delays(self, now_ns: int) -> int:
+        """Return when what must not be lost comes out, ns: in order, after the mean delay.
+
+        For what a link says for itself: opening, declaring, keeping alive. `HELD` in a
+        partition.
+        """
+        if self.what.partition:
+            return HELD
+        release_ns = now_ns + round(self.what.delay_ms * NS_PER_MS)
+        self._last_ns = max(self._last_ns, release_ns)
+        return self._last_ns
+
     def _release_ns(self, now_ns: int, size: int) -> int:
         what = self.what
         if what.partition:
@@ -179,9 +191,9 @@ class Direction:
         """End an impairment and return it with its counts; None if it is not there."""
         return self._asked.pop(number, None)
 
-    def numbers(self) -> list[int]:
-        """Return the numbers of those asked for, the one in force last."""
-        return list(self._asked)
+    def asked(self, number: int) -> Impairer | None:
+        """Return what was asked for under a number, in force or not; None if it is over."""
+        return self._asked.get(number)
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
         """Take a message in; return when it comes out, ns. As `Impairer.passes`."""

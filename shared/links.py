@@ -50,6 +50,11 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 """Names for several directions."""
 
 
+def endpoint_through(pair: Pair) -> str:
+    """Return where the injector listens for a pair: what `bus.endpoints` is without it."""
+    return f"unixsock-stream/{{run}}/through-{pair.dials}-{pair.listens}.zenoh"
+
+
 def directions_of(link: str, file: str = "--link", key: str = "link") -> tuple[str, ...]:
     """Return the directions that a name stands for.
 

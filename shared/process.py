@@ -42,6 +42,13 @@ def service_parser(description: str, example: str) -> argparse.ArgumentParser:
     return parser
 
 
+def add_injected(parser: argparse.ArgumentParser) -> None:
+    """Add the flag of a service whose links the injector can stand before."""
+    parser.add_argument(
+        "--injected", action="store_true", help="dial through the injector (services.injector)"
+    )
+
+
 class StopFlag:
     """True once SIGTERM or SIGINT has come; the loops look at it once a cycle."""
 

@@ -144,7 +144,7 @@ def service_of(file: str) -> str:
 
 def test_the_sources_are_read() -> None:
     assert {service_of(file) for file in SOURCES} == {
-        "", "joint", "planner", "harness", "simulator", "recorder",
+        "", "joint", "planner", "harness", "simulator", "recorder", "injector",
     }  # fmt: skip
     assert sum(len(found) for found in IMPORTS.values()) > 300
 

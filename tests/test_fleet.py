@@ -13,6 +13,7 @@ import pytest
 from shared.config import SERVICES, load
 from shared.exceptions import ConfigError, FleetError
 from shared.joints import MODULES
+from shared.links import PAIRS
 from shared.process import DEFAULT_CONFIG
 from tools.supervision import fleet
 from tools.supervision.run_dir import RunDir, supervisor_config
@@ -36,8 +37,22 @@ def plan(run_dir: Path, **changes: object) -> fleet.Plan:
 
 
 def test_the_table_has_one_row_for_each_service_of_the_bus() -> None:
-    names = [row.name for row in fleet.load_table().process]
+    names = [row.name for row in fleet.load_table().process if row.only != "injected"]
     assert sorted(names) == sorted(SERVICES)
+
+
+def test_the_injector_stands_between_those_that_dial_only_where_it_is_asked_for(
+    run_dir: Path,
+) -> None:
+    plain, injected = plan(run_dir), plan(run_dir, injected=True)
+    assert "injector" not in plain.commands
+    assert [name for name, words in plain.commands.items() if "--injected" in words] == []
+    dialling = {name for name, words in injected.commands.items() if "--injected" in words}
+    assert dialling == {"planner", "harness"}
+    new = {item.endpoint for item in injected.listeners} - {i.endpoint for i in plain.listeners}
+    assert len(new) == len(PAIRS) + 1, "a socket for each pair, and its own"
+    names = [row.name for row in injected.processes]
+    assert names.index("injector") < names.index("planner")
 
 
 def test_joint_commands_name_their_module_and_no_placeholder_is_left(run_dir: Path) -> None:

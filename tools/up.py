@@ -25,6 +25,7 @@ def add_parser(subparsers: Subparsers) -> None:
         """
         xrl up
         xrl up --scenario crawl --out out/crawl
+        xrl up --injectable                            # then: xrl inject --link ... --delay 30
         xrl up --config lab.toml --no-sim
         xrl up --config lab.toml --no-sim --readonly   # move the joints by hand, and look
         """,
@@ -60,6 +61,11 @@ def add_parser(subparsers: Subparsers) -> None:
         help="six modules that HOLD by themselves; `xrl start planner` lets it lead",
     )
     parser.add_argument(
+        "--injectable",
+        action="store_true",
+        help="with the injector on the links between planner, joints and harness, for `xrl inject`",
+    )
+    parser.add_argument(
         "--readonly",
         action="store_true",
         help="the joint services listen to their drives and publish, and send them nothing",
@@ -88,6 +94,7 @@ def run(args: argparse.Namespace) -> int:
         overrides=overrides,
         asleep=("planner",) if args.no_planner else (),
         simulation=not args.no_sim,
+        injected=args.injectable,
     )
     up = len(fleet.manifest.services) - args.no_planner
     print(

@@ -31,6 +31,7 @@ VERBS: Final = (
     Verb("status", "tools.status", "show every service and every module"),
     Verb("faults", "tools.faults", "list what goes wrong, what then happens, and the way out"),
     Verb("kill", "tools.kill", "send a signal to one service"),
+    Verb("inject", "tools.inject", "make a live fleet's network late, lossy or cut, for a while"),
     Verb("start", "tools.start", "start a service that is down, or continue one that is stopped"),
     Verb("estop", "tools.estop", "stop every module: a slow sink, never a drop"),
     Verb("gains", "tools.gains", "compute the certified gain schedule of a robot"),

@@ -20,6 +20,7 @@ FIFO_PRIORITY = 10
 def main() -> int:
     """Run the service until SIGTERM or SIGINT; return the exit code."""
     parser = process.service_parser(__doc__ or "", "python -m services.harness")
+    process.add_injected(parser)
     arguments = parser.parse_args()
     logger = log.setup("harness")
     config = load(arguments.config)
@@ -27,7 +28,9 @@ def main() -> int:
     law = WrenchFilter(config.harness)
     stop = process.StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
-    with bus.open_session(config, "harness", arguments.run_dir) as session:
+    with bus.open_session(
+        config, "harness", arguments.run_dir, injected=arguments.injected
+    ) as session:
         wrenches = session.publisher(topics.WRENCH, Wrench)
         requests = session.latest(topics.HARNESS_TARE, TareRequest)
         loop = HarnessLoop(sensor, law, wrenches, requests)

@@ -13,6 +13,7 @@ from shared.messages import JointCommand, JointState, OperatorIntent, PlannerSta
 from shared.priority import raise_priority
 from shared.process import (
     StopFlag,
+    add_injected,
     freeze_garbage,
     run_service,
     service_parser,
@@ -28,13 +29,14 @@ def main() -> int:
     parser = service_parser(
         "Run the whole-body law.", "python -m services.planner --run-dir /tmp/xrl"
     )
+    add_injected(parser)
     arguments = parser.parse_args()
     logger = log.setup("planner")
     robot = config.load(arguments.config)
     gain_schedule.require(robot, arguments.config)
     stop = StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
-    with open_session(robot, "planner", arguments.run_dir) as session:
+    with open_session(robot, "planner", arguments.run_dir, injected=arguments.injected) as session:
         ports = Ports(
             states=[session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES],
             wrench=session.latest(topics.WRENCH, Wrench),

@@ -13,7 +13,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+
+from shared import topics
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.joints import MODULES
+from shared.links import DIRECTIONS
+from tools.runs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 
@@ -76,6 +83,55 @@ def test_live_and_lockstep_agree_on_a_kill_a_restart_and_two_pushes(tmp_path: Pa
         if abs(live[key] - lockstep[key]) > band
     }
     assert not apart
+
+
+IMPAIRED = "all delay=12 jitter=6 loss=0.1 at=1.5 for=3"
+WHILE_IMPAIRED_S = (1.7, 4.5)
+QUANTILES_PCT = (25, 50, 75, 90)
+AGES_MS = 8.0
+"""How far a quantile of the ages may be from lockstep's: two periods of the planner."""
+
+
+def ages_ms(out: Path) -> list[float]:
+    """Return quantiles of the age of the command that each module had, while impaired."""
+    log = read_run(out / "run.mcap")
+    begin = next(t for t in log.messages(topics.SIM_TRUTH) if t.scenario_s >= 0.0)
+    start_ns = begin.t_ns - begin.scenario_s * NS_PER_S
+    first, last = (start_ns + s * NS_PER_S for s in WHILE_IMPAIRED_S)
+    ages = [
+        state.age_ns / NS_PER_MS
+        for module in MODULES
+        for state in log.messages(topics.JOINT_STATE, module)
+        if first <= state.t_ns < last
+    ]
+    return [float(age) for age in np.percentile(ages, QUANTILES_PCT)]
+
+
+def lost_share(out: Path) -> float:
+    """Return the share of messages that the network took away, of all links together."""
+    ended = [e for e in read_run(out / "run.mcap").messages(topics.LINK_EVENT) if not e.in_force]
+    assert {event.link for event in ended} == set(DIRECTIONS)
+    return sum(e.lost for e in ended) / sum(e.lost + e.passed for e in ended)
+
+
+def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
+    """On the wire between processes as in the modelled links: ages, losses and verdict."""
+    flags = ("--duration", "6", "--inject", IMPAIRED)
+    exit_lockstep, lockstep = summary_of("sim", tmp_path / "lockstep", *flags)
+    assert exit_lockstep == 0
+    modelled = ages_ms(tmp_path / "lockstep")
+    assert modelled[1] > 20.0, "the impairment is felt"
+    for attempt in range(3):
+        exit_live, live = summary_of("demo", tmp_path / f"live{attempt}", *flags)
+        assert exit_live == 0, "it stands, whatever the machine does besides"
+        if undisturbed(live, lockstep):
+            break
+    else:
+        pytest.skip("this machine stalled in each of three live runs: no figures to compare")
+    measured = ages_ms(tmp_path / f"live{attempt}")
+    assert np.abs(np.subtract(measured, modelled)).max() < AGES_MS, (measured, modelled)
+    shares = [lost_share(tmp_path / name) for name in ("lockstep", f"live{attempt}")]
+    assert shares == pytest.approx([0.1, 0.1], abs=0.02)
 
 
 def test_live_and_lockstep_agree_that_averaging_the_legs_falls(tmp_path: Path) -> None:

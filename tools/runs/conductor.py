@@ -26,7 +26,9 @@ from shared.messages import (
     SimControl,
     SimTruth,
 )
-from shared.scenario import Fault, Kill, Push, Restart, Scenario
+from shared.scenario import Fault, Inject, Kill, Push, Restart, Scenario
+from tools.runs.injection import in_words_of
+from tools.runs.injector_client import InjectorClient
 from tools.supervision import procfs
 from tools.supervision.supervise import Fleet
 
@@ -102,6 +104,7 @@ class Conductor:
     ) -> None:
         """Take the scenario's kills, and perhaps one that follows what the modules do."""
         self._fleet = fleet
+        self._injector = InjectorClient(fleet.run.path)
         self._scenario = scenario
         self._show = show
         self._chase = chase
@@ -139,11 +142,12 @@ class Conductor:
             time.sleep(LAST_WORDS_S)
             return None
         self._start()
-        todo: list[Kill | Restart | Push | Fault] = [
+        todo: list[Kill | Restart | Push | Fault | Inject] = [
             *self._scenario.kill,
             *self._scenario.restart,
             *self._scenario.push,
             *self._scenario.fault,
+            *self._scenario.inject,
         ]
         todo.sort(key=lambda row: row.at)
         fallen_at_s = None
@@ -247,7 +251,7 @@ class Conductor:
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
 
-    def _act(self, row: Kill | Restart | Push | Fault) -> None:
+    def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
         """Do what is due; pushes and faults are the simulator's doing, and only said."""
         if isinstance(row, Kill):
             self._say(RunEventKind.KILLED, row.service, row.signal)
@@ -264,6 +268,9 @@ class Conductor:
             self._fleet.start_service(row.service)
             self._next_pids_s = 0.0
             self._note = f"{row.service} back"
+        elif isinstance(row, Inject):
+            self._injector.begin(row)
+            self._note = in_words_of(row)
         elif isinstance(row, Fault):
             self._say(RunEventKind.FAULTED, row.module, row.kind)
             self._note = f"{row.module}: {row.kind}"

@@ -55,8 +55,10 @@ def run_live(
             overrides={
                 "recorder": _recorder_arguments(out, story, scenario_path, model_path),
                 "simulator": ["--scenario", str(scenario_path.absolute()), "--seed", str(seed)],
+                **({"injector": ["--seed", str(seed)]} if story.inject else {}),
             },
             no_restart=frozenset(no_restart),
+            injected=bool(story.inject),
             leashed=True,
         )
         try:

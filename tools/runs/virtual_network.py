@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-from shared.impairment import Impairer, Impairment
+from shared.impairment import Impairment
+from shared.injections import Injections
 from shared.joints import MODULES
-from shared.links import DIRECTIONS, WRENCHES, directions_of
+from shared.links import DIRECTIONS, WRENCHES
 from shared.messages import JointCommand, JointState, LinkEvent, Wrench
 from shared.scenario import Inject
 from tools.runs.network import Link
-
-
-class _Asked(NamedTuple):
-    """One `Inject` that is in force."""
-
-    until: float
-    """Scenario time, s."""
-    number: int
-    what: Inject
 
 
 class VirtualNetwork:
@@ -42,10 +34,10 @@ class VirtualNetwork:
             record: takes an event whenever something begins or ends.
         """
         self._links: dict[str, Link[Any]] = {name: Link(base, name, seed) for name in DIRECTIONS}
-        self._coming = sorted(enumerate(injects, 1), key=lambda row: row[1].at)
-        self._lasting: list[_Asked] = []
-        self._record = record
-        self._said = 0
+        self._injections = Injections(
+            {name: link.direction for name, link in self._links.items()}, record
+        )
+        self._coming = sorted(injects, key=lambda inject: inject.at)
         self._next_s = self._next()
 
     def commands(self) -> list[Link[JointCommand]]:
@@ -64,47 +56,16 @@ class VirtualNetwork:
         """Begin and end what is due."""
         if scenario_s < self._next_s:
             return
-        for asked in [row for row in self._lasting if row.until <= scenario_s]:
-            self._lasting.remove(asked)
-            for name in directions_of(asked.what.link):
-                link = self._links[name]
-                impairer = link.direction.end(asked.number)
-                link.release(now_ns)
-                self._say(now_ns, name, asked.what, impairer)
-        while self._coming and self._coming[0][1].at <= scenario_s:
-            number, what = self._coming.pop(0)
-            if what.until > scenario_s:
-                self._lasting.append(_Asked(what.until, number, what))
-                for name in directions_of(what.link):
-                    self._links[name].direction.begin(number, what)
-                    self._links[name].release(now_ns)
-                    self._say(now_ns, name, what, None)
+        self._injections.end_due(scenario_s, now_ns)
+        while self._coming and self._coming[0].at <= scenario_s:
+            inject = self._coming.pop(0)
+            if inject.until > scenario_s:
+                self._injections.begin(inject.link, inject, inject.until, now_ns)
+        for link in self._links.values():
+            link.release(now_ns)
         self._next_s = self._next()
 
     def _next(self) -> float:
         """Return when something is due, scenario time, s."""
-        times = [row.until for row in self._lasting] + [row.at for _, row in self._coming]
-        return min(times, default=math.inf)
-
-    def _say(self, now_ns: int, name: str, what: Inject, ended: Impairer | None) -> None:
-        self._said += 1
-        self._record(link_event(now_ns, self._said, name, what, ended))
-
-
-def link_event(
-    now_ns: int, seq: int, name: str, what: Impairment, ended: Impairer | None
-) -> LinkEvent:
-    """Return what the log says of an impairment that begins, or with `ended` has ended."""
-    return LinkEvent(
-        t_ns=now_ns,
-        seq=seq,
-        link=name,
-        in_force=ended is None,
-        delay_ms=what.delay_ms,
-        jitter_ms=what.jitter_ms,
-        loss=what.loss,
-        partition=what.partition,
-        detail=what.in_words(),
-        passed=0 if ended is None else ended.passed,
-        lost=0 if ended is None else ended.lost,
-    )
+        coming = self._coming[0].at if self._coming else math.inf
+        return min(coming, self._injections.next_end)

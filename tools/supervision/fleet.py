@@ -17,7 +17,9 @@ import msgspec
 
 from shared.config import RobotConfig, expand, load
 from shared.exceptions import ConfigError, FleetError
+from shared.injection import SOCKET
 from shared.joints import MODULES
+from shared.links import PAIRS, endpoint_through
 from shared.process import DEFAULT_CONFIG, SOCKET_PATH_MAX
 from shared.toml_file import Range, Section, read_toml
 from shared.topics import TOPICS
@@ -40,7 +42,7 @@ class Process(Section, frozen=True):
 
     name: str
     """Service name, or `{module}` for one service per module."""
-    kind: Literal["joint", "planner", "harness", "recorder", "simulator"]
+    kind: Literal["joint", "planner", "harness", "recorder", "simulator", "injector"]
     command: tuple[str, ...]
     """Arguments with the placeholders {python}, {config}, {run} and {module}."""
     autostart: bool
@@ -52,8 +54,9 @@ class Process(Section, frozen=True):
     settle_s: Annotated[int, Range(1, 60, "s")]
     """A start that ends sooner has failed, and the next one is delayed."""
     why: str
-    only: Literal["", "simulation"] = ""
-    """`simulation`: not started where the drives are real."""
+    only: Literal["", "simulation", "injected"] = ""
+    """`simulation`: not started where the drives are real; `injected`: only where the network is
+    to be impaired."""
     topic: str = ""
     """Topic that it publishes steadily, as in `shared.topics`; empty if there is none."""
 
@@ -98,6 +101,7 @@ def make_plan(
     services: Collection[str] | None,
     asleep: Collection[str] = (),
     simulation: bool,
+    injected: bool = False,
     table_path: Path,
 ) -> Plan:
     """Return what is to be started; the arguments are those of `supervise.Fleet.start`.
@@ -110,15 +114,21 @@ def make_plan(
     config = load(path)
     table = load_table(table_path)
     emulated = simulation and is_simulated(config)
-    rows = select(table, simulation=emulated, services=services)
+    rows = select(table, simulation=emulated, injected=injected, services=services)
     check_known([*overrides, *asleep], [row.name for row in rows])
     rows = tuple(
         msgspec.structs.replace(row, autostart=row.autostart and row.name not in asleep)
         for row in rows
     )
     check_run_dir(run_dir, config)
+    through = {pair.dials for pair in PAIRS} if injected else set()
     commands = {
-        row.name: [*command_of(row, path, run_dir), *overrides.get(row.name, ())] for row in rows
+        row.name: [
+            *command_of(row, path, run_dir),
+            *(["--injected"] if row.name in through else []),
+            *overrides.get(row.name, ()),
+        ]
+        for row in rows
     }
     listeners = listeners_of(rows, config, run_dir)
     usb = emulated and config.joint_service.driver == "odrive_usb"
@@ -158,20 +168,26 @@ def is_simulated(config: RobotConfig) -> bool:
 
 
 def select(
-    table: Table, *, simulation: bool, services: Collection[str] | None = None
+    table: Table,
+    *,
+    simulation: bool,
+    injected: bool = False,
+    services: Collection[str] | None = None,
 ) -> tuple[Process, ...]:
     """Return the rows of a fleet.
 
     Args:
         table: from `load_table`.
         simulation: False leaves out the rows that are for a simulated robot only.
+        injected: False leaves out those that impair the network.
         services: names; each is then started at once, whatever its row says. None for all.
 
     Raises:
         FleetError: a name is not in the table.
     """
     check_known(services or (), [row.name for row in table.process])
-    rows = [row for row in table.process if simulation or row.only != "simulation"]
+    wanted = {"": True, "simulation": simulation, "injected": injected}
+    rows = [row for row in table.process if wanted[row.only]]
     if services is None:
         return tuple(rows)
     return tuple(
@@ -208,6 +224,13 @@ def listeners_of(
         if row.name in config.bus.endpoints:
             endpoint = expand(config.bus.endpoints[row.name], run_dir)
             listeners.append(Listener(row.name, f"bus.endpoints.{row.name}", endpoint))
+        if row.kind == "injector":
+            listeners += [
+                Listener(row.name, "(the run directory)", expand(endpoint_through(pair), run_dir))
+                for pair in PAIRS
+            ]
+            control = f"{UNIX}{run_dir / SOCKET}"
+            listeners.append(Listener(row.name, "(the run directory)", control))
         if row.kind == "simulator":
             listeners += [
                 Listener(row.name, f"can.{name}.channel", UNIX + expand(bus.channel, run_dir))
@@ -233,6 +256,7 @@ def check_run_dir(run_dir: Path, config: RobotConfig) -> None:
         for bus in config.can.values()
         if bus.interface == SIMULATED_CAN
     ]
+    paths += [expand(endpoint_through(pair), run_dir).removeprefix(UNIX) for pair in PAIRS]
     # supervisord binds NAME.PID first, and renames it
     paths.append(f"{run_dir / SUPERVISOR_SOCKET}.4194304")
     excess = max(len(os.fsencode(path)) for path in paths) - SOCKET_PATH_MAX

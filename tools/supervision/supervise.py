@@ -48,6 +48,7 @@ class Fleet:
         services: Collection[str] | None = None,
         asleep: Collection[str] = (),
         simulation: bool = True,
+        injected: bool = False,
         leashed: bool = False,
         table_path: Path = fleet.TABLE,
         timeout_s: float = 30.0,
@@ -64,6 +65,7 @@ class Fleet:
             services: which to start; None for all that the table starts by itself.
             asleep: of these, which wait for `start_service`.
             simulation: False leaves the simulator out; where all drives are real it always is.
+            injected: with the injector on the links of planner, joints and harness.
             leashed: stop the fleet if this process dies.
             table_path: the process table.
             timeout_s: time in which every service has to be up.
@@ -82,6 +84,7 @@ class Fleet:
             services=services,
             asleep=asleep,
             simulation=simulation,
+            injected=injected,
             table_path=table_path,
         )
         fleet.check_known(no_restart, list(plan.commands))

@@ -1,0 +1,1 @@
+"""The injector: a bad network on purpose, on the wire between real processes."""

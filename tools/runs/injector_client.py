@@ -1,0 +1,69 @@
+"""Speaks to the injector of a fleet that is up."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from shared.exceptions import FleetError
+from shared.injection import SOCKET, Asked, Begin, Clear, List, Reply, Request
+from shared.scenario import Inject
+
+_PATIENCE_S: Final = 2.0
+_decode = msgspec.json.Decoder(Reply).decode
+
+
+class InjectorClient:
+    """One question, one answer, one connection each."""
+
+    def __init__(self, run_dir: Path) -> None:
+        """Name the fleet's run directory; nothing is opened yet."""
+        self._path = run_dir / SOCKET
+
+    def begin(self, inject: Inject) -> tuple[Asked, ...]:
+        """Put an impairment in force now; return all that is asked for then.
+
+        Raises:
+            FleetError: the injector is not there, or refuses.
+        """
+        return self._ask(Begin(inject))
+
+    def clear(self, link: str) -> tuple[Asked, ...]:
+        """End all that touches a link; return what is left.
+
+        Raises:
+            FleetError: the injector is not there, or knows no such link.
+        """
+        return self._ask(Clear(link))
+
+    def list(self) -> tuple[Asked, ...]:
+        """Return what is asked for.
+
+        Raises:
+            FleetError: the injector is not there.
+        """
+        return self._ask(List())
+
+    def _ask(self, request: Request) -> tuple[Asked, ...]:
+        try:
+            with socket.socket(socket.AF_UNIX) as asking:
+                asking.settimeout(_PATIENCE_S)
+                asking.connect(str(self._path))
+                asking.sendall(msgspec.json.encode(request) + b"\n")
+                with asking.makefile("rb") as answers:
+                    line = answers.readline()
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise FleetError(
+                f"no injector in {self._path.parent}; `xrl up --injectable` starts a fleet with one"
+            ) from None
+        except OSError as error:
+            raise FleetError(f"{self._path}: the injector does not answer: {error}") from None
+        if not line:
+            raise FleetError(f"{self._path}: the injector ended without an answer; see its log")
+        reply = _decode(line)
+        if reply.error:
+            raise FleetError(f"refused: {reply.error}")
+        return reply.asked
