@@ -60,7 +60,7 @@ class Injections:
         self.asked[self._count] = InForce(until, link, what)
         for name in names:
             self._directions[name].begin(self._count, what)
-            self._say(name, what, now_ns, None)
+            self._say(name, self._count, self.asked[self._count], now_ns, None)
         self._find_next()
         return self._count
 
@@ -72,7 +72,7 @@ class Injections:
         for name in directions_of(asked.link):
             impairer = self._directions[name].end(number)
             if impairer is not None:
-                self._say(name, asked.what, now_ns, impairer)
+                self._say(name, number, asked, now_ns, impairer)
         self._find_next()
 
     def end_due(self, clock: float, now_ns: int) -> bool:
@@ -104,13 +104,18 @@ class Injections:
     def _find_next(self) -> None:
         self.next_end = min((asked.until for asked in self.asked.values()), default=math.inf)
 
-    def _say(self, name: str, what: Impairment, now_ns: int, ended: Impairer | None) -> None:
+    def _say(
+        self, name: str, number: int, asked: InForce, now_ns: int, ended: Impairer | None
+    ) -> None:
         self._told += 1
+        what = asked.what
         self._tell(
             LinkEvent(
                 t_ns=now_ns,
                 seq=self._told,
                 link=name,
+                asked=asked.link,
+                number=number,
                 in_force=ended is None,
                 delay_ms=what.delay_ms,
                 jitter_ms=what.jitter_ms,

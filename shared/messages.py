@@ -335,6 +335,10 @@ class LinkEvent(Message, frozen=True):
 
     link: str
     """One direction, of `shared.links`."""
+    asked: str
+    """As it was asked for: that direction, or a group of them."""
+    number: int
+    """The same for all directions of one impairment, and for its beginning and its end."""
     in_force: bool
     """True: from now on; False: it is over."""
     delay_ms: float

@@ -17,10 +17,12 @@ from rich.table import Table
 from shared.bus import Latest, Session, open_session
 from shared.clock import NS_PER_S, now_ns
 from shared.config import load
+from shared.exceptions import FleetError
 from shared.fault_table import recovery_of
 from shared.joints import MODULES
 from shared.messages import Cause, DriveStatus, JointState, Message, Mode, Pair
 from shared.topics import TOPICS
+from tools.runs.injector_client import InjectorClient
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
@@ -80,6 +82,8 @@ class FleetStatus(msgspec.Struct, frozen=True):
     config: str
     services: dict[str, ServiceStatus]
     modules: dict[str, ModuleStatus]
+    network: tuple[str, ...] = ()
+    """What the injector does to links now, in words."""
 
 
 class Ear:
@@ -192,7 +196,18 @@ def look(fleet: Fleet, ears: Mapping[str, Ear]) -> FleetStatus:
         for module in MODULES
         if module in ears
     }
-    return FleetStatus(str(fleet.run.path), fleet.manifest.config, services, modules)
+    config, network = fleet.manifest.config, impairments(fleet)
+    return FleetStatus(str(fleet.run.path), config, services, modules, network)
+
+
+def impairments(fleet: Fleet) -> tuple[str, ...]:
+    """Return what is done to the network now, in words; nothing where there is no injector."""
+    if "injector" not in fleet.manifest.services:
+        return ()
+    try:
+        return tuple(f"{row.link} {row.detail}" for row in InjectorClient(fleet.run.path).list())
+    except FleetError:
+        return ("the injector does not answer",)
 
 
 def module_status(state: Message | None) -> ModuleStatus:
@@ -258,7 +273,8 @@ def tables(status: FleetStatus) -> Group:
             *angles,
             module.way_out.replace("MODULE", name),
         )
-    return Group(services, modules)
+    said = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl inject --clear)"
+    return Group(services, modules, *([said] if status.network else []))
 
 
 def _watch(fleet: Fleet, ears: Mapping[str, Ear]) -> None:

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from shared import topics
 from shared.clock import NS_PER_S
 from shared.joints import MODULES
-from shared.messages import JointState, Mode, RunEvent, RunEventKind
+from shared.messages import JointState, LinkEvent, Mode, RunEvent, RunEventKind
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary, course
 
@@ -27,6 +27,7 @@ MODE_COLOURS: Final = {
     Mode.FAULT: "#c0392b",
 }
 LINES: Final = ("#1f4e79", "#c8553d", "#5b8c5a")
+IMPAIRED_COLOUR: Final = "#e6e0f3"
 EVENT_COLOURS: Final = {
     RunEventKind.KILLED: "#c0392b",
     RunEventKind.RESTARTED: "#2e7d32",
@@ -56,6 +57,7 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
         axes[3].legend(loc="upper right", fontsize=8, ncols=2, framealpha=0.8)
     _modes(axes[4], log, zero_ns, float(t[-1]))
     _events(axes, log.messages(topics.RUN_EVENT))
+    _impairments(axes, log.messages(topics.LINK_EVENT), zero_ns, float(t[-1]))
     axes[4].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
     axes[4].set_xlim(0.0, float(t[-1]))
     verdict = "stood" if summary["stood"] else "FELL" if summary["fallen_at_s"] else "not finished"
@@ -117,6 +119,30 @@ def _events(axes: Any, events: list[RunEvent]) -> None:
             ha="center",
             fontsize=8,
             color=colour,
+        )
+
+
+def _impairments(axes: Any, events: list[LinkEvent], start_ns: int, end_s: float) -> None:
+    """Shade what was done to the network, and say it once for all directions together."""
+    begins: dict[int, LinkEvent] = {}
+    ends: dict[int, LinkEvent] = {}
+    for event in events:
+        (begins if event.in_force else ends).setdefault(event.number, event)
+    for number, event in begins.items():
+        begin_s = max(0.0, (event.t_ns - start_ns) / NS_PER_S)
+        over = ends.get(number)
+        until_s = end_s if over is None else (over.t_ns - start_ns) / NS_PER_S
+        for axis in axes:
+            axis.axvspan(begin_s, until_s, color=IMPAIRED_COLOUR, lw=0.0, zorder=0)
+        words = "\n".join([event.asked, *event.detail.split()])
+        axes[1].annotate(
+            words,
+            (begin_s, 0.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(3, 3),
+            textcoords="offset points",
+            fontsize=7,
+            color="#5d4b8a",
         )
 
 

@@ -1,0 +1,185 @@
+"""Impairments as a person writes them, and what a run over a bad network is judged by."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from shared import scenario, topics
+from shared.config import RobotConfig
+from shared.exceptions import ConfigError
+from shared.impairment import Impairment
+from shared.links import DIRECTIONS
+from shared.messages import Mode
+from shared.scenario import Inject
+from tests.lockstep.runs import still
+from tools import sim
+from tools.runs import experiment, injection, verdict
+from tools.runs.network import BASE
+from tools.runs.run_log import RunLog, read_run
+
+
+def parse(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    experiment.add_flags(parser)
+    return parser.parse_args(words)
+
+
+@pytest.mark.parametrize(
+    ("text", "inject"),
+    [
+        (
+            "planner->joints delay=30 jitter=10 at=3 for=4",
+            Inject(link="planner->joints", at=3.0, duration=4.0, delay_ms=30.0, jitter_ms=10.0),
+        ),
+        ("all loss=.2, burst=5", Inject(link="all", at=0.0, loss=0.2, burst=5.0)),
+        (
+            "knee_left->planner  partition ordered at=1e1",
+            Inject(link="knee_left->planner", at=10.0, partition=True, ordered=True),
+        ),
+        (
+            "harness->planner distribution=pareto jitter=3 duplicate=0.1 rate=1000",
+            Inject(
+                link="harness->planner", at=0.0, jitter_ms=3.0, distribution="pareto",
+                duplicate=0.1, rate=1000.0,
+            ),
+        ),
+    ],
+)  # fmt: skip
+def test_an_impairment_is_read_from_its_words(text: str, inject: Inject) -> None:
+    assert injection.parse_inject(text) == inject
+
+
+@pytest.mark.parametrize(
+    ("text", "right"),
+    [
+        ("", "planner->MODULE"),
+        ("elbow delay=1", "planner->MODULE"),
+        ("all", "give a delay"),
+        ("all delya=3", "KEYs: delay"),
+        ("all delay=soon", "KEYs: delay"),
+        ("all delay=nan", "KEYs: delay"),
+        ("all loss=1.5", "must be from 0 to 1"),
+        ("all delay=-1", "must be from 0 to 60000"),
+        ("all delay=1 for=0", "must be from 0.001"),
+        ("all distribution=wild jitter=1", "distribution (uniform, normal, pareto)"),
+        ("all ordered reorder=0.1", "leave one out"),
+        ("all burst=3", "loss between 0 and 1"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_what_would_be_right(text: str, right: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError) as caught:
+        injection.parse_inject(text)
+    assert right in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_words_come_back_from_what_they_made() -> None:
+    text = "all delay=30 jitter=10 loss=0.1 burst=3 distribution=normal"
+    assert injection.parse_inject(f"all {injection.parse_inject(text).in_words()}") == (
+        injection.parse_inject(text)
+    )
+
+
+def test_a_flag_replaces_the_impairments_of_the_scenario_and_is_told() -> None:
+    shipped = experiment.make_scenario(parse("--scenario", "bad_network"))
+    assert len(shipped.inject) == 4
+    story = experiment.make_scenario(
+        parse("--scenario", "bad_network", "--inject", "all loss=0.1 at=2 for=1")
+    )
+    assert [row.link for row in story.inject] == ["all"]
+    assert "all loss=0.1 at 2 s for 1 s" in experiment.in_words(story)
+
+
+def test_a_scenario_with_impairments_comes_back_from_its_own_toml(tmp_path: Path) -> None:
+    story = experiment.make_scenario(parse("--scenario", "bad_network"))
+    path = tmp_path / "x.toml"
+    path.write_text(scenario.to_toml(story))
+    assert scenario.load(path) == story
+
+
+@pytest.mark.parametrize(
+    ("inject", "key"),
+    [
+        (Inject(link="elbow", at=0.0, loss=0.1), "inject[0].link"),
+        (Inject(link="all", at=99.0, loss=0.1), "inject[0].at"),
+        (Inject(link="all", at=0.0, loss=1.1), "inject[0].loss"),
+        (Inject(link="all", at=0.0, duration=-1.0, loss=0.1), "inject[0].duration"),
+        (Inject(link="all", at=0.0, ordered=True, reorder=0.1), "inject[0]"),
+    ],
+)
+def test_a_scenario_refuses_an_impairment_by_its_key(inject: Inject, key: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        scenario.check("x.toml", still(2.0, inject=(inject,)))
+    assert caught.value.key == key
+
+
+@pytest.fixture(scope="module")
+def cut(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> RunLog:
+    """Record a stand with one leg cut off for a while, and a delay on top of it."""
+    story = still(
+        3.0,
+        inject=(
+            Inject(link="planner->left", at=0.5, duration=0.6, partition=True),
+            Inject(link="harness->planner", at=0.7, duration=0.2, delay_ms=5.0),
+        ),
+    )
+    folder = tmp_path_factory.mktemp("cut")
+    sim.simulate(robot, story, BASE, 0, folder, Console(quiet=True))
+    return read_run(folder / "run.mcap")
+
+
+def test_every_beginning_and_end_is_in_the_log_with_what_was_lost(cut: RunLog) -> None:
+    events = cut.messages(topics.LINK_EVENT)
+    assert [event.seq for event in events] == list(range(1, len(events) + 1))
+    left = [event for event in events if event.asked == "planner->left"]
+    assert {event.link for event in left} < set(DIRECTIONS)
+    assert [event.in_force for event in left] == [True] * 3 + [False] * 3
+    assert len({event.number for event in left}) == 1
+    assert all(event.lost == 150 for event in left if not event.in_force), "0.6 s at 250 Hz"
+    (late,) = [e for e in events if e.link == "harness->planner" and not e.in_force]
+    assert (late.passed, late.lost, late.detail) == (50, 0, "delay=5")
+
+
+def test_one_leg_cut_off_makes_all_six_hold_and_they_lead_again(cut: RunLog) -> None:
+    for module in ("knee_right", "knee_left"):
+        modes = [event.mode_after for event in cut.messages(topics.JOINT_EVENT, module)]
+        assert modes[-2:] == [Mode.HOLD, Mode.TRACK]
+
+
+def test_the_time_in_hold_is_not_judged_as_the_planner_leading(cut: RunLog) -> None:
+    summary = verdict.summarise(cut, 3.0)
+    assert summary["stood"]
+    assert summary["links_impaired"] == 2
+    assert summary["hold_com_x_max_mm"] is not None
+    assert summary["handover_max_ms"] is None, "nobody was killed"
+    assert summary["handover_torque_step_nm"] < 5.0
+    assert 3.0 < summary["command_age_ms"]["median"] < 12.0
+
+
+def test_impairments_that_overlap_end_each_at_its_own_time(robot: RobotConfig) -> None:
+    inner = Inject(link="planner->knee_left", at=0.4, duration=0.2, delay_ms=20.0)
+    outer = Inject(link="planner->joints", at=0.2, duration=1.0, delay_ms=5.0)
+    story = still(1.5, inject=(inner, outer))
+    ages: list[tuple[float, float]] = []
+
+    def take(topic: topics.Topic, module: str, message: object) -> None:
+        if topic is topics.JOINT_STATE and module == "knee_left":
+            ages.append((fleet.world.scenario_s, message.age_ns / 1e6))  # type: ignore[attr-defined]
+
+    fleet = sim.Lockstep(robot, story, Impairment(delay_ms=1.0), record=take)
+    for _ in fleet.run():
+        pass
+
+    def mean(begin: float, end: float) -> float:
+        found = [age for at, age in ages if begin <= at < end]
+        return sum(found) / len(found)
+
+    plain, first, second = mean(0.0, 0.2), mean(0.25, 0.4), mean(0.45, 0.6)
+    assert first == pytest.approx(plain + 5.0, abs=2.5)
+    assert second == pytest.approx(plain + 20.0, abs=2.5)
+    assert mean(0.65, 1.2) == pytest.approx(first, abs=1.0)
+    assert mean(1.25, 1.5) == pytest.approx(plain, abs=1.0)
