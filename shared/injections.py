@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from shared.impairment import Direction, Impairer, Impairment
 from shared.links import directions_of
-from shared.messages import LinkEvent
+from shared.traces import LinkEvent
 
 
 class InForce(NamedTuple):

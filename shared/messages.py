@@ -328,26 +328,3 @@ class RunEvent(Message, frozen=True):
     detail: str
     """The signal, or the push in words."""
     scenario_s: float
-
-
-class LinkEvent(Message, frozen=True):
-    """What is done to one direction of a link has changed."""
-
-    link: str
-    """One direction, of `shared.links`."""
-    asked: str
-    """As it was asked for: that direction, or a group of them."""
-    number: int
-    """The same for all directions of one impairment, and for its beginning and its end."""
-    in_force: bool
-    """True: from now on; False: it is over."""
-    delay_ms: float
-    jitter_ms: float
-    loss: float
-    partition: bool
-    detail: str
-    """All of it in words, as `xrl inject` takes it."""
-    passed: int
-    """Messages that went through while it was asked for; 0 when it begins."""
-    lost: int
-    """Messages that it took away."""

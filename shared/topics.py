@@ -155,7 +155,7 @@ RUN_EVENT: Final = Topic(
 )
 LINK_EVENT: Final = Topic(
     name="link/event",
-    type=messages.LinkEvent,
+    type=traces.LinkEvent,
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,

@@ -1,6 +1,7 @@
-"""Messages from which a service is executed again: what each of its cycles was given.
+"""Messages for the log: what a service was given, and what was done to the network.
 
-On the bus like all others; nobody but the recorder listens.
+From the first each cycle is executed again. On the bus like all others; nobody but the
+recorder listens.
 """
 
 from __future__ import annotations
@@ -82,3 +83,26 @@ class SimState(Message, frozen=True):
     """N m s/turn"""
     counts_from: tuple[float, ...]
     """What each encoder counts at the true zero."""
+
+
+class LinkEvent(Message, frozen=True):
+    """What is done to one direction of a link has changed."""
+
+    link: str
+    """One direction, of `shared.links`."""
+    asked: str
+    """As it was asked for: that direction, or a group of them."""
+    number: int
+    """The same for all directions of one impairment, and for its beginning and its end."""
+    in_force: bool
+    """True: from now on; False: it is over."""
+    delay_ms: float
+    jitter_ms: float
+    loss: float
+    partition: bool
+    detail: str
+    """All of it in words, as `xrl inject` takes it."""
+    passed: int
+    """Messages that went through while it was asked for; 0 when it begins."""
+    lost: int
+    """Messages that it took away."""

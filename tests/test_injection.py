@@ -18,6 +18,7 @@ from shared.scenario import Inject
 from tests.lockstep.runs import still
 from tools import sim
 from tools.runs import experiment, injection, verdict
+from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
 from tools.runs.run_log import RunLog, read_run
 
@@ -170,7 +171,7 @@ def test_impairments_that_overlap_end_each_at_its_own_time(robot: RobotConfig) -
         if topic is topics.JOINT_STATE and module == "knee_left":
             ages.append((fleet.world.scenario_s, message.age_ns / 1e6))  # type: ignore[attr-defined]
 
-    fleet = sim.Lockstep(robot, story, Impairment(delay_ms=1.0), record=take)
+    fleet = Lockstep(robot, story, Impairment(delay_ms=1.0), record=take)
     for _ in fleet.run():
         pass
 

@@ -18,8 +18,8 @@ from shared.impairment import Direction
 from shared.injection import SOCKET
 from shared.injections import Injections
 from shared.links import DIRECTIONS, PAIRS, Pair, endpoint_through
-from shared.messages import LinkEvent
 from shared.priority import raise_priority
+from shared.traces import LinkEvent
 
 FIFO_PRIORITY = 15
 """With those whose messages it passes on: what it delays by itself is not asked for."""

@@ -18,8 +18,8 @@ from shared.impairment import Direction
 from shared.injection import SOCKET, Begin, Clear, List, Reply
 from shared.injections import Injections
 from shared.links import COMMANDS, DIRECTIONS
-from shared.messages import LinkEvent
 from shared.scenario import Inject
+from shared.traces import LinkEvent
 from tools.runs.injector_client import InjectorClient
 
 DELAY = Inject(link="planner->joints", at=0.0, delay_ms=30.0)

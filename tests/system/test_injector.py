@@ -18,9 +18,10 @@ from shared.bus import Publisher, Session, Stream, open_session
 from shared.clock import NS_PER_MS, now_ns
 from shared.codec import Decoder
 from shared.injection import SOCKET
-from shared.messages import JointState, LinkEvent
+from shared.messages import JointState
 from shared.process import DEFAULT_CONFIG
 from shared.scenario import Inject
+from shared.traces import LinkEvent
 from tests.recorder.runs import sample
 from tools import cli
 from tools.runs.injector_client import InjectorClient

@@ -13,7 +13,8 @@ from matplotlib.patches import Patch
 from shared import topics
 from shared.clock import NS_PER_S
 from shared.joints import MODULES
-from shared.messages import JointState, LinkEvent, Mode, RunEvent, RunEventKind
+from shared.messages import JointState, Mode, RunEvent, RunEventKind
+from shared.traces import LinkEvent
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary, course
 

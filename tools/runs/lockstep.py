@@ -8,6 +8,7 @@ bit-identical from run to run with the same seed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from typing import ClassVar
 
 from services.joint.controller import JointController
 from services.joint.module import Module, ModuleMemory
@@ -27,7 +28,6 @@ from shared.impairment import Impairment
 from shared.joints import MODULE_INDEX, MODULES
 from shared.messages import (
     JointEvent,
-    LinkEvent,
     Message,
     Mode,
     PlannerStatus,
@@ -37,7 +37,7 @@ from shared.messages import (
 )
 from shared.scenario import Kill, Push, Restart, Scenario
 from shared.topics import Topic
-from shared.traces import SimState
+from shared.traces import LinkEvent, SimState
 from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
@@ -52,12 +52,17 @@ Record = Callable[[Topic, str, Message], None]
 """Takes what live would be on the bus: topic, module or "", message."""
 
 
-def _forget(_topic: Topic, _module: str, _message: Message) -> None:
+def forget(_topic: Topic, _module: str, _message: Message) -> None:
     """Record nothing."""
 
 
 class Lockstep:
-    """A whole fleet in virtual time."""
+    """A whole fleet in virtual time; a subclass may be made of other parts."""
+
+    planner_type: ClassVar[type[Planner]] = Planner
+    module_type: ClassVar[type[Module]] = Module
+    traced: ClassVar[bool] = True
+    """What is recorded has all that it takes to execute the services again."""
 
     def __init__(
         self,
@@ -66,7 +71,7 @@ class Lockstep:
         network: Impairment | None = None,
         *,
         seed: int = 0,
-        record: Record = _forget,
+        record: Record = forget,
     ) -> None:
         """Put the robot on the hoist, drives idle.
 
@@ -93,11 +98,11 @@ class Lockstep:
         self.config = config
         self.scenario = scenario
         self.world = World(config, scenario)
-        self._modules = [Module(config, module) for module in MODULES]
-        self._traces = record is not _forget
+        self._modules = [self.module_type(config, module) for module in MODULES]
+        self._traces = self.traced and record is not forget
         self._tracers = [Tracer(module) for module in self._modules]
         self._remembrance = Remembrance(config.planner.rate_hz)
-        self.planner: Planner | None = Planner(config, session=1)
+        self.planner: Planner | None = self.planner_type(config, session=1)
         self.events: list[tuple[str, JointEvent]] = []
         self.estop = False
         """Set it to stop every module."""
@@ -175,7 +180,7 @@ class Lockstep:
             self.planner = None
         else:
             self._sessions = planner[0]
-            self.planner = Planner(self.config, planner[0])
+            self.planner = self.planner_type(self.config, planner[0])
             self.planner.recall(planner[1])
         for drive in self._drives:
             drive.heard(self.now_ns)
@@ -242,11 +247,11 @@ class Lockstep:
         """Start a service that was dead; a module's takes over what its drive carries."""
         if service == "planner":
             self._sessions += 1
-            self.planner = Planner(self.config, self._sessions)
+            self.planner = self.planner_type(self.config, self._sessions)
             self._remembrance = Remembrance(self.config.planner.rate_hz)
             return
         index = MODULE_INDEX[service]
-        self._modules[index] = Module(self.config, service)
+        self._modules[index] = self.module_type(self.config, service)
         self._tracers[index] = Tracer(self._modules[index])
         self._drives[index].serve_anew()
 

@@ -10,8 +10,9 @@ from shared.impairment import Impairment
 from shared.injections import Injections
 from shared.joints import MODULES
 from shared.links import DIRECTIONS, WRENCHES
-from shared.messages import JointCommand, JointState, LinkEvent, Wrench
+from shared.messages import JointCommand, JointState, Wrench
 from shared.scenario import Inject
+from shared.traces import LinkEvent
 from tools.runs.network import Link
 
 
