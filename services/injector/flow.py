@@ -41,8 +41,8 @@ class Flow:
 
     @property
     def reads(self) -> bool:
-        """True while the source is to be read."""
-        return not self.ended and len(self._pending) < PENDING_MAX
+        """True while the source is to be read: not while too much waits for the sink."""
+        return len(self._pending) < PENDING_MAX
 
     def take(self, now_ns: int) -> list[tuple[int, bytes]]:
         """Read what there is; return (release time, batch), several of one batch if doubled.
@@ -69,9 +69,19 @@ class Flow:
         return found
 
     def put(self, batch: bytes) -> None:
-        """Write a batch that is due, or keep it until the sink takes it."""
-        self._pending += batch
-        self.flush()
+        """Write a batch that is due, or keep what the sink does not take."""
+        if self._pending:
+            self._pending += batch
+            return
+        try:
+            sent = self.sink.send(batch)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self.broken = True
+            return
+        if sent < len(batch):
+            self._pending += batch[sent:]
 
     def flush(self) -> None:
         """Write what the sink takes."""

@@ -41,17 +41,23 @@ class Relay:
         self._by_sink: dict[socket.socket, Flow] = {}
         self._due: list[tuple[int, int, Flow, bytes]] = []
         self._held: list[tuple[Flow, bytes]] = []
+        self._full: set[socket.socket] = set()
+        """Ends that had no room."""
+        self._ends: list[socket.socket] = list(self._places)
+        """Every socket that can be read; made anew when one comes or goes."""
         self._count = count()
         self.refused = 0
         """Connections to a process that was not there."""
 
     def readers(self) -> list[socket.socket]:
         """Return the sockets to wait for."""
-        return [*self._places, *(end for end, flow in self._flows.items() if flow.reads)]
+        if not self._full:
+            return self._ends
+        return [end for end in self._ends if end in self._places or self._flows[end].reads]
 
     def writers(self) -> list[socket.socket]:
         """Return the sockets that are to take more."""
-        return [end for end, flow in self._by_sink.items() if flow.writes]
+        return list(self._full)
 
     def next_ns(self) -> int | None:
         """Return when the next batch is due; None: none waits."""
@@ -73,14 +79,15 @@ class Relay:
                 self._let_out(flow, batch)
             else:
                 heapq.heappush(self._due, (release_ns, next(self._count), flow, batch))
+        if flow.ended:
+            self._list_ends()
 
     def writable(self, end: socket.socket) -> None:
         """Go on with what a socket had no room for."""
         flow = self._by_sink.get(end)
         if flow is not None:
             flow.flush()
-            if flow.broken:
-                self._part(flow)
+            self._look_at(flow)
 
     def let_out_due(self, now_ns: int) -> None:
         """Let out every batch whose time has come."""
@@ -131,6 +138,10 @@ class Relay:
             direction = self._directions.get(name) or Direction(name, 0)
             flow = Flow(source, sink, direction)
             self._flows[source] = self._by_sink[sink] = flow
+        self._list_ends()
+
+    def _list_ends(self) -> None:
+        self._ends = [*self._places, *(end for end, flow in self._flows.items() if not flow.ended)]
 
     def _let_out(self, flow: Flow, batch: bytes) -> None:
         if flow.source not in self._flows:
@@ -139,13 +150,23 @@ class Relay:
             self._part(flow)
             return
         flow.put(batch)
+        self._look_at(flow)
+
+    def _look_at(self, flow: Flow) -> None:
+        """See whether what was written has gone."""
         if flow.broken:
             self._part(flow)
+        elif flow.writes:
+            self._full.add(flow.sink)
+        else:
+            self._full.discard(flow.sink)
 
     def _part(self, flow: Flow) -> None:
         """Close a connection, both ends of it."""
         for end in (flow.source, flow.sink):
             self._flows.pop(end, None)
             self._by_sink.pop(end, None)
+            self._full.discard(end)
             end.close()
+        self._list_ends()
         self._held = [row for row in self._held if row[0].source in self._flows]
