@@ -55,6 +55,7 @@ VENDORS = {
     "casadi": ["services/planner/symbolic.py", "services/planner/kinematics.py"],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
     "mcap": ["services/recorder/mcap_log.py", "tools/reexecution/rewritten.py"],
+    "foxglove": ["tools/reports/foxglove.py"],
     "supervisor": ["tools/supervision/*.py"],
     "can": [
         "shared/unix_can.py",

@@ -41,7 +41,8 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--scene",
         action="store_true",
-        help="copy it with frames, bodies and forces at 30 Hz, for the 3-D panel of Foxglove",
+        help="copy it with frames, bodies and forces at 30 Hz, for the 3-D views of Foxglove "
+        "(all of it) and Rerun (frames and bodies)",
     )
     parser.add_argument(
         "-o",

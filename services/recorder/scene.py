@@ -13,8 +13,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-import msgspec
-
 from services.recorder import mcap_encoding as encoding
 from services.recorder import mcap_records as mcap
 from services.recorder.mcap_records import Malformed, Row
@@ -31,12 +29,14 @@ _FIRST_ID: Final = 60_000  # of new schemas and channels: far beyond those of a 
 
 
 class NewChannel(NamedTuple):
-    """A channel to add."""
+    """A channel to add. Its encodings are named as MCAP's registry has them."""
 
     topic: str
     schema_name: str
-    schema: dict[str, object]
-    """JSON schema."""
+    schema_encoding: str
+    schema: bytes
+    encoding: str
+    """Of the messages."""
     about: dict[str, str]
 
 
@@ -98,11 +98,10 @@ class _Extended(Copy):
     def announce(self) -> None:
         """Give the new channels their schemas and numbers."""
         for number, row in enumerate(self._new, _FIRST_ID):
-            data = msgspec.json.encode(row.schema)
-            head = struct.pack("<H", number) + _text(row.schema_name) + _text("jsonschema")
-            self.take(_piece(mcap.SCHEMA, head + struct.pack("<I", len(data)) + data))
+            head = struct.pack("<H", number) + _text(row.schema_name) + _text(row.schema_encoding)
+            self.take(_piece(mcap.SCHEMA, head + struct.pack("<I", len(row.schema)) + row.schema))
             about = b"".join(_text(key) + _text(value) for key, value in row.about.items())
-            body = struct.pack("<HH", number, number) + _text(row.topic) + _text("json")
+            body = struct.pack("<HH", number, number) + _text(row.topic) + _text(row.encoding)
             self.take(_piece(mcap.CHANNEL, body + struct.pack("<I", len(about)) + about))
 
     def add(self, message: NewMessage) -> None:

@@ -11,7 +11,8 @@ plotjuggler_app/nlohmann_parsers.cpp (e02aceb):
 - The file needs its summary; there is no scan of a file without one.
 - Every channel's schema is looked up; one that is missing ends the load.
 - A parser is chosen by the channel's message encoding, else by its schema's encoding; the names
-  are `json`, `cbor`, `bson`, `msgpack` and those of ROS and protobuf. The schema is not read.
+  are `json`, `cbor`, `bson`, `msgpack` and those of ROS and protobuf. For JSON the schema is not
+  read.
 - Objects go down by `/`, arrays by `[i]`, and the last entry again as `[-1]`, whatever their
   length: the limit for large arrays is not for JSON.
 - Numbers and booleans become doubles. Strings, null, and empty arrays and objects are dropped.
@@ -28,6 +29,9 @@ later ones make doubles of all numbers):
 - A column has the type of its first value: bool, integer, float or string. A message with
   another one is refused, all of it.
 - A message is at its publish time if that is within the file's log times, else at its log time.
+
+Only the rules for JSON are here. Messages in protobuf and CDR, such as those of a scene, are left
+to PlotJuggler's own parsers of these, by name (`Opened.left`).
 """
 
 from __future__ import annotations
@@ -74,6 +78,8 @@ class Opened:
     """Messages that were refused, by the path that was of another type than before."""
     unread: dict[str, str] = field(default_factory=dict)
     """Topics that are not read, and why."""
+    left: dict[str, str] = field(default_factory=dict)
+    """Topics that another of its parsers reads than that of JSON, and the parser's name."""
     messages: Counter[str] = field(default_factory=Counter)
     """Messages that were read, by topic."""
 
@@ -95,12 +101,14 @@ def opened_by_3(path: Path) -> Opened:
         described = summary.schemas.get(channel.schema_id)
         if described is None:
             raise Refused(f"{channel.topic}: schema {channel.schema_id} is not there")
-        if not {channel.message_encoding, described.encoding} & PARSERS_3:
+        names = (channel.message_encoding, described.encoding)
+        parser = next((name for name in names if name in PARSERS_3), None)
+        if parser is None:
             found.unread[channel.topic] = "no parser"
-        elif channel.message_encoding != JSON:
-            found.unread[channel.topic] = "not JSON: its rules are not written down here"
+        elif parser != JSON:
+            found.left[channel.topic] = parser
     for topic, message in _messages(path, summary):
-        if topic not in found.unread:
+        if topic not in found.unread and topic not in found.left:
             t_s = float(message.publish_time) * 1e-9
             _flatten_3(found, topic, _parsed(topic, message.data), t_s)
             found.messages[topic] += 1
@@ -128,11 +136,11 @@ def opened_by_4(path: Path) -> Opened:
         elif channel.message_encoding not in PARSERS_4:
             found.unread[channel.topic] = "no parser"
         elif channel.message_encoding != JSON:
-            found.unread[channel.topic] = "not JSON: its rules are not written down here"
+            found.left[channel.topic] = channel.message_encoding
     first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
     types: dict[str, type] = {}
     for topic, message in _messages(path, summary):
-        if topic in found.unread:
+        if topic in found.unread or topic in found.left:
             continue
         within = first_ns <= message.publish_time <= last_ns
         t_s = (message.publish_time if within else message.log_time) * 1e-9

@@ -13,7 +13,8 @@ from tests.recorder import runs
 from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, item
 from tools.runs.run_log import read_run
 
-CHANNEL = NewChannel("xrl/lab/scene/x", "x.Y", {"type": "object", "properties": {}}, {"why": "t"})
+SCHEMA = b"\n\x00\xff of any kind"
+CHANNEL = NewChannel("xrl/lab/scene/x", "x.Y", "protobuf", SCHEMA, "protobuf", {"why": "t"})
 
 
 def added(*times_ns: int) -> list[NewMessage]:
@@ -60,8 +61,8 @@ def test_the_copy_is_a_log_like_any_other(record: Path, tmp_path: Path) -> None:
     assert summary is not None
     channel = next(c for c in summary.channels.values() if c.topic == CHANNEL.topic)
     schema = summary.schemas[channel.schema_id]
-    assert (schema.name, schema.encoding) == ("x.Y", "jsonschema")
-    assert (channel.message_encoding, channel.metadata) == ("json", {"why": "t"})
+    assert (schema.name, schema.encoding, schema.data) == ("x.Y", "protobuf", SCHEMA)
+    assert (channel.message_encoding, channel.metadata) == ("protobuf", {"why": "t"})
 
 
 def test_what_was_added_stands_near_what_was_recorded_then(record: Path, tmp_path: Path) -> None:

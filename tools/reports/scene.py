@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
-import msgspec
 import numpy as np
 
 from services.planner.kinematics import Kinematics
@@ -24,8 +23,8 @@ from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
 from shared.messages import JointState, Mode, SimTruth, Vector3, Wrench
 from shared.robot_model import MODULE_RADIUS, side_sign
-from tools.reports import foxglove
-from tools.reports.foxglove import Colour, Json
+from tools.reports import foxglove, urdf
+from tools.reports.foxglove import ORIGIN, UPRIGHT, Arrow, Colour, Entity, Placed, Quaternion, Solid
 from tools.runs.run_log import RunLog
 
 RATE_HZ: Final = 30.0
@@ -35,13 +34,14 @@ METRES_PER_NEWTON: Final = 0.005
 FORCE_MIN_N: Final = 2.0
 """Smaller forces have no arrow: the sensor's noise would make it jump about."""
 
-FRAMES, LINKS, STATE = range(3)
+FRAMES, LINKS, STATE, MODEL = range(4)
 LINK: Final[Colour] = (0.62, 0.66, 0.70, 1.0)
 BODY: Final[Colour] = (0.45, 0.52, 0.60, 0.55)
 COM: Final[Colour] = (0.05, 0.37, 0.65, 1.0)
 HAND: Final[Colour] = (0.77, 0.31, 0.11, 1.0)
 PUSH: Final[Colour] = (0.55, 0.20, 0.60, 1.0)
 UNKNOWN: Final[Colour] = (0.4, 0.4, 0.4, 1.0)
+NO_MODE: Final = -1
 MODES: Final[dict[int, Colour]] = {
     Mode.DISARMED: (0.70, 0.74, 0.77, 1.0),
     Mode.HOLD: (0.85, 0.56, 0.12, 1.0),
@@ -49,8 +49,6 @@ MODES: Final[dict[int, Colour]] = {
     Mode.DAMP: (0.51, 0.33, 0.72, 1.0),
     Mode.FAULT: (0.75, 0.22, 0.17, 1.0),
 }
-
-Quaternion = tuple[float, float, float, float]
 
 
 class Pose(NamedTuple):
@@ -73,32 +71,33 @@ class Pose(NamedTuple):
     """N, world."""
 
 
-class Placed(NamedTuple):
-    """A frame in its parent."""
-
-    parent: str
-    child: str
-    at: Vector3
-    turn: Quaternion
-    """(x, y, z, w)."""
-
-
 def channels(robot: str) -> list[NewChannel]:
-    """Return the channels of a scene, `FRAMES`, `LINKS` and `STATE`."""
+    """Return the channels of a scene: `FRAMES`, `LINKS`, `STATE`, and for Rerun the `MODEL`."""
     rows = (
-        ("scene/frames", foxglove.TRANSFORMS, RATE_HZ, "where each module is"),
-        ("scene/links", foxglove.SCENE, 1.0 / LINKS_EVERY_S, "the robot's bodies"),
-        ("scene/state", foxglove.SCENE, RATE_HZ, "modes by colour, COM, forces"),
+        ("frames", foxglove.TRANSFORMS, f"{RATE_HZ:g}", "where each module is"),
+        ("links", foxglove.SCENE, f"{1.0 / LINKS_EVERY_S:g}", "the robot's bodies"),
+        ("state", foxglove.SCENE, f"{RATE_HZ:g}", "modes by colour, COM, forces"),
     )
-    return [
+    found = [
         NewChannel(
-            f"xrl/{robot}/{name}",
-            schema,
-            foxglove.SCHEMAS[schema],
-            {"rate_hz": f"{rate:g}", "why": why},
+            f"xrl/{robot}/scene/{name}",
+            schema.name,
+            schema.encoding,
+            schema.data,
+            foxglove.ENCODING,
+            {"rate_hz": rate, "why": why},
         )
         for name, schema, rate, why in rows
     ]
+    model = NewChannel(
+        f"xrl/{robot}/robot_description",  # the name by which Rerun knows it
+        urdf.SCHEMA_NAME,
+        urdf.SCHEMA_ENCODING,
+        urdf.SCHEMA,
+        urdf.ENCODING,
+        {"why": "the robot's bodies as URDF, once"},
+    )
+    return [*found, model]
 
 
 def messages(log: RunLog, robot: RobotConfig) -> Iterator[NewMessage]:
@@ -107,16 +106,22 @@ def messages(log: RunLog, robot: RobotConfig) -> Iterator[NewMessage]:
     Raises:
         RunError: the log does not hold the states of all six modules.
     """
-    encode = msgspec.json.encode
     links_ns: int | None = None
     for pose in poses(log, robot):
         ns = pose.t_ns + log.offset_ns
-        transforms = [foxglove.transform(ns, *placed) for placed in frames(robot, pose)]
-        yield NewMessage(FRAMES, ns, encode({"transforms": transforms}))
+        if links_ns is None:
+            yield NewMessage(MODEL, ns, urdf.message(model(log.robot, robot, pose)))
+        yield NewMessage(FRAMES, ns, foxglove.transforms(ns, frames(robot, pose)))
         if links_ns is None or ns - links_ns >= LINKS_EVERY_S * NS_PER_S:
             links_ns = ns
-            yield NewMessage(LINKS, ns, encode({"deletions": [], "entities": links(robot, ns)}))
-        yield NewMessage(STATE, ns, encode({"deletions": [], "entities": state(ns, pose)}))
+            yield NewMessage(LINKS, ns, foxglove.scene(ns, links(robot)))
+        yield NewMessage(STATE, ns, foxglove.scene(ns, state(pose)))
+
+
+def model(name: str, robot: RobotConfig, pose: Pose) -> str:
+    """Return all bodies of a robot of some name as URDF; the modules in no mode's colour."""
+    still = pose._replace(modes=(NO_MODE,) * len(MODULES))
+    return urdf.urdf(name, frames(robot, pose), [*links(robot), *state(still)])
 
 
 def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
@@ -152,7 +157,7 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
         torso, com, angles = kinematics.r_torso, kinematics.p[:3], kinematics.p[3:]
         yield Pose(
             row.t_ns, _vector(torso), _vector(angles), _vector(com), q, modes, force,
-            (0.0, 0.0, 0.0),
+            ORIGIN,
         )  # fmt: skip
 
 
@@ -181,11 +186,10 @@ def _thinned(rows: list[Any], first_ns: int) -> Iterator[Any]:
 def frames(robot: RobotConfig, pose: Pose) -> list[Placed]:
     """Return every frame at a moment."""
     geometry = robot.geometry
-    upright = foxglove.UPRIGHT
     found = [
         Placed("world", "torso", pose.torso, torso_turn(pose.angles)),
-        Placed("world", "com", pose.com, upright),
-        Placed("torso", "harness", geometry.harness_point, upright),
+        Placed("world", "com", pose.com, UPRIGHT),
+        Placed("torso", "harness", geometry.harness_point, UPRIGHT),
     ]
     for side in SIDES:
         sign = side_sign(side)
@@ -244,42 +248,39 @@ def along(direction: Vector3) -> Quaternion:
     return 0.0, -z / (2 * w), y / (2 * w), w
 
 
-def links(robot: RobotConfig, ns: int) -> list[Json]:
+def links(robot: RobotConfig) -> list[Entity]:
     """Return the bodies, each in its module's frame."""
     geometry = robot.geometry
-    found = [
-        foxglove.entity(ns, "torso", "torso", cubes=[foxglove.solid(geometry.torso_size, BODY)])
-    ]
+    found = [Entity("torso", "torso", (Solid("cube", geometry.torso_size, BODY),))]
     for side in SIDES:
         for kind, name, length in (("hip", "thigh", geometry.l1), ("knee", "shin", geometry.l2)):
-            shape = foxglove.cylinder((0.06, 0.06, length), LINK, (0.0, 0.0, -length / 2))
-            found.append(foxglove.entity(ns, f"{kind}_{side}", f"{name}_{side}", cylinders=[shape]))
+            bone = Solid("cylinder", (0.06, 0.06, length), LINK, (0.0, 0.0, -length / 2))
+            found.append(Entity(f"{kind}_{side}", f"{name}_{side}", (bone,)))
         size = (geometry.l_foot, geometry.w_foot, geometry.foot_height / 2)
-        sole = foxglove.solid(size, LINK, (0.0, 0.0, -0.75 * geometry.foot_height))
-        found.append(foxglove.entity(ns, f"ankle_{side}", f"sole_{side}", cubes=[sole]))
+        sole = Solid("cube", size, LINK, (0.0, 0.0, -0.75 * geometry.foot_height))
+        found.append(Entity(f"ankle_{side}", f"sole_{side}", (sole,)))
     return found
 
 
-def state(ns: int, pose: Pose) -> list[Json]:
+def state(pose: Pose) -> list[Entity]:
     """Return what changes: the modules in their modes' colours, the COM, the forces."""
     size = (MODULE_RADIUS,) * 3
     found = []
     for module, mode in zip(MODULES, pose.modes, strict=True):
-        ball = foxglove.solid(size, MODES.get(mode, UNKNOWN))
-        found.append(foxglove.entity(ns, module, f"module_{module}", spheres=[ball]))
-    ball = foxglove.solid((0.06, 0.06, 0.06), COM)
-    found.append(foxglove.entity(ns, "com", "com", spheres=[ball]))
-    found.append(foxglove.entity(ns, "harness", "operator", arrows=_arrows(pose.force, HAND)))
-    at = pose.torso
-    found.append(foxglove.entity(ns, "world", "push", arrows=_arrows(pose.push, PUSH, at)))
+        ball = Solid("sphere", size, MODES.get(mode, UNKNOWN))
+        found.append(Entity(module, f"module_{module}", (ball,)))
+    ball = Solid("sphere", (0.06, 0.06, 0.06), COM)
+    found.append(Entity("com", "com", (ball,)))
+    found.append(Entity("harness", "operator", arrows=_arrows(pose.force, HAND)))
+    found.append(Entity("world", "push", arrows=_arrows(pose.push, PUSH, pose.torso)))
     return found
 
 
-def _arrows(force: Vector3, colour: Colour, at: Vector3 = (0.0, 0.0, 0.0)) -> list[Json]:
+def _arrows(force: Vector3, colour: Colour, at: Vector3 = ORIGIN) -> tuple[Arrow, ...]:
     size = math.hypot(*force)
     if size < FORCE_MIN_N:
-        return []
-    return [foxglove.arrow(at, along(force), METRES_PER_NEWTON * size, 0.02, colour)]
+        return ()
+    return (Arrow(at, along(force), METRES_PER_NEWTON * size, 0.02, colour),)
 
 
 def _vector(values: Any) -> Vector3:
