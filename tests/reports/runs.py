@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,9 +47,13 @@ def rewritten(
     attachments: Mapping[str, bytes] | None = None,
     about: Mapping[str, str] | None = None,
     payload: Callable[[str, bytes], bytes] = lambda _, payload: payload,
+    more: Sequence[tuple[int, str, bytes]] = (),
     repeats: int = 1,
 ) -> RunLog:
-    """Write a log again with some topics, attachments or payloads changed, and read it."""
+    """Write a log again with some topics, attachments or payloads changed, and read it.
+
+    `more` are further messages: time, name of the key below the robot, payload.
+    """
     known = {key: topic for key, topic in topics.all_keys(log.robot).items() if topic.recorded}
     prefix = f"xrl/{log.robot}/"
     rows = []
@@ -57,6 +61,7 @@ def rewritten(
         name = key.removeprefix(prefix)
         if keep(name):
             rows += [(t, key, payload(name, body)) for t, body, _ in log.raw(key)]
+    rows += [(t, prefix + name, body) for t, name, body in more]
     rows.sort(key=lambda row: row[0])
     length_ns = rows[-1][0] - rows[0][0] + NS_PER_S // 1000
     metadata = {name: row for name, row in log.metadata.items() if name not in FROM_RECORDER}

@@ -16,10 +16,10 @@ for (const list of lists.slice(0, dark ? 2 : 1)) {
 const frames = [];
 
 class Context {
-  constructor() { this.ops = []; this.dash = []; this.saved = []; }
+  constructor() { this.ops = []; this.dash = []; this.saved = []; this.wiped = 0; }
   note(...op) { this.ops.push([...op, this.strokeStyle, this.fillStyle, this.lineWidth, this.dash]); }
   setTransform() { this.ops = []; }
-  clearRect() { this.ops = []; }
+  clearRect() { this.ops = []; this.wiped += 1; }
   measureText(text) { return { width: 6 * text.length }; }
   setLineDash(dash) { this.dash = dash; }
   save() { this.saved.push(this.clipped); }
@@ -34,6 +34,7 @@ class Context {
     this.note("path", this.path, this.clipped || null);
   }
   fillRect(...box) { this.note("rect", box); }
+  strokeText() {}  // the halo of what fillText says next
   fillText(text, x, y) { this.note("text", text, x, y, this.textAlign, this.textBaseline); }
 }
 
@@ -51,7 +52,7 @@ class Node {
   getBoundingClientRect() { return { left: 0, top: 0, bottom: 100 }; }
   getContext() { return (this.context ||= new Context()); }
   setPointerCapture() {}
-  scrollIntoView() {}
+  scrollIntoView() { this.shown = true; }
   say(name, event = {}) {
     const all = { preventDefault() { this.prevented = true; }, button: 0, pointerId: 1, key: "", deltaY: 0, ...event };
     for (const listener of this.listeners[name] || []) listener.call(this, all);
@@ -66,9 +67,11 @@ const ids = {};
 for (const [, id] of html.matchAll(/ id="([\w-]+)"/g)) ids[id] = new Node(id);
 ids.data.textContent = /id="data">([\s\S]*?)<\/script>/.exec(html)[1];
 const buttons = { "[data-do]": [], "[data-t]": [] };
-for (const [, name, value] of html.matchAll(/<button type="button" data-(do|t)="([^"]+)"/g)) {
+const written = /<button type="button" data-(do|t)="([^"]+)"(?: data-before="([^"]+)")?/g;
+for (const [, name, value, before] of html.matchAll(written)) {
   const node = new Node("button");
   node.dataset[name] = value;
+  if (before) node.dataset.before = before;
   buttons[`[data-${name}]`].push(node);
 }
 const windowNode = new Node("window");
@@ -80,18 +83,23 @@ const sandbox = {
   },
   window: Object.assign(windowNode, { devicePixelRatio: 1, innerHeight: 800, matchMedia: () => new Node("media") }),
   getComputedStyle: () => ({ getPropertyValue: (name) => variables[name] || (() => { throw new Error(name); })() }),
-  requestAnimationFrame: (frame) => frames.push(frame), atob, console,
+  requestAnimationFrame: (frame) => frames.push(frame), setTimeout: () => {}, atob, console,
 };
 sandbox.globalThis = sandbox;
 const source = html.slice(html.lastIndexOf("<script>") + 8, html.lastIndexOf("</script>"));
 vm.runInNewContext(source, sandbox, { filename: "report" });
 flush();
 
-const panels = ids.panels.children.map((section) => ({
-  title: section.children[0].children[0].textContent,
-  select: section.children[0].children.find((node) => node.tag === "select"),
-  canvas: section.children[1], legend: section.children[2], read: section.children[3],
-}));
+function everyNode(node) { return [node, ...node.children.filter((part) => part instanceof Node).flatMap(everyNode)]; }
+const panels = ids.panels.children.map((section) => {
+  const nodes = everyNode(section), found = (name) => nodes.find((node) => node.className === name);
+  const [canvas, over] = nodes.filter((node) => node.tag === "canvas");
+  return {
+    section, title: nodes.find((node) => node.tag === "h3").textContent,
+    select: nodes.find((node) => node.tag === "select"),
+    canvas, over, stage: found("stage"), legend: found("legend"), read: found("read"),
+  };
+});
 const panel = (title) => panels.find((one) => one.title.startsWith(title));
 const shown = () => [ids.from.value, ids.to.value].map(Number);
 const steps = {
@@ -114,10 +122,14 @@ const steps = {
   label: (title) => panel(title).canvas.attributes["aria-label"],
   strokes: (title) => panel(title).canvas.getContext().ops.filter((op) => op[0] === "path" && op[2]).map((op) => [op[3], op[1]]),
   rects: (title) => panel(title).canvas.getContext().ops.filter((op) => op[0] === "rect").map((op) => [op[3], op[1]]),
+  times: () => ids.cursor.textContent,
+  levels: (title) => [...panel(title).over.getContext().ops].map((op) => [op[0], op[0] === "path" ? op[1][0][1] : op[1]]),
   texts: (title) => panel(title).canvas.getContext().ops.filter((op) => op[0] === "text").map((op) => op[1]),
   type: (id, value) => { ids[id].value = value; ids[id].say("change"); return shown(); },
-  print: () => { windowNode.say("beforeprint"); windowNode.say("afterprint"); return true; },
-  all: () => panels.map((one) => ({ title: one.title, height: parseFloat(one.canvas.style.height), ops: one.canvas.getContext().ops })),
+  print: () => { windowNode.say("beforeprint"); const ops = panels.map((one) => one.canvas.getContext().ops.length); windowNode.say("afterprint"); return ops; },
+  all: () => panels.map((one) => ({ title: one.title, height: parseFloat(one.stage.style.height), ops: one.canvas.getContext().ops })),
+  drawings: () => panels.map((one) => one.canvas.getContext().wiped),
+  goto: (index) => { ids.goto.selectedIndex = index; ids.goto.say("change"); return panels.find((one) => one.section.shown).title; },
 };
 const answers = JSON.parse(stepsText).map(([name, ...rest]) => steps[name](...rest));
 process.stdout.write(JSON.stringify(answers));

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -70,3 +71,43 @@ def test_stretches_end_where_nothing_was_said() -> None:
     t = np.array([0.0, 0.01, 0.02, 0.03, 1.0, 1.01])
     found = segments(t, np.array([1, 1, 2, 2, 2, 2]))
     assert found == [[0.0, 0.02, 1], [0.02, 0.03, 2], [1.0, 1.01, 2]]
+
+
+def test_a_sample_alone_in_its_bin_is_one_point_in_its_own_half() -> None:
+    """Two places for one sample would draw every slow signal as stairs."""
+    t = np.array([0.0, 0.101, 0.305, 0.507, 0.999])
+    span = Span(0.0, 1.0)
+    found = packed(t, np.arange(5.0), span)
+    assert found is not None
+    where, seen = unpacked(found)
+    assert len(seen) == len(t)
+    assert np.abs(where - t).max() <= span.bin_s / 2
+
+
+def test_a_stamp_said_again_comes_when_it_was_heard() -> None:
+    """By another clock, 1 s ahead; the next stamp is never overtaken."""
+    stamps = np.array([0, 4, 8, 8, 8, 8, 48, 52]) * 1_000_000
+    heard = np.array([0, 4, 8, 18, 28, 60, 61, 62]) * 1_000_000 + 1_000_000_000
+    t = seconds(stamps.tolist(), 0, heard.tolist())
+    assert t[:5].tolist() == pytest.approx([0.0, 0.004, 0.008, 0.018, 0.028])
+    assert 0.028 < t[5] < 0.048
+    assert t[6:].tolist() == pytest.approx([0.048, 0.052])
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 5), st.integers(0, 60)).map(
+            lambda pair: (pair[0] * 4_000_000, pair[1] * 1_000_000)
+        ),
+        min_size=1,
+        max_size=60,
+    )
+)
+def test_times_never_fall_and_a_new_stamp_is_its_own_time(steps: list[tuple[int, int]]) -> None:
+    stamps = np.cumsum([step for step, _ in steps])
+    heard = np.cumsum([step for _, step in steps])
+    for said in (None, heard.tolist()):
+        t = seconds(stamps.tolist(), 0, said)
+        assert (np.diff(t) >= 0.0).all()
+        first = np.concatenate(([True], np.diff(stamps) > 0))
+        assert t[first] == pytest.approx(stamps[first] / 1e9)

@@ -115,3 +115,27 @@ function inWords(value) {
   if (size !== 0 && (size < 1e-3 || size >= 1e6)) return value.toExponential(2);
   return inDigits(value, size >= 1000 ? 0 : size >= 100 ? 1 : size >= 10 ? 2 : size >= 1 ? 3 : 4);
 }
+
+// A number of an axis as a power of ten, with the digits in which it differs from the others.
+function inPowers(value, values) {
+  if (value === 0 || values.length < 2) return value === 0 ? "0" : value.toPrecision(2);
+  const digits = Math.ceil(Math.log10(Math.abs(value / (values[1] - values[0]))) - 1e-9);
+  return value.toExponential(Math.min(5, Math.max(0, digits)));
+}
+
+function line(ctx, x0, y0, x1, y1) {
+  ctx.beginPath();
+  ctx.moveTo(x0, y0);
+  ctx.lineTo(x1, y1);
+  ctx.stroke();
+}
+
+// Text that can be read over lines.
+function haloed(ctx, theme, text, x, y, colour) {
+  ctx.lineWidth = 3;
+  ctx.lineJoin = "round";
+  ctx.strokeStyle = theme("--bg");
+  ctx.strokeText(text, x, y);
+  ctx.fillStyle = theme(colour);
+  ctx.fillText(text, x, y);
+}

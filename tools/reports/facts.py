@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 import tomllib
+from datetime import datetime
 from typing import Any, Final, NamedTuple
 
 from rich.console import Console
@@ -21,7 +23,6 @@ REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
 
 MACHINE: Final = {
     "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
-    "thread_env": "threads",
 }  # fmt: skip
 
 
@@ -33,6 +34,8 @@ class Verdict(NamedTuple):
     """None: there is nothing to judge."""
     rows: list[tuple[str, str, str, str]]
     """(what, measured, limit, `ok` or `over`)."""
+    caution: str = ""
+    """Why the figures are not to be trusted."""
 
 
 class Lost(NamedTuple):
@@ -59,7 +62,9 @@ def judge(source: Source) -> Verdict:
         return Verdict(f"No verdict: {error}", None, [])
     if log.metadata["run"].get("lockstep"):
         summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
-    return Verdict(_sentence(summary), bool(summary["stood"]), _rows(summary))
+    said = _said(summary)
+    caution = "" if summary["in_real_time"] else said[-2]
+    return Verdict(said[-1], bool(summary["stood"]), _rows(summary), caution)
 
 
 def _duration_s(source: Source) -> float:
@@ -72,11 +77,12 @@ def _duration_s(source: Source) -> float:
         return float(source.course.t[-1])
 
 
-def _sentence(summary: Summary) -> str:
-    """Return the last line of the verdict as the other verbs print it."""
+def _said(summary: Summary) -> list[str]:
+    """Return the lines of the verdict as the other verbs print it; the last is the verdict."""
     text = io.StringIO()
-    verdict_table.show(summary, Console(file=text, width=200, color_system=None))
-    return text.getvalue().strip().splitlines()[-1].strip()
+    console = Console(file=text, width=200, color_system=None, soft_wrap=True)
+    verdict_table.show(summary, console)
+    return [line.strip() for line in text.getvalue().strip().splitlines()]
 
 
 def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
@@ -87,8 +93,13 @@ def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
             continue
         unit = f" {limit.unit}" if limit.unit else ""
         mark = "ok" if value <= limit.limit else "over"
-        rows.append((limit.what, f"{value:.3g}{unit}", f"{limit.limit:g}{unit}", mark))
+        rows.append((limit.what, f"{_digits(value)}{unit}", f"{limit.limit:g}{unit}", mark))
     return rows
+
+
+def _digits(value: float) -> str:
+    """Return a number in three digits; without a power of ten where it can be read so."""
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def head(source: Source) -> list[tuple[str, str]]:
@@ -96,19 +107,37 @@ def head(source: Source) -> list[tuple[str, str]]:
     log, about = source.log, source.log.metadata["run"]
     begin, end = source.span
     rows = [
-        ("robot", log.robot),
         ("scenario", _scenario(source)),
+        ("started", _moment(about.get("started", ""))),
         ("virtual time", about.get("lockstep", "")),
-        ("started", about.get("started", "")),
         ("length", f"{end - begin:.1f} s"),
         ("file", log.path.name),
         ("recording", "finished" if log.complete else "not finished: the recorder did not end it"),
         ("git commit", _commit(about)),
+        ("robot", log.robot),
         ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
         ("log version", about.get("schema_version", "")),
     ]
     rows += [(name, about.get(key, "")) for key, name in MACHINE.items()]
-    return [(name, value) for name, value in rows if value and value != "{}"]
+    rows.append(("threads", _threads(about.get("thread_env", ""))))
+    return [(name, value) for name, value in rows if value]
+
+
+def _threads(raw: str) -> str:
+    """Return the environment that limits threads in words; as it is, if it is not JSON."""
+    try:
+        found = json.loads(raw or "{}")
+        return ", ".join(f"{name}={value}" for name, value in sorted(found.items()))
+    except (json.JSONDecodeError, AttributeError):
+        return raw
+
+
+def _moment(started: str) -> str:
+    """Return a time as people write it; as it is, if it is written otherwise."""
+    try:
+        return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
+    except ValueError:
+        return started
 
 
 def _scenario(source: Source) -> str:
@@ -153,10 +182,15 @@ def damage(source: Source) -> list[str]:
 def files(source: Source) -> list[tuple[str, str]]:
     """Return (name, text) of the files that the run was made from, as they are in its log."""
     found = []
-    for name, raw in sorted(source.log.attachments.items()):
-        if name.endswith(".toml"):
+    for name, raw in sorted(source.log.attachments.items(), key=lambda row: _order(row[0])):
+        if name.endswith((".toml", ".json")):
             found.append((name, raw.decode(errors="replace")))
     return found
+
+
+def _order(name: str) -> tuple[bool, str]:
+    """What people wrote goes before what was computed from it."""
+    return not name.endswith(".toml"), name
 
 
 def packages(source: Source) -> list[tuple[str, str]]:

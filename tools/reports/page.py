@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Final
 
-from tools.reports import facts, panels, timeline, torques
+from tools.reports import facts, network, panels, timeline, times, torques
 from tools.reports.facts import Verdict
 from tools.reports.sheet import Happening, Sheet
 from tools.reports.source import Source
@@ -16,7 +16,23 @@ from tools.runs.run_log import RunLog
 
 HERE: Final = Path(__file__).parent
 STYLE: Final = "page.css"
-SCRIPTS: Final = ("draw.js", "plot.js", "page.js")
+SCRIPTS: Final = ("draw.js", "plot.js", "legend.js", "view.js", "page.js")
+
+BEFORE_FALL_S: Final = 3.0
+"""A click on a fall shows so much before it."""
+
+HELP: Final = "".join(
+    f"<li>{line}</li>"
+    for line in (
+        "Drag in a plot to zoom, in all of them; double-click for the whole run.",
+        "Ctrl and wheel zoom at the cursor; Shift and wheel move the time shown.",
+        "The legends tell the values at the cursor; dotted red lines are limits.",
+        "A click pins the cursor, and the time from there is told; Escape takes the pin away.",
+        "A click on a name in a legend hides its line or shows it.",
+        "Keys in a plot: arrows move the cursor, with Shift the time shown; Enter pins.",
+        "Keys in a plot: + and &minus; zoom, 0 shows the whole run.",
+    )
+)
 
 POLICY: Final = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
@@ -35,17 +51,18 @@ def render(log: RunLog) -> str:
     events = timeline.happenings(source)
     judged = facts.judge(source)
     name = log.metadata["run"].get("scenario") or log.path.name
+    fell_s = next((row.t for row in events if row.kind == "fall"), None)
     parts = (
         _head(source, judged, name),
-        _tools(source),
-        '<main id="panels"></main>',
+        _tools(source, fell_s),
+        f'<div class="work">{_timeline(events)}<main id="panels"></main></div>',
         _left_out(sheet),
-        _timeline(events),
         _lost(source),
         _folded(source),
     )
     data = json.dumps(sheet.as_data(events), separators=(",", ":"), allow_nan=False)
-    return _document(f"{log.robot}: {name}", "\n".join(parts), data)
+    said = "" if judged.good is None else f"{judged.sentence}: "
+    return _document(f"{said}{name}, {log.robot}", "\n".join(parts), data)
 
 
 def fill(source: Source) -> Sheet:
@@ -53,10 +70,11 @@ def fill(source: Source) -> Sheet:
     sheet = Sheet(source.span)
     panels.add_body(source, sheet)
     panels.add_states(source, sheet)
+    network.add_network(source, sheet)
     panels.add_certificate(source, sheet)
     torques.add_joints(source, sheet)
     panels.add_harness(source, sheet)
-    panels.add_times(source, sheet)
+    times.add_times(source, sheet)
     return sheet
 
 
@@ -91,20 +109,22 @@ def _head(source: Source, judged: Verdict, name: str) -> str:
         f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>"
         for key, value in facts.head(source)
     )
+    caution = f'<p class="caution">{escape(judged.caution)}</p>' if judged.caution else ""
     table = ""
     if judged.rows:
-        cells = [(what, value, limit, mark) for what, value, limit, mark in judged.rows]
-        table = _details("Figures against their limits", _table(
-            ("what", "measured", "limit", ""), cells, numbers=(1, 2)
-        ), opened=True)  # fmt: skip
+        over = sum(mark == "over" for *_, mark in judged.rows)
+        count = f"{over} of {len(judged.rows)} over" if over else f"all {len(judged.rows)} ok"
+        names = ("what", "measured", "limit", "")
+        cells = _table(names, judged.rows, numbers=(1, 2))
+        table = _details(f"Figures against their limits: {count}", cells, opened=True)
     return (
         f"<header><h1>{escape(source.log.robot)}: {escape(name)}</h1>"
-        f'<p class="verdict {word}" id="verdict">{escape(judged.sentence)}</p>'
-        f"<dl>{rows}</dl>{table}</header>"
+        f'<p class="verdict {word}" id="verdict">{escape(judged.sentence)}</p>{caution}'
+        f'<div class="head">{table}<dl>{rows}</dl></div></header>'
     )
 
 
-def _tools(source: Source) -> str:
+def _tools(source: Source, fell_s: float | None) -> str:
     begin, end = source.span
     buttons = "".join(
         f'<button type="button" data-do="{do}" title="{title}" aria-label="{title}">{text}</button>'
@@ -113,18 +133,23 @@ def _tools(source: Source) -> str:
             ("in", "+", "zoom in"), ("out", "&minus;", "zoom out"), ("all", "all", "whole run"),
         )
     )  # fmt: skip
+    if fell_s is not None:
+        title = f"the last {BEFORE_FALL_S:g} s before the fall"
+        buttons += (
+            f'<button type="button" data-t="{fell_s:.4f}" data-before="{BEFORE_FALL_S:g}" '
+            f'title="{title}" aria-label="{title}">fall</button>'
+        )
     field = '<input type="number" step="any" min="{0:.3f}" max="{1:.3f}" value="{2:.3f}" id="{3}">'
     fields = (
-        f"<label>from {field.format(begin, end, begin, 'from')}</label>"
-        f"<label>to {field.format(begin, end, end, 'to')} s</label>"
+        f'<span class="range"><label>from {field.format(begin, end, begin, "from")}</label>'
+        f"<label>to {field.format(begin, end, end, 'to')} s</label></span>"
+        '<select id="goto" aria-label="go to a panel"><option value="">go to ...</option></select>'
     )
     return (
-        f'<nav class="tools" aria-label="time shown">{buttons}{fields}'
+        f'<nav class="tools" aria-label="time shown"><span class="buttons">{buttons}</span>{fields}'
         f'<output id="cursor"></output></nav>'
-        f'<p class="hint">{escape(source.axis[0].upper() + source.axis[1:])}. Drag to zoom, '
-        "double-click for the whole run, Ctrl and wheel to zoom at the cursor; with the keyboard "
-        "in a plot: arrows move the cursor, with Shift the time shown, + and &minus; zoom, 0 "
-        "shows the whole run. A click on a name in a legend hides its line.</p>"
+        f'<details class="hint"><summary>{escape(source.axis[0].upper() + source.axis[1:])}. '
+        f"How to read and zoom</summary><ul>{HELP}</ul></details>"
         "<noscript><p>The plots need JavaScript; verdict, timeline and tables do not.</p>"
         "</noscript>"
     )
@@ -139,15 +164,22 @@ def _left_out(sheet: Sheet) -> str:
 
 def _timeline(events: Sequence[Happening]) -> str:
     rows = "".join(
-        f'<li class="{escape(row.kind)}"><button type="button" data-t="{row.t:.4f}">'
+        f'<li class="{escape(row.kind)}"><button type="button" data-t="{row.t:.4f}"'
+        f"{_before(row)}>"
         f"<time>{row.t:.3f} s</time> <span>{escape(row.text)}</span></button></li>"
         for row in events
     )
     rows = rows or "<li>nothing</li>"
     return (
         '<section id="timeline"><h2>What happened</h2>'
-        f'<p class="hint">A click shows that moment in the plots.</p><ol>{rows}</ol></section>'
+        f'<p class="hint">A click shows that moment in the plots.</p><ol tabindex="0" '
+        f'aria-label="what happened">{rows}</ol></section>'
     )
+
+
+def _before(row: Happening) -> str:
+    """A fall is looked at from before it; all else from a little before to what came of it."""
+    return f' data-before="{BEFORE_FALL_S:g}"' if row.kind == "fall" else ""
 
 
 def _lost(source: Source) -> str:
@@ -183,7 +215,10 @@ def _details(title: str, body: str, *, opened: bool = False) -> str:
 
 
 def _table(names: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[int]) -> str:
-    head = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
+    head = "".join(
+        f'<th scope="col"{_class("", number=column in numbers)}>{escape(name)}</th>'
+        for column, name in enumerate(names)
+    )
     body = ""
     for row in rows:
         cells = "".join(

@@ -1,4 +1,4 @@
-"""The panels of a page: body, hand, harness, certificate, times and rates."""
+"""The panels of a page: body, hand, feet, states, harness, certificate."""
 
 from __future__ import annotations
 
@@ -8,22 +8,20 @@ from typing import Final
 import numpy as np
 
 from shared import topics
-from shared.clock import NS_PER_MS
 from shared.joints import MODULES
 from shared.messages import DriveStatus, Mode, PlannerMode, SplitSource
-from shared.topics import Topic
 from tools.reports.sheet import Limit, Line, Row, Sheet
-from tools.reports.signals import Array, seconds
-from tools.reports.source import Source, module_of
+from tools.reports.signals import Array
+from tools.reports.source import Source
+from tools.runs.verdict import LIMITS
 
 NO_WORLD: Final = "no sim/truth in this log"
 NO_PLANNER: Final = "no planner/status in this log"
 NO_HARNESS: Final = "no harness/wrench in this log"
 NO_STATES: Final = "no joint/*/state in this log"
 
-RATE_WINDOW_S: Final = 0.25
-AGE_REACH: Final = 4.0
-"""Times the greatest usable age: ages of seconds, in HOLD, would flatten all others."""
+ALLOWED: Final = {row.key: row.limit for row in LIMITS}
+"""The verdict's limits; those of a robot that is led, for the panels."""
 
 MODE_COLOURS: Final[dict[int, str]] = {
     Mode.DISARMED: "idle", Mode.HOLD: "warn", Mode.TRACK: "good",
@@ -74,44 +72,90 @@ def add_body(source: Source, sheet: Sheet) -> None:
         "COM", "mm",
         [*both("x", com[:, 0] * 1e3, p[:, 0] * 1e3, 0),
          *both("y", com[:, 1] * 1e3, p[:, 1] * 1e3, 1)],
+        limits=[*_led("alive_com_x_max_mm", "x, while led"),
+                *_led("alive_com_y_max_mm", "y, while led")],
+        note="World axes: x forward, y left; 0 is midway between the ankles.",
         otherwise=neither,
     )  # fmt: skip
     sheet.plot(
         "Height", "m",
         [Line("torso", t, torso[:, 2], 0), *both("COM", com[:, 2], p[:, 2], 1),
          Line("COM asked for", t_p, p_ref[:, 2], 2, hidden=True, dashed=True)],
-        otherwise=neither,
+        note="Above the ankles.", otherwise=neither,
     )  # fmt: skip
     sheet.plot(
         "Torso angles", "rad",
-        [line for number, name in enumerate(("roll", "pitch", "yaw"))
-         for line in both(name, angles[:, number], p[:, 3 + number], number)],
-        otherwise=neither,
+        [*(line for number, name in enumerate(("roll", "pitch", "yaw"))
+           for line in both(name, angles[:, number], p[:, 3 + number], number)),
+         Line("pitch asked for", t_p, p_ref[:, 4], 4, hidden=True, dashed=True)],
+        limits=_led("alive_roll_max_rad", "roll and yaw, while led"), otherwise=neither,
     )  # fmt: skip
     _add_hand(source, sheet)
+    _add_feet(source, sheet)
 
 
 def _add_hand(source: Source, sheet: Sheet) -> None:
-    hand, load, given, push, right, left = _truth(
-        source, "operator_force", "load_n", "harness_force_z", "push",
-        "foot_right_tilt", "foot_left_tilt",
-    )  # fmt: skip
-    t = source.times(topics.SIM_TRUTH)
-    rests, pushed = bool(load.any()), bool(push.any())
+    hand, load, given, push = _truth(source, "operator_force", "load_n", "harness_force_z", "push")
+    t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
+    wanted, assist = source.columns(topics.PLANNER_STATUS, "", "assist_wanted_n", "assist_n")
     lines = [Line("hand, z", t, hand[:, 2], 0)]
-    if rests:
+    if load.any():
         lines += [Line("weight on the harness", t, load, 1), Line("carried", t, given, 2)]
-    if pushed:
+    if wanted.any() or assist.any():
         lines += [
-            Line(f"push, {axis}", t, push[:, number], 3 + number, hidden=True)
-            for number, axis in enumerate("xyz")
-            if push[:, number].any()
+            Line("assist asked for", t_p, wanted, 6, dashed=True),
+            Line("assist, planner's", t_p, assist, 7, hidden=True),
         ]
-    sheet.plot("Operator's force", "N", lines, otherwise=NO_WORLD)
+    lines += [
+        Line(f"push, {axis}", t, push[:, number], 3 + number, hidden=True)
+        for number, axis in enumerate("xyz")
+        if push[:, number].any()
+    ]
+    sheet.plot(
+        "Operator's force", "N", lines if len(t) else [],
+        limits=_led("operator_peak_n", "hand, while led"),
+        note="World axes, on the torso.", otherwise=NO_WORLD,
+    )  # fmt: skip
+
+
+def _add_feet(source: Source, sheet: Sheet) -> None:
+    """Add whether the soles lie flat, stay where they are, and agree about the torso."""
+    right, left, slip = _truth(source, "foot_right_tilt", "foot_left_tilt", "feet_slip")
+    t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
     sheet.plot(
         "Tilt of the soles", "rad", [Line("right", t, right, 0), Line("left", t, left, 1)],
+        limits=_led("alive_sole_tilt_max_rad", "while led")[:1],
+        note="Angle between sole and floor: a foot that tips stands on an edge.",
         otherwise=NO_WORLD,
     )  # fmt: skip
+    sheet.plot(
+        "Slip of the feet", "mm", [Line("the further ankle", t, slip * 1e3, 0)],
+        note="Distance of an ankle from where it stood at the start.", otherwise=NO_WORLD,
+    )  # fmt: skip
+    mode, closure = source.columns(topics.PLANNER_STATUS, "", "mode", "closure")
+    closure = _wide(closure, 6)
+    closure[(mode == PlannerMode.WAITING) | (t_p < source.armed_s())] = np.nan
+    note = (
+        "Left minus right leg's estimate of where the torso is: the planner's own sign of a "
+        "foot that slips or tips."
+    )
+    sheet.plot(
+        "The legs' disagreement, position", "mm",
+        [Line(axis, t_p, closure[:, number] * 1e3, number) for number, axis in enumerate("xyz")],
+        note=note, otherwise=NO_PLANNER,
+    )  # fmt: skip
+    sheet.plot(
+        "The legs' disagreement, angle", "rad",
+        [Line(axis, t_p, closure[:, 3 + number], number)
+         for number, axis in enumerate(("roll", "pitch", "yaw"))],
+        otherwise=NO_PLANNER,
+    )  # fmt: skip
+
+
+def _led(key: str, label: str) -> list[Limit]:
+    """Return a limit of the verdict to both sides; drawn once a line comes near it."""
+    most = ALLOWED[key]
+    return [Limit(most, label, shown=False), Limit(-most, label, shown=False)]
 
 
 def add_states(source: Source, sheet: Sheet) -> None:
@@ -172,66 +216,6 @@ def add_certificate(source: Source, sheet: Sheet) -> None:
         note="What stands if the planner is gone: 1 is the stiffness required, 0 is a fall.",
         otherwise=NO_PLANNER,
     )  # fmt: skip
-
-
-def add_times(source: Source, sheet: Sheet) -> None:
-    """Add command ages, message rates and the planner's tick."""
-    lines = []
-    for number, module in enumerate(MODULES):
-        (age,) = source.columns(topics.JOINT_STATE, module, "age_ns")
-        age[age < 0.0] = np.nan
-        lines.append(
-            Line(module, source.times(topics.JOINT_STATE, module), age / NS_PER_MS, number)
-        )
-    limits, reach = [], None
-    note = "Age of the newest command in use, by each joint service's own clock."
-    if source.robot is not None:
-        most_ms = source.robot.joint_service.max_command_age_ms
-        limits, reach = [Limit(most_ms, "HOLD")], AGE_REACH * most_ms
-        note += f" The axis ends at {reach:g} ms."
-    sheet.plot(
-        "Command age", "ms", lines, limits=limits, reach=reach, note=note,
-        otherwise="no command was ever in use",
-    )  # fmt: skip
-    _add_rates(source, sheet)
-    t = source.times(topics.PLANNER_STATUS)
-    (tick,) = source.columns(topics.PLANNER_STATUS, "", "tick_us")
-    if tick.any():
-        sheet.plot("Planner tick", "us", [Line("tick", t, tick, 0)])
-    else:
-        sheet.left_out.append(("Planner tick", "no real time in this log"))
-
-
-def _add_rates(source: Source, sheet: Sheet) -> None:
-    lines = []
-    for number, topic in enumerate(row for row in topics.TOPICS if row.rate_hz >= 10.0):
-        t, rate = _rate(source, topic)
-        name = topic.name.replace("/*/", "/") if topic.per_module else topic.name
-        label = f"{name}, slowest module" if topic.per_module else name
-        lines.append(Line(label, t, rate, number, hidden=topic is topics.JOINT_TRACE))
-    sheet.plot(
-        "Messages recorded", "Hz", lines,
-        note=f"Mean over {RATE_WINDOW_S:g} s, by the recorder's clock.",
-        otherwise="no messages",
-    )  # fmt: skip
-
-
-def _rate(source: Source, topic: Topic) -> tuple[Array, Array]:
-    """Return messages per second in windows; of the slowest module that is there."""
-    begin, end = source.span
-    edges = np.arange(begin, end, RATE_WINDOW_S)
-    if len(edges) < 2:
-        return np.zeros(0), np.zeros(0)
-    counts = []
-    for key in topics.keys(topic, source.log.robot):
-        received = source.log.received_ns(topic, module_of(topic, key))
-        if received:
-            t = seconds(received, source.zero_ns)
-            counts.append(np.histogram(t, edges)[0])
-    if not counts:
-        return np.zeros(0), np.zeros(0)
-    rate = np.min(counts, axis=0) / RATE_WINDOW_S
-    return edges[:-1] + RATE_WINDOW_S / 2, rate.astype(np.float64)
 
 
 def _truth(source: Source, *names: str) -> list[Array]:

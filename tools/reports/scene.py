@@ -242,9 +242,11 @@ def product(a: Quaternion, b: Quaternion) -> Quaternion:
 def along(direction: Vector3) -> Quaternion:
     """Return the turn that takes x to a direction, which is not zero."""
     x, y, z = (part / math.hypot(*direction) for part in direction)
-    if x < -1.0 + 1e-12:
+    across = y * y + z * z
+    beyond = across / (1.0 - x) if x < 0.0 else 1.0 + x  # 1 + x, also where that is all but 0
+    if beyond < 1e-24:
         return 0.0, 0.0, 1.0, 0.0
-    w = math.sqrt((1.0 + x) / 2)
+    w = math.sqrt(beyond / 2)
     return 0.0, -z / (2 * w), y / (2 * w), w
 
 

@@ -45,7 +45,8 @@ class Happening(NamedTuple):
 
     t: float
     kind: str
-    """`kill`, `restart`, `push`, `fault`, `estop`: also a mark in the plots; others are not."""
+    """`kill`, `restart`, `push`, `fault`, `network`, `estop`, `fall`: also a mark in the plots;
+    `limit`, `bad` and `note` are not."""
     text: str
     mark: str = ""
     """What the mark says; empty: no mark."""
@@ -58,6 +59,7 @@ class Sheet:
         self.span = span
         self.signals: list[dict[str, Any]] = []
         self.panels: list[dict[str, Any]] = []
+        self._places: dict[tuple[Any, ...], int] = {}
         self.left_out: list[tuple[str, str]] = []
         """(panel, why) of what the log has no data for."""
 
@@ -174,17 +176,23 @@ class Sheet:
         for line in lines:
             signal = packed(line.t, line.values, self.span)
             if signal is not None:
-                self.signals.append(signal)
                 found.append(
                     {
                         "label": line.label,
-                        "signal": len(self.signals) - 1,
+                        "signal": self._place(signal),
                         "colour": line.colour,
                         "hidden": line.hidden,
                         "dashed": line.dashed,
                     }
                 )
         return found
+
+    def _place(self, signal: dict[str, Any]) -> int:
+        """Return where a signal is among all; one that is there already is not kept twice."""
+        place = self._places.setdefault(tuple(signal.values()), len(self.signals))
+        if place == len(self.signals):
+            self.signals.append(signal)
+        return place
 
 
 def _levels(limits: Sequence[Limit]) -> list[dict[str, Any]]:

@@ -18,7 +18,8 @@ from shared.clock import NS_PER_S
 Array = NDArray[np.float64]
 
 BINS: Final = 4500
-"""Of each signal, over the whole run: 13 ms in a run of a minute."""
+"""Of each signal, over the whole run: 13 ms in a run of a minute. A bin has two places: two
+extremes, or one sample in that half of the bin in which it was taken."""
 BIN_MIN_S: Final = 0.002
 GAP_S: Final = 0.1
 """A signal that is silent for longer is interrupted in the plot."""
@@ -44,29 +45,39 @@ class Span(NamedTuple):
         return max((self.end - self.begin) / BINS, BIN_MIN_S)
 
 
-def seconds(stamps_ns: list[int], zero_ns: int) -> Array:
+def seconds(stamps_ns: list[int], zero_ns: int, heard_ns: list[int] | None = None) -> Array:
     """Return times in s that rise.
 
     A joint service whose drive is silent goes on saying when its last sample came: messages
-    with the same stamp are spread over the time until the next one, at most at half the
-    usual rate.
+    with the same stamp come as far after the first as they were heard after it, but before
+    the next stamp. Those that were heard at once (in virtual time, all) are spread until then,
+    at half the usual rate or faster.
 
     Args:
         stamps_ns: of messages, in the order in which they came.
         zero_ns: time zero.
+        heard_ns: when each message was heard, by another clock perhaps; None: the stamps are
+            these times.
     """
-    t = (np.array(stamps_ns, dtype=np.int64) - zero_ns) / NS_PER_S
-    t = np.maximum.accumulate(t) if len(t) else t
-    steps = np.diff(t)
-    if not len(steps) or steps.all():
+    stamps = np.maximum.accumulate(np.array(stamps_ns, dtype=np.int64))
+    t = (stamps - zero_ns) / NS_PER_S
+    if not len(t) or np.diff(stamps).all():
         return t
-    usual = float(np.median(steps[steps > 0.0])) if steps.any() else 0.0
-    starts = np.flatnonzero(np.concatenate(([True], steps > 0.0)))
+    starts = np.flatnonzero(np.concatenate(([True], np.diff(stamps) > 0)))
     counts = np.diff(np.append(starts, len(t)))
-    until = np.append(t[starts[1:]], t[-1] + usual * counts[-1])
-    step = np.minimum((until - t[starts]) / counts, 2.0 * usual)
+    room = np.repeat(counts, counts)
     within = np.arange(len(t)) - np.repeat(starts, counts)
-    return np.asarray(t + within * np.repeat(step, counts), dtype=np.float64)
+    steps = np.diff(t)
+    usual = float(np.median(steps[steps > 0.0])) if steps.any() else 0.0
+    until = np.repeat(np.append(t[starts[1:]], np.inf), counts)
+    later = within * usual * np.where(np.isfinite(until), 2.0, 1.0)
+    if heard_ns is not None:
+        heard = np.maximum.accumulate(np.array(heard_ns, dtype=np.int64))
+        after = (heard - np.repeat(heard[starts], counts)) / NS_PER_S
+        told = np.repeat(np.maximum.reduceat(after, starts) > 0.0, counts)
+        later = np.where(told, after, later)
+    latest = t + (until - t) * (within + 1) / (room + 1)
+    return np.asarray(np.minimum(t + later, np.where(within > 0, latest, t)), dtype=np.float64)
 
 
 def packed(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
@@ -82,17 +93,20 @@ def packed(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
     if not len(t):
         return None
     width = span.bin_s
-    bins = ((t - span.begin) / width).astype(np.int64)
+    places = (t - span.begin) / width
+    bins = places.astype(np.int64)
     starts = np.flatnonzero(np.concatenate(([True], np.diff(bins) > 0)))
-    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-    first, second = _ordered(values, starts, low, high)
-    lo, hi = float(low.min()), float(high.max())
+    first, second = _extremes(values, starts)
+    lo, hi = float(values.min()), float(values.max())
     step = (hi - lo) / STEPS
     codes = np.full((int(bins[-1] - bins[0]) + 1, 2), SKIP, dtype=np.int16)
-    places = bins[starts] - bins[0]
     for column, extremes in enumerate((first, second)):
         scaled = np.rint((extremes - lo) / step) if step > 0.0 else np.zeros(len(extremes))
-        codes[places, column] = np.clip(scaled, 0, STEPS).astype(np.int64) + FIRST
+        coded = np.clip(scaled, 0, STEPS).astype(np.int64) + FIRST
+        codes[bins[starts] - bins[0], column] = coded
+    alone = starts[np.diff(np.append(starts, len(t))) == 1]
+    late = (places[alone] - bins[alone] >= 0.5).astype(np.int64)
+    codes[bins[alone] - bins[0], 1 - late] = SKIP  # one sample is one point, in its own half
     silent = np.flatnonzero(np.diff(t) > _gap(t))
     after = bins[silent] - bins[0] + 1
     after = after[after < bins[silent + 1] - bins[0]]
@@ -112,10 +126,9 @@ def _gap(t: Array) -> float:
     return max(GAP_S, 5.0 * usual)
 
 
-def _ordered(
-    values: Array, starts: NDArray[np.int64], low: Array, high: Array
-) -> tuple[Array, Array]:
+def _extremes(values: Array, starts: NDArray[np.int64]) -> tuple[Array, Array]:
     """Return the two extremes of each bin, that which came first before the other."""
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     counts = np.diff(np.append(starts, len(values)))
     places = np.arange(len(values))
     beyond = len(values)

@@ -10,6 +10,8 @@ from shared import topics
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.exceptions import XrlError
+from shared.joints import MODULES
+from shared.messages import DriveStatus
 from shared.topics import Topic
 from tools.explain import robot_of
 from tools.reports.signals import Array, Span, seconds
@@ -68,7 +70,7 @@ class Source:
                 message.t_ns if message.t_ns >= earliest_ns else heard_ns
                 for message, heard_ns in zip(messages, received, strict=True)
             ]
-            found = seconds(stamps, self.zero_ns)
+            found = seconds(stamps, self.zero_ns, received)
             self._times[topic.name, module] = found
         return found
 
@@ -79,6 +81,20 @@ class Source:
             np.array([getattr(message, name) for message in messages], dtype=np.float64)
             for name in names
         ]
+
+    def armed_s(self) -> float:
+        """Return when all six drives were armed for the first time, s; if never, the begin.
+
+        What is told before then is about a robot that does not stand yet.
+        """
+        found = []
+        for module in MODULES:
+            (drive,) = self.columns(topics.JOINT_STATE, module, "drive")
+            armed = np.flatnonzero(drive == DriveStatus.ARMED)
+            if not len(armed):
+                return self.span.begin
+            found.append(float(self.times(topics.JOINT_STATE, module)[armed[0]]))
+        return max(found)
 
     def has(self, topic: Topic, module: str = "") -> bool:
         """Return True if there is at least one message."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from shared.messages import (
     Tare,
     Wrench,
 )
+from tools.reports.crossings import crossings
+from tools.reports.network import injections
 from tools.reports.sheet import Happening
 from tools.reports.signals import GAP_S, seconds
 from tools.reports.source import Source
@@ -31,6 +33,8 @@ from tools.reports.source import Source
 TOGETHER_S: Final = 0.1
 """The same change of several modules within this time is told in one line."""
 LINES_MAX: Final = 500
+
+Row = TypeVar("Row", bound=tuple[Any, ...])
 
 KINDS: Final = {
     RunEventKind.KILLED: "kill",
@@ -52,6 +56,8 @@ def happenings(source: Source) -> list[Happening]:
         *_harness(source),
         *_world(source),
         *_silences(source),
+        *crossings(source),
+        *injections(source),
     ]
     found.sort(key=lambda row: row.t)
     if len(found) > LINES_MAX:
@@ -75,13 +81,13 @@ def _from_outside(source: Source) -> Iterator[Happening]:
     events: list[RunEvent] = source.log.messages(topics.RUN_EVENT)
     for event in events:
         kind = KINDS.get(_known(RunEventKind, event.kind), "note")
-        text = " ".join((event.subject, _word(RunEventKind, event.kind), event.detail)).strip()
+        text = _said(event)
         mark = ""
         if kind != "note":
             mark = f"{event.subject} {event.detail}".strip() if kind != "restart" else ""
             mark = mark or f"{event.subject} back"
         if kind == "push":
-            text, mark = f"push {event.detail}", f"push {event.detail.partition(' for ')[0]}"
+            mark = f"push {event.detail.partition(' for ')[0]}"
         yield Happening(_at(source, event.t_ns), kind, text, mark)
     last = None
     for stop in source.log.messages(topics.ESTOP):
@@ -93,39 +99,63 @@ def _from_outside(source: Source) -> Iterator[Happening]:
         yield Happening(_at(source, request.t_ns), "note", f"tare asked for by {request.source}")
 
 
+def _said(event: RunEvent) -> str:
+    words = {
+        RunEventKind.STARTED: f"{event.subject} starts",
+        RunEventKind.KILLED: f"{event.subject} gets SIG{event.detail}",
+        RunEventKind.RESTARTED: f"{event.subject} is started again",
+        RunEventKind.PUSHED: f"push {event.detail}",
+        RunEventKind.FINISHED: f"{event.subject} ends {event.detail}".strip(),
+        RunEventKind.FAULTED: f"{event.subject}: fault {event.detail} begins",
+    }
+    other = f"{event.subject} {_word(RunEventKind, event.kind)} {event.detail}"
+    return words.get(_known(RunEventKind, event.kind), other.strip())
+
+
 def _changes_of_mode(source: Source) -> Iterator[Happening]:
-    changes: list[tuple[int, str, JointEvent]] = sorted(
-        (event.t_ns, module, event)
+    changes: list[tuple[float, str, JointEvent]] = sorted(
+        (_at(source, event.t_ns), module, event)
         for module in MODULES
         for event in source.log.messages(topics.JOINT_EVENT, module)
     )
-    while changes:
-        t_ns, _, first = changes[0]
-        alike = [
-            row
-            for row in changes
-            if row[0] - t_ns <= TOGETHER_S * NS_PER_S
-            and (row[2].mode_before, row[2].mode_after, row[2].cause)
-            == (first.mode_before, first.mode_after, first.cause)
-        ]
-        changes = [row for row in changes if row not in alike]
-        yield Happening(_at(source, t_ns), _severity(first), _change_in_words(alike))
+    for alike in _together(
+        changes, lambda row: (row[2].mode_before, row[2].mode_after, row[2].cause)
+    ):
+        t, _, first = alike[0]
+        yield Happening(t, _severity(first), _change_in_words(alike))
+
+
+def _together(changes: Sequence[Row], what: Callable[[Row], Any]) -> list[list[Row]]:
+    """Return rows, which begin with their time, in groups: the same, at about the same time."""
+    groups: list[list[Row]] = []
+    open_: dict[Any, list[Row]] = {}
+    for row in changes:
+        group = open_.get(what(row))
+        if group is None or row[0] - group[0][0] > TOGETHER_S:
+            group = open_[what(row)] = []
+            groups.append(group)
+        group.append(row)
+    return groups
+
+
+def _who(found: Iterable[str]) -> str:
+    modules = sorted(set(found), key=MODULES.index)
+    return "all six" if len(modules) == len(MODULES) else ", ".join(modules)
 
 
 def _severity(event: JointEvent) -> str:
     return "bad" if event.mode_after in (Mode.FAULT, Mode.DAMP) else "note"
 
 
-def _change_in_words(alike: Sequence[tuple[int, str, JointEvent]]) -> str:
+def _change_in_words(alike: Sequence[tuple[float, str, JointEvent]]) -> str:
     first = alike[0][2]
-    modules = sorted({module for _, module, _ in alike}, key=MODULES.index)
-    who = "all six" if len(modules) == len(MODULES) else ", ".join(modules)
+    who = _who(module for _, module, _ in alike)
     step = max(
         abs(b - a)
         for _, _, event in alike
         for a, b in zip(event.tau_before, event.tau_after, strict=True)
     )
-    within_ms = (alike[-1][0] - alike[0][0]) / NS_PER_MS
+    within_ms = (alike[-1][0] - alike[0][0]) * 1e3
     text = (
         f"{who}: {_word(Mode, first.mode_before)} to {_word(Mode, first.mode_after)}, "
         f"{_word(Cause, first.cause)}"
@@ -139,20 +169,33 @@ def _change_in_words(alike: Sequence[tuple[int, str, JointEvent]]) -> str:
 
 
 def _drives(source: Source) -> Iterator[Happening]:
+    changes: list[tuple[float, str, JointState, JointState]] = []
     for module in MODULES:
         states: list[JointState] = source.log.messages(topics.JOINT_STATE, module)
         t = source.times(topics.JOINT_STATE, module)
-        for index in _changes([(state.drive, state.drive_error) for state in states]):
-            before, after = states[index - 1], states[index]
-            parts = []
-            if before.drive != after.drive:
-                parts.append(
-                    f"drive {_word(DriveStatus, before.drive)} to {_word(DriveStatus, after.drive)}"
-                )
-            if before.drive_error != after.drive_error:
-                parts.append(f"error bits {after.drive_error:#x}")
-            kind = "note" if after.drive == DriveStatus.ARMED else "bad"
-            yield Happening(float(t[index]), kind, f"{module}: {', '.join(parts)}")
+        changes += [
+            (float(t[index]), module, states[index - 1], states[index])
+            for index in _changes([(state.drive, state.drive_error) for state in states])
+        ]
+    changes.sort(key=lambda row: row[0])
+    for alike in _together(changes, _what_of_drive):
+        t_s, _, before, after = alike[0]
+        worse = after.drive != DriveStatus.ARMED and before.drive == DriveStatus.ARMED
+        bad = worse or after.drive == DriveStatus.ERROR or after.drive_error != 0
+        who = _who(module for _, module, _, _ in alike)
+        yield Happening(t_s, "bad" if bad else "note", f"{who}: {_what_of_drive(alike[0])}")
+
+
+def _what_of_drive(row: tuple[float, str, JointState, JointState]) -> str:
+    _, _, before, after = row
+    parts = []
+    if before.drive != after.drive:
+        parts.append(
+            f"drive {_word(DriveStatus, before.drive)} to {_word(DriveStatus, after.drive)}"
+        )
+    if before.drive_error != after.drive_error:
+        parts.append(f"error bits {after.drive_error:#x}")
+    return ", ".join(parts)
 
 
 def _planner(source: Source) -> Iterator[Happening]:
@@ -181,22 +224,38 @@ def _world(source: Source) -> Iterator[Happening]:
     rows: list[SimTruth] = source.log.messages(topics.SIM_TRUTH)
     for row in rows:
         if row.fallen:
-            yield Happening(_at(source, row.t_ns), "kill", "the robot fell", "fell")
+            yield Happening(_at(source, row.t_ns), "fall", "the robot fell", "fell")
             return
 
 
 def _silences(source: Source) -> Iterator[Happening]:
-    """Tell where a topic with a rate said nothing for long, as the recorder heard it."""
+    """Tell where topics with a rate said nothing for long, as the recorder heard them."""
+    found: list[tuple[float, str, float]] = []
     for key, topic in topics.all_keys(source.log.robot).items():
         if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
             continue
-        name = key.removeprefix(f"xrl/{source.log.robot}/")
-        if topic is topics.JOINT_COMMAND and not name.startswith(f"joint/{MODULES[0]}/"):
-            continue  # the planner's six fall silent together
         t = seconds([row[0] for row in source.log.raw(key)], source.zero_ns)
         steps = np.diff(t)
-        for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz)):
-            yield Happening(float(t[index]), "note", f"{name} silent for {steps[index]:.2f} s")
+        name = key.removeprefix(f"xrl/{source.log.robot}/")
+        found += [
+            (float(t[index]), name, float(steps[index]))
+            for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz))
+        ]
+    for alike in _together(sorted(found), lambda _: None):
+        names = _folded([name for _, name, _ in alike])
+        longest = max(length for *_, length in alike)
+        word = "silent for up to" if len(alike) > 1 else "silent for"
+        yield Happening(alike[0][0], "note", f"{', '.join(names)} {word} {longest:.2f} s")
+
+
+def _folded(names: Sequence[str]) -> list[str]:
+    """Return names; those of all six modules as one."""
+    left = list(dict.fromkeys(names))
+    for topic in topics.TOPICS:
+        six = [topic.name.replace("*", module) for module in MODULES]
+        if topic.per_module and set(six) <= set(left):
+            left = [topic.name, *(name for name in left if name not in six)]
+    return left
 
 
 def _changes(values: Sequence[Any]) -> list[int]:

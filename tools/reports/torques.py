@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, TypeAlias
 
 import msgspec
 import numpy as np
@@ -16,6 +16,9 @@ from tools.reports.sheet import Limit, Line, Sheet
 from tools.reports.signals import Array
 from tools.reports.source import Source
 
+Sets: TypeAlias = dict[str, tuple[list[Line], list[Limit]]]
+"""Lines and levels of each joint."""
+
 NO_STATES: Final = "no joint/*/state in this log"
 
 
@@ -24,28 +27,43 @@ class Origins(msgspec.Struct):
 
     feedforward: Array
     coupled: Array
+    """As the planner sent it."""
     local: Array
     """k_p (q_ref - q) + k_d (v_ref - v)."""
+    taken_off: Array
+    """What the service sent less these: what the gate cut off, and what of `coupled` it left
+    out because the commands' ages were unsteady."""
 
 
 def add_joints(source: Source, sheet: Sheet) -> None:
     """Add the joints' panels."""
     robot = source.robot
     most = robot.joint.tau_module_max if robot is not None else None
-    sums, torques, angles, peaks = [], {}, {}, {}
+    sums: list[Line] = []
+    torques: Sets = {}
+    angles: Sets = {}
+    rates: Sets = {}
+    peaks: dict[str, float] = {}
     for number, module in enumerate(MODULES):
         t = source.times(topics.JOINT_STATE, module)
         if not len(t):
             continue
-        tau, q = source.columns(topics.JOINT_STATE, module, "tau", "q")
+        tau, q, v = source.columns(topics.JOINT_STATE, module, "tau", "q", "v")
         sums.append(Line(module, t, np.abs(tau).sum(axis=1), number))
         found = origins(source, robot, module) if robot is not None else None
-        q_ref = _references(source, module)
+        t_ref, q_ref, v_ref = _references(source, module)
         for axis, name in enumerate(AXES):
             joint = f"{module}_{name}"
             peaks[joint] = float(np.abs(tau[:, axis]).max())
             torques[joint] = (_torques(t, tau, found, axis), _torque_limits(most))
-            angles[joint] = _angles(source, module, axis, Line("q", t, q[:, axis], 0), q_ref)
+            angles[joint] = (
+                [Line("q", t, q[:, axis], 0), Line("q_ref", t_ref, q_ref[:, axis], 1)],
+                _stops(source, module, axis),
+            )
+            rates[joint] = (
+                [Line("v", t, v[:, axis], 0), Line("v_ref", t_ref, v_ref[:, axis], 1)],
+                [],
+            )
     sheet.plot(
         "Torque of each module against its limit", "N m", sums,
         limits=[Limit(most, "limit")] if most is not None else [],
@@ -62,6 +80,7 @@ def add_joints(source: Source, sheet: Sheet) -> None:
     sheet.choice("Torque of one joint, by origin", "N m", "joint", torques, initial=hardest,
                  note=note, otherwise=NO_STATES)  # fmt: skip
     sheet.choice("Angle of one joint", "rad", "joint", angles, initial=hardest, otherwise=NO_STATES)
+    sheet.choice("Rate of one joint", "rad/s", "joint", rates, initial=hardest, otherwise=NO_STATES)
 
 
 def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
@@ -74,7 +93,7 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
     commands: list[JointCommand] = source.log.messages(topics.JOINT_COMMAND, module)
     known = {(command.session, command.seq): command for command in commands}
     shape = (len(states), 2)
-    found = Origins(*(np.full(shape, np.nan) for _ in range(3)))
+    found = Origins(*(np.full(shape, np.nan) for _ in range(4)))
     blend_ns = robot.joint_service.blend_ms * NS_PER_MS
     aging_max_s = robot.joint_service.command_aging_max_ms / 1e3
     tracking_since_ns: int | None = None
@@ -96,6 +115,8 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
             found.local[index, axis] = command.k_p[axis] * (q_ref - state.q[axis]) + command.k_d[
                 axis
             ] * (v_ref - state.v[axis])
+    sent = np.array([state.tau for state in states]).reshape(shape)
+    found.taken_off = sent - found.feedforward - found.coupled - found.local
     return found
 
 
@@ -104,11 +125,12 @@ def _torques(t: Array, tau: Array, found: Origins | None, axis: int) -> list[Lin
     if found is not None:
         lines += [
             Line("tau_ff", t, found.feedforward[:, axis], 1),
-            Line("tau_coupled", t, found.coupled[:, axis], 2),
+            Line("tau_coupled, as sent", t, found.coupled[:, axis], 2),
             Line("local PD", t, found.local[:, axis], 3),
+            Line("taken off by the service", t, found.taken_off[:, axis], 5, hidden=True),
         ]
-    sibling = np.abs(tau[:, 1 - axis])
-    return [*lines, Line(f"|tau_{AXES[1 - axis]}|", t, sibling, 4, hidden=True, dashed=True)]
+    sibling = f"total of {AXES[1 - axis]}"
+    return [*lines, Line(sibling, t, tau[:, 1 - axis], 4, hidden=True, dashed=True)]
 
 
 def _torque_limits(most: float | None) -> list[Limit]:
@@ -117,18 +139,16 @@ def _torque_limits(most: float | None) -> list[Limit]:
     return [Limit(most, "limit", shown=False), Limit(-most, "limit", shown=False)]
 
 
-def _references(source: Source, module: str) -> tuple[Array, Array]:
+def _references(source: Source, module: str) -> tuple[Array, Array, Array]:
     t = source.times(topics.JOINT_COMMAND, module)
-    (q_ref,) = source.columns(topics.JOINT_COMMAND, module, "q_ref")
-    return t, q_ref if q_ref.ndim == 2 else np.zeros((0, 2))
+    q_ref, v_ref = source.columns(topics.JOINT_COMMAND, module, "q_ref", "v_ref")
+    if q_ref.ndim != 2:
+        q_ref = v_ref = np.zeros((0, 2))
+    return t, q_ref, v_ref
 
 
-def _angles(
-    source: Source, module: str, axis: int, measured: Line, references: tuple[Array, Array]
-) -> tuple[list[Line], list[Limit]]:
-    t, q_ref = references
-    limits = []
-    if source.robot is not None:
-        low, high = source.robot.joint_limits()[2 * MODULES.index(module) + axis]
-        limits = [Limit(low, "soft stop", shown=False), Limit(high, "soft stop", shown=False)]
-    return [measured, Line("q_ref", t, q_ref[:, axis], 1)], limits
+def _stops(source: Source, module: str, axis: int) -> list[Limit]:
+    if source.robot is None:
+        return []
+    low, high = source.robot.joint_limits()[2 * MODULES.index(module) + axis]
+    return [Limit(low, "soft stop", shown=False), Limit(high, "soft stop", shown=False)]

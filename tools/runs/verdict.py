@@ -116,7 +116,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "world_time_lost_s": last.late_s,
         "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
     }
-    alive = (t < kill_s) & _leading(log, truth)
+    alive = leading(log, np.array([row.t_ns for row in truth]))
     poses = np.array([(*row.com, *row.angles) for row in truth])
     for prefix, mask in (("", t >= 0.0), ("alive_", alive), ("hold_", ~alive)):
         summary |= _extent(prefix, poses[mask])
@@ -174,22 +174,27 @@ def _transitions(log: RunLog, module: str) -> list[JointEvent]:
     return events
 
 
-def _leading(log: RunLog, truth: Sequence[SimTruth]) -> NDArray[np.bool_]:
-    """Return, for each row, whether all six modules were in TRACK.
+def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return, for each time, whether the planner is taken to lead: what is judged by its limits.
 
-    Only where the network was impaired on purpose: HOLD is then what is to be expected. A module
-    that drops out otherwise is no excuse.
+    Until the first kill. Where the network was impaired on purpose, while all six modules track:
+    HOLD is then what is to be expected. A module that drops out otherwise is no excuse.
+
+    Args:
+        log: the run.
+        times_ns: monotonic, as of messages.
     """
-    leading = np.ones(len(truth), dtype=bool)
+    events: list[RunEvent] = log.messages(topics.RUN_EVENT)
+    kills = [row.t_ns for row in events if row.kind == RunEventKind.KILLED]
+    led = times_ns < (kills[0] if kills else np.iinfo(np.int64).max)
     if not log.count(topics.LINK_EVENT.key(log.robot)):
-        return leading
-    times = np.array([row.t_ns for row in truth])
+        return led
     for module in MODULES:
-        rows = [row for row in _transitions(log, module) if row.mode_after != row.mode_before]
-        at = np.searchsorted([row.t_ns for row in rows], times, side="right") - 1
+        rows = _transitions(log, module)
+        at = np.searchsorted([row.t_ns for row in rows], times_ns, side="right") - 1
         modes = np.array([row.mode_after for row in rows] or [Mode.DISARMED])
-        leading &= modes[at] == Mode.TRACK
-    return leading
+        led &= modes[at] == Mode.TRACK
+    return led
 
 
 def _command_age(log: RunLog, start_ns: int) -> dict[str, float] | None:

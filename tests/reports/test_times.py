@@ -1,0 +1,131 @@
+"""Ages, rates, late cycles; what the timeline says together; the network's impairments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from shared import topics
+from shared.joints import MODULES
+from shared.messages import DriveStatus
+from shared.traces import LinkEvent
+from tests.reports import pages, runs
+from tools.reports.network import Link
+from tools.reports.page import render
+from tools.reports.source import Source
+from tools.reports.timeline import happenings
+from tools.runs.run_log import RunLog
+
+
+def test_the_cycles_of_a_service_come_at_its_rate(page: str) -> None:
+    for module in MODULES:
+        _, rate = pages.line(pages.data_of(page), "Control cycles of each service", module)
+        assert np.abs(rate - 500.0).max() < 10.0
+
+
+def test_late_cycles_are_counted_from_the_arming_on_and_across_a_restart(
+    log: RunLog, tmp_path: Path
+) -> None:
+    source = Source(log)
+    begin_ns = source.zero_ns + round(source.armed_s() * 1e9)
+
+    def late(name: str, body: bytes) -> bytes:
+        """40 while it starts up; then one in 0.1 s; restarted at 2 s, it counts from 0."""
+        if name != "joint/hip_right/state":
+            return body
+        state = msgspec.json.decode(body)
+        t = (state["t_ns"] - source.zero_ns) / 1e9
+        since = (state["t_ns"] - begin_ns) / 1e9
+        state["late"] = 40 + int(10.0 * max(0.0, since)) if t < 2.0 else int(10.0 * (t - 2.0))
+        return msgspec.json.encode(state)
+
+    page = render(runs.rewritten(log, tmp_path, payload=late))
+    _, counted = pages.line(pages.data_of(page), "Control cycles that came late", "hip_right")
+    assert counted[0] == 0.0
+    assert counted[-1] == pytest.approx(10.0 * (4.0 - source.armed_s()), abs=3.0)
+    assert (np.diff(counted[np.isfinite(counted)]) >= 0.0).all()
+
+
+def test_what_virtual_time_cannot_tell_is_left_out(page: str) -> None:
+    for line in (
+        "Control cycles that came late: none came late",
+        "Planner tick: no real time in this log",
+    ):
+        assert f"<li>{line}</li>" in page
+
+
+def test_a_machine_too_slow_is_said_beside_the_verdict(log: RunLog, tmp_path: Path) -> None:
+    def slow(name: str, body: bytes) -> bytes:
+        return body.replace(b'"late_s":0.0', b'"late_s":1.5') if name == "sim/truth" else body
+
+    about = {key: value for key, value in log.metadata["run"].items() if key != "lockstep"}
+    page = render(runs.rewritten(log, tmp_path, payload=slow, about=about))
+    caution = page.partition('<p class="caution">')[2].partition("</p>")[0]
+    assert "too slow for real time" in caution
+    assert "1.50 s" in caution
+    assert 'class="caution">' not in render(log), "virtual time is never too slow"
+
+
+def test_drives_that_come_up_together_are_one_line_and_no_alarm(
+    log: RunLog, tmp_path: Path
+) -> None:
+    source = Source(log)
+
+    def coming_up(name: str, body: bytes) -> bytes:
+        if not name.endswith("/state") or not name.startswith("joint/"):
+            return body
+        state = msgspec.json.decode(body)
+        t = (state["t_ns"] - source.zero_ns) / 1e9
+        if t < -2.0:
+            state["drive"] = int(DriveStatus.LOST if t < -2.1 else DriveStatus.IDLE)
+        if 3.0 <= t < 3.1 and name == "joint/knee_left/state":
+            state["drive"] = int(DriveStatus.IDLE)
+        return msgspec.json.encode(state)
+
+    rows = happenings(Source(runs.rewritten(log, tmp_path, payload=coming_up)))
+    told = {row.text: row.kind for row in rows if "drive" in row.text}
+    assert told["all six: drive LOST to IDLE"] == "note"
+    assert told["all six: drive IDLE to ARMED"] == "note"
+    assert told["knee_left: drive ARMED to IDLE"] == "bad"
+
+
+def impairment(number: int, link: str, t_ns: int, *, begins: bool, cut: bool) -> LinkEvent:
+    return LinkEvent(
+        t_ns=t_ns, seq=number, link=link, asked="planner->left", number=number, in_force=begins,
+        delay_ms=0.0 if cut else 5.0, jitter_ms=0.0, loss=0.0, partition=cut,
+        detail="partition" if cut else "delay=5", passed=0 if begins else 20,
+        lost=0 if begins else 7,
+    )  # fmt: skip
+
+
+def test_what_was_injected_into_the_network_is_a_panel_marks_and_lines(
+    log: RunLog, tmp_path: Path
+) -> None:
+    source = Source(log)
+    more: list[tuple[int, str, bytes]] = []
+    for number, cut, begin, end in ((1, False, 0.5, 2.0), (2, True, 1.0, 1.5)):
+        for t, begins in ((begin, True), (end, False)):
+            for module in ("ankle_left", "knee_left", "hip_left"):
+                t_ns = source.zero_ns + round(t * 1e9)
+                event = impairment(number, f"planner->{module}", t_ns, begins=begins, cut=cut)
+                more.append((t_ns, topics.LINK_EVENT.name, msgspec.json.encode(event)))
+    data, rows = panel_and_rows(runs.rewritten(log, tmp_path, more=more))
+    (row,) = pages.panel(data, "Network, as injected")["rows"]
+    assert row["label"] == "to left"
+    assert [(pytest.approx(a, abs=1e-3), code) for a, _, code in row["spans"][1:]] == [
+        (0.5, Link.IMPAIRED), (1.0, Link.CUT), (1.5, Link.IMPAIRED), (2.0, Link.CLEAR),
+    ]  # fmt: skip
+    assert [mark[2] for mark in data["marks"] if mark[1] == "network"] == ["delay=5", "partition"]
+    assert "network, to left: partition ends; 60 messages passed, 21 lost" in rows
+
+
+def panel_and_rows(log: RunLog) -> tuple[dict[str, Any], list[str]]:
+    return pages.data_of(render(log)), [row.text for row in happenings(Source(log))]
+
+
+def test_a_log_with_nothing_injected_says_so(page: str) -> None:
+    assert "<li>Network, as injected: nothing was injected into the network" in page

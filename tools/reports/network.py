@@ -1,0 +1,103 @@
+"""What was done to the network on purpose: a panel of bars, and lines of the timeline."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from shared import topics
+from shared.clock import NS_PER_S
+from shared.links import GROUPS
+from shared.traces import LinkEvent
+from tools.reports.sheet import Happening, Row, Sheet
+from tools.reports.signals import GAP_S
+from tools.reports.source import Source
+
+NOTHING_DONE: Final = "nothing was injected into the network, as far as this log says"
+
+
+class Link(IntEnum):
+    """What is done to one direction of a link."""
+
+    CLEAR = 0
+    IMPAIRED = 1
+    """Delayed, or lossy."""
+    CUT = 2
+
+
+COLOURS: Final[dict[int, str]] = {Link.CLEAR: "good", Link.IMPAIRED: "warn", Link.CUT: "bad"}
+History = tuple[tuple[float, Link], ...]
+
+
+def add_network(source: Source, sheet: Sheet) -> None:
+    """Add the directions that were impaired; those that fared alike in one row."""
+    alike: dict[History, list[str]] = defaultdict(list)
+    for name, history in _histories(source).items():
+        alike[history].append(name)
+    rows = [_row(source, label, history) for history, names in alike.items()
+            for label in _labels(names)]  # fmt: skip
+    sheet.bars("Network, as injected", rows, Link, COLOURS, otherwise=NOTHING_DONE)
+
+
+def injections(source: Source) -> Iterator[Happening]:
+    """Yield when an impairment begins and ends; all its directions at once."""
+    groups: dict[tuple[int, int, bool], list[LinkEvent]] = defaultdict(list)
+    events: list[LinkEvent] = source.log.messages(topics.LINK_EVENT)
+    for event in events:
+        groups[event.number, event.t_ns, event.in_force].append(event)
+    for (_, t_ns, begins), group in groups.items():
+        first = group[0]
+        what = f"network, {_short(first.asked)}: {first.detail}"
+        t = (t_ns - source.zero_ns) / NS_PER_S
+        if begins:
+            yield Happening(t, "network", what, first.detail)
+            continue
+        passed, lost = (sum(getattr(row, name) for row in group) for name in ("passed", "lost"))
+        yield Happening(t, "note", f"{what} ends; {passed} messages passed, {lost} lost")
+
+
+def _histories(source: Source) -> dict[str, History]:
+    """Return (time, what is in force from then on) of each direction that was ever impaired."""
+    found: dict[str, list[tuple[float, Link]]] = defaultdict(list)
+    in_force: dict[str, dict[int, bool]] = defaultdict(dict)
+    events: list[LinkEvent] = source.log.messages(topics.LINK_EVENT)
+    for event in events:
+        cuts = in_force[event.link]
+        if event.in_force:
+            cuts[event.number] = event.partition
+        else:
+            cuts.pop(event.number, None)
+        now = Link.CUT if any(cuts.values()) else Link.IMPAIRED if cuts else Link.CLEAR
+        found[event.link].append(((event.t_ns - source.zero_ns) / NS_PER_S, now))
+    return {name: tuple(history) for name, history in found.items()}
+
+
+def _row(source: Source, label: str, history: History) -> Row:
+    """Return a history as samples that are close enough to be one bar."""
+    begin, end = source.span
+    changes = np.array([t for t, _ in history])
+    codes = np.array([Link.CLEAR, *(code for _, code in history)])
+    t = np.union1d(np.arange(begin, end, GAP_S / 2), changes)
+    return Row(label, t, codes[np.searchsorted(changes, t, side="right")])
+
+
+def _labels(names: Iterable[str]) -> list[str]:
+    """Return directions in few words: the greatest groups that they make up, then the rest."""
+    left, found = set(names), []
+    for group, members in sorted(GROUPS.items(), key=lambda item: -len(item[1])):
+        if set(members) <= left:
+            found.append(group)
+            left -= set(members)
+    found += sorted(left)
+    return [_short(name) for name in found]
+
+
+def _short(name: str) -> str:
+    sender, arrow, receiver = name.partition("->")
+    if not arrow:
+        return name
+    return f"to {receiver}" if sender == "planner" else f"from {sender}"

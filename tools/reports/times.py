@@ -1,0 +1,165 @@
+"""The panels of a page about time: ages, rates, the planner's tick, and what came late."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from shared import topics
+from shared.clock import NS_PER_MS
+from shared.joints import MODULES
+from shared.topics import Topic
+from tools.reports.sheet import Limit, Line, Sheet
+from tools.reports.signals import Array, seconds
+from tools.reports.source import Source, module_of
+
+RATE_WINDOW_S: Final = 0.25
+AGE_REACH: Final = 4.0
+"""Times the greatest usable age: ages of seconds, in HOLD, would flatten all others."""
+NO_REAL_TIME: Final = "no real time in this log"
+NO_PLANNER: Final = "no planner/status in this log"
+LATE_NOTE: Final = "More than two periods after the one before; since all six drives were armed."
+REFUSED_NOTE: Final = (
+    "Too old, of another session, out of order or out of limits; since all six drives were armed."
+)
+
+
+def add_times(source: Source, sheet: Sheet) -> None:
+    """Add ages both ways, rates, late cycles, refused commands, the planner's tick."""
+    _add_command_ages(source, sheet)
+    _add_state_ages(source, sheet)
+    _add_rates(source, sheet)
+    _add_cycles(source, sheet)
+    _add_tick(source, sheet)
+
+
+def _add_command_ages(source: Source, sheet: Sheet) -> None:
+    lines = []
+    for number, module in enumerate(MODULES):
+        (age,) = source.columns(topics.JOINT_STATE, module, "age_ns")
+        age[age < 0.0] = np.nan
+        lines.append(
+            Line(module, source.times(topics.JOINT_STATE, module), age / NS_PER_MS, number)
+        )
+    limits, reach = [], None
+    note = "Age of the newest command in use, by each joint service's own clock."
+    if source.robot is not None:
+        most_ms = source.robot.joint_service.max_command_age_ms
+        limits, reach = [Limit(most_ms, "HOLD")], AGE_REACH * most_ms
+        note += f" The axis ends at {reach:g} ms."
+    sheet.plot(
+        "Command age", "ms", lines, limits=limits, reach=reach, note=note,
+        otherwise="no command was ever in use",
+    )  # fmt: skip
+
+
+def _add_state_ages(source: Source, sheet: Sheet) -> None:
+    """Add what the planner's inputs were worth when it used them."""
+    (ages,) = source.columns(topics.PLANNER_STATUS, "", "state_age_ns")
+    (sample,) = source.columns(topics.WRENCH, "", "age_ns")
+    if not ages.any() and not (sample > 0.0).any():
+        sheet.left_out.append(("Age of the planner's inputs", NO_REAL_TIME))
+        return
+    t = source.times(topics.PLANNER_STATUS)
+    ages[ages < 0.0] = np.nan
+    sample[sample < 0.0] = np.nan
+    lines = [
+        Line(f"state, {module}", t, ages[:, number] / NS_PER_MS, number)
+        for number, module in enumerate(MODULES)
+        if len(ages)
+    ]
+    wrench_t = source.times(topics.WRENCH)
+    lines.append(Line("sample of the harness sensor", wrench_t, sample / NS_PER_MS, 6, hidden=True))
+    sheet.plot(
+        "Age of the planner's inputs", "ms", lines,
+        note="Time since each module's newest state arrived, by the planner's clock.",
+        otherwise=NO_PLANNER,
+    )  # fmt: skip
+
+
+def _add_rates(source: Source, sheet: Sheet) -> None:
+    lines = []
+    for number, topic in enumerate(row for row in topics.TOPICS if row.rate_hz >= 10.0):
+        t, rate = _rate(source, topic)
+        name = topic.name.replace("/*/", "/") if topic.per_module else topic.name
+        label = f"{name}, slowest module" if topic.per_module else name
+        lines.append(Line(label, t, rate, number, hidden=topic is topics.JOINT_TRACE))
+    sheet.plot(
+        "Messages recorded", "Hz", lines,
+        note=f"Mean over {RATE_WINDOW_S:g} s, by the recorder's clock.",
+        otherwise="no messages",
+    )  # fmt: skip
+
+
+def _add_cycles(source: Source, sheet: Sheet) -> None:
+    """Add the control loops: how fast they ran, what came late, what they refused."""
+    armed_s = source.armed_s()
+    rates: list[Line] = []
+    late: list[Line] = []
+    refused: list[Line] = []
+    for number, module in enumerate(MODULES):
+        t = source.times(topics.JOINT_STATE, module)
+        if len(t) < 2:
+            continue
+        cycles, *counts = source.columns(topics.JOINT_STATE, module, "cycle", "late", "refused")
+        rates.append(Line(module, *_cycle_rate(t, cycles), number))
+        for lines, count in zip((late, refused), counts, strict=True):
+            lines.append(Line(module, t[t >= armed_s], _grown(count[t >= armed_s]), number))
+    sheet.plot(
+        "Control cycles of each service", "Hz", rates,
+        note=f"Mean over {RATE_WINDOW_S:g} s, by each service's clock.",
+        otherwise="no joint/*/state in this log",
+    )  # fmt: skip
+    for title, lines, note, none in (
+        ("Control cycles that came late", late, LATE_NOTE, "none came late"),
+        ("Commands refused", refused, REFUSED_NOTE, "none was refused"),
+    ):
+        some = any(line.values.any() for line in lines)
+        sheet.plot(title, "count", lines if some else [], note=note, otherwise=none)
+
+
+def _cycle_rate(t: Array, cycles: Array) -> tuple[Array, Array]:
+    """Return cycles per second over windows; a service that restarts counts anew."""
+    edges = np.arange(t[0], t[-1], RATE_WINDOW_S)
+    places = np.unique(np.minimum(np.searchsorted(t, edges), len(t) - 1))
+    t, cycles = t[places], cycles[places]
+    steps = np.diff(t)
+    rate = np.where(np.diff(cycles) >= 0.0, np.diff(cycles) / np.maximum(steps, 1e-9), np.nan)
+    return t[:-1] + steps / 2, rate
+
+
+def _grown(count: Array) -> Array:
+    """Return how much a counter grew since its first value; after a restart it counts from 0."""
+    steps = np.diff(count, prepend=count[:1])
+    return np.asarray(np.cumsum(np.where(steps >= 0.0, steps, count)))
+
+
+def _add_tick(source: Source, sheet: Sheet) -> None:
+    t = source.times(topics.PLANNER_STATUS)
+    (tick,) = source.columns(topics.PLANNER_STATUS, "", "tick_us")
+    if not tick.any():
+        sheet.left_out.append(("Planner tick", NO_REAL_TIME))
+        return
+    sheet.plot(
+        "Planner tick", "\u00b5s", [Line("tick", t, tick, 0)],
+        note="From reading the inputs to the last command put.",
+    )  # fmt: skip
+
+
+def _rate(source: Source, topic: Topic) -> tuple[Array, Array]:
+    """Return messages per second in windows; of the slowest module that is there."""
+    begin, end = source.span
+    edges = np.arange(begin, end, RATE_WINDOW_S)
+    if len(edges) < 2:
+        return np.zeros(0), np.zeros(0)
+    counts = []
+    for key in topics.keys(topic, source.log.robot):
+        received = source.log.received_ns(topic, module_of(topic, key))
+        if received:
+            t = seconds(received, source.zero_ns)
+            counts.append(np.histogram(t, edges)[0])
+    if not counts:
+        return np.zeros(0), np.zeros(0)
+    rate = np.min(counts, axis=0) / RATE_WINDOW_S
+    return edges[:-1] + RATE_WINDOW_S / 2, rate.astype(np.float64)
