@@ -188,6 +188,8 @@ class JointServiceConfig(Section, frozen=True):
     k_p_max: LocalStiffness
     k_d_max: LocalDamping
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
+    unsteady_age_ms: Milliseconds = 4.5
+    """Mean deviation of command ages at which tau_coupled has faded out; whole up to 2/3 of it."""
 
 
 class PlannerConfig(Section, frozen=True):

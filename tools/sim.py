@@ -23,8 +23,8 @@ from shared.messages import Message
 from shared.robot_model import mjcf
 from shared.scenario import Scenario
 from shared.topics import Topic
+from tools.centralised.fleet import CONTROLS, SHIPPED
 from tools.runs import experiment, figure, verdict, verdict_table
-from tools.runs.lockstep import Lockstep
 from tools.runs.run_log import read_run
 from tools.verbs import Subparsers, add_verb
 
@@ -40,14 +40,20 @@ class Outbox:
     def __init__(self, robot: str) -> None:
         self._robot = robot
         self._queue: deque[tuple[str, bytes, int]] = deque()
+        self._newest_ns = 0
 
     def __len__(self) -> int:
         """Return how many wait."""
         return len(self._queue)
 
     def put(self, topic: Topic, module: str, message: Message) -> None:
-        """Take a message as the bus would."""
-        self._queue.append((topic.key(self._robot, module), encode(message), message.t_ns))
+        """Take a message as the bus would.
+
+        It arrives no earlier than those before it: a joint service that hears nothing of its
+        drive stamps its states with the last sample that it had.
+        """
+        self._newest_ns = max(self._newest_ns, message.t_ns)
+        self._queue.append((topic.key(self._robot, module), encode(message), self._newest_ns))
 
     def take(self) -> tuple[str, bytes, int] | None:
         """Return the oldest, or None."""
@@ -64,6 +70,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl sim --delay 10 --out out/slow
         xrl sim --delay 5 --jitter 5 --loss 0.1 --seed 3
         xrl sim --scenario crawl --kill planner@8
+        xrl sim --delay 50 --control centralised
         xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
         xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
         """,
@@ -77,6 +84,13 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument(
         "--loss", type=float, default=0.0, metavar="P", help="share of messages lost, 0 to 1 (0)"
+    )
+    parser.add_argument(
+        "--control",
+        choices=CONTROLS,
+        default=SHIPPED,
+        help="who computes the torques; centralised: the planner all of them, a baseline to "
+        "compare with (default: distributed)",
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="where results go (default: out/sim-<time>)"
@@ -93,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     out = experiment.make_out(args.out, "sim")
     console.print(f"[bold]{story.name}[/]: {story.about}{experiment.in_words(story)}")
     begin = time.monotonic()
-    simulated_s = simulate(robot, story, network, args.seed, out, console)
+    simulated_s = simulate(robot, story, network, args.seed, out, console, args.control)
     factor = simulated_s / (time.monotonic() - begin)
     log = read_run(out / "run.mcap")
     summary = verdict.summarise(log, story.duration)
@@ -112,11 +126,12 @@ def simulate(
     seed: int,
     out: Path,
     console: Console,
+    control: str = SHIPPED,
 ) -> float:
     """Run lockstep into a log with a progress bar; return the time simulated, s."""
     inputs = experiment.write_inputs(out, robot, story)
     outbox = Outbox(robot.name)
-    fleet = Lockstep(robot, story, network, seed=seed, record=outbox.put)
+    fleet = CONTROLS[control](robot, story, network, seed=seed, record=outbox.put)
     bar = Progress(
         BarColumn(), TextColumn("{task.completed:5.1f} of {task.total:g} s"),
         TimeRemainingColumn(), console=console, transient=True,
@@ -127,7 +142,7 @@ def simulate(
             out,
             recorded,
             offset_ns=0,
-            metadata=_metadata(robot.name, story.name, network, seed),
+            metadata=_metadata(robot.name, story.name, network, seed, control),
             attachments={file.name: file.read_bytes() for file in inputs}
             | {"model.xml": mjcf(robot).encode()},
             chunk_kib=robot.recorder.chunk_kib,
@@ -149,7 +164,7 @@ def simulate(
 
 
 def _metadata(
-    robot: str, scenario: str, network: Impairment, seed: int
+    robot: str, scenario: str, network: Impairment, seed: int, control: str
 ) -> dict[str, dict[str, str]]:
     run_facts = {
         "schema_version": SCHEMA_VERSION,
@@ -158,6 +173,7 @@ def _metadata(
         "scenario": scenario,
         "lockstep": f"delay {network.delay_ms:g} ms, jitter {network.jitter_ms:g} ms, "
         f"loss {network.loss:g}, seed {seed}",
+        "control": control,
     }
     root = Path(__file__).resolve().parents[1]
     return {

@@ -38,6 +38,7 @@ from shared.messages import (
 from shared.scenario import Kill, Push, Restart, Scenario
 from shared.topics import Topic
 from shared.traces import LinkEvent, SimState
+from tools.runs.host_clock import HostClock, HostLink
 from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
@@ -72,6 +73,7 @@ class Lockstep:
         *,
         seed: int = 0,
         record: Record = forget,
+        clocks: Mapping[str, HostClock] | None = None,
     ) -> None:
         """Put the robot on the hoist, drives idle.
 
@@ -83,6 +85,7 @@ class Lockstep:
                 scenario injects comes on top.
             seed: of the network and of the harness sensor's noise.
             record: takes every message.
+            clocks: by service, of a host whose clock is not virtual time; not the simulator's.
 
         Raises:
             RunError: the scenario kills what has no process here.
@@ -120,8 +123,16 @@ class Lockstep:
         )
         self._states, self._commands = self.network.states(), self.network.commands()
         self._wrenches = self.network.wrenches()
+        clock_of = clocks or {}
+        self._clocks = [clock_of.get(module, HostClock()) for module in MODULES]
+        self._planner_clock = clock_of.get("planner", HostClock())
+        self._harness_clock = clock_of.get("harness", HostClock())
+        self._harness_link = HostLink(self._wrenches)
         self.harness = VirtualHarness(
-            config, self._wrenches, lambda wrench: record(topics.WRENCH, "", wrench), seed
+            config,
+            self._harness_link,
+            lambda wrench: record(topics.WRENCH, "", wrench),
+            seed,
         )
         self._harness_ns = round(NS_PER_S / config.harness.rate_hz)
         self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
@@ -154,6 +165,10 @@ class Lockstep:
     def controllers(self) -> list[JointController]:
         """Each module's control law."""
         return [module.controller for module in self._modules]
+
+    def memory_of(self, module: str) -> ModuleMemory:
+        """Return what a joint service knows now, for `go_on`; it shares what still changes."""
+        return self._modules[MODULE_INDEX[module]].remember()
 
     def go_on(
         self,
@@ -219,7 +234,8 @@ class Lockstep:
         elif self.bank.regulates:
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
         if now % self._harness_ns == 0:
-            self.harness.advance(self.world, now)
+            self._harness_link.now_ns = now
+            self.harness.advance(self.world, self._harness_clock.read(now))
         if self.planner is not None and "planner" not in self._frozen:
             self._advance_planner(self.planner, now)
         self._begin_when_tracking(now)
@@ -274,40 +290,41 @@ class Lockstep:
         for index, (name, module) in enumerate(zip(MODULES, self._modules, strict=True)):
             if name in self._frozen:
                 continue
-            drive = self._drives[index]
-            reading, command = drive.read(now), self._commands[index].take(now)
-            step = module.step(now, reading, command, self.estop)
+            drive, host_ns = self._drives[index], self._clocks[index].read(now)
+            reading, command = drive.read(host_ns), self._commands[index].take(now)
+            step = module.step(host_ns, reading, command, self.estop)
             drive.carry_out(step, onboard=module.onboard)
             if step.event is not None:
                 self.events.append((name, step.event))
                 self._record(topics.JOINT_EVENT, name, step.event)
             if module.controller.cycle % self._state_every == 0:
-                state = module.controller.state(now)
+                state = module.controller.state(host_ns)
                 self._states[index].put(now, state)
                 self._record(topics.JOINT_STATE, name, state)
             if self._traces:
-                trace = self._tracers[index].after(now, reading, command, self.estop, step)
+                trace = self._tracers[index].after(host_ns, reading, command, self.estop, step)
                 if trace is not None:
                     self._record(topics.JOINT_TRACE, name, trace)
 
     def _advance_planner(self, planner: Planner, now: int) -> None:
         """Hand over what has arrived, and tick as the live loop does."""
+        host_ns = self._planner_clock.read(now)
         for index, link in enumerate(self._states):
             state = link.take(now)
             if state is not None:
-                planner.hear_state(index, state, now)
-        if not planner.is_due(now):
+                planner.hear_state(index, state, host_ns)
+        if not planner.is_due(host_ns):
             return
         wrench = self._wrenches.take(now)
         if wrench is not None:
-            planner.hear_wrench(wrench, now)
+            planner.hear_wrench(wrench, host_ns)
         planner.hear_assist(self.world.lead().assist)
-        for index, command in enumerate(planner.tick(now)):
+        for index, command in enumerate(planner.tick(host_ns)):
             self._commands[index].put(now, command)
             self._record(topics.JOINT_COMMAND, MODULES[index], command)
-        status: PlannerStatus = planner.status(now, 0.0)
+        status: PlannerStatus = planner.status(host_ns, 0.0)
         self._record(topics.PLANNER_STATUS, "", status)
-        memory = self._remembrance.after(planner, now) if self._traces else None
+        memory = self._remembrance.after(planner, host_ns) if self._traces else None
         if memory is not None:
             self._record(topics.PLANNER_MEMORY, "", memory)
 

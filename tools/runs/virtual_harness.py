@@ -7,6 +7,7 @@ publishes to a modelled link and to the log (design section 7).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
@@ -15,7 +16,6 @@ from services.simulator.world import World
 from shared.config import RobotConfig
 from shared.loadcell_can import LegSample, SampleAssembler
 from shared.messages import TareRequest, Vector6, Wrench
-from tools.runs.network import Link
 
 
 class Cells:
@@ -42,13 +42,20 @@ class Cells:
         """Do nothing: there is no link."""
 
 
+class Sender(Protocol):
+    """Where wrenches go: a link, or what stands for one."""
+
+    def put(self, now_ns: int, message: Wrench, /) -> None:
+        """Send."""
+
+
 class VirtualHarness:
     """Sensor and service in one; both begin with a tare, while the hoist holds."""
 
     def __init__(
         self,
         config: RobotConfig,
-        wrenches: Link[Wrench],
+        wrenches: Sender,
         record: Callable[[Wrench], None],
         seed: int,
     ) -> None:

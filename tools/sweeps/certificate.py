@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import time
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from shared import config
 from shared.config import RobotConfig
-from shared.exceptions import RunError
-from tools.sweeps import certificate_study as study
-from tools.sweeps import pool
+from shared.process import DEFAULT_CONFIG
+from tools.sweeps import certificate_study, study
 from tools.sweeps.certificate_study import Cases, Outcome
-from tools.sweeps.table import Table, code_digest
+from tools.sweeps.table import Table, code_digest, code_of
 from tools.verbs import add_config
 
 N: Final = 200
@@ -25,7 +22,7 @@ BATCH: Final = 20
 """Cases a worker is given at once: what draws them is built once for a batch."""
 TABLE: Final = "certificate.csv"
 PICTURE: Final = "certificate.png"
-CODE: Final = ("services", "shared", "tools/sweeps/certificate_study.py")
+CODE: Final = code_of("tools.sweeps.certificate_study")
 
 EXAMPLES: Final = """
     xrl sweep certificate
@@ -47,10 +44,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the study's flags."""
     add_config(parser)
     parser.add_argument("--n", type=int, default=N, help=f"cases ({N})")
-    parser.add_argument("--seed", type=int, default=1, help="of the cases (1)")
-    parser.add_argument(
-        "--workers", type=int, default=pool.cores(), help=f"processes (one a core: {pool.cores()})"
-    )
     parser.add_argument(
         "--rigid", action="store_true", help="a floor as hard as the certificate takes it"
     )
@@ -59,47 +52,34 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="with the joints' dry friction, which holds up what is a little too soft",
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help=f"where {TABLE} and {PICTURE} go (default: out/sweep-certificate-<time>); a study "
-        "that was stopped is gone on with",
-    )
+    study.add_flags(parser, "certificate", f"{TABLE} and {PICTURE}")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if a case fell that was said to stand."""
-    for flag, value in (("--n", args.n), ("--workers", args.workers)):
-        if value < 1:
-            raise RunError(f"{flag} {value}: must be at least 1")
+    study.check_least(("--n", args.n, 1), ("--workers", args.workers, 1))
     robot = config.load(args.config)
     if not args.friction:
-        robot = study.without_friction(robot)
+        robot = certificate_study.without_friction(robot)
     console = Console()
-    out = args.out or Path("out") / time.strftime("sweep-certificate-%Y%m%d-%H%M%S")
-    numbers = range(args.n)
-    cases = Cases(robot)
-    first = row_of(study.run(robot, cases.draw(args.seed, 0), rigid=args.rigid))
+    out = study.folder(args.out, "certificate")
+    first = row_of(certificate_study.run(robot, Cases(robot).draw(args.seed, 0), rigid=args.rigid))
     with Table(out, TABLE, tuple(first), _inputs(args, robot)) as table:
-        missing = [number for number in numbers if number not in table.numbers]
+        missing = [number for number in range(args.n) if number not in table.numbers]
         batches = [
             Batch(robot, args.seed, tuple(missing[start : start + BATCH]), args.rigid)
             for start in range(0, len(missing), BATCH)
         ]
-        with _bar(console) as bar:
-            shown = bar.add_task("", total=args.n, completed=args.n - len(missing))
-            for batch, outcomes in pool.results(_run_batch, batches, args.workers, _name):
-                for outcome in outcomes:
-                    table.add(row_of(outcome))
-                bar.update(shown, advance=len(batch.numbers))
+        crew = study.crew_of(args, CODE)
+        with study.resumable(table, out, _command(args), crew, console):
+            study.fill(table, JOB, batches, crew, args.n, console)
     rows = table.rows(args.n)
     said = [(float(row["margin"]), row["stood"] == "True") for row in rows]
-    found = study.confusion(said)
+    found = certificate_study.confusion(said)
     console.print(
         f"said to stand: {found.stand_stood} stood, {found.stand_fell} fell\n"
         f"said to fall: {found.fall_stood} stood, {found.fall_fell} fell\n"
-        f"fewest mistakes with a margin of {study.threshold(said):.3f} as the limit"
+        f"fewest mistakes with a margin of {certificate_study.threshold(said):.3f} as the limit"
     )
     for row, (margin, stood) in zip(rows, said, strict=True):
         if (margin > 0.0) != stood:
@@ -109,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
                 style="dim",
             )
     title = f"{len(rows)} random postures and gains, seed {args.seed}"
-    study.draw_picture(rows, title, out / PICTURE)
+    certificate_study.draw_picture(rows, title, out / PICTURE)
     console.print(f"{out / TABLE}, {PICTURE}", style="dim", soft_wrap=True)
     return 1 if found.stand_fell else 0
 
@@ -140,13 +120,33 @@ def row_of(outcome: Outcome) -> dict[str, object]:
 def _run_batch(batch: Batch) -> list[Outcome]:
     cases = Cases(batch.robot)
     return [
-        study.run(batch.robot, cases.draw(batch.seed, number), rigid=batch.rigid)
+        certificate_study.run(batch.robot, cases.draw(batch.seed, number), rigid=batch.rigid)
         for number in batch.numbers
     ]
 
 
 def _name(batch: Batch) -> str:
     return f"cases {batch.numbers[0]} to {batch.numbers[-1]} (seed {batch.seed})"
+
+
+def _rows(_batch: Batch, outcomes: list[Outcome]) -> list[dict[str, object]]:
+    return [row_of(outcome) for outcome in outcomes]
+
+
+def _fell(row: Mapping[str, object]) -> bool:
+    return str(row["stood"]) == "False"
+
+
+JOB: Final = study.Job(_run_batch, _name, _rows, _fell)
+
+
+def _command(args: argparse.Namespace) -> str:
+    """Return the command of this study, but for --out."""
+    flags = [f"--n {args.n}", f"--seed {args.seed}"]
+    if args.config != DEFAULT_CONFIG:
+        flags.append(f"--config {args.config}")
+    flags += [f"--{name}" for name in ("rigid", "friction") if getattr(args, name)]
+    return " ".join(["xrl sweep certificate", *flags])
 
 
 def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
@@ -158,10 +158,3 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
         "robot": digest,
         "code": code_digest(CODE),
     }
-
-
-def _bar(console: Console) -> Progress:
-    return Progress(
-        BarColumn(), TextColumn("{task.completed} of {task.total} cases"), TimeRemainingColumn(),
-        console=console, transient=True,
-    )  # fmt: skip

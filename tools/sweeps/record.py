@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias, TypeVar
 
 from services.recorder import provenance
 from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
@@ -14,32 +14,43 @@ from shared import topics
 from shared.config import RobotConfig
 from shared.messages import SimTruth
 from shared.robot_model import mjcf
+from shared.scenario import Scenario
 from tools.runs import experiment, figure, verdict
+from tools.runs.lockstep import Record
 from tools.runs.run_log import read_run
 from tools.runs.verdict import Summary
-from tools.sim import AFTER_FALL_S, DRAIN_EVERY, NOT_HERE, Outbox
-from tools.sweeps.cases import Case, story_of
-from tools.sweeps.outcome import Outcome, run_case
+from tools.sim import DRAIN_EVERY, NOT_HERE, Outbox
+
+Outcome = TypeVar("Outcome")
+Watch: TypeAlias = Callable[[SimTruth], None]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 
 
-def record_case(
-    case: Case, robot: RobotConfig, out: Path, command: str, watch: Callable[[SimTruth], None]
+def record_run(
+    story: Scenario,
+    robot: RobotConfig,
+    out: Path,
+    facts: dict[str, str],
+    run: Callable[[Record, Watch], Outcome],
+    watch: Watch,
 ) -> tuple[Outcome, Summary]:
     """Run a case into `run.mcap`, with `summary.json` and `run.png` beside it.
 
     Args:
-        case: what happens.
-        robot: with the case's payload, ready to run.
+        story: what happens.
+        robot: ready to run.
         out: an empty folder.
-        command: that runs this case, for the log.
+        facts: for the log, beside robot and scenario: `lockstep` with the command, at least.
+        run: runs the case; it is given who takes every message, and who sees the world.
         watch: sees the world at its rate.
+
+    Returns:
+        What `run` returned, and the log's summary.
 
     Raises:
         RunError: the log cannot be written, or holds nothing to judge.
     """
-    story = story_of(robot, case)
     inputs = experiment.write_inputs(out, robot, story)
     outbox = Outbox(robot.name)
     recorded = {key: topic for key, topic in topics.all_keys(robot.name).items() if topic.recorded}
@@ -48,15 +59,13 @@ def record_case(
         "robot": robot.name,
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
         "scenario": story.name,
-        "lockstep": f"{command}; delay {case.delay_ms:g} ms, "
-        + ("hand on" if case.let_go_s is None else f"hand off at {case.let_go_s:g} s"),
     }
     with RunWriter(
         out,
         recorded,
         offset_ns=0,
         metadata={
-            "run": run_facts | provenance.code(ROOT) | provenance.machine(),
+            "run": run_facts | facts | provenance.code(ROOT) | provenance.machine(),
             "packages": provenance.packages(),
         },
         attachments={file.name: file.read_bytes() for file in inputs}
@@ -69,7 +78,7 @@ def record_case(
                 writer.take_from(outbox, len(outbox))
             watch(truth)
 
-        outcome = run_case(case, robot, record=outbox.put, watch=drain, after_fall_s=AFTER_FALL_S)
+        outcome = run(outbox.put, drain)
         writer.take_from(outbox, len(outbox))
     log = read_run(out / "run.mcap")
     summary = verdict.summarise(log, story.duration)

@@ -6,6 +6,7 @@ refused. A finished table is sorted by case: the same inputs give the same file.
 
 from __future__ import annotations
 
+import ast
 import csv
 import hashlib
 import json
@@ -18,17 +19,40 @@ from typing import Final
 from shared.exceptions import RunError
 
 INPUTS_FILE: Final = "inputs.json"
+ROOT: Final = Path(__file__).resolve().parents[2]
 Row = Mapping[str, str]
+
+
+def code_of(*modules: str) -> tuple[str, ...]:
+    """Return all of our code that some modules of the tools run: the parts for `code_digest`.
+
+    Args:
+        modules: by name, such as `tools.runs.lockstep`.
+
+    Returns:
+        Services and shared, and of the tools the files of these modules and of all that they
+        import, and so on.
+    """
+    todo, files = list(modules), set[str]()
+    while todo:
+        name = todo.pop()
+        file = f"{name.replace('.', '/')}.py"
+        if file in files or not name.startswith("tools.") or not (ROOT / file).is_file():
+            continue
+        files.add(file)
+        for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                todo += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return ("services", "shared", *sorted(files))
 
 
 def code_digest(parts: Sequence[str]) -> str:
     """Return the SHA-256 of Python files, named as files or folders from the root on."""
-    root = Path(__file__).resolve().parents[2]
     digest = hashlib.sha256()
     for part in parts:
-        place = root / part
+        place = ROOT / part
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+            digest.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()
 
 

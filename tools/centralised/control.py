@@ -1,0 +1,126 @@
+"""Planner and joint modules of the centralised control.
+
+The planner's law is the shipped one. What its commands leave to the joint services (design
+section 3 e)
+
+    tau = D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled
+
+is worked out by the planner too, with the states that it has, into one torque for each joint.
+The modules hand it to the drives unchanged until the next one comes. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+
+from services.joint import law
+from services.joint.differential import motor_torque
+from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.gate import diamond
+from services.joint.module import Module, Obstacle, Order, Step
+from services.planner.engagement import Engagement
+from services.planner.planner import Planner
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus
+
+
+class LeadsOn(Engagement):
+    """Engages as shipped, and then leads whatever it hears: nothing stands below it to hold."""
+
+    def advance(
+        self,
+        now_ns: int,
+        fresh: list[bool],
+        ready: list[bool],
+        modes: list[int],
+        forbidden: PlannerMode | None = None,
+    ) -> bool:
+        """Take the modules' news, as `Engagement.advance`."""
+        if self.mode is PlannerMode.LEADING:
+            return False
+        return super().advance(now_ns, fresh, ready, modes, forbidden)
+
+
+class CentralPlanner(Planner):
+    """The shipped planner, whose commands are whole torques."""
+
+    def __init__(self, config: RobotConfig, session: int) -> None:
+        """Take the robot and the session, as the shipped planner does."""
+        super().__init__(config, session)
+        self._engagement = LeadsOn()
+
+    def tick(self, now_ns: int) -> list[JointCommand]:
+        """Run the law; return six commands, `tau_ff` of which is all of a joint's torque."""
+        commands = super().tick(now_ns)
+        states: Sequence[JointState] = [state for state in self._states if state is not None]
+        return [_whole(*pair) for pair in zip(commands, states, strict=True)] if commands else []
+
+    def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
+        """Return what the last tick saw and decided; no margin, for nothing stands alone."""
+        status = super().status(now_ns, tick_us)
+        return msgspec.structs.replace(status, margin=0.0, margin_onboard=0.0)
+
+
+def _whole(command: JointCommand, state: JointState) -> JointCommand:
+    """Return the command with all that it asks for, in a state, as one torque."""
+    return msgspec.structs.replace(
+        command,
+        v_ref=law.ZERO,
+        tau_ff=law.torque(law.aged(command, 0.0), state.q, state.v),
+        dtau_ff=law.ZERO,
+        tau_coupled=law.ZERO,
+        k_p=law.ZERO,
+        k_d=law.ZERO,
+        margin=0.0,
+        margin_onboard=0.0,
+    )
+
+
+class PassThrough(Module):
+    """A joint module that passes torques on.
+
+    It comes up as the shipped one, from the hoist through HOLD into TRACK. From the end of that
+    blend on it has no law: the newest torque that has come goes to the drive until the next
+    one, however old. Of the gate only the torque diamond is left. An e-stop, or a drive that is
+    lost, is the shipped module's again.
+    """
+
+    def __init__(self, config: RobotConfig, name: str) -> None:
+        """Take the robot and the module's name."""
+        super().__init__(config, name)
+        self._blend_ns = config.joint_service.blend_ms * NS_PER_MS
+        self._tau_module_max = config.joint.tau_module_max
+        self._tracks_since_ns: int | None = None
+
+    def step(
+        self,
+        now_ns: int,
+        reading: DriveReading | None,
+        command: JointCommand | None,
+        estop: bool,
+    ) -> Step:
+        """Run one cycle; arguments as for the shipped module."""
+        amiss = estop or (reading is not None and reading.status is not DriveStatus.ARMED)
+        if amiss or not self._passes(now_ns):
+            step = super().step(now_ns, reading, command, estop)
+            if step.event is not None:
+                tracks = step.event.mode_after == Mode.TRACK
+                self._tracks_since_ns = now_ns if tracks else None
+            return step
+        controller = self.controller
+        controller.cycle += 1
+        if reading is not None:
+            controller.samples.take(reading, armed=True)
+        if command is not None and all(map(math.isfinite, command.tau_ff)):
+            controller.failsafe.command = command  # its age goes into the states
+            controller.tau = diamond(command.tau_ff, self._tau_module_max)
+        torque = motor_torque(controller.tau, self._gear_ratio)
+        return Step(None, Order.TORQUE, torque, None, Obstacle.NONE)
+
+    def _passes(self, now_ns: int) -> bool:
+        since_ns = self._tracks_since_ns
+        return since_ns is not None and now_ns - since_ns >= self._blend_ns

@@ -1,0 +1,48 @@
+"""Lockstep of the centralised control, and the controls by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import msgspec
+
+from shared.config import RobotConfig
+from shared.impairment import Impairment
+from shared.scenario import Scenario
+from tools.centralised.control import CentralPlanner, PassThrough
+from tools.runs.lockstep import Lockstep, Record, forget
+
+
+def torques_only(config: RobotConfig) -> RobotConfig:
+    """Return the robot with drives that are sent torques and hold nothing by themselves."""
+    service = msgspec.structs.replace(config.joint_service, loop="service")
+    return msgspec.structs.replace(config, joint_service=service)
+
+
+class CentralisedLockstep(Lockstep):
+    """A whole fleet in virtual time, each torque computed by the planner."""
+
+    planner_type = CentralPlanner
+    module_type = PassThrough
+    traced = False  # the services that could be executed again are the shipped ones
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        scenario: Scenario,
+        network: Impairment | None = None,
+        *,
+        seed: int = 0,
+        record: Record = forget,
+    ) -> None:
+        """Put the robot on the hoist; arguments as for `Lockstep`."""
+        super().__init__(torques_only(config), scenario, network, seed=seed, record=record)
+
+
+SHIPPED: Final = "distributed"
+CONTROLS: Final[Mapping[str, type[Lockstep]]] = {
+    SHIPPED: Lockstep,
+    "centralised": CentralisedLockstep,
+}
+"""By who computes the torques."""

@@ -1,0 +1,50 @@
+"""Clocks of hosts in virtual time: each counts from somewhere else, and at its own pace. Pure.
+
+Live, a service reads its host's monotonic clock. That one cannot step, whatever is done to the
+time of day, but no two hosts agree on it: an age is told on one clock only (design section 4).
+"""
+
+from __future__ import annotations
+
+from typing import Generic, TypeVar
+
+from shared.messages import Message
+from tools.runs.network import Link
+
+M = TypeVar("M", bound=Message)
+
+
+class HostClock:
+    """What one host takes for the time."""
+
+    def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
+        """Begin.
+
+        Args:
+            offset_ns: ahead of virtual time at its zero.
+            drift_ppm: so much too fast, in millionths.
+        """
+        self.offset_ns = offset_ns
+        self.drift_ppm = drift_ppm
+
+    def read(self, now_ns: int) -> int:
+        """Return what it says at a virtual time, ns."""
+        return now_ns + self.offset_ns + round(now_ns * self.drift_ppm * 1e-6)
+
+    def step(self, by_ns: int) -> None:
+        """Put it on or back: what a monotonic clock never does."""
+        self.offset_ns += by_ns
+
+
+class HostLink(Generic[M]):
+    """A link as a process sees it that knows its own host's time only."""
+
+    def __init__(self, link: Link[M]) -> None:
+        """Take the link, which is in virtual time."""
+        self._link = link
+        self.now_ns = 0
+        """Virtual time; set before the process runs."""
+
+    def put(self, _host_ns: int, message: M) -> None:
+        """Send, whatever the host takes for the time."""
+        self._link.put(self.now_ns, message)

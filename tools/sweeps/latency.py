@@ -1,0 +1,284 @@
+"""`xrl sweep latency`: three controls over networks from good to hopeless, under pushes."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import re
+from collections.abc import Callable
+from itertools import product
+from typing import Final, TypeAlias
+
+import msgspec
+from rich.console import Console
+
+from shared import config
+from shared.config import RobotConfig
+from shared.messages import SimTruth
+from shared.process import DEFAULT_CONFIG
+from shared.toml_file import check_ranges
+from tools.runs import experiment
+from tools.sim import AFTER_FALL_S
+from tools.sweeps import latency_picture, latency_report, study
+from tools.sweeps.latency_trial import CONTROLS, Network, Outcome, Trial, robot_of, run_trial
+from tools.sweeps.outcome import Ending
+from tools.sweeps.record import record_run
+from tools.sweeps.table import Table, code_digest, code_of
+from tools.verbs import add_config
+
+DELAYS_MS: Final = "0,10,20,30,50,100,200"
+LOSSES: Final = "0,0.1,0.3,0.5"
+TRIALS: Final = 4
+DELAY_MAX_MS: Final = 60_000.0
+VALUES_MAX: Final = 1000
+TABLE: Final = "latency.csv"
+CODE: Final = code_of("tools.sweeps.latency_trial")
+"""What decides how a trial comes out."""
+COLUMNS_OUT: Final = Outcome.__struct_fields__
+Task: TypeAlias = "tuple[Trial, RobotConfig]"
+
+EXAMPLES: Final = """
+    xrl sweep latency
+    xrl sweep latency --delay 0:200:10 --jitter 5 --loss 0,0.2 --trials 10 --out out/latency
+    xrl sweep latency --control distributed --delay 0:60:5 --loss 0 --lead-easing 0
+    xrl sweep latency --only 137 --out out/trial137
+    xrl sweep latency --cluster tcp://HOST:8786
+"""
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the study's flags."""
+    add_config(parser)
+    delays = values_in(0.0, DELAY_MAX_MS)
+    parser.add_argument(
+        "--delay",
+        type=delays,
+        default=delays(DELAYS_MS),
+        metavar="MS",
+        help=f"of every link, each way: numbers and A:B:STEP, with commas ({DELAYS_MS})",
+    )
+    parser.add_argument(
+        "--jitter",
+        type=delays,
+        default=(0.0,),
+        metavar="MS",
+        help="uniform, +- so much; several as for --delay (0)",
+    )
+    shares = values_in(0.0, 1.0)
+    parser.add_argument(
+        "--loss",
+        type=shares,
+        default=shares(LOSSES),
+        metavar="P",
+        help=f"share of the messages that is lost; several as for --delay ({LOSSES})",
+    )
+    parser.add_argument(
+        "--trials", type=int, default=TRIALS, help=f"for each of these networks ({TRIALS})"
+    )
+    about = "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items())
+    parser.add_argument(
+        "--control",
+        type=parse_controls,
+        default=tuple(CONTROLS),
+        metavar="NAME,...",
+        help=f"which to compare (all): {about}",
+    )
+    parser.add_argument(
+        "--lead-easing", type=float, metavar="ALPHA", help="law.lead_easing, for all controls"
+    )
+    parser.add_argument("--only", type=int, metavar="NUMBER", help="run this trial alone")
+    alone = "; with --only: where the trial's log goes (default: none)"
+    study.add_flags(parser, "latency", "the table and its pictures", alone)
+
+
+def values_in(low: float, high: float) -> Callable[[str], tuple[float, ...]]:
+    """Return a reader for argparse: `0,10,50:200:50` as numbers, rising, none twice."""
+
+    def read(text: str) -> tuple[float, ...]:
+        number = r"(\d+(?:\.\d*)?|\.\d+)"
+        found: set[float] = set()
+        for piece in text.split(","):
+            match = re.fullmatch(rf"{number}(?::{number}:{number})?", piece.strip())
+            if match is None:
+                raise argparse.ArgumentTypeError(
+                    f"{text!r}; write numbers such as 0,10,50, or FROM:TO:STEP such as 0:200:10"
+                )
+            first = float(match[1])
+            last, step = (float(match[2]), float(match[3])) if match[2] else (first, 1.0)
+            if last < first or step <= 0.0 or (last - first) / step > VALUES_MAX:
+                raise argparse.ArgumentTypeError(
+                    f"{piece!r}: FROM:TO:STEP must rise, in at most {VALUES_MAX} steps"
+                )
+            count = int((last - first) / step + 1e-9) + 1
+            found.update(round(first + i * step, 9) for i in range(count))
+        if max(found) > high or min(found) < low:
+            raise argparse.ArgumentTypeError(f"{text!r}: must be from {low:g} to {high:g}")
+        return tuple(sorted(found))
+
+    return read
+
+
+def parse_controls(text: str) -> tuple[str, ...]:
+    """Read names with commas, for argparse."""
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
+    if unknown := [name for name in names if name not in CONTROLS]:
+        raise argparse.ArgumentTypeError(f"{unknown[0]!r}; some of {', '.join(CONTROLS)}")
+    return tuple(name for name in CONTROLS if name in names)
+
+
+def trials_of(args: argparse.Namespace) -> list[Trial]:
+    """Return all trials, in the order of their numbers.
+
+    The whole grid once, then once more: a study that is stopped has something of each network,
+    and one that is gone on with may have more trials.
+    """
+    networks = [Network(d, j, p) for p, j, d in product(args.loss, args.jitter, args.delay)]
+    grid = list(product(range(args.trials), networks, args.control))
+    return [
+        Trial(number=number, repeat=repeat, seed=args.seed, control=control, network=network)
+        for number, (repeat, network, control) in enumerate(grid)
+    ]
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study, or one trial of it; 1 if the shipped control fell."""
+    study.check_least(
+        ("--trials", args.trials, 1), ("--workers", args.workers, 1), ("--only", args.only or 0, 0)
+    )
+    robot = experiment.load_robot(args.config)
+    if args.lead_easing is not None:
+        law = msgspec.structs.replace(robot.law, lead_easing=args.lead_easing)
+        robot = msgspec.structs.replace(robot, law=law)
+        check_ranges("--lead-easing", law)
+    console = Console()
+    trials = trials_of(args)
+    if args.only is not None:
+        return _run_one(args, trials, robot, console)
+    return _run_all(args, trials, robot, console)
+
+
+def _run_all(
+    args: argparse.Namespace, trials: list[Trial], robot: RobotConfig, console: Console
+) -> int:
+    out = study.folder(args.out, "latency")
+    columns = [*row_of(trials[0]), *COLUMNS_OUT]
+    with Table(out, TABLE, columns, _inputs(args, robot)) as table:
+        robots = {name: robot_of(robot, name) for name in args.control}
+        tasks = [(t, robots[t.control]) for t in trials if t.number not in table.numbers]
+        crew = study.crew_of(args, CODE)
+        again = f"{_command(args)} --trials {args.trials}"
+        with study.resumable(table, out, again, crew, console):
+            seconds = study.fill(table, JOB, tasks, crew, len(trials), console)
+    rows = table.rows(len(trials))
+    what = f"seed {args.seed}" + (f", jitter {_joined(args.jitter)} ms" if any(args.jitter) else "")
+    pictures = latency_picture.draw(rows, robot.simulation.operator.force_max, what, out)
+    latency_report.show(rows, _command(args), console)
+    pace = f"; {seconds:.2f} s a trial" if tasks else ""
+    files = ", ".join(path.name for path in pictures)
+    console.print(f"{out / TABLE}, {files}{pace}", style="dim", soft_wrap=True)
+    fallen = [row for row in rows if row["ending"] != Ending.STOOD]
+    return 1 if any(row["control"] == "distributed" for row in fallen) else 0
+
+
+def _run_one(
+    args: argparse.Namespace, trials: list[Trial], robot: RobotConfig, console: Console
+) -> int:
+    if args.only >= len(trials):
+        args.trials = 1 + args.only // (len(trials) // args.trials)
+        trials = trials_of(args)
+    trial = trials[args.only]
+    robot = robot_of(robot, trial.control)
+    study.show(f"Trial {trial.number}", row_of(trial), console)
+    with study.bar("{task.completed:.1f} of {task.total:.1f} s", console) as bar:
+        story = trial.story(robot)
+        shown = bar.add_task("", total=story.duration)
+
+        def watch(truth: SimTruth) -> None:
+            bar.update(shown, completed=max(0.0, truth.scenario_s))
+
+        if args.out is None:
+            outcome = run_trial(trial, robot, watch=watch)
+        else:
+            out = experiment.make_out(args.out, "sweep-latency")
+            facts = {
+                "lockstep": f"{_command(args)} --only {trial.number}",
+                "control": trial.control,
+            }
+            outcome, _ = record_run(
+                story,
+                robot,
+                out,
+                facts,
+                lambda record, look: run_trial(
+                    trial, robot, record=record, watch=look, after_fall_s=AFTER_FALL_S
+                ),
+                watch,
+            )
+    study.show("Measured", msgspec.structs.asdict(outcome), console)
+    if args.out is not None:
+        console.print(f"{args.out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
+    console.print(f"[bold]{outcome.ending}[/]")
+    return 0 if outcome.stood else 1
+
+
+def row_of(trial: Trial) -> dict[str, object]:
+    """Return what a trial is, by column."""
+    row: dict[str, object] = {
+        "number": trial.number,
+        "repeat": trial.repeat,
+        "control": trial.control,
+    }
+    row |= msgspec.structs.asdict(trial.network)
+    return row | {"impaired_from_s": trial.draw.impaired_from_s}
+
+
+def _run_task(task: Task) -> Outcome:
+    return run_trial(*task)
+
+
+def _name(task: Task) -> str:
+    trial = task[0]
+    network = trial.network
+    return (
+        f"trial {trial.number} ({trial.control}, delay {network.delay_ms:g} ms, "
+        f"jitter {network.jitter_ms:g} ms, loss {network.loss:g})"
+    )
+
+
+def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
+    return [row_of(task[0]) | msgspec.structs.asdict(outcome)]
+
+
+JOB: Final = study.Job(_run_task, _name, _rows, lambda row: row["ending"] != Ending.STOOD)
+
+
+def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
+    return {
+        "study": "latency",
+        "seed": str(args.seed),
+        "delay": _joined(args.delay),
+        "jitter": _joined(args.jitter),
+        "loss": _joined(args.loss),
+        "control": ",".join(args.control),
+        "robot": hashlib.sha256(config.to_toml(robot).encode()).hexdigest(),
+        "code": code_digest(CODE),
+    }
+
+
+def _joined(values: tuple[float, ...]) -> str:
+    return ",".join(f"{value:g}" for value in values)
+
+
+def _command(args: argparse.Namespace) -> str:
+    """Return the command of this study, but for --trials, --only and --out."""
+    flags = [f"--seed {args.seed}"]
+    for name, standard in (("delay", DELAYS_MS), ("jitter", "0"), ("loss", LOSSES)):
+        if (given := _joined(getattr(args, name))) != standard:
+            flags.append(f"--{name} {given}")
+    if args.control != tuple(CONTROLS):
+        flags.append(f"--control {','.join(args.control)}")
+    if args.lead_easing is not None:
+        flags.append(f"--lead-easing {args.lead_easing:g}")
+    if args.config != DEFAULT_CONFIG:
+        flags.append(f"--config {args.config}")
+    return " ".join(["xrl sweep latency", *flags])

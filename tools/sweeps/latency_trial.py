@@ -1,0 +1,290 @@
+"""One trial of the latency study: a squat led by hand under pushes, over a bad network.
+
+The fleet comes up and is led over a good network; at some moment every link gets bad, both
+ways, and stays so. What is drawn, that moment and the pushes, is the same for every delay and
+every control, and another for each repeat, loss and jitter: trials at one delay are independent.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+from typing import Final, TypeAlias
+
+import msgspec
+import numpy as np
+
+from shared.clock import NS_PER_S
+from shared.config import RobotConfig
+from shared.impairment import Impairment
+from shared.joints import MODULES
+from shared.messages import (
+    JointEvent,
+    JointState,
+    Message,
+    Mode,
+    Pair,
+    RunEvent,
+    RunEventKind,
+    SimTruth,
+)
+from shared.scenario import Inject, Keyframe, Push, Scenario
+from shared.topics import Topic
+from tools.centralised.fleet import CentralisedLockstep
+from tools.runs.lockstep import Lockstep, Record
+from tools.sweeps.outcome import END_TOLERANCE_S, Ending, is_tipping
+
+Watch: TypeAlias = Callable[[SimTruth], None]
+
+SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
+"""s, and m below the stand: as in the paper's Fig. 7, at its pace."""
+DURATION_S: Final = 7.0
+IMPAIRED_FROM_S: Final = (0.1, 2.5)
+"""On the first way down; the robot that holds from then on holds there."""
+PUSH_N: Final = (20.0, 40.0)
+PUSH_S: Final = 0.3
+PUSHES: Final = 3
+PUSHED_UNTIL_S: Final = 5.3
+"""The pushes come over the bad network, one in each third of the time, at random."""
+DIGITS: Final = 3
+
+
+class Control(msgspec.Struct, frozen=True):
+    """One way to control the robot."""
+
+    about: str
+    fleet: type[Lockstep]
+    split: str | None = None
+    """`law.split`; None: as the robot file has it."""
+
+
+CONTROLS: Final = {
+    "distributed": Control("as shipped: local gains certified, the rest by the planner", Lockstep),
+    "diagonal": Control("the paper's local gains, diag(K_q)", Lockstep, "diagonal"),
+    "centralised": Control("every torque by the planner", CentralisedLockstep),
+}
+"""By name."""
+
+
+class Network(msgspec.Struct, frozen=True):
+    """What every link does, each way, once it is bad. Datagrams: nothing waits."""
+
+    delay_ms: float
+    jitter_ms: float
+    """Uniform, +- so much."""
+    loss: float
+    """Share of the messages."""
+
+
+class Draw(msgspec.Struct, frozen=True):
+    """What is left to chance."""
+
+    impaired_from_s: float
+    pushes: tuple[Push, ...]
+
+
+class Trial(msgspec.Struct, frozen=True, kw_only=True):
+    """What is run."""
+
+    number: int
+    """Of the row."""
+    repeat: int
+    seed: int
+    control: str
+    network: Network
+
+    @property
+    def draw(self) -> Draw:
+        """What is left to chance, whatever the delay and the control are."""
+        network = self.network
+        dice = random.Random(
+            f"latency {self.seed} {self.repeat} {network.jitter_ms:g} {network.loss:g}"
+        )
+        begin = round(dice.uniform(*IMPAIRED_FROM_S), DIGITS)
+        third = (PUSHED_UNTIL_S - begin) / PUSHES
+        pushes = []
+        for index in range(PUSHES):
+            at = begin + index * third + dice.uniform(0.0, third - PUSH_S)
+            force, angle = dice.uniform(*PUSH_N), dice.uniform(-math.pi, math.pi)
+            x, y = (round(force * part, DIGITS) for part in (math.cos(angle), math.sin(angle)))
+            pushes.append(Push(at=round(at, DIGITS), duration=PUSH_S, force=(x, y, 0.0)))
+        return Draw(begin, tuple(pushes))
+
+    def story(self, robot: RobotConfig) -> Scenario:
+        """Return the trial as a scenario."""
+        stand = robot.simulation.stand_height
+        draw = self.draw
+        fields = msgspec.structs.asdict(self.network)
+        bad = Inject(link="all", at=draw.impaired_from_s, **fields)
+        return Scenario(
+            name=f"latency-{self.seed}-{self.number}",
+            about=f"trial {self.number} of `xrl sweep latency --seed {self.seed}`",
+            duration=DURATION_S,
+            keyframe=tuple(Keyframe(at=at, height=stand - depth) for at, depth in SQUATS),
+            push=draw.pushes,
+            inject=(bad,) if any(fields.values()) else (),
+        )
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """The figures of a trial, over the bad network, to the end or the fall."""
+
+    ending: str
+    fell_at_s: float | None = None
+    operator_peak_n: float | None = None
+    """Vertical force of the hand."""
+    operator_rms_n: float | None = None
+    com_max_mm: float | None = None
+    """Largest horizontal distance of the COM from the middle of the ankles."""
+    hold_share: float | None = None
+    """Of the time: a module held, and so the robot did not follow the hand. Always 0 where
+    every torque is the planner's: there is no HOLD."""
+    holds: int | None = None
+    """Changes from TRACK to HOLD of the busiest module."""
+    torque_step_nm: float | None = None
+    """Largest change of a joint's torque from one state to the next (4 ms)."""
+    hold_step_nm: float | None = None
+    """Largest step of a joint's torque into or out of HOLD, from one cycle to the next."""
+    sole_tilt_max_rad: float | None = None
+
+    @property
+    def stood(self) -> bool:
+        """True if the robot stood to the end."""
+        return self.ending == Ending.STOOD
+
+
+def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
+    """Return the robot with the gain split of a control."""
+    split = CONTROLS[control].split
+    if split is None:
+        return robot
+    return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, split=split))
+
+
+class Ear:
+    """Hears what the figures need of what would be on the bus, and passes all of it on."""
+
+    def __init__(self, on_to: Record | None, impaired_from_s: float) -> None:
+        """Take who hears it too, and from when on it matters, scenario time."""
+        self._on_to = on_to
+        self._tau: dict[str, Pair] = {}
+        self._after_ns = round(impaired_from_s * NS_PER_S)
+        self.from_ns: int | None = None
+        """When the network gets bad; None before the scenario has begun."""
+        self.fallen = False
+        """From then on nothing counts."""
+        self.torque_step = 0.0
+        """As `Outcome.torque_step_nm`."""
+
+    def __call__(self, topic: Topic, module: str, message: Message) -> None:
+        """Take a message as the bus would."""
+        if isinstance(message, JointState):
+            if self.from_ns is not None and message.t_ns >= self.from_ns and not self.fallen:
+                before, after = self._tau[module], message.tau
+                step = max(abs(after[0] - before[0]), abs(after[1] - before[1]))
+                self.torque_step = max(self.torque_step, step)
+            self._tau[module] = message.tau
+        elif isinstance(message, RunEvent) and message.kind == RunEventKind.STARTED:
+            self.from_ns = message.t_ns + self._after_ns
+        if self._on_to is not None:
+            self._on_to(topic, module, message)
+
+
+def run_trial(
+    trial: Trial,
+    robot: RobotConfig,
+    *,
+    record: Record | None = None,
+    watch: Watch | None = None,
+    after_fall_s: float = 0.0,
+) -> Outcome:
+    """Run a trial to its end or to the fall.
+
+    Args:
+        trial: what happens.
+        robot: as `robot_of` gives it.
+        record: takes every message.
+        watch: sees the world at its rate.
+        after_fall_s: how long to go on after a fall; what is measured ends with it.
+    """
+    impaired_from_s = trial.draw.impaired_from_s
+    ear = Ear(record, impaired_from_s)
+    fleet_type = CONTROLS[trial.control].fleet
+    seed = trial.seed * 1_000_003 + trial.repeat
+    fleet = fleet_type(robot, trial.story(robot), Impairment(), seed=seed, record=ear)
+    rows: list[SimTruth] = []
+    for row in fleet.run():
+        ear.fallen |= row.fallen
+        if watch is not None:
+            watch(row)
+        if rows and rows[-1].fallen:
+            if row.scenario_s > rows[-1].scenario_s + after_fall_s:
+                break
+        elif row.scenario_s >= impaired_from_s or row.fallen:
+            rows.append(row)
+    return measure(rows, fleet.events, ear, robot)
+
+
+def measure(
+    rows: Sequence[SimTruth],
+    events: Sequence[tuple[str, JointEvent]],
+    ear: Ear,
+    robot: RobotConfig,
+) -> Outcome:
+    """Return the figures of a run.
+
+    Args:
+        rows: the world since the network got bad, to the fall if there was one.
+        events: every change of mode, by module.
+        ear: what else was heard.
+        robot: for the size of its feet.
+    """
+    if not rows or ear.from_ns is None:
+        return Outcome(ending=Ending.FELL if ear.fallen else Ending.UNREADY)
+    last = rows[-1]
+    ending = Ending.STOOD
+    if last.fallen or last.scenario_s < DURATION_S - END_TOLERANCE_S:
+        ending = Ending.FELL
+    elif is_tipping(last, robot):
+        ending = Ending.TIPPING
+    hand = np.array([row.operator_force[2] for row in rows])
+    within = [(m, e) for m, e in events if ear.from_ns <= e.t_ns <= last.t_ns]
+    since = [(m, e) for m, e in within if e.mode_after in (Mode.HOLD, Mode.TRACK)]
+    changes = [abs(b - a) for _, e in since for a, b in zip(e.tau_before, e.tau_after, strict=True)]
+    into_hold = [m for m, e in since if e.mode_after == Mode.HOLD]
+    return Outcome(
+        ending=ending,
+        fell_at_s=last.scenario_s if last.fallen else None,
+        operator_peak_n=float(np.abs(hand).max()),
+        operator_rms_n=float(np.sqrt(np.mean(hand * hand))),
+        com_max_mm=1e3 * max(math.hypot(*row.com[:2]) for row in rows),
+        hold_share=hold_share(since, ear.from_ns, last.t_ns),
+        holds=max(into_hold.count(module) for module in MODULES),
+        torque_step_nm=ear.torque_step,
+        hold_step_nm=max(changes, default=0.0),
+        sole_tilt_max_rad=max(max(row.foot_right_tilt, row.foot_left_tilt) for row in rows),
+    )
+
+
+def hold_share(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> float:
+    """Return the share of the time in which at least one module held.
+
+    Args:
+        events: changes to HOLD and to TRACK between the two, by module; all track at first.
+        from_ns: beginning.
+        to_ns: end.
+    """
+    holding: set[str] = set()
+    held_ns, since_ns = 0, from_ns
+    for module, event in sorted(events, key=lambda row: row[1].t_ns):
+        if holding:
+            held_ns += event.t_ns - since_ns
+        since_ns = event.t_ns
+        if event.mode_after == Mode.HOLD:
+            holding.add(module)
+        else:
+            holding.discard(module)
+    if holding:
+        held_ns += to_ns - since_ns
+    return held_ns / max(1, to_ns - from_ns)
