@@ -23,6 +23,7 @@ from typing import Final, Generic, Self, TypeAlias, TypeVar
 
 import zenoh
 
+from shared import linger
 from shared.clock import now_ns
 from shared.codec import Decoder, encode
 from shared.config import SERVICES, RobotConfig, expand
@@ -72,6 +73,7 @@ _PRIORITIES: Final = {
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
 _UNIX: Final = "unixsock-stream/"
+_TCP: Final = ("tcp/", "tls/")
 _ALIVE_TIMEOUT_S: Final = 0.2
 
 
@@ -186,12 +188,16 @@ class Stream:
 class Session:
     """One process on the bus. Use it in a `with` statement; see `open_session`."""
 
-    def __init__(self, session: zenoh.Session, robot: str, name: str) -> None:
+    def __init__(
+        self, session: zenoh.Session, robot: str, name: str, *, over_tcp: bool = False
+    ) -> None:
         self.robot = robot
         self.name = name
         self._session = session
         self._alive_prefix = f"xrl/{robot}/alive/"
         self._token = session.liveliness().declare_token(self._alive_prefix + name)
+        if over_tcp:  # held, or it would end
+            self._links = session.info.declare_link_events_listener(_meet_link, history=True)
 
     def __enter__(self) -> Self:
         """Return the session itself."""
@@ -362,9 +368,29 @@ def open_session(
         zenoh_config = zenoh.Config()
         for key, value in settings.items():
             zenoh_config.insert_json5(key, json.dumps(value))
-        return Session(zenoh.open(zenoh_config), config.name, name)
+        over_tcp = any(endpoint.startswith(_TCP) for endpoint in (*listening, *dialling))
+        return Session(zenoh.open(zenoh_config), config.name, name, over_tcp=over_tcp)
     except (zenoh.ZError, OSError) as error:
         raise _open_error(name, listening, error) from None
+
+
+def _meet_link(event: zenoh.LinkEvent) -> None:
+    """Have the socket of a new TCP link closed at once when the link is given up.
+
+    Zenoh sets SO_LINGER to 10 s and closes from its only thread: after a cable was cut for
+    longer than the lease, all links of the process stood still for up to 10 s for each link
+    that was lost.
+    """
+    link = event.link
+    if event.kind == zenoh.SampleKind.PUT and link.src.startswith(_TCP):
+        linger.turn_off(_address(link.src), _address(link.dst))
+
+
+def _address(locator: str) -> linger.Address:
+    """Return host and port of tcp/HOST:PORT, as Zenoh tells them of a link: numeric."""
+    address = re.split("[?#]", locator.partition("/")[2])[0]
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), int(port)
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:

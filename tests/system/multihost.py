@@ -1,0 +1,226 @@
+"""Leads a live fleet on three hosts through cuts of its network; what test_namespaces starts.
+
+One host has planner, harness, recorder, simulator and the tool that leads, which is this
+process; each leg's host has its three joint services. Emulated drives are reached through
+UNIX sockets, which no cut reaches, as a leg's real drives are on wires of their own.
+
+    unshare --net python -m tests.system.multihost OUT RUN_DIR PARENT_PID
+
+leaves in OUT the record, the services' logs, and what was cut and when (`Report`).
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+import msgspec
+import tomli_w
+
+from shared import scenario
+from shared.bus import open_session
+from shared.clock import now_ns
+from shared.config import RobotConfig
+from shared.joints import MODULES
+from shared.process import DEFAULT_CONFIG
+from shared.scenario import Push, Scenario
+from tests.system.namespaces import Network
+from tools.runs import experiment
+from tools.runs.conductor import Conductor, Snapshot
+from tools.supervision import fleet
+from tools.supervision.leash import die_with_parent
+from tools.supervision.supervise import Fleet
+
+BODY: Final = "body"
+LEGS: Final = {
+    side: tuple(module for module in MODULES if module.endswith(f"_{side}"))
+    for side in ("right", "left")
+}
+"""The hosts beside `BODY`, and what runs there."""
+
+REPORT: Final = "report.json"
+STEADY_S: Final = 1.0
+"""All six modules track for so long before a cut, and after the last."""
+_ALL_TRACK: Final = ("T",) * len(MODULES)
+_FIRST_PORT: Final = 7447
+
+
+class Cut(msgspec.Struct):
+    """A host that is alone for a while."""
+
+    host: str
+    duration_s: float
+    pulled: bool
+    """True: its cable is pulled. False: the switch loses its frames, and nobody is told."""
+    down_ns: int = 0
+    """Monotonic clock, the same for all: no frame passes after this."""
+    up_ns: int = 0
+    """From here on frames may pass again; 0: they never did."""
+
+
+class Report(msgspec.Struct):
+    """What test_namespaces needs to know beside the record."""
+
+    namespaces: list[str]
+    cuts: list[Cut]
+    finished_ns: int = 0
+    """When all six tracked again after the last cut; 0: they did not."""
+
+
+def cuts() -> list[Cut]:
+    """Return what is cut: with a lease of 1 s, one link outlives its cut and two do not."""
+    return [
+        Cut("right", 0.4, pulled=False),
+        Cut("left", 2.0, pulled=True),
+        Cut(BODY, 2.0, pulled=False),
+    ]
+
+
+class _FinishedError(Exception):
+    """Every cut has been made and survived."""
+
+
+class Cutter:
+    """Makes the cuts one after the other, each once all six modules track steadily."""
+
+    def __init__(self, network: Network, report: Report) -> None:
+        self._network = network
+        self._report = report
+        self._tracking = False
+        self._course = self._make_all()
+
+    def see(self, snapshot: Snapshot) -> None:
+        """Do what is due; the conductor calls this with each news of the simulated world."""
+        self._tracking = snapshot.modes == _ALL_TRACK
+        if snapshot.truth is not None and snapshot.truth.scenario_s >= 0.0:
+            next(self._course)
+
+    def _make_all(self) -> Iterator[None]:
+        for cut in self._report.cuts:
+            yield from self._until_steady()
+            self._set(cut, joined=False)
+            cut.down_ns = now_ns()
+            # Not by the bus, which the cut itself may silence.
+            mender = threading.Timer(cut.duration_s, self._mend, (cut,))
+            mender.daemon = True
+            mender.start()
+            while mender.is_alive():
+                yield
+        yield from self._until_steady()
+        self._report.finished_ns = now_ns()
+        raise _FinishedError
+
+    def _until_steady(self) -> Iterator[None]:
+        since = time.monotonic()
+        while time.monotonic() - since < STEADY_S:
+            yield
+            if not self._tracking:
+                since = time.monotonic()
+
+    def _mend(self, cut: Cut) -> None:
+        cut.up_ns = now_ns()
+        self._set(cut, joined=True)
+
+    def _set(self, cut: Cut, *, joined: bool) -> None:
+        if cut.pulled:
+            self._network.plug(cut.host, plugged=joined)
+        else:
+            self._network.forward(cut.host, forwarded=joined)
+
+
+def host_of(service: str) -> str:
+    """Return where a service runs."""
+    return next((leg for leg, modules in LEGS.items() if service in modules), BODY)
+
+
+def spread(robot: RobotConfig, network: Network) -> RobotConfig:
+    """Return the robot with every bus endpoint on its host."""
+    endpoints = {
+        service: f"tcp/{network.address(host_of(service))}:{port}"
+        for port, service in enumerate(robot.bus.endpoints, start=_FIRST_PORT)
+    }
+    bus = msgspec.structs.replace(robot.bus, endpoints=endpoints)
+    return msgspec.structs.replace(robot, bus=bus)
+
+
+def write_table(path: Path, network: Network) -> Path:
+    """Write the process table with each command on its host."""
+    table: dict[str, Any] = msgspec.to_builtins(fleet.load_table())
+    for row in table["process"]:
+        row["command"] = [*network.entering(host_of(row["name"])), *row["command"]]
+    path.write_text(tomli_w.dumps(table), encoding="utf-8")
+    return path
+
+
+def story() -> Scenario:
+    """Return the squat, led by the operator throughout and pushed every two seconds."""
+    squat = scenario.load(experiment.scenario_file("squat"))
+    pushes = [Push(at=t, duration=0.2, force=(25.0, 0.0, 0.0)) for t in range(2, 40, 2)]
+    return msgspec.structs.replace(
+        squat, duration=40.0, kill=(), restart=(), fault=(), push=tuple(pushes)
+    )
+
+
+def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
+    """Start the fleet, cut and mend, stop the fleet.
+
+    Args:
+        out: for the record, what it is made from, and the services' logs; absolute.
+        run_dir: for sockets; short.
+        network: of the hosts.
+        report: what to cut; when, and whether the robot led again, is written into it.
+    """
+    # Before it starts a service, the supervisor tries whether its endpoint can be bound.
+    network.allow_foreign_addresses()
+    robot = spread(experiment.load_robot(DEFAULT_CONFIG), network)
+    told = story()
+    robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, told)
+    started = Fleet.start(
+        robot_path,
+        run_dir,
+        overrides={
+            "recorder": ["--out", str(out), "--scenario", str(scenario_path)],
+            "simulator": ["--scenario", str(scenario_path)],
+        },
+        leashed=True,
+        table_path=write_table(out / "processes.toml", network),
+    )
+    try:
+        with open_session(robot, "multihost", run_dir) as session:
+            try:
+                Conductor(started, session, told, Cutter(network, report).see).run()
+            except _FinishedError:
+                return
+    finally:
+        started.stop(keep_logs=True)
+        shutil.copytree(started.run.logs, out / "logs")
+
+
+def main() -> None:
+    """Run as the module's docstring says; end with the process that started this one."""
+    out, run_dir, parent_pid = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
+    signal.signal(signal.SIGTERM, _leave)
+    die_with_parent(parent_pid, signal.SIGTERM)
+    with Network((BODY, *LEGS)) as network:
+        report = Report(network.namespaces(), cuts())
+        (out / REPORT).write_bytes(msgspec.json.encode(report))
+        try:
+            lead(out, run_dir, network, report)
+        finally:
+            (out / REPORT).write_bytes(msgspec.json.encode(report))
+
+
+def _leave(number: int, _frame: FrameType | None) -> None:
+    """Leave as if by an exception, so that the fleet is stopped."""
+    sys.exit(128 + number)
+
+
+if __name__ == "__main__":
+    main()

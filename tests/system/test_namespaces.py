@@ -1,0 +1,227 @@
+"""The fleet on three hosts, live: their network is cut and mended, and the robot stands.
+
+Outcomes only, no milliseconds: within one machine all hosts have the same monotonic clock, so
+what a module did during a cut is told by the stamps of its states, however late they come.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import pytest
+
+from shared import topics
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.joints import MODULES
+from shared.messages import (
+    Cause,
+    JointCommand,
+    JointEvent,
+    JointState,
+    Mode,
+    PlannerMode,
+    PlannerStatus,
+    SimTruth,
+)
+from tests.system.multihost import BODY, LEGS, REPORT, Cut, Report
+from tests.system.namespaces import isolation, processes_in
+from tools.runs.run_log import RunLog, read_run
+from tools.supervision import procfs
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
+
+ROOT = Path(__file__).resolve().parents[2]
+TRIES = 2
+LEADING_S = 80.0
+ENDING_S = 20.0
+HOLDING_HOSTS = """
+import sys, time
+from tests.system.namespaces import Network
+with Network(("one", "two")) as network:
+    print(*network.namespaces(), flush=True)
+    time.sleep(600)
+"""
+
+
+class Led(NamedTuple):
+    """A run on three hosts, after its end."""
+
+    report: Report
+    log: RunLog
+    run_dir: Path
+    interfaces_before: list[str]
+
+
+def start(*arguments: str, **options: object) -> subprocess.Popen[str]:
+    """Start Python in a network namespace of its own, or skip the test where none can be had."""
+    words, refusal = isolation()
+    if refusal:
+        pytest.skip(refusal)
+    command = [*words, sys.executable, *arguments]
+    # a session of its own: Ctrl-C reaches this process alone, which then ends the other
+    return subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+
+
+def interfaces() -> list[str]:
+    """Return the network interfaces of this process's own namespace."""
+    return sorted(path.name for path in Path("/sys/class/net").iterdir())
+
+
+def wait_until_empty(namespaces: list[str]) -> set[int]:
+    """Wait until no process is in these namespaces; return those that still are."""
+    deadline = time.monotonic() + ENDING_S
+    while left := processes_in(namespaces):
+        if time.monotonic() > deadline:
+            break
+        time.sleep(0.05)
+    return left
+
+
+@pytest.fixture(scope="module")
+def led(tmp_path_factory: pytest.TempPathFactory) -> Led:
+    """Lead the fleet through every cut, once for all claims.
+
+    A machine that stalls makes drop-outs of its own, after which the modules wait: such a run is
+    made again.
+    """
+    before = interfaces()
+    for _ in range(TRIES):
+        out = tmp_path_factory.mktemp("multihost")
+        with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as parent:
+            run_dir = Path(parent) / "run"
+            said = lead_in_a_process(out, run_dir)
+        report = msgspec.json.decode((out / REPORT).read_bytes(), type=Report)
+        if report.finished_ns:
+            return Led(report, read_run(out), run_dir, before)
+    pytest.fail(f"not all six track again after the cuts: {report.cuts}; logs in {out}\n{said}")
+
+
+def lead_in_a_process(out: Path, run_dir: Path) -> str:
+    """Run `tests.system.multihost` to its end; return what it printed."""
+    leader = start("-m", "tests.system.multihost", str(out), str(run_dir), str(os.getpid()))
+    try:
+        return leader.communicate(timeout=LEADING_S)[0]
+    finally:
+        leader.terminate()
+        leader.wait(ENDING_S)
+
+
+def spans(led: Led) -> list[tuple[Cut, int]]:
+    """Return each cut with the time up to which what happens is its doing."""
+    ends = [*(cut.down_ns for cut in led.report.cuts[1:]), led.report.finished_ns]
+    return list(zip(led.report.cuts, ends, strict=True))
+
+
+def reached(cut: Cut) -> tuple[str, ...]:
+    """Return the modules that the planner still reaches."""
+    return () if cut.host == BODY else tuple(m for m in MODULES if m not in LEGS[cut.host])
+
+
+def test_the_robot_stands_through_every_cut_and_leads_again(led: Led) -> None:
+    truth: list[SimTruth] = led.log.messages(topics.SIM_TRUTH)
+    assert not any(row.fallen for row in truth)
+    for cut, end_ns in spans(led):
+        assert 0 < cut.down_ns < cut.up_ns < end_ns
+        for module in MODULES:
+            states: list[JointState] = led.log.messages(topics.JOINT_STATE, module)
+            tracking = [s for s in states if s.mode == Mode.TRACK and cut.up_ns < s.t_ns < end_ns]
+            assert tracking, f"{module} did not track again after {cut}"
+
+
+def test_the_modules_of_a_cut_off_leg_hold_by_themselves(led: Led, robot: RobotConfig) -> None:
+    patience_ns = round(robot.joint_service.max_command_age_ms * NS_PER_MS)
+    seen = 0
+    for cut, _ in spans(led):
+        for module in set(MODULES) - set(reached(cut)):
+            states: list[JointState] = led.log.messages(topics.JOINT_STATE, module)
+            # No echo is younger than the cut, so no command is usable beyond its age limit.
+            alone = [s for s in states if cut.down_ns + patience_ns < s.t_ns < cut.up_ns]
+            assert {s.mode for s in alone} <= {Mode.HOLD}
+            assert {s.cause for s in alone} <= {Cause.COMMAND_STALE, Cause.HOLD_ALL}
+            seen += len(alone)
+            before = [s.dropouts for s in states if s.t_ns <= cut.down_ns]
+            after = [s.dropouts for s in states if s.t_ns > cut.up_ns]
+            assert max(after) > before[-1], f"{module} was never without commands in {cut}"
+    assert seen, "no link outlived its cut: nothing tells what the modules did meanwhile"
+
+
+def test_the_modules_that_are_still_reached_are_told_to_hold(led: Led) -> None:
+    causes = set()
+    for cut, _ in spans(led):
+        for module in reached(cut):
+            commands: list[JointCommand] = led.log.messages(topics.JOINT_COMMAND, module)
+            assert any(c.hold for c in commands if cut.down_ns < c.t_ns < cut.up_ns)
+            events: list[JointEvent] = led.log.messages(topics.JOINT_EVENT, module)
+            into_hold = [
+                event
+                for event in events
+                if cut.down_ns < event.t_ns < cut.up_ns and event.mode_after == Mode.HOLD
+            ]
+            assert into_hold, f"{module} worked against the leg that was cut off in {cut}"
+            causes |= {event.cause for event in into_hold}
+    assert Cause.HOLD_ALL in causes
+
+
+def test_the_planner_leads_only_while_it_hears_all_six(led: Led) -> None:
+    statuses: list[PlannerStatus] = led.log.messages(topics.PLANNER_STATUS)
+    for cut, end_ns in spans(led):
+        modes = [s.mode for s in statuses if cut.down_ns < s.t_ns < end_ns]
+        assert PlannerMode.WAITING in modes
+        assert modes[-1] == PlannerMode.LEADING
+
+
+def test_a_cut_silences_no_process_on_the_hosts_that_are_not_cut_off(led: Led) -> None:
+    for topic in (topics.PLANNER_STATUS, topics.SIM_TRUTH):
+        key = topic.key(led.log.robot)
+        assert led.log.gaps()[key].missing == 0, f"{key} was not heard on its own host"
+
+
+def test_nothing_passes_a_cut_until_it_is_mended(led: Led) -> None:
+    late = 0
+    for cut, _ in spans(led):
+        for module in set(MODULES) - set(reached(cut)):
+            states: list[JointState] = led.log.messages(topics.JOINT_STATE, module)
+            received_ns = led.log.received_ns(topics.JOINT_STATE, module)
+            meanwhile = [
+                received
+                for state, received in zip(states, received_ns, strict=True)
+                if cut.down_ns < state.t_ns < cut.up_ns
+            ]
+            assert all(received > cut.up_ns for received in meanwhile)
+            late += len(meanwhile)
+    assert late, "no link outlived its cut and brought what was said meanwhile"
+
+
+def test_a_run_on_three_hosts_leaves_no_process_and_no_network(led: Led) -> None:
+    assert len(set(led.report.namespaces)) == len(LEGS) + 2
+    assert wait_until_empty(led.report.namespaces) == set()
+    assert procfs.fleet_pids(led.run_dir) == set()
+    assert interfaces() == led.interfaces_before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_namespaces_end_with_the_process_that_made_them(number: signal.Signals) -> None:
+    before = interfaces()
+    process = start("-c", HOLDING_HOSTS)
+    assert process.stdout is not None
+    try:
+        namespaces = process.stdout.readline().split()
+        assert len(processes_in(namespaces)) == len(namespaces) == 3, namespaces
+    finally:
+        process.send_signal(number)
+        process.wait(ENDING_S)
+        process.stdout.close()
+    assert wait_until_empty(namespaces) == set()
+    assert interfaces() == before

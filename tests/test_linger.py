@@ -1,0 +1,76 @@
+"""A TCP link that is given up must not hold up the thread that all links share."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import time
+from pathlib import Path
+
+import msgspec
+
+from shared import config, linger
+from shared.bus import open_session
+from shared.process import DEFAULT_CONFIG
+
+ON_FOR_10_S = struct.pack("ii", 1, 10)
+
+
+def lingers(connection: socket.socket) -> bool:
+    """Return True if `close` waits for the other side."""
+    option = connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(ON_FOR_10_S))
+    return bool(struct.unpack("ii", option)[0])
+
+
+def connections() -> list[bool]:
+    """Return for each TCP connection of this process whether it lingers."""
+    found = []
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            if not str(entry.readlink()).startswith("socket:"):
+                continue
+            connection = socket.socket(fileno=int(entry.name))
+        except OSError:
+            continue
+        try:
+            connection.getpeername()
+            if connection.family == socket.AF_INET:
+                found.append(lingers(connection))
+        except OSError:
+            pass
+        finally:
+            connection.detach()
+    return found
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_only_the_connection_between_the_two_addresses_is_changed() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        with (
+            socket.create_connection(server.getsockname()) as one,
+            socket.create_connection(server.getsockname()) as other,
+        ):
+            for connection in (one, other):
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, ON_FOR_10_S)
+            assert linger.turn_off(one.getsockname(), one.getpeername())
+            assert not lingers(one)
+            assert lingers(other)
+        assert not linger.turn_off(("127.0.0.1", 1), ("127.0.0.1", 2))
+
+
+def test_no_tcp_link_of_the_bus_lingers_when_it_is_given_up(tmp_path: Path) -> None:
+    robot = config.load(DEFAULT_CONFIG)
+    endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in robot.bus.endpoints}
+    bus = msgspec.structs.replace(robot.bus, endpoints=endpoints)
+    robot = msgspec.structs.replace(robot, bus=bus)
+    with open_session(robot, "knee_left", tmp_path), open_session(robot, "planner", tmp_path):
+        deadline = time.monotonic() + 10.0
+        # both ends of the one link are in this process
+        while (found := connections()) != [False, False] and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert found == [False, False]
