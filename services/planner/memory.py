@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from services.planner.coherence import Coherence
 from services.planner.engagement import Engagement
 from shared.messages import JointState, Pair, SplitSource, Wrench
 
@@ -59,3 +60,5 @@ class TickMemory(msgspec.Struct, frozen=True):
     engagement: Engagement
     overload: OverloadMemory
     law: LawMemory
+    coherence: Coherence = msgspec.field(default_factory=Coherence)
+    """Not in logs before it was there: then as at the start."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from services.planner.assist import Overload
 from services.planner.certificate import Margins
+from services.planner.coherence import Coherence
 from services.planner.engagement import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.memory import TickMemory
@@ -73,6 +74,7 @@ class Planner:
             round(harness.overload_after_ms * NS_PER_MS),
             round(harness.overload_release_s * NS_PER_S),
         )
+        self._coherence = Coherence()
         self._wrench_seq = -1
         self._last_ns = 0
         self._new = 0  # bit i: module i has a state that no tick has used
@@ -145,6 +147,7 @@ class Planner:
             wrench=self._usable_wrench(now_ns),
         )
         self._source = self._output.local.source
+        self._coherence.take([state.age_ns for state in states])
         self._seq += 1
         return self._commands(now_ns, states, self._output)
 
@@ -163,6 +166,7 @@ class Planner:
             msgspec.structs.replace(self._engagement),
             self._overload.remember(),
             self._law.remember(),
+            msgspec.structs.replace(self._coherence),
         )
 
     def recall(self, memory: TickMemory) -> None:
@@ -175,6 +179,7 @@ class Planner:
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
         self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
         self._engagement = msgspec.structs.replace(m.engagement)
+        self._coherence = msgspec.structs.replace(m.coherence)
         self._overload.recall(m.overload)
         self._law.recall(m.law)
 
@@ -209,7 +214,7 @@ class Planner:
                 output.v_ref,
                 output.tau_ff,
                 output.dtau_ff,
-                output.tau_coupled,
+                output.tau_coupled * self._coherence.share(),
                 output.local.D,
                 output.local.D_B,
             )

@@ -218,7 +218,7 @@ def squats(seconds: float) -> tuple[Keyframe, ...]:
 
 @pytest.mark.timeout(600)  # a minute of virtual time, on a machine that may be busy
 def test_a_minute_of_20_ms_jitter_and_10_percent_loss(robot: RobotConfig) -> None:
-    """Streams: a late message holds up those behind it. Without the fade it falls in 12 s."""
+    """On streams. Before ages were watched and the planner waited, the robot fell in 12 s."""
     link = Inject(link="all", at=0.0, jitter_ms=20.0, loss=0.1, ordered=True)
     story = Scenario(name="flap", about="", duration=60.0, keyframe=squats(60.0), inject=(link,))
     fleet = Lockstep(robot, story)
