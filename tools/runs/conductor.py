@@ -104,7 +104,6 @@ class Conductor:
     ) -> None:
         """Take the scenario's kills, and perhaps one that follows what the modules do."""
         self._fleet = fleet
-        self._injector = InjectorClient(fleet.run.path)
         self._scenario = scenario
         self._show = show
         self._chase = chase
@@ -269,7 +268,7 @@ class Conductor:
             self._next_pids_s = 0.0
             self._note = f"{row.service} back"
         elif isinstance(row, Inject):
-            self._injector.begin(row)
+            InjectorClient(self._fleet.run.path).begin(row)
             self._note = in_words_of(row)
         elif isinstance(row, Fault):
             self._say(RunEventKind.FAULTED, row.module, row.kind)
