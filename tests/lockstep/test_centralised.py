@@ -213,6 +213,22 @@ def test_a_command_is_all_that_the_shipped_planner_asks_for_as_one_torque(
             assert whole.echo_t_ns == parts.echo_t_ns
 
 
+def test_torques_stay_whole_however_far_apart_in_time_the_modules_act(robot: RobotConfig) -> None:
+    """The shipped planner gives no tau_coupled then; here nothing would be left of the law."""
+    planners = Planner(robot, 1), CentralPlanner(robot, 1), CentralPlanner(robot, 1)
+    now = NS_PER_S
+    heard = states(robot, now, 1)
+    for _ in range(100):
+        now += 4 * NS_PER_MS
+        for planner, late_ns in zip(planners, (60 * NS_PER_MS, 60 * NS_PER_MS, 0), strict=True):
+            for index, state in enumerate(heard):
+                age_ns = late_ns if index == 0 else 0
+                planner.hear_state(index, msgspec.structs.replace(state, age_ns=age_ns), now)
+        shipped, apart, together = (planner.tick(now) for planner in planners)
+    assert all(command.tau_coupled == law.ZERO for command in shipped)
+    assert apart == together
+
+
 def test_once_it_leads_the_planner_leads_whatever_it_hears(robot: RobotConfig) -> None:
     planners = Planner(robot, 1), CentralPlanner(robot, 1)
     heard = states(robot, NS_PER_S, 1)
