@@ -15,7 +15,7 @@ from services.joint import law
 from services.joint.differential import joint_torque
 from services.joint.drivers.base import DriveReading
 from services.joint.failsafe import Event, Failsafe, timing_of
-from services.joint.gate import gate, limits_of
+from services.joint.gate import diamond, gate, limits_of
 from services.joint.law import Setpoint
 from services.joint.samples import Samples
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -51,6 +51,8 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     late: int
     events: int
     states: int
+    residual: Pair = law.ZERO
+    resumed_ns: int = 0
 
 
 class JointController:
@@ -85,6 +87,9 @@ class JointController:
         self._samples = Samples(config.joint.gear_ratio)
         self._found_tau: Pair | None = None
         """What a drive that was found armed carries, N m: it is taken over without a step."""
+        self._residual: Pair = law.ZERO
+        """What the drive carried beyond the law as the service went on after a gap, N m."""
+        self._resumed_ns = 0
         self._cause = 0
         self.tau: Pair = law.ZERO
         self.cycle = 0
@@ -126,12 +131,29 @@ class JointController:
         if failsafe.mode in (Mode.DISARMED, Mode.FAULT):
             self.tau = law.ZERO
         else:
-            wanted = law.torque(self._setpoint, samples.q, samples.v)
+            wanted = self._wanted(now_ns)
             self.tau = gate(wanted, samples.q, tau_before, self._limits)
         event = None
         if cause is not None:
             event = self._event(now_ns, before, cause, tau_before)
         return CycleResult(self.tau, event)
+
+    def resume(self, now_ns: int, carried: Pair) -> Pair:
+        """Go on from what the drive carries, after a gap in which nobody told it anything.
+
+        What the law asks for beyond that, or less, comes in over `joint_service.blend_ms`.
+        Returns the joint torque of this cycle, N m: what is carried, within the diamond.
+
+        Args:
+            now_ns: this module's monotonic clock, of the cycle just run.
+            carried: joint torques (phi, theta) that the drive gives now, N m.
+        """
+        s = self._samples
+        wanted = law.torque(self._setpoint, s.q, s.v)
+        self._residual = (carried[0] - wanted[0], carried[1] - wanted[1])
+        self._resumed_ns = now_ns
+        self.tau = diamond(carried, self._limits.tau_module_max)
+        return self.tau
 
     @property
     def samples(self) -> Samples:
@@ -193,6 +215,8 @@ class JointController:
             self.late,
             self._events,
             self._states,
+            self._residual,
+            self._resumed_ns,
         )
 
     def recall(self, memory: ControllerMemory) -> None:
@@ -205,11 +229,24 @@ class JointController:
         self._found_tau, self._cause, self.tau = m.found_tau, m.cause, m.tau
         self._damp_stop = -math.inf if m.damp_stop is None else m.damp_stop
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
+        self._residual, self._resumed_ns = m.residual, m.resumed_ns
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""
         limits, q = self._limits, self._samples.q
         return limits.phi[0] <= q[0] <= limits.phi[1] and limits.theta[0] <= q[1] <= limits.theta[1]
+
+    def _wanted(self, now_ns: int) -> Pair:
+        """Return the law's torque, N m, and what is left of a gap's difference."""
+        wanted = law.torque(self._setpoint, self._samples.q, self._samples.v)
+        if self._residual == law.ZERO:
+            return wanted
+        share = 1.0 - (now_ns - self._resumed_ns) / self._blend_ns
+        if share <= 0.0:
+            self._residual = law.ZERO
+            return wanted
+        phi, theta = self._residual
+        return (wanted[0] + share * phi, wanted[1] + share * theta)
 
     def _count(self, now_ns: int) -> None:
         self.cycle += 1

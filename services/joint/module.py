@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from services.joint.controller import ControllerMemory, JointController
+from services.joint.controller import ControllerMemory, CycleResult, JointController
 from services.joint.differential import motor_torque
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.onboard import OnboardLaw
@@ -24,6 +24,10 @@ ARM_EVERY_NS: Final = 500 * NS_PER_MS
 """Arming is asked for again after this long, while DISARMED."""
 IDLE_EVERY_NS: Final = 500 * NS_PER_MS
 """A drive one of whose axes has disarmed is told to go idle this often: its sibling goes on."""
+GAP_NS: Final = 20 * NS_PER_MS
+"""A service that ran no cycle for so long was frozen: its drive has gone on by itself."""
+LISTEN_NS: Final = 10 * NS_PER_MS
+"""Then it listens for so long before it speaks: what waits in the link's buffer is old."""
 ARM_TRIES: Final = 10
 """A drive that has not armed by then needs a person."""
 
@@ -71,9 +75,13 @@ class ModuleMemory(msgspec.Struct, frozen=True):
     idle_at_ns: int
     tries: int
     forgets: bool
+    target: MotorTarget | None = None
+    last_cycle_ns: int = 0
+    listen_until_ns: int = 0
 
 
 _NO_TORQUE: Pair = (0.0, 0.0)
+_UNCONTROLLED: Final = (Mode.DISARMED, Mode.FAULT)
 
 
 class Module:
@@ -94,6 +102,11 @@ class Module:
         self._idle_at_ns = 0
         self._tries = 0
         self._forgets = config.drive.zero_mark_turns > 0.0
+        self._target: MotorTarget | None = None
+        """The last that the drive was told."""
+        self._last_cycle_ns = 0
+        self._listen_until_ns = 0
+        """Listening after a gap; 0: not."""
 
     @property
     def leaves_holding(self) -> bool:
@@ -112,9 +125,21 @@ class Module:
         self._estop = self._estop or estop
         if self._tries == 0 and reading is not None and reading.status is DriveStatus.ARMED:
             reading = self._found_armed(now_ns, reading)
+        if self._last_cycle_ns and now_ns - self._last_cycle_ns > GAP_NS:
+            self._listen_until_ns = now_ns + LISTEN_NS
+        self._last_cycle_ns = now_ns
         controller = self.controller
+        tau_before = controller.tau
         result = controller.step(now_ns, reading, command, self._estop)
         mode = controller.failsafe.mode
+        if self._listen_until_ns:
+            if mode in _UNCONTROLLED:
+                self._listen_until_ns = 0
+            else:
+                result = self._resumed(now_ns, result, tau_before)
+                if now_ns < self._listen_until_ns or reading is None:
+                    return Step(result.event, Order.NOTHING, _NO_TORQUE, None, Obstacle.NONE)
+                self._listen_until_ns = 0
         if mode is Mode.DISARMED and now_ns >= self._arm_at_ns:
             obstacle = self._obstacle(now_ns, reading)
             if obstacle is not None:
@@ -129,6 +154,7 @@ class Module:
             samples = controller.samples
             order = Order.TARGET
             target = self._law.target(controller.setpoint, result.tau, samples.pos, samples.vel)
+            self._target = target
         return Step(result.event, order, torque, target, Obstacle.NONE)
 
     def remember(self) -> ModuleMemory:
@@ -141,6 +167,9 @@ class Module:
             self._idle_at_ns,
             self._tries,
             self._forgets,
+            self._target,
+            self._last_cycle_ns,
+            self._listen_until_ns,
         )
 
     def recall(self, memory: ModuleMemory) -> None:
@@ -150,6 +179,19 @@ class Module:
         self._law.gains = m.gains
         self._estop, self._arm_at_ns, self._idle_at_ns = m.estop, m.arm_at_ns, m.idle_at_ns
         self._tries, self._forgets = m.tries, m.forgets
+        self._target, self._last_cycle_ns = m.target, m.last_cycle_ns
+        self._listen_until_ns = m.listen_until_ns
+
+    def _resumed(self, now_ns: int, result: CycleResult, tau_before: Pair) -> CycleResult:
+        """Return the cycle's result with the torque that the drive, left alone, carries."""
+        samples, carried = self.controller.samples, tau_before
+        if self._target is not None:
+            carried = self._law.carried(self._target, samples.pos, samples.vel)
+        tau = self.controller.resume(now_ns, carried)
+        event = result.event
+        if event is not None:
+            event = msgspec.structs.replace(event, tau_before=carried, tau_after=tau)
+        return CycleResult(tau, event)
 
     def _in_fault(self, now_ns: int) -> Order:
         """Return what the drive of a module in FAULT is to be told.

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from services.joint.differential import motor_from_joint, motor_torque
+from services.joint.differential import joint_torque, motor_from_joint, motor_torque
 from services.joint.drivers.base import MotorTarget
 from services.joint.law import Setpoint
 from shared.messages import Pair
@@ -74,6 +74,23 @@ class OnboardLaw:
             (pos_gain, pos_gain),
             (vel_gain, vel_gain),
         )
+
+    def carried(self, target: MotorTarget, pos: Pair, vel: Pair) -> Pair:
+        """Return the joint torques, N m, that a drive left with this target gives at a sample.
+
+        Args:
+            target: the last that was sent.
+            pos: motor positions of the sample, turns.
+            vel: motor velocities of the sample, turn/s.
+        """
+        t, limit = target, self._vel_limit
+        a = t.vel_turns[0] + t.pos_gain[0] * (t.pos_turns[0] - pos[0])
+        b = t.vel_turns[1] + t.pos_gain[1] * (t.pos_turns[1] - pos[1])
+        motors = (
+            t.torque[0] + t.vel_gain[0] * (min(limit, max(-limit, a)) - vel[0]),
+            t.torque[1] + t.vel_gain[1] * (min(limit, max(-limit, b)) - vel[1]),
+        )
+        return joint_torque(motors, self._gear_ratio)
 
     def _follow(self, stiffness: float, damping: float) -> None:
         """Take over gains that have changed by more than `GAIN_CHANGE`; N m and N m s a turn."""

@@ -54,6 +54,17 @@ def test_the_drive_gives_the_torque_that_the_service_asks_for(
     np.testing.assert_allclose(joint_torque(firmware(target, pos, vel), N), tau, atol=1e-7)
 
 
+@given(setpoints, pairs(torque), pairs(angle), pairs(rate), pairs(angle), pairs(rate))
+def test_the_service_knows_what_a_drive_that_it_left_alone_gives_anywhere(
+    setpoint: Setpoint, tau: Pair, q: Pair, v: Pair, later_q: Pair, later_v: Pair
+) -> None:
+    onboard = OnboardLaw(N, VEL_LIMIT)
+    target = onboard.target(setpoint, tau, motor_from_joint(q, N), motor_from_joint(v, N))
+    pos, vel = motor_from_joint(later_q, N), motor_from_joint(later_v, N)
+    given_by_drive = joint_torque(firmware(target, pos, vel), N)
+    np.testing.assert_allclose(onboard.carried(target, pos, vel), given_by_drive, atol=1e-7)
+
+
 @given(st.lists(setpoints, min_size=2, max_size=5), pairs(angle), pairs(torque))
 def test_it_does_so_with_the_gains_that_the_drive_happens_to_have(
     course: list[Setpoint], q: Pair, tau: Pair
