@@ -8,12 +8,10 @@ at most one in four, and `STUFFING` as measured on this robot's frames.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
+from shared.config import RobotConfig
 from shared.exceptions import ConfigError
-
-if TYPE_CHECKING:
-    from shared.config import RobotConfig
 
 BITRATE: Final = 1_000_000
 """bit/s"""

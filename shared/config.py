@@ -1,17 +1,9 @@
-"""The robot's configuration, read from `deploy/robot.toml` into typed structs.
-
-Unknown keys, wrong sizes and impossible values are refused with the file, the key,
-the value and what would be right (`shared.exceptions.ConfigError`).
-"""
+"""The robot's configuration as typed structs; `shared.config_file` reads it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
-import tomli_w
-
-from shared import config_check, gain_schedule
 from shared.config_sections import (
     AssistConfig,
     BusConfig,
@@ -19,6 +11,7 @@ from shared.config_sections import (
     CertificateConfig,
     ContactConfig,
     DriveConfig,
+    GainSchedule,
     GeometryConfig,
     HarnessConfig,
     JointConfig,
@@ -34,10 +27,8 @@ from shared.config_sections import (
     StandConfig,
     StandGains,
 )
-from shared.exceptions import ConfigError
-from shared.gain_schedule import GainSchedule
 from shared.joints import MODULES, kind_of
-from shared.toml_file import Section, parse_toml, read_toml
+from shared.toml_file import Section
 
 SERVICES = ("planner", "harness", "recorder", "simulator", *MODULES)
 """Every service of the fleet; each has an endpoint on the bus."""
@@ -102,50 +93,6 @@ class RobotConfig(Section, frozen=True):
     def total_mass(self) -> float:
         """m_total of the paper in kg."""
         return self.torso_mass + 4 * self.mass.module
-
-
-def load(path: Path) -> RobotConfig:
-    """Read and check a robot file, and the gain schedule beside it if there is one.
-
-    Raises:
-        ConfigError: a file cannot be read, or a key or value is not as it should be.
-    """
-    config = load_without_schedule(path)
-    schedule = gain_schedule.read(gain_schedule.path_beside(path))
-    return msgspec.structs.replace(config, gain_schedule=schedule)
-
-
-def load_without_schedule(path: Path) -> RobotConfig:
-    """Read and check a robot file alone.
-
-    Raises:
-        ConfigError: the file cannot be read, or a key or value is not as it should be.
-    """
-    return _checked(read_toml(path, RobotConfig), str(path))
-
-
-def parse(text: str, file: str) -> RobotConfig:
-    """Return the robot that a TOML text describes, without a gain schedule.
-
-    Raises:
-        ConfigError: a key or value is not as it should be; `file` names the text.
-    """
-    return _checked(parse_toml(text, file, RobotConfig), file)
-
-
-def _checked(config: RobotConfig, file: str) -> RobotConfig:
-    if config.gain_schedule is not None:
-        right = "remove it: the schedule is a file of its own, made by `xrl gains`"
-        raise ConfigError(file, "gain_schedule", "unknown key", right)
-    config_check.check(file, config, SERVICES)
-    return config
-
-
-def to_toml(config: RobotConfig) -> str:
-    """Return the robot as TOML that `load` reads back; comments are not kept."""
-    table = msgspec.to_builtins(config)
-    del table["gain_schedule"]
-    return tomli_w.dumps(table)
 
 
 def expand(text: str, run_dir: Path) -> str:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from shared.can_load import check_buses
+from shared.config import RobotConfig
+from shared.config_sections import LimitConfig
 from shared.exceptions import ConfigError
 from shared.joints import KINDS, MODULES
-
-if TYPE_CHECKING:
-    from shared.config import RobotConfig
-    from shared.config_sections import LimitConfig
 
 
 def check(file: str, config: RobotConfig, services: Sequence[str]) -> None:

@@ -1,9 +1,11 @@
-"""The tables of `deploy/robot.toml` as typed structs; `shared.config` reads them."""
+"""The tables of `deploy/robot.toml` as typed structs; `shared.config` puts them together."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeAlias
+
+import msgspec
 
 from shared.toml_file import Range, Section
 
@@ -284,3 +286,24 @@ class SimulationConfig(Section, frozen=True):
     operator: OperatorConfig
     can_dialect: Literal["0.5", "0.6"] = "0.5"
     """Firmware whose CANSimple the emulated drives speak; the services find out by themselves."""
+
+
+Stiffness: TypeAlias = Annotated[float, Range(0.0, 1e4, "N m/rad")]
+LegGains: TypeAlias = tuple[Stiffness, Stiffness, Stiffness, Stiffness, Stiffness, Stiffness]
+"""(ankle phi, theta, knee phi, theta, hip phi, theta), N m/rad; both legs are alike."""
+
+
+class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Local joint stiffnesses over COM height and torso pitch; made by `shared.gain_schedule`."""
+
+    version: int
+    digest: str
+    """SHA-256 of the inputs."""
+    inputs: dict[str, Any]
+    """What the robot was when this was made, by dotted key."""
+    z: tuple[float, ...]
+    """COM heights of the nodes, m above the ankles, rising."""
+    pitch: tuple[float, ...]
+    """Torso pitches of the nodes, rad, rising."""
+    D: tuple[tuple[LegGains, ...], ...]
+    """Local stiffness at [z][pitch]."""

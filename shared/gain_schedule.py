@@ -9,38 +9,17 @@ from __future__ import annotations
 import hashlib
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import Any
 
 import msgspec
 
+from shared.config import RobotConfig
+from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
-from shared.toml_file import Range, check_ranges
-
-if TYPE_CHECKING:
-    from shared.config import RobotConfig
+from shared.toml_file import check_ranges
 
 VERSION = 1
 """Of the file and of the program that makes it: another one is made again."""
-
-Stiffness: TypeAlias = Annotated[float, Range(0.0, 1e4, "N m/rad")]
-LegGains: TypeAlias = tuple[Stiffness, Stiffness, Stiffness, Stiffness, Stiffness, Stiffness]
-"""(ankle phi, theta, knee phi, theta, hip phi, theta), N m/rad; both legs are alike."""
-
-
-class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The file."""
-
-    version: int
-    digest: str
-    """SHA-256 of the inputs."""
-    inputs: dict[str, Any]
-    """What the robot was when this was made, by dotted key."""
-    z: tuple[float, ...]
-    """COM heights of the nodes, m above the ankles, rising."""
-    pitch: tuple[float, ...]
-    """Torso pitches of the nodes, rad, rising."""
-    D: tuple[tuple[LegGains, ...], ...]
-    """Local stiffness at [z][pitch]."""
 
 
 def inputs_of(config: RobotConfig) -> dict[str, Any]:

@@ -13,8 +13,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared import config, topics
+from shared import config_file, topics
 from shared.bus import Latest, Publisher, Session, open_session, peers_of
+from shared.config import SERVICES
 from shared.exceptions import BusError
 from shared.joints import MODULES
 from shared.messages import Estop, JointCommand, JointEvent, Wrench
@@ -22,17 +23,17 @@ from shared.process import DEFAULT_CONFIG
 from shared.topics import Topic
 
 ROOT = Path(__file__).resolve().parent.parent
-ROBOT = config.load(DEFAULT_CONFIG)
+ROBOT = config_file.load(DEFAULT_CONFIG)
 TOOL = "test"
 
 PRELUDE = """
 import os, sys, time
 from pathlib import Path
-from shared import config, topics
+from shared import config_file, topics
 from shared.bus import open_session
 from shared.messages import Estop, JointCommand, JointEvent
 from shared.process import DEFAULT_CONFIG
-robot, run_dir = config.load(DEFAULT_CONFIG), Path(sys.argv[1])
+robot, run_dir = config_file.load(DEFAULT_CONFIG), Path(sys.argv[1])
 """
 
 ECHO = """
@@ -493,12 +494,12 @@ def test_every_publisher_has_a_link_to_every_subscriber() -> None:
 
 
 def test_each_pair_is_linked_once_and_joint_services_not_to_one_another() -> None:
-    for one in config.SERVICES:
+    for one in SERVICES:
         assert one not in peers_of(one)
         assert len(set(peers_of(one))) == len(peers_of(one))
-        for other in config.SERVICES:
+        for other in SERVICES:
             both = (one in peers_of(other)) + (other in peers_of(one))
             expected = 0 if one == other or {one, other} <= set(MODULES) else 1
             assert both == expected, (one, other)
-    assert set(peers_of(TOOL)) == set(config.SERVICES)
-    assert not any(TOOL in peers_of(service) for service in config.SERVICES)
+    assert set(peers_of(TOOL)) == set(SERVICES)
+    assert not any(TOOL in peers_of(service) for service in SERVICES)

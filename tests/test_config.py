@@ -13,8 +13,8 @@ import msgspec
 import pytest
 import tomli_w
 
-from shared import config
-from shared.config import RobotConfig
+from shared import config_file
+from shared.config import RobotConfig, expand
 from shared.exceptions import ConfigError
 from shared.joints import MODULES
 from shared.scenario import Fault, Scenario
@@ -33,7 +33,7 @@ def load_changed(tmp_path: Path, change: Callable[[Table], object]) -> RobotConf
     assert raw != RAW
     path = tmp_path / "robot.toml"
     path.write_text(tomli_w.dumps(raw), encoding="utf-8")
-    return config.load(path)
+    return config_file.load(path)
 
 
 def setting(dotted: str, value: object) -> Callable[[Table], None]:
@@ -228,7 +228,7 @@ def test_a_file_that_cannot_be_read_is_refused_by_name(tmp_path: Path, kind: str
     elif kind == "not text":
         path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError) as caught:
-        config.load(path)
+        config_file.load(path)
     assert str(path) in str(caught.value)
     assert "TOML" in caught.value.expected
 
@@ -313,17 +313,17 @@ def test_every_number_of_the_file_is_refused_when_it_is_absurd(tmp_path: Path, h
 def test_a_robot_comes_back_from_its_own_toml(robot: RobotConfig, tmp_path: Path) -> None:
     assert robot.gain_schedule is not None
     path = tmp_path / "again.toml"
-    path.write_text(config.to_toml(robot), encoding="utf-8")
-    assert config.load(path).gain_schedule is None
+    path.write_text(config_file.to_toml(robot), encoding="utf-8")
+    assert config_file.load(path).gain_schedule is None
     shutil.copy(ROBOT_FILE.with_name("robot.gains.json"), tmp_path / "again.gains.json")
-    assert config.load(path) == robot
+    assert config_file.load(path) == robot
 
 
 def test_text_is_read_as_a_file_is_without_a_schedule(robot: RobotConfig) -> None:
-    parsed = config.parse(TEXT, "robot.toml of a log")
+    parsed = config_file.parse(TEXT, "robot.toml of a log")
     assert parsed == msgspec.structs.replace(robot, gain_schedule=None)
     with pytest.raises(ConfigError, match=r"robot\.toml of a log"):
-        config.parse("name = 3", "robot.toml of a log")
+        config_file.parse("name = 3", "robot.toml of a log")
 
 
 def test_a_frozen_robot_cannot_be_changed(robot: RobotConfig) -> None:
@@ -350,5 +350,5 @@ def test_modules_and_their_gains_are_found_by_name(robot: RobotConfig) -> None:
 
 
 def test_the_run_directory_is_filled_in_wherever_it_stands(tmp_path: Path) -> None:
-    assert config.expand("unixsock-stream/{run}/a", tmp_path) == f"unixsock-stream/{tmp_path}/a"
-    assert config.expand("tcp/10.0.0.1:7447", tmp_path) == "tcp/10.0.0.1:7447"
+    assert expand("unixsock-stream/{run}/a", tmp_path) == f"unixsock-stream/{tmp_path}/a"
+    assert expand("tcp/10.0.0.1:7447", tmp_path) == "tcp/10.0.0.1:7447"

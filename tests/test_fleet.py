@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from shared.config import SERVICES, load
+from shared.config import SERVICES
+from shared.config_file import load
 from shared.exceptions import ConfigError, FleetError
 from shared.joints import MODULES
 from shared.links import PAIRS

@@ -14,13 +14,14 @@ import msgspec
 import pytest
 import tomli_w
 
-from shared import config, gain_schedule
+from shared import config_file, gain_schedule
 from shared.config import RobotConfig
+from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
-from shared.gain_schedule import GainSchedule, digest_of, inputs_of
+from shared.gain_schedule import digest_of, inputs_of
 from tests.conftest import ROBOT_FILE
 
-INPUTS = inputs_of(config.load(ROBOT_FILE))
+INPUTS = inputs_of(config_file.load(ROBOT_FILE))
 
 
 @pytest.fixture
@@ -144,7 +145,7 @@ def test_a_corrupt_file_is_refused_in_one_line_with_the_command_to_run(
     path = tmp_path / "lab.gains.json"
     path.write_bytes(content)
     with pytest.raises(ConfigError) as caught:
-        config.load(robot_file)
+        config_file.load(robot_file)
     error = caught.value
     assert (error.file, error.key) == (str(path), key)
     assert found in error.found
@@ -177,7 +178,7 @@ def test_the_shipped_schedule_fits_the_shipped_robot(robot: RobotConfig) -> None
 
 
 def test_a_robot_read_from_its_own_toml_has_the_same_digest(robot: RobotConfig) -> None:
-    again = config.parse(config.to_toml(robot), "again.toml")
+    again = config_file.parse(config_file.to_toml(robot), "again.toml")
     assert digest_of(inputs_of(again)) == digest_of(inputs_of(robot))
 
 
@@ -240,7 +241,7 @@ def test_a_planner_with_a_stale_schedule_refuses_to_start_with_the_command_to_ru
     tmp_path: Path,
 ) -> None:
     robot_file = tmp_path / "lab.toml"
-    table = msgspec.to_builtins(config.load(ROBOT_FILE))
+    table = msgspec.to_builtins(config_file.load(ROBOT_FILE))
     del table["gain_schedule"]
     table["mass"]["payload"] = 12.5
     robot_file.write_text(tomli_w.dumps(table), encoding="utf-8")

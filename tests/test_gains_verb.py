@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared import config, gain_schedule
+from shared import config_file, gain_schedule
 from tests.conftest import ROBOT_FILE
 
 TEXT = ROBOT_FILE.read_text(encoding="utf-8")
@@ -56,7 +56,7 @@ def test_a_schedule_for_no_payload_is_written_beside_the_robot_file(
     path, said = unladen
     assert {found.name for found in path.parent.iterdir()} == {"lab.toml", "lab.gains.json"}
     assert f"written to {path.with_name('lab.gains.json')}" in said
-    robot = config.load(path)
+    robot = config_file.load(path)
     assert robot.mass.payload == 0.0
     gain_schedule.require(robot, path)
 
@@ -65,7 +65,7 @@ def test_the_printed_margins_are_above_what_the_planner_asks_for(
     unladen: tuple[Path, str],
 ) -> None:
     path, said = unladen
-    certificate = config.load(path).certificate
+    certificate = config_file.load(path).certificate
     spoken = " ".join(said.split())
     found = re.search(
         r"smallest margin[^:]*: ([\d.]+) of what is required.*?, ([\d.]+) with", spoken
@@ -76,7 +76,10 @@ def test_the_printed_margins_are_above_what_the_planner_asks_for(
 
 
 def test_a_lighter_robot_is_held_more_softly(unladen: tuple[Path, str]) -> None:
-    light, full = config.load(unladen[0]).gain_schedule, config.load(ROBOT_FILE).gain_schedule
+    light, full = (
+        config_file.load(unladen[0]).gain_schedule,
+        config_file.load(ROBOT_FILE).gain_schedule,
+    )
     assert light is not None
     assert full is not None
     ankle_theta = 1

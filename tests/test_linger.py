@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from shared import config, linger
+from shared import config_file, linger
 from shared.bus import open_session
 from shared.process import DEFAULT_CONFIG
 
@@ -64,7 +64,7 @@ def test_only_the_connection_between_the_two_addresses_is_changed() -> None:
 
 
 def test_no_tcp_link_of_the_bus_lingers_when_it_is_given_up(tmp_path: Path) -> None:
-    robot = config.load(DEFAULT_CONFIG)
+    robot = config_file.load(DEFAULT_CONFIG)
     endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in robot.bus.endpoints}
     bus = msgspec.structs.replace(robot.bus, endpoints=endpoints)
     robot = msgspec.structs.replace(robot, bus=bus)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared import config
+from shared import config_file
 from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tests.recorder import runs
@@ -111,7 +111,7 @@ def test_the_bus_is_that_of_the_robot_file_given_else_of_the_log_else_as_shipped
     assert "another version" in found.note
     found = play.bus_of(recording, arguments_of(old, "--config", str(given), *words))
     assert (found.robot.name, found.note) == ("given", "")
-    text = config.to_toml(robot).replace('name = "xrl"', 'name = "lab"', 1)
+    text = config_file.to_toml(robot).replace('name = "xrl"', 'name = "lab"', 1)
     monkeypatch.setitem(runs.ATTACHMENTS, "robot.toml", text.encode())
     new = write(tmp_path / "new", [item(0)])
     found = play.bus_of(reading.read([new]), arguments_of(new, *words))

@@ -21,7 +21,7 @@ from rich.progress import track
 from rich.table import Table
 
 from services.planner.planner import Planner
-from shared import config, gain_schedule, scenario, topics
+from shared import config_file, gain_schedule, scenario, topics
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print; with --strict 1 if a target is missed."""
     if args.rounds < 1:
         raise RunError(f"--rounds {args.rounds}: at least 1")
-    robot = config.load(args.config)
+    robot = config_file.load(args.config)
     gain_schedule.require(robot, args.config)
     console = Console()
     figures = measure(robot, args.rounds, console)

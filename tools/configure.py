@@ -16,7 +16,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from shared import config, drive_settings
+from shared import config_file, drive_settings
 from shared.config import RobotConfig
 from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     """Show the difference, and close it if told to; 0 if the drives are as wanted now."""
     console = Console()
     path = bench.robot_file(args)
-    robot = config.load_without_schedule(path)
+    robot = config_file.load_without_schedule(path)
     saved = backup.read(args.restore) if args.restore else None
     modules = modules_of(args, robot, saved)
     check_plants(robot, args.run_dir, args.plant)

@@ -7,7 +7,7 @@ import argparse
 import msgspec
 from rich.console import Console
 
-from shared import config
+from shared import config_file
 from tools.bringup import bench
 from tools.bringup.reach import add_plant, check_plants
 from tools.bringup.report import report_of, show
@@ -37,7 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Look at everything; 0 if nothing is wrong, 1 if something is."""
     path = bench.robot_file(args)
-    robot = config.load(path)
+    robot = config_file.load(path)
     check_plants(robot, args.run_dir, args.plant)
     with Console(stderr=True).status("looking") as status:
         groups = survey(

@@ -12,7 +12,7 @@ from rich.console import Console
 from shared import topics
 from shared.bus import open_session
 from shared.clock import now_ns
-from shared.config import load
+from shared.config_file import load
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.messages import Estop, JointState, Mode

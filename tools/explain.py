@@ -19,11 +19,11 @@ from services.planner.certificate import Weakest
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.inverse_kinematics import in_words as in_words_of_reach
 from services.planner.kinematics import Kinematics
-from shared import config, gain_schedule, topics
+from shared import config_file, gain_schedule, topics
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
+from shared.config_sections import GainSchedule
 from shared.exceptions import RunError
-from shared.gain_schedule import GainSchedule
 from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus, SplitSource
 from shared.robot_model import stand_pose
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     if sum(given is not None for given in (args.log, args.q, args.p)) != 1:
         raise RunError("give a run's log, --q ANGLES or --p POSE; one of them")
     if args.log is None:
-        robot = config.load(args.config)
+        robot = config_file.load(args.config)
         gain_schedule.require(robot, args.config)
         q = at_pose(robot, args.p) if args.q is None else parse("--q", args.q, N_JOINTS)
         still = np.zeros(N_JOINTS)
@@ -158,7 +158,7 @@ def robot_of(log: RunLog) -> RobotConfig:
         raw = log.attachments["robot.toml"].decode()
     except KeyError:
         raise RunError(f"{log.path}: holds no robot.toml; a run of this project has one") from None
-    robot = config.parse(raw, f"{log.path}: robot.toml")
+    robot = config_file.parse(raw, f"{log.path}: robot.toml")
     schedule = log.attachments.get("robot.gains.json")
     if schedule is None:
         return robot

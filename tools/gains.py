@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from shared import config, gain_schedule
+from shared import config_file, gain_schedule
 from shared.config import RobotConfig
-from shared.gain_schedule import GainSchedule
+from shared.config_sections import GainSchedule
 from tools.verbs import Subparsers, add_config, add_verb
 
 SHOWN = 6
@@ -39,10 +39,10 @@ def run(args: argparse.Namespace) -> int:
     path = gain_schedule.path_beside(args.config)
     console = Console()
     if args.check:
-        stale = gain_schedule.why_stale(config.load(args.config))
+        stale = gain_schedule.why_stale(config_file.load(args.config))
         console.print(f"{path}: {stale or 'fits the robot'}", soft_wrap=True)
         return 1 if stale else 0
-    robot = config.load_without_schedule(args.config)
+    robot = config_file.load_without_schedule(args.config)
     schedule = compute(robot, console)
     gain_schedule.write(path, schedule)
     _show(robot, schedule, console)

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from services.joint.__main__ import open_drive
 from services.joint.differential import joint_from_motor
-from shared import config
+from shared import config_file
 from shared.config import RobotConfig
 from shared.exceptions import DriveError, FleetError
 from shared.joints import AXES, MODULES
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     plan = plan_of(args)
     path = bench.robot_file(args)
     module: str = args.module
-    robot = gentle(config.load_without_schedule(path), plan)
+    robot = gentle(config_file.load_without_schedule(path), plan)
     refuse_service(robot, args)
     with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
         if started:

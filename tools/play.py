@@ -14,10 +14,10 @@ from typing import Final, NamedTuple
 from rich.console import Console
 from rich.markup import escape
 
-from shared import config
+from shared import config_file
 from shared.bus import RawPublisher, Session, open_session
 from shared.clock import NS_PER_S, now_ns
-from shared.config import RobotConfig
+from shared.config import RobotConfig, expand
 from shared.exceptions import ConfigError, FleetError, RunError
 from shared.process import DEFAULT_CONFIG
 from tools.cli import INTERRUPTED
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         schedule = schedule_of(recording, targets, part, loop=args.loop)
         listen = [] if args.listen == arguments.NOWHERE else [args.listen]
         session = stack.enter_context(open_session(bus.robot, "play", args.run_dir, listen=listen))
-        listening = config.expand(args.listen, args.run_dir) if listen else ""
+        listening = expand(args.listen, args.run_dir) if listen else ""
         words = where(list(targets.values()), recording.robot, part, listening)
         console.print(words, markup=False, soft_wrap=True)
         keyboard = stack.enter_context(Keyboard())
@@ -104,18 +104,19 @@ def bus_of(recording: Recording, args: argparse.Namespace) -> Bus:
         ConfigError: the file given cannot be used.
     """
     if args.config is not None:
-        return Bus(config.load_without_schedule(args.config), "")
+        return Bus(config_file.load_without_schedule(args.config), "")
     with contextlib.suppress(FleetError):
         fleet = Fleet.attach(args.run_dir)
-        return Bus(config.load_without_schedule(Path(fleet.manifest.config)), "")
+        return Bus(config_file.load_without_schedule(Path(fleet.manifest.config)), "")
     why = "the log holds no robot file"
     if recording.robot_file is not None:
         try:
-            return Bus(config.parse(recording.robot_file, f"{reading.ROBOT_FILE} in the log"), "")
+            robot = config_file.parse(recording.robot_file, f"{reading.ROBOT_FILE} in the log")
+            return Bus(robot, "")
         except ConfigError as error:
             why = f"{error}: of another version"
     note = f"{why}; the bus is that of {DEFAULT_CONFIG.name} as shipped (--config: another)"
-    return Bus(config.load_without_schedule(DEFAULT_CONFIG), note)
+    return Bus(config_file.load_without_schedule(DEFAULT_CONFIG), note)
 
 
 def schedule_of(

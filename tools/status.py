@@ -16,7 +16,7 @@ from rich.table import Table
 
 from shared.bus import Latest, Session, open_session
 from shared.clock import NS_PER_S, now_ns
-from shared.config import load
+from shared.config_file import load
 from shared.exceptions import FleetError
 from shared.fault_table import recovery_of
 from shared.joints import MODULES

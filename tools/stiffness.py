@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from services.planner.body_stiffness import BodyStiffness, for_robot
-from shared import config
+from shared import config_file
 from tools.verbs import Subparsers, add_config, add_verb
 
 ROWS = (
@@ -37,7 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the design for x and y."""
-    robot = config.load(args.config)
+    robot = config_file.load(args.config)
     design = for_robot(robot)
     table = Table(title="Body stiffness, legs straight (paper section IV)", title_justify="left")
     table.add_column("")

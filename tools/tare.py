@@ -14,7 +14,7 @@ from rich.console import Console
 from shared import topics
 from shared.bus import open_session
 from shared.clock import now_ns
-from shared.config import load
+from shared.config_file import load
 from shared.exceptions import FleetError
 from shared.messages import Tare, TareRequest, Wrench
 from tools.supervision.supervise import Fleet

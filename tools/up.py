@@ -6,7 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
-from shared import config, gain_schedule
+from shared import config_file, gain_schedule
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.runs.experiment import make_out, scenario_file
@@ -74,7 +74,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start the fleet and say where it is."""
-    gain_schedule.require(config.load(args.config), args.config)
+    gain_schedule.require(config_file.load(args.config), args.config)
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
     make_out(out, "up")
     overrides = {"recorder": ["--out", str(out.absolute())]}

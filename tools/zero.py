@@ -17,7 +17,7 @@ from rich.table import Table
 
 from services.joint.__main__ import open_drive
 from services.joint.drivers.base import Drive
-from shared import config, topics
+from shared import config_file, topics
 from shared.bus import open_session
 from shared.config import RobotConfig
 from shared.exceptions import DriveError, FleetError
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     """Look, ask, set, read back."""
     console = Console()
     path = bench.robot_file(args)
-    robot = config.load_without_schedule(path)
+    robot = config_file.load_without_schedule(path)
     wanted = angles_of(args, robot, console)
     holders = {module: bench.service_on(robot, module, args.run_dir) for module in wanted}
     with bench.drives_to_ourselves(robot, path, args.run_dir, console.print):

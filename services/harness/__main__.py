@@ -9,7 +9,8 @@ from services.harness.loop import HarnessLoop, run
 from services.harness.sensor import CanHarnessSensor
 from shared import bus, log, process, topics
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig, expand, load
+from shared.config import RobotConfig, expand
+from shared.config_file import load
 from shared.messages import TareRequest, Wrench
 from shared.priority import raise_priority
 

@@ -12,7 +12,8 @@ from services.injector.control import Control
 from services.injector.loop import Orders, run
 from services.injector.relay import Place, Relay
 from shared import bus, log, process, topics
-from shared.config import RobotConfig, expand, load
+from shared.config import RobotConfig, expand
+from shared.config_file import load
 from shared.exceptions import BusError
 from shared.impairment import Direction
 from shared.injection import SOCKET

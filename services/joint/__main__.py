@@ -11,7 +11,7 @@ from services.joint.drivers.signed import Signed
 from services.joint.drivers.zeroed import Zeroed
 from services.joint.loop import JointLoop, Ports
 from services.joint.module import Module
-from shared import config, log, topics
+from shared import config_file, log, topics
 from shared.bus import open_session
 from shared.config import RobotConfig, expand
 from shared.config_sections import CanConfig
@@ -44,7 +44,7 @@ def main() -> int:
     arguments = parser.parse_args()
     module: str = arguments.module
     logger = log.setup(module)
-    robot = config.load(arguments.config)
+    robot = config_file.load(arguments.config)
     stop = StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
     with open_session(robot, module, arguments.run_dir) as session:

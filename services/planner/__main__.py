@@ -6,7 +6,7 @@ import secrets
 
 from services.planner.loop import PlannerLoop, Ports
 from services.planner.planner import Planner
-from shared import config, gain_schedule, log, topics
+from shared import config_file, gain_schedule, log, topics
 from shared.bus import open_session
 from shared.joints import MODULES
 from shared.messages import JointCommand, JointState, OperatorIntent, PlannerStatus, Wrench
@@ -32,7 +32,7 @@ def main() -> int:
     add_injected(parser)
     arguments = parser.parse_args()
     logger = log.setup("planner")
-    robot = config.load(arguments.config)
+    robot = config_file.load(arguments.config)
     gain_schedule.require(robot, arguments.config)
     stop = StopFlag()
     granted = raise_priority(FIFO_PRIORITY)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from services.planner.certificate import Certificate, Margins
 from shared import gain_schedule
 from shared.config import RobotConfig
+from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
-from shared.gain_schedule import GainSchedule
 from shared.joints import MODULES
 from shared.messages import SplitSource
 

@@ -28,8 +28,9 @@ from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
 from services.planner.split import ScheduledGains
 from shared.config import GRAVITY, RobotConfig
+from shared.config_sections import GainSchedule, LegGains
 from shared.exceptions import RunError
-from shared.gain_schedule import VERSION, GainSchedule, LegGains, digest_of, inputs_of
+from shared.gain_schedule import VERSION, digest_of, inputs_of
 from shared.joints import N_JOINTS, N_LEG
 from shared.robot_model import stand_pose
 

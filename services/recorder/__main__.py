@@ -28,7 +28,7 @@ from services.recorder.space import MIB
 from shared import gain_schedule, log, topics
 from shared.bus import open_session
 from shared.clock import now_ns
-from shared.config import load
+from shared.config_file import load
 from shared.config_sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
 from shared.priority import raise_priority

@@ -15,7 +15,7 @@ from services.simulator.harness_front import HarnessFront
 from services.simulator.loop import Ports, SimulatorLoop
 from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
-from shared import config, log, scenario, topics
+from shared import config_file, log, scenario, topics
 from shared.bus import open_session
 from shared.config import RobotConfig, expand
 from shared.joints import MODULE_INDEX, N_JOINTS
@@ -61,7 +61,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
     arguments = parser.parse_args()
     logger = log.setup("simulator")
-    robot = config.load(arguments.config)
+    robot = config_file.load(arguments.config)
     story = scenario.load(arguments.scenario)
     stop = StopFlag()
     granted = raise_priority(FIFO_PRIORITY)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from shared.config import load_without_schedule
+from shared.config_file import load_without_schedule
 from shared.drive_settings import AXES, of_module
 from tests.conftest import ROBOT_FILE
 from tools.bringup.boards import Value

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
-from shared import config, loadcell_can
+from shared import config_file, loadcell_can
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.codec import encode
 from shared.config import RobotConfig
@@ -22,7 +22,7 @@ from shared.messages import TareRequest, Vector6, Wrench
 from shared.process import DEFAULT_CONFIG
 from shared.stewart import geometry_matrix
 
-ROBOT = config.load(DEFAULT_CONFIG)
+ROBOT = config_file.load(DEFAULT_CONFIG)
 HARNESS = ROBOT.harness
 G = geometry_matrix(HARNESS.base_radius, HARNESS.platform_radius, HARNESS.height)
 PERIOD_NS = 4 * NS_PER_MS

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import pytest
 
-from shared import codec, config, topics
+from shared import codec, config_file, topics
 from shared.bus import Session, open_session
 from shared.messages import Estop, JointCommand, JointState, Message, SimTruth, Wrench
 from shared.process import DEFAULT_CONFIG
@@ -24,7 +24,7 @@ from tests.recorder.runs import Queue, sample
 from tools.playback.arguments import LISTEN
 
 ROOT = DEFAULT_CONFIG.parents[1]
-ROBOT = config.load(DEFAULT_CONFIG)
+ROBOT = config_file.load(DEFAULT_CONFIG)
 NAME = ROBOT.name
 PATIENCE_S = 30.0
 BEGAN = 5_000_000_000
@@ -60,7 +60,7 @@ def write(
 ) -> Path:
     """Write a run of the shipped robot, in one file or several, and return its directory."""
     monkeypatch.setitem(runs.METADATA, "run", {**runs.METADATA["run"], "robot": NAME})
-    monkeypatch.setitem(runs.ATTACHMENTS, "robot.toml", config.to_toml(ROBOT).encode())
+    monkeypatch.setitem(runs.ATTACHMENTS, "robot.toml", config_file.to_toml(ROBOT).encode())
     with runs.writer(directory, keys=topics.all_keys(NAME)) as run:
         size = -(-len(rows) // parts)
         for part in range(parts):

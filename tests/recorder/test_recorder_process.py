@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 
 from shared import topics
 from shared.bus import Publisher, open_session
-from shared.config import load
+from shared.config_file import load
 from shared.exceptions import RunError
 from shared.messages import JointState
 from shared.process import DEFAULT_CONFIG

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from shared import config, topics
+from shared import config_file, topics
 from shared.bus import Publisher, Session, Stream, open_session
 from shared.clock import NS_PER_MS, now_ns
 from shared.codec import Decoder
@@ -28,7 +28,7 @@ from tools.runs.injector_client import InjectorClient
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
-ROBOT = config.load(DEFAULT_CONFIG)
+ROBOT = config_file.load(DEFAULT_CONFIG)
 KNEE = "knee_left"
 PERIOD_S = 0.004
 PATIENCE_S = 20.0

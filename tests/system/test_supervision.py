@@ -30,7 +30,7 @@ JOINT = """
 import sys, time
 from pathlib import Path
 from shared.bus import open_session
-from shared.config import load
+from shared.config_file import load
 from shared.messages import JointState, Mode
 from shared.topics import JOINT_STATE
 zero = (0.0, 0.0)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shared import config
+from shared import config_file
 from shared.config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.usb import robot_file
@@ -40,16 +40,16 @@ def test_a_wrong_serial_number_is_refused_whichever_the_driver(
     text = path.read_text().replace("odrive_usb", driver, 1).replace("3A0000000001", serial)
     path.write_text(text)
     with pytest.raises(ConfigError, match=words):
-        config.load(path)
+        config_file.load(path)
 
 
 def test_a_missing_serial_number_is_refused_on_usb_only(tmp_path: Path) -> None:
     path = robot_file.write(tmp_path)
     path.write_text(path.read_text().replace('serial_number = "3A0000000004"\n', ""))
     with pytest.raises(ConfigError, match="ankle_left"):
-        config.load(path)
+        config_file.load(path)
     path.write_text(path.read_text().replace('"odrive_usb"', '"odrive_can"', 1))
-    assert config.load(path).module_named("ankle_left").serial_number == ""
+    assert config_file.load(path).module_named("ankle_left").serial_number == ""
 
 
 def test_only_an_emulated_robot_on_usb_has_the_stand_in(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from shared import config
+from shared import config_file
 from shared.config import RobotConfig, expand
 from shared.exceptions import FleetError, XrlError
 from shared.joints import MODULES
@@ -59,7 +59,7 @@ def service_on(robot: RobotConfig, module: str, run_dir: Path) -> Fleet | None:
         if manifest is None:
             continue
         with contextlib.suppress(XrlError):  # a file that has been broken since tells nothing
-            other = config.load_without_schedule(Path(manifest.config))
+            other = config_file.load_without_schedule(Path(manifest.config))
             services = [name for name in manifest.services if name in MODULES]
             if any(_drive_of(other, name, path) == drive for name in services):
                 return Fleet(path)

@@ -10,10 +10,10 @@ from typing import Any, Final
 import msgspec
 import tomli_w
 
-from shared import config, gain_schedule
+from shared import config_file, gain_schedule
 from shared.config import RobotConfig
+from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
-from shared.gain_schedule import GainSchedule
 
 DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Names of the six rows of K_p and B_p."""
@@ -40,7 +40,7 @@ def with_params(robot: RobotConfig, texts: Sequence[str], file: str) -> RobotCon
         if not equals:
             raise ConfigError("--param", text, "no value", "NAME=VALUE")
         _set(table, _GAIN.sub(r"law.\1_p.\2", name.strip()), value.strip(), file)
-    changed = config.parse(tomli_w.dumps(table), f"{file}, with --param")
+    changed = config_file.parse(tomli_w.dumps(table), f"{file}, with --param")
     return msgspec.structs.replace(changed, gain_schedule=_kept(robot, changed))
 
 

@@ -13,7 +13,7 @@ from typing import TypeVar, get_args, get_type_hints
 
 import msgspec
 
-from shared import config, gain_schedule, scenario
+from shared import config_file, gain_schedule, scenario
 from shared.config import SERVICES, RobotConfig
 from shared.config_sections import LawConfig
 from shared.exceptions import FleetError, RunError
@@ -240,7 +240,7 @@ def load_robot(path: Path, **law: str) -> RobotConfig:
     Raises:
         ConfigError: the file cannot be used, or the gain split lacks its schedule.
     """
-    robot = config.load(path)
+    robot = config_file.load(path)
     robot = msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **law))
     gain_schedule.require(robot, path)
     return robot
@@ -269,7 +269,7 @@ def write_inputs(out: Path, robot: RobotConfig, story: Scenario) -> tuple[Path, 
         The files: robot, scenario and, if the robot has one, its gain schedule.
     """
     robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
-    robot_path.write_text(config.to_toml(robot), encoding="utf-8")
+    robot_path.write_text(config_file.to_toml(robot), encoding="utf-8")
     scenario_path.write_text(scenario.to_toml(story), encoding="utf-8")
     if robot.gain_schedule is None:
         return robot_path, scenario_path

@@ -15,7 +15,8 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 
-from shared.config import RobotConfig, expand, load
+from shared.config import RobotConfig, expand
+from shared.config_file import load
 from shared.exceptions import ConfigError, FleetError
 from shared.injection import SOCKET
 from shared.joints import MODULES

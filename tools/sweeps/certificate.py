@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from rich.console import Console
 
-from shared import config
+from shared import config_file
 from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.sweeps import certificate_study, study
@@ -58,7 +58,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if a case fell that was said to stand."""
     study.check_least(("--n", args.n, 1), ("--workers", args.workers, 1))
-    robot = config.load(args.config)
+    robot = config_file.load(args.config)
     if not args.friction:
         robot = certificate_study.without_friction(robot)
     console = Console()
@@ -150,7 +150,7 @@ def _command(args: argparse.Namespace) -> str:
 
 
 def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
-    digest = hashlib.sha256(config.to_toml(robot).encode()).hexdigest()
+    digest = hashlib.sha256(config_file.to_toml(robot).encode()).hexdigest()
     return {
         "study": "certificate",
         "seed": str(args.seed),

@@ -8,7 +8,7 @@ from typing import Final, TypeAlias
 
 from rich.console import Console
 
-from shared import config
+from shared import config_file
 from shared.config import RobotConfig
 from shared.messages import SimTruth
 from shared.process import DEFAULT_CONFIG
@@ -161,7 +161,7 @@ def _figures(outcome: Outcome) -> dict[str, object]:
 
 
 def _inputs(seed: int, robot: RobotConfig) -> dict[str, str]:
-    digest = hashlib.sha256(config.to_toml(robot).encode()).hexdigest()
+    digest = hashlib.sha256(config_file.to_toml(robot).encode()).hexdigest()
     return {"study": "kill", "seed": str(seed), "robot": digest, "code": code_digest(CODE)}
 
 

@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 import msgspec
 from rich.console import Console
 
-from shared import config
+from shared import config_file
 from shared.config import RobotConfig
 from shared.messages import SimTruth
 from shared.process import DEFAULT_CONFIG
@@ -260,7 +260,7 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
         "jitter": _joined(args.jitter),
         "loss": _joined(args.loss),
         "control": ",".join(args.control),
-        "robot": hashlib.sha256(config.to_toml(robot).encode()).hexdigest(),
+        "robot": hashlib.sha256(config_file.to_toml(robot).encode()).hexdigest(),
         "code": code_digest(CODE),
     }
 
