@@ -154,6 +154,9 @@ class JointState(Message, frozen=True):
     """`DriveStatus`."""
     drive_error: int
     """The drives' error bits, both axes or-ed; 0 if none."""
+    coupled_share: float = 1.0
+    """How much of tau_coupled this module would use: 1, and less where its commands' ages are
+    unsteady, down to 0."""
 
 
 class JointCommand(Message, frozen=True):
@@ -174,7 +177,8 @@ class JointCommand(Message, frozen=True):
     dtau_ff: Pair
     """N m/s"""
     tau_coupled: Pair
-    """(K_q - D)(q_ref - q) + (B_q - D_B)(v_ref - v) in N m; dropped in HOLD."""
+    """(K_q - D)(q_ref - q) + (B_q - D_B)(v_ref - v) in N m; dropped in HOLD. A module uses
+    `coupled_share` of it, or less."""
     k_p: Pair
     """Local stiffness D in N m/rad."""
     k_d: Pair
@@ -184,6 +188,9 @@ class JointCommand(Message, frozen=True):
     stiffness required, 0 is a fall."""
     margin_onboard: float
     """The same with the joint services gone and the drives' own loops left."""
+    coupled_share: float = 1.0
+    """How much of tau_coupled all six are to use, 0 .. 1: less while they act apart in time. What
+    it does not hold then, HOLD's gains do."""
 
 
 class JointEvent(Message, frozen=True):
@@ -260,6 +267,8 @@ class PlannerStatus(Message, frozen=True):
     """Assist that the operator asked for, N, as this tick took it."""
     state_age_ns: Modules
     """Time since each module's newest state arrived, by the planner's clock; -1 if none yet."""
+    coupled_share: float = 1.0
+    """Of the commands."""
 
 
 class OperatorIntent(Message, frozen=True):

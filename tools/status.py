@@ -21,7 +21,7 @@ from shared.exceptions import FleetError
 from shared.fault_table import recovery_of
 from shared.joints import MODULES
 from shared.messages import Cause, DriveStatus, JointState, Message, Mode, Pair
-from shared.topics import TOPICS
+from shared.topics import JOINT_STATE, TOPICS
 from tools.runs.injector_client import InjectorClient
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
@@ -146,7 +146,8 @@ def run(args: argparse.Namespace) -> int:
     """Look at the fleet once, or until interrupted."""
     fleet = Fleet.attach(args.run_dir)
     with open_session(load(Path(fleet.manifest.config)), "status", fleet.run.path) as session:
-        ears = ears_of(session, fleet.manifest.topics)
+        ears = ears_of(session, dict.fromkeys(MODULES, JOINT_STATE.name))
+        ears |= ears_of(session, fleet.manifest.topics)
         _listen(ears, _LINKS_S, until=lambda: all(ear.newest for ear in ears.values()))
         if args.watch:
             _watch(fleet, ears)

@@ -10,6 +10,7 @@ from shared import config_file, gain_schedule
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.runs.experiment import make_out, scenario_file
+from tools.supervision.fleet import check_known, load_table
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
 
@@ -27,6 +28,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl up --scenario crawl --out out/crawl
         xrl up --injectable                            # then: xrl inject --link ... --delay 30
         xrl up --config lab.toml --no-sim
+        xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # of one host
         xrl up --config lab.toml --no-sim --readonly   # move the joints by hand, and look
         """,
     )
@@ -48,6 +50,13 @@ def add_parser(subparsers: Subparsers) -> None:
         "--no-sim",
         action="store_true",
         help="start no simulator: the drives are real, or come later",
+    )
+    parser.add_argument(
+        "--only",
+        type=_names,
+        metavar="SERVICE,...",
+        help="only these: the robot's other services run on other hosts, where their endpoints in "
+        "the robot file are",
     )
     parser.add_argument(
         "--snapshot",
@@ -75,30 +84,71 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Start the fleet and say where it is."""
     gain_schedule.require(config_file.load(args.config), args.config)
+    services = _services(args)
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
-    make_out(out, "up")
+    overrides = _overrides(args, out)
+    if services is not None:
+        overrides = {name: words for name, words in overrides.items() if name in services}
+    if services is None or "recorder" in services:
+        make_out(out, "up")
+    asleep = args.no_planner and (services is None or "planner" in services)
+    fleet = Fleet.start(
+        args.config,
+        args.run_dir,
+        overrides=overrides,
+        services=services,
+        asleep=("planner",) if asleep else (),
+        simulation=not args.no_sim,
+        injected=args.injectable,
+    )
+    up = len(fleet.manifest.services) - asleep
+    record = f", record: {out}" if "recorder" in fleet.manifest.services else ""
+    print(
+        f"{up} service{'s are' if up != 1 else ' is'} up in {fleet.run.path} "
+        f"(logs: {fleet.run.logs}{record}); `xrl status` shows them, `xrl down` stops them"
+    )
+    return 0
+
+
+def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:
+    """Return what the arguments add to the services' own."""
     overrides = {"recorder": ["--out", str(out.absolute())]}
     if args.snapshot is not None:
         overrides["recorder"] += ["--snapshot", f"{args.snapshot:g}"]
     if args.readonly:
         overrides |= {module: ["--readonly"] for module in MODULES}
     if args.scenario is not None:
-        if args.no_sim:
-            raise FleetError("--scenario is for the simulator, and --no-sim starts none; leave one")
         path = str(scenario_file(args.scenario))
         overrides["simulator"] = ["--scenario", path, "--autostart", str(SETTLE_S)]
         overrides["recorder"] += ["--scenario", path, "--scenario-text", args.scenario]
-    fleet = Fleet.start(
-        args.config,
-        args.run_dir,
-        overrides=overrides,
-        asleep=("planner",) if args.no_planner else (),
-        simulation=not args.no_sim,
-        injected=args.injectable,
-    )
-    up = len(fleet.manifest.services) - args.no_planner
-    print(
-        f"{up} services are up in {fleet.run.path} "
-        f"(logs: {fleet.run.logs}, record: {out}); `xrl status` shows them, `xrl down` stops them"
-    )
-    return 0
+    return overrides
+
+
+def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
+    """Return what `--only` names, None for all, if it goes with the other arguments.
+
+    Raises:
+        FleetError: an argument is for a service that is not started.
+    """
+    only: tuple[str, ...] | None = args.only
+    absent = {"simulator"} if args.no_sim else set()
+    if only is not None:
+        if not only:
+            raise FleetError("--only names no service; --only planner,harness,recorder, say")
+        check_known(only, [row.name for row in load_table().process])
+        absent |= {"simulator", "recorder", "planner", *MODULES} - set(only)
+    for option, is_given, service in (
+        ("--scenario", args.scenario is not None, "simulator"),
+        ("--snapshot", args.snapshot is not None, "recorder"),
+        ("--injectable", args.injectable, "planner"),
+    ):
+        if is_given and service in absent:
+            why = "--no-sim" if only is None or service in only else "--only"
+            raise FleetError(f"{option} is for the {service}, and {why} starts none; leave one")
+    if only is not None and args.injectable:
+        return (*only, "injector")
+    return only
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))

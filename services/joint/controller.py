@@ -55,6 +55,23 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     resumed_ns: int = 0
 
 
+def hold_gains(config: RobotConfig, module: str) -> tuple[Pair, Pair]:
+    """Return (k_p, k_d) that a module's gains rise to where no tau_coupled holds it.
+
+    The stand gains of the ankles and of every phi, zero elsewhere; (phi, theta), N m/rad and
+    N m s/rad. With gains as they were (design section 4), the operator's 60 N m of pitch moment
+    in the crawl leaned the COM back by 42 mm and the soles tipped, and pushes from the side
+    tipped them in 15 of 500 random cases. Not the theta of hips and knees: a torso that does not
+    follow a hand that leads on hands all of its moment to the soles, and 6 of 300 fell.
+
+    In TRACK without tau_coupled the same: the certified gains are stiff enough to stand, but
+    sway damped by 0.055 only; two pushes of 40 N from the side, 2 s apart, made it fall.
+    """
+    stand = config.stand_gains(module)
+    theta = float(kind_of(module) in config.joint_service.hold_stiffens_theta)
+    return (stand.k_p[0], theta * stand.k_p[1]), (stand.k_d[0], theta * stand.k_d[1])
+
+
 class JointController:
     """The control law of one module and its memory."""
 
@@ -68,9 +85,7 @@ class JointController:
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
         self._damp_k_d = service.damp_k_d
         self._sinks = (False, kind_of(module) in service.damp_sinks)
-        theta = float(kind_of(module) in service.hold_stiffens_theta)
-        self._hold_k_p = (stand.k_p[0], theta * stand.k_p[1])
-        self._hold_k_d = (stand.k_d[0], theta * stand.k_d[1])
+        self._hold_k_p, self._hold_k_d = hold_gains(config, module)
         knee = kind_of(module) == "knee"
         self._damp_stop = service.damp_knee_stop if knee else -math.inf
         self._gear_ratio = config.joint.gear_ratio
@@ -196,6 +211,7 @@ class JointController:
             refused=failsafe.refused,
             drive=int(samples.status),
             drive_error=samples.error,
+            coupled_share=failsafe.coupled_share(self.timing),
         )
 
     def remember(self) -> ControllerMemory:
@@ -279,7 +295,10 @@ class JointController:
             command = self.failsafe.command
             assert command is not None  # noqa: S101 - TRACK is entered on fresh commands only
             age_s = (now_ns - command.echo_t_ns) / NS_PER_S
-            fresh = law.aged(command, min(age_s, self._aging_max_s))
+            share = min(command.coupled_share, self.failsafe.coupled_share(self.timing))
+            fresh = law.aged(command, min(age_s, self._aging_max_s), share)
+            if share < 1.0:
+                fresh = law.stiffened(fresh, self._hold_k_p, self._hold_k_d, 1.0 - share)
             if since_ns >= self._blend_ns:
                 return fresh
             return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
@@ -293,14 +312,7 @@ class JointController:
         return self._held(since_ns)
 
     def _held(self, since_ns: int) -> Setpoint:
-        """Return HOLD's law: the anchor frozen; some gains rise to the stand gains.
-
-        The ankles' and every phi's: with these as they were (design section 4), the
-        operator's 60 N m of pitch moment in the crawl leaned the COM back by 42 mm and the
-        soles tipped, and pushes from the side tipped them in 15 of 500 random cases. Not the
-        theta of hips and knees: a torso that does not follow a hand that leads on hands all
-        of its moment to the soles, and 6 of 300 fell.
-        """
+        """Return HOLD's law: the anchor frozen; some gains rise to the stand gains."""
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._blend_ns)
         frozen = law.held(self._anchor, moving)

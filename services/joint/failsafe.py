@@ -122,7 +122,7 @@ class Failsafe(msgspec.Struct):
 
     mode: Mode = Mode.DISARMED
     command: JointCommand | None = None
-    """The newest command taken; `tau_coupled` of it is less where ages are unsteady."""
+    """The newest command taken."""
     session: int = 0
     """Session of the commands that are taken; 0 before the first."""
     retired: tuple[int, ...] = ()
@@ -140,13 +140,7 @@ class Failsafe(msgspec.Struct):
     """Running mean of how far from that mean they were."""
 
     def offer(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
-        """Take a command if it is usable; count it if not.
-
-        `tau_coupled` fades out as ages become unsteady. It is feedback from all six modules,
-        and right only if all six act on the same tick: with ages of 4 to 46 ms, all within
-        the rule, the six acted on different ticks, and the robot shook until it fell. Late by
-        always the same it harms nobody: 50 ms each way stood through pushes.
-        """
+        """Take a command if it is usable; count it if not."""
         refusal = self._judge(command, now_ns, timing)
         if refusal is not Refusal.NONE:
             self.refused += 1
@@ -157,15 +151,17 @@ class Failsafe(msgspec.Struct):
             self.session = command.session
             self.fresh_since_ns = -1
         self._watch_age(now_ns - command.echo_t_ns)
-        share = self.coupled_share(timing)
-        if share < 1.0 and command.tau_coupled != (0.0, 0.0):
-            phi, theta = command.tau_coupled
-            command = msgspec.structs.replace(command, tau_coupled=(share * phi, share * theta))
         self.command = command
         return refusal
 
     def coupled_share(self, timing: Timing) -> float:
-        """Return how much of tau_coupled is used: 1 while ages are steady, 0 if they are not."""
+        """Return how much of tau_coupled may be used: 1 while ages are steady, 0 if not.
+
+        It is feedback from all six modules, and right only if all six act on the same tick:
+        with ages of 4 to 46 ms, all within the rule, the six acted on different ticks, and
+        the robot shook until it fell. Late by always the same it harms nobody: 50 ms each way
+        stood through pushes.
+        """
         limit = timing.unsteady_age_ns
         share = (limit - self.age_deviation_ns) / (limit * (1.0 - STEADY_SHARE))
         return min(1.0, max(0.0, share))
@@ -270,6 +266,8 @@ def within_limits(command: JointCommand, timing: Timing) -> bool:
 
     Written so that a NaN fails: every comparison with it is false.
     """
+    if not 0.0 <= command.coupled_share <= 1.0:
+        return False
     for axis in (0, 1):
         if not (
             0.0 <= command.k_p[axis] <= timing.k_p_max

@@ -3,12 +3,12 @@
 tau_coupled is feedback from all six modules to all six (design section 3 c): it is right only if
 they act on it at about the same time. With one knee 22 ms late each way, every command within
 the age rule, the robot shook until it fell; late by the same in all six it harmed nobody.
-Without tau_coupled each module stands by its own certified gains.
+What tau_coupled does not hold is held by stiffer local gains (`services.joint.controller`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import msgspec
@@ -37,6 +37,14 @@ class Coherence(msgspec.Struct):
             spread_ns = min(max(ages_ns) - youngest, MOST_NS)
             self.spread_ns += (spread_ns - self.spread_ns) / TICKS
 
-    def share(self) -> float:
-        """Return how much of tau_coupled is given: 1 while they act together, 0 if apart."""
-        return min(1.0, max(0.0, (NONE_NS - self.spread_ns) / (NONE_NS - WHOLE_NS)))
+    def share(self, wanted: Iterable[float]) -> float:
+        """Return how much of tau_coupled all six get: 1 while they act together, 0 if apart.
+
+        Never more than any of them would use: one that does without, among five that do not,
+        is held by nobody's certificate.
+
+        Args:
+            wanted: per module, `JointState.coupled_share`.
+        """
+        together = (NONE_NS - self.spread_ns) / (NONE_NS - WHOLE_NS)
+        return max(0.0, min(1.0, together, *wanted))

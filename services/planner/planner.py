@@ -75,6 +75,7 @@ class Planner:
             round(harness.overload_release_s * NS_PER_S),
         )
         self._coherence = Coherence()
+        self._coupled_share = 1.0
         self._wrench_seq = -1
         self._last_ns = 0
         self._new = 0  # bit i: module i has a state that no tick has used
@@ -148,6 +149,7 @@ class Planner:
         )
         self._source = self._output.local.source
         self._coherence.take([state.age_ns for state in states])
+        self._coupled_share = self._coherence.share(state.coupled_share for state in states)
         self._seq += 1
         return self._commands(now_ns, states, self._output)
 
@@ -214,7 +216,7 @@ class Planner:
                 output.v_ref,
                 output.tau_ff,
                 output.dtau_ff,
-                output.tau_coupled * self._coherence.share(),
+                output.tau_coupled,
                 output.local.D,
                 output.local.D_B,
             )
@@ -222,8 +224,9 @@ class Planner:
         by_module = rows.transpose(1, 0, 2).tolist()
         hold = self._hold()
         margins = output.local.margins
+        share = self._coupled_share
         return [
-            _command(now_ns, self._seq, self.session, state.t_ns, hold, margins, rows)
+            _command(now_ns, self._seq, self.session, state.t_ns, hold, margins, share, rows)
             for state, rows in zip(states, by_module, strict=True)
         ]
 
@@ -258,6 +261,7 @@ class Planner:
             wrench_seq=self._wrench_seq,
             assist_wanted_n=self._assist_wanted,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
+            coupled_share=self._coupled_share,
         )
 
 
@@ -268,6 +272,7 @@ def _command(
     echo_t_ns: int,
     hold: bool,
     margins: Margins,
+    coupled_share: float,
     rows: list[list[float]],
 ) -> JointCommand:
     pairs: list[Pair] = [(row[0], row[1]) for row in rows]
@@ -286,6 +291,7 @@ def _command(
         k_d=pairs[6],
         margin=margins.service,
         margin_onboard=margins.onboard,
+        coupled_share=coupled_share,
     )
 
 

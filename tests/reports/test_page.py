@@ -41,7 +41,7 @@ BARS = (
     "Harness sensor",
 )  # fmt: skip
 ORIGINS = {
-    "total, after the gate", "tau_ff", "tau_coupled, as sent", "local PD",
+    "total, after the gate", "tau_ff", "tau_coupled, as used", "local PD",
     "taken off by the service",
 }  # fmt: skip
 

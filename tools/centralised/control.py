@@ -12,7 +12,7 @@ The modules hand it to the drives unchanged until the next one comes. Pure.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import msgspec
 
@@ -49,7 +49,7 @@ class LeadsOn(Engagement):
 class Undivided(Coherence):
     """Gives all of tau_coupled however far apart the modules act: there are no local gains."""
 
-    def share(self) -> float:
+    def share(self, wanted: Iterable[float]) -> float:  # noqa: ARG002 - whatever they want
         """Return 1."""
         return 1.0
 

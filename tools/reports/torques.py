@@ -7,6 +7,8 @@ from typing import Final, TypeAlias
 import msgspec
 import numpy as np
 
+from services.joint import law
+from services.joint.controller import hold_gains
 from shared import topics
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
@@ -27,12 +29,12 @@ class Origins(msgspec.Struct):
 
     feedforward: Array
     coupled: Array
-    """As the planner sent it."""
+    """What was used of it."""
     local: Array
-    """k_p (q_ref - q) + k_d (v_ref - v)."""
+    """k_p (q_ref - q) + k_d (v_ref - v), the gains as stiff as they then were."""
     taken_off: Array
-    """What the service sent less these: what the gate cut off, and what of `coupled` it left
-    out because the commands' ages were unsteady."""
+    """What the service sent less these: what the gate cut off, and what is left of a step that
+    a service that was frozen did not make."""
 
 
 def add_joints(source: Source, sheet: Sheet) -> None:
@@ -96,6 +98,7 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
     found = Origins(*(np.full(shape, np.nan) for _ in range(4)))
     blend_ns = robot.joint_service.blend_ms * NS_PER_MS
     aging_max_s = robot.joint_service.command_aging_max_ms / 1e3
+    stiffest = hold_gains(robot, module)
     tracking_since_ns: int | None = None
     for index, state in enumerate(states):
         if state.mode != Mode.TRACK:
@@ -107,15 +110,13 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
         if command is None or state.t_ns - tracking_since_ns < blend_ns or state.age_ns < 0:
             continue
         age_s = min(state.age_ns / NS_PER_S, aging_max_s)
-        for axis in (0, 1):
-            v_ref = command.v_ref[axis]
-            q_ref = command.q_ref[axis] + v_ref * age_s
-            found.feedforward[index, axis] = command.tau_ff[axis] + command.dtau_ff[axis] * age_s
-            found.coupled[index, axis] = command.tau_coupled[axis]
-            found.local[index, axis] = command.k_p[axis] * (q_ref - state.q[axis]) + command.k_d[
-                axis
-            ] * (v_ref - state.v[axis])
+        share = min(command.coupled_share, state.coupled_share)
+        used = law.stiffened(law.aged(command, age_s, share), *stiffest, 1.0 - share)
+        found.feedforward[index] = used.tau_ff
+        found.coupled[index] = used.tau_coupled
+        found.local[index] = law.torque(used, state.q, state.v)
     sent = np.array([state.tau for state in states]).reshape(shape)
+    found.local -= found.feedforward + found.coupled
     found.taken_off = sent - found.feedforward - found.coupled - found.local
     return found
 
@@ -125,7 +126,7 @@ def _torques(t: Array, tau: Array, found: Origins | None, axis: int) -> list[Lin
     if found is not None:
         lines += [
             Line("tau_ff", t, found.feedforward[:, axis], 1),
-            Line("tau_coupled, as sent", t, found.coupled[:, axis], 2),
+            Line("tau_coupled, as used", t, found.coupled[:, axis], 2),
             Line("local PD", t, found.local[:, axis], 3),
             Line("taken off by the service", t, found.taken_off[:, axis], 5, hidden=True),
         ]

@@ -324,6 +324,8 @@ def _tcp_fault(endpoint: str) -> str:
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 return "port in use"
+            if error.errno == errno.EADDRNOTAVAIL:
+                return "an address of another host (`--only` starts the services of this one)"
             return f"cannot be listened on: {error.strerror or error}"
     return ""
 

@@ -1,0 +1,120 @@
+"""A robot whose services run on several hosts: `xrl up --only` on each.
+
+Three run directories stand for the hosts; they share the bus over TCP, and, as they are one
+machine after all, the emulated drives.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from shared import config_file
+from shared.config import SERVICES, RobotConfig
+from shared.joints import MODULES
+from shared.process import DEFAULT_CONFIG
+from tools import cli
+from tools.supervision import procfs
+from tools.supervision.supervise import Fleet
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+
+BODY = ("simulator", "harness", "recorder", "planner")
+HOSTS = {
+    "body": BODY,
+    "right": tuple(module for module in MODULES if module.endswith("_right")),
+    "left": tuple(module for module in MODULES if module.endswith("_left")),
+}
+
+
+@pytest.fixture
+def run_dirs() -> Iterator[dict[str, Path]]:
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as parent:
+        paths = {host: Path(parent) / host for host in HOSTS}
+        yield paths
+        for path in paths.values():
+            Fleet(path).stop()
+
+
+def spread(robot: RobotConfig, drives: Path) -> RobotConfig:
+    """Return the robot with its endpoints at free TCP ports, and its drives in one place."""
+    with ExitStack() as stack:
+        sockets = {name: stack.enter_context(socket.socket()) for name in SERVICES}
+        for probe in sockets.values():
+            probe.bind(("127.0.0.1", 0))
+        endpoints = {
+            name: f"tcp/127.0.0.1:{probe.getsockname()[1]}" for name, probe in sockets.items()
+        }
+    can = {
+        name: msgspec.structs.replace(bus, channel=bus.channel.replace("{run}", str(drives)))
+        for name, bus in robot.can.items()
+    }
+    bus = msgspec.structs.replace(robot.bus, endpoints=endpoints)
+    return msgspec.structs.replace(robot, bus=bus, can=can)
+
+
+def wait_for(truth: Callable[[], bool], timeout_s: float = 60.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not truth():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.2)
+    return True
+
+
+def test_each_host_starts_its_own_services_and_all_six_modules_track(
+    robot: RobotConfig, run_dirs: dict[str, Path], tmp_path: Path, capsys: Any
+) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(config_file.to_toml(spread(robot, run_dirs["body"])), encoding="utf-8")
+    schedule = DEFAULT_CONFIG.with_suffix(".gains.json")
+    (tmp_path / "robot.gains.json").write_bytes(schedule.read_bytes())
+    for host, services in HOSTS.items():
+        where = ["--config", str(path), "--run-dir", str(run_dirs[host])]
+        assert (
+            cli.main(["up", *where, "--out", str(tmp_path / host), "--only", ",".join(services)])
+            == 0
+        )
+        assert set(Fleet.attach(run_dirs[host]).pids()) == set(services)
+    assert (tmp_path / "body" / "run.mcap").exists()
+    assert not (tmp_path / "right").exists(), "a host without recorder records nothing"
+
+    def modes() -> set[str]:
+        capsys.readouterr()
+        assert cli.main(["status", "--json", "--run-dir", str(run_dirs["left"])]) == 0
+        status = json.loads(capsys.readouterr().out)
+        assert set(status["services"]) == set(HOSTS["left"])
+        return {module["mode"] for module in status["modules"].values()}
+
+    assert wait_for(lambda: modes() == {"TRACK"}), "each host hears the modules of all"
+    for run_dir in run_dirs.values():
+        assert cli.main(["down", "--run-dir", str(run_dir)]) == 0
+        assert procfs.fleet_pids(run_dir) == set()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--only", "knee"], "no service 'knee'; one of simulator, ankle_right"),
+        (["--only", " , "], "--only names no service"),
+        (["--only", "planner", "--scenario", "squat"], "--only starts none"),
+        (["--only", "planner", "--snapshot", "5"], "--snapshot is for the recorder"),
+        (["--only", "recorder", "--injectable"], "--injectable is for the planner"),
+        (["--no-sim", "--scenario", "squat"], "--no-sim starts none"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_and_nothing_is_started(
+    arguments: list[str], words: str, run_dirs: dict[str, Path], capsys: Any
+) -> None:
+    assert cli.main(["up", "--run-dir", str(run_dirs["body"]), *arguments]) == 2
+    assert words in capsys.readouterr().err
+    assert not run_dirs["body"].exists()
