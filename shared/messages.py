@@ -269,6 +269,8 @@ class PlannerStatus(Message, frozen=True):
     """Time since each module's newest state arrived, by the planner's clock; -1 if none yet."""
     coupled_share: float = 1.0
     """Of the commands."""
+    wait_s: float = 0.0
+    """Until it may lead again after drop-outs, s; 0 if nothing is waited for."""
 
 
 class OperatorIntent(Message, frozen=True):

@@ -7,7 +7,8 @@ from itertools import product
 import pytest
 
 from shared.messages import Cause, DriveStatus, JointState, Mode
-from tools.status import module_status
+from tools.runs.fleet_status import LeadStatus, lead_status, module_status
+from tools.status import lead_in_words
 
 
 def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:
@@ -40,3 +41,17 @@ def test_angles_are_told_only_where_the_drive_knows_them(drive: DriveStatus) -> 
 def test_a_module_that_is_not_heard_is_not_guessed_at() -> None:
     status = module_status(None)
     assert (status.mode, status.tier, status.q, status.way_out) == (None, None, None, "")
+
+
+def test_a_planner_that_is_not_heard_is_said_so() -> None:
+    assert lead_status(None) is None
+    assert "each module holds" in lead_in_words(None)
+
+
+def test_why_the_planner_does_not_lead_yet_and_what_ages_cost_is_told() -> None:
+    good = LeadStatus("LEADING", wait_s=0.0, coupled_share=1.0, margin=1.2)
+    assert lead_in_words(good) == "planner LEADING, margin 1.20"
+    waits = lead_in_words(LeadStatus("ALIGNING", wait_s=12.3, coupled_share=1.0, margin=1.2))
+    assert "leads again in 12 s" in waits
+    uneven = lead_in_words(LeadStatus("LEADING", wait_s=0.0, coupled_share=0.25, margin=1.2))
+    assert "tau_coupled 25 %" in uneven

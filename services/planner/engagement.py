@@ -67,6 +67,10 @@ class Engagement(msgspec.Struct):
             self.mode, self.since_ns = after, now_ns
         return changed
 
+    def wait_ns(self, now_ns: int) -> int:
+        """Return how long it does not lead yet because of drop-outs, ns; 0 if it may."""
+        return max(0, self.dropped_ns + WAITS_NS[self.dropouts] - now_ns)
+
     def _next(
         self,
         now_ns: int,
@@ -83,8 +87,7 @@ class Engagement(msgspec.Struct):
             settled = now_ns - self.since_ns > GRACE_NS
             lost = settled and any(mode != Mode.TRACK for mode in modes)
             return PlannerMode.ALIGNING if lost else PlannerMode.LEADING
-        waited = now_ns - self.dropped_ns >= WAITS_NS[self.dropouts]
-        if self.mode is PlannerMode.ALIGNING and waited and all(ready):
+        if self.mode is PlannerMode.ALIGNING and not self.wait_ns(now_ns) and all(ready):
             return PlannerMode.LEADING
         return PlannerMode.ALIGNING
 

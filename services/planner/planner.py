@@ -239,6 +239,7 @@ class Planner:
             now_ns - arrived if state is not None else -1
             for state, arrived in zip(states, self._arrived_ns, strict=True)
         ]
+        leads = self._engagement.mode is PlannerMode.LEADING
         zero: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         return PlannerStatus(
             t_ns=now_ns,
@@ -262,6 +263,7 @@ class Planner:
             assist_wanted_n=self._assist_wanted,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
             coupled_share=self._coupled_share,
+            wait_s=0.0 if leads else self._engagement.wait_ns(now_ns) / NS_PER_S,
         )
 
 

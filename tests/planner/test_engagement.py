@@ -5,7 +5,7 @@ from typing import TypeVar
 import pytest
 
 from services.joint.drivers.base import DriveStatus
-from services.planner.engagement import GRACE_NS, Engagement
+from services.planner.engagement import GRACE_NS, WAITS_NS, Engagement
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.joints import MODULES
@@ -168,3 +168,13 @@ def test_a_silent_module_counts_before_what_is_forbidden(forbidden: PlannerMode)
     engagement = leading()
     engagement.advance(T0, but(YES, 3, False), YES, TRACK, forbidden)
     assert engagement.mode is PlannerMode.WAITING
+
+
+@pytest.mark.parametrize("dropouts", range(len(WAITS_NS)))
+def test_it_tells_how_long_it_waits_and_leads_when_that_is_over(dropouts: int) -> None:
+    engagement = Engagement(PlannerMode.ALIGNING, T0, dropouts=dropouts, dropped_ns=T0)
+    assert engagement.wait_ns(T0) == WAITS_NS[dropouts]
+    for now_ns in (T0 + WAITS_NS[dropouts] - 1, T0 + WAITS_NS[dropouts]):
+        left_ns = engagement.wait_ns(now_ns)
+        engagement.advance(now_ns, YES, YES, HOLD)
+        assert engagement.hold is (left_ns > 0)
