@@ -29,6 +29,7 @@ PLOTS = {
     "The legs' disagreement, position": ("x", "y", "z"),
     "The legs' disagreement, angle": ("roll", "pitch", "yaw"),
     "Certificate margin": ("joint services alone", "drives alone"),
+    "Share of tau_coupled": ("given to all six",),
     "Torque of each module against its limit": MODULES,
     "Harness force": ("x", "y", "z"),
     "Harness moment": ("x", "y", "z"),

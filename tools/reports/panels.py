@@ -195,7 +195,7 @@ def add_harness(source: Source, sheet: Sheet) -> None:
 
 
 def add_certificate(source: Source, sheet: Sheet) -> None:
-    """Add the margins of the gains in force, and the least allowed."""
+    """Add the margins of the gains in force, the least allowed, and what is coupled beside them."""
     t = source.times(topics.PLANNER_STATUS)
     mode, service, onboard = source.columns(
         topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
@@ -214,6 +214,16 @@ def add_certificate(source: Source, sheet: Sheet) -> None:
         [Line("joint services alone", t, service, 0), Line("drives alone", t, onboard, 1)],
         limits=limits,
         note="What stands if the planner is gone: 1 is the stiffness required, 0 is a fall.",
+        otherwise=NO_PLANNER,
+    )  # fmt: skip
+    mode, share = source.columns(topics.PLANNER_STATUS, "", "mode", "coupled_share")
+    share[mode != PlannerMode.LEADING] = np.nan
+    sheet.plot(
+        "Share of tau_coupled", "",
+        [Line("given to all six", t, share, 0)],
+        limits=[Limit(0.0, "none"), Limit(1.0, "all")],
+        note="Less where the modules act on commands of unsteady or unlike ages, while led; what "
+        "it does not hold, stiffer local gains do.",
         otherwise=NO_PLANNER,
     )  # fmt: skip
 

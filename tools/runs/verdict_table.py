@@ -24,7 +24,7 @@ def show(summary: Summary, console: Console) -> None:
         if row.key == "sequence_gaps" and not good and summary["stopped"]:
             mark = "of a service that was stopped"
         unit = f" {row.unit}" if row.unit else ""
-        table.add_row(row.what, f"{value:.3g}{unit}", f"{row.limit:g}{unit}", mark)
+        table.add_row(row.what, f"{_three_digits(value)}{unit}", f"{row.limit:g}{unit}", mark)
     console.print(table)
     if not summary["in_real_time"]:
         console.print(
@@ -33,6 +33,11 @@ def show(summary: Summary, console: Console) -> None:
             f"time given up. The times above are not those of a robot.[/]"
         )
     console.print(_sentence(summary))
+
+
+def _three_digits(value: float) -> str:
+    """Return a figure with three digits, or all before the point: 1540, not 1.54e+03."""
+    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
 def _sentence(summary: Summary) -> str:
