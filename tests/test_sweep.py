@@ -1,4 +1,4 @@
-"""`xrl sweep`: the pool, the table, the words and the verb around them."""
+"""`xrl sweep`: the pool, the words and the verb around them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,9 @@ from shared import gain_schedule
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from tools import cli
-from tools.sweeps import cases, pool, report
+from tools.sweeps import cases, pool
 from tools.sweeps.prepare import prepare
-from tools.sweeps.table import Table
-
-INPUTS = {"study": "test", "seed": "1"}
-COLUMNS = ("number", "value")
+from tools.sweeps.wilson import wilson
 
 
 def sweep(*flags: str) -> int:
@@ -70,7 +67,7 @@ def test_an_error_names_its_task_and_leaves_no_worker() -> None:
 
 
 def test_a_killed_worker_is_an_error_and_no_wait() -> None:
-    with pytest.raises(RunError, match="go on"):
+    with pytest.raises(RunError, match="fewer --workers"):
         list(pool.results(die, [1, 2], 2, str))
 
 
@@ -83,46 +80,26 @@ def test_a_loop_left_early_leaves_no_worker() -> None:
     assert multiprocessing.active_children() == []
 
 
-def test_a_table_is_sorted_whatever_came_first(tmp_path: Path) -> None:
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
-        for number in (3, 1, 2):
-            table.add({"number": number, "value": number / 2})
-    assert [row["number"] for row in rows_of(tmp_path / "t.csv")] == ["1", "2", "3"]
-
-
-def test_a_row_is_on_the_disk_when_it_is_done(tmp_path: Path) -> None:
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
-        table.add({"number": 7, "value": None})
-        assert rows_of(tmp_path / "t.csv") == [{"number": "7", "value": ""}]
-
-
-@pytest.mark.parametrize("torn", ["2,0.", "2", "2\n", ""])
-def test_a_row_cut_off_in_the_middle_is_done_again(tmp_path: Path, torn: str) -> None:
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
-        table.add({"number": 1, "value": 0.5})
-    with (tmp_path / "t.csv").open("a") as file:
-        file.write(torn)
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
-        assert table.numbers == {1}
-        table.add({"number": 2, "value": 1.5})
-    assert [row["value"] for row in rows_of(tmp_path / "t.csv")] == ["0.5", "1.5"]
-
-
-def test_a_folder_of_other_inputs_is_refused(tmp_path: Path) -> None:
-    Table(tmp_path, "t.csv", COLUMNS, INPUTS)
-    with pytest.raises(RunError, match=r"another seed \(1, now 2\); choose another --out"):
-        Table(tmp_path, "t.csv", COLUMNS, INPUTS | {"seed": "2"})
-    with pytest.raises(RunError, match="other columns"):
-        Table(tmp_path, "t.csv", (*COLUMNS, "more"), INPUTS)
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [(("--workers", "2"), "--workers"), (("--only", "1"), "--only")],
+)
+def test_flags_that_a_cluster_would_not_heed_are_refused(
+    flags: tuple[str, str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert sweep("--cluster", "tcp://127.0.0.1:1", *flags, "--out", str(out)) == 2
+    assert words in capsys.readouterr().err
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(("hits", "of"), [(0, 500), (3, 200), (1, 1), (20, 20)])
 def test_wilsons_bounds_solve_his_equation(hits: int, of: int) -> None:
     """A bound p is as far from what was seen as 1.96 deviations of a share p allow."""
-    for p in report.wilson(hits, of):
+    for p in wilson(hits, of):
         share = hits / of
         assert (share - p) ** 2 == pytest.approx(1.959964**2 * p * (1 - p) / of, abs=1e-12)
-    low, high = report.wilson(hits, of)
+    low, high = wilson(hits, of)
     assert 0.0 <= low <= hits / of <= high <= 1.0
     assert low < high
 
@@ -237,7 +214,7 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
 ) -> None:
     """Ctrl-C goes to every process of the terminal; SIGKILL here to the first only."""
     command = [sys.executable, "-m", "tools.cli", "sweep", "kill", "--split", "diagonal"]
-    study = subprocess.Popen(
+    process = subprocess.Popen(
         [*command, "--n", "200", "--workers", "2", "--out", str(tmp_path)],
         start_new_session=True,
         stdout=subprocess.DEVNULL,
@@ -248,16 +225,16 @@ def test_a_study_that_is_stopped_keeps_its_rows_and_leaves_no_process(
     try:
         wait_until(lambda: table.exists() and len(rows_of(table)) >= 2, "no case came")
         if number is signal.SIGINT:
-            os.killpg(study.pid, number)
+            os.killpg(process.pid, number)
         else:
-            study.kill()
-        _, said = study.communicate(timeout=60)
-        assert study.returncode == code
+            process.kill()
+        _, said = process.communicate(timeout=60)
+        assert process.returncode == code
         assert "Traceback" not in said
-        wait_until(lambda: session(study.pid) == [], "a worker stayed")
+        wait_until(lambda: session(process.pid) == [], "a worker stayed")
         assert len(rows_of(table)) >= 2
     finally:
-        for pid in session(study.pid):
+        for pid in session(process.pid):
             os.kill(pid, signal.SIGKILL)
 
 

@@ -20,7 +20,8 @@ from shared.scenario import Keyframe, Push, Scenario, lead
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import cases
 from tools.sweeps.cases import Case
-from tools.sweeps.outcome import Ending, FootLoads, is_tipping, run_case
+from tools.sweeps.figures import Ending, is_tipping
+from tools.sweeps.outcome import FootLoads, run_case
 
 
 @pytest.fixture(scope="module")

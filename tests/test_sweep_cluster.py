@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Sequence
+from concurrent.futures import CancelledError
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 
+from shared.config import RobotConfig
 from shared.exceptions import RunError
 from tools import cli
-from tools.sweeps import cluster
+from tools.sweeps import cluster, latency
+from tools.sweeps.latency import JOB
+from tools.sweeps.latency_trial import Network, Trial
 from tools.sweeps.table import code_digest
 
 CODE = ("tools/sweeps/pool.py",)
@@ -105,15 +110,46 @@ def test_a_worker_of_other_code_is_refused() -> None:
         cluster.checked(3, stumble, CODE, "another digest")
 
 
-def test_a_real_cluster_gives_what_this_machine_gives() -> None:
+def give_up(_number: int) -> int:
+    raise CancelledError("scheduler-connection-lost.\nClient lost the connection.")
+
+
+def test_a_scheduler_that_is_lost_is_said_in_one_line(dask: Inline) -> None:
+    with pytest.raises(RunError) as caught:
+        list(cluster.results(give_up, [1], "tcp://127.0.0.1:5", str, ()))
+    assert str(caught.value) == "--cluster tcp://127.0.0.1:5: connection to the scheduler lost"
+    assert dask.closed
+
+
+def test_dask_logs_nothing_into_a_study(dask: Inline, caplog: pytest.LogCaptureFixture) -> None:
+    logger = logging.getLogger("distributed.client")
+    logger.setLevel(logging.WARNING)
+
+    def work(number: int) -> int:
+        logger.error("Traceback ...")
+        return number
+
+    assert list(cluster.results(work, [1], "tcp://127.0.0.1:5", str, CODE)) == [(1, 1)]
+    assert dask.closed
+    assert caplog.records == []
+    assert logger.level == logging.WARNING
+
+
+def test_a_trial_on_a_real_cluster_is_the_trial_of_this_machine(robot: RobotConfig) -> None:
+    """In a process of its own, as a worker is; it falls early, and so takes no time."""
     distributed = pytest.importorskip("distributed")
+    network = Network(200.0, 0.0, 0.0)
+    trial = Trial(number=0, repeat=0, seed=1, control="centralised", network=network)
+    task = trial, robot
     with distributed.LocalCluster(
         n_workers=1,
         threads_per_worker=1,
-        processes=False,
+        processes=True,
         dashboard_address=None,
         host="127.0.0.1",
         protocol="tcp://",
     ) as local:
-        found = dict(cluster.results(abs, [-1, -2], local.scheduler_address, str, CODE))
-    assert found == {-1: 1, -2: 2}
+        address = local.scheduler_address
+        found = list(cluster.results(JOB.work, [task], address, JOB.name, latency.CODE))
+    assert found == [(task, JOB.work(task))]
+    assert found[0][1].ending == "fell"

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-from collections.abc import Callable
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +17,16 @@ from shared.links import DIRECTIONS
 from shared.messages import JointEvent, Mode
 from tools import cli
 from tools.runs.lockstep import Lockstep
-from tools.sweeps import kill, latency, latency_picture, latency_report, study
+from tools.sweeps import kill, latency, latency_picture
 from tools.sweeps.latency_trial import (
     CONTROLS,
     DURATION_S,
     Network,
     Trial,
+    fleet_of,
     hold_share,
     robot_of,
 )
-from tools.sweeps.table import Row
 
 ROOT = Path(__file__).resolve().parents[1]
 GOOD = Network(0.0, 0.0, 0.0)
@@ -47,7 +46,13 @@ def grid(*flags: str) -> list[Trial]:
 
 
 def trial(**changes: Any) -> Trial:
-    fields = {"number": 0, "repeat": 0, "seed": 1, "control": "distributed", "network": GOOD}
+    fields: dict[str, Any] = {
+        "number": 0,
+        "repeat": 0,
+        "seed": 1,
+        "control": "distributed",
+        "network": GOOD,
+    }
     return Trial(**(fields | changes))
 
 
@@ -126,6 +131,49 @@ def test_trials_are_paired_over_delays_and_controls_and_independent_at_one_delay
     assert trial(seed=2).draw not in by_draw
 
 
+def lost(robot: RobotConfig, of: int, **network: float) -> set[int]:
+    """Return which messages of a link are lost in a trial over such a network."""
+    t = trial(network=Network(**({"delay_ms": 0.0, "jitter_ms": 0.0} | network)))
+    links = fleet_of(t, robot, lambda *_: None).network
+    links.advance(3.0, 10**9)
+    direction = links._links["planner->ankle_left"].direction
+    return {number for number in range(of) if not direction.passes(10**9, 0)}
+
+
+def test_another_loss_loses_other_messages_and_another_delay_the_same(robot: RobotConfig) -> None:
+    """Else the trials at one delay would be one trial told four times."""
+    few, more = lost(robot, 4000, loss=0.1), lost(robot, 4000, loss=0.3)
+    assert len(few) == pytest.approx(400, abs=80)
+    assert len(few & more) / len(few) == pytest.approx(0.3, abs=0.1)
+    assert lost(robot, 4000, loss=0.1, delay_ms=100.0) == few
+    assert lost(robot, 4000, loss=0.1, jitter_ms=5.0) != few
+
+
+def test_the_command_is_of_this_study_whatever_its_numbers_are(robot: RobotConfig) -> None:
+    flags = (
+        "--loss",
+        "0.1234567,0.1234568",
+        "--delay",
+        "12345.67,0.00001",
+        "--lead-easing",
+        "1e-7",
+    )
+    parser = argparse.ArgumentParser()
+    latency.add_flags(parser)
+    args = parser.parse_args(flags)
+    command = latency._command(args)
+    assert "--delay 0.00001,12345.67 --loss 0.1234567,0.1234568" in command
+    again = parser.parse_args(command.split()[3:])
+    assert latency.trials_of(again) == latency.trials_of(args)
+    assert again.lead_easing == args.lead_easing
+    assert latency._inputs(args, robot)["loss"] == "0.1234567,0.1234568"
+    assert len({(t.draw, t.repeat) for t in latency.trials_of(args)}) == 2 * 4
+    assert {latency.row_of(t)["delay_ms"] for t in latency.trials_of(args)} == {
+        "0.00001",
+        "12345.67",
+    }
+
+
 def test_no_draw_is_beyond_the_study() -> None:
     angles, begins = [], []
     for repeat in range(200):
@@ -149,7 +197,7 @@ def test_the_network_is_good_until_the_scenario_has_begun_and_then_bad_to_its_en
     story = trial(network=Network(30.0, 5.0, 0.2)).story(robot)
     scenario.check("trial", story)
     (inject,) = story.inject
-    assert inject.in_words() == "delay=30 jitter=5 loss=0.2"
+    assert (inject.delay_ms, inject.jitter_ms, inject.loss) == (30.0, 5.0, 0.2)
     begins = trial(network=Network(30.0, 5.0, 0.2)).draw.impaired_from_s
     assert (inject.link, inject.at, inject.duration) == ("all", begins, None)
     assert not inject.ordered, "datagrams: what is late does not hold up the rest"
@@ -195,57 +243,17 @@ def event(t_ns: int, after: Mode) -> JointEvent:
         ([("a", 20, Mode.HOLD), ("b", 40, Mode.HOLD), ("a", 50, Mode.TRACK)], 0.8),
         ([("b", 40, Mode.HOLD), ("b", 60, Mode.TRACK), ("a", 20, Mode.HOLD),
           ("a", 50, Mode.TRACK), ("a", 90, Mode.HOLD)], 0.5),
+        ([("a", -20, Mode.HOLD)], 1.0),
+        ([("a", -20, Mode.HOLD), ("a", 30, Mode.TRACK)], 0.3),
+        ([("a", -20, Mode.HOLD), ("a", -10, Mode.TRACK), ("a", 120, Mode.HOLD)], 0.0),
+        ([("a", 20, Mode.HOLD), ("a", 60, Mode.DAMP)], 0.4),
     ],
 )  # fmt: skip
-def test_the_robot_holds_while_any_module_does(
+def test_the_robot_holds_while_any_module_does_that_did_before_the_network_got_bad_included(
     rows: list[tuple[str, int, Mode]], share: float
 ) -> None:
     events = [(name, event(t, after)) for name, t, after in rows]
     assert hold_share(events, 0, 100) == pytest.approx(share)
-
-
-def made_up(fell: Callable[[str, float, float], bool]) -> list[Row]:
-    """Return rows of a whole grid, two trials each."""
-    columns = ("operator_peak_n", "hold_share", "com_max_mm", "torque_step_nm", "hold_step_nm")
-    grid = product(("centralised", "distributed"), (0.0, 50.0), (0.0, 0.5), range(2))
-    return [
-        {
-            "number": str(number),
-            "control": control,
-            "delay_ms": f"{delay:g}",
-            "jitter_ms": "0",
-            "loss": f"{loss:g}",
-            "ending": "fell" if fell(control, delay, loss) else "stood",
-            **dict.fromkeys(columns, str(10 + number)),
-        }
-        for number, (control, delay, loss, _) in enumerate(grid)
-    ]
-
-
-def test_falls_are_counted_where_they_were(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
-    assert latency_report.controls_in(rows) == ["distributed", "centralised"]
-    own = latency_report.chosen(rows, "centralised", delay_ms=50.0)
-    assert latency_report.falls(own) == (4, 4)
-    assert latency_report.falls(latency_report.chosen(rows, "centralised")) == (4, 8)
-    assert latency_report.falls(own).bounds[0] > 0.3
-    assert {row["loss"] for row in latency_report.without_loss(rows)} == {"0"}
-    latency_report.show(rows, "xrl sweep latency", study.Console(width=120))
-    said = capsys.readouterr().out
-    assert "4 of 8 fell; at 50 ms 4 of 4: 51 to 100 % (95 %, Wilson)" in said
-    assert "0 of 8 fell; at 0 ms 0 of 4: 0 to 49 %" in said
-    assert "xrl sweep latency --only 4" in said
-
-
-def test_pictures_are_drawn_of_what_there_is(tmp_path: Path) -> None:
-    """A study that was stopped early, and one in which everything fell at once."""
-    rows = made_up(lambda *_: True)
-    short = [row | {"operator_peak_n": "", "hold_share": ""} for row in rows[:3]]
-    for name, some in (("all", rows), ("few", short)):
-        folder = tmp_path / name
-        folder.mkdir()
-        for path in latency_picture.draw(some, 150.0, "made up", folder):
-            assert 10_000 < path.stat().st_size < 150_000
 
 
 def test_the_digest_has_every_tool_that_decides_a_run_and_no_picture() -> None:

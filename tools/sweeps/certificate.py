@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from rich.console import Console
 
+from services.planner.certificate import DIRECTIONS
 from shared import config_file
 from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
@@ -23,6 +23,7 @@ BATCH: Final = 20
 TABLE: Final = "certificate.csv"
 PICTURE: Final = "certificate.png"
 CODE: Final = code_of("tools.sweeps.certificate_study")
+WORDS: Final = {"stood": {"True", "False"}, "weakest": frozenset(DIRECTIONS)}
 
 EXAMPLES: Final = """
     xrl sweep certificate
@@ -57,20 +58,20 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if a case fell that was said to stand."""
-    study.check_least(("--n", args.n, 1), ("--workers", args.workers, 1))
+    study.check_least(("--n", args.n, 1))
+    crew = study.crew_of(args, CODE)
     robot = config_file.load(args.config)
     if not args.friction:
         robot = certificate_study.without_friction(robot)
     console = Console()
     out = study.folder(args.out, "certificate")
     first = row_of(certificate_study.run(robot, Cases(robot).draw(args.seed, 0), rigid=args.rigid))
-    with Table(out, TABLE, tuple(first), _inputs(args, robot)) as table:
+    with Table(out, TABLE, tuple(first), _inputs(args, robot), WORDS) as table:
         missing = [number for number in range(args.n) if number not in table.numbers]
         batches = [
             Batch(robot, args.seed, tuple(missing[start : start + BATCH]), args.rigid)
             for start in range(0, len(missing), BATCH)
         ]
-        crew = study.crew_of(args, CODE)
         with study.resumable(table, out, _command(args), crew, console):
             study.fill(table, JOB, batches, crew, args.n, console)
     rows = table.rows(args.n)
@@ -150,11 +151,10 @@ def _command(args: argparse.Namespace) -> str:
 
 
 def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
-    digest = hashlib.sha256(config_file.to_toml(robot).encode()).hexdigest()
     return {
         "study": "certificate",
         "seed": str(args.seed),
         "rigid": str(args.rigid),
-        "robot": digest,
+        "robot": study.digest_of(robot),
         "code": code_digest(CODE),
     }

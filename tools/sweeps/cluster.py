@@ -7,7 +7,10 @@ this project's own code, so each compares it with the study's before its first t
 from __future__ import annotations
 
 import importlib
+import logging
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
 from functools import lru_cache
 from threading import Lock
 from typing import Any, Final, TypeVar
@@ -47,14 +50,28 @@ def results(
         code: files that decide a result, as for `code_digest`.
 
     Raises:
-        RunError: Dask is not installed, no scheduler or worker is there, a worker's code is
-            another, or the work failed on a task.
+        RunError: Dask is not installed, no scheduler or worker is there, the connection is lost,
+            a worker's code is another, or the work failed on a task.
     """
     if not tasks:
         return
     place = _checked_address(address)
     dask = _dask()
-    client = _client(dask, place)
+    with _silent():
+        client = _client(dask, place)
+        yield from _results(dask, client, work, tasks, place, name, code)
+
+
+def _results(
+    dask: Any,
+    client: Any,
+    work: Callable[[T], R],
+    tasks: Sequence[T],
+    place: str,
+    name: Callable[[T], str],
+    code: tuple[str, ...],
+) -> Iterator[tuple[T, R]]:
+    """Yield as `results`, and close the client."""
     try:
         digest = code_digest(code)
         futures = client.map(checked, tasks, work=work, code=code, digest=digest, pure=False)
@@ -63,7 +80,7 @@ def results(
             _wait_for_a_worker(client, place)
             for future in dask.as_completed(futures, loop=client.loop):
                 task = task_of[future.key]
-                yield task, _result(future, name(task))
+                yield task, _result(future, name(task), place)
         finally:
             client.cancel(futures)
     finally:
@@ -126,10 +143,32 @@ def _wait_for_a_worker(client: Any, address: str) -> None:
         ) from None
 
 
-def _result(future: Any, name: str) -> Any:
+def _result(future: Any, name: str, address: str) -> Any:
     try:
         return future.result()
     except RunError:
         raise
+    except CancelledError:
+        raise RunError(f"--cluster {address}: connection to the scheduler lost") from None
     except Exception as error:
-        raise RunError(f"{name}: {type(error).__name__}: {error}") from error
+        words = " ".join(str(error).split())
+        raise RunError(f"{name}: {type(error).__name__}: {words}") from error
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep Dask from logging: what goes wrong is an error here, and said in one line."""
+    logger = logging.getLogger("distributed")
+    children = [
+        child
+        for child in logging.root.manager.loggerDict.values()
+        if isinstance(child, logging.Logger) and child.name.startswith("distributed.")
+    ]
+    before = [(each, each.level) for each in (logger, *children)]
+    for each, _ in before:
+        each.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for each, level in before:
+            each.setLevel(level)

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
+from functools import partial
 from typing import Final, TypeAlias
 
+import msgspec
 from rich.console import Console
 
-from shared import config_file
 from shared.config import RobotConfig
-from shared.messages import SimTruth
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
-from tools.sim import AFTER_FALL_S
 from tools.sweeps import cases, picture, report, study
 from tools.sweeps.cases import Case
-from tools.sweeps.outcome import Ending, Outcome, run_case
+from tools.sweeps.figures import ENDINGS, Ending
+from tools.sweeps.outcome import Outcome, run_case
 from tools.sweeps.prepare import needs_schedule, prepare
-from tools.sweeps.record import record_run
+from tools.sweeps.record import run_alone
 from tools.sweeps.table import Table, code_digest, code_of
 from tools.verbs import add_config
 
@@ -28,6 +27,7 @@ PICTURE: Final = "cases.png"
 CODE: Final = code_of("tools.sweeps.outcome")
 """What decides how a case comes out."""
 COLUMNS_OUT: Final = Outcome.__struct_fields__
+WORDS: Final = {"ending": ENDINGS}
 Task: TypeAlias = "tuple[Case, RobotConfig]"
 
 EXAMPLES: Final = """
@@ -49,7 +49,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "--jacobian", choices=experiment.choices("jacobian"), help="how the legs share the load"
     )
     parser.add_argument(
-        "--only", type=int, metavar="CASE", help="run this case alone and print all of it"
+        "--only",
+        type=int,
+        metavar="CASE",
+        help="run this case alone and print all of it; exit code 1 if it fell",
     )
     alone = "; with --only: where the case's log goes (default: none)"
     study.add_flags(parser, "kill", f"{TABLE} and {PICTURE}", alone)
@@ -57,25 +60,26 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one case of it; 1 if any fell."""
-    study.check_least(
-        ("--n", args.n, 1), ("--workers", args.workers, 1), ("--only", args.only or 0, 0)
-    )
+    study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
+    crew = study.crew_of(args, CODE)
     robot = experiment.make_robot(args)
     console = Console()
-    return (
-        _run_one(args, robot, console) if args.only is not None else _run_all(args, robot, console)
-    )
+    if args.only is not None:
+        return _run_one(args, robot, console)
+    return _run_all(args, robot, crew, console)
 
 
-def _run_all(args: argparse.Namespace, robot: RobotConfig, console: Console) -> int:
+def _run_all(
+    args: argparse.Namespace, robot: RobotConfig, crew: study.Crew, console: Console
+) -> int:
     out = study.folder(args.out, "kill")
     drawn = [cases.draw(robot, args.seed, number) for number in range(args.n)]
-    columns = [*cases.row_of(drawn[0]), *COLUMNS_OUT]
-    with Table(out, TABLE, columns, _inputs(args.seed, robot)) as table:
+    rows_begin = [cases.row_of(case) for case in drawn]
+    columns = [*rows_begin[0], *COLUMNS_OUT]
+    with Table(out, TABLE, columns, _inputs(args.seed, robot), WORDS, rows_begin) as table:
         missing = [case for case in drawn if case.number not in table.numbers]
-        crew = study.crew_of(args, CODE)
         with study.resumable(table, out, f"{_command(args)} --n {args.n}", crew, console):
-            robots = _robots({case.payload_kg for case in missing}, robot, args.workers, console)
+            robots = _robots({case.payload_kg for case in missing}, robot, crew.workers, console)
             tasks = [(case, robots[case.payload_kg]) for case in missing]
             seconds = study.fill(table, JOB, tasks, crew, args.n, console)
     rows = table.rows(args.n)
@@ -108,36 +112,17 @@ def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> 
     case = cases.draw(robot, args.seed, args.only)
     loaded = _robots({case.payload_kg}, robot, 1, console)[case.payload_kg]
     study.show(f"Case {case.number}, drawn", cases.row_of(case), console)
-    command = f"{_command(args)} --only {case.number}"
-    with study.bar("{task.completed:.1f} of {task.total:.1f} s", console) as bar:
-        shown = bar.add_task("", total=case.end_s)
-
-        def watch(truth: SimTruth) -> None:
-            bar.update(shown, completed=max(0.0, truth.scenario_s))
-
-        if args.out is None:
-            outcome = run_case(case, loaded, watch=watch)
-        else:
-            out = experiment.make_out(args.out, "sweep-kill")
-            words = f"{command}; delay {case.delay_ms:g} ms, " + (
-                "hand on" if case.let_go_s is None else f"hand off at {case.let_go_s:g} s"
-            )
-            story = cases.story_of(loaded, case)
-            outcome, _ = record_run(
-                story,
-                loaded,
-                out,
-                {"lockstep": words},
-                lambda record, look: run_case(
-                    case, loaded, record=record, watch=look, after_fall_s=AFTER_FALL_S
-                ),
-                watch,
-            )
-    study.show("Measured", _figures(outcome), console)
-    if args.out is not None:
-        console.print(f"{args.out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
-    console.print(f"[bold]{outcome.ending}[/]")
-    return 0 if outcome.stood else 1
+    words = f"{_command(args)} --only {case.number}; delay {case.delay_ms:g} ms, " + (
+        "hand on" if case.let_go_s is None else f"hand off at {case.let_go_s:g} s"
+    )
+    return run_alone(
+        partial(run_case, case, loaded),
+        cases.story_of(loaded, case),
+        loaded,
+        args.out,
+        {"lockstep": words},
+        console,
+    )
 
 
 def _run_task(task: Task) -> Outcome:
@@ -150,19 +135,19 @@ def _name(task: Task) -> str:
 
 
 def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
-    return [cases.row_of(task[0]) | _figures(outcome)]
+    return [cases.row_of(task[0]) | msgspec.structs.asdict(outcome)]
 
 
 JOB: Final = study.Job(_run_task, _name, _rows, lambda row: row["ending"] != Ending.STOOD)
 
 
-def _figures(outcome: Outcome) -> dict[str, object]:
-    return {name: getattr(outcome, name) for name in COLUMNS_OUT}
-
-
 def _inputs(seed: int, robot: RobotConfig) -> dict[str, str]:
-    digest = hashlib.sha256(config_file.to_toml(robot).encode()).hexdigest()
-    return {"study": "kill", "seed": str(seed), "robot": digest, "code": code_digest(CODE)}
+    return {
+        "study": "kill",
+        "seed": str(seed),
+        "robot": study.digest_of(robot),
+        "code": code_digest(CODE),
+    }
 
 
 def _command(args: argparse.Namespace) -> str:

@@ -3,26 +3,32 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import re
 from collections.abc import Callable
+from functools import partial
 from itertools import product
 from typing import Final, TypeAlias
 
 import msgspec
 from rich.console import Console
 
-from shared import config_file
 from shared.config import RobotConfig
-from shared.messages import SimTruth
 from shared.process import DEFAULT_CONFIG
 from shared.toml_file import check_ranges
 from tools.runs import experiment
-from tools.sim import AFTER_FALL_S
 from tools.sweeps import latency_picture, latency_report, study
-from tools.sweeps.latency_trial import CONTROLS, Network, Outcome, Trial, robot_of, run_trial
-from tools.sweeps.outcome import Ending
-from tools.sweeps.record import record_run
+from tools.sweeps.figures import ENDINGS, Ending
+from tools.sweeps.latency_trial import (
+    CONTROLS,
+    FLAG_DIGITS,
+    Network,
+    Outcome,
+    Trial,
+    plain,
+    robot_of,
+    run_trial,
+)
+from tools.sweeps.record import run_alone
 from tools.sweeps.table import Table, code_digest, code_of
 from tools.verbs import add_config
 
@@ -35,6 +41,7 @@ TABLE: Final = "latency.csv"
 CODE: Final = code_of("tools.sweeps.latency_trial")
 """What decides how a trial comes out."""
 COLUMNS_OUT: Final = Outcome.__struct_fields__
+WORDS: Final = {"control": frozenset(CONTROLS), "ending": ENDINGS}
 Task: TypeAlias = "tuple[Trial, RobotConfig]"
 
 EXAMPLES: Final = """
@@ -86,7 +93,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lead-easing", type=float, metavar="ALPHA", help="law.lead_easing, for all controls"
     )
-    parser.add_argument("--only", type=int, metavar="NUMBER", help="run this trial alone")
+    parser.add_argument(
+        "--only",
+        type=int,
+        metavar="NUMBER",
+        help="run this trial alone; exit code 1 if it fell, whatever its control (the study's is 1 "
+        "if distributed fell)",
+    )
     alone = "; with --only: where the trial's log goes (default: none)"
     study.add_flags(parser, "latency", "the table and its pictures", alone)
 
@@ -110,7 +123,7 @@ def values_in(low: float, high: float) -> Callable[[str], tuple[float, ...]]:
                     f"{piece!r}: FROM:TO:STEP must rise, in at most {VALUES_MAX} steps"
                 )
             count = int((last - first) / step + 1e-9) + 1
-            found.update(round(first + i * step, 9) for i in range(count))
+            found.update(round(first + i * step, FLAG_DIGITS) for i in range(count))
         if max(found) > high or min(found) < low:
             raise argparse.ArgumentTypeError(f"{text!r}: must be from {low:g} to {high:g}")
         return tuple(sorted(found))
@@ -142,9 +155,8 @@ def trials_of(args: argparse.Namespace) -> list[Trial]:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one trial of it; 1 if the shipped control fell."""
-    study.check_least(
-        ("--trials", args.trials, 1), ("--workers", args.workers, 1), ("--only", args.only or 0, 0)
-    )
+    study.check_least(("--trials", args.trials, 1), ("--only", args.only or 0, 0))
+    crew = study.crew_of(args, CODE)
     robot = experiment.load_robot(args.config)
     if args.lead_easing is not None:
         law = msgspec.structs.replace(robot.law, lead_easing=args.lead_easing)
@@ -154,24 +166,28 @@ def run(args: argparse.Namespace) -> int:
     trials = trials_of(args)
     if args.only is not None:
         return _run_one(args, trials, robot, console)
-    return _run_all(args, trials, robot, console)
+    return _run_all(args, trials, robot, crew, console)
 
 
 def _run_all(
-    args: argparse.Namespace, trials: list[Trial], robot: RobotConfig, console: Console
+    args: argparse.Namespace,
+    trials: list[Trial],
+    robot: RobotConfig,
+    crew: study.Crew,
+    console: Console,
 ) -> int:
     out = study.folder(args.out, "latency")
-    columns = [*row_of(trials[0]), *COLUMNS_OUT]
-    with Table(out, TABLE, columns, _inputs(args, robot)) as table:
+    drawn = [row_of(trial) for trial in trials]
+    columns = [*drawn[0], *COLUMNS_OUT]
+    with Table(out, TABLE, columns, _inputs(args, robot), WORDS, drawn) as table:
         robots = {name: robot_of(robot, name) for name in args.control}
         tasks = [(t, robots[t.control]) for t in trials if t.number not in table.numbers]
-        crew = study.crew_of(args, CODE)
         again = f"{_command(args)} --trials {args.trials}"
         with study.resumable(table, out, again, crew, console):
             seconds = study.fill(table, JOB, tasks, crew, len(trials), console)
     rows = table.rows(len(trials))
-    what = f"seed {args.seed}" + (f", jitter {_joined(args.jitter)} ms" if any(args.jitter) else "")
-    pictures = latency_picture.draw(rows, robot.simulation.operator.force_max, what, out)
+    force_max = robot.simulation.operator.force_max
+    pictures = latency_picture.draw(rows, force_max, f"seed {args.seed}", out)
     latency_report.show(rows, _command(args), console)
     pace = f"; {seconds:.2f} s a trial" if tasks else ""
     files = ", ".join(path.name for path in pictures)
@@ -189,36 +205,10 @@ def _run_one(
     trial = trials[args.only]
     robot = robot_of(robot, trial.control)
     study.show(f"Trial {trial.number}", row_of(trial), console)
-    with study.bar("{task.completed:.1f} of {task.total:.1f} s", console) as bar:
-        story = trial.story(robot)
-        shown = bar.add_task("", total=story.duration)
-
-        def watch(truth: SimTruth) -> None:
-            bar.update(shown, completed=max(0.0, truth.scenario_s))
-
-        if args.out is None:
-            outcome = run_trial(trial, robot, watch=watch)
-        else:
-            out = experiment.make_out(args.out, "sweep-latency")
-            facts = {
-                "lockstep": f"{_command(args)} --only {trial.number}",
-                "control": trial.control,
-            }
-            outcome, _ = record_run(
-                story,
-                robot,
-                out,
-                facts,
-                lambda record, look: run_trial(
-                    trial, robot, record=record, watch=look, after_fall_s=AFTER_FALL_S
-                ),
-                watch,
-            )
-    study.show("Measured", msgspec.structs.asdict(outcome), console)
-    if args.out is not None:
-        console.print(f"{args.out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
-    console.print(f"[bold]{outcome.ending}[/]")
-    return 0 if outcome.stood else 1
+    facts = {"lockstep": f"{_command(args)} --only {trial.number}", "control": trial.control}
+    return run_alone(
+        partial(run_trial, trial, robot), trial.story(robot), robot, args.out, facts, console
+    )
 
 
 def row_of(trial: Trial) -> dict[str, object]:
@@ -228,7 +218,8 @@ def row_of(trial: Trial) -> dict[str, object]:
         "repeat": trial.repeat,
         "control": trial.control,
     }
-    row |= msgspec.structs.asdict(trial.network)
+    network = msgspec.structs.asdict(trial.network)
+    row |= {name: plain(value) for name, value in network.items()}
     return row | {"impaired_from_s": trial.draw.impaired_from_s}
 
 
@@ -240,8 +231,8 @@ def _name(task: Task) -> str:
     trial = task[0]
     network = trial.network
     return (
-        f"trial {trial.number} ({trial.control}, delay {network.delay_ms:g} ms, "
-        f"jitter {network.jitter_ms:g} ms, loss {network.loss:g})"
+        f"trial {trial.number} ({trial.control}, delay {plain(network.delay_ms)} ms, "
+        f"jitter {plain(network.jitter_ms)} ms, loss {plain(network.loss)})"
     )
 
 
@@ -260,13 +251,13 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
         "jitter": _joined(args.jitter),
         "loss": _joined(args.loss),
         "control": ",".join(args.control),
-        "robot": hashlib.sha256(config_file.to_toml(robot).encode()).hexdigest(),
+        "robot": study.digest_of(robot),
         "code": code_digest(CODE),
     }
 
 
 def _joined(values: tuple[float, ...]) -> str:
-    return ",".join(f"{value:g}" for value in values)
+    return ",".join(map(plain, values))
 
 
 def _command(args: argparse.Namespace) -> str:
@@ -278,7 +269,7 @@ def _command(args: argparse.Namespace) -> str:
     if args.control != tuple(CONTROLS):
         flags.append(f"--control {','.join(args.control)}")
     if args.lead_easing is not None:
-        flags.append(f"--lead-easing {args.lead_easing:g}")
+        flags.append(f"--lead-easing {args.lead_easing}")
     if args.config != DEFAULT_CONFIG:
         flags.append(f"--config {args.config}")
     return " ".join(["xrl sweep latency", *flags])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
@@ -12,10 +13,12 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from tools.sweeps.latency_report import (
+    Falls,
     chosen,
     controls_in,
     falls,
     figures,
+    mix,
     values_in,
     without_loss,
 )
@@ -31,6 +34,12 @@ SHARES: Final = LinearSegmentedColormap.from_list("falls", ["#e3f1e7", "#f2b7a0"
 HOLDS: Final = 0.1
 """With a larger share of the time in HOLD, a robot does not follow the hand."""
 DPI: Final = 120
+SHARES_IN: Final = 2.7
+"""Height of the curves, inches."""
+BOUNDS_COLUMNS: Final = 8
+"""In a map of more delays there is room in a cell for falls and trials only;"""
+COUNTS_COLUMNS: Final = 24
+"""of more than these, for nothing."""
 
 
 class Look(NamedTuple):
@@ -69,45 +78,63 @@ def draw(rows: Sequence[Row], force_max: float, what: str, folder: Path) -> tupl
 
 def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:
     names = controls_in(rows)
-    figure = Figure(figsize=(7.5, 6.4), dpi=DPI, layout="constrained")
-    grid = figure.add_gridspec(2, len(names), height_ratios=(1.0, 1.15))
+    map_in = 0.5 + 0.26 * min(len(values_in(rows, "loss")), 12)
+    height = 1.0 + (map_in + 0.2) * len(names) + SHARES_IN
+    figure = Figure(figsize=(7.5, height), dpi=DPI, layout="constrained")
+    grid = figure.add_gridspec(len(names) + 1, 1, height_ratios=[map_in] * len(names) + [SHARES_IN])
     for index, name in enumerate(names):
-        axis = figure.add_subplot(grid[0, index])
+        axis = figure.add_subplot(grid[index])
         _draw_map(axis, rows, name)
-        axis.set_ylabel("messages lost in %" if index == 0 else "")
-        if index:
-            axis.set_yticklabels([])
-    _draw_shares(figure.add_subplot(grid[1, :]), rows)
+    axis.set_xlabel("delay each way in ms", fontsize=9)
+    _draw_shares(figure.add_subplot(grid[-1]), rows)
     figure.suptitle(
         f"Who falls: {len(rows)} runs of {DURATION_S:g} s, led by hand, {PUSHES} pushes of "
-        f"{PUSH_N[0]:g} to {PUSH_N[1]:g} N in each;\n"
-        f"all links get bad, both ways, on the way down; {what}",
-        fontsize=11, x=0.01, ha="left",
+        f"{PUSH_N[0]:g} to {PUSH_N[1]:g} N in each; {what};\n"
+        "all links get bad, both ways, on the way down. Cells: falls/trials, 95 % interval of the "
+        "share (Wilson)",
+        fontsize=10, x=0.01, ha="left",
     )  # fmt: skip
     figure.savefig(path)
 
 
 def _draw_map(axis: Any, rows: Sequence[Row], name: str) -> None:
-    """Share of falls over delay and loss, with the falls and the trials in each cell."""
+    """Share of falls over delay and loss; in each cell falls, trials, and the share's bounds."""
     delays, losses = values_in(rows, "delay_ms"), values_in(rows, "loss")
     cells = [
         [falls(chosen(rows, name, delay_ms=delay, loss=loss)) for delay in delays]
         for loss in losses
     ]
-    shares = [[cell.fallen / max(1, cell.of) for cell in line] for line in cells]
+    shares = [[cell.fallen / cell.of if cell.of else math.nan for cell in line] for line in cells]
     axis.imshow(shares, cmap=SHARES, vmin=0.0, vmax=1.0, origin="lower", aspect="auto")
-    if len(delays) * len(losses) <= 50:
-        for y, line in enumerate(cells):
-            for x, cell in enumerate(line):
-                light = cell.fallen > 0.7 * cell.of
+    for y, line in enumerate(cells):
+        for x, cell in enumerate(line):
+            if cell.of:
                 axis.text(
-                    x, y, f"{cell.fallen}/{cell.of}", ha="center", va="center", fontsize=8,
-                    color="white" if light else "#333333",
+                    x, y, _in_cell(cell, len(delays)), ha="center", va="center", fontsize=7.5,
+                    color="white" if cell.fallen > 0.7 * cell.of else "#333333",
                 )  # fmt: skip
+    title = f"{name}: {_in_all(rows, name)}"
+    if len(jitters := values_in(rows, "jitter_ms")) > 1:
+        title += f"; {', '.join(f'{jitter:g}' for jitter in jitters)} ms of jitter together"
+    if len(delays) > BOUNDS_COLUMNS:
+        none = Falls(0, max(cell.of for line in cells for cell in line))
+        title += f"; none of {none.of} is {none.bounds_in_words}"
+    axis.set_title(title, fontsize=10)
+    for between in range(1, len(delays)):
+        axis.axvline(between - 0.5, color="white", lw=0.8)
+    for between in range(1, len(losses)):
+        axis.axhline(between - 0.5, color="white", lw=0.8)
     axis.set_xticks(range(len(delays)), [f"{delay:g}" for delay in delays], fontsize=8)
-    axis.set_yticks(range(len(losses)), [f"{100 * loss:g}" for loss in losses], fontsize=9)
-    axis.set_xlabel("delay each way in ms", fontsize=9)
-    axis.set_title(name, fontsize=10)
+    axis.set_yticks(range(len(losses)), [f"{100 * loss:g}" for loss in losses], fontsize=8)
+    axis.set_ylabel("% lost", fontsize=9)
+
+
+def _in_cell(cell: Falls, columns: int) -> str:
+    """Return as much as there is room for."""
+    if columns > COUNTS_COLUMNS:
+        return ""
+    count = f"{cell.fallen}/{cell.of}"
+    return count if columns > BOUNDS_COLUMNS else f"{count}   {cell.bounds_in_words}"
 
 
 def _draw_shares(axis: Any, rows: Sequence[Row]) -> None:
@@ -130,20 +157,27 @@ def _draw_shares(axis: Any, rows: Sequence[Row]) -> None:
         ]
         axis.errorbar(
             places, shares, yerr=spread, color=look.colour, marker=look.marker, ms=6, lw=1.6,
-            elinewidth=1.2, capsize=3, label=f"{name} ({_in_all(rows, name)})",
+            elinewidth=1.2, capsize=3, label=name,
         )  # fmt: skip
-    each = falls(chosen(rows, controls_in(rows)[0], delay_ms=delays[0])).of
-    axis.set_xticks(range(len(delays)), [f"{delay:g}" for delay in delays])
+    axis.set_xticks(range(len(delays)), [f"{delay:g}" for delay in delays], fontsize=8)
     axis.set_ylim(-3.0, 103.0)
-    axis.set_xlabel("delay each way in ms (not to scale)")
-    axis.set_ylabel("falls in %")
-    axis.set_title(
-        f"All losses together: share of falls, and its 95 % interval (Wilson), {each} trials a "
-        "point",
-        fontsize=10,
-    )  # fmt: skip
-    axis.legend(fontsize=9, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.2), frameon=False)
+    axis.tick_params("y", labelsize=8)
+    axis.set_xlabel("delay each way in ms (not to scale)", fontsize=9)
+    axis.set_ylabel("falls in %", fontsize=9)
+    axis.set_title(f"All of this mix together: {mix(rows)}; {_each(rows)}", fontsize=10)
+    axis.legend(fontsize=9, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.17), frameon=False)
     axis.grid(visible=True, lw=0.3)
+
+
+def _each(rows: Sequence[Row]) -> str:
+    """Return how many trials a point of the curves has."""
+    counts = {
+        falls(chosen(rows, name, delay_ms=delay)).of
+        for name in controls_in(rows)
+        for delay in values_in(rows, "delay_ms")
+    } - {0}
+    some = f"{max(counts)}" if len(counts) == 1 else f"{min(counts)} to {max(counts)}"
+    return f"{some} trials a point"
 
 
 def _in_all(rows: Sequence[Row], name: str) -> str:
@@ -178,10 +212,8 @@ def _draw_effort(rows: Sequence[Row], force_max: float, what: str, path: Path) -
     hold.set_xlabel("delay each way in ms (not to scale)")
     for axis in (effort, hold):
         axis.grid(visible=True, lw=0.3)
-    loss = 100 * float(rows[0]["loss"])
     figure.suptitle(
-        f"What the hand meets: squats under {PUSHES} pushes, {loss:g} % lost; {len(rows)} runs, "
-        f"{what}",
+        f"What the hand meets: squats under {PUSHES} pushes; {mix(rows)}; {len(rows)} runs, {what}",
         fontsize=11, x=0.01, ha="left",
     )  # fmt: skip
     figure.savefig(path)

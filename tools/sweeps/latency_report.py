@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Final, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
+from tools.sweeps.figures import Ending
 from tools.sweeps.latency_trial import CONTROLS
-from tools.sweeps.outcome import Ending
-from tools.sweeps.report import wilson
 from tools.sweeps.table import Row
+from tools.sweeps.wilson import wilson
 
 WORST: Final = (
     ("com_max_mm", "COM {:.0f} mm off"),
@@ -20,6 +20,8 @@ WORST: Final = (
     ("hold_step_nm", "{:.1f} N m at HOLD"),
 )
 """Column, and in words."""
+LISTED: Final = 6
+"""Values in a title; of more the first two and the last."""
 
 
 class Falls(NamedTuple):
@@ -30,8 +32,14 @@ class Falls(NamedTuple):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Of the share, 95 %, Wilson."""
+        """Of the share, 95 %, Wilson; over several losses or jitters, of that mix of them."""
         return wilson(self.fallen, self.of)
+
+    @property
+    def bounds_in_words(self) -> str:
+        """The bounds in %."""
+        low, high = self.bounds
+        return f"{100 * low:.0f}-{100 * high:.0f} %"
 
 
 def controls_in(rows: Sequence[Row]) -> list[str]:
@@ -71,6 +79,19 @@ def figures(rows: Sequence[Row], column: str) -> list[float]:
     return [float(row[column]) for row in rows if row[column]]
 
 
+def mix(rows: Sequence[Row]) -> str:
+    """Return in words what trials at one delay differ in, but for what is left to chance."""
+    losses = [100 * loss for loss in values_in(rows, "loss")]
+    words = f"{_listed(losses)} % lost"
+    jitters = values_in(rows, "jitter_ms")
+    return words if jitters == [0.0] else f"{words}, {_listed(jitters)} ms of jitter"
+
+
+def _listed(values: Sequence[float]) -> str:
+    words = [f"{value:g}" for value in values]
+    return ", ".join(words if len(words) <= LISTED else [*words[:2], "...", words[-1]])
+
+
 def show(rows: Sequence[Row], command: str, console: Console) -> None:
     """Print what came of the study.
 
@@ -79,18 +100,19 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
         command: that runs one trial alone, but for the trial's number.
         console: to print on.
     """
-    console.print(_table(rows))
+    console.print(_falls_table(rows))
+    console.print(_lead_table(rows))
     for name in controls_in(rows):
         own = chosen(rows, name)
         counted = falls(own)
-        delay, worst_there = _worst_delay(own)
-        low, high = (100 * bound for bound in worst_there.bounds)
-        colour = "red" if counted.fallen else "green"
-        console.print(
-            f"[bold]{name}[/]: [{colour}]{counted.fallen} of {counted.of} fell[/]; at {delay:g} ms "
-            f"{worst_there.fallen} of {worst_there.of}: {low:.0f} to {high:.0f} % (95 %, Wilson)",
-            highlight=False,
-        )
+        words = f"[bold]{name}[/]: [green]none of {counted.of} fell[/]"
+        if counted.fallen:
+            delay, there = _worst_delay(own)
+            words = (
+                f"[bold]{name}[/]: [red]{counted.fallen} of {counted.of} fell[/]; most at "
+                f"{delay:g} ms, {there.fallen} of {there.of}"
+            )
+        console.print(words, highlight=False)
         standing = [row for row in own if row["ending"] == Ending.STOOD]
         if standing:
             worst = [words.format(max(figures(standing, key))) for key, words in WORST]
@@ -103,8 +125,7 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
 def _worst_delay(rows: Sequence[Row]) -> tuple[float, Falls]:
     """Return the delay with the largest share of falls, and its falls.
 
-    Trials at one delay are independent; those at different delays are not, so that all of
-    them together have no bounds.
+    Its bounds would be too narrow: it was chosen for what was seen there.
     """
     found = [
         (delay, falls([row for row in rows if float(row["delay_ms"]) == delay]))
@@ -113,26 +134,37 @@ def _worst_delay(rows: Sequence[Row]) -> tuple[float, Falls]:
     return max(found, key=lambda pair: pair[1].fallen / pair[1].of)
 
 
-def _table(rows: Sequence[Row]) -> Table:
-    """Return falls of all trials, and what the hand met without loss, by delay."""
+def _falls_table(rows: Sequence[Row]) -> Table:
+    """Return the falls at each delay, with the bounds of their share."""
+    what = f"Falls, 95 % of their share (Wilson) in this mix: {mix(rows)}"
+
+    def cell(own: Sequence[Row]) -> str:
+        fell = falls(own)
+        return f"{fell.fallen} of {fell.of} {fell.bounds_in_words:>9}" if fell.of else ""
+
+    return _by_delay(what, rows, cell)
+
+
+def _lead_table(rows: Sequence[Row]) -> Table:
+    """Return what the hand met at each delay, with the least that is lost."""
     quiet = without_loss(rows)
+    what = f"Hand's peak force, time in HOLD; medians; {mix(quiet)}"
+
+    def cell(own: Sequence[Row]) -> str:
+        hand = _median(own, "operator_peak_n", "{:.0f} N")
+        return f"{hand} {_median(own, 'hold_share', '{:.0f} %', 100.0):>6}"
+
+    return _by_delay(what, quiet, cell)
+
+
+def _by_delay(title: str, rows: Sequence[Row], cell: Callable[[Sequence[Row]], str]) -> Table:
+    table = Table(title=title, title_justify="left")
     names = controls_in(rows)
-    loss = 100 * float(quiet[0]["loss"])
-    table = Table(
-        title=f"Falls; hand and HOLD at {loss:g} % lost",
-        title_justify="left",
-    )
-    table.add_column("delay\nms", justify="right")
+    table.add_column("delay ms", justify="right")
     for name in names:
-        table.add_column(f"{name}\n fell   hand HOLD", justify="right")
+        table.add_column(name, justify="right")
     for delay in values_in(rows, "delay_ms"):
-        cells = []
-        for name in names:
-            fell = "{}/{}".format(*falls(chosen(rows, name, delay_ms=delay)))
-            own = chosen(quiet, name, delay_ms=delay)
-            hand = _median(own, "operator_peak_n", "{:.0f} N")
-            hold = _median(own, "hold_share", "{:.0f} %", 100.0)
-            cells.append(f"{fell:>5} {hand:>6} {hold:>5}")
+        cells = [cell(chosen(rows, name, delay_ms=delay)) for name in names]
         table.add_row(f"{delay:g}", *cells)
     return table
 

@@ -1,16 +1,17 @@
 """One trial of the latency study: a squat led by hand under pushes, over a bad network.
 
 The fleet comes up and is led over a good network; at some moment every link gets bad, both
-ways, and stays so. What is drawn, that moment and the pushes, is the same for every delay and
-every control, and another for each repeat, loss and jitter: trials at one delay are independent.
+ways, and stays so. What is left to chance, that moment, the pushes, and which messages are lost,
+is the same for every delay and every control, and another for each repeat, loss and jitter: a
+control's trials at one delay are independent.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Sequence
-from typing import Final, TypeAlias
+from collections.abc import Sequence
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -33,9 +34,18 @@ from shared.scenario import Inject, Keyframe, Push, Scenario
 from shared.topics import Topic
 from tools.centralised.fleet import CentralisedLockstep
 from tools.runs.lockstep import Lockstep, Record
-from tools.sweeps.outcome import END_TOLERANCE_S, Ending, is_tipping
-
-Watch: TypeAlias = Callable[[SimTruth], None]
+from tools.sweeps.figures import (
+    Ended,
+    Ending,
+    Watch,
+    com_max_mm,
+    ending_of,
+    event_steps_nm,
+    operator_peak_n,
+    sole_tilt_max_rad,
+    step_nm,
+    that_count,
+)
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
 """s, and m below the stand: as in the paper's Fig. 7, at its pace."""
@@ -48,6 +58,8 @@ PUSHES: Final = 3
 PUSHED_UNTIL_S: Final = 5.3
 """The pushes come over the bad network, one in each third of the time, at random."""
 DIGITS: Final = 3
+FLAG_DIGITS: Final = 9
+"""Decimals to which a number of a flag is taken."""
 
 
 class Control(msgspec.Struct, frozen=True):
@@ -62,9 +74,18 @@ class Control(msgspec.Struct, frozen=True):
 CONTROLS: Final = {
     "distributed": Control("as shipped: local gains certified, the rest by the planner", Lockstep),
     "diagonal": Control("the paper's local gains, diag(K_q)", Lockstep, "diagonal"),
-    "centralised": Control("every torque by the planner", CentralisedLockstep),
+    "centralised": Control(
+        "every torque by the planner, and nothing below it: gains not retuned for the delay, no "
+        "damping on the drives, the last torques kept when no new ones come, overload ignored",
+        CentralisedLockstep,
+    ),
 }
 """By name."""
+
+
+def plain(value: float) -> str:
+    """Return a number as the flags take it: in full, without an exponent."""
+    return f"{value:.{FLAG_DIGITS}f}".rstrip("0").rstrip(".")
 
 
 class Network(msgspec.Struct, frozen=True):
@@ -82,6 +103,8 @@ class Draw(msgspec.Struct, frozen=True):
 
     impaired_from_s: float
     pushes: tuple[Push, ...]
+    fleet_seed: int
+    """Of what is lost, of jitter, and of the harness sensor's noise."""
 
 
 class Trial(msgspec.Struct, frozen=True, kw_only=True):
@@ -97,10 +120,8 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def draw(self) -> Draw:
         """What is left to chance, whatever the delay and the control are."""
-        network = self.network
-        dice = random.Random(
-            f"latency {self.seed} {self.repeat} {network.jitter_ms:g} {network.loss:g}"
-        )
+        jitter, loss = plain(self.network.jitter_ms), plain(self.network.loss)
+        dice = random.Random(f"latency {self.seed} {self.repeat} {jitter} {loss}")
         begin = round(dice.uniform(*IMPAIRED_FROM_S), DIGITS)
         third = (PUSHED_UNTIL_S - begin) / PUSHES
         pushes = []
@@ -109,7 +130,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
             force, angle = dice.uniform(*PUSH_N), dice.uniform(-math.pi, math.pi)
             x, y = (round(force * part, DIGITS) for part in (math.cos(angle), math.sin(angle)))
             pushes.append(Push(at=round(at, DIGITS), duration=PUSH_S, force=(x, y, 0.0)))
-        return Draw(begin, tuple(pushes))
+        return Draw(begin, tuple(pushes), dice.getrandbits(48))
 
     def story(self, robot: RobotConfig) -> Scenario:
         """Return the trial as a scenario."""
@@ -127,11 +148,9 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class Outcome(Ended, frozen=True, kw_only=True):
     """The figures of a trial, over the bad network, to the end or the fall."""
 
-    ending: str
-    fell_at_s: float | None = None
     operator_peak_n: float | None = None
     """Vertical force of the hand."""
     operator_rms_n: float | None = None
@@ -147,11 +166,6 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     hold_step_nm: float | None = None
     """Largest step of a joint's torque into or out of HOLD, from one cycle to the next."""
     sole_tilt_max_rad: float | None = None
-
-    @property
-    def stood(self) -> bool:
-        """True if the robot stood to the end."""
-        return self.ending == Ending.STOOD
 
 
 def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
@@ -181,14 +195,26 @@ class Ear:
         """Take a message as the bus would."""
         if isinstance(message, JointState):
             if self.from_ns is not None and message.t_ns >= self.from_ns and not self.fallen:
-                before, after = self._tau[module], message.tau
-                step = max(abs(after[0] - before[0]), abs(after[1] - before[1]))
+                step = step_nm(self._tau[module], message.tau)
                 self.torque_step = max(self.torque_step, step)
             self._tau[module] = message.tau
         elif isinstance(message, RunEvent) and message.kind == RunEventKind.STARTED:
             self.from_ns = message.t_ns + self._after_ns
         if self._on_to is not None:
             self._on_to(topic, module, message)
+
+
+def fleet_of(trial: Trial, robot: RobotConfig, record: Record) -> Lockstep:
+    """Return the fleet of a trial, before its first step.
+
+    Args:
+        trial: what happens.
+        robot: as `robot_of` gives it.
+        record: takes every message.
+    """
+    fleet_type = CONTROLS[trial.control].fleet
+    seed = trial.draw.fleet_seed
+    return fleet_type(robot, trial.story(robot), Impairment(), seed=seed, record=record)
 
 
 def run_trial(
@@ -210,19 +236,11 @@ def run_trial(
     """
     impaired_from_s = trial.draw.impaired_from_s
     ear = Ear(record, impaired_from_s)
-    fleet_type = CONTROLS[trial.control].fleet
-    seed = trial.seed * 1_000_003 + trial.repeat
-    fleet = fleet_type(robot, trial.story(robot), Impairment(), seed=seed, record=ear)
+    fleet = fleet_of(trial, robot, ear)
     rows: list[SimTruth] = []
-    for row in fleet.run():
-        ear.fallen |= row.fallen
-        if watch is not None:
-            watch(row)
-        if rows and rows[-1].fallen:
-            if row.scenario_s > rows[-1].scenario_s + after_fall_s:
-                break
-        elif row.scenario_s >= impaired_from_s or row.fallen:
-            rows.append(row)
+    for row in that_count(fleet.run(), impaired_from_s, watch, after_fall_s):
+        rows.append(row)
+        ear.fallen = row.fallen
     return measure(rows, fleet.events, ear, robot)
 
 
@@ -236,34 +254,28 @@ def measure(
 
     Args:
         rows: the world since the network got bad, to the fall if there was one.
-        events: every change of mode, by module.
+        events: every change of mode since the start, by module.
         ear: what else was heard.
         robot: for the size of its feet.
     """
     if not rows or ear.from_ns is None:
-        return Outcome(ending=Ending.FELL if ear.fallen else Ending.UNREADY)
+        return Outcome(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]
-    ending = Ending.STOOD
-    if last.fallen or last.scenario_s < DURATION_S - END_TOLERANCE_S:
-        ending = Ending.FELL
-    elif is_tipping(last, robot):
-        ending = Ending.TIPPING
     hand = np.array([row.operator_force[2] for row in rows])
     within = [(m, e) for m, e in events if ear.from_ns <= e.t_ns <= last.t_ns]
     since = [(m, e) for m, e in within if e.mode_after in (Mode.HOLD, Mode.TRACK)]
-    changes = [abs(b - a) for _, e in since for a, b in zip(e.tau_before, e.tau_after, strict=True)]
     into_hold = [m for m, e in since if e.mode_after == Mode.HOLD]
     return Outcome(
-        ending=ending,
+        ending=ending_of(last, DURATION_S, robot),
         fell_at_s=last.scenario_s if last.fallen else None,
-        operator_peak_n=float(np.abs(hand).max()),
+        operator_peak_n=operator_peak_n(rows),
         operator_rms_n=float(np.sqrt(np.mean(hand * hand))),
-        com_max_mm=1e3 * max(math.hypot(*row.com[:2]) for row in rows),
-        hold_share=hold_share(since, ear.from_ns, last.t_ns),
+        com_max_mm=com_max_mm(rows),
+        hold_share=hold_share(events, ear.from_ns, last.t_ns),
         holds=max(into_hold.count(module) for module in MODULES),
         torque_step_nm=ear.torque_step,
-        hold_step_nm=max(changes, default=0.0),
-        sole_tilt_max_rad=max(max(row.foot_right_tilt, row.foot_left_tilt) for row in rows),
+        hold_step_nm=max(event_steps_nm(event for _, event in since), default=0.0),
+        sole_tilt_max_rad=sole_tilt_max_rad(rows),
     )
 
 
@@ -271,20 +283,23 @@ def hold_share(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: in
     """Return the share of the time in which at least one module held.
 
     Args:
-        events: changes to HOLD and to TRACK between the two, by module; all track at first.
+        events: every change of mode since the start, by module.
         from_ns: beginning.
         to_ns: end.
     """
+    if to_ns <= from_ns:
+        return 0.0
     holding: set[str] = set()
     held_ns, since_ns = 0, from_ns
     for module, event in sorted(events, key=lambda row: row[1].t_ns):
+        now_ns = min(max(event.t_ns, from_ns), to_ns)
         if holding:
-            held_ns += event.t_ns - since_ns
-        since_ns = event.t_ns
+            held_ns += now_ns - since_ns
+        since_ns = now_ns
         if event.mode_after == Mode.HOLD:
             holding.add(module)
         else:
             holding.discard(module)
     if holding:
         held_ns += to_ns - since_ns
-    return held_ns / max(1, to_ns - from_ns)
+    return held_ns / (to_ns - from_ns)

@@ -2,14 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from enum import StrEnum
-from typing import Final
-
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from services.simulator.world import World
 from shared.clock import NS_PER_MS
@@ -27,34 +20,25 @@ from shared.messages import (
 from shared.topics import Topic
 from tools.runs.lockstep import Lockstep, Record
 from tools.sweeps.cases import Case, network_of, story_of
-
-Array = NDArray[np.float64]
-Watch = Callable[[SimTruth], None]
-
-END_TOLERANCE_S: Final = 0.1
-TIPPING_RAD: Final = 0.05
-"""A sole tilted more than this at the end does not lie down again by itself."""
-
-
-class Ending(StrEnum):
-    """How a case came out."""
-
-    STOOD = "stood"
-    FELL = "fell"
-    TIPPING = "tipping"
-    """Not down yet at the end, but a sole is up or the COM beyond the soles: it will fall."""
-    UNREADY = "unready"
-    """The robot stands, but the six modules never came to track: there was no scenario."""
+from tools.sweeps.figures import (
+    Ended,
+    Ending,
+    Watch,
+    com_max_mm,
+    ending_of,
+    event_steps_nm,
+    operator_peak_n,
+    sole_tilt_max_rad,
+    that_count,
+)
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class Outcome(Ended, frozen=True, kw_only=True):
     """The figures of a case; None where there is nothing to measure.
 
     "After" is from the kill on, "before" from the scenario's start to the kill.
     """
 
-    ending: str
-    fell_at_s: float | None = None
     kill_height_m: float | None = None
     """Torso, as it was at the kill."""
     kill_pitch_rad: float | None = None
@@ -83,11 +67,6 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     sole_tilt_max_rad: float | None = None
     slip_max_mm: float | None = None
     """Of an ankle from where it stood."""
-
-    @property
-    def stood(self) -> bool:
-        """True if the robot stood to the end."""
-        return self.ending == Ending.STOOD
 
 
 class Ear:
@@ -131,33 +110,17 @@ def run_case(
     feet = FootLoads(fleet.world)
     rows: list[SimTruth] = []
     loads: list[float] = []
-    fallen = False
-    for row in fleet.run():
-        fallen |= row.fallen
+
+    def see(row: SimTruth) -> None:
         if case.let_go_s is not None and row.scenario_s >= case.let_go_s:
             fleet.world.let_go()
         if watch is not None:
             watch(row)
-        if rows and rows[-1].fallen:
-            if row.scenario_s > rows[-1].scenario_s + after_fall_s:
-                break
-        elif row.scenario_s >= 0.0:
-            rows.append(row)
-            loads.append(min(feet.read()))
-    outcome = measure(case, rows, loads, fleet.events, ear, fallen=fallen)
-    if outcome.stood and is_tipping(rows[-1], robot):
-        return msgspec.structs.replace(outcome, ending=Ending.TIPPING)
-    return outcome
 
-
-def is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
-    """Return True if the robot is beyond what it can come back from."""
-    geometry = robot.geometry
-    return (
-        abs(row.com[0]) > geometry.l_foot / 2
-        or abs(row.com[1]) > (geometry.w_base + geometry.w_foot) / 2
-        or max(row.foot_right_tilt, row.foot_left_tilt) > TIPPING_RAD
-    )
+    for row in that_count(fleet.run(), 0.0, see, after_fall_s):
+        rows.append(row)
+        loads.append(min(feet.read()))
+    return measure(case, rows, loads, fleet.events, ear, robot)
 
 
 class FootLoads:
@@ -189,23 +152,21 @@ def measure(
     loads: list[float],
     events: list[tuple[str, JointEvent]],
     ear: Ear,
-    *,
-    fallen: bool,
+    robot: RobotConfig,
 ) -> Outcome:
     """Return the figures of a run.
 
     Args:
         case: what was run.
-        rows: the world since the scenario's start.
+        rows: the world since the scenario's start, or the fall before it.
         loads: of the lighter foot, at each row, N.
         events: every change of mode, by module.
         ear: what else was heard.
-        fallen: True if the robot fell, perhaps before the start.
+        robot: for the size of its feet.
     """
-    if not rows:
-        return Outcome(ending=Ending.FELL if fallen else Ending.UNREADY)
-    fell_at = next((row.scenario_s for row in rows if row.fallen), None)
-    reached = rows[-1].scenario_s >= case.end_s - END_TOLERANCE_S
+    if not rows or rows[0].scenario_s < 0.0:
+        return Outcome(ending=Ending.FELL if rows else Ending.UNREADY)
+    last = rows[-1]
     figures = _before([row for row in rows if row.scenario_s < case.kill_s])
     after = [row for row in rows if row.scenario_s >= case.kill_s]
     if after and ear.kill_ns is not None:
@@ -217,8 +178,8 @@ def measure(
     start_ns = rows[0].t_ns
     until_ns = ear.kill_ns if ear.kill_ns is not None else rows[-1].t_ns
     return Outcome(
-        ending=Ending.STOOD if reached and fell_at is None else Ending.FELL,
-        fell_at_s=fell_at,
+        ending=ending_of(last, case.end_s, robot),
+        fell_at_s=last.scenario_s if last.fallen else None,
         holds_before=_drop_outs(events, start_ns, until_ns),
         **figures,
     )
@@ -228,8 +189,8 @@ def _before(rows: list[SimTruth]) -> dict[str, float]:
     if not rows:
         return {}
     return {
-        "operator_peak_before_n": max(abs(row.operator_force[2]) for row in rows),
-        "com_before_max_mm": 1e3 * max(math.hypot(*row.com[:2]) for row in rows),
+        "operator_peak_before_n": operator_peak_n(rows),
+        "com_before_max_mm": com_max_mm(rows),
     }
 
 
@@ -242,10 +203,10 @@ def _after(rows: list[SimTruth]) -> dict[str, float]:
         "com_x_max_mm": float(x.max()),
         "com_y_min_mm": float(y.min()),
         "com_y_max_mm": float(y.max()),
-        "com_max_mm": float(np.hypot(x, y).max()),
+        "com_max_mm": com_max_mm(rows),
         "roll_max_rad": max(abs(row.angles[0]) for row in rows),
         "yaw_max_rad": max(abs(row.angles[2]) for row in rows),
-        "sole_tilt_max_rad": max(max(row.foot_right_tilt, row.foot_left_tilt) for row in rows),
+        "sole_tilt_max_rad": sole_tilt_max_rad(rows),
         "slip_max_mm": 1e3 * max(row.feet_slip for row in rows),
     }
 
@@ -262,11 +223,7 @@ def _handover(events: list[tuple[str, JointEvent]], kill_ns: int) -> dict[str, f
     figures = {}
     if len(late) == len(MODULES):
         figures["hold_ms"] = max(event.t_ns - kill_ns for event in late.values()) / NS_PER_MS
-    steps = [
-        abs(b - a)
-        for event in late.values()
-        for a, b in zip(event.tau_before, event.tau_after, strict=True)
-    ]
+    steps = event_steps_nm(late.values())
     if steps:
         figures["torque_step_nm"] = max(steps)
     return figures

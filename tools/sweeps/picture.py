@@ -16,7 +16,7 @@ from matplotlib.patches import Rectangle
 
 from shared.config import RobotConfig
 from tools.sweeps.cases import PUSHES_MAX, payloads
-from tools.sweeps.outcome import Ending
+from tools.sweeps.figures import Ending
 from tools.sweeps.table import Row
 
 mpl.use("Agg")

@@ -66,8 +66,7 @@ def _result(get: Callable[[], R], name: str) -> R:
         return get()
     except BrokenProcessPool:
         raise RunError(
-            "a worker process was killed (out of memory?); what is done is kept: "
-            "run the same command again to go on, perhaps with fewer --workers"
+            "a worker process was killed (out of memory?); it may need fewer --workers"
         ) from None
     except Exception as error:
         raise RunError(f"{name}: {type(error).__name__}: {error}") from error

@@ -6,7 +6,10 @@ import json
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, TypeAlias, TypeVar
+from typing import Final, Protocol, TypeVar
+
+import msgspec
+from rich.console import Console
 
 from services.recorder import provenance
 from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
@@ -19,12 +22,76 @@ from tools.runs import experiment, figure, verdict
 from tools.runs.lockstep import Record
 from tools.runs.run_log import read_run
 from tools.runs.verdict import Summary
-from tools.sim import DRAIN_EVERY, NOT_HERE, Outbox
+from tools.sim import AFTER_FALL_S, DRAIN_EVERY, NOT_HERE, Outbox
+from tools.sweeps import study
+from tools.sweeps.figures import Ended, Watch
 
-Outcome = TypeVar("Outcome")
-Watch: TypeAlias = Callable[[SimTruth], None]
+Outcome = TypeVar("Outcome", bound=Ended)
+Outcome_co = TypeVar("Outcome_co", bound=Ended, covariant=True)
 
 ROOT: Final = Path(__file__).resolve().parents[2]
+
+
+class Run(Protocol[Outcome_co]):
+    """Runs a case."""
+
+    def __call__(
+        self,
+        *,
+        record: Record | None = None,
+        watch: Watch | None = None,
+        after_fall_s: float = 0.0,
+    ) -> Outcome_co:
+        """Run it; `record` takes every message, `watch` sees the world at its rate."""
+
+
+def run_alone(
+    run: Run[Ended],
+    story: Scenario,
+    robot: RobotConfig,
+    out: Path | None,
+    facts: dict[str, str],
+    console: Console,
+) -> int:
+    """Run a case under a progress bar and print its figures.
+
+    Args:
+        run: runs it.
+        story: what happens.
+        robot: ready to run.
+        out: folder for its log; None: no log.
+        facts: for the log, as for `record_run`.
+        console: to print on.
+
+    Returns:
+        0 if the robot stood, else 1.
+
+    Raises:
+        RunError: the log cannot be written.
+    """
+    with study.bar("{task.completed:.1f} of {task.total:.1f} s", console) as bar:
+        shown = bar.add_task("", total=story.duration)
+
+        def watch(truth: SimTruth) -> None:
+            bar.update(shown, completed=max(0.0, truth.scenario_s))
+
+        if out is None:
+            outcome = run(watch=watch)
+        else:
+            experiment.make_out(out, "sweep")
+            outcome, _ = record_run(
+                story,
+                robot,
+                out,
+                facts,
+                lambda record, look: run(record=record, watch=look, after_fall_s=AFTER_FALL_S),
+                watch,
+            )
+    study.show("Measured", msgspec.structs.asdict(outcome), console)
+    if out is not None:
+        console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
+    console.print(f"[bold]{outcome.ending}[/]")
+    return 0 if outcome.stood else 1
 
 
 def record_run(

@@ -2,32 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Final
 
 from rich.console import Console
 from rich.table import Table
 
-from tools.sweeps.outcome import Ending
+from tools.sweeps.figures import Ending
 from tools.sweeps.table import Row
+from tools.sweeps.wilson import wilson
 
-Z_95: Final = 1.959964
-"""Two-sided 95 % of a normal distribution, in standard deviations."""
 FALLS_SHOWN: Final = 10
-
-
-def wilson(hits: int, of: int) -> tuple[float, float]:
-    """Return the 95 % Wilson score interval of a share (E. B. Wilson, 1927).
-
-    Args:
-        hits: how often it was so.
-        of: trials, at least 1.
-    """
-    share, z2 = hits / of, Z_95 * Z_95
-    middle = (share + z2 / (2 * of)) / (1.0 + z2 / of)
-    half = Z_95 / (1.0 + z2 / of) * math.sqrt(share * (1.0 - share) / of + z2 / (4 * of * of))
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 WORST: Final = (

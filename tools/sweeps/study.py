@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
+import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from shared import config_file
+from shared.config import RobotConfig
 from shared.exceptions import RunError
 from tools.sweeps import cluster, pool
 from tools.sweeps.table import Table
@@ -55,7 +60,7 @@ def add_flags(parser: argparse.ArgumentParser, name: str, files: str, more: str 
     """
     parser.add_argument("--seed", type=int, default=1, help="of the cases (1)")
     parser.add_argument(
-        "--workers", type=int, default=pool.cores(), help=f"processes (one a core: {pool.cores()})"
+        "--workers", type=int, help=f"processes of this machine (one a core: {pool.cores()})"
     )
     parser.add_argument(
         "--cluster",
@@ -73,8 +78,18 @@ def add_flags(parser: argparse.ArgumentParser, name: str, files: str, more: str 
 
 
 def crew_of(args: argparse.Namespace, code: tuple[str, ...]) -> Crew:
-    """Return who runs the study, by its flags."""
-    return Crew(args.workers, args.cluster, code)
+    """Return who runs the study, by its flags.
+
+    Raises:
+        RunError: the flags do not go together, or make no sense.
+    """
+    if args.workers is not None:
+        check_least(("--workers", args.workers, 1))
+    if args.cluster is not None and args.workers is not None:
+        raise RunError("--workers are of this machine, --cluster has its own; leave one out")
+    if args.cluster is not None and getattr(args, "only", None) is not None:
+        raise RunError("--only runs here, in one process; leave --cluster out")
+    return Crew(args.workers or pool.cores(), args.cluster, code)
 
 
 def check_least(*flags: tuple[str, int, int]) -> None:
@@ -86,6 +101,12 @@ def check_least(*flags: tuple[str, int, int]) -> None:
     for flag, value, least in flags:
         if value < least:
             raise RunError(f"{flag} {value}: must be at least {least}")
+
+
+def digest_of(robot: RobotConfig) -> str:
+    """Return the SHA-256 of a robot file and of the gain schedule beside it."""
+    schedule = msgspec.json.encode(robot.gain_schedule)
+    return hashlib.sha256(config_file.to_toml(robot).encode() + schedule).hexdigest()
 
 
 def folder(out: Path | None, name: str) -> Path:
@@ -142,7 +163,7 @@ def fill(
 def resumable(
     table: Table, out: Path, command: str, crew: Crew, console: Console
 ) -> Iterator[None]:
-    """Say at Ctrl-C and SIGTERM what is kept, and how to go on.
+    """Say what is kept, and how to go on, at Ctrl-C, SIGTERM and when a worker is lost.
 
     Args:
         table: the study's.
@@ -153,11 +174,11 @@ def resumable(
     """
     try:
         yield
-    except (KeyboardInterrupt, SystemExit):
-        done = len(table.numbers)
-        cluster_flag = f" --cluster {crew.cluster}" if crew.cluster else ""
-        again = f"{command}{cluster_flag} --out {out}"
-        console.print(f"{done} cases are in {out}; go on with: {again}", soft_wrap=True)
+    except (KeyboardInterrupt, SystemExit, RunError):
+        if done := len(table.numbers):
+            cluster_flag = f" --cluster {crew.cluster}" if crew.cluster else ""
+            again = f"{command}{cluster_flag} --out {shlex.quote(str(out))}"
+            console.print(f"{done} cases are in {out}; go on with: {again}", soft_wrap=True)
         raise
 
 

@@ -1,26 +1,31 @@
 """A study's table: one CSV row a case, written as it is done, gone on with after a stop.
 
 Beside the table, `inputs.json` says what it was made from; a folder of other inputs is
-refused. A finished table is sorted by case: the same inputs give the same file.
+refused, and so is one that another study is writing to. A finished table is sorted by case: the
+same inputs give the same file.
 """
 
 from __future__ import annotations
 
 import ast
 import csv
+import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from types import TracebackType
-from typing import Final
+from types import MappingProxyType, TracebackType
+from typing import IO, Final, TypeAlias
 
 from shared.exceptions import RunError
 
 INPUTS_FILE: Final = "inputs.json"
 ROOT: Final = Path(__file__).resolve().parents[2]
-Row = Mapping[str, str]
+Row: TypeAlias = Mapping[str, str]
+Words: TypeAlias = Mapping[str, Set[str]]
+"""The columns that hold words, and all that each may hold."""
+NO_WORDS: Final[Words] = MappingProxyType({})
 
 
 def code_of(*modules: str) -> tuple[str, ...]:
@@ -41,7 +46,9 @@ def code_of(*modules: str) -> tuple[str, ...]:
             continue
         files.add(file)
         for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom) and node.module:
+            if isinstance(node, ast.Import):
+                todo += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
                 todo += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
     return ("services", "shared", *sorted(files))
 
@@ -60,28 +67,48 @@ class Table:
     """The open table; use it as a context."""
 
     def __init__(
-        self, folder: Path, name: str, columns: Sequence[str], inputs: Mapping[str, str]
+        self,
+        folder: Path,
+        name: str,
+        columns: Sequence[str],
+        inputs: Mapping[str, str],
+        words: Words = NO_WORDS,
+        drawn: Iterable[Mapping[str, object]] = (),
     ) -> None:
         """Open or go on with a table; its first column is the case's number.
+
+        Rows that are not whole, cut off or damaged, are left out: their cases are run again.
 
         Args:
             folder: of the results; made if it is not there.
             name: of the CSV file.
             columns: of the table.
             inputs: what the rows depend on, by name.
+            words: what is no number.
+            drawn: of each case, what the row of its number says first.
 
         Raises:
-            RunError: the folder cannot be used, or was made from other inputs.
+            RunError: the folder cannot be used, another study is writing to it, or it is not
+                known to be of these inputs.
         """
         self._path, self._columns = folder / name, tuple(columns)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            _claim(folder / INPUTS_FILE, inputs)
-            self._rows = _whole_rows(self._path, self._columns)
-            self._write()  # a row cut off by a power failure is out
-            self._file = self._path.open("a", encoding="utf-8", newline="")
+            self._inputs = (folder / INPUTS_FILE).open("a+", encoding="utf-8")
         except OSError as error:
-            raise RunError(f"{folder}: {error.strerror}; choose another --out") from None
+            raise _unusable(folder, error) from None
+        try:
+            _claim(self._inputs, self._path, inputs)
+            self._rows = _whole_rows(self._path, self._columns, words)
+            for case in drawn:
+                self._check({name: _text(value) for name, value in case.items()})
+            self._write()
+            self._file = self._path.open("a", encoding="utf-8", newline="")
+        except BaseException as error:
+            self._inputs.close()  # and no longer locked
+            if isinstance(error, OSError):
+                raise _unusable(folder, error) from None
+            raise
 
     def __enter__(self) -> Table:
         """Return the table."""
@@ -96,6 +123,7 @@ class Table:
         """Sort the rows and close the file; however the study ended."""
         self._file.close()
         self._write()
+        self._inputs.close()
 
     @property
     def numbers(self) -> set[int]:
@@ -113,6 +141,13 @@ class Table:
         csv.DictWriter(self._file, self._columns).writerow(row)
         self._file.flush()
 
+    def _check(self, case: Row) -> None:
+        """Leave out the row of a case if it is of another one."""
+        number = int(case[self._columns[0]])
+        there = self._rows.get(number, case)
+        if any(there[name] != value for name, value in case.items()):
+            del self._rows[number]
+
     def _write(self) -> None:
         """Write all rows anew; the file is whole or the old one."""
         temporary = self._path.with_suffix(".tmp")
@@ -125,23 +160,41 @@ class Table:
         temporary.replace(self._path)
 
 
-def _claim(path: Path, inputs: Mapping[str, str]) -> None:
-    """Write the inputs, or compare them with those that are there.
+def _unusable(folder: Path, error: OSError) -> RunError:
+    return RunError(f"{folder}: {error.strerror}; choose another --out")
+
+
+def _claim(file: IO[str], table: Path, inputs: Mapping[str, str]) -> None:
+    """Lock the inputs' file; write them into it, or compare them with those that are there.
 
     Raises:
-        RunError: they differ.
+        RunError: it is locked, or they differ.
     """
+    folder = table.parent
     try:
-        there = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        path.write_text(json.dumps(dict(inputs), indent=2) + "\n", encoding="utf-8")
-        return
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RunError(f"{folder}: another study is writing there; choose another --out") from None
+    file.seek(0)
+    try:
+        text = file.read()
+        there = json.loads(text) if text else None
     except ValueError:
-        raise RunError(f"{path}: cannot be read; choose another --out") from None
+        text, there = "?", None
+    if not text and not table.exists():
+        file.write(json.dumps(dict(inputs), indent=2) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+        return
+    if not isinstance(there, dict):
+        raise RunError(
+            f"{folder}: {INPUTS_FILE} does not say what {table.name} was made from; choose another "
+            "--out"
+        )
     for name, value in inputs.items():
         if there.get(name) != value:
             raise RunError(
-                f"{path.parent}: holds a study of another {name} "
+                f"{folder}: holds a study of another {name} "
                 f"({_short(there.get(name))}, now {_short(value)}); choose another --out"
             )
 
@@ -151,15 +204,50 @@ def _short(value: object) -> str:
     return text if len(text) <= 20 else f"{text[:8]}..."
 
 
-def _whole_rows(path: Path, columns: Sequence[str]) -> dict[int, Row]:
-    """Read the rows that are whole."""
+def _whole_rows(path: Path, columns: Sequence[str], words: Words) -> dict[int, Row]:
+    """Read the rows that are whole, by number.
+
+    Raises:
+        RunError: the file has other columns.
+    """
     if not path.exists():
         return {}
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1]  # what has no end is not whole
-    rows = csv.DictReader(lines)
-    if tuple(rows.fieldnames or ()) != tuple(columns):
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = map(_cells, text.split("\n")[:-1])  # what has no end is not whole
+    if next(lines, list(columns)) != list(columns):
         raise RunError(f"{path}: has other columns; choose another --out")
-    return {int(row[columns[0]]): row for row in rows if None not in (*row, *row.values())}
+    return {int(row[columns[0]]): row for row in _whole(lines, columns, words)}
+
+
+def _whole(lines: Iterator[list[str]], columns: Sequence[str], words: Words) -> Iterator[Row]:
+    for cells in lines:
+        row = dict(zip(columns, cells, strict=False))
+        if (
+            len(cells) == len(columns)
+            and cells[0].isdecimal()
+            and all(
+                value in words[name] if name in words else _is_number(value)
+                for name, value in row.items()
+            )
+        ):
+            yield row
+
+
+def _cells(line: str) -> list[str]:
+    """Return what is between the commas; nothing if it is no line of a CSV file."""
+    try:
+        return next(csv.reader([line], strict=True), [])
+    except csv.Error:
+        return []
+
+
+def _is_number(value: str) -> bool:
+    """Return True for a number, and for none."""
+    try:
+        float(value or "0")
+    except ValueError:
+        return False
+    return True
 
 
 def _text(value: object) -> str:
