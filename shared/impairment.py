@@ -1,24 +1,29 @@
 """What a bad network does to messages: delay, jitter, loss, partitions; seeded. Pure.
 
-The words are those of tc-netem. One object decides for the modelled network of lockstep and
-for the injector on the wire, so that both mean the same (design sections 6 and 7).
+The words are those of tc-netem where it has them. One object decides for the modelled network
+of lockstep and for the injector on the wire, so that both mean the same (design sections 6 and
+7). A message is one that is put in lockstep, and a batch of Zenoh's on the wire: what is sent at
+once travels, and is lost, as one.
 """
 
 from __future__ import annotations
 
 import math
 import random
+from decimal import Decimal
 from typing import Annotated, Final, Literal
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.toml_file import Range, Section
 
-Share = Annotated[float, Range(0.0, 1.0, "")]
+Share = Annotated[float, Range(0.0, 1.0, "(1 is 100 %)")]
 Ms = Annotated[float, Range(0.0, 60_000.0, "ms")]
 Distribution = Literal["uniform", "normal", "pareto"]
 
 HELD: Final = 1 << 62
 """Release time, ns, of what waits for the end of a partition."""
+ROUNDING: Final = 1e-9
+"""Relative, of shares: 1 - 0.9 is not quite 0.1."""
 QUEUE_MAX: Final = 1000
 """Messages that wait for a slow line; what comes on top is lost, as in netem."""
 
@@ -28,7 +33,8 @@ class Impairment(Section, frozen=True, kw_only=True):
 
     delay_ms: Ms = 0.0
     jitter_ms: Ms = 0.0
-    """uniform: delay +- jitter; normal, pareto: the standard deviation. Never before its time."""
+    """uniform: delay +- jitter; normal, pareto: the standard deviation. Nothing comes before it
+    was sent: with less delay than jitter, the share that would has none."""
     distribution: Distribution = "uniform"
     loss: Share = 0.0
     """Probability that a message never comes."""
@@ -42,22 +48,23 @@ class Impairment(Section, frozen=True, kw_only=True):
     """Bytes a second that the line carries; 0: any."""
     ordered: bool = False
     """A late message holds up those behind it, and a partition holds them all back until its
-    end, as on a stream (TCP). Without it: overtaken and lost, as datagrams are."""
+    end, as on a stream (TCP); but nothing that `loss` takes is sent again. Without it:
+    overtaken and lost, as datagrams are."""
     partition: bool = False
     """Nothing passes."""
 
     def in_words(self) -> str:
-        """Return what is done, as `xrl inject` takes it: `delay=30 jitter=10`; `nothing`."""
+        """Return what is done, as `--inject` takes it: `delay=30ms loss=20%`; `nothing`."""
         words = [
-            f"{name}={value:g}"
-            for name, value, standard in (
-                ("delay", self.delay_ms, 0.0),
-                ("jitter", self.jitter_ms, 0.0),
-                ("loss", self.loss, 0.0),
-                ("burst", self.burst, 1.0),
-                ("duplicate", self.duplicate, 0.0),
-                ("reorder", self.reorder, 0.0),
-                ("rate", self.rate, 0.0),
+            f"{name}={_digits(value, places)}{unit}"
+            for name, value, standard, places, unit in (
+                ("delay", self.delay_ms, 0.0, 0, "ms"),
+                ("jitter", self.jitter_ms, 0.0, 0, "ms"),
+                ("loss", self.loss, 0.0, 2, "%"),
+                ("burst", self.burst, 1.0, 0, ""),
+                ("duplicate", self.duplicate, 0.0, 2, "%"),
+                ("reorder", self.reorder, 0.0, 2, "%"),
+                ("rate", self.rate, 0.0, 0, ""),
             )
             if value != standard
         ]
@@ -67,15 +74,34 @@ class Impairment(Section, frozen=True, kw_only=True):
         return " ".join(words) or "nothing"
 
     def fault(self) -> str:
-        """Return what does not go together, `; ` and what would be right; empty if all does."""
+        """Return what does not go together, or is without effect; empty if nothing is.
+
+        What is amiss, `; ` and what would be right.
+        """
+        late = self.delay_ms or self.jitter_ms
+        alone = Impairment(partition=self.partition, ordered=self.ordered).in_words()
+        if self.partition and self.in_words() != alone:
+            return f"{self.in_words()}; in a partition nothing passes: leave out all but ordered"
         if self.ordered and self.reorder:
             return "ordered, and reorder; on a stream nothing overtakes: leave one out"
         if self.burst > 1.0 and not 0.0 < self.loss < 1.0:
             return f"burst {self.burst:g}, and a loss of {self.loss:g}; give a loss between 0 and 1"
-        if self.burst > 1.0 and self.loss > self.burst * (1.0 - self.loss):
-            shortest = self.loss / (1.0 - self.loss)
-            return f"burst {self.burst:g}, and a loss of {self.loss:g}; bursts of {shortest:.3g} on"
+        least = self.loss / (1.0 - self.loss) * (1.0 - ROUNDING) if self.loss < 1.0 else 1.0
+        if 1.0 < self.burst < least:
+            found = f"loss {_digits(self.loss, 2)}% in rows of {self.burst:g}, and less than one"
+            return f"{found} message between them; give a burst of {math.ceil(least)} or more"
+        if self.reorder and not late:
+            return "reorder, and no delay that others could overtake; give a delay"
+        if self.distribution != "uniform" and not self.jitter_ms:
+            return f"distribution {self.distribution}, and no jitter; give a jitter"
+        if self.ordered and not (late or self.rate or self.partition):
+            return "ordered, and nothing late or held back; give a delay, a rate or a partition"
         return ""
+
+
+def _digits(value: float, places: int) -> str:
+    """Return a number times 10**places; its digits, read again, are the same number."""
+    return f"{Decimal(repr(value)).scaleb(places).normalize():f}"
 
 
 class Impairer:
@@ -85,7 +111,7 @@ class Impairer:
         """Begin; the same seed decides the same."""
         self.what = what
         self.passed = self.lost = 0
-        """Messages that came out, or will; and those that never do."""
+        """Messages that came out, or will; and those that never do. What is doubled counts once."""
         self._random = random.Random(seed)
         self._in_burst = False
         self._line_free_ns = 0
@@ -120,6 +146,11 @@ class Impairer:
         release_ns = now_ns + round(self.what.delay_ms * NS_PER_MS)
         self._last_ns = max(self._last_ns, release_ns)
         return self._last_ns
+
+    def drop(self) -> None:
+        """Count one as lost that has passed and will not come out after all: its link is gone."""
+        self.passed -= 1
+        self.lost += 1
 
     def _release_ns(self, now_ns: int, size: int) -> int:
         what = self.what
@@ -163,8 +194,9 @@ class Impairer:
 class Direction:
     """One direction of a link, and what is done to it at the moment.
 
-    Several impairments may be asked for at once: the one that began last is in force, and
-    when it ends the one before it is again.
+    Several impairments may be asked for at once; one is in force: a partition before all else,
+    otherwise the one that began last. When it ends, the next by that rule is. That a stream keeps
+    its order over such a change is for the one to see to that has its queue.
     """
 
     def __init__(self, name: str, seed: int) -> None:
@@ -175,21 +207,21 @@ class Direction:
             seed: of all that will be decided here.
         """
         self.name = name
+        self.in_force: Impairer | None = None
+        """What decides now; None: everything passes at once."""
         self._seed = f"{seed} {name}"
         self._asked: dict[int, Impairer] = {}
 
-    @property
-    def in_force(self) -> Impairer | None:
-        """What decides now; None: everything passes at once."""
-        return next(reversed(self._asked.values()), None)
-
     def begin(self, number: int, what: Impairment) -> None:
-        """Put an impairment in force; `number` tells it from all others, for `end`."""
+        """Take an impairment in; `number` tells it from all others, for `end`."""
         self._asked[number] = Impairer(what, f"{self._seed} {number}")
+        self._choose()
 
     def end(self, number: int) -> Impairer | None:
         """End an impairment and return it with its counts; None if it is not there."""
-        return self._asked.pop(number, None)
+        ended = self._asked.pop(number, None)
+        self._choose()
+        return ended
 
     def asked(self, number: int) -> Impairer | None:
         """Return what was asked for under a number, in force or not; None if it is over."""
@@ -197,5 +229,9 @@ class Direction:
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
         """Take a message in; return when it comes out, ns. As `Impairer.passes`."""
-        impairer = self.in_force
-        return (now_ns,) if impairer is None else impairer.passes(now_ns, size)
+        return (now_ns,) if self.in_force is None else self.in_force.passes(now_ns, size)
+
+    def _choose(self) -> None:
+        asked = self._asked.values()
+        cut = [impairer for impairer in asked if impairer.what.partition]
+        self.in_force = next(reversed(cut or [*asked]), None)

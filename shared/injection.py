@@ -6,6 +6,7 @@ from typing import Final, TypeAlias
 
 import msgspec
 
+from shared.links import directions_of
 from shared.scenario import Inject
 
 SOCKET: Final = "injector.sock"
@@ -14,13 +15,15 @@ LINE_MAX: Final = 65536
 
 
 class Begin(msgspec.Struct, frozen=True, tag="begin"):
-    """Put an impairment in force, now; `at` of it is not looked at."""
+    """Put an impairment in force, now or soon; `at` of it is not looked at."""
 
     inject: Inject
+    in_s: float = 0.0
+    """From now, s; the injector waits, not the one that asks."""
 
 
 class Clear(msgspec.Struct, frozen=True, tag="clear"):
-    """End what is done to a link."""
+    """End what is done to a link, or would be."""
 
     link: str = "all"
 
@@ -38,11 +41,31 @@ class Asked(msgspec.Struct, frozen=True):
     number: int
     link: str
     detail: str
-    """As `Impairment.in_words`."""
+    """What is done, as `--inject` takes it."""
     left_s: float | None
-    """Until it ends, s; None: it does not by itself."""
+    """Until it ends, s from now; None: it does not by itself."""
     passed: int
+    """Messages (batches of Zenoh's) while it was in force."""
     lost: int
+    """Of them, those that it took away."""
+    in_s: float = 0.0
+    """Until it begins, s from now; 0: it has."""
+    hidden: tuple[str, ...] = ()
+    """Its directions on which another one is in force (`shared.impairment.Direction`)."""
+
+    def standing(self) -> str:
+        """Return what keeps it from being done now, and where; empty if nothing does."""
+        if self.in_s:
+            return f"in {self.in_s:.1f} s"
+        if not self.hidden:
+            return ""
+        count = len(directions_of(self.link))
+        return "hidden" if len(self.hidden) == count else f"hidden on {len(self.hidden)} of {count}"
+
+    def in_words(self) -> str:
+        """Return where it is, what, and what keeps it from being done now."""
+        standing = self.standing()
+        return f"{self.link} {self.detail}{f' ({standing})' if standing else ''}"
 
 
 class Reply(msgspec.Struct, frozen=True):
@@ -50,4 +73,4 @@ class Reply(msgspec.Struct, frozen=True):
 
     error: str = ""
     asked: tuple[Asked, ...] = ()
-    """What is asked for after the request was carried out; the last one on a link counts."""
+    """What is asked for after the request was carried out, the newest last."""

@@ -95,14 +95,15 @@ class LinkEvent(Message, frozen=True):
     number: int
     """The same for all directions of one impairment, and for its beginning and its end."""
     in_force: bool
-    """True: from now on; False: it is over."""
+    """True: from now on, unless a partition or what begins later hides it; False: it is over."""
     delay_ms: float
     jitter_ms: float
     loss: float
     partition: bool
     detail: str
-    """All of it in words, as `xrl inject` takes it."""
+    """All of it in words, as `--inject` takes it."""
     passed: int
-    """Messages that went through while it was asked for; 0 when it begins."""
+    """Messages (live: batches of Zenoh's) that went through while it was in force; 0 when it
+    begins."""
     lost: int
     """Messages that it took away."""

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import ConfigError
-from shared.impairment import HELD, QUEUE_MAX, Direction, Impairer, Impairment
+from shared.impairment import HELD, QUEUE_MAX, Direction, Distribution, Impairer, Impairment
 from shared.links import DIRECTIONS, GROUPS, PAIRS, directions_of
 
 EVERY_NS = 4 * NS_PER_MS
@@ -42,7 +42,7 @@ def test_uniform_jitter_stays_in_its_bounds_and_fills_them() -> None:
 
 
 @pytest.mark.parametrize("distribution", ["normal", "pareto"])
-def test_other_jitter_has_the_mean_and_the_deviation_asked_for(distribution: str) -> None:
+def test_other_jitter_has_the_mean_and_the_deviation_asked_for(distribution: Distribution) -> None:
     what = Impairment(delay_ms=100.0, jitter_ms=10.0, distribution=distribution)
     found = delays_ms(what, 40_000)
     assert statistics.mean(found) == pytest.approx(100.0, abs=0.5)
@@ -163,16 +163,78 @@ def test_what_began_last_is_in_force_and_what_it_hid_comes_back() -> None:
     assert direction.passes(7, SIZE) == (7,)
 
 
+CHANGES = st.lists(
+    st.tuples(st.sampled_from(["begin", "end"]), st.integers(0, 5), st.booleans()), max_size=20
+)
+
+
+@given(CHANGES)
+def test_a_partition_in_force_wins_over_whatever_begins_later(
+    changes: list[tuple[str, int, bool]],
+) -> None:
+    """By what passes: of the others the one that began last, and its delay is its number."""
+    direction = Direction("planner->knee_left", 0)
+    asked: dict[int, bool] = {}
+    for what, number, cut in changes:
+        if what == "end":
+            assert (direction.end(number) is not None) is (number in asked)
+            asked.pop(number, None)
+        elif number not in asked:
+            direction.begin(number, Impairment(delay_ms=0.0 if cut else number, partition=cut))
+            asked[number] = cut
+        expected: tuple[int, ...] = (next(reversed(asked), 0) * NS_PER_MS,)
+        assert direction.passes(0, SIZE) == (() if any(asked.values()) else expected)
+
+
+def test_what_has_passed_and_does_not_come_out_after_all_is_lost() -> None:
+    impairer = Impairer(Impairment(partition=True, ordered=True), "a")
+    impairer.passes(0, SIZE)
+    impairer.drop()
+    assert (impairer.passed, impairer.lost) == (0, 1)
+
+
 @pytest.mark.parametrize(
     ("changes", "right"),
     [
         ({"ordered": True, "reorder": 0.1}, "leave one out"),
         ({"burst": 3.0}, "loss between 0 and 1"),
-        ({"burst": 2.0, "loss": 0.9}, "bursts of 9 on"),
+        ({"burst": 2.0, "loss": 0.91}, "a burst of 11 or more"),
+        ({"partition": True, "delay_ms": 5.0}, "leave out all but ordered"),
+        ({"partition": True, "ordered": True, "loss": 0.5}, "leave out all but ordered"),
     ],
 )
 def test_what_does_not_go_together_is_told(changes: dict[str, float], right: str) -> None:
     assert right in msgspec.structs.replace(Impairment(), **changes).fault()
+
+
+@given(st.floats(0.51, 0.999))
+def test_the_burst_that_is_advised_is_accepted(loss: float) -> None:
+    right = Impairment(loss=loss, burst=1.001).fault().partition("; ")[2]
+    least = float(right.split()[4])
+    assert not Impairment(loss=loss, burst=least).fault()
+    assert least < 1.0 + loss / (1.0 - loss)
+
+
+def test_a_loss_of_nine_in_ten_comes_in_rows_of_nine() -> None:
+    assert not Impairment(loss=0.9, burst=9.0).fault()
+
+
+@pytest.mark.parametrize(
+    ("idle", "cure"),
+    [
+        (Impairment(reorder=0.1), "delay_ms"),
+        (Impairment(loss=0.1, distribution="pareto"), "jitter_ms"),
+        (Impairment(ordered=True), "rate"),
+        (Impairment(ordered=True, loss=0.1), "delay_ms"),
+    ],
+)
+def test_what_would_be_without_effect_is_told_with_what_it_lacks(
+    idle: Impairment, cure: str
+) -> None:
+    found, _, right = idle.fault().partition("; ")
+    assert found
+    assert cure.removesuffix("_ms") in right
+    assert not msgspec.structs.replace(idle, **{cure: 10.0}).fault()
 
 
 def test_every_link_has_both_of_its_directions_but_nobody_speaks_to_the_harness() -> None:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 from shared import scenario, topics
@@ -58,17 +61,32 @@ def test_an_impairment_is_read_from_its_words(text: str, inject: Inject) -> None
     ("text", "right"),
     [
         ("", "planner->MODULE"),
+        (" , ", "planner->MODULE"),
         ("elbow delay=1", "planner->MODULE"),
         ("all", "give a delay"),
-        ("all delya=3", "KEYs: delay"),
-        ("all delay=soon", "KEYs: delay"),
-        ("all delay=nan", "KEYs: delay"),
-        ("all loss=1.5", "must be from 0 to 1"),
-        ("all delay=-1", "must be from 0 to 60000"),
-        ("all delay=1 for=0", "must be from 0.001"),
-        ("all distribution=wild jitter=1", "distribution (uniform, normal, pareto)"),
+        ("all delya=3", "perhaps 'delay'; LINK KEY=VALUE"),
+        ("all xyz=3", "not understood; LINK KEY=VALUE ...; LINK is planner->joints"),
+        ("planner->joint delay=3", "perhaps 'planner->joints'; one of"),
+        ("planner- delay=3", "put it in quotes"),
+        ("all delay=3 loss=1 delay=4", "a second delay; leave one out"),
+        ("all partition delay=10", "leave out all but ordered"),
+        ("all delay=soon", "delay: 'soon' is not understood; write 30 (ms), 0.03s or 500us"),
+        ("all delay=nan", "write 30 (ms)"),
+        ("all delay=30%", "write 30 (ms)"),
+        ("all delay", "KEYs: delay"),
+        ("all partition=3", "words: partition"),
+        ("all loss=1.5", "must be from 0 to 1 (1 is 100 %); write 0.2 or 20%"),
+        ("all loss=101%", "loss: '101%' is out of range"),
+        ("all loss=20ms", "loss: '20ms' is not understood"),
+        ("all delay=-1", "must be from 0 to 60000 ms"),
+        ("all delay=100s", "delay: '100s' is out of range"),
+        ("all delay=1 for=0", "for: '0' is out of range; must be from 0.001"),
+        ("all delay=1 at=1e999", "at: '1e999' is out of range"),
+        ("all rate=1mbit", "bytes"),
+        ("all distribution=wild jitter=1", "one of uniform, normal, pareto"),
         ("all ordered reorder=0.1", "leave one out"),
         ("all burst=3", "loss between 0 and 1"),
+        ("all reorder=0.1", "give a delay"),
     ],
 )
 def test_what_makes_no_sense_is_refused_with_what_would_be_right(text: str, right: str) -> None:
@@ -78,11 +96,46 @@ def test_what_makes_no_sense_is_refused_with_what_would_be_right(text: str, righ
     assert "\n" not in str(caught.value)
 
 
-def test_words_come_back_from_what_they_made() -> None:
-    text = "all delay=30 jitter=10 loss=0.1 burst=3 distribution=normal"
-    assert injection.parse_inject(f"all {injection.parse_inject(text).in_words()}") == (
-        injection.parse_inject(text)
+@pytest.mark.parametrize(
+    ("word", "texts", "value"),
+    [
+        ("delay", ("30", "30ms", "0.03s", "30000us", "3e1ms"), 30.0),
+        ("jitter", ("0.5", ".5ms", "500us", "0.0005s"), 0.5),
+        ("loss", ("0.07", "7%", "7.0%"), 0.07),
+        ("duplicate", ("1", "100%"), 1.0),
+        ("rate", ("1e4", "10000"), 1e4),
+        ("for", ("4", "4s", "4000ms"), 4.0),
+        ("at", ("0.25", "250ms"), 0.25),
+    ],
+)
+def test_a_number_is_the_same_in_each_of_its_units(
+    word: str, texts: tuple[str, ...], value: float
+) -> None:
+    for text in texts:
+        inject = injection.make("all", {"burst": "1", "delay": "1", word: text})
+        assert getattr(inject, injection.NUMBERS[word].field) == value
+
+
+SHARES = st.floats(0.0, 1.0)
+
+
+@given(
+    st.builds(
+        Impairment, delay_ms=st.floats(1e-3, 6e4), jitter_ms=st.floats(1e-3, 6e4), loss=SHARES,
+        duplicate=SHARES, rate=st.floats(0.0, 1e10), ordered=st.booleans(),
+        distribution=st.sampled_from(["uniform", "normal", "pareto"]),
     )
+)  # fmt: skip
+def test_words_come_back_exactly_from_what_they_made(what: Impairment) -> None:
+    inject = injection.parse_inject(f"all {what.in_words()}")
+    assert {name: getattr(inject, name) for name in what.__struct_fields__} == (
+        msgspec.structs.asdict(what)
+    )
+
+
+def test_what_is_done_is_told_with_units_and_shares_in_percent() -> None:
+    what = injection.parse_inject("all delay=0.03s jitter=10 loss=1 burst=1 duplicate=.125")
+    assert what.in_words() == "delay=30ms jitter=10ms loss=100% duplicate=12.5%"
 
 
 def test_a_flag_replaces_the_impairments_of_the_scenario_and_is_told() -> None:
@@ -92,7 +145,7 @@ def test_a_flag_replaces_the_impairments_of_the_scenario_and_is_told() -> None:
         parse("--scenario", "bad_network", "--inject", "all loss=0.1 at=2 for=1")
     )
     assert [row.link for row in story.inject] == ["all"]
-    assert "all loss=0.1 at 2 s for 1 s" in experiment.in_words(story)
+    assert "all loss=10% at 2 s for 1 s" in experiment.in_words(story)
 
 
 def test_a_scenario_with_impairments_comes_back_from_its_own_toml(tmp_path: Path) -> None:
@@ -126,6 +179,7 @@ def cut(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> RunLog:
         inject=(
             Inject(link="planner->left", at=0.5, duration=0.6, partition=True),
             Inject(link="harness->planner", at=0.7, duration=0.2, delay_ms=5.0),
+            Inject(link="knee_left->planner", at=2.0, delay_ms=1.0),
         ),
     )
     folder = tmp_path_factory.mktemp("cut")
@@ -142,7 +196,12 @@ def test_every_beginning_and_end_is_in_the_log_with_what_was_lost(cut: RunLog) -
     assert len({event.number for event in left}) == 1
     assert all(event.lost == 150 for event in left if not event.in_force), "0.6 s at 250 Hz"
     (late,) = [e for e in events if e.link == "harness->planner" and not e.in_force]
-    assert (late.passed, late.lost, late.detail) == (50, 0, "delay=5")
+    assert (late.passed, late.lost, late.detail) == (50, 0, "delay=5ms")
+
+
+def test_what_lasts_to_the_end_of_a_run_is_in_its_log_with_its_counts(cut: RunLog) -> None:
+    (ended,) = [e for e in cut.messages(topics.LINK_EVENT) if e.number == 3 and not e.in_force]
+    assert ended.passed == pytest.approx(250, abs=3), "1 s at 250 Hz"
 
 
 def test_one_leg_cut_off_makes_all_six_hold_and_they_lead_again(cut: RunLog) -> None:
@@ -154,7 +213,7 @@ def test_one_leg_cut_off_makes_all_six_hold_and_they_lead_again(cut: RunLog) -> 
 def test_the_time_in_hold_is_not_judged_as_the_planner_leading(cut: RunLog) -> None:
     summary = verdict.summarise(cut, 3.0)
     assert summary["stood"]
-    assert summary["links_impaired"] == 2
+    assert summary["links_impaired"] == 3
     assert summary["hold_com_x_max_mm"] is not None
     assert summary["handover_max_ms"] is None, "nobody was killed"
     assert summary["handover_torque_step_nm"] < 5.0

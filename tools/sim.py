@@ -159,6 +159,7 @@ def simulate(
                 fallen_at_s = truth.scenario_s
             if fallen_at_s is not None and truth.scenario_s > fallen_at_s + AFTER_FALL_S:
                 break
+        fleet.network.end(fleet.now_ns)
         writer.take_from(outbox, len(outbox))
     return fleet.now_ns / 1e9
 

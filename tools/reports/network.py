@@ -1,9 +1,9 @@
-"""What was done to the network on purpose: a panel of bars, and lines of the timeline."""
+"""What was done to the network on purpose: a panel of bars."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from enum import IntEnum
 from typing import Final
 
@@ -13,7 +13,7 @@ from shared import topics
 from shared.clock import NS_PER_S
 from shared.links import GROUPS
 from shared.traces import LinkEvent
-from tools.reports.sheet import Happening, Row, Sheet
+from tools.reports.sheet import Row, Sheet
 from tools.reports.signals import GAP_S
 from tools.reports.source import Source
 
@@ -36,43 +36,36 @@ History = tuple[tuple[float, Link], ...]
 def add_network(source: Source, sheet: Sheet) -> None:
     """Add the directions that were impaired; those that fared alike in one row."""
     alike: dict[History, list[str]] = defaultdict(list)
-    for name, history in _histories(source).items():
+    events: list[LinkEvent] = source.log.messages(topics.LINK_EVENT)
+    for name, history in histories(events, source.zero_ns).items():
         alike[history].append(name)
     rows = [_row(source, label, history) for history, names in alike.items()
             for label in _labels(names)]  # fmt: skip
     sheet.bars("Network, as injected", rows, Link, COLOURS, otherwise=NOTHING_DONE)
 
 
-def injections(source: Source) -> Iterator[Happening]:
-    """Yield when an impairment begins and ends; all its directions at once."""
-    groups: dict[tuple[int, int, bool], list[LinkEvent]] = defaultdict(list)
-    events: list[LinkEvent] = source.log.messages(topics.LINK_EVENT)
-    for event in events:
-        groups[event.number, event.t_ns, event.in_force].append(event)
-    for (_, t_ns, begins), group in groups.items():
-        first = group[0]
-        what = f"network, {_short(first.asked)}: {first.detail}"
-        t = (t_ns - source.zero_ns) / NS_PER_S
-        if begins:
-            yield Happening(t, "network", what, first.detail)
-            continue
-        passed, lost = (sum(getattr(row, name) for row in group) for name in ("passed", "lost"))
-        yield Happening(t, "note", f"{what} ends; {passed} messages passed, {lost} lost")
+def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
+    """Return (time, what is in force from then on) of each direction that was ever impaired.
 
+    Of several a partition counts before all others (`shared.impairment.Direction`).
 
-def _histories(source: Source) -> dict[str, History]:
-    """Return (time, what is in force from then on) of each direction that was ever impaired."""
+    Args:
+        events: as they were told.
+        zero_ns: stamp of time 0.
+
+    Returns:
+        Times in s.
+    """
     found: dict[str, list[tuple[float, Link]]] = defaultdict(list)
-    in_force: dict[str, dict[int, bool]] = defaultdict(dict)
-    events: list[LinkEvent] = source.log.messages(topics.LINK_EVENT)
+    asked: dict[str, dict[int, bool]] = defaultdict(dict)
     for event in events:
-        cuts = in_force[event.link]
+        cuts = asked[event.link]
         if event.in_force:
             cuts[event.number] = event.partition
         else:
             cuts.pop(event.number, None)
         now = Link.CUT if any(cuts.values()) else Link.IMPAIRED if cuts else Link.CLEAR
-        found[event.link].append(((event.t_ns - source.zero_ns) / NS_PER_S, now))
+        found[event.link].append(((event.t_ns - zero_ns) / NS_PER_S, now))
     return {name: tuple(history) for name, history in found.items()}
 
 

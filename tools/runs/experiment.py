@@ -87,8 +87,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         type=parse_inject,
         metavar="'LINK KEY=VALUE ...'",
         help="what the network does to a link, such as 'planner->joints delay=30 jitter=10 at=3 "
-        "for=4' (ms and s), 'all loss=0.2 burst=5', 'planner->left partition at=3'; `xrl inject "
-        "--help` explains each word; replaces the scenario's; may be repeated",
+        "for=4' (ms and s), 'all loss=20%% burst=5', 'planner->left partition at=3'; at is "
+        "scenario time; `xrl inject --help` explains each word, and which of several counts; "
+        "replaces the scenario's; may be repeated",
     )
     parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
     parser.add_argument(
@@ -97,7 +98,12 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         help="how the legs share the load; average comes with the diagonal split: no gains "
         "certify it",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="of the sensors' noise, and of what the network loses and how late it is",
+    )
 
 
 def parse_kill(text: str) -> Kill:

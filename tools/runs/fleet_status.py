@@ -198,7 +198,7 @@ def impairments(fleet: Fleet) -> tuple[str, ...]:
     if "injector" not in fleet.manifest.services:
         return ()
     try:
-        return tuple(f"{row.link} {row.detail}" for row in InjectorClient(fleet.run.path).list())
+        return tuple(row.in_words() for row in InjectorClient(fleet.run.path).list())
     except FleetError:
         return ("the injector does not answer",)
 

@@ -1,7 +1,9 @@
 """A modelled network link, seeded (design section 7). Pure.
 
 What a link does by itself, and what is done to it meanwhile (`xrl sim --inject`), are both
-`shared.impairment`: the injector of a live fleet decides with the same objects.
+`shared.impairment`: the injector of a live fleet decides with the same objects. A link here is
+never given up: there is neither lease nor dialling again, and a stream delivers all that a
+partition held back, however long it was.
 """
 
 from __future__ import annotations
@@ -43,6 +45,8 @@ class Link(Generic[M]):
         self._queue: list[tuple[int, int, M]] = []  # by arrival
         self._held: list[tuple[int, M]] = []
         self._sent = self._newest = 0
+        self._stream_ns = 0
+        """When the last message of a stream has passed: until then all others wait for it."""
 
     def put(self, now_ns: int, message: M) -> None:
         """Send."""
@@ -51,7 +55,7 @@ class Link(Generic[M]):
             if release_ns == HELD:
                 self._held.append((self._sent, message))
             else:
-                self._enter(release_ns, self._sent, message)
+                self._enter(self._behind(now_ns, release_ns), self._sent, message)
 
     def take(self, now_ns: int) -> M | None:
         """Return the newest that has arrived, as a ring of depth 1 does; None if none has."""
@@ -65,12 +69,29 @@ class Link(Generic[M]):
         return newest
 
     def release(self, now_ns: int) -> None:
-        """Let out what a partition has held back, if it is over."""
+        """Let out what a partition has held back, if it is over: in order, and as late as all."""
+        if not self._held:
+            return
         impairer = self.direction.in_force
-        if impairer is None or not impairer.what.partition:
-            held, self._held = self._held, []
-            for number, message in held:
-                self._enter(now_ns, number, message)
+        release_ns = now_ns if impairer is None else impairer.delays(now_ns)
+        if release_ns == HELD:
+            return
+        release_ns = self._stream_ns = max(release_ns, self._stream_ns)
+        held, self._held = self._held, []
+        for number, message in held:
+            self._enter(release_ns, number, message)
+
+    def _behind(self, now_ns: int, release_ns: int) -> int:
+        """Return when a message passes: not before what still waits on a stream.
+
+        Also where that was sent under another impairment than is in force now.
+        """
+        if now_ns < self._stream_ns:
+            release_ns = max(release_ns, self._stream_ns)
+        impairer = self.direction.in_force
+        if impairer is not None and impairer.what.ordered:
+            self._stream_ns = release_ns
+        return release_ns
 
     def _enter(self, now_ns: int, number: int, message: M) -> None:
         for arrival_ns in self._base.passes(now_ns, 0):

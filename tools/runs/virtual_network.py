@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -38,8 +37,8 @@ class VirtualNetwork:
         self._injections = Injections(
             {name: link.direction for name, link in self._links.items()}, record
         )
-        self._coming = sorted(injects, key=lambda inject: inject.at)
-        self._next_s = self._next()
+        for inject in sorted(injects, key=lambda inject: inject.at):
+            self._injections.plan(inject.link, inject, inject.at, inject.until)
 
     def commands(self) -> list[Link[JointCommand]]:
         """Return the links from the planner, in the order of the modules."""
@@ -54,19 +53,11 @@ class VirtualNetwork:
         return self._links[WRENCHES]
 
     def advance(self, scenario_s: float, now_ns: int) -> None:
-        """Begin and end what is due."""
-        if scenario_s < self._next_s:
-            return
-        self._injections.end_due(scenario_s, now_ns)
-        while self._coming and self._coming[0].at <= scenario_s:
-            inject = self._coming.pop(0)
-            if inject.until > scenario_s:
-                self._injections.begin(inject.link, inject, inject.until, now_ns)
-        for link in self._links.values():
-            link.release(now_ns)
-        self._next_s = self._next()
+        """Begin and end what is due, and let out what was held until then."""
+        if self._injections.advance(scenario_s, now_ns):
+            for link in self._links.values():
+                link.release(now_ns)
 
-    def _next(self) -> float:
-        """Return when something is due, scenario time, s."""
-        coming = self._coming[0].at if self._coming else math.inf
-        return min(coming, self._injections.next_end)
+    def end(self, now_ns: int) -> None:
+        """End all that is done, so that its counts are told: the run is over."""
+        self._injections.clear("all", now_ns)

@@ -1,0 +1,33 @@
+"""The network's panel shows what was in force, by the rule that the links themselves have."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.clock import NS_PER_S
+from shared.impairment import Direction, Impairment
+from shared.injections import Injections
+from shared.links import DIRECTIONS, WRENCHES
+from shared.traces import LinkEvent
+from tools.reports.network import Link, histories
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(1, 6), st.integers(1, 9)), max_size=8))
+def test_cut_is_shown_when_nothing_passes_and_only_then(
+    asked: list[tuple[bool, int, int]],
+) -> None:
+    directions = {name: Direction(name, 0) for name in DIRECTIONS}
+    told: list[LinkEvent] = []
+    injections = Injections(directions, told.append)
+    for cut, begins, lasts in asked:
+        what = Impairment(delay_ms=0.0 if cut else 5.0, partition=cut)
+        injections.plan(WRENCHES, what, float(begins), float(begins + lasts))
+    for s in range(20):
+        injections.advance(float(s), s * NS_PER_S)
+        rows = histories(told, 0).get(WRENCHES, ())
+        shown = rows[-1][1] if rows else Link.CLEAR
+        now_ns = s * NS_PER_S
+        passed = directions[WRENCHES].passes(now_ns, 0)
+        assert (shown is Link.CUT) is (passed == ())
+        assert (shown is Link.CLEAR) is (passed == (now_ns,))
