@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 from pathlib import Path
 
 import msgspec
@@ -22,6 +21,7 @@ from shared.robot_model import stand_pose
 from shared.scenario import Inject, Scenario
 from tests.joint.helpers import command
 from tests.lockstep.runs import push, story
+from tests.test_architecture import IMPORTS, Import, imports_in
 from tools import cli
 from tools.centralised.control import CentralPlanner, PassThrough
 from tools.centralised.fleet import CONTROLS, SHIPPED, torques_only
@@ -244,16 +244,27 @@ def test_once_it_leads_the_planner_leads_whatever_it_hears(robot: RobotConfig) -
     assert modes == [PlannerMode.WAITING, PlannerMode.LEADING]
 
 
+def knows_it(imports: list[Import]) -> bool:
+    return any(f"{one.full}.".startswith("tools.centralised.") for one in imports)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from tools.centralised.control import PassThrough",
+        "from tools.centralised import fleet",
+        "from tools import centralised",
+        "import tools.centralised",
+        "def f():\n    import tools.centralised.control as c",
+    ],
+)
+def test_whoever_imports_it_is_seen_however_it_is_written(source: str) -> None:
+    assert knows_it(imports_in(source))
+    assert not knows_it(imports_in(source.replace("centralised", "centralised_else")))
+
+
 def test_nothing_but_two_tools_knows_it_and_no_file_names_it() -> None:
-    users = set()
-    for package in ("services", "shared", "tools"):
-        for path in (ROOT / package).rglob("*.py"):
-            tree = ast.parse(path.read_text(encoding="utf-8"))
-            names = [
-                node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)
-            ]
-            if any(name.startswith("tools.centralised") for name in names):
-                users.add(path.relative_to(ROOT).as_posix())
+    users = {file for file, imports in IMPORTS.items() if knows_it(imports)}
     assert users == {
         "tools/sim.py",
         "tools/sweeps/latency_trial.py",

@@ -12,13 +12,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 import pytest
 
-from shared import topics
+from shared import codec, topics
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.joints import MODULES
@@ -32,6 +33,7 @@ from shared.messages import (
     PlannerStatus,
     SimTruth,
 )
+from tests.recorder.runs import ROBOT, sample, write
 from tests.system.multihost import BODY, LEGS, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in
 from tools.runs.run_log import RunLog, read_run
@@ -50,6 +52,13 @@ with Network(("one", "two")) as network:
     print(*network.namespaces(), flush=True)
     time.sleep(600)
 """
+
+
+class Ended(NamedTuple):
+    """How the process that leads ended."""
+
+    code: int
+    said: str
 
 
 class Led(NamedTuple):
@@ -91,28 +100,44 @@ def wait_until_empty(namespaces: list[str]) -> set[int]:
 
 @pytest.fixture(scope="module")
 def led(tmp_path_factory: pytest.TempPathFactory) -> Led:
-    """Lead the fleet through every cut, once for all claims.
+    """Lead the fleet through every cut, once for all claims."""
+    return lead_to_the_end(lambda: tmp_path_factory.mktemp("multihost"), lead_in_a_process)
 
-    A machine that stalls makes drop-outs of its own, after which the modules wait: such a run is
-    made again.
+
+def lead_to_the_end(folder: Callable[[], Path], lead: Callable[[Path, Path], Ended]) -> Led:
+    """Return a run that was led through every cut.
+
+    A machine that stalls makes drop-outs of its own, after which the modules wait: a run that
+    came too late is made again, but only if the robot stood and nothing went wrong in it.
+
+    Args:
+        folder: makes a new one for a run.
+        lead: takes that and a run directory, and leads the fleet.
     """
     before = interfaces()
     for _ in range(TRIES):
-        out = tmp_path_factory.mktemp("multihost")
+        out = folder()
         with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as parent:
             run_dir = Path(parent) / "run"
-            said = lead_in_a_process(out, run_dir)
+            ended = lead(out, run_dir)
+        assert ended.code == 0, f"it could not be led; logs in {out}\n{ended.said}"
         report = msgspec.json.decode((out / REPORT).read_bytes(), type=Report)
+        log = read_run(out)
+        truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
+        assert truth, f"nothing of the robot was recorded; logs in {out}\n{ended.said}"
+        fell = [row.scenario_s for row in truth if row.fallen]
+        assert not fell, f"the robot fell at {fell[0]:.2f} s of {report.cuts}; record in {out}"
         if report.finished_ns:
-            return Led(report, read_run(out), run_dir, before)
-    pytest.fail(f"not all six track again after the cuts: {report.cuts}; logs in {out}\n{said}")
+            return Led(report, log, run_dir, before)
+    pytest.fail(f"not all six track again after the cuts: {report.cuts}; logs in {out}")
 
 
-def lead_in_a_process(out: Path, run_dir: Path) -> str:
-    """Run `tests.system.multihost` to its end; return what it printed."""
+def lead_in_a_process(out: Path, run_dir: Path) -> Ended:
+    """Run `tests.system.multihost` to its end."""
     leader = start("-m", "tests.system.multihost", str(out), str(run_dir), str(os.getpid()))
     try:
-        return leader.communicate(timeout=LEADING_S)[0]
+        said = leader.communicate(timeout=LEADING_S)[0]
+        return Ended(leader.returncode, said)
     finally:
         leader.terminate()
         leader.wait(ENDING_S)
@@ -127,6 +152,50 @@ def spans(led: Led) -> list[tuple[Cut, int]]:
 def reached(cut: Cut) -> tuple[str, ...]:
     """Return the modules that the planner still reaches."""
     return () if cut.host == BODY else tuple(m for m in MODULES if m not in LEGS[cut.host])
+
+
+class Told(NamedTuple):
+    """What a run that only a test tells of came to."""
+
+    fallen: bool = False
+    finished_ns: int = 0
+    code: int = 0
+
+
+def outcome_of(*runs: Told) -> tuple[Led, int]:
+    """Judge runs that follow one another; return what was taken, and how many were made."""
+    made = 0
+
+    def lead(out: Path, _run_dir: Path) -> Ended:
+        nonlocal made
+        told = runs[made]
+        made += 1
+        (out / REPORT).write_bytes(msgspec.json.encode(Report([], [], told.finished_ns)))
+        rows = (False, told.fallen)
+        key = topics.SIM_TRUTH.key(ROBOT)
+        truths = [sample(SimTruth, seq=seq, fallen=row) for seq, row in enumerate(rows)]
+        write(out, [(key, codec.encode(truth), truth.seq) for truth in truths])
+        return Ended(told.code, "RunError")
+
+    with tempfile.TemporaryDirectory() as folder:
+        return lead_to_the_end(lambda: Path(tempfile.mkdtemp(dir=folder)), lead), made
+
+
+def test_a_run_that_came_too_late_is_made_again_if_the_robot_stood() -> None:
+    led, made = outcome_of(Told(), Told(finished_ns=7))
+    assert (led.report.finished_ns, made) == (7, 2)
+    with pytest.raises(pytest.fail.Exception, match="not all six track again"):
+        outcome_of(*[Told()] * TRIES)
+
+
+@pytest.mark.parametrize(
+    ("first", "words"),
+    [(Told(fallen=True), "fell"), (Told(code=1), "could not be led")],
+    ids=["fell", "error"],
+)
+def test_a_fall_or_an_error_is_not_hidden_by_a_second_run(first: Told, words: str) -> None:
+    with pytest.raises(AssertionError, match=words):
+        outcome_of(first, Told(finished_ns=7))
 
 
 def test_the_robot_stands_through_every_cut_and_leads_again(led: Led) -> None:

@@ -26,6 +26,7 @@ from shared.scenario import Inject, Keyframe, Kill, Push, Restart, Scenario
 from shared.topics import Topic
 from shared.traces import SimState
 from tools.runs.lockstep import Lockstep, Record, forget
+from tools.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 
 FailureKind = Literal["links", "commands", "states", "frozen"]
 KINDS: Final[Mapping[FailureKind, str]] = {
@@ -49,6 +50,7 @@ PUSH: Final = Push(at=1.2, duration=0.3, force=(28.0, 28.0, 0.0))
 """40 N to the front left, while what failed is out: no leg mirrors the other."""
 HEAL_S: Final = 2.0
 END_S: Final = 3.4
+LAST_S: Final = 0.3
 SQUAT: Final = (
     Keyframe(at=0.0, height=1.188),
     Keyframe(at=2.5, height=0.948),
@@ -67,9 +69,10 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """The figures of a case; None where there was nothing of the kind."""
 
     stood: bool
+    """Neither fallen nor, at the end, tipping."""
     hold_shown_ms: float | None
     """From the cut to the first planner status that says `hold`."""
-    tracked_ms: float | None
+    track_left_ms: float | None
     """From the cut to when the last module left TRACK; None: one never did before the heal."""
     led_again_s: float | None
     """From the heal until all six track under a planner that leads; None: not by the end."""
@@ -77,8 +80,11 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """Largest step of a joint's torque at a change of mode, as the drives give it."""
     com_max_mm: float
     """Largest horizontal distance of the COM from between the ankles."""
-    operator_peak_n: float
-    """Of the hand, vertical."""
+    operator_end_n: float
+    """Most of the hand, vertical, in the run's last `LAST_S`, with all six back in TRACK.
+
+    While they HOLD it leads on against them and comes to its limit, whatever failed.
+    """
 
 
 class Start(msgspec.Struct, frozen=True):
@@ -147,8 +153,8 @@ class Fleet(Lockstep):
         told, changed = len(self.events), self._changed
         super().advance()
         for index, before in changed.items():
-            for a, b in zip(before, self._torque_of(index), strict=True):
-                self.torque_step_nm = max(self.torque_step_nm, abs(b - a))
+            step = step_nm(before, self._torque_of(index))
+            self.torque_step_nm = max(self.torque_step_nm, step)
         names = {name for name, _ in self.events[told:]}
         self._changed = {MODULE_INDEX[name]: self._torque_of(MODULE_INDEX[name]) for name in names}
 
@@ -223,12 +229,13 @@ def _measure(
     # a frozen service changes no mode: what it did last goes on, on its drive
     awake = set(MODULES) - set(case.modules if case.kind == "frozen" else ())
     all_left = bool(left) and awake <= set(left)
+    last_s = rows[-1].scenario_s - LAST_S
     return Outcome(
-        stood=not rows[-1].fallen,
+        stood=ending_of(rows[-1], END_S, fleet.config) is Ending.STOOD,
         hold_shown_ms=(held[0] - cut_ns) / NS_PER_MS if held else None,
-        tracked_ms=(max(left.values()) - cut_ns) / NS_PER_MS if all_left else None,
+        track_left_ms=(max(left.values()) - cut_ns) / NS_PER_MS if all_left else None,
         led_again_s=None if led_ns is None else (led_ns - heal_ns) / NS_PER_S,
         torque_step_nm=fleet.torque_step_nm,
-        com_max_mm=1e3 * max((row.com[0] ** 2 + row.com[1] ** 2) ** 0.5 for row in rows),
-        operator_peak_n=max(abs(row.operator_force[2]) for row in rows),
+        com_max_mm=com_max_mm(rows),
+        operator_end_n=operator_peak_n([row for row in rows if row.scenario_s > last_s]),
     )
