@@ -5,16 +5,19 @@ They dial it (`--injected`) in place of one another; `xrl inject` says what it i
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 
 from services.injector.control import Control
-from services.injector.loop import Orders, run
-from services.injector.relay import Place, Relay
+from services.injector.listener import Listener
+from services.injector.loop import run
+from services.injector.orders import Orders
+from services.injector.place import Place, address_of
+from services.injector.relay import Relay
+from services.injector.watch import Watch
 from shared import bus, log, process, topics
+from shared.clock import NS_PER_MS, now_ns
 from shared.config import RobotConfig, expand
 from shared.config_file import load
-from shared.exceptions import BusError
 from shared.impairment import Direction
 from shared.injection import SOCKET
 from shared.injections import Injections
@@ -37,61 +40,39 @@ def main() -> int:
     stop = process.StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
     directions = {name: Direction(name, arguments.seed) for name in DIRECTIONS}
+    places = [_place(pair, config, arguments.run_dir) for pair in PAIRS]
+    watch = Watch()
+    relay = Relay(places, directions, watch, round(config.bus.lease_ms * NS_PER_MS))
     with bus.open_session(config, "injector", arguments.run_dir) as session:
-        events = session.publisher(topics.LINK_EVENT, LinkEvent)
-        injections = Injections(directions, events.put)
+        injections = Injections(directions, session.publisher(topics.LINK_EVENT, LinkEvent).put)
         orders = Orders(injections)
-        places = [_place(pair, config, arguments.run_dir) for pair in PAIRS]
-        relay = Relay(places, directions)
-        control = Control(arguments.run_dir / SOCKET, orders.obey)
+        control = Control(arguments.run_dir / SOCKET, orders.obey, watch)
         logger.info("between %d pairs, priority %s", len(places), granted)
         process.freeze_garbage()
         try:
-            run(relay, control, orders, injections, stop)
+            run(watch, relay, orders, injections, stop)
         finally:
             control.close()
             relay.close()
-            for pair in PAIRS:
-                _socket_path(pair, arguments.run_dir).unlink(missing_ok=True)
-    logger.info("stopped: %d connections to a process that was not there", relay.refused)
+            injections.clear("all", now_ns())  # the log is to have what each of them did
+            watch.close()
+    logger.info(
+        "stopped: %d connections to a process that was not there, %d that stood still",
+        relay.refused,
+        relay.stuck,
+    )
     return 0
 
 
 def _place(pair: Pair, config: RobotConfig, run_dir: Path) -> Place:
-    """Listen for the one that dials.
+    """Stand between two processes.
 
     Raises:
         BusError: it is not possible there.
     """
-    path = _socket_path(pair, run_dir)
-    path.unlink(missing_ok=True)  # of an injector that was killed
-    listener = socket.socket(socket.AF_UNIX)
-    try:
-        listener.bind(str(path))
-        listener.listen()
-    except OSError as error:
-        raise BusError(f"{path}: {error.strerror}; an endpoint it may use is needed") from None
-    listener.setblocking(False)
-    return Place(pair, listener, address_of(expand(config.bus.endpoints[pair.listens], run_dir)))
-
-
-def address_of(endpoint: str) -> str | tuple[str, int]:
-    """Return a Zenoh endpoint as a socket's address.
-
-    Raises:
-        BusError: it is neither a UNIX socket nor TCP.
-    """
-    kind, _, place = endpoint.partition("/")
-    if kind == "unixsock-stream":
-        return place
-    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
-    if kind != "tcp" or not port.isdecimal():
-        raise BusError(f"{endpoint}: cannot be stood before; unixsock-stream or tcp can")
-    return host.strip("[]"), int(port)
-
-
-def _socket_path(pair: Pair, run_dir: Path) -> Path:
-    return Path(expand(endpoint_through(pair), run_dir).removeprefix(_UNIX))
+    path = Path(expand(endpoint_through(pair), run_dir).removeprefix(_UNIX))
+    beyond = address_of(expand(config.bus.endpoints[pair.listens], run_dir))
+    return Place(pair, Listener(path), beyond)
 
 
 if __name__ == "__main__":

@@ -2,75 +2,120 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
+from services.injector.listener import Listener
+from services.injector.watch import READ, WRITE, Watch
 from shared.injection import LINE_MAX, Reply, Request
 
+ASKERS_MAX: Final = 16
+"""Who asks at once; one more, and the one that came first has to go."""
 _decode = msgspec.json.Decoder(Request).decode
+
+
+class _Asker:
+    """One who asks: what came of its next requests, and what is left of the last answer."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self.end = end
+        self.half = bytearray()
+        self.answer = bytearray()
+        self.gone = False
+
+    def read(self) -> None:
+        try:
+            data = self.end.recv(LINE_MAX)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        self.half += data
+        self.gone = not data or (len(self.half) > LINE_MAX and b"\n" not in self.half)
+
+    def next_line(self) -> bytes | None:
+        """Return the next request; None: none is whole, or the last answer has not gone yet."""
+        at = self.half.find(b"\n")
+        if at < 0 or self.answer:
+            return None
+        line = bytes(self.half[:at])
+        del self.half[: at + 1]
+        return line
+
+    def write(self) -> None:
+        try:
+            sent = self.end.send(self.answer)
+        except BlockingIOError:
+            return
+        except OSError:  # it did not wait for its answer
+            self.gone = True
+            self.half.clear()
+            self.answer.clear()
+            return
+        del self.answer[:sent]
 
 
 class Control:
     """A UNIX socket that takes one request a line."""
 
-    def __init__(self, path: Path, obey: Callable[[Request], Reply]) -> None:
+    def __init__(self, path: Path, obey: Callable[[Request], Reply], watch: Watch) -> None:
         """Listen.
 
         Args:
             path: of the socket; what a killed injector left there is removed.
             obey: carries a request out.
+            watch: of the loop.
+
+        Raises:
+            BusError: it is not possible there.
         """
-        self._obey = obey
-        self._path = path
-        with contextlib.suppress(FileNotFoundError):
-            path.unlink()
-        self._listener = socket.socket(socket.AF_UNIX)
-        self._listener.bind(str(path))
-        self._listener.listen()
-        self._listener.setblocking(False)
-        self._half: dict[socket.socket, bytes] = {}
-
-    def sockets(self) -> list[socket.socket]:
-        """Return the sockets to wait for."""
-        return [self._listener, *self._half]
-
-    def readable(self, end: socket.socket) -> bool:
-        """Take in what has come; return False if the socket is none of these."""
-        if end is self._listener:
-            with contextlib.suppress(OSError):
-                asker, _ = self._listener.accept()
-                asker.setblocking(False)
-                self._half[asker] = b""
-            return True
-        if end not in self._half:
-            return False
-        try:
-            data = end.recv(LINE_MAX)
-        except BlockingIOError:
-            return True
-        except OSError:
-            data = b""
-        *lines, rest = (self._half[end] + data).split(b"\n")
-        for line in lines:
-            with contextlib.suppress(OSError):  # it did not wait for its answer
-                end.sendall(msgspec.json.encode(self._answer(line)) + b"\n")
-        self._half[end] = rest
-        if not data or len(rest) > LINE_MAX:
-            del self._half[end]
-            end.close()
-        return True
+        self._obey, self._watch = obey, watch
+        self._askers: list[_Asker] = []
+        self._listener = Listener(path)
+        watch.want(self._listener.socket, READ, self._dialled)
 
     def close(self) -> None:
         """Listen no more."""
-        for end in self.sockets():
-            end.close()
-        self._half.clear()
-        with contextlib.suppress(FileNotFoundError):
-            self._path.unlink()
+        for asker in list(self._askers):
+            self._leave(asker)
+        self._watch.want(self._listener.socket, 0, self._dialled)
+        self._listener.close()
+
+    def _dialled(self, _events: int, _now_ns: int) -> None:
+        end = self._listener.accept()
+        if end is None:
+            return
+        if len(self._askers) >= ASKERS_MAX:
+            self._leave(self._askers[0])
+        self._askers.append(_Asker(end))
+        self._watch.want(end, READ, partial(self._is_ready, self._askers[-1]))
+
+    def _is_ready(self, asker: _Asker, events: int, _now_ns: int) -> None:
+        """Go on with one: the answer first, and then the next request."""
+        if asker not in self._askers:
+            return  # it went in this same turn
+        if events & WRITE:
+            asker.write()
+        if events & READ:
+            asker.read()
+        while (line := asker.next_line()) is not None:
+            asker.answer += msgspec.json.encode(self._answer(line)) + b"\n"
+            asker.write()
+        if asker.gone and not asker.answer:
+            self._leave(asker)
+        else:
+            ready = partial(self._is_ready, asker)
+            self._watch.want(asker.end, WRITE if asker.answer else READ, ready)
+
+    def _leave(self, asker: _Asker) -> None:
+        self._askers.remove(asker)
+        self._watch.want(asker.end, 0, partial(self._is_ready, asker))
+        asker.end.close()
 
     def _answer(self, line: bytes) -> Reply:
         try:

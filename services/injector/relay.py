@@ -2,171 +2,155 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import heapq
-import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import count
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-from services.injector.flow import Flow
-from shared.impairment import HELD, Direction
-from shared.links import Pair
+from services.injector.connection import Connection
+from services.injector.flow import Flow, Waiting
+from services.injector.place import Place
+from services.injector.watch import READ, Watch
+from shared.impairment import Direction
+
+LINKS_MAX: Final = 16
+"""Connections of one pair. In a partition a process that lives dials again each second or so,
+and one that is frozen gives none of them up. One more, and the oldest that was left is parted."""
 
 
-class Place(NamedTuple):
-    """Where one pair of processes is linked through."""
+class _Due(NamedTuple):
+    """What waits for its time; of two for the same time, the one that came first."""
 
-    pair: Pair
-    listener: socket.socket
-    """Where the one that dials comes to; it does not block."""
-    address: str | tuple[str, int]
-    """Where the other one listens: path of a UNIX socket, or host and port."""
+    release_ns: int
+    number: int
+    connection: Connection
+    flow: Flow
+    row: Waiting
 
 
 class Relay:
-    """Every connection, and every batch that waits."""
+    """Every connection, and every batch that is not due yet."""
 
-    def __init__(self, places: list[Place], directions: Mapping[str, Direction]) -> None:
-        """Take what to listen on.
+    def __init__(
+        self,
+        places: Sequence[Place],
+        directions: Mapping[str, Direction],
+        watch: Watch,
+        lease_ns: int,
+    ) -> None:
+        """Begin to listen.
 
         Args:
             places: one for each pair.
             directions: what is done to each direction, by name; others pass at once.
+            watch: of the loop.
+            lease_ns: after which Zenoh gives up a link that is silent.
         """
-        self._places = {place.listener: place for place in places}
-        self._directions = directions
-        self._flows: dict[socket.socket, Flow] = {}
-        self._by_sink: dict[socket.socket, Flow] = {}
-        self._due: list[tuple[int, int, Flow, bytes]] = []
-        self._held: list[tuple[Flow, bytes]] = []
-        self._full: set[socket.socket] = set()
-        """Ends that had no room."""
-        self._ends: list[socket.socket] = list(self._places)
-        """Every socket that can be read; made anew when one comes or goes."""
+        self._directions, self._watch, self._lease_ns = directions, watch, lease_ns
+        self._links: dict[Place, list[Connection]] = {place: [] for place in places}
+        self._due: list[_Due] = []
+        self._looks_ns = 0
         self._count = count()
-        self.refused = 0
-        """Connections to a process that was not there."""
+        self.stuck = 0
+        """Connections that were parted because an end took nothing any more."""
+        for place in places:
+            watch.want(place.listener.socket, READ, partial(self._dialled, place))
 
-    def readers(self) -> list[socket.socket]:
-        """Return the sockets to wait for."""
-        if not self._full:
-            return self._ends
-        return [end for end in self._ends if end in self._places or self._flows[end].reads]
+    @property
+    def links(self) -> int:
+        """Connections that there are."""
+        return sum(map(len, self._links.values()))
 
-    def writers(self) -> list[socket.socket]:
-        """Return the sockets that are to take more."""
-        return list(self._full)
+    @property
+    def refused(self) -> int:
+        """Connections to a process that was not there, or beyond what can be held."""
+        return sum(place.missing + place.listener.turned_away for place in self._links)
 
     def next_ns(self) -> int | None:
         """Return when the next batch is due; None: none waits."""
-        return self._due[0][0] if self._due else None
-
-    def readable(self, end: socket.socket, now_ns: int) -> None:
-        """Take in what has come on a socket."""
-        place = self._places.get(end)
-        if place is not None:
-            self._link(place)
-            return
-        flow = self._flows.get(end)
-        if flow is None:
-            return  # closed in this same round
-        for release_ns, batch in flow.take(now_ns):
-            if release_ns == HELD:
-                self._held.append((flow, batch))
-            elif release_ns <= now_ns:
-                self._let_out(flow, batch)
-            else:
-                heapq.heappush(self._due, (release_ns, next(self._count), flow, batch))
-        if flow.ended:
-            self._list_ends()
-
-    def writable(self, end: socket.socket) -> None:
-        """Go on with what a socket had no room for."""
-        flow = self._by_sink.get(end)
-        if flow is not None:
-            flow.flush()
-            self._look_at(flow)
+        return self._due[0].release_ns if self._due else None
 
     def let_out_due(self, now_ns: int) -> None:
         """Let out every batch whose time has come."""
-        while self._due and self._due[0][0] <= now_ns:
-            _, _, flow, batch = heapq.heappop(self._due)
-            self._let_out(flow, batch)
+        while self._due and self._due[0].release_ns <= now_ns:
+            due = heapq.heappop(self._due)
+            due.flow.put(due.row)
+            self._settle(due.connection)
 
-    def release(self) -> None:
-        """Let out what partitions that are over have held back."""
-        held, self._held = self._held, []
-        for flow, batch in held:
-            impairer = flow.direction.in_force
-            if impairer is not None and impairer.what.partition:
-                self._held.append((flow, batch))
-            else:
-                self._let_out(flow, batch)
+    def release(self, now_ns: int) -> None:
+        """Send on what partitions that are over have held back."""
+        for links in list(self._links.values()):
+            for connection in list(links):
+                for flow in connection.flows:
+                    self._pass_on(connection, flow, flow.release(now_ns), now_ns)
+
+    def give_up(self, now_ns: int) -> None:
+        """Part what stands still: an end that has taken nothing for a lease has left its link.
+
+        Zenoh may have given it up without closing it, at both ends: each waits for room to say
+        so, and reads no more. While all this waits here, nobody else would ever end it.
+        """
+        if now_ns < self._looks_ns:
+            return
+        self._looks_ns = now_ns + self._lease_ns // 8
+        for links in self._links.values():
+            for connection in list(links):
+                if max(flow.stuck_ns(now_ns) for flow in connection.flows) > self._lease_ns:
+                    self.stuck += 1
+                    self._part(connection)
+                else:
+                    self._settle(connection)
 
     def close(self) -> None:
         """End every connection, and listen no more."""
-        for end in (*self._flows, *self._places):
-            end.close()
-        self._flows.clear()
-        self._by_sink.clear()
+        for place, links in self._links.items():
+            for connection in list(links):
+                self._part(connection)
+            place.listener.close()
 
-    def _link(self, place: Place) -> None:
-        """Accept a connection and make the one beyond."""
-        try:
-            dialling, _ = place.listener.accept()
-        except OSError:
+    def _dialled(self, place: Place, _events: int, _now_ns: int) -> None:
+        ends = place.link()
+        if ends is None:
             return
-        unix = isinstance(place.address, str)
-        beyond = socket.socket(socket.AF_UNIX if unix else socket.AF_INET)
-        beyond.setblocking(False)
-        if beyond.connect_ex(place.address) not in (0, errno.EINPROGRESS):
-            self.refused += 1  # the one that dials sees the end of its own, and tries again
-            dialling.close()
-            beyond.close()
+        links = self._links[place]
+        if len(links) >= LINKS_MAX:
+            self._part(next((one for one in links if one.left), links[0]))
+        there, back = (
+            self._directions.get(name) or Direction(name, 0)
+            for name in (place.pair.there, place.pair.back)
+        )
+        links.append(Connection(ends, (there, back), self._watch, self._pass_on))
+
+    def _pass_on(
+        self, connection: Connection, flow: Flow, rows: list[Waiting], now_ns: int
+    ) -> None:
+        """Let out what is due, and keep the rest until it is."""
+        for row in rows:
+            if row.release_ns <= now_ns:
+                flow.put(row)
+            else:
+                due = _Due(row.release_ns, next(self._count), connection, flow, row)
+                heapq.heappush(self._due, due)
+        self._settle(connection)
+
+    def _settle(self, connection: Connection) -> None:
+        """Part it if it is over; else go on with it."""
+        if connection.over:
+            self._part(connection)
+        elif not connection.parted:
+            connection.look()
+
+    def _part(self, connection: Connection) -> None:
+        """Close a connection; what waits for it is lost."""
+        if connection.parted:
             return
-        for end in (dialling, beyond):
-            end.setblocking(False)
-            if not unix:
-                with contextlib.suppress(OSError):
-                    end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        for source, sink, name in (
-            (dialling, beyond, place.pair.there),
-            (beyond, dialling, place.pair.back),
-        ):
-            direction = self._directions.get(name) or Direction(name, 0)
-            flow = Flow(source, sink, direction)
-            self._flows[source] = self._by_sink[sink] = flow
-        self._list_ends()
-
-    def _list_ends(self) -> None:
-        self._ends = [*self._places, *(end for end, flow in self._flows.items() if not flow.ended)]
-
-    def _let_out(self, flow: Flow, batch: bytes) -> None:
-        if flow.source not in self._flows:
-            return  # its connection is gone
-        if not batch:
-            self._part(flow)
-            return
-        flow.put(batch)
-        self._look_at(flow)
-
-    def _look_at(self, flow: Flow) -> None:
-        """See whether what was written has gone."""
-        if flow.broken:
-            self._part(flow)
-        elif flow.writes:
-            self._full.add(flow.sink)
-        else:
-            self._full.discard(flow.sink)
-
-    def _part(self, flow: Flow) -> None:
-        """Close a connection, both ends of it."""
-        for end in (flow.source, flow.sink):
-            self._flows.pop(end, None)
-            self._by_sink.pop(end, None)
-            self._full.discard(end)
-            end.close()
-        self._list_ends()
-        self._held = [row for row in self._held if row[0].source in self._flows]
+        connection.part()
+        for links in self._links.values():
+            if connection in links:
+                links.remove(connection)
+        for due in self._due:
+            if due.connection is connection:
+                due.row.lose()
+        self._due = [due for due in self._due if due.connection is not connection]
+        heapq.heapify(self._due)

@@ -1,96 +1,12 @@
-"""The relay between two ends, on real sockets and a clock of the test's."""
+"""The relay between two ends: what comes out, when, how often and in which order."""
 
 from __future__ import annotations
 
-import select
-import socket
-import struct
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
-from services.injector.flow import PENDING_MAX
-from services.injector.relay import Place, Relay
-from shared.clock import NS_PER_MS
-from shared.impairment import Direction, Impairment
-from shared.links import Pair
-
-PAIR = Pair("planner", "knee_left")
-MESSAGE = bytes.fromhex("25 05 9d 01 21")
-DECLARE = bytes.fromhex("a5 05 31 00 9e 21")
-WAIT_S = 5.0
-
-
-def batch(body: bytes, number: int = 0) -> bytes:
-    whole = body + struct.pack("<I", number)
-    return struct.pack("<H", len(whole)) + whole
-
-
-class Rig:
-    """A relay with the two ends of a link, in virtual time."""
-
-    def __init__(self, folder: Path) -> None:
-        self.now_ns = 0
-        self.there, self.back = Direction(PAIR.there, 0), Direction(PAIR.back, 0)
-        through, beyond = folder / "t", folder / "b"
-        listener = socket.socket(socket.AF_UNIX)
-        listener.bind(str(through))
-        listener.listen()
-        listener.setblocking(False)
-        self.beyond = socket.socket(socket.AF_UNIX)
-        self.beyond.bind(str(beyond))
-        self.beyond.listen()
-        names = {PAIR.there: self.there, PAIR.back: self.back}
-        self.relay = Relay([Place(PAIR, listener, str(beyond))], names)
-        self.through = str(through)
-        self.ends: list[socket.socket] = [self.beyond]
-
-    def link(self) -> tuple[socket.socket, socket.socket]:
-        dialling = socket.socket(socket.AF_UNIX)
-        dialling.connect(self.through)
-        self.turn()
-        self.beyond.settimeout(WAIT_S)
-        answering, _ = self.beyond.accept()
-        for end in (dialling, answering):
-            end.setblocking(False)
-        self.ends += [dialling, answering]
-        return dialling, answering
-
-    def turn(self) -> None:
-        """Take in what is there, and let out what is due."""
-        while True:
-            ready, room, _ = select.select(self.relay.readers(), self.relay.writers(), [], 0.02)
-            for end in ready:
-                self.relay.readable(end, self.now_ns)
-            for end in room:
-                self.relay.writable(end)
-            if not ready:
-                break
-        self.relay.let_out_due(self.now_ns)
-
-    def at(self, ms: float) -> None:
-        self.now_ns = round(ms * NS_PER_MS)
-        self.turn()
-
-
-@pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path)
-    try:
-        yield made
-    finally:
-        made.relay.close()
-        for end in made.ends:
-            end.close()
-
-
-def heard(end: socket.socket) -> bytes | None:
-    """Return what there is; None if there is nothing, empty if it has ended."""
-    try:
-        return end.recv(1 << 20)
-    except BlockingIOError:
-        return None
+from services.injector.flow import PENDING_MAX, WAITING_MAX
+from shared.impairment import Impairment
+from tests.injector.rig import DECLARE, MESSAGE, Rig, batch, heard, numbers
 
 
 def test_unimpaired_everything_passes_at_once_both_ways(rig: Rig) -> None:
@@ -119,14 +35,56 @@ def test_a_delay_is_of_its_direction_only_and_holds_messages_and_declarations(ri
 def test_only_messages_are_lost(rig: Rig) -> None:
     planner, knee = rig.link()
     rig.there.begin(1, Impairment(loss=1.0))
-    for number in range(20):
-        planner.send(batch(MESSAGE, number))
+    rig.say(planner, *range(20))
     planner.send(batch(DECLARE, 99))
     rig.turn()
     assert heard(knee) == batch(DECLARE, 99)
     ended = rig.there.end(1)
     assert ended is not None
     assert (ended.passed, ended.lost) == (0, 20)
+
+
+def test_what_is_doubled_comes_out_twice_byte_for_byte(rig: Rig) -> None:
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(duplicate=1.0))
+    rig.say(planner, 1, 2)
+    assert heard(knee) == 2 * batch(MESSAGE, 1) + 2 * batch(MESSAGE, 2)
+
+
+def test_jitter_lets_some_overtake_loses_none_and_keeps_within_its_bounds(rig: Rig) -> None:
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(delay_ms=20.0, jitter_ms=10.0))
+    rig.say(planner, *range(50))
+    rig.at(9.9)
+    assert heard(knee) is None
+    came = []
+    for ms in range(10, 31):
+        rig.at(ms)
+        came += numbers(knee)
+    assert sorted(came) == list(range(50))
+    assert came != sorted(came)
+
+
+def test_what_is_reordered_has_no_delay(rig: Rig) -> None:
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(delay_ms=20.0, reorder=0.5))
+    rig.say(planner, *range(40))
+    first = numbers(knee)
+    assert 10 < len(first) < 30
+    rig.at(20.0)
+    assert sorted(first + numbers(knee)) == list(range(40))
+
+
+def test_a_slow_line_lets_out_so_many_bytes_a_second(rig: Rig) -> None:
+    planner, knee = rig.link()
+    size = len(batch(MESSAGE))
+    rig.there.begin(1, Impairment(rate=100.0 * size))
+    rig.say(planner, *range(10))
+    for ms in range(0, 100, 10):
+        rig.at(ms)
+        assert numbers(knee) == ([ms // 10 - 1] if ms else [])
+    rig.at(100.0)
+    assert numbers(knee) == [9]
 
 
 @pytest.mark.parametrize("ordered", [True, False])
@@ -138,69 +96,129 @@ def test_a_partition_holds_what_a_stream_would_and_loses_datagrams(rig: Rig, ord
     rig.at(5000.0)
     assert heard(knee) is None
     rig.there.end(1)
-    rig.relay.release()
+    rig.release()
     assert heard(knee) == (batch(MESSAGE, 1) if ordered else b"") + batch(DECLARE, 2)
 
 
-def test_the_end_of_a_link_is_seen_as_late_as_what_was_said_before_it(rig: Rig) -> None:
+def test_a_stream_stays_in_order_when_its_delay_ends(rig: Rig) -> None:
     planner, knee = rig.link()
-    rig.there.begin(1, Impairment(delay_ms=10.0))
-    planner.send(batch(MESSAGE, 1))
+    rig.there.begin(1, Impairment(delay_ms=100.0, ordered=True))
+    rig.say(planner, 1)
+    rig.at(50.0)
+    rig.there.end(1)
+    rig.release()
+    rig.say(planner, 2)
+    assert numbers(knee) == []
+    rig.at(100.0)
+    rig.say(planner, 3)
+    assert numbers(knee) == [1, 2, 3]
+
+
+def test_what_a_partition_held_comes_in_order_and_after_the_delay_in_force(rig: Rig) -> None:
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(delay_ms=200.0, ordered=True))
+    rig.say(planner, 1)
+    rig.at(10.0)
+    rig.there.begin(2, Impairment(partition=True, ordered=True))
+    rig.say(planner, 2)
+    rig.at(60.0)
+    rig.there.end(2)
+    rig.release()
+    rig.say(planner, 3)
+    came = []
+    for ms in (199.9, 200.0, 259.9, 260.0):
+        rig.at(ms)
+        came.append(numbers(knee))
+    assert came == [[], [1], [], [2, 3]]
+
+
+def test_what_a_partition_held_is_not_overtaken_within_the_turn_that_ends_it(rig: Rig) -> None:
+    """A request ends it while the loop still goes round what can be read."""
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(partition=True, ordered=True))
+    rig.say(planner, 1)
+    rig.there.end(1)
+    rig.say(planner, 2)
+    rig.release()
+    assert numbers(knee) == [1, 2]
+
+
+def test_on_a_stream_a_message_stays_behind_a_declaration_and_one_behind_it(rig: Rig) -> None:
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(delay_ms=20.0, jitter_ms=20.0, ordered=True))
+    sent = b"".join(batch(DECLARE if n % 3 else MESSAGE, n) for n in range(60))
+    planner.send(sent)
     rig.turn()
-    planner.close()
-    rig.at(9.0)
+    rig.there.end(1)
+    rig.say(planner, 60)
+    rig.at(50.0)
+    assert heard(knee) == sent + batch(MESSAGE, 60)
+
+
+def test_a_stream_that_begins_stays_behind_a_declaration_that_is_late_already(rig: Rig) -> None:
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(delay_ms=50.0))
+    planner.send(batch(DECLARE, 1))
+    rig.turn()
+    rig.there.begin(2, Impairment(delay_ms=1.0, ordered=True))
+    rig.say(planner, 2)
+    rig.at(49.0)
     assert heard(knee) is None
-    rig.at(20.0)
-    assert heard(knee) == batch(MESSAGE, 1)
-    assert heard(knee) == b"", "ended"
+    rig.at(50.0)
+    assert numbers(knee) == [1, 2]
 
 
-def test_a_link_to_a_process_that_is_not_there_ends_at_once(rig: Rig) -> None:
-    rig.beyond.close()
-    dialling = socket.socket(socket.AF_UNIX)
-    rig.ends.append(dialling)
-    dialling.connect(rig.through)
-    rig.turn()
-    dialling.settimeout(WAIT_S)
-    assert dialling.recv(10) == b""
-    assert rig.relay.refused == 1
+def test_what_a_partition_held_is_not_overtaken_by_datagrams_after_it(rig: Rig) -> None:
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(delay_ms=30.0, reorder=1.0))
+    rig.there.begin(2, Impairment(partition=True, ordered=True))
+    rig.say(planner, 1)
+    rig.there.end(2)
+    rig.release()
+    rig.say(planner, 2)
+    assert heard(knee) is None
+    rig.at(30.0)
+    assert numbers(knee) == [1, 2]
+
+
+def test_datagrams_do_not_wait_for_declarations(rig: Rig) -> None:
+    planner, knee = rig.link()
+    rig.there.begin(1, Impairment(delay_ms=20.0, reorder=1.0))
+    planner.send(batch(DECLARE, 1))
+    rig.say(planner, 2)
+    assert numbers(knee) == [2]
 
 
 def test_a_receiver_that_takes_nothing_stops_the_sender_and_loses_nothing(rig: Rig) -> None:
     planner, knee = rig.link()
-    sent = b""
-    body = batch(MESSAGE + bytes(4000))
-    for _ in range(10_000):
-        rest = body
-        try:
-            while rest:
-                rest = rest[planner.send(rest) :]
-        except BlockingIOError:
-            sent += body[: len(body) - len(rest)]
-            rig.turn()
-            if len(sent) > 4 * PENDING_MAX or planner not in select.select([], [planner], [], 0)[1]:
-                break
-            continue
-        sent += body
-    else:
-        pytest.fail("the sender was never stopped")
+    body, sent, rest = batch(MESSAGE + bytes(4000)), 0, b""
+    while not rest:
+        assert sent < 16 * PENDING_MAX, "the sender was never stopped"
+        rest = rig.push(planner, body)
+        sent += len(body)
     got = b""
-    for _ in range(1000):
+    while len(got) < sent:
+        rest = rig.push(planner, rest)
         rig.turn()
-        more = heard(knee)
-        got += more or b""
-        if more is None and len(got) >= len(sent) - len(body):
-            break
-    assert got == sent[: len(got)]
-    assert len(got) > len(sent) - len(body), "every whole batch has come"
+        got += heard(knee) or b""
+    assert got == sent // len(body) * body
 
 
-def test_a_process_that_dials_again_is_linked_again(rig: Rig) -> None:
+def test_a_sender_is_stopped_when_too_much_is_on_its_way(rig: Rig) -> None:
     planner, knee = rig.link()
-    planner.close()
-    rig.turn()
-    assert heard(knee) == b""
-    planner, knee = rig.link()
-    planner.send(batch(MESSAGE, 7))
-    rig.turn()
-    assert heard(knee) == batch(MESSAGE, 7)
+    rig.there.begin(1, Impairment(delay_ms=60_000.0))
+    body, sent, rest = batch(MESSAGE + bytes(60_000)), 0, b""
+    while not rest:
+        assert sent < 2 * WAITING_MAX, "the sender was never stopped"
+        rest = rig.push(planner, body)
+        sent += len(body)
+    assert sent > WAITING_MAX
+    rig.at(60_000.0)
+    rig.there.end(1)
+    rig.release()
+    got = b""
+    while len(got) < sent:
+        rest = rig.push(planner, rest)
+        rig.turn()
+        got += heard(knee) or b""
+    assert got == sent // len(body) * body

@@ -23,13 +23,13 @@ class InjectorClient:
         """Name the fleet's run directory; nothing is opened yet."""
         self._path = run_dir / SOCKET
 
-    def begin(self, inject: Inject) -> tuple[Asked, ...]:
-        """Put an impairment in force now; return all that is asked for then.
+    def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[Asked, ...]:
+        """Put an impairment in force, in so many s; return all that is asked for then.
 
         Raises:
             FleetError: the injector is not there, or refuses.
         """
-        return self._ask(Begin(inject))
+        return self._ask(Begin(inject, in_s))
 
     def clear(self, link: str) -> tuple[Asked, ...]:
         """End all that touches a link; return what is left.
@@ -63,7 +63,11 @@ class InjectorClient:
             raise FleetError(f"{self._path}: the injector does not answer: {error}") from None
         if not line:
             raise FleetError(f"{self._path}: the injector ended without an answer; see its log")
-        reply = _decode(line)
+        try:
+            reply = _decode(line)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            said = f"{self._path}: the answer is none of an injector of this version: {error}"
+            raise FleetError(said) from None
         if reply.error:
             raise FleetError(f"refused: {reply.error}")
         return reply.asked
