@@ -11,7 +11,7 @@ from services.planner.account import account
 from services.planner.kinematics import Kinematics
 from shared import topics
 from shared.config import RobotConfig
-from shared.joints import JOINTS, N_JOINTS
+from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.messages import PlannerStatus
 from shared.robot_model import stand_pose
 from tools import cli, explain
@@ -52,6 +52,52 @@ def test_the_tick_is_the_last_at_or_before_the_time(log: RunLog) -> None:
     early, late = explain.tick_at(log, 1.0).status, explain.tick_at(log, 1.004).status
     assert late.seq == early.seq + 1
     assert explain.tick_at(log, None).status == statuses[-1]
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
+    """Return a run: late commands from 0.5 s, then nothing passes from 1.2 s on."""
+    out = tmp_path_factory.mktemp("cut")
+    late, gone = "planner->joints delay=20 at=0.5 for=0.5", "all partition at=1.2 for=0.4"
+    flags = ["--duration", "2", "--inject", late, "--inject", gone]
+    assert cli.main(["sim", "--out", str(out), *flags]) == 0
+    return read_run(out / "run.mcap")
+
+
+@pytest.mark.parametrize(
+    ("at", "words"),
+    [
+        ("0.3", "network: nothing is done to it here"),
+        ("0.8", "network: planner->joints delay=20ms, 0.50 to 1.00 s"),
+        ("1.5", "network: all partition, 1.20 to 1.60 s"),
+    ],
+)
+def test_what_is_done_to_the_network_at_the_tick_is_told(
+    cut: RunLog, at: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", str(cut.path), "--at", at]) == 0
+    assert words in capsys.readouterr().out
+
+
+def test_how_old_each_command_was_and_how_much_is_coupled_is_told(
+    cut: RunLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", str(cut.path), "--at", "0.8"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for module in MODULES:
+        found = re.search(rf"{module} TRACK (\d+\.\d) ms", shown)
+        assert found is not None
+        assert 20.0 <= float(found[1]) < 32.0
+    assert re.search(r"share of tau_coupled: \d+ %", shown)
+
+
+def test_where_the_planner_did_not_tick_the_modules_are_told_as_they_were_then(
+    cut: RunLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", str(cut.path), "--at", "1.5"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "at 1.5 s the planner did not tick" in shown
+    assert re.search(r"The modules at 1.5 s: ankle_right HOLD 30\d\.\d ms", shown)
 
 
 def test_the_torques_by_origin_of_every_joint_are_printed(

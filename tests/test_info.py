@@ -10,6 +10,7 @@ import pytest
 
 from shared import codec, topics
 from shared.messages import JointState, Wrench
+from shared.traces import LinkEvent
 from tests.recorder import runs
 from tests.recorder.runs import OFFSET_NS, ROBOT, STATE_KEY, Queue
 from tools import cli
@@ -154,6 +155,27 @@ def test_a_slow_topic_stands_beside_its_rate_and_an_event_has_none(
     assert row == ["harness/wrench", "11", "100.0", "250", "10.0", "0", "0"]
     (row,) = [line.split() for line in said.splitlines() if "run/event" in line]
     assert row == ["run/event", "3", "0", "0"]
+
+
+def test_what_was_injected_is_told_with_its_counts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    items = [state(seq, 4 * seq) for seq in range(50)]
+    for seq, (t_ms, begins) in enumerate(((100, True), (150, False))):
+        event = runs.sample(
+            LinkEvent, t_ns=t_ms * MS, seq=seq, link="planner->knee_left", number=1,
+            asked="planner->left", detail="delay=5ms", in_force=begins, passed=20, lost=7,
+        )  # fmt: skip
+        items.append((topics.LINK_EVENT.key(ROBOT), codec.encode(event), t_ms * MS))
+    said = " ".join(as_text(capsys, runs.write(tmp_path, items)).split())
+    assert "injected planner->left delay=5ms: 0." in said
+    assert "20 messages passed, 7 lost (s since the log begins)" in said
+
+
+def test_of_a_log_without_an_injection_none_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "injected" not in as_text(capsys, runs.write(tmp_path, [state(0, 0)]))
 
 
 def test_a_file_without_a_message_is_shown(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.injection import Asked
+from shared.injector_protocol import Asked
 from shared.links import COMMANDS
 from shared.scenario import Inject
 from tools import cli, inject

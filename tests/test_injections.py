@@ -8,8 +8,8 @@ import pytest
 
 from shared.exceptions import ConfigError
 from shared.impairment import Direction, Impairment
-from shared.injection import Asked
 from shared.injections import Injections
+from shared.injector_protocol import Asked
 from shared.links import COMMANDS, DIRECTIONS, WRENCHES
 from shared.traces import LinkEvent
 

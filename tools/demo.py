@@ -8,8 +8,10 @@ from pathlib import Path
 
 from rich.console import Console
 
+from shared import topics
 from shared.bus import Session
 from shared.config import SERVICES, RobotConfig
+from shared.messages import PlannerStatus
 from shared.scenario import Scenario
 from tools.runs import experiment, figure, verdict, verdict_table
 from tools.runs.conductor import Conductor
@@ -83,7 +85,8 @@ def lead_run(
     )
 
     def lead(fleet: Fleet, session: Session) -> float | None:
-        with LiveView(console) as view:
+        planner = session.latest(topics.PLANNER_STATUS, PlannerStatus)
+        with LiveView(console, story.inject, planner) as view:
             return Conductor(fleet, session, story, view.show).run()
 
     return run_live(

@@ -25,14 +25,16 @@ from shared.config import RobotConfig
 from shared.config_sections import GainSchedule
 from shared.exceptions import RunError
 from shared.joints import JOINTS, MODULES, N_JOINTS
-from shared.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus, SplitSource
+from shared.messages import JointCommand, JointState, PlannerMode, PlannerStatus, SplitSource
 from shared.robot_model import stand_pose
-from tools.runs import verdict
+from tools.runs import moment, verdict
 from tools.runs.run_log import RunLog, read_run
 from tools.verbs import RUN_HELP, Subparsers, add_config, add_verb
 
 Array = NDArray[np.float64]
 
+AWAY_S = 0.1
+"""A tick so long before the time that was asked for is not what the robot did then."""
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 SPLIT_IN_WORDS = {
     SplitSource.DIAGONAL: "diag(K_q)",
@@ -98,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     log = read_run(args.log)
     robot = robot_of(log)
     tick = tick_at(log, args.at)
-    _introduce(log, tick, console)
+    _introduce(log, tick, args.at, console)
     q, v = (_joined(tick.states, name) for name in ("q", "v"))
     q_ref, v_ref = (_joined(tick.commands, name) for name in ("q_ref", "v_ref"))
     found = account(robot, q, v, q_ref, v_ref, tick.status.assist_n)
@@ -211,13 +213,9 @@ def _joined(messages: list[Any], name: str) -> Array:
     return np.array([getattr(message, name) for message in messages], dtype=float).ravel()
 
 
-def _introduce(log: RunLog, tick: Tick, console: Console) -> None:
+def _introduce(log: RunLog, tick: Tick, at_s: float | None, console: Console) -> None:
     status = tick.status
     course = verdict.course(log)
-    modes = ", ".join(
-        f"{module} {Mode(state.mode).name}"
-        for module, state in zip(MODULES, tick.states, strict=True)
-    )
     ages = max(status.state_age_ns) / NS_PER_MS
     console.print(
         f"[bold]tick {status.seq}[/] at {(status.t_ns - course.zero_ns) / 1e9:.3f} s: planner "
@@ -225,7 +223,20 @@ def _introduce(log: RunLog, tick: Tick, console: Console) -> None:
         f"{ages:.1f} ms old, assist {status.assist_n:.1f} N, IK {status.ik_iterations} steps, "
         f"residual {status.ik_residual:.1e}"
     )
-    console.print(f"modules: {modes}", style="dim")
+    words = moment.modules_in_words(tick.states)
+    console.print(f"modules, and how old their commands were: {words}", style="dim")
+    console.print(f"share of tau_coupled: {100.0 * status.coupled_share:.0f} %", style="dim")
+    at_ns = status.t_ns if at_s is None else course.zero_ns + round(at_s * 1e9)
+    late_s = (at_ns - status.t_ns) / 1e9
+    if late_s > AWAY_S:
+        words = moment.modules_in_words(moment.states_at(log, at_ns))
+        console.print(
+            f"[yellow]at {at_s:g} s the planner did not tick: its last, {late_s:.2f} s before, "
+            f"is shown. The modules at {at_s:g} s: {words}[/]"
+        )
+    network = moment.network_in_words(log, at_ns, course.zero_ns)
+    if network:
+        console.print(f"network: {network}", style="yellow", markup=False, highlight=False)
 
 
 def show(robot: RobotConfig, found: Account, console: Console) -> None:

@@ -16,14 +16,21 @@ from rich.text import Text
 from services.recorder.mcap_log import SCHEMA_VERSION
 from services.recorder.recovery import clock_time, lost_in_words
 from services.recorder.salvage import Loss
+from shared import topics
 from shared.clock import NS_PER_S
+from shared.exceptions import XrlError
 from tools.logs.files import files_of_run
 from tools.logs.survey import FileFacts, Survey, TopicFacts
+from tools.runs import verdict
+from tools.runs.impaired import impairments
+from tools.runs.run_log import RunLog, read_run
 from tools.verbs import Subparsers, add_verb
 
 SLOW: Final = 0.9
 """Of a topic's rate in the table of topics: less is marked."""
 MIB: Final = 1 << 20
+INJECTED_MAX: Final = 12
+"""Impairments with a line of their own."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -168,14 +175,46 @@ def _show_run(survey: Survey, console: Console) -> None:
         grid.add_row("foreign", f"{written}: `xrl` reads no more of it than this")
     elif version != SCHEMA_VERSION:
         grid.add_row("version", f"{plain(version) or 'unknown'}; this code writes {SCHEMA_VERSION}")
+    for number, line in enumerate(_injected(survey)):
+        grid.add_row("" if number else "injected", plain(line))
     console.print(grid)
 
 
-def _table(topics: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
+def _injected(survey: Survey) -> list[str]:
+    """Return a line for each impairment of the network, times as of the scenario if it began.
+
+    Files without one are not read again.
+    """
+    robot = survey.files[0].metadata.get("run", {}).get("robot", "")
+    topic = survey.topics.get(topics.LINK_EVENT.key(robot))
+    if topic is None or not topic.sequence.count or not survey.files[0].ours:
+        return []
+    try:
+        logs = [read_run(file.path) for file in survey.files]
+        events = [event for log in logs for event in log.messages(topics.LINK_EVENT)]
+        zero_ns, since = _zero(logs[0])
+    except XrlError as error:
+        return [str(error)]
+    lines = [f"{row.title}: {row.when(zero_ns)}; {row.counts()}" for row in impairments(events)]
+    more = len(lines) - INJECTED_MAX
+    if more > 0:
+        lines[INJECTED_MAX:] = [f"and {more} more"]
+    return [line + since for line in lines[:1]] + lines[1:]
+
+
+def _zero(log: RunLog) -> tuple[int, str]:
+    """Return the stamp that impairments are told from, and what it is if not the scenario's."""
+    try:
+        return verdict.course(log).zero_ns, ""
+    except XrlError:
+        return log.began_ns(), " (s since the log begins)"
+
+
+def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
     """Return a row for each topic.
 
     Args:
-        topics: with at least one message each.
+        found: topics with at least one message each.
         prefix: left out of their names.
         events: a topic without a rate is one of events: its mean rate means nothing.
     """
@@ -183,7 +222,7 @@ def _table(topics: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table
     table.add_column("topic", overflow="fold")
     for name in ("count", "Hz", "of Hz", "gap ms", "lost", "restarts"):
         table.add_column(name, justify="right", no_wrap=True)
-    for name, topic in sorted(topics.items()):
+    for name, topic in sorted(found.items()):
         rate, nominal = topic.rate_hz, topic.nominal_hz
         slow = rate is not None and nominal > 0.0 and rate < SLOW * nominal
         steady = rate is not None and (nominal > 0.0 or not events)

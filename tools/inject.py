@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from shared.exceptions import ConfigError, RunError
-from shared.injection import Asked
+from shared.injector_protocol import Asked
 from shared.links import GROUPS
 from shared.scenario import Inject
-from tools.runs.injection import DISTRIBUTION, NUMBERS, SWITCHES, check_link, make, parse_inject
+from tools.runs.inject_words import DISTRIBUTION, NUMBERS, SWITCHES, check_link, make, parse_inject
 from tools.runs.injector_client import InjectorClient
 from tools.verbs import Subparsers, add_run_dir, add_verb
 

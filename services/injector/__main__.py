@@ -19,8 +19,8 @@ from shared.clock import NS_PER_MS, now_ns
 from shared.config import RobotConfig, expand
 from shared.config_file import load
 from shared.impairment import Direction
-from shared.injection import SOCKET
 from shared.injections import Injections
+from shared.injector_protocol import SOCKET
 from shared.links import DIRECTIONS, PAIRS, Pair, endpoint_through
 from shared.priority import raise_priority
 from shared.traces import LinkEvent

@@ -12,7 +12,7 @@ import msgspec
 
 from services.injector.listener import Listener
 from services.injector.watch import READ, WRITE, Watch
-from shared.injection import LINE_MAX, Reply, Request
+from shared.injector_protocol import LINE_MAX, Reply, Request
 
 ASKERS_MAX: Final = 16
 """Who asks at once; one more, and the one that came first has to go."""

@@ -7,8 +7,8 @@ from typing import Final
 
 from shared.clock import NS_PER_S, now_ns
 from shared.exceptions import ConfigError
-from shared.injection import Asked, Begin, Clear, Reply, Request
 from shared.injections import Injections
+from shared.injector_protocol import Asked, Begin, Clear, Reply, Request
 from shared.toml_file import check_ranges
 
 ASKED_MAX: Final = 64

@@ -17,8 +17,8 @@ from services.injector.orders import ASKED_MAX, Orders
 from services.injector.watch import Watch
 from shared.exceptions import FleetError
 from shared.impairment import Direction
-from shared.injection import LINE_MAX, SOCKET, Begin, Clear, List, Reply
 from shared.injections import Injections
+from shared.injector_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
 from shared.links import COMMANDS, DIRECTIONS
 from shared.scenario import Inject
 from shared.traces import LinkEvent

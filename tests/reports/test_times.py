@@ -116,11 +116,60 @@ def test_what_was_injected_into_the_network_is_a_panel_marks_and_lines(
     data, rows = panel_and_rows(runs.rewritten(log, tmp_path, more=more))
     (row,) = pages.panel(data, "Network, as injected")["rows"]
     assert row["label"] == "to left"
-    assert [(pytest.approx(a, abs=1e-3), code) for a, _, code in row["spans"][1:]] == [
-        (0.5, Link.IMPAIRED), (1.0, Link.CUT), (1.5, Link.IMPAIRED), (2.0, Link.CLEAR),
+    starts, _, codes = zip(*row["spans"][1:], strict=True)
+    assert starts == pytest.approx((0.5, 1.0, 1.5, 2.0), abs=1e-3)
+    assert codes == (Link.IMPAIRED, Link.CUT, Link.IMPAIRED, Link.CLEAR)
+    assert [mark[2] for mark in data["marks"] if mark[1] == "network"] == [
+        "planner->left delay=5", "planner->left partition", "planner->left ends",
+        "planner->left ends",
     ]  # fmt: skip
-    assert [mark[2] for mark in data["marks"] if mark[1] == "network"] == ["delay=5", "partition"]
-    assert "network, to left: partition ends; 60 messages passed, 21 lost" in rows
+    assert "network, planner->left partition ends; 60 messages passed, 21 lost" in rows
+
+
+def test_ages_stand_beside_what_was_done_to_the_network(log: RunLog, tmp_path: Path) -> None:
+    t_ns = Source(log).zero_ns + 10**9
+    event = msgspec.json.encode(impairment(1, "planner->knee_left", t_ns, begins=True, cut=True))
+    data = pages.data_of(
+        render(runs.rewritten(log, tmp_path, more=[(t_ns, topics.LINK_EVENT.name, event)]))
+    )
+    titles = [panel["title"] for panel in data["panels"]]
+    place = titles.index("Network, as injected")
+    assert titles[place + 1] == "Command age"
+
+
+def test_inputs_of_seconds_do_not_flatten_the_ages_of_milliseconds(
+    log: RunLog, tmp_path: Path
+) -> None:
+    def cut_off(name: str, body: bytes) -> bytes:
+        if name != "planner/status":
+            return body
+        status = msgspec.json.decode(body)
+        status["state_age_ns"] = [3_000_000_000] * 6
+        return msgspec.json.encode(status)
+
+    page = render(runs.rewritten(log, tmp_path, payload=cut_off))
+    panel = pages.panel(pages.data_of(page), "Age of the planner's inputs")
+    assert panel["reach"] == pytest.approx(200.0)
+    assert "what it was late by then is not in it" in panel["note"]
+
+
+def test_a_planner_that_waits_after_drop_outs_is_in_the_timeline(
+    log: RunLog, tmp_path: Path
+) -> None:
+    zero_ns = Source(log).zero_ns
+
+    def waits(name: str, body: bytes) -> bytes:
+        if name != "planner/status":
+            return body
+        status = msgspec.json.decode(body)
+        t_s = (status["t_ns"] - zero_ns) / 1e9
+        status["wait_s"] = 3.5 - t_s if 2.5 <= t_s < 3.5 else 0.0
+        return msgspec.json.encode(status)
+
+    found = happenings(Source(runs.rewritten(log, tmp_path, payload=waits)))
+    (row,) = [row for row in found if "leads again" in row.text]
+    assert row.t == pytest.approx(2.5, abs=0.01)
+    assert row.text.startswith("planner: leads again in 1.0 s at the earliest")
 
 
 def panel_and_rows(log: RunLog) -> tuple[dict[str, Any], list[str]]:

@@ -26,7 +26,7 @@ from shared.bus import Publisher, Session, open_session
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.codec import Decoder
 from shared.impairment import Impairer, Impairment
-from shared.injection import SOCKET
+from shared.injector_protocol import SOCKET
 from shared.joints import MODULES
 from shared.links import DIRECTIONS
 from shared.messages import JointState

@@ -19,7 +19,7 @@ from shared import config_file, topics
 from shared.bus import Publisher, Session, Stream, open_session
 from shared.clock import NS_PER_MS, now_ns
 from shared.codec import Decoder
-from shared.injection import SOCKET
+from shared.injector_protocol import SOCKET
 from shared.messages import JointState
 from shared.process import DEFAULT_CONFIG
 from shared.scenario import Inject

@@ -33,7 +33,7 @@ class Verdict(NamedTuple):
     good: bool | None
     """None: there is nothing to judge."""
     rows: list[tuple[str, str, str, str]]
-    """(what, measured, limit, `ok` or `over`)."""
+    """(what, measured, limit, `ok`, or `over` and perhaps why)."""
     caution: str = ""
     """Why the figures are not to be trusted."""
 
@@ -92,14 +92,10 @@ def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
         if value is None:
             continue
         unit = f" {limit.unit}" if limit.unit else ""
-        mark = "ok" if value <= limit.limit else "over"
-        rows.append((limit.what, f"{_digits(value)}{unit}", f"{limit.limit:g}{unit}", mark))
+        measured = f"{verdict_table.digits(value)}{unit}"
+        mark = verdict_table.mark(limit, summary)
+        rows.append((limit.what, measured, f"{limit.limit:g}{unit}", mark))
     return rows
-
-
-def _digits(value: float) -> str:
-    """Return a number in three digits; without a power of ten where it can be read so."""
-    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def head(source: Source) -> list[tuple[str, str]]:

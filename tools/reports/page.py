@@ -12,6 +12,7 @@ from tools.reports import facts, network, panels, timeline, times, torques
 from tools.reports.facts import Verdict
 from tools.reports.sheet import Happening, Sheet
 from tools.reports.source import Source
+from tools.runs import verdict_table
 from tools.runs.run_log import RunLog
 
 HERE: Final = Path(__file__).parent
@@ -71,6 +72,7 @@ def fill(source: Source) -> Sheet:
     panels.add_body(source, sheet)
     panels.add_states(source, sheet)
     network.add_network(source, sheet)
+    times.add_ages(source, sheet)
     panels.add_certificate(source, sheet)
     torques.add_joints(source, sheet)
     panels.add_harness(source, sheet)
@@ -112,7 +114,7 @@ def _head(source: Source, judged: Verdict, name: str) -> str:
     caution = f'<p class="caution">{escape(judged.caution)}</p>' if judged.caution else ""
     table = ""
     if judged.rows:
-        over = sum(mark == "over" for *_, mark in judged.rows)
+        over = sum(mark.startswith(verdict_table.OVER) for *_, mark in judged.rows)
         count = f"{over} of {len(judged.rows)} over" if over else f"all {len(judged.rows)} ok"
         names = ("what", "measured", "limit", "")
         cells = _table(names, judged.rows, numbers=(1, 2))
@@ -231,5 +233,6 @@ def _table(names: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequ
 
 
 def _class(value: str, *, number: bool) -> str:
-    kind = "n" if number else value if value in ("ok", "over") else ""
+    word = value.partition(",")[0]
+    kind = "n" if number else word if word in (verdict_table.OK, verdict_table.OVER) else ""
     return f' class="{kind}"' if kind else ""

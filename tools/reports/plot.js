@@ -7,7 +7,7 @@ const MARK_COLOURS = {
 const LEAST = {
   mm: 0.01, m: 1e-5, rad: 1e-5, "rad/s": 1e-4, N: 0.01, "N m": 0.01, ms: 0.01, "\u00b5s": 1, Hz: 1, count: 1,
 };
-const ROW = 18, ROW_NARROW = 30, MARKS_ROOM = 31;
+const ROW = 18, ROW_NARROW = 30, MARKS_ROOM = 44;
 
 class Panel {
   constructor(spec, data, view, first) {
@@ -229,7 +229,7 @@ class Panel {
   // Marks of what happened; in the first panel with their names.
   drawMarks(ctx, theme, x) {
     const { box } = this;
-    const free = [-Infinity, -Infinity];  // two rows of names
+    const free = [-Infinity, -Infinity, -Infinity];  // three rows of names
     ctx.lineWidth = 1;
     for (const [t, kind, label] of this.data.marks) {
       const px = Math.round(x(t)) + 0.5;

@@ -25,14 +25,18 @@ from shared.messages import (
     Wrench,
 )
 from tools.reports.crossings import crossings
-from tools.reports.network import injections
 from tools.reports.sheet import Happening
 from tools.reports.signals import GAP_S, seconds
 from tools.reports.source import Source
+from tools.runs.impaired import impairments
 
 TOGETHER_S: Final = 0.1
 """The same change of several modules within this time is told in one line."""
 LINES_MAX: Final = 500
+WAIT_S: Final = 0.5
+"""A planner that waits for so long after drop-outs says it in the timeline."""
+END_S: Final = 0.1
+"""What ends so close to the end of the log has no mark: the run ends with it."""
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
 
@@ -57,7 +61,7 @@ def happenings(source: Source) -> list[Happening]:
         *_world(source),
         *_silences(source),
         *crossings(source),
-        *injections(source),
+        *_network(source),
     ]
     found.sort(key=lambda row: row.t)
     if len(found) > LINES_MAX:
@@ -97,6 +101,18 @@ def _from_outside(source: Source) -> Iterator[Happening]:
         last = t
     for request in source.log.messages(topics.HARNESS_TARE):
         yield Happening(_at(source, request.t_ns), "note", f"tare asked for by {request.source}")
+
+
+def _network(source: Source) -> Iterator[Happening]:
+    """Tell when each impairment begins and ends; all its directions at once."""
+    for row in impairments(source.log.messages(topics.LINK_EVENT)):
+        begin_s, end_s = row.begin_s(source.zero_ns), row.end_s(source.zero_ns)
+        yield Happening(begin_s, "network", f"network, {row.title}", row.title)
+        if end_s is None:
+            continue
+        text = f"network, {row.title} ends; {row.counts()}"
+        mark = f"{row.link} ends" if end_s < source.span.end - END_S else ""
+        yield Happening(end_s, "network" if mark else "note", text, mark)
 
 
 def _said(event: RunEvent) -> str:
@@ -207,6 +223,10 @@ def _planner(source: Source) -> Iterator[Happening]:
         text = f"planner: {_word(PlannerMode, before.mode)} to {_word(PlannerMode, after.mode)}"
         bad = after.mode in (PlannerMode.OVERLOADED, PlannerMode.UNCERTIFIED)
         yield Happening(float(t[index]), "bad" if bad else "note", text + fresh)
+    for index in _changes([row.wait_s > 0.0 for row in rows]):
+        if rows[index].wait_s >= WAIT_S:
+            text = f"planner: leads again in {rows[index].wait_s:.1f} s at the earliest, for links"
+            yield Happening(float(t[index]), "note", f"{text} have dropped out")
 
 
 def _harness(source: Source) -> Iterator[Happening]:

@@ -25,10 +25,14 @@ REFUSED_NOTE: Final = (
 )
 
 
-def add_times(source: Source, sheet: Sheet) -> None:
-    """Add ages both ways, rates, late cycles, refused commands, the planner's tick."""
+def add_ages(source: Source, sheet: Sheet) -> None:
+    """Add ages both ways, to be read beside what was done to the network."""
     _add_command_ages(source, sheet)
     _add_state_ages(source, sheet)
+
+
+def add_times(source: Source, sheet: Sheet) -> None:
+    """Add rates, late cycles, refused commands, the planner's tick."""
     _add_rates(source, sheet)
     _add_cycles(source, sheet)
     _add_tick(source, sheet)
@@ -71,9 +75,17 @@ def _add_state_ages(source: Source, sheet: Sheet) -> None:
     ]
     wrench_t = source.times(topics.WRENCH)
     lines.append(Line("sample of the harness sensor", wrench_t, sample / NS_PER_MS, 6, hidden=True))
+    limits, reach = [], None
+    note = (
+        "Counted from when each module's newest state arrived, by the planner's clock: what it was "
+        "late by then is not in it."
+    )
+    if source.robot is not None:
+        most_ms = source.robot.planner.state_stale_ms
+        limits, reach = [Limit(most_ms, "planner waits")], AGE_REACH * most_ms
+        note += f" The axis ends at {reach:g} ms."
     sheet.plot(
-        "Age of the planner's inputs", "ms", lines,
-        note="Time since each module's newest state arrived, by the planner's clock.",
+        "Age of the planner's inputs", "ms", lines, limits=limits, reach=reach, note=note,
         otherwise=NO_PLANNER,
     )  # fmt: skip
 

@@ -27,7 +27,6 @@ from shared.messages import (
     SimTruth,
 )
 from shared.scenario import Fault, Inject, Kill, Push, Restart, Scenario
-from tools.runs.injection import in_words_of
 from tools.runs.injector_client import InjectorClient
 from tools.supervision import procfs
 from tools.supervision.supervise import Fleet
@@ -269,7 +268,6 @@ class Conductor:
             self._note = f"{row.service} back"
         elif isinstance(row, Inject):
             InjectorClient(self._fleet.run.path).begin(row)
-            self._note = in_words_of(row)
         elif isinstance(row, Fault):
             self._say(RunEventKind.FAULTED, row.module, row.kind)
             self._note = f"{row.module}: {row.kind}"

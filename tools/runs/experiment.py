@@ -20,7 +20,7 @@ from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
 from shared.scenario import FAULT_KINDS, SIGNALS, Fault, Inject, Kill, Push, Restart, Scenario
-from tools.runs.injection import in_words_of, parse_inject
+from tools.runs.inject_words import in_words_of, parse_inject
 from tools.verbs import add_config
 
 E = TypeVar("E", Kill, Restart, Push, Fault, Inject)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,11 +12,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from shared import topics
-from shared.clock import NS_PER_S
+from shared import config_file, topics
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.exceptions import ConfigError
 from shared.joints import MODULES
-from shared.messages import JointState, Mode, RunEvent, RunEventKind
-from shared.traces import LinkEvent
+from shared.messages import JointState, Mode, PlannerMode, RunEvent, RunEventKind
+from tools.runs.impaired import Impaired, impairments
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary, course
 
@@ -28,22 +31,39 @@ MODE_COLOURS: Final = {
     Mode.FAULT: "#c0392b",
 }
 LINES: Final = ("#1f4e79", "#c8553d", "#5b8c5a")
-IMPAIRED_COLOUR: Final = "#e6e0f3"
+MODULE_LINES: Final = ("#1f4e79", "#4a90c4", "#7fc4d8", "#8c2d19", "#c8553d", "#e09f5b")
+IMPAIRED_COLOUR: Final = "#8f7fc8"
+IMPAIRED_TEXT: Final = "#3f2f6f"
+LEADS_COLOUR: Final = MODE_COLOURS[Mode.TRACK]
+WAITS_COLOUR: Final = "#b9c4cf"
 EVENT_COLOURS: Final = {
     RunEventKind.KILLED: "#c0392b",
     RunEventKind.RESTARTED: "#2e7d32",
     RunEventKind.PUSHED: "#7f7f7f",
     RunEventKind.FAULTED: "#b8590b",
 }
+AGE_MOST_MS: Final = 50.0
+"""If the log does not tell its robot's greatest usable age."""
+AGE_REACH: Final = 1.2
+"""Times that age: the panel ends there; what is older is not used."""
+SILENT_S: Final = 0.1
+"""A service that says nothing for so long has a gap in the picture."""
+LANES_MAX: Final = 8
+"""Impairments with a lane each; the rest share the last, without words."""
 
 
 def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     """Draw a run into a PNG file."""
     t, rows, began, zero_ns = course(log)
-    figure = Figure(figsize=(11, 9.5), dpi=110, layout="constrained")
+    end_s = float(t[-1])
+    network = impairments(log.messages(topics.LINK_EVENT))
+    heights = [2.0, 1.4, 1.7, 1.5, 1.6, 1.6]
+    if network:
+        heights.insert(4, 0.2 + 0.22 * min(len(network), LANES_MAX))
+    figure = Figure(figsize=(11.5, 1.15 * sum(heights)), dpi=110, layout="constrained")
     axes = figure.subplots(
-        5, 1, sharex=True, gridspec_kw={"height_ratios": [2.2, 1.6, 1.8, 1.6, 1.4]}
-    )
+        len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}, squeeze=False
+    )[:, 0]
     com = np.array([row.com for row in rows]) * 1e3
     _lines(axes[0], t, com[:, :2], ("x", "y"), "COM in mm")
     height = np.array([row.torso[2] for row in rows])
@@ -51,55 +71,116 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     angles = np.array([row.angles for row in rows])
     _lines(axes[2], t, angles, ("roll", "pitch", "yaw"), "torso in rad")
     force = np.array([row.operator_force[2] for row in rows])
-    _lines(axes[3], t, force[:, None], ("operator's hand, z",), "force in N")
+    _lines(axes[3], t, force[:, None], ("operator's\nhand, z",), "force in N")
     if any(row.load_n for row in rows):
         load = [row.load_n for row in rows]
-        axes[3].plot(t, load, color=LINES[1], lw=1.1, label="weight on the harness")
-        axes[3].legend(loc="upper right", fontsize=8, ncols=2, framealpha=0.8)
-    _modes(axes[4], log, zero_ns, float(t[-1]))
-    _events(axes, log.messages(topics.RUN_EVENT))
-    _impairments(axes, log.messages(topics.LINK_EVENT), zero_ns, float(t[-1]))
-    axes[4].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
-    axes[4].set_xlim(0.0, float(t[-1]))
+        axes[3].plot(t, load, color=LINES[1], lw=1.1, label="weight on\nthe harness")
+        _legend(axes[3])
+    _ages(axes[-2], log, zero_ns)
+    _modes(axes[-1], log, zero_ns, end_s)
+    plots = [*axes[:4], *axes[-2:]]
+    _events(plots, log.messages(topics.RUN_EVENT))
+    if network:
+        _network(axes[4], network, zero_ns, end_s)
+        _shade(plots, network, zero_ns, end_s)
+    axes[-1].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
+    axes[-1].set_xlim(0.0, end_s)
     verdict = "stood" if summary["stood"] else "FELL" if summary["fallen_at_s"] else "not finished"
     figure.suptitle(f"{name}: {verdict}", fontsize=12, x=0.01, ha="left")
     figure.savefig(path)
 
 
-def _lines(axis: Any, t: Any, columns: Any, names: tuple[str, ...], label: str) -> None:
+def _lines(axis: Any, t: Any, columns: Any, names: Sequence[str], label: str) -> None:
     for column, name, colour in zip(columns.T, names, LINES, strict=False):
         axis.plot(t, column, color=colour, lw=1.1, label=name)
+    _dress(axis, label)
+    _legend(axis)
+
+
+def _dress(axis: Any, label: str) -> None:
     axis.set_ylabel(label, fontsize=9)
     axis.grid(visible=True, lw=0.3, color="#bbbbbb")
-    axis.legend(loc="upper right", fontsize=8, ncols=len(names), framealpha=0.8)
     axis.tick_params(labelsize=8)
 
 
-def _modes(axis: Any, log: RunLog, start_ns: int, end_s: float) -> None:
-    """Draw each service's mode as a coloured bar; white where it said nothing."""
-    for row, module in enumerate(MODULES):
+def _legend(axis: Any, handles: Sequence[Any] | None = None) -> None:
+    """Put the legend beside the panel, where no curve is."""
+    found = axis.get_legend_handles_labels()[0] if handles is None else handles
+    axis.legend(
+        handles=found, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False,
+        borderaxespad=0.2, handlelength=1.4,
+    )  # fmt: skip
+
+
+def _ages(axis: Any, log: RunLog, zero_ns: int) -> None:
+    """Draw how old the newest command of each module was, and from where on it is not used."""
+    most_ms = _greatest_age_ms(log)
+    for module, colour in zip(MODULES, MODULE_LINES, strict=True):
         states: list[JointState] = log.messages(topics.JOINT_STATE, module)
-        begin, mode, last = None, None, 0.0
-        spans: dict[int, list[tuple[float, float]]] = {}
-        for state in states:
-            t = (state.t_ns - start_ns) / NS_PER_S
-            if begin is None or state.mode != mode or t - last > 0.1:
-                if begin is not None and mode is not None:
-                    spans.setdefault(mode, []).append((begin, last - begin))
-                begin, mode = t, state.mode
-            last = t
-        if begin is not None and mode is not None:
-            spans.setdefault(mode, []).append((begin, last - begin))
-        for value, bars in spans.items():
-            axis.broken_barh(bars, (row - 0.4, 0.8), color=MODE_COLOURS[Mode(value)])
-    axis.set_yticks(range(len(MODULES)), MODULES, fontsize=8)
+        t = np.array([(state.t_ns - zero_ns) / NS_PER_S for state in states])
+        age = np.array([state.age_ns / NS_PER_MS for state in states])
+        age[age < 0.0] = np.nan
+        age[np.diff(t, prepend=t[:1]) > SILENT_S] = np.nan
+        style = "-" if module.endswith("right") else "--"
+        axis.plot(t, age, color=colour, lw=0.7, ls=style, label=module)
+    axis.axhline(most_ms, color="#c0392b", lw=1.0)
+    axis.annotate(
+        f"{most_ms:g} ms: HOLD", (1.005, most_ms), xycoords=("axes fraction", "data"),
+        fontsize=8, color="#c0392b", va="center", annotation_clip=False,
+    )  # fmt: skip
+    axis.set_ylim(0.0, AGE_REACH * most_ms)
+    _dress(axis, "command age\nin ms")
+    handles = axis.get_legend_handles_labels()[0]
+    axis.legend(
+        handles=handles, loc="lower left", bbox_to_anchor=(1.0, 0.0), fontsize=8, frameon=False,
+        borderaxespad=0.1, handlelength=1.4, labelspacing=0.2,
+    )  # fmt: skip
+
+
+def _greatest_age_ms(log: RunLog) -> float:
+    """Return the age from which on a command is not used, by the robot file in the log, ms."""
+    with contextlib.suppress(ConfigError, UnicodeDecodeError):
+        raw = log.attachments.get("robot.toml", b"").decode()
+        return config_file.parse(raw, "robot.toml").joint_service.max_command_age_ms
+    return AGE_MOST_MS
+
+
+def _modes(axis: Any, log: RunLog, start_ns: int, end_s: float) -> None:
+    """Draw the planner's state and each service's mode as bars; white where one said nothing."""
+    statuses = log.messages(topics.PLANNER_STATUS)
+    leads = [
+        LEADS_COLOUR if row.mode == PlannerMode.LEADING else WAITS_COLOUR if row.wait_s > 0 else ""
+        for row in statuses
+    ]
+    _bars(axis, 0, [(row.t_ns - start_ns) / NS_PER_S for row in statuses], leads)
+    for place, module in enumerate(MODULES, 1):
+        states: list[JointState] = log.messages(topics.JOINT_STATE, module)
+        times = [(state.t_ns - start_ns) / NS_PER_S for state in states]
+        _bars(axis, place, times, [MODE_COLOURS[Mode(state.mode)] for state in states])
+    axis.set_yticks(range(len(MODULES) + 1), ["planner", *MODULES], fontsize=8)
     axis.invert_yaxis()
     axis.set_xlim(0.0, end_s)
+    axis.tick_params(labelsize=8)
     handles = [Patch(color=colour, label=mode.name) for mode, colour in MODE_COLOURS.items()]
-    axis.legend(
-        handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=5, fontsize=8,
-        frameon=False,
-    )  # fmt: skip
+    handles[2].set_label("TRACK; planner leads")
+    if WAITS_COLOUR in leads:
+        handles.append(Patch(color=WAITS_COLOUR, label="planner waits\nafter drop-outs"))
+    _legend(axis, handles)
+
+
+def _bars(axis: Any, place: int, times: Sequence[float], colours: Sequence[str]) -> None:
+    """Draw one row of coloured bars; nothing where the colour is empty, or none was told."""
+    begin, colour, last = 0.0, "", 0.0
+    spans: dict[str, list[tuple[float, float]]] = {}
+    for t, now in zip(times, colours, strict=True):
+        if now != colour or t - last > SILENT_S:
+            spans.setdefault(colour, []).append((begin, last - begin))
+            begin, colour = t, now
+        last = t
+    spans.setdefault(colour, []).append((begin, last - begin))
+    for name, bars in spans.items():
+        if name:
+            axis.broken_barh(bars, (place - 0.4, 0.8), color=name)
 
 
 def _events(axes: Any, events: list[RunEvent]) -> None:
@@ -123,28 +204,46 @@ def _events(axes: Any, events: list[RunEvent]) -> None:
         )
 
 
-def _impairments(axes: Any, events: list[LinkEvent], start_ns: int, end_s: float) -> None:
-    """Shade what was done to the network, and say it once for all directions together."""
-    begins: dict[int, LinkEvent] = {}
-    ends: dict[int, LinkEvent] = {}
-    for event in events:
-        (begins if event.in_force else ends).setdefault(event.number, event)
-    for number, event in begins.items():
-        begin_s = max(0.0, (event.t_ns - start_ns) / NS_PER_S)
-        over = ends.get(number)
-        until_s = end_s if over is None else (over.t_ns - start_ns) / NS_PER_S
+def _shade(axes: Any, network: Sequence[Impaired], zero_ns: int, end_s: float) -> None:
+    """Shade what was done to the network: darker where two overlap, a line where each begins."""
+    for row in network:
+        begin, end = _extent(row, zero_ns, end_s)
         for axis in axes:
-            axis.axvspan(begin_s, until_s, color=IMPAIRED_COLOUR, lw=0.0, zorder=0)
-        words = "\n".join([event.asked, *event.detail.split()])
-        axes[1].annotate(
-            words,
-            (begin_s, 0.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(3, 3),
-            textcoords="offset points",
-            fontsize=7,
-            color="#5d4b8a",
-        )
+            axis.axvspan(begin, end, color=IMPAIRED_COLOUR, alpha=0.2, lw=0.0, zorder=0)
+            for edge, style in ((begin, "-"), (end, ":")):
+                axis.axvline(edge, color=IMPAIRED_COLOUR, lw=0.7, ls=style, zorder=0.5)
+
+
+def _network(axis: Any, network: Sequence[Impaired], zero_ns: int, end_s: float) -> None:
+    """Draw a lane for each impairment, with its words in a place where nothing else is."""
+    for number, row in enumerate(network):
+        lane = min(number, LANES_MAX - 1)
+        begin, end = _extent(row, zero_ns, end_s)
+        axis.broken_barh([(begin, end - begin)], (lane - 0.42, 0.84), color=IMPAIRED_COLOUR,
+                         alpha=0.45, lw=0.0)  # fmt: skip
+        words = f"{row.title}, {row.when(zero_ns)}"
+        if len(network) > LANES_MAX and number >= LANES_MAX - 1:
+            if number > LANES_MAX - 1:
+                continue
+            words = f"{len(network) - number} more"
+        late = begin > end_s / 2.0
+        axis.annotate(
+            words, (end if late else begin, lane), xytext=(-3 if late else 3, 0),
+            textcoords="offset points", ha="right" if late else "left", va="center_baseline",
+            fontsize=8, color=IMPAIRED_TEXT, zorder=5,
+        )  # fmt: skip
+    axis.set_ylim(min(len(network), LANES_MAX) - 0.4, -0.6)
+    axis.set_yticks([])
+    axis.set_ylabel("network", fontsize=9)
+    axis.grid(visible=True, axis="x", lw=0.3, color="#bbbbbb")
+    axis.tick_params(labelsize=8)
+
+
+def _extent(row: Impaired, zero_ns: int, end_s: float) -> tuple[float, float]:
+    """Return where an impairment begins and ends within the picture, s."""
+    end = row.end_s(zero_ns)
+    begin = min(max(0.0, row.begin_s(zero_ns)), end_s)
+    return begin, end_s if end is None else min(max(begin, end), end_s)
 
 
 def _label(kind: RunEventKind, event: RunEvent) -> str:

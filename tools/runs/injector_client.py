@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from shared.exceptions import FleetError
-from shared.injection import SOCKET, Asked, Begin, Clear, List, Reply, Request
+from shared.injector_protocol import SOCKET, Asked, Begin, Clear, List, Reply, Request
 from shared.scenario import Inject
 
 _PATIENCE_S: Final = 2.0

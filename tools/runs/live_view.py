@@ -3,22 +3,48 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from typing import Protocol
 
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from shared.messages import PlannerStatus
+from shared.scenario import Inject
 from tools.runs.conductor import Snapshot
 
 PERIOD_S = 0.1
 PLAIN_PERIOD_S = 1.0
+UNHEARD_S = 0.5
+"""What a planner said that is silent for so long is not shown."""
+
+
+class Newest(Protocol):
+    """Gives what the planner said last (`shared.bus.Latest`)."""
+
+    def take(self) -> PlannerStatus | None:
+        """Return the newest message if it was not taken before, else None."""
 
 
 class LiveView:
     """A line that is renewed in a terminal, or printed once a second into a file."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(
+        self, console: Console, injects: Sequence[Inject] = (), planner: Newest | None = None
+    ) -> None:
+        """Begin.
+
+        Args:
+            console: where the line goes.
+            injects: what the scenario does to the network.
+            planner: says how long it waits after drop-outs; None: that is not shown.
+        """
         self._console = console
+        self._injects = injects
+        self._planner = planner
+        self._status: PlannerStatus | None = None
+        self._heard_s = 0.0
         self._period_s = PERIOD_S if console.is_terminal else PLAIN_PERIOD_S
         self._next_s = 0.0
         self._live: Live | None = None
@@ -41,19 +67,44 @@ class LiveView:
         if now < self._next_s or snapshot.truth is None:
             return
         self._next_s = now + self._period_s
-        line = _line(snapshot)
+        words = (
+            snapshot.note,
+            in_force(self._injects, snapshot.truth.scenario_s),
+            waiting(self._hear(now)),
+        )
+        line = _line(snapshot, "; ".join(word for word in words if word))
         if self._live is not None:
             self._live.update(Text(line), refresh=True)
         else:
             self._console.print(line, highlight=False, soft_wrap=True)
 
+    def _hear(self, now_s: float) -> PlannerStatus | None:
+        """Return what the planner says of itself; None if it says nothing."""
+        status = None if self._planner is None else self._planner.take()
+        if status is not None:
+            self._status, self._heard_s = status, now_s
+        return self._status if now_s - self._heard_s < UNHEARD_S else None
 
-def _line(snapshot: Snapshot) -> str:
+
+def in_force(injects: Sequence[Inject], scenario_s: float) -> str:
+    """Return what a scenario does to the network at a time, in words; empty if nothing."""
+    found = [row for row in injects if row.at <= scenario_s < row.until]
+    return ", ".join(f"{row.link} {row.in_words()}" for row in found)
+
+
+def waiting(status: PlannerStatus | None) -> str:
+    """Return when a planner that waits after drop-outs leads again; empty if it does not wait."""
+    if status is None or status.wait_s <= 0.0:
+        return ""
+    return f"leads again in {status.wait_s:.0f} s" if status.wait_s >= 1.0 else "leads again soon"
+
+
+def _line(snapshot: Snapshot, note: str) -> str:
     truth = snapshot.truth
     assert truth is not None  # noqa: S101 - `show` has looked
     clock = f"{truth.scenario_s:6.2f} s" if truth.scenario_s >= 0.0 else "   --  s"
     x, y = truth.com[0] * 1e3, truth.com[1] * 1e3
     return (
         f"{clock}  height {truth.torso[2]:.3f} m  COM {x:+5.1f} {y:+5.1f} mm  "
-        f"hand {truth.operator_force[2]:+6.1f} N  modes {''.join(snapshot.modes)}  {snapshot.note}"
+        f"hand {truth.operator_force[2]:+6.1f} N  modes {''.join(snapshot.modes)}  {note}"
     )

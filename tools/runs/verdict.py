@@ -17,6 +17,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.messages import JointEvent, JointState, Mode, RunEvent, RunEventKind, SimTruth
+from tools.runs.impaired import Impaired, impairments, touches
 from tools.runs.run_log import RunLog
 
 Array = NDArray[np.float64]
@@ -98,7 +99,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     Raises:
         RunError: the log holds no simulated world, or the scenario never began.
     """
-    t, truth, began, _ = course(log)
+    t, truth, began, zero_ns = course(log)
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row for row in events if row.kind == RunEventKind.KILLED]
     kill_s = kills[0].scenario_s if kills else np.inf
@@ -135,8 +136,10 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary |= _handover(log, kills)
     summary["reengage_s"] = _reengage(log, events)
     summary["hold_entries"] = _hold_entries(log, truth[0].t_ns)
-    summary["command_age_ms"] = _command_age(log, truth[0].t_ns)
-    summary["links_impaired"] = len({e.number for e in log.messages(topics.LINK_EVENT)})
+    network = impairments(log.messages(topics.LINK_EVENT))
+    summary |= _command_age(log, truth[0].t_ns, network)
+    summary["links_impaired"] = len(network)
+    summary["impairments"] = [row.as_dict(zero_ns) for row in network]
     summary["pd_cycles_late_pct"] = _late_share(log, truth[0].t_ns)
     summary["planner_tick_us"] = _tick(log, truth[0].t_ns)
     summary["stopped"] = sorted({row.subject for row in kills if row.detail == "STOP"})
@@ -197,17 +200,33 @@ def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     return led
 
 
-def _command_age(log: RunLog, start_ns: int) -> dict[str, float] | None:
-    """Return how old the newest command of each module was, from the start on, ms."""
-    ages = [
-        row.age_ns / NS_PER_MS
-        for module in MODULES
-        for row in log.messages(topics.JOINT_STATE, module)
-        if row.t_ns >= start_ns and row.mode == Mode.TRACK
-    ]
-    if not ages:
+def _command_age(log: RunLog, start_ns: int, network: Sequence[Impaired]) -> Summary:
+    """Return how old the newest command of each module that tracks was, from the start on, ms.
+
+    All in all, while a link of that module was impaired, and otherwise.
+    """
+    ages, impaired = [np.zeros(0)], [np.zeros(0, dtype=bool)]
+    for module in MODULES:
+        rows: list[JointState] = [
+            row
+            for row in log.messages(topics.JOINT_STATE, module)
+            if row.t_ns >= start_ns and row.mode == Mode.TRACK
+        ]
+        ages.append(np.array([row.age_ns / NS_PER_MS for row in rows]))
+        impaired.append(touches(network, module, np.array([row.t_ns for row in rows], np.int64)))
+    age, mask = np.concatenate(ages), np.concatenate(impaired)
+    return {
+        "command_age_ms": _middle_and_most(age),
+        "command_age_impaired_ms": _middle_and_most(age[mask]),
+        "command_age_otherwise_ms": _middle_and_most(age[~mask]),
+    }
+
+
+def _middle_and_most(values: Array) -> dict[str, float] | None:
+    """Return the median and the 99th percentile; None of nothing."""
+    if not len(values):
         return None
-    median, p99 = np.percentile(ages, [50, 99])
+    median, p99 = np.percentile(values, [50, 99])
     return {"median": float(median), "p99": float(p99)}
 
 
@@ -287,7 +306,4 @@ def _late_share(log: RunLog, start_ns: int) -> float | None:
 
 def _tick(log: RunLog, start_ns: int) -> dict[str, float] | None:
     ticks = [row.tick_us for row in log.messages(topics.PLANNER_STATUS) if row.t_ns >= start_ns]
-    if not ticks:
-        return None
-    median, p99 = np.percentile(ticks, [50, 99])
-    return {"median": float(median), "p99": float(p99)}
+    return _middle_and_most(np.array(ticks))

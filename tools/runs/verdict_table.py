@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from rich.console import Console
 from rich.table import Table
 
-from tools.runs.verdict import LIMITS, Summary
+from tools.runs.verdict import LIMITS, Limit, Summary
+
+OK: Final = "ok"
+OVER: Final = "over"
+NOTHING: Final = 5e-4
+"""Less than this is shown as 0.00: no limit is near it."""
 
 
 def show(summary: Summary, console: Console) -> None:
@@ -19,13 +26,15 @@ def show(summary: Summary, console: Console) -> None:
         value = summary.get(row.key)
         if value is None:
             continue
-        good = value <= row.limit
-        mark = "[green]ok[/]" if good else "[yellow]over[/]"
-        if row.key == "sequence_gaps" and not good and summary["stopped"]:
-            mark = "of a service that was stopped"
+        word = mark(row, summary)
+        colour = "green" if word == OK else "yellow" if word.startswith(OVER) else "default"
         unit = f" {row.unit}" if row.unit else ""
-        table.add_row(row.what, f"{_three_digits(value)}{unit}", f"{row.limit:g}{unit}", mark)
+        table.add_row(
+            row.what, f"{digits(value)}{unit}", f"{row.limit:g}{unit}", f"[{colour}]{word}[/]"
+        )
     console.print(table)
+    for line in network(summary):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     if not summary["in_real_time"]:
         console.print(
             f"[yellow]The machine was too slow for real time: real-time factor "
@@ -35,8 +44,39 @@ def show(summary: Summary, console: Console) -> None:
     console.print(_sentence(summary))
 
 
-def _three_digits(value: float) -> str:
-    """Return a figure with three digits, or all before the point: 1540, not 1.54e+03."""
+def mark(row: Limit, summary: Summary) -> str:
+    """Return what a figure that is there is worth: `ok`, or `over` and perhaps why."""
+    if summary[row.key] <= row.limit:
+        return OK
+    if row.key == "sequence_gaps" and summary["stopped"]:
+        return "of a service that was stopped"
+    return f"{OVER}, links impaired" if summary.get("links_impaired") else OVER
+
+
+def network(summary: Summary) -> list[str]:
+    """Return a line for each impairment: where, what, when, what passed and what was lost.
+
+    With any of them, one of the commands' ages meanwhile and otherwise.
+    """
+    lines = [str(row["said"]) for row in summary.get("impairments", ())]
+    ages = [
+        f"{digits(found['median'])} ms, 99 % within {digits(found['p99'])} ms {word}"
+        for word, key in (("while impaired", "command_age_impaired_ms"),
+                          ("otherwise", "command_age_otherwise_ms"))
+        if (found := summary.get(key)) is not None
+    ]  # fmt: skip
+    if lines and ages:
+        lines.append(f"median age of commands in TRACK: {'; '.join(ages)}")
+    return lines
+
+
+def digits(value: float) -> str:
+    """Return a figure with three digits, or all before the point: 1540, not 1.54e+03.
+
+    Next to nothing is 0.00; none is 0.
+    """
+    if abs(value) < NOTHING:
+        return "0.00" if value else "0"
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 

@@ -18,7 +18,7 @@ import msgspec
 from shared.config import RobotConfig, expand
 from shared.config_file import load
 from shared.exceptions import ConfigError, FleetError
-from shared.injection import SOCKET
+from shared.injector_protocol import SOCKET
 from shared.joints import MODULES
 from shared.links import PAIRS, endpoint_through
 from shared.process import DEFAULT_CONFIG, SOCKET_PATH_MAX

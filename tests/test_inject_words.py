@@ -20,7 +20,7 @@ from shared.messages import Mode
 from shared.scenario import Inject
 from tests.lockstep.runs import still
 from tools import sim
-from tools.runs import experiment, injection, verdict
+from tools.runs import experiment, inject_words, verdict
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
 from tools.runs.run_log import RunLog, read_run
@@ -54,7 +54,7 @@ def parse(*words: str) -> argparse.Namespace:
     ],
 )  # fmt: skip
 def test_an_impairment_is_read_from_its_words(text: str, inject: Inject) -> None:
-    assert injection.parse_inject(text) == inject
+    assert inject_words.parse_inject(text) == inject
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_an_impairment_is_read_from_its_words(text: str, inject: Inject) -> None
 )
 def test_what_makes_no_sense_is_refused_with_what_would_be_right(text: str, right: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError) as caught:
-        injection.parse_inject(text)
+        inject_words.parse_inject(text)
     assert right in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -112,8 +112,8 @@ def test_a_number_is_the_same_in_each_of_its_units(
     word: str, texts: tuple[str, ...], value: float
 ) -> None:
     for text in texts:
-        inject = injection.make("all", {"burst": "1", "delay": "1", word: text})
-        assert getattr(inject, injection.NUMBERS[word].field) == value
+        inject = inject_words.make("all", {"burst": "1", "delay": "1", word: text})
+        assert getattr(inject, inject_words.NUMBERS[word].field) == value
 
 
 SHARES = st.floats(0.0, 1.0)
@@ -127,14 +127,14 @@ SHARES = st.floats(0.0, 1.0)
     )
 )  # fmt: skip
 def test_words_come_back_exactly_from_what_they_made(what: Impairment) -> None:
-    inject = injection.parse_inject(f"all {what.in_words()}")
+    inject = inject_words.parse_inject(f"all {what.in_words()}")
     assert {name: getattr(inject, name) for name in what.__struct_fields__} == (
         msgspec.structs.asdict(what)
     )
 
 
 def test_what_is_done_is_told_with_units_and_shares_in_percent() -> None:
-    what = injection.parse_inject("all delay=0.03s jitter=10 loss=1 burst=1 duplicate=.125")
+    what = inject_words.parse_inject("all delay=0.03s jitter=10 loss=1 burst=1 duplicate=.125")
     assert what.in_words() == "delay=30ms jitter=10ms loss=100% duplicate=12.5%"
 
 
