@@ -84,6 +84,23 @@ class RobotConfig(Section, frozen=True):
         gains: StandGains = getattr(self.stand, kind_of(module))
         return gains
 
+    def hold_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return (k_p, k_d) that a module's gains rise to where no tau_coupled holds it.
+
+        The stand gains of the ankles and of every phi, zero elsewhere; (phi, theta), N m/rad and
+        N m s/rad. With gains as they were (design section 4), the operator's 60 N m of pitch
+        moment in the crawl leaned the COM back by 42 mm and the soles tipped, and pushes from the
+        side tipped them in 15 of 500 random cases. Not the theta of hips and knees: a torso that
+        does not follow a hand that leads on hands all of its moment to the soles, and 6 of 300
+        fell.
+
+        In TRACK without tau_coupled the same: the certified gains are stiff enough to stand, but
+        sway damped by 0.055 only; two pushes of 40 N from the side, 2 s apart, made it fall.
+        """
+        stand = self.stand_gains(module)
+        theta = float(kind_of(module) in self.joint_service.hold_stiffens_theta)
+        return (stand.k_p[0], theta * stand.k_p[1]), (stand.k_d[0], theta * stand.k_d[1])
+
     @property
     def torso_mass(self) -> float:
         """m_torso of the paper in kg: two hip modules, two batteries, the payload."""

@@ -53,23 +53,7 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     states: int
     residual: Pair = law.ZERO
     resumed_ns: int = 0
-
-
-def hold_gains(config: RobotConfig, module: str) -> tuple[Pair, Pair]:
-    """Return (k_p, k_d) that a module's gains rise to where no tau_coupled holds it.
-
-    The stand gains of the ankles and of every phi, zero elsewhere; (phi, theta), N m/rad and
-    N m s/rad. With gains as they were (design section 4), the operator's 60 N m of pitch moment
-    in the crawl leaned the COM back by 42 mm and the soles tipped, and pushes from the side
-    tipped them in 15 of 500 random cases. Not the theta of hips and knees: a torso that does not
-    follow a hand that leads on hands all of its moment to the soles, and 6 of 300 fell.
-
-    In TRACK without tau_coupled the same: the certified gains are stiff enough to stand, but
-    sway damped by 0.055 only; two pushes of 40 N from the side, 2 s apart, made it fall.
-    """
-    stand = config.stand_gains(module)
-    theta = float(kind_of(module) in config.joint_service.hold_stiffens_theta)
-    return (stand.k_p[0], theta * stand.k_p[1]), (stand.k_d[0], theta * stand.k_d[1])
+    share: float = 1.0
 
 
 class JointController:
@@ -85,7 +69,7 @@ class JointController:
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
         self._damp_k_d = service.damp_k_d
         self._sinks = (False, kind_of(module) in service.damp_sinks)
-        self._hold_k_p, self._hold_k_d = hold_gains(config, module)
+        self._hold_k_p, self._hold_k_d = config.hold_gains(module)
         knee = kind_of(module) == "knee"
         self._damp_stop = service.damp_knee_stop if knee else -math.inf
         self._gear_ratio = config.joint.gear_ratio
@@ -102,6 +86,10 @@ class JointController:
         self._samples = Samples(config.joint.gear_ratio)
         self._found_tau: Pair | None = None
         """What a drive that was found armed carries, N m: it is taken over without a step."""
+        self._share = 1.0
+        """Of tau_coupled, used in the last cycle in TRACK."""
+        self._share_up = 1e3 / (service.rate_hz * service.blend_ms)
+        self._share_down = 1e3 / (service.rate_hz * service.coupled_ramp_ms)
         self._residual: Pair = law.ZERO
         """What the drive carried beyond the law as the service went on after a gap, N m."""
         self._resumed_ns = 0
@@ -211,7 +199,7 @@ class JointController:
             refused=failsafe.refused,
             drive=int(samples.status),
             drive_error=samples.error,
-            coupled_share=failsafe.coupled_share(self.timing),
+            coupled_share=self._wanted_share(),
         )
 
     def remember(self) -> ControllerMemory:
@@ -233,6 +221,7 @@ class JointController:
             self._states,
             self._residual,
             self._resumed_ns,
+            self._share,
         )
 
     def recall(self, memory: ControllerMemory) -> None:
@@ -245,7 +234,7 @@ class JointController:
         self._found_tau, self._cause, self.tau = m.found_tau, m.cause, m.tau
         self._damp_stop = -math.inf if m.damp_stop is None else m.damp_stop
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
-        self._residual, self._resumed_ns = m.residual, m.resumed_ns
+        self._residual, self._resumed_ns, self._share = m.residual, m.resumed_ns, m.share
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""
@@ -295,7 +284,7 @@ class JointController:
             command = self.failsafe.command
             assert command is not None  # noqa: S101 - TRACK is entered on fresh commands only
             age_s = (now_ns - command.echo_t_ns) / NS_PER_S
-            share = min(command.coupled_share, self.failsafe.coupled_share(self.timing))
+            share = self._slewed(min(command.coupled_share, self._wanted_share()))
             fresh = law.aged(command, min(age_s, self._aging_max_s), share)
             if share < 1.0:
                 fresh = law.stiffened(fresh, self._hold_k_p, self._hold_k_d, 1.0 - share)
@@ -310,6 +299,18 @@ class JointController:
                 return law.caught(sunk, self._damp_stop, self._stand_k_p[1], self._stand_k_d[1])
             return sunk
         return self._held(since_ns)
+
+    def _wanted_share(self) -> float:
+        """Return how much of tau_coupled this module would use, by its own ages."""
+        return self.failsafe.coupled_share(self.timing)
+
+    def _slewed(self, share: float) -> float:
+        """Return the share of this cycle: let go of in `coupled_ramp_ms`, back in `blend_ms`.
+
+        One message can change it by most of its range: at once that was a step of 20 N m.
+        """
+        self._share = min(self._share + self._share_up, max(self._share - self._share_down, share))
+        return self._share
 
     def _held(self, since_ns: int) -> Setpoint:
         """Return HOLD's law: the anchor frozen; some gains rise to the stand gains."""

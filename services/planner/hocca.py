@@ -79,6 +79,7 @@ class Hocca:
         self._p_C0: Array = np.zeros(6)
         self._since_align_s = 0.0
         self._aligned = False
+        self._has_led = False
         self._F_assist: Array = np.zeros(3)
         self._per_p: Array = np.eye(12)[:, :6].copy()
 
@@ -102,13 +103,18 @@ class Hocca:
             dt: time since the last tick, s.
             align: start from the measured pose, so that taking over makes no step: p_C is
                 where the robot is, and glides to zero (COM over the ankles, no roll, no
-                yaw) in `law.recentre_s` of ticks without `align`.
+                yaw) in `law.recentre_s` of ticks without `align`. A planner that has led
+                before starts from zero: where it finds the robot is a sway, and were it lost
+                again, HOLD would stay where the sway was. A robot held off centre by 25 mm so
+                fell at the second push; the modules' blend makes no step of it.
             wrench: of the operator on the torso, if it is fresh and valid.
         """
         measured, ik = self._measured, self._ik
         measured.update(q)
         if align or not self._aligned:
             self._align(q)
+        else:
+            self._has_led = True
         pdot = measured.J @ v
         p_C, pdot_C = self._closed_loop_reference(dt)
         p_ref = self._S_perp * p_C + self._S * measured.p
@@ -165,19 +171,21 @@ class Hocca:
             tuple(self._ik.q.tolist()),
             self._assist.remember(),
             self._easing.remember(),
+            self._has_led,
         )
 
     def recall(self, memory: LawMemory) -> None:
         """Go on from a memory."""
         self._p_C0 = np.array(memory.p_C0)
         self._since_align_s, self._aligned = memory.since_align_s, memory.aligned
+        self._has_led = memory.has_led
         self._ik.q[:] = memory.q
         self._assist.recall(memory.assist)
         self._easing.recall(memory.easing)
 
     def _align(self, q: Array) -> None:
         self._aligned = True
-        self._p_C0 = self._measured.p * self._S_perp
+        self._p_C0 = self._measured.p * (0.0 if self._has_led else self._S_perp)
         self._since_align_s = 0.0
         self._ik.q[:] = q
 

@@ -43,6 +43,7 @@ class LawMemory(msgspec.Struct, frozen=True):
     """Where the inverse kinematics starts from, rad."""
     assist: AssistMemory
     easing: EasingMemory
+    has_led: bool = False
 
 
 class TickMemory(msgspec.Struct, frozen=True):

@@ -12,9 +12,11 @@ import pytest
 from scipy.signal import find_peaks
 
 from shared.config import RobotConfig
+from shared.impairment import Impairment
 from shared.messages import Mode
-from shared.scenario import Inject, Push
+from shared.scenario import Inject, Keyframe, Push, Scenario
 from tests.lockstep.runs import Run, push, run, still, story
+from tools.runs.lockstep import Lockstep
 
 
 def one_late(module: str, delay_ms: float) -> tuple[Inject, ...]:
@@ -59,6 +61,54 @@ def test_it_stands_through_pushes_while_all_six_track(
 def test_so_it_does_with_any_other_module_late(robot: RobotConfig, module: str) -> None:
     told = still(5.0, height=1.0, push=(push(2.4, 0.0, 60.0, 0.0),), inject=one_late(module, 22.0))
     assert_it_stood_and_tracked(run(robot, told))
+
+
+class Steps(Lockstep):
+    """Watches how far the joint torques go from one cycle to the next."""
+
+    traced = False
+    largest_nm = 0.0
+
+    def advance(self) -> None:
+        before = [controller.tau for controller in self.controllers]
+        super().advance()
+        for tau, last in zip([c.tau for c in self.controllers], before, strict=True):
+            change_nm = max(abs(a - b) for a, b in zip(tau, last, strict=True))
+            if self.world.scenario_s > 0.0:
+                self.largest_nm = max(self.largest_nm, change_nm)
+
+
+def steps(robot: RobotConfig, told: Scenario) -> float:
+    """Run to the end; return the largest step of a joint's torque in a cycle, N m."""
+    fleet = Steps(robot, told, Impairment(delay_ms=1.0))
+    falls = [row.fallen for row in fleet.run()]
+    assert not any(falls)
+    return fleet.largest_nm
+
+
+@pytest.mark.parametrize("delay_ms", [3.5, 4.7])
+def test_two_hips_a_little_late_do_not_make_the_legs_shake(
+    robot: RobotConfig, delay_ms: float
+) -> None:
+    """At 49 Hz, by 40 N m a cycle, it did from 4.5 s on, unpushed, with all of tau_coupled."""
+    late = (*one_late("hip_right", delay_ms), *one_late("hip_left", delay_ms))
+    assert steps(robot, story("squat", duration=6.0, kill=(), push=(), inject=late)) < 5.0
+
+
+def test_a_drop_out_in_the_middle_of_a_sway_is_not_held_off_centre(robot: RobotConfig) -> None:
+    """Led from where the sway was, and lost again, HOLD stood 25 mm to the side, and fell."""
+    frames = tuple(Keyframe(at=t, height=h) for t, h in ((0.0, 1.188), (1.0, 1.188), (3.0, 0.948)))
+    told = story(
+        "stand",
+        duration=6.0,
+        keyframe=frames,
+        push=tuple(push(t, 0.0, 40.0, 0.0) for t in (1.6, 3.1, 4.6)),
+        inject=(Inject(link="ankle_left->planner", at=0.3, loss=0.7, burst=5),),
+    )
+    fleet = Lockstep(robot, told, Impairment(delay_ms=1.0), seed=2038)
+    rows = list(fleet.run())
+    assert not any(row.fallen for row in rows)
+    assert max(abs(row.com[1]) for row in rows) < 0.055
 
 
 def test_without_tau_coupled_sway_is_damped_as_well_as_in_hold(robot: RobotConfig) -> None:

@@ -27,7 +27,7 @@ def test_all_late_alike_keep_all_of_it(age_ms: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spread_ms", "share"), [(0.0, 1.0), (9.9, 1.0), (12.5, 0.5), (15.0, 0.0), (44.0, 0.0)]
+    ("spread_ms", "share"), [(0.0, 1.0), (3.9, 1.0), (7.0, 0.5), (10.0, 0.0), (44.0, 0.0)]
 )
 def test_the_share_falls_between_its_bounds(spread_ms: float, share: float) -> None:
     assert after([4.0, 4.0, 4.0, 4.0, 4.0, 4.0 + spread_ms]).share(WHOLE) == pytest.approx(

@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 
 from services.joint import law
-from services.joint.controller import hold_gains
 from shared import topics
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
@@ -98,7 +97,7 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
     found = Origins(*(np.full(shape, np.nan) for _ in range(4)))
     blend_ns = robot.joint_service.blend_ms * NS_PER_MS
     aging_max_s = robot.joint_service.command_aging_max_ms / 1e3
-    stiffest = hold_gains(robot, module)
+    stiffest = robot.hold_gains(module)
     tracking_since_ns: int | None = None
     for index, state in enumerate(states):
         if state.mode != Mode.TRACK:
