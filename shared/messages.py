@@ -157,6 +157,8 @@ class JointState(Message, frozen=True):
     coupled_share: float = 1.0
     """How much of tau_coupled this module would use: 1, and less where its commands' ages are
     unsteady, down to 0."""
+    coupled_used: float = 1.0
+    """How much of it was used in this cycle, in TRACK; it follows what is wanted in a ramp."""
 
 
 class JointCommand(Message, frozen=True):

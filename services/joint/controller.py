@@ -200,6 +200,7 @@ class JointController:
             drive=int(samples.status),
             drive_error=samples.error,
             coupled_share=self._wanted_share(),
+            coupled_used=self._share,
         )
 
     def remember(self) -> ControllerMemory:

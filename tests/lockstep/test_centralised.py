@@ -225,7 +225,7 @@ def test_torques_stay_whole_however_far_apart_in_time_the_modules_act(robot: Rob
                 age_ns = late_ns if index == 0 else 0
                 planner.hear_state(index, msgspec.structs.replace(state, age_ns=age_ns), now)
         shipped, apart, together = (planner.tick(now) for planner in planners)
-    assert all(command.tau_coupled == law.ZERO for command in shipped)
+    assert all(command.coupled_share == 0.0 for command in shipped)
     assert apart == together
 
 

@@ -188,7 +188,7 @@ def test_text_from_a_log_is_text_in_the_page(log: RunLog, tmp_path: Path) -> Non
 
 
 def test_the_origins_of_a_torque_add_up_to_it(log: RunLog) -> None:
-    """But for what the service leaves out of tau_coupled, and the gate cuts off."""
+    """But for what the gate cuts off."""
     source = Source(log)
     assert source.robot is not None
     most = source.robot.joint.tau_module_max
@@ -203,9 +203,8 @@ def test_the_origins_of_a_torque_add_up_to_it(log: RunLog) -> None:
         sent = np.array([state.tau for state in states])
         assert np.abs(total + found.taken_off - sent)[known].max() < 1e-9
         off = np.abs(found.taken_off)[known]
-        assert np.mean(off.max(axis=1) < 1e-9) > 0.5
         cut = np.abs(sent[known]).sum(axis=1) > 0.999 * most
-        assert (cut | (off <= np.abs(found.coupled[known]) + 1e-9).all(axis=1)).all()
+        assert (cut | (off < 1e-9).all(axis=1)).all()
 
 
 def test_the_timeline_tells_kill_hold_and_what_came_after(log: RunLog) -> None:

@@ -109,7 +109,7 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
         if command is None or state.t_ns - tracking_since_ns < blend_ns or state.age_ns < 0:
             continue
         age_s = min(state.age_ns / NS_PER_S, aging_max_s)
-        share = min(command.coupled_share, state.coupled_share)
+        share = state.coupled_used
         used = law.stiffened(law.aged(command, age_s, share), *stiffest, 1.0 - share)
         found.feedforward[index] = used.tau_ff
         found.coupled[index] = used.tau_coupled
