@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.system.stalls import stalled_before_it_began
 from tools.supervision import procfs
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
@@ -37,6 +38,8 @@ def test_the_robot_stands_when_a_knees_service_is_killed_in_the_squat(tmp_path: 
         timeout=150,
         check=False,
     )
+    if stalled_before_it_began(done.returncode, done.stdout + done.stderr, tmp_path):
+        pytest.skip("this machine stalled so often that the squat could not begin")
     assert done.returncode == 0, done.stdout + done.stderr
     document = json.loads((tmp_path / "results.json").read_text())
     assert document["complete"] is True

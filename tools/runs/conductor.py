@@ -31,7 +31,8 @@ from tools.runs.injector_client import InjectorClient
 from tools.supervision import procfs
 from tools.supervision.supervise import Fleet
 
-READY_TIMEOUT_S: Final = 30.0
+READY_TIMEOUT_S: Final = 45.0
+"""Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
 SETTLE_S: Final = 2.0
 """All six modules track for so long before the scenario starts."""
 AFTER_FALL_S: Final = 1.0
