@@ -199,7 +199,7 @@ class JointController:
             refused=failsafe.refused,
             drive=int(samples.status),
             drive_error=samples.error,
-            coupled_share=self._wanted_share(),
+            coupled_share=failsafe.share,
             coupled_used=self._share,
         )
 
@@ -285,7 +285,7 @@ class JointController:
             command = self.failsafe.command
             assert command is not None  # noqa: S101 - TRACK is entered on fresh commands only
             age_s = (now_ns - command.echo_t_ns) / NS_PER_S
-            share = self._slewed(min(command.coupled_share, self._wanted_share()))
+            share = self._slewed(min(command.coupled_share, self.failsafe.share))
             fresh = law.aged(command, min(age_s, self._aging_max_s), share)
             if share < 1.0:
                 fresh = law.stiffened(fresh, self._hold_k_p, self._hold_k_d, 1.0 - share)
@@ -300,10 +300,6 @@ class JointController:
                 return law.caught(sunk, self._damp_stop, self._stand_k_p[1], self._stand_k_d[1])
             return sunk
         return self._held(since_ns)
-
-    def _wanted_share(self) -> float:
-        """Return how much of tau_coupled this module would use, by its own ages."""
-        return self.failsafe.coupled_share(self.timing)
 
     def _slewed(self, share: float) -> float:
         """Return the share of this cycle: let go of in `coupled_ramp_ms`, back in `blend_ms`.

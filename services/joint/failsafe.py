@@ -138,6 +138,8 @@ class Failsafe(msgspec.Struct):
     """Running mean of the ages at which commands came; -1 before the first."""
     age_deviation_ns: float = 0.0
     """Running mean of how far from that mean they were."""
+    share: float = 1.0
+    """`coupled_share` as of the newest command taken."""
 
     def offer(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
         """Take a command if it is usable; count it if not."""
@@ -151,6 +153,7 @@ class Failsafe(msgspec.Struct):
             self.session = command.session
             self.fresh_since_ns = -1
         self._watch_age(now_ns - command.echo_t_ns)
+        self.share = self.coupled_share(timing)
         self.command = command
         return refusal
 
