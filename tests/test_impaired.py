@@ -96,6 +96,9 @@ def test_a_limit_passed_with_links_impaired_says_so_and_otherwise_does_not() -> 
     over = judged(alive_com_y_max_mm=row.limit + 1.0)
     assert verdict_table.mark(row, over) == "over"
     assert verdict_table.mark(row, over | {"links_impaired": 1}) == "over, links impaired"
+    cpu = next(row for row in LIMITS if row.key == "fleet_cpu_pct")
+    busy = {cpu.key: cpu.limit + 1.0, "links_impaired": 1}
+    assert verdict_table.mark(cpu, busy) == "over", "no link makes a machine busy"
     good = judged(alive_com_y_max_mm=row.limit, links_impaired=1)
     assert verdict_table.mark(row, good) == "ok"
 

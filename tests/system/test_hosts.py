@@ -9,8 +9,7 @@ from __future__ import annotations
 import json
 import socket
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from shared import config_file
 from shared.config import SERVICES, RobotConfig
 from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
+from tests.system.waiting import wait_for
 from tools import cli
 from tools.supervision import procfs
 from tools.supervision.supervise import Fleet
@@ -62,15 +62,6 @@ def spread(robot: RobotConfig, drives: Path) -> RobotConfig:
     return msgspec.structs.replace(robot, bus=bus, can=can)
 
 
-def wait_for(truth: Callable[[], bool], timeout_s: float = 60.0) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not truth():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.2)
-    return True
-
-
 def test_each_host_starts_its_own_services_and_all_six_modules_track(
     robot: RobotConfig, run_dirs: dict[str, Path], tmp_path: Path, capsys: Any
 ) -> None:
@@ -95,7 +86,9 @@ def test_each_host_starts_its_own_services_and_all_six_modules_track(
         assert set(status["services"]) == set(HOSTS["left"])
         return {module["mode"] for module in status["modules"].values()}
 
-    assert wait_for(lambda: modes() == {"TRACK"}), "each host hears the modules of all"
+    assert wait_for(lambda: modes() == {"TRACK"}, timeout_s=60.0), (
+        "each host hears the modules of all"
+    )
     for run_dir in run_dirs.values():
         assert cli.main(["down", "--run-dir", str(run_dir)]) == 0
         assert procfs.fleet_pids(run_dir) == set()

@@ -17,6 +17,7 @@ import pytest
 
 from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
+from tests.system.waiting import wait_for
 from tools import cli
 from tools.supervision import procfs
 from tools.supervision.supervise import Fleet, ServiceInfo
@@ -89,15 +90,6 @@ def start(run_dir: Path, tmp_path: Path) -> Start:
         return Fleet.start(DEFAULT_CONFIG, run_dir, table_path=table, **arguments)
 
     return start
-
-
-def wait_for(truth: Callable[[], bool], timeout_s: float = 20.0) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not truth():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.05)
-    return True
 
 
 def service(fleet: Fleet, name: str) -> ServiceInfo:
