@@ -169,3 +169,10 @@ def test_the_code_of_a_study_is_all_that_it_imports_in_either_way(
     ):
         (tmp_path / "tools" / f"{name}.py").write_text(text)
     assert code_of("tools.a") == ("services", "shared", "tools/a.py", "tools/b.py", "tools/c.py")
+
+
+def test_a_folder_of_something_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_bytes(b"a run")
+    with pytest.raises(RunError, match="holds other files than a study's; choose another --out"):
+        Table(tmp_path, "t.csv", COLUMNS, INPUTS)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]

@@ -16,7 +16,15 @@ from rich.table import Table
 from shared.bus import open_session
 from shared.config_file import load
 from shared.messages import DriveStatus
-from tools.runs.fleet_status import Ear, FleetStatus, LeadStatus, ears_of, listen_for_all, look
+from tools.runs.fleet_status import (
+    SILENT_INJECTOR,
+    Ear,
+    FleetStatus,
+    LeadStatus,
+    ears_of,
+    listen_for_all,
+    look,
+)
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
@@ -117,7 +125,8 @@ def tables(status: FleetStatus) -> Group:
             *angles,
             module.way_out.replace("MODULE", name),
         )
-    said = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl inject --clear)"
+    way_out = "kill injector" if SILENT_INJECTOR in status.network else "inject --clear"
+    said = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
     lead = f" {lead_in_words(status.lead)}"
     return Group(services, modules, lead, *([said] if status.network else []))
 

@@ -32,6 +32,7 @@ TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
 mode the joint service does not, and the mode says why."""
 
 PLANNER: Final = "planner"
+SILENT_INJECTOR: Final = "not known, for the injector does not answer"
 
 _LINKS_S: Final = 1.0
 """Longest wait for the first message of each service."""
@@ -200,7 +201,7 @@ def impairments(fleet: Fleet) -> tuple[str, ...]:
     try:
         return tuple(row.in_words() for row in InjectorClient(fleet.run.path).list())
     except FleetError:
-        return ("the injector does not answer",)
+        return (SILENT_INJECTOR,)
 
 
 def module_status(state: Message | None) -> ModuleStatus:

@@ -11,6 +11,7 @@ import msgspec
 from shared.exceptions import FleetError
 from shared.injector_protocol import SOCKET, Asked, Begin, Clear, List, Reply, Request
 from shared.scenario import Inject
+from tools.supervision.run_dir import RunDir
 
 _PATIENCE_S: Final = 2.0
 _decode = msgspec.json.Decoder(Reply).decode
@@ -56,11 +57,11 @@ class InjectorClient:
                 with asking.makefile("rb") as answers:
                     line = answers.readline()
         except (FileNotFoundError, ConnectionRefusedError):
-            raise FleetError(
-                f"no injector in {self._path.parent}; `xrl up --injectable` starts a fleet with one"
-            ) from None
+            raise FleetError(self._why_absent()) from None
         except OSError as error:
-            raise FleetError(f"{self._path}: the injector does not answer: {error}") from None
+            out = "`xrl kill injector --signal CONT` if it was stopped, or `xrl kill injector`"
+            said = f"{self._path}: the injector does not answer: {error}; {out}"
+            raise FleetError(said) from None
         if not line:
             raise FleetError(f"{self._path}: the injector ended without an answer; see its log")
         try:
@@ -71,3 +72,21 @@ class InjectorClient:
         if reply.error:
             raise FleetError(f"refused: {reply.error}")
         return reply.asked
+
+    def _why_absent(self) -> str:
+        """Return why nobody listens there, and the way out."""
+        folder = RunDir(self._path.parent)
+        manifest = folder.read_manifest()
+        if manifest is None or not folder.supervisor_socket.exists():
+            return (
+                f"no fleet is up in {folder.path}; `xrl up --injectable` starts one to inject into"
+            )
+        if "injector" not in manifest.services:
+            return (
+                f"the fleet in {folder.path} was started without an injector; `xrl down`, then "
+                "`xrl up --injectable`"
+            )
+        return (
+            f"the injector in {folder.path} is down, or being started again, and all that was done "
+            "to links is over; `xrl status`, `xrl start injector`"
+        )

@@ -94,6 +94,7 @@ class Table:
         self._path, self._columns = folder / name, tuple(columns)
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            _refuse_foreign(folder, self._path)
             self._inputs = (folder / INPUTS_FILE).open("a+", encoding="utf-8")
         except OSError as error:
             raise _unusable(folder, error) from None
@@ -158,6 +159,16 @@ class Table:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(self._path)
+
+
+def _refuse_foreign(folder: Path, table: Path) -> None:
+    """Refuse a folder that holds something, and no study.
+
+    Raises:
+        RunError: it does.
+    """
+    if any(folder.iterdir()) and not (folder / INPUTS_FILE).exists() and not table.exists():
+        raise RunError(f"{folder}: holds other files than a study's; choose another --out")
 
 
 def _unusable(folder: Path, error: OSError) -> RunError:
