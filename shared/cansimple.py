@@ -96,7 +96,11 @@ class InputMode(IntEnum):
 
 
 class AxisError(IntFlag):
-    """`axis.error`; it can stay 0 while the motor or the controller has failed."""
+    """`axis.error`.
+
+    From 0.5.5 on it says that the motor, the encoder or the controller has failed; up to 0.5.4
+    it stayed 0 then, and it still does where an axis is idle for no error of its own.
+    """
 
     NONE = 0
     INVALID_STATE = 0x0000_0001
@@ -125,6 +129,8 @@ class MotorError(IntFlag):
     I_BUS_OUT_OF_RANGE = 0x0040_0000
     SYSTEM_LEVEL = 0x0100_0000
     UNKNOWN_PHASE_ESTIMATE = 0x0400_0000
+    UNKNOWN_TORQUE = 0x1000_0000
+    UNKNOWN_VOLTAGE_COMMAND = 0x1_0000_0000
 
 
 class OdriveError(IntFlag):
@@ -144,6 +150,7 @@ class EncoderError(IntFlag):
     NONE = 0
     CPR_POLEPAIRS_MISMATCH = 0x02
     NO_RESPONSE = 0x04
+    ABS_SPI_COM_FAIL = 0x80
 
 
 class ControllerError(IntFlag):

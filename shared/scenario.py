@@ -86,7 +86,7 @@ class FaultTraits(NamedTuple):
 FAULT_KINDS: Final[Mapping[str, FaultTraits]] = {
     "over_temperature": FaultTraits("an output stage too hot", 5.0, whole=False),
     "over_voltage": FaultTraits("the supply too high", 0.1, whole=True),
-    "encoder": FaultTraits("an encoder lost, it reads 0", 5.0, whole=False),
+    "encoder": FaultTraits("an encoder lost, it repeats its last", 5.0, whole=False),
     "watchdog": FaultTraits("an axis's watchdog fires", None, whole=False),
     "link_lost": FaultTraits("the cable out: nothing sent, nothing heard", 0.5, whole=True),
     "disarmed": FaultTraits("an axis goes idle without an error", None, whole=False),

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.axis_bank import AXIS_NAMES, FAULTS, AxisBank
-from shared.cansimple import AxisError, AxisState, ControlMode, InputMode
+from services.simulator.axis_bank import AXIS_NAMES, FAULTS, AxisBank, Fault
+from shared.cansimple import AxisError, AxisState, ControllerError, ControlMode, InputMode
 from shared.exceptions import DriveError
 from tests.simulator.banks import CPR, DRIVE, DT, ZERO, make_bank
 
@@ -32,15 +32,16 @@ def firmware_torque(
 ) -> float:
     """Return the torque of one axis as controller.cpp computes it, one number at a time."""
     vel_limit, gain = float(bank.vel_limit[axis]), float(bank.vel_gain[axis])
-    torque = float(bank.input_torque[axis])
+    torque_lim = float(bank.current_lim[axis]) * DRIVE.torque_constant
+    torque = clamp(float(bank.input_torque[axis]), torque_lim)
     if mode >= 2:
-        vel_des = float(bank.input_vel[axis])
+        vel_des = clamp(float(bank.input_vel[axis]), vel_limit)
         if mode == 3:
             vel_des += float(bank.pos_gain[axis]) * (float(bank.input_pos[axis]) - pos)
         torque += gain * (clamp(vel_des, vel_limit) - vel) + integrator
     else:
         torque = max((-vel_limit - vel) * gain, min((vel_limit - vel) * gain, torque))
-    return clamp(torque, float(bank.current_lim[axis]) * DRIVE.torque_constant)
+    return clamp(torque, torque_lim)
 
 
 number = st.floats(-50.0, 50.0)
@@ -105,7 +106,7 @@ def test_torque_is_clamped_to_current_lim_times_torque_constant() -> None:
     assert torque[6:] == pytest.approx(-60.0 * 0.0827)
 
 
-def test_overspeed_disarms_in_torque_mode_with_axis_error_zero() -> None:
+def test_overspeed_disarms_in_torque_mode_and_axis_error_says_what_failed() -> None:
     bank = make_bank()
     bank.input_torque[:] = 1.0
     speed = np.zeros(12)
@@ -117,8 +118,29 @@ def test_overspeed_disarms_in_torque_mode_with_axis_error_zero() -> None:
     assert torque[3] == 0.0
     assert torque[2] == 1.0
     assert heartbeat.axis_state == AxisState.IDLE
-    assert heartbeat.axis_error == 0
+    assert heartbeat.axis_error == AxisError.CONTROLLER_FAILED | AxisError.MOTOR_FAILED
     assert heartbeat.controller_failed
+    assert heartbeat.motor_failed
+
+
+def test_an_idle_axis_spun_too_fast_has_the_error_once_it_has_been_armed() -> None:
+    bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, watchdog=False)
+    bank.step(0.0, ZERO, ZERO)
+    bank.request_state(3, AxisState.CLOSED_LOOP_CONTROL)
+    bank.request_state(3, AxisState.IDLE)
+    speed = np.full(12, 80.0)
+    for k in range(1, 30):
+        bank.step(k * DT, speed * k * DT, speed)
+    assert [axis for axis in range(12) if bank.faults[axis] != Fault()] == [3]
+    assert bank.faults[3].controller == ControllerError.OVERSPEED
+
+
+def test_position_mode_told_anew_makes_where_the_motor_is_its_target() -> None:
+    bank = make_bank(ControlMode.POSITION, turns=2.0)
+    bank.input_pos[:] = 5.0
+    bank.set_modes(1, ControlMode.POSITION, InputMode.PASSTHROUGH)
+    bank.set_modes(2, ControlMode.VELOCITY, InputMode.PASSTHROUGH)
+    assert list(bank.input_pos[:3]) == [5.0, 2.0, 5.0]
 
 
 def test_speed_below_the_tolerance_keeps_the_axis_armed() -> None:
@@ -261,7 +283,8 @@ def test_a_drive_that_was_zeroed_counts_from_its_mark() -> None:
 def test_a_drive_that_got_power_knows_where_it_is_within_a_turn() -> None:
     bank = AxisBank(DRIVE, encoder_counts_per_turn=CPR, zeroed=False)
     bank.step(0.0, np.linspace(-9.3, 9.2, 12), ZERO)
-    np.testing.assert_allclose(bank.pos_estimate, np.linspace(-9.3, 9.2, 12) % 1.0, atol=1e-4)
+    within = (np.linspace(-9.3, 9.2, 12) + 0.5) % 1.0 - 0.5
+    np.testing.assert_allclose(bank.pos_estimate, within, atol=1e-4)
 
 
 def test_a_restart_loses_the_whole_turns_and_only_of_its_own_drive() -> None:
@@ -270,7 +293,7 @@ def test_a_restart_loses_the_whole_turns_and_only_of_its_own_drive() -> None:
     bank.step(0.0, np.full(12, 5.75), ZERO)
     bank.reboot(4)
     bank.step(DT, np.full(12, 5.75), ZERO)
-    assert bank.pos_estimate[[4, 5]] == pytest.approx([0.75, 0.75])
+    assert bank.pos_estimate[[4, 5]] == pytest.approx([-0.25, -0.25])
     assert np.delete(bank.pos_estimate, [4, 5]) == pytest.approx([69.75] * 10)
 
 
@@ -290,7 +313,7 @@ def test_an_encoder_that_was_lost_comes_back_where_it_was_told_to_be_since() -> 
     bank.step(0.0, ZERO, ZERO)
     bank.conditions.lose_encoder(2, lost=True)
     bank.step(DT, ZERO, ZERO)
-    assert bank.pos_estimate[2] == 0.0
+    assert bank.pos_estimate[2] == 64.0, "it reads what it did"
     bank.set_count(2, 0.0)
     bank.conditions.lose_encoder(2, lost=False)
     bank.step(2 * DT, ZERO, ZERO)

@@ -2,8 +2,9 @@
 
 Firmware 0.5.6; the traps are kept on purpose: OVERSPEED disarms in torque mode too, a
 disarmed axis floats while its sibling keeps its torque, the watchdog runs in IDLE as well,
-re-arming does not zero `input_torque`, errors leave `axis_error` at 0, an encoder that is
-lost reads 0, and a restart brings back what was saved of the settings.
+re-arming does not zero `input_torque`, a mode that is set moves `input_pos` to the motor, an
+axis can be in IDLE with `axis_error` 0, an encoder that is lost goes on reading what it did and
+is back without the turns made meanwhile, and a restart brings back what was saved of the settings.
 
 Pure: no clock, no I/O. Axes 2i and 2i + 1 are axis0 and axis1 of module i, one ODrive.
 Units at the motor: turns, turn/s, N m, A.
@@ -20,14 +21,13 @@ from numpy.typing import NDArray
 from services.simulator.axis_calibration import SEQUENCES, Calibration
 from services.simulator.axis_conditions import Conditions
 from services.simulator.axis_control import AxisControl
-from services.simulator.axis_faults import AXIS_NAMES, BUS_FAULTS, FAULTS, Fault
+from services.simulator.axis_faults import AXIS_NAMES, BUS_FAULTS, FAULTS, Fault, controller_fault
 from services.simulator.axis_settings import Settings, configured
 from services.simulator.dc_bus import DEAD_VOLTAGE, DcBus
 from shared.cansimple import (
     AxisError,
     AxisState,
     ControllerError,
-    ControlMode,
     Heartbeat,
     InputMode,
 )
@@ -89,7 +89,7 @@ class AxisBank:
         self.vel_integrator_gain = control.vel_integrator_gain
         self.vel_limit, self.current_lim = control.vel_limit, control.current_lim
         self.pos_estimate, self.vel_estimate = control.pos_estimate, control.vel_estimate
-        self.encoder_turns = control.turns
+        self.encoder_turns, self.connected = control.turns, control.connected
         self.now_s = -math.inf
         self.calibration = Calibration(self.settings)
         self.conditions = Conditions(self.settings, control)
@@ -168,13 +168,17 @@ class AxisBank:
             self._fail(axis, Fault(AxisError.INVALID_STATE))
 
     def set_modes(self, axis: int, control_mode: int, input_mode: int) -> None:
-        """Set the controller's modes; only PASSTHROUGH is emulated, others are an error."""
+        """Set the controller's modes; only PASSTHROUGH is emulated, others are an error.
+
+        Position mode, also where it was on already, sets `input_pos` to where the motor is.
+        """
         if input_mode != InputMode.PASSTHROUGH or control_mode not in (1, 2, 3):
-            self._fail(axis, Fault(controller=ControllerError.INVALID_INPUT_MODE))
+            self._fail(axis, controller_fault(ControllerError.INVALID_INPUT_MODE))
             return
         below = f"axis{axis & 1}.controller.config"
         self.settings.set(axis >> 1, f"{below}.control_mode", control_mode)
         self.settings.set(axis >> 1, f"{below}.input_mode", input_mode)
+        self._control.stay(axis)
 
     def set_count(self, axis: int, count: float) -> None:
         """Tell an axis that its encoder reads so many counts here; `input_pos` stays."""
@@ -204,6 +208,7 @@ class AxisBank:
             self.state[each] = AxisState.UNDEFINED
             self.faults[each] = Fault()
             self.input_pos[each] = self.input_vel[each] = self.input_torque[each] = 0.0
+            self._control.connected[each] = 0.0
         self.settings.restore(drive)
         for each in _both(axis):
             self.calibration.restart(each)
@@ -288,11 +293,8 @@ class AxisBank:
 
     def _arm(self, axis: int) -> None:
         """Enter closed loop; `input_torque` is left as it stands, as the firmware does."""
-        if self.control_mode[axis] >= ControlMode.POSITION:
-            self.input_pos[axis] = self.pos_estimate[axis]
-        self._control.integrator[axis] = 0.0
+        self._control.arm(axis)
         self.state[axis] = AxisState.CLOSED_LOOP_CONTROL
-        self._control.armed[axis] = 1.0
         self.feed(axis)
 
     def _disarm(self, axis: int) -> None:

@@ -87,7 +87,8 @@ class Calibration:
         task = self.running[axis]
         of_encoder = task.state == AxisState.ENCODER_OFFSET_CALIBRATION
         if of_encoder and abs(turns - task.start_turns) > SLIP:
-            return Fault(encoder=EncoderError.CPR_POLEPAIRS_MISMATCH)
+            failed = AxisError.ENCODER_FAILED
+            return Fault(failed, encoder=EncoderError.CPR_POLEPAIRS_MISMATCH)
         if now_s < task.until_s:
             return task.state
         (self.encoder if of_encoder else self.motor)[axis] = True

@@ -81,6 +81,7 @@ class Conditions:
         """Take an axis's encoder away, or bring it back."""
         if lost:
             self.blind.add(axis)
+            self._control.blind(axis)  # what it says now it goes on saying
         elif axis in self.blind:
             self.blind.remove(axis)
             self._control.see_again(axis)
@@ -99,7 +100,7 @@ class Conditions:
         (self._hot.add if over else self._hot.discard)(axis)
 
     def failing(self) -> list[tuple[int, Fault]]:
-        """Return the axes that a condition disarms, and with what; blind ones read 0."""
+        """Return the axes that a condition disarms, and with what; blind ones stand still."""
         for axis in self.blind:
             self._control.blind(axis)
         failing = [(axis, FAULTS["ENCODER"]) for axis in sorted(self.blind)]

@@ -1,9 +1,13 @@
 """Estimators and control law of the emulated axes, as arrays (design section 5).
 
 Firmware 0.5.6, pass-through: torque = input_torque + vel_gain (clamp(input_vel +
-pos_gain (input_pos - pos)) - vel) + integrator, clamped to current_lim. The firmware runs
-its loop at 8 kHz; here it is evaluated once a step, with filters discretised exactly for the
-step's length.
+pos_gain (input_pos - pos)) - vel) + integrator, clamped to current_lim; input_vel and
+input_torque are each clamped to the same limits first. The firmware runs its loop at 8 kHz;
+here it is evaluated once a step, with filters discretised exactly for the step's length.
+
+Left out, each below what a joint feels: the firmware's estimate moves in quanta (one count in
+position, 0.0076 turn/s in velocity, which snaps to 0 below half of that), and the current
+follows its set-point with the current loop's 1 ms; here a step's torque is at once there.
 
 Pure: no clock, no I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns,
 turn/s, N m, A.
@@ -12,7 +16,7 @@ turn/s, N m, A.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +30,18 @@ Vector = NDArray[np.float64]
 FIRMWARE_RATE_HZ: Final = 8000.0
 INTEGRATOR_DECAY: Final = 0.99
 """Per firmware cycle in which the torque is limited."""
+
+
+class _LostEncoder(NamedTuple):
+    """What is left of an encoder that has stopped answering."""
+
+    at: int
+    """Its count then."""
+    said: int | None
+    """What it counts from when it is back; None: from its place within a turn."""
+    pos: float
+    vel: float
+    """The last estimates, turns and turn/s."""
 
 
 class AxisControl:
@@ -48,10 +64,14 @@ class AxisControl:
         self.torque = np.zeros(n)
         self.armed = np.zeros(n)
         """1.0 in closed loop: also the factor of the torque."""
+        self.connected = np.zeros(n)
+        """1.0 once in closed loop since it started up: from then on the controller sees the
+        encoder, in IDLE as well."""
         self.derating = np.ones(n)
         """What heat leaves of current_lim, where `derated`."""
         self.derated = False
         self.integrator = np.zeros(n)
+        self._lost: dict[int, _LostEncoder] = {}
         self.counts_from = np.zeros(n)
         """What each encoder's count says at the true zero: whole counts."""
         self._rows = np.zeros((4, n))  # estimates of position and velocity; turns before and now
@@ -63,6 +83,7 @@ class AxisControl:
         self._dt_s = 0.0
         self._decay = 1.0
         self._work, self._high, self._low = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._torque_lim, self._torque_min = np.zeros(n), np.zeros(n)
         self._speed = np.zeros(n)
 
     def start(self, pos_turns: Vector, vel_turns: Vector) -> None:
@@ -76,24 +97,41 @@ class AxisControl:
         """Have an axis's encoder read so many counts here, as `set_linear_count` does."""
         if self._seen != self._settings.version:
             self._derive()
+        if axis in self._lost:  # the estimates follow when it is back
+            self._lost[axis] = self._lost[axis]._replace(said=round(count))
+            return
         cpr = self._cpr[axis]
-        self.counts_from[axis] += round(count) - round(self._rows[3, axis] * cpr)
+        self.counts_from[axis] += round(count) - self._counted(axis)
         self._rows[2:, axis] = self._rows[0, axis] = round(count) / cpr
 
     def lose_turns(self, axis: int) -> None:
         """Have an axis's encoder know no more than where it is within a turn, as at power-up."""
         if self._seen != self._settings.version:
             self._derive()
-        count = round(self._rows[3, axis] * self._cpr[axis] - self.counts_from[axis])
-        self.set_count(axis, count % self._counts_per_turn)
+        if axis in self._lost:
+            self._lost[axis] = _LostEncoder(0, None, 0.0, 0.0)
+            return
+        count = self._counted(axis) - round(self.counts_from[axis])
+        self.set_count(axis, self._within_a_turn(count))
 
     def blind(self, axis: int) -> None:
-        """Take an axis's estimates away: the firmware then reports zeros."""
-        self._rows[:3, axis] = 0.0
+        """Hold an axis's estimates: the firmware goes on reporting the last it had."""
+        lost = self._lost.get(axis)
+        if lost is None:
+            at, (pos, vel) = self._counted(axis), self._rows[:2, axis].tolist()
+            self._lost[axis] = lost = _LostEncoder(at, at, pos, vel)
+        self._rows[:2, axis] = lost.pos, lost.vel
 
     def see_again(self, axis: int) -> None:
-        """Start an axis's estimates anew at the encoder's count."""
-        self._rows[(0, 2), axis] = self._rows[3, axis]
+        """Start an axis's estimates anew; turns that it made meanwhile nobody has counted."""
+        lost = self._lost.pop(axis, None)
+        if lost is None:
+            return
+        if lost.said is None:
+            self.lose_turns(axis)
+        else:
+            moved = self._counted(axis) - lost.at
+            self.set_count(axis, lost.said + self._within_a_turn(moved))
         self._rows[1, axis] = 0.0
 
     def estimate(self, dt_s: float, pos_turns: Vector) -> None:
@@ -124,27 +162,47 @@ class AxisControl:
         return bool(np.count_nonzero(self._speed > self._high))
 
     def overspeed(self) -> list[int]:
-        """Return the axes in closed loop that are beyond their OVERSPEED limit."""
-        return np.flatnonzero((self._speed > self._high) * self.armed).tolist()
+        """Return the axes beyond their OVERSPEED limit; in IDLE it is checked all the same."""
+        return np.flatnonzero((self._speed > self._high) * self.connected).tolist()
+
+    def stay(self, axis: int) -> None:
+        """Make where the motor is its target, in position mode: `control_mode_updated`."""
+        if self.control_mode[axis] >= ControlMode.POSITION:
+            self.input_pos[axis] = self.pos_estimate[axis]
+
+    def arm(self, axis: int) -> None:
+        """Let an axis's torque through, from where it is; `input_torque` stays as it stands."""
+        self.stay(axis)
+        self.integrator[axis] = 0.0
+        self.armed[axis] = self.connected[axis] = 1.0
 
     def control(self) -> None:
         """Write the firmware's law to `torque`, zero where an axis is not in closed loop."""
         if self._seen != self._settings.version:
             self._derive()
-        torque = self.torque
-        torque[:] = self.input_torque
-        if self._any_torque_limited:
-            self._limit_torque_mode()
-        limit = self._high
+        torque, limit, low = self.torque, self._torque_lim, self._torque_min
         np.multiply(self.current_lim, self._torque_constant, out=limit)
         if self.derated:
             limit *= self.derating
+        np.negative(limit, out=low)
+        np.minimum(self.input_torque, limit, out=torque)
+        np.maximum(torque, low, out=torque)
+        if self._any_torque_limited:
+            self._limit_torque_mode()
         if self._any_regulates:
-            self._regulate(limit)
+            self._regulate()
         np.minimum(torque, limit, out=torque)
-        np.negative(limit, out=limit)
-        np.maximum(torque, limit, out=torque)
+        np.maximum(torque, low, out=torque)
         torque *= self.armed
+
+    def _counted(self, axis: int) -> int:
+        """Return an axis's encoder's count."""
+        return round(float(self._rows[3, axis] * self._cpr[axis]))
+
+    def _within_a_turn(self, count: int) -> int:
+        """Return the count that an absolute encoder, which knows no turns, is taken to be at."""
+        half = self._counts_per_turn // 2
+        return half - (half - count) % self._counts_per_turn
 
     def _count(self, pos_turns: Vector) -> None:
         """Write the encoder's whole counts, in turns as the setting `cpr` has them."""
@@ -222,16 +280,18 @@ class AxisControl:
         else:
             np.copyto(self.torque, limited, where=self._torque_limited)
 
-    def _regulate(self, torque_lim: Vector) -> None:
+    def _regulate(self) -> None:
         """Add the velocity loop, under it the position loop, where the mode has them."""
-        v_err, low = self._work, self._low
+        v_err, high, low = self._work, self._high, self._low
         np.subtract(self.input_pos, self.pos_estimate, out=v_err)
         v_err *= self.pos_gain
         if not self._all_position:
             v_err *= self._positions
-        v_err += self.input_vel
-        np.minimum(v_err, self._vel_clamp, out=v_err)
         np.negative(self._vel_clamp, out=low)
+        np.minimum(self.input_vel, self._vel_clamp, out=high)
+        np.maximum(high, low, out=high)
+        v_err += high
+        np.minimum(v_err, self._vel_clamp, out=v_err)
         np.maximum(v_err, low, out=v_err)
         v_err -= self.vel_estimate
         if not self._all_regulate:
@@ -239,12 +299,12 @@ class AxisControl:
         np.multiply(v_err, self.vel_gain, out=low)
         self.torque += low
         if np.count_nonzero(self.vel_integrator_gain) or np.count_nonzero(self.integrator):
-            self._integrate(v_err, torque_lim)
+            self._integrate(v_err)
 
-    def _integrate(self, v_err: Vector, torque_lim: Vector) -> None:
+    def _integrate(self, v_err: Vector) -> None:
         """Add the integrator to the torque and run it on; it decays where that is limited."""
         self.torque += self.integrator
-        limited = np.abs(self.torque) > torque_lim
+        limited = np.abs(self.torque) > self._torque_lim
         v_err *= self.vel_integrator_gain
         v_err *= self._dt_s
         v_err *= self.armed

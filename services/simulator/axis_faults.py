@@ -1,7 +1,8 @@
 """Error registers of the emulated drives, and faults by name.
 
-What firmware 0.5.6 leaves in its registers. There `disarm_with_error` of the motor sets the
-motor's register alone: `axis.error` stays 0 while the axis is disarmed.
+What firmware 0.5.6 leaves in its registers. What fails in the motor, the encoder or the
+controller is in `axis.error` too (up to 0.5.4 that stayed 0); a controller that fails gives no
+torque, so the motor misses its command in the same cycle.
 """
 
 from __future__ import annotations
@@ -37,21 +38,27 @@ class Fault(NamedTuple):
         return Fault(*(a | b for a, b in zip(self, other, strict=True)))
 
 
+def _motor(error: MotorError) -> Fault:
+    return Fault(AxisError.MOTOR_FAILED, motor=error)
+
+
+def controller_fault(error: ControllerError) -> Fault:
+    """Return what is left of a controller that fails: it gives no torque."""
+    no_command = MotorError.UNKNOWN_TORQUE | MotorError.UNKNOWN_VOLTAGE_COMMAND
+    axis = AxisError.CONTROLLER_FAILED | AxisError.MOTOR_FAILED
+    return Fault(axis, motor=no_command, controller=error)
+
+
 FAULTS: Final[Mapping[str, Fault]] = {
     "DISARM": Fault(),
-    "OVERSPEED": Fault(motor=MotorError.CONTROLLER_FAILED, controller=ControllerError.OVERSPEED),
-    "SPINOUT": Fault(
-        motor=MotorError.CONTROLLER_FAILED, controller=ControllerError.SPINOUT_DETECTED
+    "OVERSPEED": controller_fault(ControllerError.OVERSPEED),
+    "SPINOUT": controller_fault(ControllerError.SPINOUT_DETECTED),
+    "DRV_FAULT": _motor(MotorError.DRV_FAULT),
+    "REGENERATION": _motor(MotorError.I_BUS_OUT_OF_RANGE),
+    "ENCODER": controller_fault(ControllerError.INVALID_ESTIMATE).with_(
+        Fault(AxisError.ENCODER_FAILED, encoder=EncoderError.ABS_SPI_COM_FAIL)
     ),
-    "DRV_FAULT": Fault(motor=MotorError.DRV_FAULT),
-    "REGENERATION": Fault(motor=MotorError.I_BUS_OUT_OF_RANGE),
-    "ENCODER": Fault(
-        AxisError.ENCODER_FAILED,
-        motor=MotorError.UNKNOWN_PHASE_ESTIMATE,
-        encoder=EncoderError.NO_RESPONSE,
-        controller=ControllerError.INVALID_ESTIMATE,
-    ),
-    "OVER_TEMP": Fault(motor=MotorError.FET_THERMISTOR_OVER_TEMP),
+    "OVER_TEMP": _motor(MotorError.FET_THERMISTOR_OVER_TEMP),
     "WATCHDOG": Fault(AxisError.WATCHDOG_TIMER_EXPIRED),
     "ESTOP": Fault(AxisError.ESTOP_REQUESTED),
 }
@@ -62,7 +69,7 @@ DISARM is the silent one: IDLE and no error at all.
 
 
 def _system(error: OdriveError) -> Fault:
-    return Fault(motor=MotorError.SYSTEM_LEVEL, odrive=error)
+    return _motor(MotorError.SYSTEM_LEVEL)._replace(odrive=error)
 
 
 BUS_FAULTS: Final[Mapping[str, Fault]] = {

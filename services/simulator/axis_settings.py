@@ -6,6 +6,10 @@ its limits from the columns, a front reads and writes single values by name.
 
 Source: the configuration structs of firmware 0.5.6 (odriverobotics/ODrive). The over-voltage
 level is that of the 56 V board.
+
+The spinout thresholds are kept and not acted on: the emulated windings do not warm, so that
+SPINOUT_DETECTED comes by injection only. `encoder.config.direction` has no effect on the motion,
+as on a calibrated drive; it is the sign that currents are reported with.
 """
 
 from __future__ import annotations
@@ -53,6 +57,8 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "controller.config.enable_vel_limit": True,
     "controller.config.enable_overspeed_error": True,
     "controller.config.enable_torque_mode_vel_limit": True,
+    "controller.config.spinout_electrical_power_threshold": 10.0,
+    "controller.config.spinout_mechanical_power_threshold": -10.0,
     "motor.config.pre_calibrated": False,
     "motor.config.pole_pairs": 7,
     "motor.config.torque_constant": 0.04,
@@ -64,6 +70,7 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "encoder.config.mode": 0,
     "encoder.config.cpr": 8192,
     "encoder.config.bandwidth": 1000.0,
+    "encoder.config.direction": 0,
     "encoder.config.pre_calibrated": False,
 }
 """Of each axis, below `axis0.` and `axis1.`: the default, whose type is the setting's."""
@@ -88,6 +95,8 @@ NAMES: Final = (
 
 PHASE_RESISTANCE: Final = 0.1
 """ohm; assumed, of a motor with this torque constant. Calibration finds it, nobody sets it."""
+DIRECTION: Final = 1
+"""+1 or -1 by how a motor's phases are wired. Calibration finds it, nobody sets it."""
 
 _TRUTH: Final = {"true": True, "false": False}
 
@@ -145,6 +154,15 @@ class Settings:
         column[row] = bool(value) if isinstance(default, bool) else number
         self.version += 1
 
+    def current(self, axis: int, torque: float) -> float:
+        """Return the current that an axis (0 .. 11) reports for a motor torque, A.
+
+        The firmware turns the torque round where the encoder's calibration has found that the
+        phases are wired the other way (Motor::update), so the current has that sign.
+        """
+        amperes = float(torque / self._axes["motor.config.torque_constant"][axis])
+        return -amperes if self._axes["encoder.config.direction"][axis] < 0.0 else amperes
+
     def table(self, drive: int) -> dict[str, Value]:
         """Return every setting of a drive by name."""
         return {name: self.get(drive, name) for name in NAMES}
@@ -185,6 +203,7 @@ def configured(
     for name, value in drive_settings.of_every_drive(need).items():
         settings.fill(name, value)
     settings.fill("motor.config.phase_resistance", PHASE_RESISTANCE)
+    settings.fill("encoder.config.direction", DIRECTION)
     for index in range(N_DRIVES):
         settings.save(index)
     return settings

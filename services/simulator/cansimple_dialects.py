@@ -1,7 +1,8 @@
 """The two dialects of CANSimple as the emulated drives speak them.
 
-Firmware 0.5 and 0.6 share set-points, limits, gains and estimates; `DIALECTS` holds what
-differs. Endpoint ids of 0.6 come with each firmware's `flat_endpoints.json`; the emulation's
+Firmware 0.5 and 0.6 share set-points, limits and gains; `DIALECTS` holds what differs. A trap of
+0.5.6: its encoder frames say 0, 0 from each start-up until the first closed loop.
+Endpoint ids of 0.6 come with each firmware's `flat_endpoints.json`; the emulation's
 are `SDO_ENDPOINTS`.
 """
 
@@ -11,6 +12,9 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_faults import Fault
@@ -36,6 +40,7 @@ from shared.cansimple_06 import (
 from shared.exceptions import DriveError
 
 DialectName = Literal["0.5", "0.6"]
+Vector = NDArray[np.float64]
 Answer = Callable[[AxisBank, int], bytes]
 Setter = Callable[[AxisBank, int, bytes], None]
 
@@ -48,7 +53,7 @@ _ERRORS_06: Final[tuple[tuple[str, int, DriveError06], ...]] = (
     ("motor", MotorError.FET_THERMISTOR_OVER_TEMP, DriveError06.INVERTER_OVER_TEMP),
     ("motor", MotorError.MOTOR_THERMISTOR_OVER_TEMP, DriveError06.MOTOR_OVER_TEMP),
     ("motor", MotorError.I_BUS_OUT_OF_RANGE, DriveError06.DC_BUS_OVER_REGEN_CURRENT),
-    ("encoder", EncoderError.NO_RESPONSE, DriveError06.MISSING_ESTIMATE),
+    ("encoder", EncoderError.ABS_SPI_COM_FAIL, DriveError06.MISSING_ESTIMATE),
     ("encoder", EncoderError.CPR_POLEPAIRS_MISMATCH, DriveError06.CALIBRATION_ERROR),
     ("controller", ControllerError.OVERSPEED, DriveError06.VELOCITY_LIMIT_VIOLATION),
     ("controller", ControllerError.INVALID_INPUT_MODE, DriveError06.BAD_CONFIG),
@@ -72,6 +77,8 @@ class Dialect(NamedTuple):
     """What a firmware reports and takes in its own way."""
 
     heartbeat: Answer
+    estimates: Callable[[AxisBank], tuple[Vector, Vector]]
+    """Position and velocity of all axes (12,) as their frames have them."""
     answers: Mapping[int, Answer]
     """By command, to a request for data."""
     sdo: Callable[[AxisBank, int, bytes], bytes | None] | None
@@ -110,7 +117,22 @@ def _heartbeat_06(bank: AxisBank, axis: int) -> bytes:
     )
 
 
-def _encoder_estimates(bank: AxisBank, axis: int) -> bytes:
+def _estimates_05(bank: AxisBank) -> tuple[Vector, Vector]:
+    """Return what the controllers see: 0.5.6 asks them, and they see nothing before they ran."""
+    connected = bank.connected > 0.0
+    return np.where(connected, bank.pos_estimate, 0.0), np.where(connected, bank.vel_estimate, 0.0)
+
+
+def _estimates_06(bank: AxisBank) -> tuple[Vector, Vector]:
+    return bank.pos_estimate, bank.vel_estimate
+
+
+def _encoder_estimates_05(bank: AxisBank, axis: int) -> bytes:
+    pos, vel = _estimates_05(bank)
+    return cansimple.pack_two_floats(pos[axis], vel[axis])
+
+
+def _encoder_estimates_06(bank: AxisBank, axis: int) -> bytes:
     return cansimple.pack_two_floats(bank.pos_estimate[axis], bank.vel_estimate[axis])
 
 
@@ -121,7 +143,7 @@ def _encoder_count(bank: AxisBank, axis: int) -> bytes:
 
 
 def _iq(bank: AxisBank, axis: int) -> bytes:
-    iq = bank.torque[axis] / bank.settings.axis("motor.config.torque_constant")[axis]
+    iq = bank.settings.current(axis, bank.torque[axis])
     return cansimple.pack_two_floats(iq, iq)
 
 
@@ -207,7 +229,6 @@ def sdo_layout(value: Value) -> str:
 
 
 _BOTH: Final[Mapping[int, Answer]] = {
-    Command.GET_ENCODER_ESTIMATES: _encoder_estimates,
     Command.GET_IQ: _iq,
     Command.GET_VBUS: _vbus,
 }
@@ -215,8 +236,10 @@ _BOTH: Final[Mapping[int, Answer]] = {
 DIALECTS: Final[Mapping[DialectName, Dialect]] = {
     "0.5": Dialect(
         _heartbeat_05,
+        _estimates_05,
         {
             **_BOTH,
+            Command.GET_ENCODER_ESTIMATES: _encoder_estimates_05,
             Command.GET_MOTOR_ERROR: _motor_error,
             Command.GET_ENCODER_ERROR: _encoder_error,
             Command.GET_ENCODER_COUNT: _encoder_count,
@@ -227,8 +250,10 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
     ),
     "0.6": Dialect(
         _heartbeat_06,
+        _estimates_06,
         {
             **_BOTH,
+            Command.GET_ENCODER_ESTIMATES: _encoder_estimates_06,
             Command06.GET_VERSION: _version,
             Command06.GET_ERROR: _error,
             Command06.GET_TEMPERATURE: _temperature,

@@ -91,8 +91,7 @@ class CanSimpleFront:
         self._read_periods()
         now_s, silent = bank.now_s, bank.conditions.silent
         due_s, periods_s = self._next_encoder_s, self._encoder_periods_s
-        pos = bank.pos_estimate.tolist()
-        vel = bank.vel_estimate.tolist()
+        pos, vel = (column.tolist() for column in self._dialect.estimates(bank))
         for bus in self._buses:
             if not bus.hub.clients:
                 continue

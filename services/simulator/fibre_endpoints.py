@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_settings import AXIS_SETTINGS, DRIVE_SETTINGS, Value
-from shared.cansimple import AxisState
+from shared.cansimple import AxisState, InputMode
 
 AXES: Final = (0, 1)
 HARDWARE: Final = (3, 6, 56)
@@ -41,7 +41,8 @@ _UNSIGNED = {
     "encoder.config.mode": "uint16",
 }
 """Whole settings that are not an int32."""
-_MODES = ("controller.config.control_mode", "controller.config.input_mode")
+_INPUT_MODE = "controller.config.input_mode"
+_MODES = ("controller.config.control_mode", _INPUT_MODE)
 
 
 class Board(NamedTuple):
@@ -172,8 +173,7 @@ def _fault(name: str, kind: str, i: int, register: str) -> Property:
 
 def _current(board: Board, i: int) -> float:
     axis = board.axis(i)
-    torque_constant = board.bank.settings.axis("motor.config.torque_constant")[axis]
-    return float(board.bank.torque[axis] / torque_constant)
+    return board.bank.settings.current(axis, board.bank.torque[axis])
 
 
 def _input(name: str, i: int) -> Property:
@@ -201,9 +201,9 @@ def _setting(name: str, default: Value) -> Property:
 
 
 def _set(board: Board, name: str, value: Value) -> None:
-    """Set a setting; the modes go through the controller, which knows which there are."""
+    """Set a setting; a mode goes to the controller, which knows which there are."""
     axis, _, below = name.partition(".")
-    if below not in _MODES:
+    if below not in _MODES or (below == _INPUT_MODE and value == InputMode.PASSTHROUGH):
         board.bank.settings.set(board.drive, name, value)
         return
     modes = [int(board.bank.settings.get(board.drive, f"{axis}.{mode}")) for mode in _MODES]

@@ -27,6 +27,8 @@ from services.simulator.fibre_endpoints import (
 from shared.exceptions import DriveError
 
 PROTOCOL_VERSION: Final = 1
+ANSWER_BYTES: Final = 62
+"""What a packet of 64 bytes carries behind the sequence number; a longer answer is cut."""
 
 _CRC16_POLYNOMIAL = 0x3D65
 _ANSWER = 0x8000
@@ -76,15 +78,11 @@ class FibreFront:
         (trailer,) = _U16.unpack_from(packet, len(packet) - _U16.size)
         payload = packet[_HEADER.size : -_U16.size]
         number = endpoint & ~_ANSWER
-        known = number <= len(self._rows)
-        if (
-            sequence & _ANSWER
-            or not known
-            or trailer != (self._crc if number else PROTOCOL_VERSION)
-        ):
+        if sequence & _ANSWER or trailer != (self._crc if number else PROTOCOL_VERSION):
             self.ignored += 1
             return None
-        result = self._operate(number, payload)[:size]
+        known = number <= len(self._rows)  # of any other the firmware has nothing to say
+        result = self._operate(number, payload)[: min(size, ANSWER_BYTES)] if known else b""
         if not endpoint & _ANSWER:
             return None
         return _U16.pack(sequence | _ANSWER) + result

@@ -18,6 +18,8 @@ TRAPS = {
     "axis0.controller.config.enable_torque_mode_vel_limit": True,
     "axis0.controller.config.vel_limit_tolerance": 1.2,
     "axis0.motor.config.current_lim": 10.0,
+    "axis0.controller.config.spinout_electrical_power_threshold": 10.0,
+    "axis0.controller.config.spinout_mechanical_power_threshold": -10.0,
     "axis0.config.can.encoder_rate_ms": 10,
     "axis0.config.enable_watchdog": False,
     "axis0.config.watchdog_timeout": 0.0,
@@ -77,6 +79,20 @@ def test_a_wrong_name_or_value_is_refused_with_what_would_be_right(
 ) -> None:
     with pytest.raises(DriveError, match=says):
         Settings().set(0, name, value)
+
+
+@pytest.mark.parametrize(("direction", "sign"), [(1, 1.0), (-1, -1.0), (0, 1.0)])
+def test_a_current_has_the_sign_of_the_phases_and_the_motor_none_of_it(
+    direction: int, sign: float
+) -> None:
+    """Motor::update turns the torque round, and the phases turn it back."""
+    bank = make_bank()
+    bank.settings.set(0, "axis1.encoder.config.direction", direction)
+    bank.input_torque[:2] = 0.0827
+    torque = step_for(bank, DT)
+    assert torque[:2] == pytest.approx([0.0827, 0.0827])
+    currents = [bank.settings.current(axis, torque[axis]) for axis in (0, 1)]
+    assert currents == pytest.approx([1.0, sign])
 
 
 def test_a_restart_brings_back_what_was_saved() -> None:

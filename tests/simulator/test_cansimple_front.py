@@ -24,7 +24,7 @@ from shared.cansimple import AxisState, Command, arbitration_id
 from shared.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode
 from shared.unix_can import REMOTE_FLAG, UnixCanBus
 from shared.unix_can_hub import UnixCanHub
-from tests.simulator.banks import DT, ZERO, make_bank
+from tests.simulator.banks import CPR, DT, ZERO, make_bank
 
 NODE, AXIS = 5, 3  # axis1 of knee_right
 
@@ -193,9 +193,32 @@ def test_an_endpoint_that_does_not_exist_and_a_value_that_is_no_number_change_no
     assert new.bank.settings.table(1) == before
 
 
+@pytest.mark.parametrize("dialect", ["0.5", "0.6"])
+def test_in_0_5_estimates_are_zeros_from_each_start_up_to_the_first_closed_loop(
+    directory: Path, dialect: DialectName
+) -> None:
+    for bench_ in bench(directory, dialect):
+        bank = bench_.bank
+        bank.connected[AXIS] = 0.0  # the bench has armed it
+        bank.set_count(AXIS, 7 * CPR)
+        silent = bytes(8) if dialect == "0.5" else struct.pack("<ff", 7.0, 0.0)
+        assert bench_.ask(Command.GET_ENCODER_ESTIMATES) == silent
+        bank.request_state(AXIS, AxisState.CLOSED_LOOP_CONTROL)
+        bank.request_state(AXIS, AxisState.IDLE)
+        assert bench_.ask(Command.GET_ENCODER_ESTIMATES) == struct.pack("<ff", 7.0, 0.0)
+        bank.reboot(AXIS)
+        assert bank.connected[AXIS] == 0.0
+
+
+def test_in_0_5_the_count_says_where_an_axis_is_that_was_never_armed(old: Bench) -> None:
+    old.bank.connected[AXIS] = 0.0
+    old.bank.set_count(AXIS, 7 * CPR + 5)
+    assert old.ask(Command.GET_ENCODER_COUNT) == struct.pack("<ii", 7 * CPR + 5, 5)
+
+
 def test_in_0_5_the_same_frame_asks_for_the_encoders_error(old: Bench) -> None:
     old.bank.inject("knee_right.axis1", "ENCODER")
-    assert old.ask(Command.GET_ENCODER_ERROR) == struct.pack("<II", 4, 0)
+    assert old.ask(Command.GET_ENCODER_ERROR) == struct.pack("<II", 0x80, 0)
 
 
 # ---- silence
@@ -214,6 +237,16 @@ def test_a_drive_that_does_not_talk_neither_sends_nor_hears_nor_feeds(old: Bench
     old.send(Command.GET_IQ, remote=True)
     assert old.heard() == []
     assert old.bank.input_torque[AXIS] == 0.0
+
+
+def test_a_current_has_the_sign_that_the_encoders_calibration_found(old: Bench) -> None:
+    """CAN of 0.5 has no way to ask for it."""
+    old.bank.input_torque[AXIS] = 0.0827
+    for direction, sign in ((1, 1.0), (-1, -1.0)):
+        old.bank.settings.set(AXIS // 2, "axis1.encoder.config.direction", direction)
+        old.step()
+        assert old.bank.torque[AXIS] == pytest.approx(0.0827)
+        assert cansimple.unpack_two_floats(old.ask(Command.GET_IQ)) == pytest.approx((sign, sign))
 
 
 def test_a_drive_sends_again_when_its_cable_is_back(old: Bench) -> None:

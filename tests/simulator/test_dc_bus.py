@@ -9,7 +9,7 @@ import pytest
 
 from services.simulator.axis_settings import PHASE_RESISTANCE
 from services.simulator.dc_bus import SUPPLY_RESISTANCE, SUPPLY_VOLTAGE
-from shared.cansimple import AxisState, MotorError, OdriveError
+from shared.cansimple import AxisError, AxisState, MotorError, OdriveError
 from tests.simulator.banks import DT, make_bank, step_for
 
 KT = 0.0827
@@ -49,7 +49,7 @@ def test_with_the_limit_as_shipped_a_braking_leg_disarms_both_axes() -> None:
         assert bank.state[axis] == AxisState.IDLE
         assert bank.faults[axis].motor & MotorError.SYSTEM_LEVEL
         assert bank.faults[axis].odrive == OdriveError.DC_BUS_OVER_REGEN_CURRENT
-        assert bank.heartbeat(axis).axis_error == 0, "the trap: only the motor's flag shows it"
+        assert bank.heartbeat(axis).axis_error == AxisError.MOTOR_FAILED
     assert bank.state[6] == AxisState.CLOSED_LOOP_CONTROL
 
 

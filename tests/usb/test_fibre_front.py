@@ -148,6 +148,15 @@ def test_the_answer_is_no_longer_than_asked_for(client: Client) -> None:
     assert [len(client.operate(number, size)) for size in (0, 2, 4, 8)] == [0, 2, 4, 4]
 
 
+def test_the_answer_is_no_longer_than_a_packet_holds(client: Client) -> None:
+    assert client.operate(0, 512, struct.pack("<I", 3)) == client.front.descriptor[3:65]
+
+
+def test_an_endpoint_that_does_not_exist_has_an_empty_answer(client: Client) -> None:
+    assert client.operate(1 + max(row["id"] for row in client.endpoints.values()), 4) == b""
+    assert client.operate(0x7FFF, 4) == b""
+
+
 def test_a_request_that_wants_no_answer_is_carried_out(client: Client, bank: AxisBank) -> None:
     number = client.endpoints["axis0.controller.input_vel"]["id"]
     packet = struct.pack("<HHHfH", 0x81, number, 0, 1.5, client.trailer)
@@ -204,6 +213,16 @@ def test_a_mode_that_is_not_there_is_an_error(client: Client, bank: AxisBank) ->
     client.exchange("axis0.controller.config.input_mode", 5)
     assert client.exchange("axis0.controller.error") == 2
     assert client.exchange("axis0.controller.config.input_mode") == 1
+
+
+def test_position_mode_written_makes_where_the_motor_is_its_target(
+    client: Client, bank: AxisBank
+) -> None:
+    bank.input_pos[:] = 3.0
+    client.exchange("axis0.controller.config.input_mode", 1)
+    assert client.exchange("axis0.controller.input_pos") == 3.0
+    client.exchange("axis0.controller.config.control_mode", 3)
+    assert client.exchange("axis0.controller.input_pos") == 0.0
 
 
 def test_a_setting_that_is_no_number_is_not_taken(client: Client, bank: AxisBank) -> None:

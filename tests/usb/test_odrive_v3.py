@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.drivers.base import MotorTarget
-from services.joint.drivers.odrive_v3 import GAIN_STEP, TargetWriter, values_of
+from services.joint.drivers.odrive_v3 import OdriveV3, TargetWriter, values_of
 
 FLOAT = SimpleNamespace(struct_format="f", size=4)
 PROPERTIES = [SimpleNamespace(endpoint_id=number, codec=FLOAT) for number in range(8)]
@@ -67,16 +67,14 @@ def test_then_only_what_is_new_is_written(wire: Wire, writer: TargetWriter) -> N
     assert wire.values[3] == -0.25
 
 
-def test_a_gain_is_written_when_it_differs_enough_from_the_drives(
+def test_gains_are_written_when_they_change_by_however_little(
     wire: Wire, writer: TargetWriter
 ) -> None:
+    """The law has its own threshold, and works its torques out for the gains it asked for."""
     asyncio.run(writer.write(TARGET))
-    wire.last = []
-    for step in range(10):
-        gain = 20.0 * (1.0 + 0.3 * GAIN_STEP * step)
-        asyncio.run(writer.write(changed(pos_gain=(gain, 20.0))))
-        assert wire.values[4] == pytest.approx(gain, rel=1.1 * GAIN_STEP)
+    asyncio.run(writer.write(changed(pos_gain=(20.0 * 1.0001, 20.0))))
     assert wire.last == [4]
+    assert wire.values[4] == pytest.approx(20.0 * 1.0001, rel=1e-7)
 
 
 def test_after_a_failure_everything_is_written_anew(wire: Wire, writer: TargetWriter) -> None:
@@ -89,12 +87,76 @@ def test_after_a_failure_everything_is_written_anew(wire: Wire, writer: TargetWr
     assert wire.last == list(range(8))
 
 
-@given(pos_ref=number, vel_ref=number, torque=number, pos=number, vel=number)
+@given(
+    pos_ref=number, vel_ref=number, torque=number, pos=number, vel=number,
+    k=st.just(0.0) | st.floats(1e-3, 400.0), limit=st.floats(1.0, 100.0),
+)  # fmt: skip
 def test_the_drive_gives_the_targets_torque_without_its_input_vel(
-    pos_ref: float, vel_ref: float, torque: float, pos: float, vel: float
+    pos_ref: float, vel_ref: float, torque: float, pos: float, vel: float, k: float, limit: float
 ) -> None:
-    k, b = 20.0, 0.25
+    """Also where its clamp on the velocity is active; without a pos_gain it is not meant to be."""
+    b = 0.25
+    limit = limit if k else 100.0
     target = MotorTarget((pos_ref,) * 2, (vel_ref,) * 2, (torque,) * 2, (k,) * 2, (b,) * 2)
-    wanted = torque + b * (vel_ref + k * (pos_ref - pos) - vel)
-    input_pos, input_torque, *_ = values_of(target)
-    assert input_torque + b * (0.0 + k * (input_pos - pos) - vel) == pytest.approx(wanted)
+
+    def law(input_pos: float, input_vel: float, input_torque: float) -> float:
+        wanted_vel = min(limit, max(-limit, input_vel + k * (input_pos - pos)))
+        return input_torque + b * (wanted_vel - vel)
+
+    wanted = law(pos_ref, vel_ref, torque)
+    for axis in (0, 1):
+        input_pos, input_torque = values_of(target)[2 * axis : 2 * axis + 2]
+        assert law(input_pos, 0.0, input_torque) == pytest.approx(wanted, abs=1e-9)
+
+
+class Tree:
+    """Stands for the package's device: a tree of properties with values to be read."""
+
+    def __init__(self, values: dict[str, float]) -> None:
+        self.device = self
+        self.serial_number, self.fw_version = "0", (0, 5, 6)
+        self.functions: dict[str, str] = {}
+        self._values = list(values.values())
+        self.properties = {
+            name: SimpleNamespace(endpoint_id=number, codec=FLOAT)
+            for number, name in enumerate(values)
+        }
+
+    async def read_endpoints(self, ids: list[int], _sizes: list[int], transient: bool) -> bytes:
+        assert not transient
+        return struct.pack(f"<{len(ids)}f", *(self._values[number] for number in ids))
+
+
+def board(**values: float) -> OdriveV3:
+    """Return a board with everything the driver uses, and some values below both axes."""
+    names = (
+        "encoder.pos_estimate", "encoder.vel_estimate", "current_state", "error", "motor.error",
+        "encoder.error", "controller.error", "controller.input_pos", "controller.input_torque",
+        "controller.config.pos_gain", "controller.config.vel_gain", "config.enable_watchdog",
+        "encoder.config.cpr",
+    )  # fmt: skip
+    tree = {f"{axis}.{name}": 0.0 for axis in ("axis0", "axis1") for name in names}
+    return OdriveV3(Tree(tree | {name.replace("__", "."): value for name, value in values.items()}))
+
+
+def currents(first: float, second: float) -> dict[str, float]:
+    name = "motor__current_control__Iq_setpoint"
+    return {f"axis0__{name}": first, f"axis1__{name}": second}
+
+
+@pytest.mark.parametrize(("directions", "signs"), [((1, 1), (1, 1)), ((-1, 1), (-1, 1))])
+def test_a_torque_has_its_sign_whichever_way_the_phases_are_wired(
+    directions: tuple[int, int], signs: tuple[int, int]
+) -> None:
+    """The firmware's current is the torque times the encoder's direction (motor.cpp)."""
+    name = "encoder__config__direction"
+    wired = {f"axis{axis}__{name}": value for axis, value in enumerate(directions)}
+    found = board(**currents(10.0, -20.0), **wired)
+    asyncio.run(found.look())
+    torque = asyncio.run(found.torques(0.5))
+    assert torque == (signs[0] * 5.0, signs[1] * -10.0)
+
+
+def test_a_current_that_is_no_number_is_no_torque() -> None:
+    assert asyncio.run(board(**currents(float("nan"), 1.0)).torques(0.5)) is None
+    assert asyncio.run(board(**currents(2.0, 1.0)).torques(0.5)) == (1.0, 0.5)
