@@ -132,6 +132,7 @@ def test_driver_is_a_drive(rig: Rig, driver: OdriveCan) -> None:
 def test_reading_holds_the_positions_and_velocities_of_both_axes(rig: Rig, path: Path) -> None:
     rig.pos[[4, 5]] = 1.5, -2.25
     rig.vel[[4, 5]] = 3.0, -4.0
+    rig.bank.connected[:] = 1.0  # as after a first closed loop: before it 0.5.6 says zeros
     driver = make_driver(path)
     rig.step()
     reading = driver.read(0.5)
@@ -139,6 +140,23 @@ def test_reading_holds_the_positions_and_velocities_of_both_axes(rig: Rig, path:
     assert reading is not None
     assert reading.pos_turns == (1.5, -2.25)
     assert reading.vel_turns == pytest.approx((3.0, -4.0))
+
+
+def test_a_drive_that_was_never_armed_is_where_its_count_says(rig: Rig, path: Path) -> None:
+    rig.pos[[4, 5]] = 64.5, -2.25
+    rig.step()
+    driver = make_driver(path)
+    first = rig.cycle(driver)
+    rig.pos[4] = 64.75
+    rig.cycle(driver)
+    second = rig.cycle(driver)
+    arm(rig, driver)
+    third = rig.cycle(driver)
+    driver.close()
+    assert first.pos_turns == (64.5, -2.25)
+    assert second.pos_turns == (64.75, -2.25)
+    assert first.status == DriveStatus.IDLE
+    assert third.pos_turns == pytest.approx((64.75, -2.25), abs=0.01)
 
 
 def test_arming_brings_both_axes_to_closed_loop_torque_control(rig: Rig, path: Path) -> None:
@@ -421,9 +439,11 @@ def test_front_answers_requests_of_the_drives_registers(rig: Rig, path: Path) ->
         rig.front.receive()
         rig.bank.step(0.0, rig.pos, rig.vel)
         rig.bank.inject("hip_right.axis1", "OVERSPEED")
+        assert ask(rig, client, Command.GET_ENCODER_ESTIMATES) == bytes(8)
+        rig.bank.connected[:] = 1.0  # as after a first closed loop
         assert ask(rig, client, Command.GET_ENCODER_ESTIMATES) == struct.pack("<ff", -0.25, 0.0)
         assert ask(rig, client, Command.GET_ENCODER_COUNT) == struct.pack("<ii", -4096, 12288)
-        assert ask(rig, client, Command.GET_MOTOR_ERROR) == struct.pack("<Q", 0x200000)
+        assert ask(rig, client, Command.GET_MOTOR_ERROR) == struct.pack("<Q", 0x1_1000_0000)
         assert ask(rig, client, Command.GET_CONTROLLER_ERROR) == struct.pack("<II", 1, 0)
         assert ask(rig, client, Command.GET_VBUS) == struct.pack("<ff", 48.0, 0.0)
 

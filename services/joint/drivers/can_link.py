@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Final, TypeAlias
@@ -20,8 +21,9 @@ RETRY_MS: Final = 200
 """Between two attempts to open the bus: on socketcan an attempt may cost a millisecond."""
 ORDERS_MS: Final = 100
 """An order that the bus has not taken by then is given up: it belongs to another moment."""
-KERNEL_FILTERS: Final = ("socketcan",)
-"""Interfaces that throw the other modules' frames away before a process is woken for them."""
+IN_KERNEL: Final = ("socketcan",)
+"""Interfaces whose frames all wait in the kernel, behind one file descriptor: it throws other
+modules' frames away before a process is woken for them, and is waited for by `select`."""
 
 BUS_OFF: Final = 0x40
 """Class of an error frame (linux/can/error.h): the controller has left the bus."""
@@ -70,7 +72,7 @@ class CanLink:
         self.error_frames = 0
         self._config = config
         self._options: dict[str, Any] = {}
-        if config.interface in KERNEL_FILTERS:
+        if config.interface in IN_KERNEL:
             self._options["can_filters"] = filters(node_ids)
         self._bus: can.BusABC | None = None
         self._receive: Receive = _nothing
@@ -109,7 +111,7 @@ class CanLink:
         except (can.CanError, OSError):
             return False
         self.connections += 1
-        self._receive = receiver(self._bus)
+        self._receive = receiver(self._bus, in_kernel=self._config.interface in IN_KERNEL)
         self._send = sender(self._bus)
         return True
 
@@ -198,13 +200,22 @@ def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
     ]
 
 
-def receiver(bus: can.BusABC) -> Receive:
-    """Return the bus's `recv_many`, or one made for it: one wait, then all that is there."""
+def receiver(bus: can.BusABC, *, in_kernel: bool) -> Receive:
+    """Return the bus's `recv_many`, or one made for it: one wait, then all that is there.
+
+    Where it can be, the wait is not python-can's: that is by the wall clock, and one set back
+    in the middle of it on a silent bus (NTP) would hold up the loop by as much.
+    """
     ready: Receive | None = getattr(bus, "recv_many", None)
     if ready is not None:
         return ready
+    waits_for = (bus,) if in_kernel else ()
 
     def receive(timeout_s: float) -> Sequence[Frame]:
+        if waits_for:
+            if not select.select(waits_for, (), (), timeout_s)[0]:
+                return ()
+            timeout_s = 0.0
         frames: list[Frame] = []
         for _ in range(FRAMES_PER_READ):
             message = bus.recv(timeout_s)

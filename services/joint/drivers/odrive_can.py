@@ -9,21 +9,23 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable
-from math import isfinite
 from typing import Final
 
 from services.joint.drivers import odrive_frames
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.can_link import RETRY_MS, CanLink, message, request_of
+from services.joint.drivers.can_link import RETRY_MS, CanLink, message
+from services.joint.drivers.encoder_pair import EncoderPair
+from services.joint.drivers.odrive_answers import NOTHING, Answers
 from services.joint.drivers.odrive_dialects import (
     HEARTBEAT_BYTES,
     VERSION_BYTES,
     AxesReport,
     Dialect,
 )
+from services.joint.drivers.odrive_due import Due, Row
 from services.joint.drivers.odrive_frames import Frames
 from shared import cansimple
-from shared.cansimple import Command
+from shared.cansimple import AxisState, Command
 from shared.cansimple_06 import Command06
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.config_sections import CanConfig, DriveConfig
@@ -35,23 +37,20 @@ __all__ = ["RETRY_MS", "OdriveCan"]
 
 REBOOT_MS: Final = 500
 """After so long a silence the drive may have been switched off and on: what its
-heartbeats said before is forgotten."""
+heartbeats said before is forgotten. So it is when an axis sends estimates and no heartbeats:
+nothing else would tell that it has disarmed."""
 ARM_GRACE_MS: Final = 10
 """Heartbeats this soon after `arm` may have been sent before it; they are not believed."""
 FEED_MS: Final = 1000
 """So long after `arm` reading feeds the watchdogs until the drive is ARMED: that shows
 only in the next heartbeat, and a watchdog may run out before it."""
-SETTLE_MS: Final = 1000
-"""So long after `arm`, or the first target, limits and modes are told again with what is
-written: nothing shows whether the drive has them, and 2 turn/s or torque mode would be felt."""
-GAINS_MS: Final = 100
-"""Gains go to the drive when they change and this often: a frame may have been lost."""
+INSIST_MS: Final = 1000
+"""So long after `idle` an axis that still reports closed loop is told again at once."""
 LOST_MS: Final = 100
 """Silence of a drive without a watchdog after which it counts as lost."""
 CLOSE_MS: Final = 20
 """So long an order that the bus had no room for may hold up `close`."""
 
-_BOTH = 0b11
 _unpack_two_floats = struct.Struct("<ff").unpack_from
 
 
@@ -100,12 +99,12 @@ class OdriveCan:
         self._frames = Frames(node_ids, drive)
         # The firmware takes it as food for the watchdog, and 0.6 tells its version besides.
         self._food = [message(n, Command06.GET_VERSION, b"") for n in node_ids]
-        self._ask_version = [request_of(n, Command06.GET_VERSION) for n in node_ids]
-        self._ask_iq = [request_of(n, Command.GET_IQ) for n in node_ids]
+        self._answers = Answers(node_ids, drive.torque_constant, encoder_counts_per_turn)
         take: dict[int, Callable[[int, bytes], None]] = {
             Command.GET_ENCODER_ESTIMATES: self._take_estimates,
+            Command.GET_ENCODER_COUNT: self._answers.take_count,
             Command.HEARTBEAT: self._take_heartbeat,
-            Command.GET_IQ: self._take_iq,
+            Command.GET_IQ: self._answers.take_current,
             Command06.GET_VERSION: self._take_version,
         }
         self._takers = {
@@ -115,14 +114,14 @@ class OdriveCan:
         }
         self._link = CanLink(can_config, node_ids)
         self._report = AxesReport()
-        self._found: list[float | None] = [None, None]  # torques of a drive that was found armed
-        self._gains_sent: tuple[Pair, Pair] | None = None
-        self._again_at_ns = 0  # when gains, or limits and modes, are due once more
-        self._settle_until_ns = 0
+        self._due = Due()
+        self._first = 0  # the axis that is written first
+        self._insist_until_ns = 0
         self._believe_from_ns = 0
         self._feed_until_ns = 0
-        self._estimates: list[Pair] = [(0.0, 0.0), (0.0, 0.0)]
-        self._fresh = 0  # bit i: axis i has a frame since the last sample
+        self._encoders = EncoderPair()
+        self._arrived_ns = 0  # when the frames at hand came
+        self._heard_ns = [0, 0]  # its newest heartbeat
         self._sample_ns = now_ns()
         self._has_sample = False
         self._connect()
@@ -161,11 +160,14 @@ class OdriveCan:
         while True:
             self._pump((deadline - now) / NS_PER_S)
             now = now_ns()
-            if self._fresh == _BOTH:
-                self._fresh = 0
+            if self._encoders.complete():
                 self._sample_ns = now
                 self._has_sample = True
                 status = self._report.status
+                unheard_ns = now - min(self._heard_ns)
+                if status is not DriveStatus.LOST and unheard_ns > REBOOT_MS * NS_PER_MS:
+                    self._forget()
+                    status = DriveStatus.LOST
                 if status is not DriveStatus.ARMED and now < self._feed_until_ns:
                     self._link.send(self._food)
                 return self._reading(status)
@@ -178,13 +180,13 @@ class OdriveCan:
         frames = self._frames
         frames.fill_torques(torque)
         messages = frames.torques
-        now = now_ns()
-        if self._again_at_ns <= now < self._settle_until_ns:
-            self._again_at_ns = now + GAINS_MS * NS_PER_MS
+        settles = self._due.with_torques(now_ns())
+        if settles:
             messages = frames.torques_anew
         if not self._link.send(messages):
-            self._again_at_ns = 0
             self.write_failures += 1
+            if settles:
+                self._due.cut_off(Row.ANEW)
 
     def write(self, target: MotorTarget) -> None:
         """Send what both motors' own loops are to do; gains before what they act on.
@@ -197,19 +199,13 @@ class OdriveCan:
             self.write_failures += 1
             return
         frames.fill_inputs(target)
-        messages = frames.inputs
-        gains = (target.pos_gain, target.vel_gain)
-        now = now_ns()
-        if gains != self._gains_sent or now >= self._again_at_ns:
-            if self._gains_sent is None:  # the first since connecting: taken over as it stands
-                self._settle_until_ns = now + SETTLE_MS * NS_PER_MS
-            settled = now >= self._settle_until_ns
-            messages = frames.inputs_and_gains if settled else frames.inputs_anew
-            self._gains_sent, self._again_at_ns = gains, now + GAINS_MS * NS_PER_MS
+        row = self._due.with_target((target.pos_gain, target.vel_gain), now_ns())
+        if row is not Row.INPUTS:
             frames.fill_gains(target)
-        if not self._link.send(messages):
-            self._again_at_ns = 0
+        if not self._link.send(frames.rows[row][self._first]):
             self.write_failures += 1
+            self._first ^= 1  # what is cut off again is then the other axis's
+            self._due.cut_off(row)
 
     def arm(self, *, onboard: bool) -> None:
         """Ask for closed loop control on both axes; see `Drive.arm`.
@@ -220,15 +216,15 @@ class OdriveCan:
         """
         self._order(odrive_frames.arming(self._drive, onboard=onboard), armed=True)
         now = now_ns()
-        self._gains_sent = ((0.0, 0.0), (0.0, 0.0))
-        self._again_at_ns = 0
-        self._settle_until_ns = now + SETTLE_MS * NS_PER_MS
+        self._due.armed(now)
+        self._insist_until_ns = 0
         self._feed_until_ns = now + FEED_MS * NS_PER_MS
 
     def idle(self) -> None:
         """Ask both axes to go idle, with their input torque zeroed."""
         self._order(odrive_frames.IDLING, armed=False)
-        self._settle_until_ns = 0
+        self._insist_until_ns = now_ns() + INSIST_MS * NS_PER_MS
+        self._due.idle()
         self._feed_until_ns = 0
 
     def set_position(self, turns: Pair) -> None:
@@ -256,14 +252,16 @@ class OdriveCan:
     def _order(self, commands: tuple[odrive_frames.Order, ...], *, armed: bool) -> None:
         """Send commands to both axes and forget what the axes reported before."""
         self._report.requested(armed=armed)
-        self._found = [None, None]
+        self._answers.forget_torques()
         self._believe_from_ns = now_ns() + ARM_GRACE_MS * NS_PER_MS
         self._link.order(odrive_frames.orders(self._node_ids, commands))
 
     def _pump(self, timeout_s: float) -> None:
         """Take in the frames of one wait; most of a shared bus's are other modules'."""
         takers = self._takers
-        for can_id, data in self._link.receive(max(0.0, timeout_s)):
+        frames = self._link.receive(max(0.0, timeout_s))
+        self._arrived_ns = now_ns()
+        for can_id, data in frames:
             found = takers.get(can_id)
             if found is not None:
                 axis, take = found
@@ -273,24 +271,30 @@ class OdriveCan:
 
     def _take_estimates(self, axis: int, data: bytes) -> None:
         if len(data) == 8:
-            pos, vel = estimates = _unpack_two_floats(data)
-            if isfinite(pos) and isfinite(vel):  # what is no number is no sample
-                self._estimates[axis] = estimates
-                self._fresh |= 1 << axis
+            estimate = _unpack_two_floats(data)
+            answers = self._answers
+            if estimate == NOTHING and self.dialect != "0.6":
+                self._link.send((answers.ask_counts[axis],))
+                estimate = answers.counted[axis] or estimate
+            else:
+                answers.counted[axis] = None
+            self._encoders.take(axis, estimate, self._arrived_ns)
 
     def _take_heartbeat(self, axis: int, data: bytes) -> None:
-        if len(data) != HEARTBEAT_BYTES or now_ns() < self._believe_from_ns:
+        now = self._arrived_ns
+        if len(data) != HEARTBEAT_BYTES or now < self._believe_from_ns:
+            return
+        self._heard_ns[axis] = now
+        if now < self._insist_until_ns and data[4] == AxisState.CLOSED_LOOP_CONTROL:
+            self._order(odrive_frames.IDLING, armed=False)  # it was lost on the way
             return
         report = self._report
         report.hear(axis, bytes(data))
         if report.dialect == "":
-            self._link.send(self._ask_version)
-        if report.status is DriveStatus.ARMED and self._gains_sent is None and None in self._found:
-            self._link.send(self._ask_iq)  # whoever takes it over asks for its torques
-
-    def _take_iq(self, axis: int, data: bytes) -> None:
-        if len(data) == 8:
-            self._found[axis] = _unpack_two_floats(data)[0] * self._drive.torque_constant
+            self._link.send(self._answers.ask_version)
+        found_armed = report.status is DriveStatus.ARMED and self._due.gains is None
+        if found_armed and self._answers.torques is None:
+            self._link.send(self._answers.ask_currents)  # whoever takes it over asks for them
 
     def _take_version(self, _axis: int, data: bytes) -> None:
         if len(data) == VERSION_BYTES:  # a request that we or others sent has none
@@ -306,34 +310,37 @@ class OdriveCan:
         if self._has_sample and silent_ns <= self._lost_after_ns:
             return None
         if silent_ns > REBOOT_MS * NS_PER_MS:
-            self._report.forget()
+            self._forget()
         return self._reading(DriveStatus.LOST)
+
+    def _forget(self) -> None:
+        """Forget what the drive has said of itself: it may have been switched off and on."""
+        self._report.forget()
+        self._answers.forget_counts()
 
     def _reading(self, status: DriveStatus) -> DriveReading:
         """Return the newest estimates with a status."""
-        (pos_0, vel_0), (pos_1, vel_1) = self._estimates
+        (pos_0, vel_0), (pos_1, vel_1) = self._encoders.estimates
         return DriveReading(
             self._sample_ns,
             (pos_0, pos_1),
             (vel_0, vel_1),
             status,
             self._report.errors,
-            self._found_torque(),
+            self._answers.torques if self._due.gains is None else None,
         )
-
-    def _found_torque(self) -> Pair | None:
-        a, b = self._found
-        return (a, b) if a is not None and b is not None and self._gains_sent is None else None
 
     def _connect(self) -> bool:
         """Open the bus if it is time to; ask what firmware is there."""
         if not self._link.connect():
             return False
-        self._fresh = 0
-        self._gains_sent = None
-        self._found = [None, None]
+        self._encoders.forget()
+        self._due.connected()
+        self._answers.forget_torques()
+        self._answers.forget_counts()
         if not self._has_sample or now_ns() - self._sample_ns > self._lost_after_ns:
             self._report.forget()
         if self._report.dialect == "":
-            self._link.send(self._ask_version)
+            self._link.send(self._answers.ask_version)
+        self._link.send(self._answers.ask_counts)
         return True

@@ -69,9 +69,11 @@ class Frames:
     Attributes:
         torques: both input torques.
         torques_anew: with the limits and modes that arming has sent.
-        inputs: both targets.
-        inputs_and_gains: with the gains before them.
-        inputs_anew: with limits, gains and modes. A mode that is set puts a 0.5 drive's
+        rows: what goes out with a target, by `odrive_due.Row`, with axis0 first and with axis1
+            first: where a full queue has cut one off, the other axis is not to go without again.
+            An axis's gains come right before the target that they belong to. Its stiffness is
+            the product of both, and where they change by much (DAMP) pos_gain falls: it goes
+            first, or the stiffness doubles in between. A mode that is set puts a 0.5 drive's
             input_pos to where the motor is: the axis's own target follows at once.
     """
 
@@ -84,15 +86,22 @@ class Frames:
             for onboard in (False, True)
         )
         self.torques = [message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in nodes]
-        self.inputs = [message(n, Command.SET_INPUT_POS, bytes(8)) for n in nodes]
+        self._inputs = [message(n, Command.SET_INPUT_POS, bytes(8)) for n in nodes]
         self._vel_gains = [message(n, Command.SET_VEL_GAINS, bytes(8)) for n in nodes]
         self._pos_gains = [message(n, Command.SET_POS_GAIN, bytes(4)) for n in nodes]
-        gains = self._vel_gains + self._pos_gains
         self.torques_anew = [*limit_frames, *torque_mode, *self.torques]
-        self.inputs_and_gains = [*gains, *self.inputs]
-        self.inputs_anew = [*limit_frames, *gains]
-        for mode, target in zip(position_mode, self.inputs, strict=True):
-            self.inputs_anew += (mode, target)
+        lone = [[target] for target in self._inputs]
+        gains = [list(both) for both in zip(self._pos_gains, self._vel_gains, strict=True)]
+        with_gains = [own + target for own, target in zip(gains, lone, strict=True)]
+        anew = [
+            [*own, mode, *target]
+            for own, mode, target in zip(gains, position_mode, lone, strict=True)
+        ]
+        self.rows = (
+            _either_first([], lone),
+            _either_first([], with_gains),
+            _either_first(limit_frames, anew),
+        )
 
     def fill_torques(self, torque: Pair) -> None:
         """Write torques, N m, at most `current_lim`'s worth; what is no number is zero."""
@@ -108,7 +117,7 @@ class Frames:
         Velocity and torque travel in thousandths: the torque to 0.035 N m at the joint.
         """
         for frame, pos, vel, torque in zip(
-            self.inputs, target.pos_turns, target.vel_turns, target.torque, strict=True
+            self._inputs, target.pos_turns, target.vel_turns, target.torque, strict=True
         ):
             frame.data[:] = cansimple.pack_input_pos(pos, vel, torque)
 
@@ -162,6 +171,14 @@ def is_target(target: MotorTarget) -> bool:
         if not (-LARGEST < first < LARGEST and -LARGEST < second < LARGEST):
             return False
     return True
+
+
+def _either_first(
+    before: list[can.Message], axes: list[list[can.Message]]
+) -> tuple[list[can.Message], list[can.Message]]:
+    """Return a row with axis0's frames before axis1's, and one the other way round."""
+    first, second = axes
+    return [*before, *first, *second], [*before, *second, *first]
 
 
 def _modes(*, onboard: bool) -> bytes:

@@ -27,8 +27,9 @@ from odrive.runtime_device import RuntimeDevice
 
 from services.joint.drivers.axes_status import AxesStatus
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.odrive_v3 import ARM_SETTINGS, IDLE_SETTINGS, OdriveV3
-from shared.cansimple import AxisState, ControlMode, InputMode
+from services.joint.drivers.odrive_v3 import OdriveV3
+from shared import log
+from shared.cansimple import AxisState
 from shared.clock import NS_PER_MS, now_ns
 from shared.config_sections import DriveConfig
 from shared.exceptions import DriveError
@@ -48,6 +49,8 @@ STATES_EVERY: Final = 4
 """Exchanges of an armed drive from one look at its states to the next: 20 ms."""
 ANSWER_S: Final = 0.003
 """So long an exchange waits for the control thread's target after its sample."""
+TELL_S: Final = 5.0
+"""A drive that is not found by then is told of: its number may be another's."""
 CLOSE_S: Final = 1.0
 """So long `close` waits for a last request; it is not for the control path."""
 
@@ -75,7 +78,7 @@ class OdriveUsb:
     Attributes:
         write_failures: targets that were no numbers, or that no drive was there for.
         connections: how often the drive was found and connected.
-        trouble: why the last connection failed or ended; "" at first.
+        trouble: why the last connection failed, ended or did not come about; "" at first.
     """
 
     def __init__(self, serial_number: str, drive: DriveConfig) -> None:
@@ -181,9 +184,7 @@ class OdriveUsb:
         self._request = _Request(arm=False)
 
     def set_position(self, turns: Pair) -> None:
-        """Ask to tell both encoders where they are, turns; see `Drive.set_position`.
-
-        Forgotten if the drive is lost before.
+        """Ask to tell both encoders where they are, turns; forgotten if the drive is lost before.
 
         Raises:
             DriveError: it is lost now.
@@ -212,7 +213,7 @@ class OdriveUsb:
                 device = await self._find(manager)
                 if device is not None:
                     board = OdriveV3(device)
-                    await board.find_watchdogs()
+                    await board.look()
                     # What was left for a drive that was not there is not for this one: it
                     # may hold the robot by its own loop, and has no use for an old target.
                     self._carried_out, self._position = self._request, None
@@ -222,7 +223,7 @@ class OdriveUsb:
                     self.connections += 1
                     await self._stay(board)
             except Exception as error:  # noqa: BLE001 - the package raises bare Exceptions
-                self.trouble = f"{type(error).__name__}: {error}"
+                self._tell(f"{type(error).__name__}: {error}")
                 await asyncio.sleep(RETRY_S)
             finally:
                 self._connected = False
@@ -235,14 +236,24 @@ class OdriveUsb:
         search = asyncio.ensure_future(
             manager.wait_for(serial_number=self._serial_number, return_type=RuntimeDevice)
         )
+        loop = asyncio.get_running_loop()
+        tell_at = loop.time() + TELL_S
         try:
             while not self._closing:
                 await asyncio.wait((search,), timeout=RETRY_S)
                 if search.done():
                     return search.result()
+                if loop.time() > tell_at:
+                    self._tell("not on USB; `xrl doctor` lists the serial numbers that are there")
         finally:
             search.cancel()
         return None
+
+    def _tell(self, trouble: str) -> None:
+        """Log what keeps the drive away, unless it is what was said last."""
+        if trouble != self.trouble:
+            self.trouble = trouble
+            log.get("xrl").warning("ODrive %s: %s", self._serial_number, trouble)
 
     async def _stay(self, board: OdriveV3) -> None:
         """Exchange at the rate until closing, or until a transfer fails."""
@@ -259,20 +270,24 @@ class OdriveUsb:
     async def _exchange(self, board: OdriveV3) -> None:
         """Carry out a request if there is one; then take a sample and send the target."""
         request, position = self._request, self._position
-        if position is not None:
+        new = request if request is not self._carried_out else None
+        if position is not None and (new is None or new.arm):
+            # Never while armed, or it jumps by as many turns: to arm waits for the next
+            # exchange, and so does the position if it comes with a request to go idle.
             await board.set_position(position)
-            self._position = None
-        if request is not None and request is not self._carried_out:
-            await self._carry_out(board, request)
+            if self._position is position:  # and not another one by now
+                self._position = None
+            request = self._carried_out
+        elif new is not None:
+            await self._carry_out(board, new)
         await self._take_sample(board)
         self._carried_out = request  # not before there is a sample of the time after it
         await self._answer()
-        target = self._target
-        new = target if target is not self._sent else None
-        if new is not None:
-            self._sent = target
-            await board.target.write(new)
-        if board.hungry and (new is not None or now_ns() < self._feed_until_ns):
+        target, sent = self._target, self._sent
+        self._sent = target
+        if target is not None and target is not sent:
+            await board.target.write(target)
+        if board.hungry and (target is not sent or now_ns() < self._feed_until_ns):
             await board.feed()
 
     async def _answer(self) -> None:
@@ -297,9 +312,7 @@ class OdriveUsb:
             await self._judge(board, values[4:])
             found = self._request is None and self._target is None
             if found and self._status is DriveStatus.ARMED:
-                first, second = await board.currents.read()
-                per_ampere = self._drive.torque_constant
-                torque = (first * per_ampere, second * per_ampere)
+                torque = await board.torques(self._drive.torque_constant)
         if all(map(isfinite, values)):  # what is no number is no sample
             pos, vel = (values[0], values[1]), (values[2], values[3])
             self._sample = DriveReading(t_ns, pos, vel, self._status, self._errors, torque)
@@ -319,22 +332,11 @@ class OdriveUsb:
     async def _carry_out(self, board: OdriveV3, request: _Request) -> None:
         """Arm or idle both axes; what they reported before is forgotten."""
         if request.arm:
-            drive = self._drive
-            await board.device.call_function("clear_errors")
-            await board.write_both(
-                ARM_SETTINGS,
-                (
-                    *(ControlMode.POSITION, InputMode.PASSTHROUGH),
-                    *(drive.vel_limit, drive.current_lim),
-                    *(0.0, 0.0, 0.0, 0.0, 0.0),
-                ),
-            )
-            await board.feed()
-            await board.write_both(("requested_state",), (AxisState.CLOSED_LOOP_CONTROL,))
+            await board.arm(self._drive.vel_limit, self._drive.current_lim)
             self._feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
             self._sent = self._target  # it was for the time before
         else:
-            await board.write_both(IDLE_SETTINGS, (0.0, AxisState.IDLE))
+            await board.idle()
             self._feed_until_ns = 0
         board.target.forget()
         self._axes = AxesStatus()

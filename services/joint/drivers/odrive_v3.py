@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from math import isclose
+from math import isfinite
 from typing import Any, Final
 
 from services.joint.drivers.base import MotorTarget
+from shared.cansimple import AxisState, ControlMode, InputMode
 from shared.exceptions import DriveError
 from shared.messages import Pair
 
@@ -24,13 +25,8 @@ ARM_SETTINGS: Final = (
 )
 """Written to each axis before it is armed, in this order."""
 IDLE_SETTINGS: Final = ("controller.input_torque", "requested_state")
-N_INPUTS: Final = 4
-"""Of a target's values, the first are inputs and the rest gains."""
-GAIN_STEP: Final = 0.005
-"""A gain that differs by less than this share from what the drive has is not sent: they drift
-with the pose, and each costs a transfer."""
-
 _AXES = ("axis0", "axis1")
+_DIRECTION = "encoder.config.direction"
 
 
 class Batch:
@@ -82,7 +78,7 @@ class TargetWriter:
             new = tuple(range(len(values)))
             written = list(values)
         else:
-            new = changed(values, written)
+            new = tuple(at for at, value in enumerate(values) if value != written[at])
         if not new:
             return
         batch = self._batches.get(new)
@@ -99,22 +95,23 @@ class TargetWriter:
 def values_of(target: MotorTarget) -> tuple[float, ...]:
     """Return a target's values in the order of `TargetWriter`.
 
-    The velocity goes with the torque, `torque + vel_gain vel_turns`, and `input_vel` stays at
-    zero: the firmware's law gives the same torque, also when nobody writes any more, and four
-    inputs are one round trip where six are two.
+    `input_vel` stays at zero, for four inputs are one round trip and six are two: the velocity
+    goes with the position, `pos + vel / pos_gain`, which the firmware's law, its clamp included,
+    cannot tell from the target itself; with the torque where there is no pos_gain. So the torque
+    is the same, also when nobody writes any more.
     """
-    (pos_0, pos_1), (vel_0, vel_1), (b_0, b_1) = target.pos_turns, target.vel_turns, target.vel_gain
-    (torque_0, torque_1), (k_0, k_1) = target.torque, target.pos_gain
-    return pos_0, torque_0 + b_0 * vel_0, pos_1, torque_1 + b_1 * vel_1, k_0, b_0, k_1, b_1
+    pos_0, torque_0 = _inputs_of(target, 0)
+    pos_1, torque_1 = _inputs_of(target, 1)
+    (k_0, k_1), (b_0, b_1) = target.pos_gain, target.vel_gain
+    return pos_0, torque_0, pos_1, torque_1, k_0, b_0, k_1, b_1
 
 
-def changed(values: Sequence[float], written: Sequence[float]) -> tuple[int, ...]:
-    """Return the places of inputs that are new, and of gains that are noticeably new."""
-    return tuple(
-        index
-        for index, (value, before) in enumerate(zip(values, written, strict=True))
-        if value != before and (index < N_INPUTS or not isclose(value, before, rel_tol=GAIN_STEP))
-    )
+def _inputs_of(target: MotorTarget, axis: int) -> tuple[float, float]:
+    """Return input_pos and input_torque of an axis."""
+    pos, vel, k = target.pos_turns[axis], target.vel_turns[axis], target.pos_gain[axis]
+    if k > 0.0:
+        return pos + vel / k, target.torque[axis]
+    return pos, target.torque[axis] + target.vel_gain[axis] * vel
 
 
 class OdriveV3:
@@ -126,7 +123,6 @@ class OdriveV3:
         sample: position of both axes, then velocity.
         sample_and_state: the same, then the state of both axes.
         errors: the four error registers of axis0, then of axis1.
-        currents: what each axis's own loop asks for.
         target: the inputs and gains of both axes.
 
     Raises:
@@ -145,22 +141,42 @@ class OdriveV3:
             device,
             self._both(("error", "motor.error", "encoder.error", "controller.error")),
         )
-        self.currents = Batch(device, self._both(("motor.current_control.Iq_setpoint",)))
+        self._currents = Batch(device, self._both(("motor.current_control.Iq_setpoint",)))
         inputs = ("controller.input_pos", "controller.input_torque")
         gains = ("controller.config.pos_gain", "controller.config.vel_gain")
         self.target = TargetWriter(device, [*self._both(inputs), *self._both(gains)])
         self._watchdogs = Batch(device, self._both(("config.enable_watchdog",)))
         self._counts_per_turn = Batch(device, self._both(("encoder.config.cpr",)))
         self._food: list[Any] = []
+        # not in the tree of firmware before 0.5.2, which has it at the motor
+        self._directions: Batch | None = None
+        if all(f"{axis}.{_DIRECTION}" in device.properties for axis in _AXES):
+            self._directions = Batch(device, self._both((_DIRECTION,)))
+        self._signs = (1, 1)
 
-    async def find_watchdogs(self) -> None:
-        """Look which axes have a watchdog that runs; they are set and saved, not switched."""
+    async def look(self) -> None:
+        """Look what is set and saved, not switched: watchdogs, and which way currents count."""
         enabled = await self._watchdogs.read()
         self._food = [
             self.device.functions[f"{axis}.watchdog_feed"]
             for axis, on in zip(_AXES, enabled, strict=True)
             if on
         ]
+        if self._directions is not None:
+            first, second = await self._directions.read()
+            self._signs = (-1 if first < 0 else 1, -1 if second < 0 else 1)
+
+    async def torques(self, torque_constant: float) -> Pair | None:
+        """Return what both axes' own loops ask for, N m; None if that is no number.
+
+        A current counts in the direction that the encoder's calibration has found, by how the
+        phases are wired: the firmware turns the torque round where it is -1.
+        """
+        first, second = await self._currents.read()
+        if not (isfinite(first) and isfinite(second)):
+            return None
+        sign_0, sign_1 = self._signs
+        return sign_0 * first * torque_constant, sign_1 * second * torque_constant
 
     @property
     def hungry(self) -> bool:
@@ -179,7 +195,19 @@ class OdriveV3:
             name = f"{axis}.encoder.set_linear_count"
             await self.device.call_function(self.device.functions[name], round(where * cpr))
 
-    async def write_both(self, names: tuple[str, ...], values: tuple[float, ...]) -> None:
+    async def arm(self, vel_limit: float, current_lim: float) -> None:
+        """Ask both axes for closed loop, without torque and gains; turn/s and A."""
+        await self.device.call_function("clear_errors")
+        modes = (ControlMode.POSITION, InputMode.PASSTHROUGH)
+        await self._write_both(ARM_SETTINGS, (*modes, vel_limit, current_lim, *[0.0] * 5))
+        await self.feed()
+        await self._write_both(("requested_state",), (AxisState.CLOSED_LOOP_CONTROL,))
+
+    async def idle(self) -> None:
+        """Ask both axes to go idle, with their input torque zeroed."""
+        await self._write_both(IDLE_SETTINGS, (0.0, AxisState.IDLE))
+
+    async def _write_both(self, names: tuple[str, ...], values: tuple[float, ...]) -> None:
         """Write the same values to both axes, axis0 first."""
         await Batch(self.device, self._both(names)).write([*values, *values])
 

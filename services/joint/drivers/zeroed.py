@@ -3,9 +3,10 @@
 The encoders sit on the motors and count turns; what a count means at the joint is lost with the
 power. So a joint is zeroed by telling the drive its position (`xrl zero`), and not by an
 offset kept in a file: the drive then forgets it when it must not be believed any more. A motor
-at q = 0 is told `mark_turns`, far from what a drive counts that has just got power (0 to 1 turn)
-and from what one shows whose encoder is lost (0): such a drive is `UNZEROED`, is never armed,
-and one that was armed is in FAULT in the same cycle.
+at q = 0 is told `mark_turns`, far from what a drive counts that has just got power (within a turn
+of 0) or says before it knows (0): such a drive is `UNZEROED`, is never armed, and one that was
+armed is in FAULT in the same cycle. A lost encoder is not known by it: it goes on saying what it
+said last, and the drive's error tells.
 """
 
 from __future__ import annotations
