@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import difflib
+import math
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any
+from importlib.metadata import entry_points
+from typing import Any, Final
 
 import msgspec
 
 from shared.can_load import check_buses
 from shared.config import RobotConfig
 from shared.config_sections import LimitConfig
+from shared.drive_settings import CURRENT_RANGE
 from shared.exceptions import ConfigError
 from shared.joints import KINDS, MODULES
+
+INTERFACES: Final = (
+    "canalystii", "cantact", "etas", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi",
+    "nican", "nixnet", "pcan", "robotell", "seeedstudio", "serial", "slcan", "socketcan",
+    "socketcand", "systec", "udp_multicast", "usb2can", "vector", "virtual", "xrl_unix",
+)  # fmt: skip
+"""What python-can brings itself, and this package; other packages may declare more."""
+
+_POWER_UP_TURNS: Final = 1.0
+"""An encoder that has just got power knows its motor within a turn."""
 
 
 def check(file: str, config: RobotConfig, services: Sequence[str]) -> None:
@@ -27,7 +41,9 @@ def check(file: str, config: RobotConfig, services: Sequence[str]) -> None:
         ConfigError: naming the file, the key, what stands there and what would be right.
     """
     _check_names(file, config, services)
+    _check_interfaces(file, config)
     _check_physics(file, config)
+    _check_drive(file, config)
     _check_timing(file, config)
     check_buses(file, config)
 
@@ -127,15 +143,62 @@ def _check_physics(file: str, config: RobotConfig) -> None:
     if geometry.l1 >= geometry.l2:
         found = f"{geometry.l1:g} m is not below l2 = {geometry.l2:g} m"
         raise ConfigError(file, "geometry.l1", found, "a thigh shorter than the shin")
-    tau_drive = 2 * config.joint.gear_ratio * config.drive.torque_constant
-    if tau_drive * config.drive.current_lim < config.joint.tau_module_max:
-        found = f"{config.drive.current_lim:g} A gives less than tau_module_max"
-        right = f"at least {config.joint.tau_module_max / tau_drive:.1f} A"
-        raise ConfigError(file, "drive.current_lim", found, right)
     for index, selected in enumerate(config.law.S):
         if not selected and config.law.K_p[index] <= 0.0:
             where = f"law.K_p[{index}]"
             raise ConfigError(file, where, "0 in a direction the robot balances", "positive")
+
+
+def _check_interfaces(file: str, config: RobotConfig) -> None:
+    """Check that python-can knows the interface of every bus."""
+    known = set(INTERFACES)
+    for name, bus in config.can.items():
+        if bus.interface not in known:
+            known |= {entry.name for entry in entry_points(group="can.interface")}
+        if bus.interface not in known:
+            found = f"{bus.interface!r} is no interface of python-can"
+            near = difflib.get_close_matches(bus.interface, known, n=1)
+            right = f"did you mean {near[0]!r}?" if near else f"one of {_words(sorted(known))}"
+            raise ConfigError(file, f"can.{name}.interface", found, right)
+
+
+def _check_drive(file: str, config: RobotConfig) -> None:
+    """Check what the drives are told against what the joints need of them."""
+    drive, turns_per_rad = config.drive, config.joint.gear_ratio / (2 * math.pi)
+    tau_per_ampere = 2 * config.joint.gear_ratio * drive.torque_constant
+    if tau_per_ampere * drive.current_lim < config.joint.tau_module_max:
+        found = f"{drive.current_lim:g} A gives less than tau_module_max"
+        right = f"at least {config.joint.tau_module_max / tau_per_ampere:.1f} A"
+        raise ConfigError(file, "drive.current_lim", found, right)
+    if drive.current_lim > CURRENT_RANGE:
+        found = f"{drive.current_lim:g} A is more than an ODrive v3 measures"
+        right = f"at most {CURRENT_RANGE:g} A, its requested_current_range"
+        raise ConfigError(file, "drive.current_lim", found, right)
+    # Up to vel_limit_tolerance times vel_limit are left for what the other axis adds.
+    speed = config.joint_service.v_max * turns_per_rad
+    if drive.vel_limit < speed:
+        found = f"{drive.vel_limit:g} turn/s is slower than joint_service.v_max"
+        right = f"at least {speed:.1f} turn/s, v_max at the motor; beyond vel_limit a drive disarms"
+        raise ConfigError(file, "drive.vel_limit", found, right)
+    if drive.zero_mark_turns > 0.0:
+        kind, turns = max(((kind, _turns(config, kind)) for kind in KINDS), key=lambda row: row[1])
+        least = 2 * (turns + _POWER_UP_TURNS)
+        if drive.zero_mark_turns < least:
+            found = f"{drive.zero_mark_turns:g} turns: the {kind} comes to half of it"
+            right = f"at least {math.ceil(least)} turns, twice a joint's range; 0: no such check"
+            raise ConfigError(file, "drive.zero_mark_turns", found, right)
+
+
+def _turns(config: RobotConfig, kind: str) -> float:
+    """Return how far from q = 0, or from where it got power, a joint's motors can be, turns.
+
+    A motor turns by gear_ratio (theta +- phi).
+    """
+    limit: LimitConfig = getattr(config.limits, kind)
+    pairs = (limit.phi, limit.theta)
+    span = sum(high - low for low, high in pairs)
+    farthest = sum(max(abs(low), abs(high)) for low, high in pairs)
+    return config.joint.gear_ratio * max(span, farthest) / (2 * math.pi)
 
 
 def _check_timing(file: str, config: RobotConfig) -> None:

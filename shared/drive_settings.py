@@ -31,6 +31,12 @@ OVERVOLTAGE_MAX: Final = 59.92
 """V; what the firmware ships on a 56 V board. Above it the output stage is not protected."""
 OVERSPEED_TOLERANCE: Final = 1.2
 """What the firmware ships; closer to 1, a noisy estimate at vel_limit disarms."""
+CURRENT_RANGE: Final = 60.0
+"""A; `motor.config.requested_current_range` as the firmware ships it: what a drive can measure."""
+SPINOUT_POWER: Final = 100.0
+"""W; 10 as shipped. A motor that brakes with more than this, and takes more than this beyond the
+copper loss of its calibrated resistance, disarms: its encoder has slipped. A winding at 100 C has
+30 % more resistance, at 30 A and 0.1 ohm 40 W, at 40 A 72 W."""
 
 _RELATIVE: Final = 1e-6
 """A drive keeps single floats."""
@@ -158,6 +164,18 @@ AXIS_TABLE: Final[tuple[Setting, ...]] = (
         "controller.config.enable_torque_mode_vel_limit",
         lambda _: False,
         "in torque mode it cuts the torque by vel_gain: with that at 0, all of it",
+    ),
+    Setting(
+        "controller.config.spinout_electrical_power_threshold",
+        lambda _: SPINOUT_POWER,
+        "a warm winding that sinks under load disarms with SPINOUT_DETECTED: the leg lets go",
+        Compare.AT_LEAST,
+    ),
+    Setting(
+        "controller.config.spinout_mechanical_power_threshold",
+        lambda _: -SPINOUT_POWER,
+        "a warm winding that sinks under load disarms with SPINOUT_DETECTED: the leg lets go",
+        Compare.AT_MOST,
     ),
     Setting(
         "motor.config.pre_calibrated",

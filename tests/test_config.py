@@ -9,12 +9,14 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import can
 import msgspec
 import pytest
 import tomli_w
 
 from shared import config_file
 from shared.config import RobotConfig, expand
+from shared.config_check import INTERFACES
 from shared.exceptions import ConfigError
 from shared.joints import MODULES
 from shared.scenario import Fault, Scenario
@@ -127,6 +129,23 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (setting("law.K_p.0", 0.0), "law.K_p[0]", "0 in a direction", "positive"),
     (setting("geometry.l1", 1.1), "geometry.l1", "1.1 m", "shorter than the shin"),
     (setting("drive.current_lim", 5.0), "drive.current_lim", "5 A", "at least 39.9 A"),
+    (setting("drive.current_lim", 60.5), "drive.current_lim", "60.5 A", "at most 60 A"),
+    (setting("drive.vel_limit", 2.0), "drive.vel_limit", "2 turn/s", "at least 55.7 turn/s"),
+    (setting("joint_service.v_max", 22.0), "drive.vel_limit", "60 turn/s", "at least 61.3"),
+    (setting("drive.zero_mark_turns", 8.0), "drive.zero_mark_turns", "8 turns: the hip", "41"),
+    (setting("joint.gear_ratio", 30.0), "drive.vel_limit", "60 turn/s", "at least 95.5"),
+    (
+        setting("can.harness.interface", "socketcam"),
+        "can.harness.interface",
+        "'socketcam'",
+        "did you mean 'socketcan'?",
+    ),
+    (
+        setting("can.hip_left.interface", "wires"),
+        "can.hip_left.interface",
+        "'wires'",
+        "one of canalystii, ",
+    ),
     (setting("drive.watchdog_timeout", 0.1), "drive.watchdog_timeout", "0.1 s disarms", "0 s: off"),
     (setting("joint_service.loop", "service"), "drive.watchdog_timeout", "0 s", "at least 0.02"),
     (setting("drive.encoder_period_ms", 10), "drive.encoder_period_ms", "10 ms", "2 ms"),
@@ -236,6 +255,27 @@ def test_a_file_that_cannot_be_read_is_refused_by_name(tmp_path: Path, kind: str
 def test_payload_may_be_all_that_is_allowed_and_nothing(tmp_path: Path) -> None:
     assert load_changed(tmp_path, setting("mass.payload", 0.0)).mass.payload == 0.0
     assert load_changed(tmp_path, setting("mass.payload_max", 20.5)).mass.payload == 20.4
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("drive.current_lim", 60.0),
+        ("drive.vel_limit", 55.8),
+        ("drive.zero_mark_turns", 41.0),
+        ("drive.zero_mark_turns", 0.0),
+        ("can.harness.interface", "socketcan"),
+        ("can.harness.interface", "slcan"),
+    ],
+)
+def test_what_the_drives_can_do_and_python_can_knows_is_taken(
+    tmp_path: Path, key: str, value: object
+) -> None:
+    load_changed(tmp_path, setting(key, value))
+
+
+def test_the_interfaces_that_python_can_knows_are_all_there() -> None:
+    assert set(INTERFACES) == set(can.VALID_INTERFACES)
 
 
 # ---- ranges

@@ -5,25 +5,29 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 import pytest
+from rich.console import Console
 
 from shared.config import RobotConfig, expand
 from shared.config_sections import CanConfig
+from shared.drive_settings import of_module
 from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
 from tests.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools import cli, configure
-from tools.bringup import backup, reach
+from tools.bringup import backup, changes, reach
 from tools.bringup.boards import Found, Value
+from tools.bringup.jog_drive import Interrupts
 from tools.supervision import procfs
 from tools.supervision.run_dir import RunDir
 
@@ -142,6 +146,43 @@ def test_a_board_that_is_not_there_or_not_known_is_refused(robot: RobotConfig) -
     newer.firmware = (0, 6, 10)
     with pytest.raises(DriveError, match=r"firmware 0\.6\.10"):
         configure.boards_of(robot, [MODULE], Found({SERIAL: newer}, {}, ()))
+
+
+def test_a_board_that_is_older_than_its_settings_names_is_refused(robot: RobotConfig) -> None:
+    older = BoardInMemory({})
+    older.firmware = (0, 5, 1)
+    with pytest.raises(DriveError, match=r"firmware 0\.5\.1"):
+        configure.boards_of(robot, [MODULE], Found({SERIAL: older}, {}, ()))
+
+
+class Interrupted(BoardInMemory):
+    """A board at which somebody presses Ctrl-C while it is being written."""
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        super().write(values)
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_ctrl_c_finishes_the_board_that_was_begun_and_touches_no_other(robot: RobotConfig) -> None:
+    """Half of a board's settings would be in force, and none saved."""
+    boards = {
+        module: kind(as_wanted() | {VEL_LIMIT: 2.0})
+        for module, kind in zip(
+            MODULES[:3], (BoardInMemory, Interrupted, BoardInMemory), strict=True
+        )
+    }
+    difference = [
+        change
+        for module, board in boards.items()
+        for change in changes.against_wanted(module, of_module(robot, MODULE), board)
+    ]
+    interrupts = Interrupts()
+    with interrupts.kept():
+        outcomes = configure.apply(Console(quiet=True), boards, difference, interrupts)
+    assert interrupts.number == signal.SIGINT
+    assert [board.kept[VEL_LIMIT] for board in boards.values()] == [60.0, 60.0, 2.0]
+    assert [board.saves for board in boards.values()] == [1, 1, 0]
+    assert [(o.change.module, o.good) for o in outcomes] == [(m, True) for m in MODULES[:2]]
 
 
 def test_nothing_is_written_while_a_joint_service_is_up(robot: RobotConfig, run_dir: Path) -> None:

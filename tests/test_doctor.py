@@ -15,6 +15,9 @@ from typing import Any
 
 import pytest
 
+from shared import cansimple
+from shared.cansimple import Command
+from shared.cansimple_06 import Command06
 from shared.process import DEFAULT_CONFIG
 from tools import cli
 from tools.supervision import procfs
@@ -67,6 +70,89 @@ def test_nothing_is_wrong_with_the_emulated_robot_as_shipped(run_dir: Path) -> N
     assert whats.count("zero") == 6
     assert whats.count("heartbeat") == 12
     assert {"load cells", "gain schedule", "endpoints", "real-time priority"} <= set(whats)
+
+
+RECORDED = """
+import contextlib, json, sys
+from shared import unix_can
+from tools import cli
+from tools.bringup import reach
+
+said = {"can": [], "usb": [], "reads": 0}
+send_many = unix_can.UnixCanBus.send_many
+
+def record_many(bus, messages):
+    said["can"] += [[m.arbitration_id, m.is_remote_frame] for m in messages]
+    send_many(bus, messages)
+
+unix_can.UnixCanBus.send_many = record_many
+emulated_usb = reach.emulated_usb
+
+@contextlib.contextmanager
+def recorded_usb(run_dir):
+    with emulated_usb(run_dir):
+        from odrive.libodrive import Device
+        read = Device.read_endpoints
+
+        async def reads(*args, **names):
+            said["reads"] += 1
+            return await read(*args, **names)
+
+        def recorded(name):
+            before = getattr(Device, name)
+            def call(*args, **names):
+                said["usb"].append(name)
+                return before(*args, **names)
+            return call
+
+        Device.read_endpoints = reads
+        for name in ("write_endpoints", "call_function"):
+            setattr(Device, name, recorded(name))
+        yield
+
+reach.emulated_usb = recorded_usb
+code = cli.main(["doctor", "--json", "--run-dir", sys.argv[1]])
+print(json.dumps(said), file=sys.stderr)
+sys.exit(code)
+"""
+"""The verb, with everything that it tells a drive written down."""
+
+
+def test_it_writes_no_endpoint_calls_no_function_and_sends_questions_only(run_dir: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-c", RECORDED, str(run_dir)],
+        capture_output=True,
+        text=True,
+        cwd=DEFAULT_CONFIG.parents[1],
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    said = json.loads(result.stderr.splitlines()[-1])
+    assert said["usb"] == []
+    assert said["reads"] > 6, "it did read, through what is recorded here"
+    assert len(said["can"]) == 36, "three questions to each axis"
+    for arbitration_id, is_remote in said["can"]:
+        _, command = cansimple.split_id(arbitration_id)
+        assert is_remote
+        assert command in (Command06.GET_VERSION, Command.GET_VBUS, Command.GET_ENCODER_COUNT)
+
+
+def test_a_board_that_is_not_set_up_as_the_others_is_named(run_dir: Path) -> None:
+    plant = "--plant=knee_left.axis1.motor.config.pole_pairs=20"
+    result = doctor(run_dir, "--json", plant)
+    assert result.returncode == 0, "a warning: nothing that is wanted is missing"
+    bad = [row for row in rows_of(result) if row["verdict"] != "ok" and row["what"] not in MEASURED]
+    assert [(row["subject"], row["what"], row["found"]) for row in bad] == [
+        ("knee_left.axis1", "motor.config.pole_pairs", "20")
+    ]
+
+
+def test_a_current_that_counts_the_other_way_is_wrong_over_can(run_dir: Path) -> None:
+    result = doctor(run_dir, "--json", f"--plant={AXIS}.encoder.config.direction=-1")
+    assert result.returncode == 1, result.stderr
+    (row,) = [row for row in rows_of(result) if row["verdict"] == "wrong"]
+    assert (row["subject"], row["what"], row["found"]) == (AXIS, "encoder.config.direction", "-1")
+    assert "two of the motor's phases" in row["fix"]
 
 
 def test_three_planted_traps_are_named_all_three(run_dir: Path) -> None:

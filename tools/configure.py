@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from rich import box
-from rich.console import Console, Group
+from rich.console import Console
 from rich.markup import escape
-from rich.padding import Padding
-from rich.table import Table
-from rich.text import Text
 
 from shared import config_file, drive_settings
 from shared.config import RobotConfig
 from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
 from tools.bringup import backup, bench, changes
-from tools.bringup.boards import FIRMWARE, Board, Found, firmware_in_words
+from tools.bringup.boards import FIRMWARE, Board, Found, firmware_in_words, is_known
 from tools.bringup.changes import Change, Outcome
 from tools.bringup.check_robot import joint_services, services_up
+from tools.bringup.difference import shown
+from tools.bringup.jog_drive import Interrupts
 from tools.bringup.reach import (
     add_plant,
     boards_on_usb,
@@ -114,8 +113,16 @@ def look_and_write(
             changes.refuse_armed(module, board)
         kept = keep(args.out, boards, path)
         console.print(f"\nwhat the boards had: {kept}; `xrl configure --restore {kept}` shows it")
-        outcomes = apply(console, boards, difference)
-    return conclude(console, robot, outcomes, emulated=started)
+        interrupts = Interrupts()
+        with interrupts.kept():
+            outcomes = apply(console, boards, difference, interrupts)
+    code = conclude(console, robot, outcomes, emulated=started)
+    if interrupts.number:
+        begun = {outcome.change.module for outcome in outcomes}
+        rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
+        console.print(f"stopped before {', '.join(rest)}" if rest else "nothing was left to do")
+        sys.exit(128 + interrupts.number)
+    return code
 
 
 def modules_of(
@@ -181,7 +188,7 @@ def boards_of(robot: RobotConfig, modules: Sequence[str], found: Found) -> dict[
                 f"{found.troubles.get(serial, 'not known')}{there if found.strangers else ''}. "
                 "Settings are written over USB; `xrl doctor` says what is missing"
             )
-        if board.firmware[:2] != FIRMWARE[:2]:
+        if not is_known(board.firmware):
             raise DriveError(
                 f"{module}: firmware {firmware_in_words(board.firmware)}; these settings are those "
                 f"of {firmware_in_words(FIRMWARE)}"
@@ -236,13 +243,20 @@ def keep(folder: Path, boards: Mapping[str, Board], robot_file: Path) -> Path:
 
 
 def apply(
-    console: Console, boards: Mapping[str, Board], difference: Sequence[Change]
+    console: Console,
+    boards: Mapping[str, Board],
+    difference: Sequence[Change],
+    interrupts: Interrupts,
 ) -> list[Outcome]:
-    """Write, save and read back, board after board; one that fails does not stop the others."""
+    """Write, save and read back, board after board; one that fails does not stop the others.
+
+    A board that was begun is finished before an interrupt is heeded: half of its settings would be
+    in force and none saved.
+    """
     outcomes: list[Outcome] = []
     for module, board in boards.items():
         mine = [change for change in difference if change.module == module]
-        if not mine:
+        if interrupts.number or not mine:
             continue
         try:
             with console.status(f"{module}: writing, saving, restarting"):
@@ -268,28 +282,5 @@ def conclude(
         restarted = dict.fromkeys(change.module for change in written)
         console.print(f"restarted, and so without a zero: {', '.join(restarted)}; `xrl zero`")
     if emulated and is_simulated(robot):
-        console.print("the drives were emulated for the while, and are gone with it")
+        console.print(bench.GONE)
     return 1 if bad else 0
-
-
-def shown(difference: Sequence[Change]) -> Group:
-    """Return the difference for the terminal: a table, and below it why each is wanted."""
-    rows = Table(title="difference", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("module", "setting", "now"):
-        rows.add_column(heading, no_wrap=heading != "now")
-    rows.add_column("new")
-    reasons: dict[str, None] = {}
-    for change in difference:
-        head, _, tail = change.name.rpartition(".")
-        rows.add_row(
-            change.module,
-            f"{head}.\n{tail}" if head else tail,
-            escape(changes.in_words(change.before)),
-            escape(changes.in_words(change.after)),
-        )
-        if change.why:
-            reasons.setdefault(f"{tail}: {change.why}")
-        if change.obstacle:
-            obstacle = f"{change.module} {change.name} cannot be written: {change.obstacle}"
-            reasons.setdefault(obstacle)
-    return Group(rows, *(Padding(Text(reason), (0, 1, 0, 2)) for reason in reasons))

@@ -15,9 +15,9 @@ from services.joint.__main__ import open_drive
 from services.joint.differential import joint_from_motor
 from shared import config_file
 from shared.config import RobotConfig
-from shared.exceptions import DriveError, FleetError
+from shared.exceptions import DriveError, FleetError, XrlError
 from shared.joints import AXES, MODULES
-from tools.bringup import bench
+from tools.bringup import bench, limits
 from tools.bringup.jog_drive import NOT_IDLE, Interrupts, Outcome, first_words, jog_drive
 from tools.bringup.jogging import Plan, Sample, gentle, judge, outside, what_to_see
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
@@ -82,42 +82,71 @@ def run(args: argparse.Namespace) -> int:
     plan = plan_of(args)
     path = bench.robot_file(args)
     module: str = args.module
-    robot = gentle(config_file.load_without_schedule(path), plan)
+    robot = config_file.load_without_schedule(path)
+    limited = gentle(robot, plan)
     refuse_service(robot, args)
+    interrupts = Interrupts()
     with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
         if started:
             console.print(f"its soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
-        drive = open_drive(robot, module, args.run_dir)
-        try:
-            try:
-                reading = first_words(drive)
-            except DriveError as error:
-                raise DriveError(f"{module}: {error}") from None
-            q = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)
-            if why := outside(robot, module, plan, q):
-                raise DriveError(f"{module}: {why}")
-            _introduce(robot, module, plan, console)
-            if not bench.confirm("Is the joint free, and the power switch at hand?", yes=args.yes):
-                console.print("nothing was moved")
-                return 2
-            refuse_service(robot, args)  # a person may take minutes to answer
-            interrupts = Interrupts()
-            with interrupts.kept():
-                outcome = jog_drive(
-                    drive,
-                    robot,
-                    module,
-                    plan,
-                    q_seen=q,
-                    interrupts=interrupts,
-                    progress=lambda sample: console.print(progress(sample, plan)),
-                )
-        finally:
-            drive.close()
+        outcome = look_ask_move(args, console, limited, plan, interrupts)
+        if outcome is None:
+            console.print("nothing was moved")
+            return 2
+        if outcome.is_idle:
+            _give_limits_back(robot, args, console)
     code = report(outcome, module, plan, console)
     if interrupts.number:
         sys.exit(128 + interrupts.number)
     return code
+
+
+def look_ask_move(
+    args: argparse.Namespace,
+    console: Console,
+    robot: RobotConfig,
+    plan: Plan,
+    interrupts: Interrupts,
+) -> Outcome | None:
+    """Open the drive, look at the joint, ask, and move it; None if the answer was no.
+
+    Args:
+        args: of the verb.
+        console: to speak on.
+        robot: as `gentle` made it.
+        plan: what to do.
+        interrupts: kept while the drive may be armed.
+
+    Raises:
+        DriveError: the drive does not answer, or the joint may not go there.
+        FleetError: a joint service has the drive.
+    """
+    module: str = args.module
+    drive = open_drive(robot, module, args.run_dir)
+    try:
+        try:
+            reading = first_words(drive)
+        except DriveError as error:
+            raise DriveError(f"{module}: {error}") from None
+        q = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)
+        if why := outside(robot, module, plan, q):
+            raise DriveError(f"{module}: {why}")
+        _introduce(robot, module, plan, console)
+        if not bench.confirm("Is the joint free, and the power switch at hand?", yes=args.yes):
+            return None
+        refuse_service(robot, args)  # a person may take minutes to answer
+        with interrupts.kept():
+            return jog_drive(
+                drive,
+                robot,
+                module,
+                plan,
+                q_seen=q,
+                interrupts=interrupts,
+                progress=lambda sample: console.print(progress(sample, plan)),
+            )
+    finally:
+        drive.close()
 
 
 def plan_of(args: argparse.Namespace) -> Plan:
@@ -184,6 +213,17 @@ def report(outcome: Outcome, module: str, plan: Plan, console: Console) -> int:
         return code
     console.print(f"[bold red]{NOT_IDLE}[/]")
     return 1
+
+
+def _give_limits_back(robot: RobotConfig, args: argparse.Namespace, console: Console) -> None:
+    """Set the drive's limits as the robot file has them, or say that they are the jog's still."""
+    try:
+        limits.give_back(robot, args.module, args.run_dir)
+    except XrlError as error:
+        console.print(
+            f"[yellow]the drive still has the limits of this jog ({escape(str(error))}): until it "
+            "is armed by its service or restarted, `xrl doctor` finds them wrong[/]"
+        )
 
 
 def _introduce(robot: RobotConfig, module: str, plan: Plan, console: Console) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
+import re
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,6 +30,10 @@ from tools.bringup.zeroing import Look, is_right, look, outside, refusal, zero
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
 
+DEGREES_FROM: Final = 7.0
+"""No joint has an angle of so many rad: more than a turn."""
+_NEGATIVE = re.compile(r"-\.?\d")
+
 HEARD_S: Final = 2.0
 """Longest wait for the states of joint services that are up."""
 
@@ -39,7 +45,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "zero",
         """
         xrl zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
-        xrl zero ankle_right --at=-0.02,0.14    # with = before a minus
+        xrl zero ankle_right --at -0.02,0.14
         xrl zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
         """,
     )
@@ -50,8 +56,10 @@ def add_parser(subparsers: Subparsers) -> None:
     where.add_argument(
         "--at",
         metavar="PHI,THETA",
-        help="the joint is at these angles now, rad; write --at=-0.1,... if it begins with a minus",
+        help="the joint is at these angles now, rad, as 0,-0.5",
     )
+    # "-0.02,0.14" is a value and no option, as a single negative number is to argparse
+    parser._negative_number_matcher = _NEGATIVE  # noqa: SLF001 - no public way
     where.add_argument(
         "--standing",
         type=float,
@@ -72,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     robot = config_file.load_without_schedule(path)
     wanted = angles_of(args, robot, console)
     holders = {module: bench.service_on(robot, module, args.run_dir) for module in wanted}
-    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print):
+    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
         refuse_services(robot, holders)
         with contextlib.ExitStack() as stack:
             drives = {module: _open(robot, module, args.run_dir, stack) for module in wanted}
@@ -84,7 +92,10 @@ def run(args: argparse.Namespace) -> int:
                 return 1
             refuse_services(robot, holders)  # a person may take minutes to answer
             _look_all(robot, drives)
-            return _set_all(robot, drives, wanted, console)
+            code = _set_all(robot, drives, wanted, console)
+    if started:
+        console.print(bench.GONE)
+    return code
 
 
 def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) -> dict[str, Pair]:
@@ -111,8 +122,16 @@ def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) ->
         wanted = {module: stand.q[module] for module in modules}
     for module, q in wanted.items():
         if fault := outside(robot, module, q):
-            raise DriveError(f"{module}: {fault}")
+            raise DriveError(f"{module}: {fault}{_if_degrees(q)}")
     return wanted
+
+
+def _if_degrees(q: Pair) -> str:
+    """Return what to write instead of angles that can only be degrees; "" if they cannot."""
+    if not max(map(abs, q)) > DEGREES_FROM:
+        return ""
+    phi, theta = map(math.radians, q)
+    return f"; if these are degrees: --at {phi:.4g},{theta:.4g}"
 
 
 def refuse_services(robot: RobotConfig, holders: Mapping[str, Fleet | None]) -> None:

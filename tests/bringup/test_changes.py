@@ -93,6 +93,28 @@ def test_a_backup_is_brought_back_to_the_last_setting() -> None:
     assert board.kept == saved
 
 
+def test_how_the_phases_were_wired_is_not_written_from_a_backup() -> None:
+    """Wired otherwise since, and with the old offset, the motor would run away."""
+    found = {
+        f"axis1.encoder.config.{name}": value
+        for name, value in (("direction", 1), ("phase_offset", 40), ("phase_offset_float", 0.5))
+    }
+    old = {name: -value for name, value in found.items()}
+    board = BoardInMemory(found | {VEL_LIMIT: 2.0})
+    difference = changes.against_backup(MODULE, old | {VEL_LIMIT: 60.0}, board)
+    outcomes = changes.apply(board, difference)
+    assert board.writes == [VEL_LIMIT]
+    assert {o.change.name for o in outcomes if not o.good} == set(found), "and it is told"
+    assert changes.against_backup(MODULE, found, board) == []
+
+
+def test_a_current_that_counts_the_other_way_is_nothing_to_write(
+    wanted: tuple[Wanted, ...],
+) -> None:
+    board = BoardInMemory(as_wanted() | {"axis0.encoder.config.direction": -1})
+    assert changes.against_wanted(MODULE, wanted, board) == []
+
+
 @pytest.mark.parametrize("state", [AxisState.CLOSED_LOOP_CONTROL, AxisState.MOTOR_CALIBRATION, 99])
 def test_a_board_with_an_axis_that_is_not_idle_is_refused(state: int) -> None:
     board = BoardInMemory({}, **{"axis1.current_state": int(state)})

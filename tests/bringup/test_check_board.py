@@ -68,6 +68,7 @@ def test_a_missing_calibration_is_not_a_matter_of_writing_settings(robot: RobotC
     [
         ((0, 5, 6), Verdict.OK),
         ((0, 5, 4), Verdict.WARNING),
+        ((0, 5, 1), Verdict.WRONG),
         ((0, 6, 10), Verdict.WRONG),
         ((0, 4, 12), Verdict.WRONG),
     ],
@@ -76,6 +77,37 @@ def test_the_firmware_is_judged_by_whether_its_settings_are_known(
     firmware: tuple[int, int, int], verdict: Verdict
 ) -> None:
     assert check_board.firmware_row(MODULE, firmware).verdict is verdict
+
+
+@pytest.mark.parametrize(
+    ("driver", "direction", "calibrated", "verdicts"),
+    [
+        ("odrive_can", 1, True, [Verdict.OK]),
+        ("odrive_can", -1, True, [Verdict.WRONG]),
+        ("odrive_can", 0, True, [Verdict.WRONG]),
+        ("odrive_can", -1, False, []),
+        ("odrive_usb", 1, True, [Verdict.OK]),
+        ("odrive_usb", -1, True, [Verdict.OK]),
+        ("odrive_usb", 0, True, [Verdict.WRONG]),
+    ],
+)
+def test_over_can_currents_must_count_as_the_encoders_do(
+    robot: RobotConfig, driver: str, direction: int, calibrated: bool, verdicts: list[Verdict]
+) -> None:
+    service = msgspec.structs.replace(robot.joint_service, driver=driver)
+    values = healthy() | {
+        "axis1.encoder.config.direction": direction,
+        "axis1.encoder.is_ready": calibrated,
+    }
+    rows = check_board.direction_rows(
+        MODULE, values, msgspec.structs.replace(robot, joint_service=service)
+    )
+    assert [(row.subject, row.verdict) for row in rows] == [
+        (f"{MODULE}.axis1", verdict) for verdict in verdicts
+    ]
+    if verdicts == [Verdict.WRONG]:
+        assert ("two of the motor's phases" in rows[0].fix) == (direction == -1)
+        assert "configure" not in rows[0].fix
 
 
 def test_every_error_register_is_named_whichever_it_is_in() -> None:
@@ -114,6 +146,35 @@ def test_the_supply_is_between_the_boards_own_trip_levels(volts: float, verdict:
     values = healthy() | {"vbus_voltage": volts}
     rows = check_board.condition_rows(MODULE, values, (8.0, 59.92), services_up=False)
     assert next(row for row in rows if row.what == "supply").verdict is verdict
+
+
+@pytest.mark.parametrize(
+    ("celsius", "verdict"),
+    [(25.0, Verdict.OK), (85.0, Verdict.WARNING), (-60.0, Verdict.WARNING),
+     (float("nan"), Verdict.WARNING)],
+)  # fmt: skip
+def test_a_hot_output_stage_or_a_broken_thermistor_is_named(
+    celsius: float, verdict: Verdict
+) -> None:
+    values = healthy() | {"axis1.motor.fet_thermistor.temperature": celsius}
+    rows = check_board.condition_rows(MODULE, values, (8.0, 59.92), services_up=False)
+    (row,) = [row for row in rows if row.what == "temperature"]
+    assert (row.subject, row.verdict) == (f"{MODULE}.axis1", verdict)
+
+
+@pytest.mark.parametrize(
+    ("enabled", "armed", "expected"),
+    [(True, True, [Verdict.OK]), (True, False, [Verdict.WRONG]), (False, False, [])],
+)
+def test_a_brake_resistor_that_is_fitted_must_be_armed(
+    enabled: bool, armed: bool, expected: list[Verdict]
+) -> None:
+    values = healthy() | {
+        "config.enable_brake_resistor": enabled,
+        "brake_resistor_armed": armed,
+    }
+    rows = check_board.condition_rows(MODULE, values, (8.0, 59.92), services_up=False)
+    assert [row.verdict for row in rows if row.what == "brake resistor"] == expected
 
 
 @pytest.mark.parametrize("part", ["motor.is_calibrated", "encoder.is_ready"])

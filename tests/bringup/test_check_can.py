@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import msgspec
 import pytest
 
@@ -104,6 +107,27 @@ def test_a_bus_that_cannot_be_opened_says_how_to_open_it(
     (row,) = rows_of(other, BusHeard(trouble="no such device"))
     assert row.verdict is Verdict.WRONG
     assert words in row.fix
+
+
+def test_a_kernel_without_can_is_not_told_to_bring_an_interface_up(robot: RobotConfig) -> None:
+    can = {name: CanConfig(interface="socketcan", channel="can7") for name in robot.can}
+    other = msgspec.structs.replace(robot, can=can)
+    trouble = f"[Errno {errno.EAFNOSUPPORT}] {os.strerror(errno.EAFNOSUPPORT)}"
+    (row,) = rows_of(other, BusHeard(trouble=trouble))
+    assert "modprobe can_raw" in row.fix
+
+
+@pytest.mark.parametrize("apart_s", [0.001, 0.005, 0.010])
+def test_two_axes_under_one_node_id_show_however_their_heartbeats_fall(
+    robot: RobotConfig, apart_s: float
+) -> None:
+    heard = healthy()
+    both = sorted(t + late for t in times(0.02, 25) for late in (0.0, apart_s))
+    # the first and the last gap are long ones: so is then the median of 1 and 19 ms
+    heard.nodes[8] = NodeHeard(IDLE, both[1:-1], times(0.002), pos_turns=64.0)
+    rows = rows_of(robot, heard)
+    assert bad(rows) == [(f"{MODULE}.axis0", "heartbeat", Verdict.WARNING)]
+    assert "the same node id" in next(row.why for row in rows if row.verdict != Verdict.OK)
 
 
 def cells(rate_hz: float = 250.0, force: float = 20.0) -> BusHeard:

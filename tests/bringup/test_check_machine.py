@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,8 +13,11 @@ import pytest
 from shared import priority
 from shared.config import RobotConfig
 from shared.config_sections import CanConfig
+from shared.process import DEFAULT_CONFIG
 from tools.bringup import check_machine
 from tools.bringup.rows import Row, Verdict
+
+ROOT = DEFAULT_CONFIG.parents[1]
 
 
 @pytest.fixture
@@ -58,6 +62,13 @@ def test_what_slows_a_loop_is_a_warning_on_a_real_robot_and_said_on_an_emulated_
         assert row.found != row.wanted
 
 
+def test_one_processor_that_sleeps_is_seen(real: RobotConfig, tmp_path: Path) -> None:
+    for cpu, governor in enumerate(("performance", "powersave", "performance")):
+        write(tmp_path, f"sys/devices/system/cpu/cpu{cpu}/cpufreq/scaling_governor", governor)
+    row = row_of(check_machine.machine_rows(real, tmp_path), "frequency governor")
+    assert (row.verdict, row.found) == (Verdict.WARNING, "performance and powersave")
+
+
 def test_a_kernel_that_tells_nothing_is_ok(robot: RobotConfig, tmp_path: Path) -> None:
     rows = check_machine.machine_rows(robot, tmp_path)
     assert row_of(rows, "frequency governor").found == "not told here"
@@ -100,16 +111,6 @@ def test_real_time_is_tried_and_not_kept(robot: RobotConfig, tmp_path: Path) -> 
     assert os.sched_getscheduler(0) == before
 
 
-def test_can_interfaces_are_there_and_up(real: RobotConfig, tmp_path: Path) -> None:
-    write(tmp_path, "sys/class/net/can0/flags", "0x40081")
-    write(tmp_path, "sys/class/net/can1/flags", "0x40080")
-    rows = check_machine.socketcan_rows(real, tmp_path)
-    assert {row.subject: row.found for row in rows}["can0"] == "up"
-    assert {row.subject: row.found for row in rows}["can1"] == "down"
-    assert {row.subject: row.found for row in rows}["can2"] == "not there"
-    assert "ip link set can1 up" in next(row.fix for row in rows if row.subject == "can1")
-
-
 def plug_in(root: Path, product: str = "0d32") -> Path:
     for name, text in (
         ("idVendor", "1209"),
@@ -136,7 +137,11 @@ def test_an_odrive_that_may_not_be_opened_wants_its_udev_rule(
     )
     (row,) = check_machine.usb_node_rows(tmp_path)
     assert row.verdict is Verdict.WRONG
-    assert 'ATTR{idVendor}=="1209"' in row.fix
+    (rules,) = (ROOT / word for word in row.fix.split() if word.endswith(".rules"))
+    ids = re.search(r'idVendor}=="1209", ATTR\{idProduct\}=="(0d3\[\d-\d\])"', rules.read_text())
+    assert ids is not None
+    named = [f"{i:04x}" for i in range(1 << 16) if re.fullmatch(ids[1], f"{i:04x}")]
+    assert tuple(named) == check_machine.ODRIVE_PRODUCTS, "the rule is for what the doctor finds"
 
 
 def test_other_usb_devices_are_not_taken_for_odrives(tmp_path: Path) -> None:

@@ -7,7 +7,14 @@ import math
 import msgspec
 import pytest
 
-from services.simulator.axis_settings import AXIS_SETTINGS, NAMES, Settings, configured, plant
+from services.simulator.axis_settings import (
+    AXIS_SETTINGS,
+    NAMES,
+    PHASE_RESISTANCE,
+    Settings,
+    configured,
+    plant,
+)
 from shared.config import RobotConfig
 from shared.drive_settings import AXIS_TABLE, DRIVE_TABLE, Compare, Wanted, of_module, same
 from shared.exceptions import DriveError
@@ -19,6 +26,8 @@ TRAPS = (
     "controller.config.enable_torque_mode_vel_limit",
     "motor.config.current_lim",
     "config.can.encoder_rate_ms",
+    "controller.config.spinout_electrical_power_threshold",
+    "controller.config.spinout_mechanical_power_threshold",
 )
 """Of design section 5, of each axis: what an ODrive ships is wrong."""
 
@@ -64,6 +73,29 @@ def test_a_drive_as_shipped_trips_at_the_first_braking_leg(robot: RobotConfig) -
     row = next(r for r in of_module(robot, "hip_left") if r.name.endswith("negative_current"))
     assert not row.fits(-0.01)
     assert row.fits(robot.drive.dc_max_negative_current)
+
+
+def test_no_winding_gets_so_warm_that_a_leg_that_sinks_is_taken_for_a_slipped_encoder(
+    robot: RobotConfig,
+) -> None:
+    """Copper at 100 C has 30 % more resistance; the firmware takes off what it had when cold."""
+    warm = 0.3 * 1.5 * PHASE_RESISTANCE * robot.drive.current_lim**2
+    electrical, mechanical = (
+        row
+        for row in of_module(robot, "knee_left")
+        if row.name.startswith("axis0.controller.config.spinout")
+    )
+    assert not electrical.fits(warm)
+    assert not mechanical.fits(-warm)
+    assert electrical.fits(150.0)
+    assert mechanical.fits(-150.0)
+
+
+def test_what_calibration_finds_is_never_written() -> None:
+    assert not {row.name for row in AXIS_TABLE} & {
+        "encoder.config.direction",
+        "motor.config.phase_resistance",
+    }
 
 
 def test_each_axis_is_wanted_at_its_own_node(robot: RobotConfig) -> None:

@@ -8,6 +8,8 @@ import msgspec
 import pytest
 from rich.console import Console
 
+from shared.drive_settings import AXES
+from shared.joints import MODULES
 from tools.bringup.report import Report, report_of, show, verdict_line
 from tools.bringup.rows import Row, Verdict, merged, ok, warning, wrong
 
@@ -36,6 +38,50 @@ def test_rows_that_are_ok_and_alike_become_one_from_the_smallest_to_the_largest(
 
 def test_rows_that_are_not_ok_stay_themselves() -> None:
     assert merged([*FINE, TRAP, NOTED])[1:] == [TRAP, NOTED]
+
+
+def trap(subject: str, what: str = "controller.config.vel_limit") -> Row:
+    module = subject.partition(".")[0]
+    fix = f"`xrl configure --apply --module {module}`"
+    return wrong(subject, what, "2", "60", fix, "it disarms")
+
+
+def test_a_trap_of_all_twelve_axes_is_one_row_and_one_command_for_all() -> None:
+    rows = [trap(f"{module}.{axis}") for module in MODULES for axis in AXES]
+    (row,) = merged(rows)
+    assert (row.subject, row.found, row.verdict) == ("all 12", "2", Verdict.WRONG)
+    assert row.fix == "`xrl configure --apply`"
+    assert verdict_line({"drives": rows}) == "12 wrong: all 12 vel_limit"
+    assert report_of({"drives": rows}).wrong == 12
+    assert len(report_of({"drives": rows}).groups["drives"]) == 12, "machines get every row"
+
+
+def test_a_trap_of_both_axes_of_one_board_is_one_row_with_its_command() -> None:
+    rows = [trap("hip_left.axis0"), trap("knee_left.axis0"), trap("knee_left.axis1")]
+    assert [row.subject for row in merged(rows)] == ["hip_left.axis0", "knee_left, both"]
+    assert merged(rows)[1].fix.endswith("--module knee_left`")
+
+
+def test_all_six_boards_are_one_row_and_five_are_not() -> None:
+    rows = [trap(module, "can.config.baud_rate") for module in MODULES]
+    assert [row.subject for row in merged(rows)] == ["all 6"]
+    assert merged(rows[:5]) == rows[:5]
+
+
+def test_values_wanted_of_one_axis_only_are_not_put_together() -> None:
+    rows = [
+        wrong(f"{module}.{axis}", "config.can.node_id", "0", str(i), "`xrl configure --apply`")
+        for i, module in enumerate(MODULES)
+        for axis in AXES
+    ]
+    assert len(merged(rows)) == len(MODULES)
+
+
+def test_the_same_said_of_several_is_said_once() -> None:
+    rows = [wrong(f"can{i}", "interface", "not there", "up", "plug it in") for i in range(7)]
+    text = " ".join(printed({"computer": rows}, 100).split())
+    assert text.count("plug it in") == 1
+    assert "can0, can1, can2, can3, can4, can5, can6 interface: plug it in" in text
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -167,6 +168,20 @@ def test_a_leg_of_the_emulated_robot_follows_and_nothing_is_left_behind(run_dir:
     assert "both axes are idle" in done.stdout
     assert not procfs.fleet_pids(run_dir)
     assert not run_dir.exists()
+
+
+def test_after_a_jog_the_doctor_finds_the_drive_as_it_was(run_dir: Path) -> None:
+    """Its limits too: `xrl configure --apply` would restart the board for them, zero and all."""
+    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator"])
+    try:
+        jogged = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
+        assert "both axes are idle" in jogged.stdout, jogged.stdout + jogged.stderr
+        report = json.loads(xrl("doctor", "--json", run_dir=run_dir).stdout)
+    finally:
+        fleet.stop()
+    rows = [row for group in report["groups"].values() for row in group]
+    assert [row for row in rows if row["verdict"] == "wrong"] == []
+    assert sum(row["what"] == "settings" for row in rows) == len(MODULES)
 
 
 def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(

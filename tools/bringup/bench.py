@@ -27,6 +27,10 @@ from tools.supervision.supervise import Fleet
 
 SETTLE_S: Final = 1.5
 """Until an emulated robot hangs still in its hoist."""
+GONE: Final = (
+    "the drives were emulated for the while, and are gone with what they were told; "
+    "`xrl up --only simulator` keeps them"
+)
 
 
 def robot_file(args: Namespace) -> Path:

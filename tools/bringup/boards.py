@@ -14,12 +14,15 @@ Value = bool | int | float | str | None
 
 FIRMWARE: Final = (0, 5, 6)
 """What the settings' names and the drivers are made for."""
+OLDEST: Final = (0, 5, 4)
+"""Before it, the CAN settings, the board's error register and the heartbeat are other ones."""
 
 AXIS_ERRORS: Final = ("error", "motor.error", "encoder.error", "controller.error")
 """An axis's error registers; any may be set while the others are 0."""
 _AXIS_STATUS: Final = (
     *AXIS_ERRORS,
     "current_state",
+    "motor.fet_thermistor.temperature",
     "motor.is_calibrated",
     "encoder.is_ready",
     "encoder.pos_estimate",
@@ -27,6 +30,7 @@ _AXIS_STATUS: Final = (
 STATUS: Final = (
     "error",
     "vbus_voltage",
+    "brake_resistor_armed",
     *(f"{axis}.{name}" for axis in AXES for name in _AXIS_STATUS),
 )
 """What a board shows of how it is, besides its settings."""
@@ -84,6 +88,11 @@ def equal(one: Value, other: Value) -> bool:
     if isinstance(other, float) and isinstance(one, int):
         return equal(other, one)
     return one == other
+
+
+def is_known(firmware: tuple[int, int, int]) -> bool:
+    """Return True for a firmware whose settings have the names that are used here."""
+    return firmware >= OLDEST and firmware[:2] == FIRMWARE[:2]
 
 
 def firmware_in_words(firmware: tuple[int, int, int]) -> str:

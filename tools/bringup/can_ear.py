@@ -1,8 +1,8 @@
 """What a CAN bus of the robot says of itself in a moment: drives' heartbeats, load cells.
 
 Nothing is sent to a bus whose services are up: any frame feeds a drive's watchdog, and would
-hide that its service is dead. Else two questions are asked of each axis: its version, which only
-firmware 0.6 answers, and the voltage of its supply.
+hide that its service is dead. Else three questions are asked of each axis: its version, which
+only firmware 0.6 answers, its encoder's count, which only 0.5 does, and its supply's voltage.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ class NodeHeard(msgspec.Struct):
     """When they came."""
     estimates_s: list[float] = []
     pos_turns: float | None = None
-    """The newest estimate."""
+    """The newest estimate; firmware 0.5.6 says 0 until its first closed loop."""
+    shadow_count: int | None = None
+    """Where its encoder is, in counts: the answer of firmware 0.5."""
     version: Version | None = None
     """The answer of firmware 0.6; 0.5 gives none."""
     vbus_voltage: float | None = None
@@ -112,6 +114,11 @@ def period_ms(times_s: Sequence[float], wanted_ms: float) -> float | None:
     return min((1e3 * median(gaps), 1e3 * fmean(gaps)), key=lambda ms: abs(ms - wanted_ms))
 
 
+def mean_ms(times_s: Sequence[float]) -> float:
+    """Return the mean period of two frames or more, ms."""
+    return 1e3 * (times_s[-1] - times_s[0]) / (len(times_s) - 1)
+
+
 def _questions(nodes: Iterable[int]) -> list[can.Message]:
     return [
         can.Message(
@@ -121,7 +128,7 @@ def _questions(nodes: Iterable[int]) -> list[can.Message]:
             is_extended_id=False,
         )
         for node in nodes
-        for command in (Command06.GET_VERSION, Command.GET_VBUS)
+        for command in (Command06.GET_VERSION, Command.GET_ENCODER_COUNT, Command.GET_VBUS)
     ]
 
 
@@ -162,6 +169,8 @@ def _of_node(message: can.Message, nodes: dict[int, NodeHeard]) -> None:
     if command == Command.GET_ENCODER_ESTIMATES:
         known.pos_turns = cansimple.unpack_two_floats(data)[0]
         known.estimates_s.append(message.timestamp)
+    elif command == Command.GET_ENCODER_COUNT:
+        known.shadow_count = cansimple.unpack_two_ints(data)[0]
     elif command == Command.GET_VBUS:
         known.vbus_voltage = cansimple.unpack_two_floats(data)[0]
     elif command == Command06.GET_VERSION:

@@ -14,6 +14,13 @@ from tools.bringup.check_board import CALIBRATE
 _CALIBRATED = {"motor.config.pre_calibrated": "motor.is_calibrated",
                "encoder.config.pre_calibrated": "encoder.is_ready"}  # fmt: skip
 """Settings that a drive takes only once it is calibrated."""
+_FOUND = (
+    "encoder.config.direction",
+    "encoder.config.phase_offset",
+    "encoder.config.phase_offset_float",
+)
+"""What the encoder's calibration finds by how the phases are wired now: with other values than
+these the motor has no torque, or runs away."""
 
 
 class Change(NamedTuple):
@@ -74,6 +81,10 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
             obstacle = "not there in this board's firmware"
         elif equal(settings[name], value):
             continue
+        elif name.partition(".")[2] in _FOUND:
+            obstacle = (
+                "calibration finds it, by how the phases are wired now; the board keeps its own"
+            )
         else:
             obstacle = ""
         changes.append(

@@ -20,7 +20,7 @@ from shared.drive_settings import AXES, Wanted, value_in_words
 from shared.exceptions import DriveError
 from shared.joints import AXES as JOINT_AXES
 from shared.joints import MODULE_INDEX
-from tools.bringup.boards import FIRMWARE, Value, firmware_in_words, number
+from tools.bringup.boards import FIRMWARE, Value, firmware_in_words, is_known, number
 from tools.bringup.rows import Row, Verdict, judged, ok, warning, wrong
 
 Values = Mapping[str, Value]
@@ -36,6 +36,11 @@ REGISTERS: Final[tuple[tuple[str, type[IntFlag]], ...]] = (
 OVERVOLTAGE_SHARE: Final = 0.95
 """Of the trip level; a supply nearer to it leaves braking legs no room."""
 
+TEMPERATURES: Final = (-10.0, 70.0)
+"""C; of an output stage that is idle."""
+_DIRECTION: Final = "encoder.config.direction"
+_TEMPERATURE: Final = "motor.fet_thermistor.temperature"
+
 CALIBRATE: Final = (
     "unload the joint, `odrivetool`: requested_state = AXIS_STATE_FULL_CALIBRATION_SEQUENCE, "
     "then pre_calibrated = True on motor and encoder"
@@ -46,12 +51,15 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Row:
     """Judge a board's firmware."""
     wanted = firmware_in_words(FIRMWARE)
     found = firmware_in_words(firmware)
-    fix = f"flash {wanted}: `odrivetool dfu`; then `xrl configure --apply --module {module}`"
-    if firmware[:2] == FIRMWARE[:2]:
+    fix = (
+        f"flash {wanted}: `odrivetool legacy-dfu FILE.elf`; then "
+        f"`xrl configure --apply --module {module}`"
+    )
+    if is_known(firmware):
         why = "settings may have other names or defaults"
         good = firmware == FIRMWARE
         return judged(good, module, "firmware", found, wanted, fix, why, otherwise=Verdict.WARNING)
-    why = "other settings, other error words: see design section 5"
+    why = "other settings, other errors, other CAN frames: nothing of it can be compared"
     return wrong(module, "firmware", found, wanted, fix, why)
 
 
@@ -70,6 +78,35 @@ def settings_rows(module: str, wanted: tuple[Wanted, ...], values: Values) -> li
             rows.append(wrong(subject, name, value_in_words(value), words, by_hand, setting.why))
     fitting = f"{len(wanted) - len(rows)} as wanted"
     return [ok(module, "other settings" if rows else "settings", fitting), *rows]
+
+
+def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Row]:
+    """Judge which way currents count, as each axis's encoder calibration has found it.
+
+    The firmware turns the torque round where it is -1, so that the motion is the same; its
+    currents then have the other sign. USB reads both; CAN of firmware 0.5 the currents only.
+
+    Args:
+        module: whose board it is.
+        values: its settings, and of `boards.STATUS`; an axis that is not calibrated has none.
+        robot: which driver is to speak to it.
+    """
+    over_can = robot.joint_service.driver == "odrive_can"
+    fix = (
+        "swap two of the motor's phases and calibrate again; `motor_signs` is for mirrored legs, "
+        "not for this"
+    )
+    why = "CAN does not tell it: a service that takes the drive over would turn its torque round"
+    rows = []
+    for axis in AXES:
+        value = values.get(f"{axis}.{_DIRECTION}")
+        if isinstance(value, int | float) and values.get(f"{axis}.encoder.is_ready"):
+            wanted = "1" if over_can else "1 or -1"
+            subject, found = f"{module}.{axis}", value_in_words(value)
+            good = value == 1 or (not over_can and value == -1)
+            by_hand = fix if value == -1 else CALIBRATE
+            rows.append(judged(good, subject, _DIRECTION, found, wanted, by_hand, why))
+    return rows
 
 
 def error_rows(module: str, values: Values) -> list[Row]:
@@ -100,12 +137,19 @@ def condition_rows(
 
     Args:
         module: whose board it is.
-        values: of `boards.STATUS`.
+        values: of `boards.STATUS`, and the board's settings.
         trip_levels: the board's own under- and over-voltage levels, V.
         services_up: whether a joint service has the drive.
     """
     rows = [_voltage(module, number(values, "vbus_voltage"), trip_levels)]
+    if values.get("config.enable_brake_resistor") and "brake_resistor_armed" in values:
+        armed = bool(values["brake_resistor_armed"])
+        fix = "look at `brake_resistance` and its wires; power off and on"
+        why = "neither axis arms without it"
+        found = "armed" if armed else "not armed"
+        rows.append(judged(armed, module, "brake resistor", found, "armed", fix, why))
     for axis in AXES:
+        rows += _temperature(f"{module}.{axis}", values.get(f"{axis}.{_TEMPERATURE}"))
         lacking = [
             part
             for part, name in (("motor", "motor.is_calibrated"), ("encoder", "encoder.is_ready"))
@@ -171,6 +215,28 @@ def flags_in_words(kind: type[IntFlag], bits: int) -> str:
     names = [flag.name or "" for flag in kind if flag and bits & flag == flag]
     rest = bits & ~sum(flag for flag in kind if flag)
     return " ".join([*names, *([hex(rest)] if rest else [])])
+
+
+def _temperature(subject: str, celsius: Value) -> list[Row]:
+    """Judge an output stage's temperature; nothing where the board does not tell it."""
+    if not isinstance(celsius, int | float):
+        return []
+    low, high = TEMPERATURES
+    fix = "let it cool; a reading that stays is a broken thermistor: another board"
+    why = "from 100 C on the drive cuts its current, at 120 C it disarms"
+    good = low <= celsius <= high  # NaN is not
+    return [
+        judged(
+            good,
+            subject,
+            "temperature",
+            f"{celsius:.0f} C",
+            f"{low:g} to {high:g} C",
+            fix,
+            why,
+            otherwise=Verdict.WARNING,
+        )
+    ]
 
 
 def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Row:

@@ -14,6 +14,7 @@ from typing import Final
 
 from shared import priority
 from shared.config import RobotConfig
+from tools.bringup.check_socketcan import ask_ip, socketcan_rows
 from tools.bringup.rows import Row, Verdict, judged, ok, warning, wrong
 from tools.supervision.fleet import is_simulated
 
@@ -27,12 +28,15 @@ FIFO_PRIORITY: Final = 20
 """Of the joint services."""
 
 ODRIVE_VENDOR: Final = "1209"
-ODRIVE_PRODUCTS: Final = ("0d31", "0d32", "0d33")
-UDEV_RULE: Final = (
-    'SUBSYSTEM=="usb", ATTR{idVendor}=="1209", ATTR{idProduct}=="0d3[0-9]", MODE="0666"'
+ODRIVE_PRODUCTS: Final = tuple(f"0d3{i}" for i in range(1, 10))
+"""As in deploy/udev/91-odrive.rules."""
+UDEV_FIX: Final = (
+    "`sudo cp deploy/udev/91-odrive.rules /etc/udev/rules.d/` and what its head says; plug in again"
 )
-RTPRIO_FIX: Final = "`@xrl - rtprio 40` in /etc/security/limits.conf, or systemd's LimitRTPRIO=40"
-_IFF_UP = 1
+RTPRIO_FIX: Final = (
+    "`YOU - rtprio 40` in /etc/security/limits.d/xrl.conf and log in again, or systemd's "
+    "LimitRTPRIO=40"
+)
 
 
 def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Row]:
@@ -54,7 +58,7 @@ def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Row]:
         return rows
     if any(module.serial_number for module in robot.module):
         rows += [_libusb(), *usb_node_rows(root)]
-    return rows + socketcan_rows(robot, root)
+    return rows + socketcan_rows(robot, root, ask_ip())
 
 
 def usb_node_rows(root: Path) -> list[Row]:
@@ -70,24 +74,7 @@ def usb_node_rows(root: Path) -> list[Row]:
         return [warning("USB", "ODrives", "none plugged in", "one for each module", fix)]
     closed = [str(node) for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
     found = f"{len(closed)} closed" if closed else f"{len(nodes)} open"
-    fix = f"the line {UDEV_RULE} in /etc/udev/rules.d/91-odrive.rules, then plug in again"
-    return [judged(not closed, "USB", "permission", found, "read and write", fix)]
-
-
-def socketcan_rows(robot: RobotConfig, root: Path) -> list[Row]:
-    """Check that the CAN interfaces are there and up."""
-    rows = []
-    names = {bus.channel for bus in robot.can.values() if bus.interface == "socketcan"}
-    for name in sorted(names):
-        fix = f"`ip link set {name} up type can bitrate 1000000`"
-        flags = _text(root / "sys/class/net" / name / "flags")
-        if not flags:
-            fix = "plug the adapter in; `ip link` lists what is there"
-            rows.append(wrong(name, "interface", "not there", "up", fix))
-        else:
-            up = bool(int(flags, 16) & _IFF_UP)
-            rows.append(judged(up, name, "interface", "up" if up else "down", "up", fix))
-    return rows
+    return [judged(not closed, "USB", "permission", found, "read and write", UDEV_FIX)]
 
 
 def _cpus() -> Row:
@@ -100,16 +87,17 @@ def _cpus() -> Row:
 
 
 def _governor(root: Path, *, emulated: bool) -> Row:
-    found = _text(root / "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+    files = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
+    found = sorted({_text(file) for file in files} - {""})
     if not found:
         return ok(SUBJECT, "frequency governor", "not told here", "performance")
     return judged(
-        found == "performance" or emulated,
+        found == ["performance"] or emulated,
         SUBJECT,
         "frequency governor",
-        found,
+        " and ".join(found),
         "performance",
-        "`cpupower frequency-set -g performance`",
+        "`sudo cpupower frequency-set -g performance`",
         "a processor that sleeps is late",
         otherwise=Verdict.WARNING,
     )
@@ -162,7 +150,7 @@ def _swap(root: Path, *, emulated: bool) -> Row:
         "swap",
         "none" if areas <= 0 else f"{areas} in use",
         "none",
-        "`swapoff -a`",
+        "`sudo swapoff -a`",
         "the services lock no memory: a page that was swapped out stops a loop",
         otherwise=Verdict.WARNING,
     )
@@ -172,7 +160,7 @@ def _libusb() -> Row:
     try:
         ctypes.CDLL("libusb-1.0.so.0")
     except OSError:
-        fix = "`apt install libusb-1.0-0`"
+        fix = "`sudo apt install libusb-1.0-0`"
         return wrong("USB", "libusb-1.0", "not found", "installed", fix, "no ODrive over USB")
     return ok("USB", "libusb-1.0", "installed", "installed")
 

@@ -11,18 +11,28 @@ import argparse
 import contextlib
 import os
 import tempfile
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 from services.simulator import usb_standin
 from services.simulator.axis_settings import Settings, plant
-from shared.config import RobotConfig
+from shared.config import RobotConfig, expand
+from shared.config_sections import CanConfig
 from shared.exceptions import FleetError
 from tools.bringup.boards import Found
+from tools.bringup.can_ear import listen
 from tools.supervision import procfs
-from tools.supervision.fleet import is_simulated
+from tools.supervision.fleet import SIMULATED_CAN, is_simulated
 from tools.supervision.run_dir import RunDir
 from tools.supervision.supervise import Fleet
+
+STARTED_S: Final = 15.0
+"""Longest wait for the first frames of a simulator that was started."""
+UP_S: Final = 3.0
+"""The same where a fleet is up: its simulator may be dead, or another verb's that is starting."""
+_POLL_S = 0.05
 
 
 def add_plant(parser: argparse.ArgumentParser) -> None:
@@ -58,6 +68,29 @@ def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> No
         plant(scratch, words)
 
 
+def refuse_half_emulated(robot: RobotConfig) -> None:
+    """Refuse a robot file some of whose buses are emulated and others real.
+
+    One bus that was forgotten would make its USB the emulated one: emulated drives are as wanted.
+
+    Raises:
+        FleetError: naming the buses.
+    """
+    used = sorted({robot.harness.bus, *(module.bus for module in robot.module)})
+    emulated = [name for name in used if robot.can[name].interface == SIMULATED_CAN]
+    if emulated and len(emulated) < len(used):
+        real = [name for name in used if name not in emulated]
+        raise FleetError(
+            f"robot file: {_tables(emulated)} {'is' if len(emulated) == 1 else 'are'} emulated "
+            f'(interface = "{SIMULATED_CAN}"), {_tables(real)} not: which drives are meant? Make '
+            "all of them real ones, or all emulated"
+        )
+
+
+def _tables(buses: Sequence[str]) -> str:
+    return ", ".join(f"[can.{name}]" for name in buses)
+
+
 def is_up(run_dir: Path) -> bool:
     """Return True if a fleet has a process in this run directory."""
     return bool(procfs.fleet_pids(RunDir(run_dir).path))
@@ -78,8 +111,10 @@ def drives_within_reach(
         plants: settings that the emulated drives have kept, as `--drive-setting` takes them.
 
     Raises:
-        FleetError: the simulator cannot be started, or it ended meanwhile.
+        FleetError: the simulator cannot be started, or it ended meanwhile, or the robot file has
+            emulated buses and real ones.
     """
+    refuse_half_emulated(robot)
     if not is_simulated(robot):
         yield False
         return
@@ -95,6 +130,7 @@ def drives_within_reach(
             leashed=True,
         )
     try:
+        wait_for_simulator(robot, run_dir, UP_S if simulator is None else STARTED_S)
         yield simulator is not None
         if simulator is not None and not simulator.pids():
             log = simulator.run.log_of("simulator")
@@ -103,6 +139,18 @@ def drives_within_reach(
     finally:
         if simulator is not None:
             simulator.stop()
+
+
+def wait_for_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
+    """Wait until an emulated robot's load cells speak: its buses are there, and its loop runs.
+
+    Not for ever: its simulator may be dead.
+    """
+    bus = robot.can[robot.harness.bus]
+    config = CanConfig(interface=bus.interface, channel=expand(bus.channel, RunDir(run_dir).path))
+    until = time.monotonic() + seconds
+    while time.monotonic() < until and not listen(config, (), ask=False, seconds=_POLL_S).frames:
+        time.sleep(_POLL_S)
 
 
 @contextlib.contextmanager

@@ -53,11 +53,13 @@ def show(console: Console, groups: Groups, *, verbose: bool) -> None:
 def verdict_line(groups: Groups) -> str:
     """Return "all ok", or how much is wrong and what: the command's answer in a line."""
     rows = list(chain(*groups.values()))
-    wrong = [row for row in rows if row.verdict is Verdict.WRONG]
-    warnings = [row for row in rows if row.verdict is Verdict.WARNING]
-    noted = f"{len(warnings)} warning{'s' * (len(warnings) != 1)}: {_names(warnings)}"
+    put_together = [row for group in groups.values() for row in merged(group)]
+    wrong, warnings = count(rows, Verdict.WRONG), count(rows, Verdict.WARNING)
+    named = _names(row for row in put_together if row.verdict is Verdict.WARNING)
+    noted = f"{warnings} warning{'s' * (warnings != 1)}: {named}"
     if wrong:
-        said = f"{len(wrong)} wrong: {_names(wrong)}"
+        named = _names(row for row in put_together if row.verdict is Verdict.WRONG)
+        said = f"{wrong} wrong: {named}"
         return f"{said}; {noted}" if warnings else said
     return f"nothing wrong; {noted}" if warnings else "all ok"
 
@@ -78,9 +80,17 @@ def _group(title: str, rows: list[Row], width: int) -> RenderableType:
         cells = [escape(cell) for cell in (row.subject, names[row.what], row.found, row.wanted)]
         cells.append(f"[{COLOURS[row.verdict]}]{row.verdict}[/]")
         table.add_row(*cells, *([escape(row.fix)] if wide else []))
-    notes = [f"{row.subject} {row.what}: {note}" for row in rows if (note := _note(row, wide=wide))]
-    below = [Padding(Text(note), (0, 1, 0, 2)) for note in notes]
+    below = [Padding(Text(note), (0, 1, 0, 2)) for note in _notes(rows, wide=wide)]
     return Group(table, *below, *([Text("")] if below else []))
+
+
+def _notes(rows: list[Row], *, wide: bool) -> list[str]:
+    """Return what is said below the table; the same about several is said once."""
+    subjects: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        if note := _note(row, wide=wide):
+            subjects.setdefault((row.what, note), []).append(row.subject)
+    return [f"{', '.join(who)} {what}: {note}" for (what, note), who in subjects.items()]
 
 
 def _broken(name: str) -> str:
@@ -97,10 +107,11 @@ def _note(row: Row, *, wide: bool) -> str:
     return f"{fix} ({row.why})" if fix and row.why else fix or row.why
 
 
-def _names(rows: list[Row]) -> str:
-    named = [f"{row.subject} {_short(row.what)}" for row in rows[:NAMED_MAX]]
-    more = len(rows) - len(named)
-    return ", ".join(named) + (f" and {more} more" if more else "")
+def _names(rows: Iterable[Row]) -> str:
+    """Return the first of the rows, and how many more lines there are."""
+    names = [f"{row.subject} {_short(row.what)}" for row in rows]
+    more = len(names) - NAMED_MAX
+    return ", ".join(names[:NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
 
 
 def _short(name: str) -> str:

@@ -8,6 +8,9 @@ from typing import Final
 
 import msgspec
 
+from shared.drive_settings import AXES
+from shared.joints import MODULES
+
 
 class Verdict(StrEnum):
     """What a row means."""
@@ -36,6 +39,9 @@ class Row(msgspec.Struct, frozen=True):
 
 ALL: Final = "all"
 """Subject of a row that stands for several alike."""
+
+_MODULES: Final = set(MODULES)
+_AXES: Final = {f"{module}.{axis}" for module in MODULES for axis in AXES}
 
 
 def ok(subject: str, what: str, found: str, wanted: str = "") -> Row:
@@ -76,18 +82,45 @@ def count(rows: Iterable[Row], verdict: Verdict) -> int:
 
 
 def merged(rows: Iterable[Row]) -> list[Row]:
-    """Return the rows with those that are ok and about the same matter put into one.
+    """Return the rows with those about the same matter put into one.
 
-    The order is that of the first of each; what is not ok stays as it is, after them.
+    What is ok becomes one row, from the smallest to the largest. What is not ok does where all
+    six modules, all twelve axes, or both axes of a module are alike: boards as shipped, or one of
+    them, are not told setting by setting and axis by axis. Else it stays as it is. What is ok comes
+    first, in the order of the first of each.
     """
     alike: dict[str, list[Row]] = {}
-    others = []
+    others: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         if row.verdict is Verdict.OK:
             alike.setdefault(row.what, []).append(row)
         else:
-            others.append(row)
-    return [_one(group) for group in alike.values()] + others
+            matter = (row.what, row.wanted, row.verdict, row.why, _anywhere(row))
+            others.setdefault(matter, []).append(row)
+    bad = [row for group in others.values() for row in _of_all_or_both_axes(group)]
+    return [_one(group) for group in alike.values()] + bad
+
+
+def _of_all_or_both_axes(group: list[Row]) -> list[Row]:
+    """Return as few rows as can stand for rows of one matter, none of which is ok."""
+    subjects = {row.subject for row in group}
+    if len(subjects) == len(group) and subjects in (_MODULES, _AXES):
+        return [msgspec.structs.replace(_one(group), fix=_anywhere(group[0]))]
+    together = []
+    for row in group:
+        module, _, axis = row.subject.partition(".")
+        both = [other for other in group if other.subject in {f"{module}.{a}" for a in AXES}]
+        if axis not in AXES or len(both) != len(AXES):
+            together.append(row)
+        elif row is both[0]:
+            together.append(msgspec.structs.replace(_one(both), subject=f"{module}, both"))
+    return together
+
+
+def _anywhere(row: Row) -> str:
+    """Return what to do about a row, whichever module it is about."""
+    module = row.subject.partition(".")[0]
+    return row.fix.replace(f" --module {module}", "").replace(module, "MODULE")
 
 
 def _one(group: list[Row]) -> Row:

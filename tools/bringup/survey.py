@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -11,8 +11,8 @@ from shared.config import RobotConfig, expand
 from shared.config_sections import CanConfig
 from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
-from tools.bringup import check_board, check_can, check_machine, check_robot
-from tools.bringup.boards import FIRMWARE, STATUS, Board, Found, number
+from tools.bringup import check_alike, check_board, check_can, check_machine, check_robot
+from tools.bringup.boards import STATUS, Board, Found, Value, is_known, number
 from tools.bringup.can_ear import BusHeard, listen, long_enough
 from tools.bringup.reach import boards_on_usb, drives_within_reach, is_up
 from tools.bringup.rows import Row, Verdict, judged, ok
@@ -102,45 +102,64 @@ def _usb(
 ) -> list[Row]:
     """Check every module's board; what of it cannot be reached over USB is a row too."""
     rows: list[Row] = []
+    read: dict[str, Mapping[str, Value]] = {}
     try:
         with boards_on_usb(robot, run_dir, MODULES) as found:
             for module in MODULES:
-                rows += _module(robot, module, found, services_up=services_up)
+                rows += _module(robot, module, found, read, services_up=services_up)
                 rows += _position(robot, module, found, heard)
+            rows += check_alike.alike_rows(read)
     except (DriveError, FleetError) as error:
         found_out, _, fix = str(error).removeprefix("USB: ").partition("; ")
         rows.append(_unreached(robot, "all drives", found_out, fix or "see there"))
     return rows
 
 
-def _module(robot: RobotConfig, module: str, found: Found, *, services_up: bool) -> list[Row]:
+def _module(
+    robot: RobotConfig,
+    module: str,
+    found: Found,
+    read: dict[str, Mapping[str, Value]],
+    *,
+    services_up: bool,
+) -> list[Row]:
+    """Check a module's board, and put what was read from it into `read`."""
     serial = robot.module_named(module).serial_number.upper()
     board = found.boards.get(serial)
     if board is None:
         return [_unreached(robot, module, *_why_not(robot, serial, found, services_up=services_up))]
     try:
-        return _board(robot, module, board, services_up=services_up)
+        return _board(robot, module, board, read, services_up=services_up)
     except DriveError as error:
         return [_unreached(robot, module, str(error), "plug it in again; look at its cable")]
 
 
-def _board(robot: RobotConfig, module: str, board: Board, *, services_up: bool) -> list[Row]:
+def _board(
+    robot: RobotConfig,
+    module: str,
+    board: Board,
+    read: dict[str, Mapping[str, Value]],
+    *,
+    services_up: bool,
+) -> list[Row]:
     """Check a board that is connected."""
     rows = [
         ok(module, "USB", board.serial_number, "there"),
         check_board.firmware_row(module, board.firmware),
     ]
-    if board.firmware[:2] != FIRMWARE[:2]:
+    if not is_known(board.firmware):
         return rows
     settings = board.read(board.settings)
     status = board.read(STATUS)
+    read[module] = {**settings, **status}
     wanted = drive_settings.of_module(robot, module)
     levels = check_board.trip_levels_of(settings)
     return [
         *rows,
         *check_board.settings_rows(module, wanted, settings),
+        *check_board.direction_rows(module, read[module], robot),
         *check_board.error_rows(module, status),
-        *check_board.condition_rows(module, status, levels, services_up=services_up),
+        *check_board.condition_rows(module, read[module], levels, services_up=services_up),
     ]
 
 

@@ -1,0 +1,117 @@
+"""What the doctor says of the kernel's CAN interfaces, by what `ip` says of them."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from shared.config import RobotConfig
+from shared.config_sections import CanConfig
+from tools.bringup import check_socketcan
+from tools.bringup.check_socketcan import socketcan_rows
+from tools.bringup.rows import Row, Verdict
+
+UP, DOWN = "0x40081", "0x40080"
+
+
+@pytest.fixture
+def real(robot: RobotConfig) -> RobotConfig:
+    """Return the shipped robot on real buses."""
+    can = {
+        name: CanConfig(interface="socketcan", channel=f"can{i}")
+        for i, name in enumerate(robot.can)
+    }
+    return msgspec.structs.replace(robot, can=can)
+
+
+def flag(root: Path, name: str, flags: str) -> None:
+    folder = root / "sys/class/net" / name
+    folder.mkdir(parents=True)
+    (folder / "flags").write_text(flags + "\n", encoding="utf-8")
+
+
+def link(length: int = 64, bitrate: int = 1_000_000, **data: Any) -> dict[str, Any]:
+    """Return an interface as iproute2 prints it with -details -json."""
+    healthy = {
+        "state": "ERROR-ACTIVE",
+        "berr_counter": {"tx": 0, "rx": 0},
+        "restart_ms": 100,
+        "bittiming": {"bitrate": bitrate, "sample_point": "0.750"},
+    }
+    info = {"info_kind": "can", "info_data": healthy | data}
+    return {"ifname": "can0", "txqlen": length, "linkinfo": info}
+
+
+def rows_of(real: RobotConfig, root: Path, said: dict[str, Any]) -> list[Row]:
+    flag(root, "can0", UP)
+    return [row for row in socketcan_rows(real, root, {"can0": said}) if row.subject == "can0"]
+
+
+def test_interfaces_are_there_and_up(real: RobotConfig, tmp_path: Path) -> None:
+    flag(tmp_path, "can0", UP)
+    flag(tmp_path, "can1", DOWN)
+    rows = {row.subject: row for row in socketcan_rows(real, tmp_path, {})}
+    assert [rows[f"can{i}"].found for i in range(3)] == ["up", "down", "not there"]
+    assert "ip link set can1 up type can bitrate 1000000" in rows["can1"].fix
+
+
+def test_an_interface_that_is_set_as_it_should_be_is_ok(real: RobotConfig, tmp_path: Path) -> None:
+    rows = rows_of(real, tmp_path, link())
+    assert {row.verdict for row in rows} == {Verdict.OK}
+    assert {"interface", "bit rate", "controller", "send queue"} <= {row.what for row in rows}
+
+
+@pytest.mark.parametrize(
+    ("said", "what", "verdict"),
+    [
+        (link(bitrate=500_000), "bit rate", Verdict.WRONG),
+        (link(state="BUS-OFF"), "controller", Verdict.WRONG),
+        (link(state="STOPPED"), "controller", Verdict.WRONG),
+        (link(state="ERROR-PASSIVE"), "controller", Verdict.WARNING),
+        (link(state="ERROR-WARNING"), "controller", Verdict.WARNING),
+        (link(ctrlmode=["LISTEN-ONLY"]), "mode", Verdict.WRONG),
+        (link(restart_ms=0), "restart-ms", Verdict.WARNING),
+        (link(length=10), "send queue", Verdict.WARNING),
+        (link(length=1000), "send queue", Verdict.WARNING),
+    ],
+)
+def test_what_stops_or_delays_frames_is_named(
+    real: RobotConfig, tmp_path: Path, said: dict[str, Any], what: str, verdict: Verdict
+) -> None:
+    rows = rows_of(real, tmp_path, said)
+    bad = [(row.what, row.verdict) for row in rows if row.verdict != Verdict.OK]
+    assert bad == [(what, verdict)]
+    assert all(row.fix for row in rows if row.verdict != Verdict.OK)
+
+
+def test_counted_errors_are_told(real: RobotConfig, tmp_path: Path) -> None:
+    rows = rows_of(real, tmp_path, link(berr_counter={"tx": 96, "rx": 3}))
+    assert "errors sent 96, received 3" in next(r.found for r in rows if r.what == "controller")
+
+
+def test_what_ip_does_not_tell_is_not_judged(real: RobotConfig, tmp_path: Path) -> None:
+    (row,) = rows_of(real, tmp_path, {"ifname": "can0", "linkinfo": {"info_kind": "vcan"}})
+    assert (row.what, row.verdict) == ("interface", Verdict.OK)
+
+
+@pytest.mark.parametrize("said", [b"", b"[]", b"[{}]", b"no JSON"])
+def test_an_ip_that_says_nothing_tells_nothing(
+    monkeypatch: pytest.MonkeyPatch, said: bytes
+) -> None:
+    def run(*_: object, **__: object) -> subprocess.CompletedProcess[bytes]:
+        return subprocess.CompletedProcess([], 0, stdout=said)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert check_socketcan.ask_ip() == {}
+
+
+def test_without_the_ip_command_there_is_nothing_to_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(*_: object, **__: object) -> None:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(subprocess, "run", run)
+    assert check_socketcan.ask_ip() == {}

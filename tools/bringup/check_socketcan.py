@@ -1,0 +1,122 @@
+"""Checks of the kernel's CAN interfaces: there, up, and set as the drives and services need them.
+
+What sysfs does not tell (bit rate, state, restart) is asked of `ip`, which asks the kernel; it
+needs no privilege and changes nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from shared.config import RobotConfig
+from shared.drive_settings import CAN_BAUD_RATE
+from tools.bringup.rows import Row, Verdict, judged, warning, wrong
+
+Links = Mapping[str, Mapping[str, Any]]
+"""By interface: what `ip` says of it."""
+
+QUEUE: Final = (32, 256)
+"""Frames. deploy/udev/92-can.rules sets 64 and says why; the kernel's default is 10."""
+_IP: Final = ("ip", "-details", "-json", "link", "show", "type", "can")
+_IP_S = 2.0
+_IFF_UP = 1
+_WELL: Final = "ERROR-ACTIVE"
+_OFF: Final = ("BUS-OFF", "STOPPED", "SLEEPING")
+
+
+def ask_ip() -> Links:
+    """Return what `ip` says of the CAN interfaces; nothing where there is no such command."""
+    try:
+        said = subprocess.run(_IP, capture_output=True, timeout=_IP_S, check=True).stdout
+        return {link["ifname"]: link for link in json.loads(said or "[]") if "ifname" in link}
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return {}
+
+
+def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Row]:
+    """Check every interface that the robot file names.
+
+    Args:
+        robot: its buses.
+        root: of the file system; another one for tests.
+        links: of `ask_ip`.
+    """
+    rows = []
+    names = {bus.channel for bus in robot.can.values() if bus.interface == "socketcan"}
+    for name in sorted(names):
+        flags = _flags(root, name)
+        if flags is None:
+            fix = "plug the adapter in; `ip link` lists what is there"
+            rows.append(wrong(name, "interface", "not there", "up", fix))
+            continue
+        up = bool(flags & _IFF_UP)
+        found = "up" if up else "down"
+        rows.append(judged(up, name, "interface", found, "up", up_command(name)))
+        if up and name in links:
+            rows += _details(name, links[name])
+    return rows
+
+
+def up_command(name: str) -> str:
+    """Return how an interface is brought up."""
+    return f"`sudo ip link set {name} up type can bitrate {CAN_BAUD_RATE} restart-ms 100`"
+
+
+def _details(name: str, link: Mapping[str, Any]) -> list[Row]:
+    """Judge an interface that is up by what `ip` says; what it does not say is not judged."""
+    data = link.get("linkinfo", {}).get("info_data", {})
+    again = f"`sudo ip link set {name} down`, then {up_command(name)}"
+    rows = []
+    bitrate = data.get("bittiming", {}).get("bitrate")
+    if bitrate is not None:
+        good = abs(bitrate / CAN_BAUD_RATE - 1.0) < 1e-3
+        why = "not one frame gets through, and every node reports errors"
+        rows.append(judged(good, name, "bit rate", str(bitrate), str(CAN_BAUD_RATE), again, why))
+    if "state" in data:
+        rows.append(_state(name, str(data["state"]), data.get("berr_counter", {}), again))
+    if "LISTEN-ONLY" in data.get("ctrlmode", ()):
+        fix = f"`sudo ip link set {name} down`, then with `listen-only off`"
+        rows.append(wrong(name, "mode", "listen-only", "normal", fix, "nothing can be sent"))
+    if data.get("restart_ms") == 0:
+        why = "after bus-off, as after a short, it stays down"
+        rows.append(warning(name, "restart-ms", "0: off", "100", again, why))
+    length = link.get("txqlen")
+    if length is not None:
+        low, high = QUEUE
+        why = "too short for an arming; too long, old frames reach a drive that was plugged in"
+        rows.append(
+            judged(
+                low <= length <= high,
+                name,
+                "send queue",
+                f"{length} frames",
+                f"{low} to {high}",
+                f"deploy/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`",
+                why,
+                otherwise=Verdict.WARNING,
+            )
+        )
+    return rows
+
+
+def _state(name: str, state: str, errors: Mapping[str, Any], again: str) -> Row:
+    counted = f" (errors sent {errors.get('tx', 0)}, received {errors.get('rx', 0)})"
+    found = state.lower() + (counted if any(errors.values()) else "")
+    if state in _OFF:
+        return wrong(name, "controller", found, _WELL.lower(), again, "it takes no part in the bus")
+    wires = "120 ohm at both ends and nowhere else, ground wired along, one bit rate, short stubs"
+    why = "frames are sent again and come late, or the bus goes off"
+    good = state == _WELL
+    wanted = _WELL.lower()
+    return judged(good, name, "controller", found, wanted, wires, why, otherwise=Verdict.WARNING)
+
+
+def _flags(root: Path, name: str) -> int | None:
+    try:
+        return int((root / "sys/class/net" / name / "flags").read_text(encoding="utf-8"), 16)
+    except (OSError, ValueError):
+        return None

@@ -1,0 +1,74 @@
+"""A drive's own limits after a jog: what the robot file wants again.
+
+A drive keeps the small limits of a jog until a service arms it or it restarts. `xrl doctor` would
+find them wrong, and `xrl configure --apply` restart the board for them, which costs its zero.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from services.joint.drivers.can_link import CanLink
+from services.joint.drivers.odrive_frames import orders
+from shared import cansimple
+from shared.cansimple import Command
+from shared.config import RobotConfig, expand
+from shared.config_sections import CanConfig
+from shared.drive_settings import AXES
+from shared.exceptions import DriveError
+from tools.bringup.boards import Value, equal
+from tools.bringup.reach import boards_on_usb
+
+TIMES: Final = 3
+"""CAN of firmware 0.5 does not tell its limits, and a frame may be lost."""
+_APART_S: Final = 0.02
+
+
+def give_back(robot: RobotConfig, module: str, run_dir: Path) -> None:
+    """Set the limits of a module's drive, which must be idle and nobody's, to the robot file's.
+
+    Raises:
+        DriveError: the drive cannot be reached, or does not keep them.
+        FleetError: the stand-in for libusb cannot be built.
+    """
+    if robot.joint_service.driver == "odrive_usb":
+        _over_usb(robot, module, run_dir)
+    else:
+        _over_can(robot, module, run_dir)
+
+
+def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
+    wiring, drive = robot.module_named(module), robot.drive
+    bus = robot.can[wiring.bus]
+    limits = (
+        Command.SET_LIMITS,
+        cansimple.pack_two_floats(drive.vel_limit, drive.current_lim),
+    )
+    channel = expand(bus.channel, run_dir)
+    link = CanLink(CanConfig(interface=bus.interface, channel=channel), wiring.node_ids)
+    try:
+        taken = link.connect()
+        for _ in range(TIMES):
+            taken = taken and link.send(orders(wiring.node_ids, (limits,)))
+            link.receive(_APART_S)
+    finally:
+        link.close()
+    if not taken:
+        raise DriveError(f"CAN bus {wiring.bus} takes no frames")
+
+
+def _over_usb(robot: RobotConfig, module: str, run_dir: Path) -> None:
+    serial, drive = robot.module_named(module).serial_number.upper(), robot.drive
+    wanted: dict[str, Value] = {}
+    for axis in AXES:
+        wanted[f"{axis}.controller.config.vel_limit"] = drive.vel_limit
+        wanted[f"{axis}.motor.config.current_lim"] = drive.current_lim
+    with boards_on_usb(robot, run_dir, [module]) as found:
+        if serial not in found.boards:
+            raise DriveError(f"ODrive {serial}: {found.troubles.get(serial, 'not there')}")
+        board = found.boards[serial]
+        board.write(wanted)
+        kept = board.read(wanted)
+    if not all(equal(kept.get(name), value) for name, value in wanted.items()):
+        raise DriveError(f"ODrive {serial}: it did not keep them")
