@@ -5,7 +5,8 @@ and holds module, others and drive to the row; `xrl crashtest` does so live, pro
 recovery included. `xrl faults` prints it.
 
 The rule behind the last column: what has let go of the robot never takes hold of it again by
-itself. It is asked for, by a person, by starting the module's service again.
+itself. It is asked for, by a person, by starting the module's service again; a service that crashes
+and is started by the supervisor knows the difference (`services.joint.will`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ class DriveFault(NamedTuple):
     """What comes of a fault of a module's ODrive.
 
     In every one the module's own mode is FAULT, and the planner has the other five go to HOLD:
-    no leg works against the other.
+    no leg works against the other. If it is a knee they brace: it may be limp, and then its leg
+    stands as a strut between an ankle and a hip that are stiff; if it is an ankle the knees do
+    (`services.planner.bracing`).
     """
 
     drive: str
@@ -55,9 +58,9 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
         recovery=f"{_HANG}; see that the supply takes back what braking legs give",
     ),
     "encoder": DriveFault(
-        f"it reports zeros; {_LIMP}",
+        f"it goes on reporting where it was; {_LIMP}",
         limp=True,
-        cause=Cause.POSITION_LOST,
+        cause=Cause.DRIVE_DISARMED,
         zero_lost=True,
         recovery=f"{_HANG}; repair the encoder or its cable, then `xrl zero`",
     ),
@@ -117,8 +120,9 @@ LOSSES: Final[dict[str, Loss]] = {
         "its drive holds by its own loop, the torques of the coupling frozen",
         "HOLD: the planner asks for it once the module's state is stale",
         "`xrl status`: not heard, restarts; planner/status: hold",
-        "by itself: the supervisor starts it, it takes the drive over, and all track again; a hung "
-        "one by `xrl kill`",
+        "by itself: the supervisor starts it, it takes the drive over once a planner is heard, and "
+        "all track again; a hung one by `xrl kill`. If the drive has let go in the meantime: hang "
+        "the robot, then `xrl kill`",
     ),
     "planner killed or hung": Loss(
         "HOLD within max_command_age: local gains, references frozen",

@@ -57,6 +57,8 @@ class DriveStatus(IntEnum):
     """At least one axis reports an error or left closed loop by itself."""
     UNZEROED = 4
     """Both axes answer, but have not been told where they are since they got power."""
+    HOLDING = 5
+    """Both axes are in closed loop by a service that is no more, and wait to be taken over."""
 
 
 class PlannerMode(IntEnum):
@@ -159,6 +161,8 @@ class JointState(Message, frozen=True):
     unsteady, down to 0."""
     coupled_used: float = 1.0
     """How much of it was used in this cycle, in TRACK; it follows what is wanted in a ramp."""
+    braced: bool = False
+    """True while this module holds with all of its stand gains, for another may be limp."""
 
 
 class JointCommand(Message, frozen=True):
@@ -193,6 +197,8 @@ class JointCommand(Message, frozen=True):
     coupled_share: float = 1.0
     """How much of tau_coupled all six are to use, 0 .. 1: less while they act apart in time. What
     it does not hold then, HOLD's gains do."""
+    brace: bool = False
+    """True while another may be limp: this module in HOLD is to rise to all its stand gains."""
 
 
 class JointEvent(Message, frozen=True):

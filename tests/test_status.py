@@ -25,7 +25,12 @@ def test_a_way_out_is_told_where_a_person_has_to_do_something_and_nowhere_else(
     mode: Mode, cause: Cause, drive: DriveStatus
 ) -> None:
     status = module_status(state(mode, cause, drive))
-    helpless = mode in (Mode.FAULT, Mode.DAMP) or drive is DriveStatus.UNZEROED
+    waits = (DriveStatus.IDLE, DriveStatus.ERROR)
+    helpless = (
+        mode in (Mode.FAULT, Mode.DAMP)
+        or drive in (DriveStatus.UNZEROED, DriveStatus.HOLDING)
+        or (mode is Mode.DISARMED and drive in waits)
+    )
     assert bool(status.way_out) is helpless
     if mode is Mode.FAULT:
         assert "xrl kill" in status.way_out

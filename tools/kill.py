@@ -6,6 +6,7 @@ import argparse
 import signal
 from typing import Final
 
+from shared.joints import MODULES
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
@@ -38,6 +39,9 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Send the signal."""
-    pid = Fleet.attach(args.run_dir).kill(args.service, SIGNALS[args.signal])
+    fleet = Fleet.attach(args.run_dir)
+    if args.signal in ("KILL", "TERM") and args.service in MODULES:
+        fleet.forget(args.service)  # its next process is asked for: it may arm the drive
+    pid = fleet.kill(args.service, SIGNALS[args.signal])
     print(f"{args.service} (pid {pid}): {args.signal} sent")
     return 0

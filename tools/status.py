@@ -114,6 +114,8 @@ def tables(status: FleetStatus) -> Group:
         modules.add_column(heading, no_wrap=heading != "way out")
     for name, module in status.modules.items():
         mode = module.mode or "not heard"
+        if module.braced:
+            mode = f"{mode}, braced"
         drive = module.drive or "-"
         angles = ("-", "-") if module.q is None else (f"{a:+.3f}" for a in module.q)
         modules.add_row(

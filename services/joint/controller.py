@@ -17,6 +17,7 @@ from services.joint.drivers.base import DriveReading
 from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.gate import diamond, gate, limits_of
 from services.joint.law import Setpoint
+from services.joint.memory import ControllerMemory
 from services.joint.samples import Samples
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
@@ -31,29 +32,6 @@ class CycleResult(NamedTuple):
     """Joint torque for the drive, N m, after the gate."""
     event: JointEvent | None
     """The change of state of this cycle, if there was one."""
-
-
-class ControllerMemory(msgspec.Struct, frozen=True):
-    """All that a controller knows beyond its configuration: it goes on from here bit for bit."""
-
-    failsafe: Failsafe
-    samples: Samples
-    anchor: Setpoint
-    setpoint: Setpoint
-    changed_ns: int
-    last_cycle_ns: int
-    found_tau: Pair | None
-    damp_stop: float | None
-    """None: there is no stop (JSON has no infinity)."""
-    cause: int
-    tau: Pair
-    cycle: int
-    late: int
-    events: int
-    states: int
-    residual: Pair = law.ZERO
-    resumed_ns: int = 0
-    share: float = 1.0
 
 
 class JointController:
@@ -93,6 +71,8 @@ class JointController:
         self._residual: Pair = law.ZERO
         """What the drive carried beyond the law as the service went on after a gap, N m."""
         self._resumed_ns = 0
+        self._braced_ns = 0
+        """Since when HOLD rises to all stand gains, for another may be limp; 0: it does not."""
         self._cause = 0
         self.tau: Pair = law.ZERO
         self.cycle = 0
@@ -129,6 +109,8 @@ class JointController:
         if cause is not None:
             self._cause = int(cause)
             self._enter(now_ns, before)
+        if not self._braced_ns and failsafe.asks_to_brace:
+            self._braced_ns = now_ns
         self._setpoint = self._evaluate(now_ns)
         tau_before = self.tau
         if failsafe.mode in (Mode.DISARMED, Mode.FAULT):
@@ -173,6 +155,20 @@ class JointController:
         """The local law of this cycle."""
         return self._setpoint
 
+    @property
+    def left_holding(self) -> Setpoint:
+        """The law that the drive is to go on with should this service die now: HOLD's gains.
+
+        Of the ankles only. On TRACK's own, with no more than 4 N m s/rad on an ankle's phi, a
+        push from the side rang on by 0.72 each half swing with all six services dead, and 7 of
+        26 pairs of pushes in step with it fell. A knee or hip whose phi alone is stiff would
+        have half of that on its theta, where the other leg's is soft. In DAMP a drive that is
+        left goes on sinking.
+        """
+        if self.failsafe.mode is Mode.DAMP or self._hold_k_p[1] == 0.0:
+            return self._setpoint
+        return law.stiffened(self._setpoint, self._hold_k_p, self._hold_k_d, 1.0)
+
     def state(self, now_ns: int) -> JointState:
         """Return the module's state message.
 
@@ -201,6 +197,7 @@ class JointController:
             drive_error=samples.error,
             coupled_share=failsafe.share,
             coupled_used=self._share,
+            braced=self._braced_ns > 0,
         )
 
     def remember(self) -> ControllerMemory:
@@ -223,6 +220,7 @@ class JointController:
             self._residual,
             self._resumed_ns,
             self._share,
+            self._braced_ns,
         )
 
     def recall(self, memory: ControllerMemory) -> None:
@@ -236,6 +234,7 @@ class JointController:
         self._damp_stop = -math.inf if m.damp_stop is None else m.damp_stop
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
         self._residual, self._resumed_ns, self._share = m.residual, m.resumed_ns, m.share
+        self._braced_ns = m.braced_ns
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""
@@ -263,9 +262,13 @@ class JointController:
     def _enter(self, now_ns: int, before: Mode) -> None:
         """Take the anchor of the new mode: what was in force until now, frozen."""
         self._changed_ns = now_ns
+        self._braced_ns = 0
         k_p, k_d = self._stand_k_p, self._stand_k_d
         if before is Mode.DISARMED and self._found_tau is not None:
             q, v = self._samples.q, self._samples.v
+            command = self.failsafe.command
+            if command is not None and self.failsafe.usable(now_ns, self.timing):
+                k_p, k_d = command.k_p, command.k_d  # as soft as the other five
             self._anchor = law.taken_over(q, v, self._found_tau, k_p, k_d)
             self.tau = self._found_tau  # what the gate takes for the last torque
         elif before is Mode.DISARMED:
@@ -273,7 +276,7 @@ class JointController:
         elif self.failsafe.mode is Mode.DAMP:
             q = self._samples.q
             self._damp_stop = min(self._damp_stop, q[1])
-            self._anchor = law.carrying(law.held(self._setpoint, 0.0), self._sinks, q)
+            self._anchor = law.carrying(self._setpoint, self._sinks, q)
         else:
             self._anchor = self._setpoint
 
@@ -294,12 +297,18 @@ class JointController:
             return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
         if mode is Mode.DAMP:
             share = max(0.0, 1.0 - since_ns / self._damp_fade_ns)
-            held = law.stiffened(self._anchor, self._stand_k_p, self._stand_k_d, 1.0 - share)
-            sunk = law.damped(held, self._sinks, self._damp_k_d, share)
+            risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
+            held = law.held(self._anchor, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
+            held = law.stiffened(held, self._stand_k_p, self._stand_k_d, 1.0 - share)
+            sunk = law.damped(held, self._sinks, self._damp_k_d, share, risen)
             if self._samples.q[1] < self._damp_stop:
                 return law.caught(sunk, self._damp_stop, self._stand_k_p[1], self._stand_k_d[1])
             return sunk
-        return self._held(since_ns)
+        held = self._held(since_ns)
+        if self._braced_ns:
+            risen = min(1.0, (now_ns - self._braced_ns) / self._blend_ns)
+            return law.stiffened(held, self._stand_k_p, self._stand_k_d, risen)
+        return held
 
     def _slewed(self, share: float) -> float:
         """Return the share of this cycle: let go of in `coupled_ramp_ms`, back in `blend_ms`.

@@ -157,6 +157,11 @@ class Failsafe(msgspec.Struct):
         self.command = command
         return refusal
 
+    @property
+    def asks_to_brace(self) -> bool:
+        """True in HOLD if the newest command taken says that another module may be limp."""
+        return self.mode is Mode.HOLD and self.command is not None and self.command.brace
+
     def coupled_share(self, timing: Timing) -> float:
         """Return how much of tau_coupled may be used: 1 while ages are steady, 0 if not.
 

@@ -120,7 +120,7 @@ def carrying(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:
     other feedforward to fade.
 
     Args:
-        setpoint: in force until now, frozen.
+        setpoint: in force until now.
         sinks: for (phi, theta), True if the axis is to sink.
         q: where it is, rad.
     """
@@ -129,29 +129,37 @@ def carrying(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:
         s.tau_ff[0] + (s.k_p[0] * (s.q_ref[0] - q[0]) if sinks[0] else 0.0),
         s.tau_ff[1] + (s.k_p[1] * (s.q_ref[1] - q[1]) if sinks[1] else 0.0),
     )
-    return Setpoint(s.q_ref, ZERO, tau_ff, ZERO, s.k_p, s.k_d)
+    return Setpoint(s.q_ref, s.v_ref, tau_ff, s.tau_coupled, s.k_p, s.k_d)
 
 
 def damped(
-    setpoint: Setpoint, sinks: tuple[bool, bool], k_d: float, feedforward_share: float
+    setpoint: Setpoint,
+    sinks: tuple[bool, bool],
+    k_d: float,
+    feedforward_share: float,
+    risen: float,
 ) -> Setpoint:
     """Return DAMP's law: axes that sink lose their stiffness, the others hold.
 
     Args:
-        setpoint: what `carrying` gave.
+        setpoint: what `carrying` gave, its rates and coupling faded.
         sinks: for (phi, theta), True if the axis is to sink.
         k_d: damping of an axis that sinks, N m s/rad.
         feedforward_share: what is left of its feedforward, 1 .. 0.
+        risen: how far its damping has come from what it was to k_d, 0 .. 1.
     """
     s, share = setpoint, feedforward_share
     phi, theta = sinks
     return Setpoint(
         s.q_ref,
-        ZERO,
+        s.v_ref,
         (s.tau_ff[0] * (share if phi else 1.0), s.tau_ff[1] * (share if theta else 1.0)),
-        ZERO,
+        s.tau_coupled,
         (0.0 if phi else s.k_p[0], 0.0 if theta else s.k_p[1]),
-        (k_d if phi else s.k_d[0], k_d if theta else s.k_d[1]),
+        (
+            s.k_d[0] + risen * (k_d - s.k_d[0]) if phi else s.k_d[0],
+            s.k_d[1] + risen * (k_d - s.k_d[1]) if theta else s.k_d[1],
+        ),
     )
 
 
@@ -160,9 +168,9 @@ def caught(setpoint: Setpoint, stop: float, k_p: float, k_d: float) -> Setpoint:
     s = setpoint
     return Setpoint(
         (s.q_ref[0], stop),
-        ZERO,
+        s.v_ref,
         s.tau_ff,
-        ZERO,
+        s.tau_coupled,
         (s.k_p[0], k_p),
         (s.k_d[0], k_d),
     )

@@ -10,6 +10,7 @@ import msgspec
 from services.joint.drivers.base import Drive
 from services.joint.module import ARM_TRIES, Module, Obstacle, Order, Step
 from services.joint.tracer import Tracer
+from services.joint.will import Will, WillFile
 from shared import log
 from shared.bus import Latest, Publisher
 from shared.clock import NS_PER_S, now_ns
@@ -30,6 +31,9 @@ _WHY_NOT: Final = {
     "encoder is lost; hang the robot and tell it where it is with `xrl zero`",
     Obstacle.OUTSIDE_LIMITS: "the joint is at phi {q[0]:.3f}, theta {q[1]:.3f} rad, outside its "
     "limits; bring it inside, or correct the joint's zero",
+    Obstacle.LET_GO: "the drive held the robot and has let go while no service looked after it: "
+    "drive error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
+    Obstacle.WAITING: "the drive holds by its own loop, and is taken over once a planner is heard",
     Obstacle.WILL_NOT: f"asked for {ARM_TRIES} times: drive error 0x{{error:x}}",
 }
 
@@ -47,8 +51,17 @@ class Ports(msgspec.Struct, frozen=True):
 class JointLoop:
     """Read, decide, write, publish: once for each encoder sample."""
 
-    def __init__(self, config: RobotConfig, module: Module, drive: Drive, ports: Ports) -> None:
+    def __init__(
+        self,
+        config: RobotConfig,
+        module: Module,
+        drive: Drive,
+        ports: Ports,
+        will: WillFile | None = None,
+    ) -> None:
+        """Take the module's parts; `will` is where it leaves what its successor has to know."""
         service = config.joint_service
+        self._will = will
         self._module = module
         self._drive = drive
         self._ports = ports
@@ -72,6 +85,8 @@ class JointLoop:
             self._ports.traces.put(rest)
         if stop.interrupted or not self._module.leaves_holding:
             self._drive.idle()
+        if stop.interrupted and self._will is not None:
+            self._will.write(Will.NOTHING)
 
     def cycle(self) -> None:
         """Run one cycle."""
@@ -87,6 +102,8 @@ class JointLoop:
             ports.states.put(controller.state(now))
         if step.event is not None:
             ports.events.put(step.event)
+        if self._will is not None:
+            self._will.write(module.will)
         trace = tracer.after(now, reading, command, estop, step)
         if trace is not None:
             ports.traces.put(trace)

@@ -12,10 +12,13 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from services.joint.controller import ControllerMemory, CycleResult, JointController
+from services.joint.controller import CycleResult, JointController
 from services.joint.differential import motor_torque
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.memory import ModuleMemory
 from services.joint.onboard import OnboardLaw
+from services.joint.will import Will
+from shared.cansimple import AxisError
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.messages import Cause, JointCommand, JointEvent, Mode, Pair
@@ -50,6 +53,10 @@ class Obstacle(Enum):
     UNZEROED = 1
     OUTSIDE_LIMITS = 2
     WILL_NOT = 3
+    LET_GO = 4
+    """It held the robot and does not any more; it is armed again when a person asks for it."""
+    WAITING = 5
+    """It holds by its own loop; it is taken over once a planner is heard."""
 
 
 class Step(NamedTuple):
@@ -64,23 +71,8 @@ class Step(NamedTuple):
     obstacle: Obstacle
 
 
-class ModuleMemory(msgspec.Struct, frozen=True):
-    """All that a module's service knows beyond its configuration."""
-
-    controller: ControllerMemory
-    gains: Pair
-    """Of the onboard law, `OnboardLaw.gains`."""
-    estop: bool
-    arm_at_ns: int
-    idle_at_ns: int
-    tries: int
-    forgets: bool
-    target: MotorTarget | None = None
-    last_cycle_ns: int = 0
-    listen_until_ns: int = 0
-
-
 _NO_TORQUE: Pair = (0.0, 0.0)
+_MAY_HOLD: Final = (DriveStatus.LOST, DriveStatus.HOLDING, DriveStatus.ARMED)
 _UNCONTROLLED: Final = (Mode.DISARMED, Mode.FAULT)
 
 
@@ -92,12 +84,19 @@ class Module:
         onboard: True if the motors' own loops hold the module.
     """
 
-    def __init__(self, config: RobotConfig, name: str) -> None:
+    def __init__(self, config: RobotConfig, name: str, will: Will = Will.NOTHING) -> None:
+        """Take what the service before this one left, if it died; start DISARMED."""
+        self.will = will
         self.controller = JointController(config, name)
         self.onboard = config.joint_service.loop == "onboard"
-        self._law = OnboardLaw(config.joint.gear_ratio, config.drive.vel_limit)
+        drive = config.drive
+        self._law = OnboardLaw(
+            config.joint.gear_ratio, drive.vel_limit, drive.current_lim * drive.torque_constant
+        )
         self._gear_ratio = config.joint.gear_ratio
-        self._estop = False
+        self._estop = will is Will.DAMP
+        self._holding = False
+        """The drive was found armed, and has not been taken over."""
         self._arm_at_ns = 0
         self._idle_at_ns = 0
         self._tries = 0
@@ -111,8 +110,9 @@ class Module:
     @property
     def leaves_holding(self) -> bool:
         """True if the drive holds the robot by its own loop should the service end now."""
-        mode = self.controller.failsafe.mode
-        return self.onboard and mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP)
+        mode, lost = self.controller.failsafe.mode, self.controller.cause is Cause.DRIVE_LOST
+        holds = mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP) or (mode is Mode.FAULT and lost)
+        return self.onboard and (holds or self._holding)
 
     def step(
         self,
@@ -130,8 +130,11 @@ class Module:
         self._last_cycle_ns = now_ns
         controller = self.controller
         tau_before = controller.tau
-        result = controller.step(now_ns, reading, command, self._estop)
+        estop = self._estop and not self._is_to_be_taken_over(reading)
+        result = controller.step(now_ns, reading, command, estop)
         mode = controller.failsafe.mode
+        if result.event is not None:
+            self.will = self._new_will(mode)
         if self._listen_until_ns:
             if mode in _UNCONTROLLED:
                 self._listen_until_ns = 0
@@ -153,7 +156,8 @@ class Module:
         elif mode is not Mode.DISARMED:
             samples = controller.samples
             order = Order.TARGET
-            target = self._law.target(controller.setpoint, result.tau, samples.pos, samples.vel)
+            left = controller.left_holding
+            target = self._law.target(left, result.tau, samples.pos, samples.vel)
             self._target = target
         return Step(result.event, order, torque, target, Obstacle.NONE)
 
@@ -170,6 +174,8 @@ class Module:
             self._target,
             self._last_cycle_ns,
             self._listen_until_ns,
+            self.will,
+            self._holding,
         )
 
     def recall(self, memory: ModuleMemory) -> None:
@@ -181,6 +187,7 @@ class Module:
         self._tries, self._forgets = m.tries, m.forgets
         self._target, self._last_cycle_ns = m.target, m.last_cycle_ns
         self._listen_until_ns = m.listen_until_ns
+        self.will, self._holding = m.will, m.holding
 
     def _resumed(self, now_ns: int, result: CycleResult, tau_before: Pair) -> CycleResult:
         """Return the cycle's result with the torque that the drive, left alone, carries."""
@@ -197,15 +204,18 @@ class Module:
         """Return what the drive of a module in FAULT is to be told.
 
         A lost one that holds by its own loop is left alone: should the link come back, it
-        holds still. Any other is to be idle, and one that has lost its position is to know no
-        zero: an encoder that comes back may have missed turns.
+        holds still, unless it has let go in the meantime, and be it one axis. Any other is to
+        be idle, and one that has lost its position is to know no zero: an encoder that comes
+        back may have missed turns.
         """
-        if self.controller.cause is Cause.DRIVE_LOST and self.onboard:
+        samples, cause = self.controller.samples, self.controller.cause
+        if cause is Cause.DRIVE_LOST and self.onboard and samples.status in _MAY_HOLD:
             return Order.NOTHING
         if now_ns >= self._idle_at_ns:
             self._idle_at_ns = now_ns + IDLE_EVERY_NS
             return Order.IDLE
-        if self._forgets and self.controller.cause is Cause.POSITION_LOST:
+        astray = cause is Cause.POSITION_LOST or samples.error & AxisError.ENCODER_FAILED
+        if self._forgets and astray:
             self._forgets = False
             return Order.FORGET_ZERO
         return Order.NOTHING
@@ -214,22 +224,49 @@ class Module:
         """Return the reading of a drive that somebody else has armed.
 
         One that holds the robot by its own loop, after the service before this one died, is
-        taken over as it is, once it has told its torques. Any other is not armed by us.
+        taken over as it is, once it has told its torques, and with the gains that the planner has
+        the other five hold on. Until one is heard it is left alone: a knee taken over with its
+        stand gains beside one that holds on soft ones rolled the torso, and the robot tipped
+        while the hand led on. Any other drive is not armed by us.
         """
-        if self.onboard and reading.torque is not None:
-            self._tries = 1
-            return reading
-        if self.onboard:
-            self._arm_at_ns = now_ns + ARM_EVERY_NS  # and it is not armed anew meanwhile
-        return msgspec.structs.replace(reading, status=DriveStatus.IDLE)
+        if not self.onboard:
+            return msgspec.structs.replace(reading, status=DriveStatus.IDLE)
+        failsafe, timing = self.controller.failsafe, self.controller.timing
+        led = self._estop or failsafe.usable(now_ns, timing)
+        self._holding = reading.torque is None or not led
+        if self._holding:
+            return msgspec.structs.replace(reading, status=DriveStatus.HOLDING)
+        self._tries = 1
+        return reading
+
+    def _is_to_be_taken_over(self, reading: DriveReading | None) -> bool:
+        """Return True if the drive may hold the module by its own loop: first it is taken over.
+
+        An emergency stop of a module whose drive is not known would make a law of nothing.
+        """
+        if not self.onboard or self.controller.failsafe.mode is not Mode.DISARMED:
+            return False
+        return reading is None or reading.status in _MAY_HOLD
+
+    def _new_will(self, mode: Mode) -> Will:
+        """Return what a service that dies now leaves to the next."""
+        if mode is Mode.DISARMED:
+            return self.will
+        return Will.DAMP if mode is Mode.DAMP or self._estop else Will.HELD
 
     def _obstacle(self, now_ns: int, reading: DriveReading | None) -> Obstacle | None:
         """Return what keeps the drive from being armed now; None: nothing is known of it."""
         if reading is None or reading.status is DriveStatus.LOST:
             return None
         self._arm_at_ns = now_ns + ARM_EVERY_NS
+        if reading.status is DriveStatus.HOLDING:
+            return Obstacle.WAITING if reading.torque is not None else None
+        self._holding = False
         if reading.status is DriveStatus.UNZEROED:
+            self.will = Will.NOTHING  # whoever zeroes it asks for it
             return Obstacle.UNZEROED
+        if self.will is not Will.NOTHING:
+            return Obstacle.LET_GO
         if not self.controller.inside_limits():
             return Obstacle.OUTSIDE_LIMITS
         self._tries += 1

@@ -1,8 +1,10 @@
 """What a drive's samples say of the joint, and which of them are believed. Pure.
 
-An encoder that fails goes on reporting numbers: firmware 0.5 sends zeros until its next
-heartbeat tells. Believed for 40 ms, such a knee was asked for -107 N m. So a sample that the
-joint cannot have come to is not used, and after a few of them the position counts as lost.
+A drive that does not know where it is goes on reporting numbers: firmware 0.5.6 repeats the last
+of an encoder that it has lost until a heartbeat tells, and begins anew, turns away, when it is
+back; one that has restarted says 0. Believed for 40 ms, a knee at 0 was asked for -107 N m. So a
+sample that the joint cannot have come to is not used, and after a few of them the position counts
+as lost.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ _EVENT: Final = {
     DriveStatus.ARMED: Event.DRIVE_ARMED,
     DriveStatus.ERROR: Event.DRIVE_DISARMED,
     DriveStatus.UNZEROED: Event.POSITION_LOST,
+    DriveStatus.HOLDING: Event.NONE,
 }
 
 

@@ -29,6 +29,9 @@ stall of the machine is not to hold the person up."""
 FORGET_NS: Final = 25 * NS_PER_S
 """Of leading without a drop-out make one forgotten. With 20 s seven would fit into a minute."""
 
+_GONE: Final = (Mode.FAULT, Mode.DAMP)
+"""No module comes from these to TRACK: there is nothing to wait for."""
+
 
 class Engagement(msgspec.Struct):
     """Where the engagement stands."""
@@ -85,7 +88,7 @@ class Engagement(msgspec.Struct):
             return forbidden
         if self.mode is PlannerMode.LEADING:
             settled = now_ns - self.since_ns > GRACE_NS
-            lost = settled and any(mode != Mode.TRACK for mode in modes)
+            lost = any(mode in _GONE or (settled and mode != Mode.TRACK) for mode in modes)
             return PlannerMode.ALIGNING if lost else PlannerMode.LEADING
         if self.mode is PlannerMode.ALIGNING and not self.wait_ns(now_ns) and all(ready):
             return PlannerMode.LEADING

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from services.planner.bracing import Bracing
 from services.planner.coherence import Coherence
 from services.planner.engagement import Engagement
 from shared.messages import JointState, Pair, SplitSource, Wrench
@@ -62,4 +63,5 @@ class TickMemory(msgspec.Struct, frozen=True):
     overload: OverloadMemory
     law: LawMemory
     coherence: Coherence = msgspec.field(default_factory=Coherence)
-    """Not in logs before it was there: then as at the start."""
+    """Not in logs before it was there: then as at the start. So is the next."""
+    bracing: Bracing = msgspec.field(default_factory=Bracing)

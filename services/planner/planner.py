@@ -7,12 +7,14 @@ re-execution from a log.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import Overload
+from services.planner.bracing import Brace, Bracing
 from services.planner.certificate import Margins
 from services.planner.coherence import Coherence
 from services.planner.engagement import Engagement
@@ -20,7 +22,7 @@ from services.planner.hocca import Hocca, LawOutput
 from services.planner.memory import TickMemory
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
-from shared.joints import N_JOINTS, N_MODULES
+from shared.joints import MODULES, N_JOINTS, N_MODULES
 from shared.messages import (
     JointCommand,
     JointState,
@@ -76,6 +78,8 @@ class Planner:
         )
         self._coherence = Coherence()
         self._coupled_share = 1.0
+        self._bracing = Bracing()
+        self._brace = Brace.NONE
         self._wrench_seq = -1
         self._last_ns = 0
         self._new = 0  # bit i: module i has a state that no tick has used
@@ -138,6 +142,7 @@ class Planner:
             [state.mode for state in states],
             self._forbidden(),
         )
+        self._brace = self._bracing.advance(now_ns, states)
         # until all engage the law starts anew from the measured pose: there is no step
         self._output = self._law.tick(
             self._q,
@@ -169,6 +174,7 @@ class Planner:
             self._overload.remember(),
             self._law.remember(),
             msgspec.structs.replace(self._coherence),
+            msgspec.structs.replace(self._bracing),
         )
 
     def recall(self, memory: TickMemory) -> None:
@@ -182,6 +188,7 @@ class Planner:
         self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
         self._engagement = msgspec.structs.replace(m.engagement)
         self._coherence = msgspec.structs.replace(m.coherence)
+        self._bracing = msgspec.structs.replace(m.bracing)
         self._overload.recall(m.overload)
         self._law.recall(m.law)
 
@@ -222,12 +229,18 @@ class Planner:
             )
         ).reshape(7, N_MODULES, 2)
         by_module = rows.transpose(1, 0, 2).tolist()
-        hold = self._hold()
-        margins = output.local.margins
-        share = self._coupled_share
+        common = _Common(
+            now_ns,
+            self._seq,
+            self.session,
+            self._hold(),
+            output.local.margins,
+            self._coupled_share,
+        )
+        brace = self._brace
         return [
-            _command(now_ns, self._seq, self.session, state.t_ns, hold, margins, share, rows)
-            for state, rows in zip(states, by_module, strict=True)
+            _command(common, state.t_ns, rows, brace=brace.of(module))
+            for module, state, rows in zip(MODULES, states, by_module, strict=True)
         ]
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
@@ -267,23 +280,27 @@ class Planner:
         )
 
 
+class _Common(NamedTuple):
+    """What the six commands of a tick have in common."""
+
+    now_ns: int
+    seq: int
+    session: int
+    hold: bool
+    margins: Margins
+    coupled_share: float
+
+
 def _command(
-    now_ns: int,
-    seq: int,
-    session: int,
-    echo_t_ns: int,
-    hold: bool,
-    margins: Margins,
-    coupled_share: float,
-    rows: list[list[float]],
+    common: _Common, echo_t_ns: int, rows: list[list[float]], *, brace: bool
 ) -> JointCommand:
     pairs: list[Pair] = [(row[0], row[1]) for row in rows]
     return JointCommand(
-        t_ns=now_ns,
-        seq=seq,
-        session=session,
+        t_ns=common.now_ns,
+        seq=common.seq,
+        session=common.session,
         echo_t_ns=echo_t_ns,
-        hold=hold,
+        hold=common.hold,
         q_ref=pairs[0],
         v_ref=pairs[1],
         tau_ff=pairs[2],
@@ -291,9 +308,10 @@ def _command(
         tau_coupled=pairs[4],
         k_p=pairs[5],
         k_d=pairs[6],
-        margin=margins.service,
-        margin_onboard=margins.onboard,
-        coupled_share=coupled_share,
+        margin=common.margins.service,
+        margin_onboard=common.margins.onboard,
+        coupled_share=common.coupled_share,
+        brace=brace,
     )
 
 

@@ -103,7 +103,7 @@ def test_damped_has_no_stiffness_and_only_what_is_left_of_the_feedforward(
     s: Setpoint, share: float, q: Pair, v: Pair
 ) -> None:
     expected = share * np.array(s.tau_ff) - 60.0 * np.array(v)
-    damped = law.damped(s, (True, True), 60.0, share)
+    damped = law.damped(law.held(s, 0.0), (True, True), 60.0, share, 1.0)
     np.testing.assert_allclose(law.torque(damped, q, v), expected, rtol=1e-12, atol=1e-9)
 
 
@@ -112,20 +112,19 @@ def test_axes_that_do_not_sink_hold_as_they_did(
     s: Setpoint, share: float, q: Pair, v: Pair
 ) -> None:
     frozen = law.held(s, 0.0)
-    tau = law.torque(law.damped(frozen, (False, True), 60.0, share), q, v)
+    tau = law.torque(law.damped(frozen, (False, True), 60.0, share, 1.0), q, v)
     assert tau[0] == law.torque(frozen, q, v)[0]
-    swapped = law.torque(law.damped(frozen, (True, False), 60.0, share), q, v)
+    swapped = law.torque(law.damped(frozen, (True, False), 60.0, share, 1.0), q, v)
     assert swapped[1] == law.torque(frozen, q, v)[1]
 
 
-@given(s=setpoints, q=angles, k_d=gains)
-def test_damping_takes_over_at_rest_what_springs_and_feedforward_carried(
-    s: Setpoint, q: Pair, k_d: float
+@given(s=setpoints, q=angles, v=rates, k_d=gains)
+def test_damping_begins_with_the_torque_that_was_in_force(
+    s: Setpoint, q: Pair, v: Pair, k_d: float
 ) -> None:
     both = (True, True)
-    at_rest = law.torque(law.damped(law.carrying(s, both, q), both, k_d, 1.0), q, (0.0, 0.0))
-    static = Setpoint(s.q_ref, law.ZERO, s.tau_ff, law.ZERO, s.k_p, s.k_d)
-    np.testing.assert_allclose(at_rest, law.torque(static, q, (0.0, 0.0)), rtol=1e-12, atol=1e-9)
+    begun = law.torque(law.damped(law.carrying(s, both, q), both, k_d, 1.0, 0.0), q, v)
+    np.testing.assert_allclose(begun, law.torque(s, q, v), rtol=1e-12, atol=1e-9)
 
 
 @given(q=angles)

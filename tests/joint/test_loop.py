@@ -217,7 +217,11 @@ def test_a_drive_that_holds_the_robot_is_taken_over_without_a_step(onboard: Rig)
     onboard.run(10)
     assert (onboard.mode, drive.armed, drive.targets) == (Mode.DISARMED, 0, [])
     drive.carries = (0.4, 1.6)
-    onboard.run(1)
+    onboard.run(10)
+    assert (onboard.mode, drive.targets) == (Mode.DISARMED, []), "no planner: its own loop holds it"
+    assert onboard.states.sent[-1].drive == DriveStatus.HOLDING
+    onboard.commands.waiting.append(command(seq=1, echo_t_ns=onboard.states.sent[-1].t_ns))
+    onboard.run(2)
     assert onboard.mode is Mode.HOLD
     assert drive.armed == 0
     assert drive.targets[0].torque == pytest.approx((0.4, 1.6))

@@ -23,9 +23,9 @@ LoopName = Literal["onboard", "service"]
 class Bench:
     """A module and its drive: the drive goes on with what it was told last."""
 
-    def __init__(self, robot: RobotConfig, loop: LoopName) -> None:
+    def __init__(self, robot: RobotConfig, loop: LoopName, module: str = "knee_right") -> None:
         self.robot = with_service(robot, loop=loop)
-        self.module = Module(self.robot, "knee_right")
+        self.module = Module(self.robot, module)
         self.cycle_ns = round(NS_PER_S / robot.joint_service.rate_hz)
         self.now_ns = T0
         self.q: Pair = (0.02, -1.0)

@@ -6,17 +6,20 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from services.joint.differential import joint_torque, motor_from_joint
+from services.joint.differential import joint_torque, motor_from_joint, motor_torque
 from services.joint.drivers.base import MotorTarget
 from services.joint.law import ZERO, Setpoint
-from services.joint.onboard import GAIN_CHANGE, POS_GAIN_MAX, OnboardLaw
+from services.joint.law import torque as law_torque
+from services.joint.onboard import GAIN_CHANGE, INPUT_TORQUE_SHARE, POS_GAIN_MAX, OnboardLaw
 from shared.messages import Pair
 
 N = 17.5
 VEL_LIMIT = 60.0
+TORQUE_MAX = 3.3
+"""What current_lim gives, N m a motor; the firmware clamps input_torque to it."""
 
 angle = st.floats(-3.0, 3.0)
 rate = st.floats(-5.0, 5.0)
@@ -34,13 +37,14 @@ setpoints = st.builds(
 )
 
 
-def firmware(target: MotorTarget, pos: Pair, vel: Pair) -> Pair:
+def firmware(target: MotorTarget, pos: Pair, vel: Pair, input_torque_max: float = math.inf) -> Pair:
     """Return the motors' torques by the firmware's law, as its documentation writes it, N m."""
     torques = []
     for i in range(2):
         wanted = target.vel_turns[i] + target.pos_gain[i] * (target.pos_turns[i] - pos[i])
         wanted = max(-VEL_LIMIT, min(VEL_LIMIT, wanted))
-        torques.append(target.torque[i] + target.vel_gain[i] * (wanted - vel[i]))
+        torque = max(-input_torque_max, min(input_torque_max, target.torque[i]))
+        torques.append(torque + target.vel_gain[i] * (wanted - vel[i]))
     return torques[0], torques[1]
 
 
@@ -119,3 +123,51 @@ def test_without_any_gains_only_torque_is_left() -> None:
     target = OnboardLaw(N, VEL_LIMIT).target(setpoint, (3.0, -4.0), (1.0, 2.0), (3.0, 4.0))
     assert target.vel_gain == (0.0, 0.0)
     assert joint_torque(target.torque, N) == pytest.approx((3.0, -4.0))
+
+
+@given(setpoints, pairs(angle), pairs(rate), pairs(torque))
+def test_the_firmware_clamps_no_input_torque_if_any_target_gives_the_torque_asked_for(
+    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
+) -> None:
+    """Else the module got another torque; without a spring nothing but input torque gives it."""
+    assume(sum(setpoint.k_p) > 1.0)
+    pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
+    target = OnboardLaw(N, VEL_LIMIT, TORQUE_MAX).target(setpoint, tau, pos, vel)
+    most = INPUT_TORQUE_SHARE * TORQUE_MAX
+    for wanted, gain, now in zip(motor_torque(tau, N), target.vel_gain, vel, strict=True):
+        assume(gain * (-VEL_LIMIT - now) - most <= wanted <= gain * (VEL_LIMIT - now) + most)
+    assert max(map(abs, target.torque)) <= most + 1e-9
+    given_by_drive = joint_torque(firmware(target, pos, vel, TORQUE_MAX), N)
+    np.testing.assert_allclose(given_by_drive, tau, atol=1e-6)
+
+
+@given(setpoints, pairs(angle), pairs(rate), pairs(torque))
+def test_targets_within_the_firmwares_clamp_are_the_ones_without_it(
+    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
+) -> None:
+    pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
+    free = OnboardLaw(N, VEL_LIMIT).target(setpoint, tau, pos, vel)
+    most = max(map(abs, free.torque)) + 1e-9
+    ample = OnboardLaw(N, VEL_LIMIT, most / INPUT_TORQUE_SHARE).target(setpoint, tau, pos, vel)
+    assert ample == free
+    assert free.pos_turns == motor_from_joint(setpoint.q_ref, N), "the reference as it is"
+
+
+@pytest.mark.parametrize("phi_off", [0.0, 0.05])
+@pytest.mark.parametrize("off", [-0.35, -0.3, 0.3])
+def test_a_hip_far_off_its_reference_stays_as_soft_as_it_is_told(
+    off: float, phi_off: float
+) -> None:
+    """HOLD's (900, 26) N m/rad is 463 on both motors: its theta was 463 stiff from 0.25 rad on."""
+    hip = Setpoint(ZERO, ZERO, (0.0, -10.0), ZERO, (900.0, 26.0), (30.0, 4.0))
+    law = OnboardLaw(N, VEL_LIMIT, TORQUE_MAX)
+    thetas = np.linspace(off, off + 0.05, 11)
+    given_by_drive = []
+    for theta in thetas:
+        q = (phi_off, float(theta))
+        pos = motor_from_joint(q, N)
+        target = law.target(hip, law_torque(hip, q, ZERO), pos, ZERO)
+        given_by_drive.append(joint_torque(firmware(target, pos, ZERO, TORQUE_MAX), N))
+    torques = np.array(given_by_drive)
+    np.testing.assert_allclose(np.diff(torques[:, 1]) / np.diff(thetas), -26.0, rtol=1e-6)
+    np.testing.assert_allclose(torques[:, 0], -900.0 * phi_off, atol=1e-7)

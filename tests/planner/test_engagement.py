@@ -84,6 +84,16 @@ def test_modules_may_take_the_grace_time_to_report_track(off_ns: int, hold: bool
     assert engagement.hold is hold
 
 
+@pytest.mark.parametrize("mode", [Mode.FAULT, Mode.DAMP])
+@pytest.mark.parametrize("since_ns", [0, 1, GRACE_NS])
+def test_a_module_that_can_not_come_to_track_is_not_waited_for(mode: Mode, since_ns: int) -> None:
+    """Within the grace time the other five tracked on beside a limp one for up to 150 ms."""
+    engagement = Engagement(PlannerMode.LEADING, T0)
+    assert engagement.advance(T0 + since_ns, YES, YES, but(HOLD, 3, int(mode)))
+    assert engagement.hold
+    assert engagement.dropouts == 1
+
+
 def test_it_goes_on_leading_while_all_six_track() -> None:
     engagement = leading()
     assert not any(engagement.advance(T0 + tick, YES, YES, TRACK) for tick in range(100))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.joint.drivers.base import DriveStatus
-from shared.clock import NS_PER_S
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import kind_of
 from shared.messages import Cause, Mode
@@ -103,9 +103,12 @@ def test_torque_in_damp_is_what_is_left_of_the_feedforward(
     entered_ns, fade_ns = bench.now_ns, robot.joint_service.damp_fade_s * NS_PER_S
     for cycle in range(2400):
         tau = bench.cycle(bench.fresh()).tau  # a planner that has not heard changes nothing
-        left = 1.0 - (bench.now_ns - entered_ns) / fade_ns
+        since_ns = bench.now_ns - entered_ns
+        left = 1.0 - since_ns / fade_ns
+        coupled = max(0.0, 1.0 - since_ns / (robot.joint_service.coupled_ramp_ms * NS_PER_MS))
         if cycle:
-            np.testing.assert_allclose(tau, (3.0, -25.0 * left), atol=1e-9)
+            expected = (3.0 + 12.0 * coupled, -25.0 * left - 9.0 * coupled)
+            np.testing.assert_allclose(tau, expected, atol=1e-9)
     assert left > 0.0
 
 
@@ -113,7 +116,8 @@ def test_damp_resists_motion(robot: RobotConfig, bench: Bench) -> None:
     bench.to_hold()
     bench.cycle(estop=True)
     bench.v = (0.0, -0.3)
-    assert bench.run(10)[-1].tau[1] == pytest.approx(robot.joint_service.damp_k_d * 0.3)
+    settled = bench.run(round(robot.joint_service.blend_ms / 2) + 10)[-1]
+    assert settled.tau[1] == pytest.approx(robot.joint_service.damp_k_d * 0.3)
 
 
 def test_a_knee_is_caught_before_it_folds_so_far_that_the_robot_topples(

@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from services.joint.module import ModuleMemory
+from services.joint.memory import ModuleMemory
 from services.planner.memory import TickMemory
 from shared import topics
 from shared.clock import NS_PER_MS

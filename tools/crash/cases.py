@@ -149,7 +149,7 @@ def _of_service(service: str, signal: str) -> Case:
 
 LIMP: Final = {
     "ankle": (Verdict.FELL, "nothing turns its sole against the floor: a push to its side tips it"),
-    "knee": (Verdict.FELL, "the leg folds, and the other cannot carry all of the weight"),
+    "knee": (Verdict.STOOD, "the other five brace, and its leg stands as a strut on a stiff hip"),
     "hip": (Verdict.STOOD, "the other hip carries the torso's pitch alone"),
 }
 """What a robot with one limp module may come to, by the kind of module, and why."""

@@ -8,7 +8,8 @@ from typing import Final
 import msgspec
 
 from services.joint.drivers.base import DriveReading
-from services.joint.module import Module, ModuleMemory
+from services.joint.memory import ModuleMemory
+from services.joint.module import Module
 from shared import topics
 from shared.config import RobotConfig
 from shared.messages import DriveStatus, JointCommand, JointState, Message

@@ -29,7 +29,7 @@ MODE_COLOURS: Final[dict[int, str]] = {
 }  # fmt: skip
 DRIVE_COLOURS: Final[dict[int, str]] = {
     DriveStatus.LOST: "bad", DriveStatus.IDLE: "idle", DriveStatus.ARMED: "good",
-    DriveStatus.ERROR: "odd", DriveStatus.UNZEROED: "warn",
+    DriveStatus.ERROR: "odd", DriveStatus.UNZEROED: "warn", DriveStatus.HOLDING: "good",
 }  # fmt: skip
 PLANNER_COLOURS: Final[dict[int, str]] = {
     PlannerMode.WAITING: "idle", PlannerMode.ALIGNING: "warn", PlannerMode.LEADING: "good",

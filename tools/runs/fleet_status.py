@@ -74,6 +74,8 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """(phi, theta), rad; None if its drive does not know."""
     way_out: str
     """What a person does to have it track again; empty if nothing has to be done."""
+    braced: bool = False
+    """It holds with all of its stand gains, for another may be limp."""
 
 
 class LeadStatus(msgspec.Struct, frozen=True):
@@ -216,9 +218,15 @@ def module_status(state: Message | None) -> ModuleStatus:
         way_out = RESTART
     elif drive is DriveStatus.UNZEROED:
         way_out = "hang the robot, xrl zero"
+    elif drive is DriveStatus.HOLDING:
+        way_out = "by itself, with the planner: the drive holds"
+    elif mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):
+        way_out = f"if it lasts: its log says why; hang the robot, then {RESTART}"
     knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
     q = state.q if knows else None
-    return ModuleStatus(mode.name, TIERS.get(mode), cause.name, drive.name, q, way_out)
+    braced = state.braced and mode is Mode.HOLD
+    tier = TIERS.get(mode)
+    return ModuleStatus(mode.name, tier, cause.name, drive.name, q, way_out, braced)
 
 
 def lead_status(message: Message | None) -> LeadStatus | None:

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import ClassVar
 
 from services.joint.controller import JointController
-from services.joint.module import Module, ModuleMemory
+from services.joint.memory import ModuleMemory
+from services.joint.module import Module
 from services.joint.tracer import Tracer
 from services.planner.memory import TickMemory
 from services.planner.planner import Planner

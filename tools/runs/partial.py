@@ -13,7 +13,7 @@ from typing import Final, Literal
 import msgspec
 
 from services.joint.differential import joint_torque
-from services.joint.module import ModuleMemory
+from services.joint.memory import ModuleMemory
 from services.planner.memory import TickMemory
 from services.simulator.state import taken
 from shared.clock import NS_PER_MS, NS_PER_S

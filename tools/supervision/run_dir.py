@@ -12,7 +12,9 @@ from pathlib import Path
 
 import msgspec
 
+from services.joint import will
 from shared.exceptions import FleetError
+from shared.joints import MODULES
 from tools.supervision.fleet import SUPERVISOR_SOCKET, UNIX, Plan, is_listening
 
 _NEVER_GIVE_UP = 1_000_000
@@ -104,6 +106,12 @@ class RunDir:
         self.manifest.write_bytes(msgspec.json.format(msgspec.json.encode(manifest)))
         for path in (*manifest.sockets, str(self.supervisor_socket)):
             _remove_socket(Path(path))
+        self._remove_wills()
+
+    def _remove_wills(self) -> None:
+        """Forget what joint services of another time have left: a fleet is asked for anew."""
+        for module in MODULES:
+            will.path_of(self.path, module).unlink(missing_ok=True)
 
     def read_manifest(self) -> Manifest | None:
         """Return the manifest of the fleet that is or was up here, or None."""
@@ -118,6 +126,7 @@ class RunDir:
         for path in manifest.sockets if manifest else ():
             _remove_socket(Path(path))
         _remove_socket(self.supervisor_socket)
+        self._remove_wills()
         for file in (self.supervisor_config, self.supervisor_pid, self.manifest):
             file.unlink(missing_ok=True)
         if not keep_logs:

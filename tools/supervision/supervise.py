@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
+from services.joint import will
 from services.simulator import usb_standin
 from shared.exceptions import FleetError
 from tools.supervision import fleet, procfs
@@ -153,9 +154,14 @@ class Fleet:
             raise FleetError(f"{service} (pid {pid}) has just ended by itself") from None
         return pid
 
+    def forget(self, service: str) -> None:
+        """Have the next process of a joint service arm its drive, whatever the last left."""
+        will.forget(self.run.path, service)
+
     def start_service(self, service: str) -> None:
         """Start a service that is down, without waiting for a restart that is delayed.
 
+        It is asked for: a drive that has let go is armed again (`services.joint.will`).
         One that is suspended is continued; one that runs is left alone.
 
         Raises:
@@ -164,6 +170,7 @@ class Fleet:
         fleet.check_known([service], self.manifest.services)
         pid = self.pids().get(service)
         if pid is None:
+            self.forget(service)
             with contextlib.suppress(RefusedError):
                 self._supervisor.call("stopProcess", service)  # ends the wait of a backoff
             try:

@@ -1,0 +1,177 @@
+"""HOLD while a knee may be limp: the module rises to all of its stand gains, and stays there."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.joint import law
+from services.joint.controller import JointController
+from services.joint.memory import ControllerMemory
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.joints import MODULES, kind_of
+from shared.messages import Mode, Pair
+from tests.joint.helpers import Bench
+
+SOFT_P: Pair = (500.0, 12.0)
+SOFT_D: Pair = (20.0, 0.8)
+POSES = {"ankle": (0.02, 0.1), "knee": (0.02, -1.0), "hip": (0.02, 0.4)}
+
+gain = st.floats(0.0, 3000.0)
+damping = st.floats(0.0, 200.0)
+
+
+def holding(robot: RobotConfig, module: str, k_p: Pair = SOFT_P, k_d: Pair = SOFT_D) -> Bench:
+    """Bring a module from TRACK on these gains to HOLD, at its reference."""
+    bench = Bench(robot, module)
+    bench.q = POSES[kind_of(module)]
+    bench.to_track(q_ref=bench.q, k_p=k_p, k_d=k_d)
+    bench.run(1, fresh=True, hold=True, q_ref=bench.q, k_p=k_p, k_d=k_d)
+    assert bench.mode is Mode.HOLD
+    return bench
+
+
+def blended(bench: Bench, robot: RobotConfig) -> int:
+    """Return how many cycles `blend_ms` takes."""
+    return round(robot.joint_service.blend_ms * NS_PER_MS / bench.cycle_ns)
+
+
+def is_braced(bench: Bench) -> bool:
+    return bench.controller.state(bench.now_ns).braced
+
+
+def at_least(robot: RobotConfig, module: str, k_p: Pair, k_d: Pair) -> tuple[Pair, Pair]:
+    stand = robot.stand_gains(module)
+    return (
+        (max(k_p[0], stand.k_p[0]), max(k_p[1], stand.k_p[1])),
+        (max(k_d[0], stand.k_d[0]), max(k_d[1], stand.k_d[1])),
+    )
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_told_to_it_rises_to_its_stand_gains_within_the_blend_time(
+    robot: RobotConfig, module: str
+) -> None:
+    bench = holding(robot, module)
+    bench.run(2 * blended(bench, robot), fresh=True, hold=True, k_p=SOFT_P, k_d=SOFT_D)
+    plain = bench.controller.setpoint
+    assert not is_braced(bench)
+    for _ in range(blended(bench, robot) + 1):
+        bench.run(1, fresh=True, hold=True, brace=True)
+        assert is_braced(bench)
+    braced = bench.controller.setpoint
+    assert (braced.k_p, braced.k_d) == at_least(robot, module, SOFT_P, SOFT_D)
+    frozen = (plain.q_ref, plain.v_ref, plain.tau_ff, plain.tau_coupled)
+    assert (braced.q_ref, braced.v_ref, braced.tau_ff, braced.tau_coupled) == frozen
+
+
+def test_a_hip_that_is_not_told_to_stays_as_soft_as_the_hand_needs_it(robot: RobotConfig) -> None:
+    bench = holding(robot, "hip_left")
+    bench.run(1000, fresh=True, hold=True)
+    assert bench.controller.setpoint.k_p[1] == SOFT_P[1]
+
+
+@settings(max_examples=25)
+@given(st.sampled_from(MODULES), st.tuples(gain, gain), st.tuples(damping, damping))
+def test_no_gain_is_ever_lowered_and_none_jumps(
+    robot: RobotConfig, module: str, k_p: Pair, k_d: Pair
+) -> None:
+    bench = holding(robot, module, k_p, k_d)
+    stand, cycles = robot.stand_gains(module), blended(bench, robot)
+    steps = [max(p, d) / cycles for p, d in zip(stand.k_p, stand.k_d, strict=True)]
+    last = bench.controller.setpoint
+    for _ in range(cycles + 5):
+        bench.run(1, fresh=True, hold=True, brace=True)
+        now = bench.controller.setpoint
+        for before, after in ((last.k_p, now.k_p), (last.k_d, now.k_d)):
+            for i in (0, 1):  # HOLD's own rise comes on top
+                assert before[i] - 1e-9 <= after[i] <= before[i] + 2.0 * steps[i] + 1e-9
+        last = now
+    wanted = at_least(robot, module, k_p, k_d)
+    assert last.k_p == pytest.approx(wanted[0])
+    assert last.k_d == pytest.approx(wanted[1])
+
+
+@pytest.mark.parametrize("after", ["told so no more", "told nothing"])
+def test_it_stays_braced_until_it_tracks_again(robot: RobotConfig, after: str) -> None:
+    """A knee that a restarted service reports for a moment is not to loosen the other five."""
+    bench = holding(robot, "hip_right")
+    bench.run(1, fresh=True, hold=True, brace=True)
+    bench.run(500, fresh=after == "told so no more", hold=True)
+    assert is_braced(bench)
+    assert bench.controller.setpoint.k_p == robot.stand_gains("hip_right").k_p
+    while bench.mode is Mode.HOLD:
+        bench.run(1, fresh=True, k_p=SOFT_P, k_d=SOFT_D)
+    assert bench.mode is Mode.TRACK
+    assert not is_braced(bench)
+    bench.run(2 * blended(bench, robot), fresh=True, k_p=SOFT_P, k_d=SOFT_D)
+    assert bench.controller.setpoint.k_p == SOFT_P
+
+
+def test_it_is_not_braced_anew_by_what_it_was_told_before_it_tracked(robot: RobotConfig) -> None:
+    bench = holding(robot, "hip_right")
+    bench.run(1, fresh=True, hold=True, brace=True)
+    while bench.mode is Mode.HOLD:
+        bench.run(1, fresh=True, k_p=SOFT_P, k_d=SOFT_D)
+    bench.run(1000)
+    assert bench.mode is Mode.HOLD
+    assert not is_braced(bench)
+
+
+def test_track_does_not_brace(robot: RobotConfig) -> None:
+    """Its gains are certified together: the hold that comes with it is what braces."""
+    bench = Bench(robot, "hip_right")
+    bench.q = POSES["hip"]
+    sent = {"q_ref": bench.q, "k_p": SOFT_P, "k_d": SOFT_D}
+    bench.to_track(**sent)
+    before = bench.controller.setpoint
+    bench.run(100, fresh=True, brace=True, **sent)
+    assert bench.mode is Mode.TRACK
+    assert not is_braced(bench)
+    assert bench.controller.setpoint == before
+    bench.run(1, fresh=True, hold=True, brace=True, **sent)
+    assert is_braced(bench)
+
+
+def test_bracing_and_going_on_to_track_is_without_a_step(robot: RobotConfig) -> None:
+    """With the joint off its reference, where a gain is a torque."""
+    bench = holding(robot, "hip_right")
+    bench.move((bench.q[0] + 0.02, bench.q[1] - 0.05))
+    off = {"q_ref": (bench.q[0], bench.q[1] + 0.03), "k_p": SOFT_P, "k_d": SOFT_D}
+    bench.run(blended(bench, robot), fresh=True, hold=True, **off)
+    last, largest = bench.controller.tau, 0.0
+    for told in ({"hold": True, "brace": True}, {}):
+        for _ in range(2 * blended(bench, robot)):
+            bench.run(1, fresh=True, **(off | told))
+            tau = bench.controller.tau
+            largest = max(largest, *(abs(b - a) for a, b in zip(last, tau, strict=True)))
+            last = tau
+    assert bench.mode is Mode.TRACK
+    whole = robot.stand_gains("hip_right").k_p[1] * 0.05
+    assert largest < 3.0 * whole / blended(bench, robot), "a share of it in each cycle"
+
+
+def test_a_controller_that_goes_on_from_its_memory_goes_on_bracing(robot: RobotConfig) -> None:
+    bench = holding(robot, "hip_right")
+    bench.run(20, fresh=True, hold=True, brace=True)
+    text = msgspec.json.encode(bench.controller.remember())
+    twin = JointController(robot, "hip_right")
+    twin.recall(msgspec.json.decode(text, type=ControllerMemory))
+    for _ in range(200):
+        bench.cycle()
+        twin.step(bench.now_ns, bench.reading(), None, estop=False)
+        assert twin.setpoint == bench.controller.setpoint
+    assert twin.state(bench.now_ns).braced
+
+
+def test_an_emergency_stop_of_a_braced_module_sinks(robot: RobotConfig) -> None:
+    bench = holding(robot, "knee_right")
+    bench.run(300, fresh=True, hold=True, brace=True)
+    bench.cycle(bench.fresh(hold=True, brace=True), estop=True)
+    bench.run(5, fresh=True, hold=True, brace=True)
+    assert bench.mode is Mode.DAMP
+    assert bench.controller.setpoint.k_p[1] == law.ZERO[1]
+    assert not is_braced(bench)

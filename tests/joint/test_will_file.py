@@ -1,0 +1,164 @@
+"""The file of what a joint service left, and the verbs that ask for a module anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from services.joint.will import Will, WillFile, forget, path_of
+from tools import kill
+from tools.supervision import fleet as fleets
+from tools.supervision import procfs, supervise
+from tools.supervision.run_dir import RunDir
+from tools.supervision.supervise import Fleet
+
+MODULE = "knee_left"
+PID = 4711
+
+
+@pytest.fixture
+def left(tmp_path: Path) -> WillFile:
+    """Return what a service of MODULE left that held, mapped as by one that runs."""
+    file = WillFile(tmp_path, MODULE)
+    file.write(Will.HELD)
+    return file
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> WillFile:
+    return WillFile(tmp_path, MODULE)
+
+
+def test_where_nobody_was_nothing_is_left(file: WillFile) -> None:
+    assert file.read() is Will.NOTHING
+
+
+@pytest.mark.parametrize("will", list(Will))
+def test_what_a_process_leaves_the_next_one_reads(tmp_path: Path, will: Will) -> None:
+    WillFile(tmp_path, MODULE).write(will)
+    assert WillFile(tmp_path, MODULE).read() is will
+    assert WillFile(tmp_path, "ankle_left").read() is Will.NOTHING
+
+
+@pytest.mark.parametrize("byte", [3, 0x20, 0xFF])
+def test_what_is_no_will_counts_as_held(tmp_path: Path, byte: int) -> None:
+    path_of(tmp_path, MODULE).write_bytes(bytes([byte]))
+    assert WillFile(tmp_path, MODULE).read() is Will.HELD
+
+
+@pytest.mark.parametrize("will", [Will.HELD, Will.DAMP])
+def test_what_is_forgotten_is_so_for_a_process_that_has_it_mapped(
+    tmp_path: Path, file: WillFile, will: Will
+) -> None:
+    file.write(will)
+    forget(tmp_path, MODULE)
+    assert file.read() is Will.NOTHING
+    file.write(will)
+    assert file.read() is Will.NOTHING, "it has nothing new to say: that undoes nothing"
+    other = Will.HELD if will is Will.DAMP else Will.DAMP
+    file.write(other)
+    assert WillFile(tmp_path, MODULE).read() is other, "still the same file"
+
+
+def test_a_will_that_was_never_made_is_forgotten_without_a_word(tmp_path: Path) -> None:
+    forget(tmp_path, MODULE)
+    assert list(tmp_path.iterdir()) == []
+
+
+class Calls:
+    """Stands for the supervisor and the system: takes what they are asked to do."""
+
+    def __init__(self, pids: dict[str, int], *, suspended: bool) -> None:
+        self.pids = pids
+        self.suspended = suspended
+        self.made: list[tuple[object, ...]] = []
+
+    def call(self, *asked: object) -> None:
+        self.made.append(asked)
+
+    def kill(self, *asked: object) -> None:
+        self.made.append(("kill", *asked))
+
+
+def fleet_of(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls, services: tuple[str, ...]
+) -> Fleet:
+    fleet = Fleet(run_dir)
+    monkeypatch.setattr(fleet, "_supervisor", SimpleNamespace(call=calls.call))
+    monkeypatch.setattr(fleet, "pids", lambda: calls.pids)
+    monkeypatch.setattr(Fleet, "manifest", SimpleNamespace(services=services))
+    monkeypatch.setattr(Fleet, "attach", lambda _run_dir: fleet)
+    monkeypatch.setattr(procfs, "is_suspended", lambda _pid: calls.suspended)
+    monkeypatch.setattr(supervise, "os", SimpleNamespace(kill=calls.kill))
+    return fleet
+
+
+def test_a_service_that_is_down_is_started_as_if_none_had_been_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: WillFile
+) -> None:
+    calls = Calls({}, suspended=False)
+    fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
+    assert ("startProcess", MODULE, False) in calls.made
+    assert left.read() is Will.NOTHING
+
+
+@pytest.mark.parametrize("suspended", [True, False])
+def test_a_service_that_is_up_is_not_asked_for_anew_by_starting_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: WillFile, suspended: bool
+) -> None:
+    """It knows itself what it has held; should it crash after, the next has to know as well."""
+    calls = Calls({MODULE: PID}, suspended=suspended)
+    fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
+    assert [made[0] for made in calls.made] == ["kill"] * suspended
+    assert left.read() is Will.HELD
+
+
+@pytest.mark.parametrize(
+    ("signal", "after"),
+    [
+        ("KILL", Will.NOTHING),
+        ("TERM", Will.NOTHING),
+        ("STOP", Will.HELD),
+        ("CONT", Will.HELD),
+    ],
+)
+def test_the_verb_that_ends_a_service_asks_for_the_next_and_one_that_suspends_it_does_not(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    left: WillFile,
+    signal: str,
+    after: Will,
+) -> None:
+    calls = Calls({MODULE: PID}, suspended=False)
+    fleet_of(tmp_path, monkeypatch, calls, (MODULE,))
+    args = SimpleNamespace(run_dir=tmp_path, service=MODULE, signal=signal)
+    assert kill.run(cast("kill.argparse.Namespace", args)) == 0
+    assert calls.made == [("kill", PID, kill.SIGNALS[signal])]
+    assert left.read() is after
+
+
+def test_a_service_without_a_drive_leaves_nothing_to_forget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = Calls({"planner": PID}, suspended=False)
+    fleet_of(tmp_path, monkeypatch, calls, ("planner",))
+    args = SimpleNamespace(run_dir=tmp_path, service="planner", signal="KILL")
+    assert kill.run(cast("kill.argparse.Namespace", args)) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ends", ["a new fleet", "a fleet that goes down"])
+def test_a_fleet_does_not_hear_of_what_held_before_it(
+    tmp_path: Path, left: WillFile, ends: str
+) -> None:
+    assert left.read() is Will.HELD
+    if ends == "a new fleet":
+        plan = SimpleNamespace(listeners=(), processes=(), config_path=tmp_path / "robot.toml")
+        plan.processes = (SimpleNamespace(name=MODULE, topic="", stop_s=1.0),)
+        RunDir(tmp_path).prepare(cast("fleets.Plan", plan))
+    else:
+        RunDir(tmp_path).clear(keep_logs=True)
+    assert not path_of(tmp_path, MODULE).exists()
