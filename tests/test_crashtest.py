@@ -66,8 +66,8 @@ def test_a_fall_is_not_tried_again_and_keeps_its_log(
     outcome, logs = run_with([FELL, STOOD], tmp_path, monkeypatch, robot)
     assert (outcome.verdict, outcome.tries) == (Verdict.FELL, 1)
     assert len(logs) == 1
-    limp_knee = BY_NAME["disarmed-knee_left"]
-    _, logs = run_with([FELL], tmp_path, monkeypatch, robot, limp_knee)
+    limp_ankle = BY_NAME["disarmed-ankle_left"]
+    _, logs = run_with([FELL], tmp_path, monkeypatch, robot, limp_ankle)
     assert len(logs) == 1, "also where it is allowed"
     _, logs = run_with([STOOD], tmp_path, monkeypatch, robot)
     assert logs == []
@@ -114,7 +114,7 @@ def test_what_is_chased_is_killed_once_as_the_modules_track_again(
 RESULTS = [
     Result(PLANNER, STOOD),
     Result(KNEE, FELL),
-    Result(BY_NAME["disarmed-knee_left"], FELL),
+    Result(BY_NAME["disarmed-ankle_left"], FELL),
     Result(BY_NAME["kill-harness"], LOST),
 ]
 
@@ -134,7 +134,7 @@ def test_json_says_what_was_done_and_what_came_of_it(tmp_path: Path) -> None:
     assert document["counts"] == {"stood": 1, "sank": 0, "fell": 2, "unjudged": 1}
     rows = {row["name"]: row for row in document["cases"]}
     assert rows["kill-knee_left"]["as_expected"] is False
-    assert rows["disarmed-knee_left"]["as_expected"] is True
+    assert rows["disarmed-ankle_left"]["as_expected"] is True
     assert rows["kill-knee_left"]["fell_after_s"] == 0.7
     assert rows["kill-knee_left"]["safe_ms"] is None
     assert "knee_left KILL at 2.4 s" in rows["kill-knee_left"]["what"]
