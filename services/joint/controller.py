@@ -86,6 +86,8 @@ class JointController:
         reading: DriveReading | None,
         command: JointCommand | None,
         estop: bool,
+        *,
+        listens: bool = False,
     ) -> CycleResult:
         """Run one cycle.
 
@@ -94,12 +96,15 @@ class JointController:
             reading: the drive's newest sample; None if none came in time.
             command: the newest command, if one came since the last cycle.
             estop: the emergency stop is engaged.
+            listens: the service was frozen, and what the link's buffer kept comes first: samples
+                may jump from where the joint was to where it is.
         """
         self._count(now_ns)
         failsafe, samples = self.failsafe, self._samples
         drive = Event.NONE
         if reading is not None:
-            drive = samples.take(reading, armed=failsafe.mode is not Mode.DISARMED)
+            controlled = failsafe.mode is not Mode.DISARMED and not listens
+            drive = samples.take(reading, armed=controlled)
             if reading.torque is not None:
                 self._found_tau = joint_torque(reading.torque, self._gear_ratio)
         if command is not None:

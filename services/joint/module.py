@@ -131,7 +131,8 @@ class Module:
         controller = self.controller
         tau_before = controller.tau
         estop = self._estop and not self._is_to_be_taken_over(reading)
-        result = controller.step(now_ns, reading, command, estop)
+        listens = self._listen_until_ns > 0
+        result = controller.step(now_ns, reading, command, estop, listens=listens)
         mode = controller.failsafe.mode
         if result.event is not None:
             self.will = self._new_will(mode)

@@ -201,3 +201,28 @@ def test_a_memory_taken_while_it_goes_on_is_gone_on_with_bit_for_bit(
         pos, vel = motor_from_joint(bench.q, ratio), motor_from_joint(bench.v, ratio)
         reading = DriveReading(now, pos, vel, bench.status, 0)
         assert bench.cycle() == twin.step(now, reading, None, estop=False)
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_what_the_link_kept_from_before_the_freeze_does_not_make_the_joint_seem_to_jump(
+    robot: RobotConfig, loop: LoopName
+) -> None:
+    """The first sample is of the time before, the next is where the hand has led the joint."""
+    bench = Bench(robot, loop)
+    bench.to(Mode.HOLD)
+    bench.now_ns += 3 * NS_PER_S
+    bench.cycle()
+    bench.q = (0.02, -1.1)
+    for _ in range(100):
+        bench.cycle()
+    assert bench.mode is Mode.HOLD
+    assert bench.module.controller.samples.q == pytest.approx(bench.q)
+
+
+def test_a_jump_without_a_freeze_is_not_believed(robot: RobotConfig) -> None:
+    bench = Bench(robot, "onboard")
+    bench.to(Mode.HOLD)
+    bench.q = (0.02, -1.1)
+    for _ in range(5):
+        bench.cycle()
+    assert bench.mode is Mode.FAULT
