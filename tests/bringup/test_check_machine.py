@@ -7,27 +7,15 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from shared import priority
 from shared.config import RobotConfig
-from shared.config_sections import CanConfig
 from shared.process import DEFAULT_CONFIG
 from tools.bringup import check_machine
 from tools.bringup.rows import Row, Verdict
 
 ROOT = DEFAULT_CONFIG.parents[1]
-
-
-@pytest.fixture
-def real(robot: RobotConfig) -> RobotConfig:
-    """Return the shipped robot on real buses."""
-    can = {
-        name: CanConfig(interface="socketcan", channel=f"can{i}")
-        for i, name in enumerate(robot.can)
-    }
-    return msgspec.structs.replace(robot, can=can)
 
 
 def write(root: Path, path: str, text: str) -> None:

@@ -6,26 +6,14 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from shared.config import RobotConfig
-from shared.config_sections import CanConfig
 from tools.bringup import check_socketcan
 from tools.bringup.check_socketcan import socketcan_rows
 from tools.bringup.rows import Row, Verdict
 
 UP, DOWN = "0x40081", "0x40080"
-
-
-@pytest.fixture
-def real(robot: RobotConfig) -> RobotConfig:
-    """Return the shipped robot on real buses."""
-    can = {
-        name: CanConfig(interface="socketcan", channel=f"can{i}")
-        for i, name in enumerate(robot.can)
-    }
-    return msgspec.structs.replace(robot, can=can)
 
 
 def flag(root: Path, name: str, flags: str) -> None:
