@@ -181,10 +181,15 @@ def test_a_drive_found_armed_tells_its_torque_until_it_is_taken_over(
     with usb.lock:
         usb.bank.settings.fill("config.enable_watchdog", value=False)
     drive.close()
-    with Control(OdriveUsb(serial_number(MODULE), config.drive)).running() as heir:
-        heir.target = None
-        assert eventually(lambda: heir.status is DriveStatus.ARMED)
-        assert heir.torque == pytest.approx((0.02, -0.03))
+    heir = Control(OdriveUsb(serial_number(MODULE), config.drive))
+    heir.target = None
+    with heir.running():
+        assert eventually(lambda: heir.torque is not None)
+        for _ in range(10):  # in every sample: a service waits on it until a planner is heard
+            before = heir.samples
+            assert eventually(lambda before=before: heir.samples > before)
+            assert heir.torque == pytest.approx((0.02, -0.03))
+        assert heir.status is DriveStatus.ARMED
         heir.target = (0.01, 0.01)
         assert eventually(lambda: usb.bank.torque[5] == pytest.approx(0.01))
         assert eventually(lambda: heir.torque is None)

@@ -46,7 +46,7 @@ LOST_S: Final = 0.1
 RETRY_S: Final = 0.2
 """Between two attempts to connect."""
 STATES_EVERY: Final = 4
-"""Exchanges of an armed drive from one look at its states to the next: 20 ms."""
+"""Exchanges of a drive that we hold armed from one look at its states to the next: 20 ms."""
 ANSWER_S: Final = 0.003
 """So long an exchange waits for the control thread's target after its sample."""
 TELL_S: Final = 5.0
@@ -303,14 +303,14 @@ class OdriveUsb:
         """Take a sample of both axes, for the control thread."""
         self._exchanges += 1
         torque = None
-        if self._status is DriveStatus.ARMED and self._exchanges % STATES_EVERY:
+        found = self._request is None and self._target is None
+        if self._status is DriveStatus.ARMED and not found and self._exchanges % STATES_EVERY:
             values = await board.sample.read()
             t_ns = now_ns()
         else:
             values = await board.sample_and_state.read()
             t_ns = now_ns()
             await self._judge(board, values[4:])
-            found = self._request is None and self._target is None
             if found and self._status is DriveStatus.ARMED:
                 torque = await board.torques(self._drive.torque_constant)
         if all(map(isfinite, values)):  # what is no number is no sample
