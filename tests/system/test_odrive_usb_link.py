@@ -116,7 +116,7 @@ def test_no_call_waits_for_a_board_that_hangs(
     usb.stalled.clear()
     assert eventually(lambda: drive.connections == 2)
     assert eventually(lambda: armed.status is not LOST)
-    assert armed.longest_s < 0.1, "the package's transfer timeout is 0.5 s"
+    assert armed.longest_s < 0.4, "the package's transfer timeout is 0.5 s"
     assert armed.raised is None
 
 
