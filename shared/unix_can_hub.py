@@ -103,6 +103,8 @@ class UnixCanHub:
             packet = client.recv(PACKET_BYTES)
         except BlockingIOError:
             return []
+        except ConnectionResetError:
+            return []  # it left frames unread, says the kernel, once; what it sent comes next
         except OSError:
             packet = b""
         if not packet:
@@ -115,13 +117,16 @@ class UnixCanHub:
         return unpack_frames(packet)
 
     def _hand(self, client: socket.socket, packet: bytes) -> None:
-        """Send without waiting; drop what a slow client has no room for."""
+        """Send without waiting; drop what a slow client has no room for.
+
+        A client that has gone is parted with in `_take`, once what it sent has been read.
+        """
         try:
             client.send(packet)
         except BlockingIOError:
             self.dropped += 1
         except OSError:
-            self._part(client)
+            pass
 
     def _part(self, client: socket.socket) -> None:
         """Close a client's side."""

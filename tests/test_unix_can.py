@@ -135,6 +135,33 @@ def test_hub_parts_with_clients_that_leave(hub: UnixCanHub) -> None:
     assert hub.clients == 0
 
 
+def test_what_a_client_sent_before_it_left_is_heard_though_it_left_frames_unread(
+    hub: UnixCanHub,
+) -> None:
+    """A tool that sends one order and goes: the kernel tells of the unread ones first."""
+    leaving = connect(hub)
+    hub.broadcast([(0x1, b"unread")])
+    leaving.send(message(0x55, b"order"))
+    leaving.shutdown()
+    assert hub.poll() == [(0x55, b"order")]
+    assert hub.clients == 0
+
+
+def test_what_a_client_sent_before_it_left_is_heard_though_others_talk_to_it(
+    hub: UnixCanHub,
+) -> None:
+    talker = connect(hub)
+    leaving = connect(hub)
+    leaving.send(message(0x55, b"order"))
+    leaving.shutdown()
+    hub.broadcast([(0x1, b"too late")])
+    with talker:
+        talker.send(message(0x2, b"too"))
+        assert sorted(hub.poll()) == [(0x2, b"too"), (0x55, b"order")]
+    assert hub.poll() == []
+    assert hub.clients == 0
+
+
 def test_client_learns_that_the_hub_has_closed(path: Path) -> None:
     hub = UnixCanHub(path)
     with connect(hub) as bus:
