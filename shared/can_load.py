@@ -21,8 +21,13 @@ bus delays a frame by as much as is queued before it. Torques for 12 axes at 333
 heartbeats at 10 Hz, are 82 %."""
 STUFFING: Final = 0.06
 """Stuff bits for each bit that can be stuffed: 0.05 while the robot stands."""
+BLEND_MAX: Final = 0.98
+"""Share of a bus that may be taken while gains blend, for tenths of a second: what is more queues
+up, and joints are led on samples of before."""
 GAINS_HZ: Final = 10.0
 """How often the onboard loop's gains go out even if they stand still."""
+BLEND_HZ: Final = 125.0
+"""And while they blend: `FOLLOW_MS` of `services.joint.onboard`."""
 LOADCELL_FRAMES: Final = 3
 """To a sample of the harness sensor."""
 
@@ -34,23 +39,36 @@ class BusLoad(NamedTuple):
     """By each axis for each Hz of the control rate: estimate and target, bit."""
     steady: float
     """By each axis: heartbeat and gains, bit/s."""
+    blend: float
+    """By each axis while gains blend, on top, bit/s."""
     other: float
     """By the harness sensor, bit/s."""
     axes: int
 
-    def share(self, rate_hz: float) -> float:
+    def share(self, rate_hz: float, *, blending: bool = False) -> float:
         """Return the load at a control rate, as a share of the bus."""
-        return (self.axes * (self.cyclic * rate_hz + self.steady) + self.other) / BITRATE
+        steady = self.steady + self.blend * blending
+        return (self.axes * (self.cyclic * rate_hz + steady) + self.other) / BITRATE
 
     def rate_max_hz(self) -> float:
-        """Return the control rate at which the load is `LOAD_MAX`; 0 if there is none."""
-        left = LOAD_MAX * BITRATE - self.other - self.axes * self.steady
-        return max(0.0, left / (self.axes * self.cyclic))
+        """Return the highest control rate that the bus carries, blends included; 0: none."""
+        rates = (
+            (most * BITRATE - self.other - self.axes * each) / (self.axes * self.cyclic)
+            for most, each in self._limits()
+        )
+        return max(0.0, min(rates))
 
     def axes_max(self, rate_hz: float) -> int:
-        """Return how many axes the bus carries at a control rate."""
-        left = LOAD_MAX * BITRATE - self.other
-        return max(0, math.floor(left / (self.cyclic * rate_hz + self.steady)))
+        """Return how many axes the bus carries at a control rate, blends included."""
+        counts = (
+            math.floor((most * BITRATE - self.other) / (self.cyclic * rate_hz + each))
+            for most, each in self._limits()
+        )
+        return max(0, min(counts))
+
+    def _limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return what share may be taken, and what each axis takes whatever the rate, bit/s."""
+        return ((LOAD_MAX, self.steady), (BLEND_MAX, self.steady + self.blend))
 
 
 def frame_bits(data_bytes: int) -> float:
@@ -74,10 +92,11 @@ def bus_load(
         loadcell_rate_hz: samples of a harness sensor on this bus.
     """
     full, half = frame_bits(8), frame_bits(4)
-    gains = GAINS_HZ * (full + half) if onboard else 0.0
+    gains = full + half if onboard else 0.0
     return BusLoad(
         cyclic=full + (full if onboard else half),
-        steady=1e3 / heartbeat_period_ms * full + gains,
+        steady=1e3 / heartbeat_period_ms * full + GAINS_HZ * gains,
+        blend=(BLEND_HZ - GAINS_HZ) * gains,
         other=LOADCELL_FRAMES * loadcell_rate_hz * full,
         axes=axes,
     )
@@ -106,14 +125,16 @@ def check_buses(file: str, config: RobotConfig) -> None:
             heartbeat_period_ms=config.drive.heartbeat_period_ms,
             loadcell_rate_hz=config.harness.rate_hz if channel == sensor else 0.0,
         )
-        share = load.share(service.rate_hz)
-        if share > LOAD_MAX:
-            carried = load.axes_max(service.rate_hz) // 2
+        rate_hz = service.rate_hz
+        carried, rate_max_hz = load.axes_max(rate_hz) // 2, load.rate_max_hz()
+        if carried < count:
             raise ConfigError(
                 file,
                 f"can.{names[channel]}",
-                f"{count} module{'s' if count > 1 else ''} at {service.rate_hz:g} Hz would load "
-                f"it to {share:.0%} of 1 Mbit/s",
-                f"at most {LOAD_MAX:.0%}: {carried} module{'s' if carried != 1 else ''} on a bus "
-                f"at this rate, or joint_service.rate_hz of at most {load.rate_max_hz():.0f} Hz",
+                f"{count} module{'s' if count > 1 else ''} at {rate_hz:g} Hz would load it to "
+                f"{load.share(rate_hz):.0%} of 1 Mbit/s"
+                f" ({load.share(rate_hz, blending=True):.0%} while gains blend)",
+                f"at most {LOAD_MAX:.0%} ({BLEND_MAX:.0%}): {carried} "
+                f"module{'s' if carried != 1 else ''} on a bus at this rate, or "
+                f"joint_service.rate_hz of at most {math.floor(rate_max_hz)} Hz",
             )

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from shared.can_load import LOAD_MAX, BusLoad, bus_load, frame_bits
+from services.joint.drivers.odrive_due import Due, Row
+from services.joint.law import ZERO, Setpoint
+from services.joint.onboard import FOLLOW_MS, OnboardLaw
+from shared.can_load import BLEND_HZ, BLEND_MAX, LOAD_MAX, BusLoad, bus_load, frame_bits
 from shared.cansimple import Command, arbitration_id, pack_input_pos, pack_two_floats
 from shared.config import RobotConfig
 from shared.exceptions import ConfigError
@@ -82,16 +85,43 @@ def test_the_loads_are_those_of_the_design() -> None:
 def test_what_a_bus_is_said_to_carry_loads_it_to_the_limit() -> None:
     for axes in (2, 6, 12):
         load = bus_load(axes, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=250.0)
-        assert load.share(load.rate_max_hz()) == pytest.approx(LOAD_MAX)
+        assert is_at_limit(load, load.rate_max_hz())
         most = load.axes_max(500.0)
-        assert load._replace(axes=most).share(500.0) <= LOAD_MAX
-        assert load._replace(axes=most + 1).share(500.0) > LOAD_MAX
+        assert fits(load._replace(axes=most), 500.0)
+        assert not fits(load._replace(axes=most + 1), 500.0)
 
 
-def test_a_bus_that_the_sensor_has_filled_carries_nothing() -> None:
-    load = bus_load(2, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=5000.0)
-    assert load.rate_max_hz() == 0.0
-    assert load.axes_max(500.0) == 0
+def fits(load: BusLoad, rate_hz: float) -> bool:
+    blending = load.share(rate_hz, blending=True)
+    return load.share(rate_hz) <= LOAD_MAX and blending <= BLEND_MAX
+
+
+def is_at_limit(load: BusLoad, rate_hz: float) -> bool:
+    return fits(load, rate_hz * (1.0 - 1e-9)) and not fits(load, rate_hz * (1.0 + 1e-9))
+
+
+def test_gains_blend_at_the_rate_that_the_joint_services_send_them() -> None:
+    assert BLEND_HZ == 1e3 / FOLLOW_MS
+
+
+def test_with_torques_alone_no_gains_blend() -> None:
+    load = design(12)
+    assert load.share(300.0, blending=True) == load.share(300.0)
+    assert is_at_limit(load, load.rate_max_hz())
+
+
+def test_a_whole_blend_sends_gains_no_more_often_than_is_planned_with() -> None:
+    """As the law of the drives' own loops changes them, and as they are told over CAN."""
+    rate_hz, blend_s = 500.0, 0.3
+    law, due = OnboardLaw(17.5, 60.0), Due()
+    due.armed(0)
+    sent, cycles = 0, round(blend_s * rate_hz)
+    for cycle in range(1, cycles + 1):
+        now_ns, done = round(cycle * 1e9 / rate_hz), cycle / cycles
+        k_p, k_d = (900.0 * done, 600.0 * (1.0 - done)), (60.0 * done, 20.0)
+        target = law.target(now_ns, Setpoint(ZERO, ZERO, ZERO, ZERO, k_p, k_d), ZERO, ZERO, ZERO)
+        sent += due.with_target((target.pos_gain, target.vel_gain), now_ns) is not Row.INPUTS
+    assert 0.9 * blend_s * BLEND_HZ <= sent <= blend_s * BLEND_HZ + 2, "the first two at once"
 
 
 # ---- in a robot file
@@ -120,18 +150,22 @@ def test_one_bus_for_all_six_is_refused_with_what_it_would_carry(tmp_path: Path)
         load_changed(tmp_path, on_buses(*[RIGHT] * 6))
     message = str(refused.value)
     assert "can.hip_right" in message
-    assert "6 modules at 500 Hz would load it to 150% of 1 Mbit/s" in message
-    assert "at most 85%: 3 modules on a bus at this rate" in message
+    assert (
+        "6 modules at 500 Hz would load it to 150% of 1 Mbit/s (177% while gains blend)" in message
+    )
+    assert "at most 85% (98%): 3 modules on a bus at this rate, or" in message
+    assert "joint_service.rate_hz of at most 217 Hz" in message
 
 
 def test_the_rate_that_the_refusal_names_is_accepted(tmp_path: Path) -> None:
     def change(raw: Table) -> None:
         on_buses(*[RIGHT] * 6)(raw)
-        raw["joint_service"].update(rate_hz=250.0, state_rate_hz=250.0)
-        raw["simulation"]["encoder_rate_hz"] = 250.0
-        raw["drive"]["encoder_period_ms"] = 4
+        raw["joint_service"].update(rate_hz=200.0, state_rate_hz=200.0)
+        raw["planner"]["rate_hz"] = 200.0
+        raw["simulation"]["encoder_rate_hz"] = 200.0
+        raw["drive"]["encoder_period_ms"] = 5
 
-    assert load_changed(tmp_path, change).joint_service.rate_hz == 250.0
+    assert load_changed(tmp_path, change).joint_service.rate_hz == 200.0
 
 
 def test_the_sensor_counts_on_the_bus_that_it_is_on(tmp_path: Path) -> None:

@@ -80,7 +80,11 @@ def test_the_joint_gets_the_same_torque_by_either_loop_to_rounding(rig: Rig, pat
             rig.pos[list(AXES)] = (1.0 - share) * before[list(AXES)] + share * there
             reading = rig.cycle(driver)
         tau = tuple(dice.uniform(-50.0, 50.0, 2))
-        driver.write(law.target(setpoint, (tau[0], tau[1]), reading.pos_turns, reading.vel_turns))
+        driver.write(
+            law.target(
+                reading.t_ns, setpoint, (tau[0], tau[1]), reading.pos_turns, reading.vel_turns
+            )
+        )
         rig.front.receive()
         motors = rig.bank.step(rig.now_s, rig.pos, rig.vel)[list(AXES)]
         np.testing.assert_allclose(joint_torque((motors[0], motors[1]), N), tau, atol=0.05)

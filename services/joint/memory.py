@@ -56,3 +56,4 @@ class ModuleMemory(msgspec.Struct, frozen=True):
     listen_until_ns: int = 0
     will: Will = Will.NOTHING
     holding: bool = False
+    gains_changed_ns: int = 0

@@ -158,7 +158,7 @@ class Module:
             samples = controller.samples
             order = Order.TARGET
             left = controller.left_holding
-            target = self._law.target(left, result.tau, samples.pos, samples.vel)
+            target = self._law.target(now_ns, left, result.tau, samples.pos, samples.vel)
             self._target = target
         return Step(result.event, order, torque, target, Obstacle.NONE)
 
@@ -177,13 +177,14 @@ class Module:
             self._listen_until_ns,
             self.will,
             self._holding,
+            self._law.changed_ns,
         )
 
     def recall(self, memory: ModuleMemory) -> None:
         """Go on from a memory, bit for bit."""
         m = memory
         self.controller.recall(m.controller)
-        self._law.gains = m.gains
+        self._law.gains, self._law.changed_ns = m.gains, m.gains_changed_ns
         self._estop, self._arm_at_ns, self._idle_at_ns = m.estop, m.arm_at_ns, m.idle_at_ns
         self._tries, self._forgets = m.tries, m.forgets
         self._target, self._last_cycle_ns = m.target, m.last_cycle_ns

@@ -19,11 +19,15 @@ from typing import Final
 from services.joint.differential import joint_torque, motor_from_joint, motor_torque
 from services.joint.drivers.base import MotorTarget
 from services.joint.law import Setpoint
+from shared.clock import NS_PER_MS
 from shared.messages import Pair
 
 GAIN_CHANGE: Final = 0.02
 """Gains that have changed by less than this share are left as they are on the drive: what is
 missing goes in as torque, and the bus is spared."""
+FOLLOW_MS: Final = 8
+"""Between two changes of the drive's gains. In a blend they would change in every cycle, and three
+modules on one CAN bus were 10 to 20 ms behind by its end; what is missing goes in as torque."""
 POS_GAIN_MAX: Final = 400.0
 """1/s; a stiffness with hardly a damping is given the damping that this asks for."""
 INPUT_TORQUE_SHARE: Final = 0.75
@@ -33,7 +37,11 @@ rest is more than the clamp lets through: its theta was 463 stiff instead of 26.
 
 
 class OnboardLaw:
-    """Makes the drive's targets; remembers the gains that the drive has."""
+    """Makes the drive's targets; remembers the gains that the drive has.
+
+    Attributes:
+        changed_ns: monotonic time of their last change; 0: none yet.
+    """
 
     def __init__(self, gear_ratio: float, vel_limit: float, torque_max: float = math.inf) -> None:
         """Take the gear ratio N, the drive's velocity limit, turn/s, and its torque limit, N m."""
@@ -43,6 +51,7 @@ class OnboardLaw:
         self._vel_limit = vel_limit
         self._stiffness = 0.0
         self._vel_gain = 0.0
+        self.changed_ns = 0
 
     @property
     def gains(self) -> Pair:
@@ -53,17 +62,22 @@ class OnboardLaw:
     def gains(self, gains: Pair) -> None:
         self._stiffness, self._vel_gain = gains
 
-    def target(self, setpoint: Setpoint, tau: Pair, pos: Pair, vel: Pair) -> MotorTarget:
+    def target(
+        self, now_ns: int, setpoint: Setpoint, tau: Pair, pos: Pair, vel: Pair
+    ) -> MotorTarget:
         """Return the target under which the motors give the joint torques tau at this sample.
 
         Args:
+            now_ns: this module's monotonic clock.
             setpoint: the local law of this instant.
             tau: joint torques (phi, theta) that are to act now, N m, after the gate.
             pos: motor positions of the sample, turns.
             vel: motor velocities of the sample, turn/s.
         """
         s = setpoint
-        self._follow(self._per_turn * (s.k_p[0] + s.k_p[1]), self._per_turn * (s.k_d[0] + s.k_d[1]))
+        if now_ns - self.changed_ns >= FOLLOW_MS * NS_PER_MS or not self.changed_ns:
+            stiffness, damping = s.k_p[0] + s.k_p[1], s.k_d[0] + s.k_d[1]
+            self._follow(now_ns, self._per_turn * stiffness, self._per_turn * damping)
         vel_gain = self._vel_gain
         pos_gain = self._stiffness / vel_gain if vel_gain > 0.0 else 0.0
         pos_ref = motor_from_joint(s.q_ref, self._gear_ratio)
@@ -103,10 +117,10 @@ class OnboardLaw:
         )
         return joint_torque(motors, self._gear_ratio)
 
-    def _follow(self, stiffness: float, damping: float) -> None:
+    def _follow(self, now_ns: int, stiffness: float, damping: float) -> None:
         """Take over gains that have changed by more than `GAIN_CHANGE`; N m and N m s a turn."""
         damping = max(damping, stiffness / POS_GAIN_MAX)
         if abs(stiffness - self._stiffness) > GAIN_CHANGE * self._stiffness:
-            self._stiffness = stiffness
+            self._stiffness, self.changed_ns = stiffness, now_ns
         if abs(damping - self._vel_gain) > GAIN_CHANGE * self._vel_gain:
-            self._vel_gain = damping
+            self._vel_gain, self.changed_ns = damping, now_ns

@@ -203,7 +203,8 @@ class Jog:
         self.done = t_s > duration_s(self._plan)
         if self.trouble:
             return None
-        return self._onboard.target(setpoint, self._tau, reading.pos_turns, reading.vel_turns)
+        pos, vel = reading.pos_turns, reading.vel_turns
+        return self._onboard.target(now_ns, setpoint, self._tau, pos, vel)
 
     def _watch(self, t_s: float, q_ref: Pair, q: Pair) -> str:
         """Return what speaks against going on; "" if nothing does."""
