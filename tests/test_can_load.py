@@ -124,6 +124,12 @@ def test_a_whole_blend_sends_gains_no_more_often_than_is_planned_with() -> None:
     assert 0.9 * blend_s * BLEND_HZ <= sent <= blend_s * BLEND_HZ + 2, "the first two at once"
 
 
+def test_a_bus_that_the_sensor_has_filled_carries_nothing() -> None:
+    load = bus_load(2, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=5000.0)
+    assert load.rate_max_hz() == 0.0
+    assert load.axes_max(500.0) == 0
+
+
 # ---- in a robot file
 
 
@@ -157,7 +163,7 @@ def test_one_bus_for_all_six_is_refused_with_what_it_would_carry(tmp_path: Path)
     assert "joint_service.rate_hz of at most 217 Hz" in message
 
 
-def test_the_rate_that_the_refusal_names_is_accepted(tmp_path: Path) -> None:
+def test_a_rate_below_the_one_that_the_refusal_names_is_accepted(tmp_path: Path) -> None:
     def change(raw: Table) -> None:
         on_buses(*[RIGHT] * 6)(raw)
         raw["joint_service"].update(rate_hz=200.0, state_rate_hz=200.0)

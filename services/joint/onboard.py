@@ -27,7 +27,7 @@ GAIN_CHANGE: Final = 0.02
 missing goes in as torque, and the bus is spared."""
 FOLLOW_MS: Final = 8
 """Between two changes of the drive's gains. In a blend they would change in every cycle, and three
-modules on one CAN bus were 10 to 20 ms behind by its end; what is missing goes in as torque."""
+modules on one CAN bus were 15 to 20 ms behind by its end; what is missing goes in as torque."""
 POS_GAIN_MAX: Final = 400.0
 """1/s; a stiffness with hardly a damping is given the damping that this asks for."""
 INPUT_TORQUE_SHARE: Final = 0.75

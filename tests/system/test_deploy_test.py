@@ -1,0 +1,99 @@
+"""The script that runs all checks: what it says of failures, and that Ctrl-C ends all of it.
+
+In a copy of `deploy` with an environment of its own, whose tools only say that they were called.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from shared.process import DEFAULT_CONFIG
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Return a project of which nothing is there but its scripts and what they make it from."""
+    real = DEFAULT_CONFIG.parents[1]
+    shutil.copytree(real / "deploy", tmp_path / "deploy")
+    for name in ("requirements.lock", "pyproject.toml"):
+        shutil.copy(real / name, tmp_path)
+    (tmp_path / ".venv/bin").mkdir(parents=True)
+    subprocess.run(
+        ["bash", "-c", "source deploy/lib.sh; fingerprint >.venv/xrl.stamp"],
+        cwd=tmp_path,
+        check=True,
+    )
+    for name in ("python", "ruff", "mypy", "pytest"):
+        write_tool(tmp_path, name, f"echo {name} called")
+    return tmp_path
+
+
+def write_tool(root: Path, name: str, body: str) -> None:
+    tool = root / ".venv/bin" / name
+    tool.write_text(f"#!/usr/bin/env bash\n{body}\n")
+    tool.chmod(0o755)
+
+
+def start(root: Path) -> subprocess.Popen[str]:
+    """Start the script as a terminal does: in a process group of its own."""
+    return subprocess.Popen(
+        ["bash", "deploy/test"],
+        cwd=root,
+        env={**os.environ, "TMPDIR": str(root)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def run(root: Path) -> tuple[int, str]:
+    script = start(root)
+    said, _ = script.communicate(timeout=30)
+    return script.returncode, said
+
+
+def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
+    code, said = run(root)
+    assert code == 0
+    assert said.count("ruff called") == 2
+    assert said.count("mypy called") == 1
+    assert said.count("pytest called") == 2
+
+
+@pytest.mark.parametrize("status", [1, 2], ids=["a failure", "a file that cannot be imported"])
+def test_what_failed_is_said_last_and_the_other_parts_are_run(root: Path, status: int) -> None:
+    write_tool(root, "mypy", "exit 1")
+    write_tool(root, "pytest", f"echo ERROR tests/test_x.py; echo one of $*; exit {status}")
+    code, said = run(root)
+    assert code == 1
+    assert said.count("== pytest -m") == 2
+    last = said[said.index("== failed:") :]
+    assert "== failed: mypy" in last
+    assert last.count("== failed: ERROR tests/test_x.py") == 2
+
+
+@pytest.mark.parametrize("part", ["mypy", "pytest"])
+def test_ctrl_c_ends_all_of_it(root: Path, part: str) -> None:
+    """Whatever the part that it meets makes of it: pytest ends with 2, and not by the signal."""
+    write_tool(root, part, f"trap 'kill $!; exit 2' INT\nsleep 30 &\necho {part} begins\nwait")
+    script = start(root)
+    assert script.stdout is not None
+    said = ""
+    while f"{part} begins" not in said:
+        line = script.stdout.readline()
+        assert line, said
+        said += line
+    os.killpg(script.pid, signal.SIGINT)
+    rest, _ = script.communicate(timeout=30)
+    assert script.returncode == 130
+    assert "begins" not in rest
+    assert not list(root.glob("tmp.*")), "its file is gone"
