@@ -23,6 +23,7 @@ from shared.config_sections import (
     ModuleConfig,
     PlannerConfig,
     RecorderConfig,
+    RobustnessConfig,
     SimulationConfig,
     StandConfig,
     StandGains,
@@ -50,6 +51,7 @@ class RobotConfig(Section, frozen=True):
     module: tuple[ModuleConfig, ...]
     law: LawConfig
     certificate: CertificateConfig
+    robustness: RobustnessConfig
     assist: AssistConfig
     stand: StandConfig
     joint_service: JointServiceConfig

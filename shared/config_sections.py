@@ -138,6 +138,34 @@ class CertificateConfig(Section, frozen=True):
     onboard_margin_min: Share
 
 
+class RobustnessConfig(Section, frozen=True):
+    """What the loop must be stable with (the dynamic certificate)."""
+
+    stiffness: tuple[Annotated[float, Range(500.0, 1e6, "N m/rad")], ...]
+    """Of the drivetrain between motor and joint: what yours may have; 1e6 is rigid."""
+    damping_s: Annotated[float, Range(0.0, 0.1, "s")]
+    """Of the drivetrain, N m s/rad per N m/rad."""
+    torque_lag_ms: Annotated[float, Range(0.05, 20.0, "ms")]
+    """First-order lag of the drives' torque."""
+    delay_ms: Annotated[float, Range(1.0, 100.0, "ms")]
+    """From a state's sample to the first use of its command."""
+    delay_margin: Annotated[float, Range(1.0, 10.0, "1")]
+    gain_margin: Annotated[float, Range(1.0, 10.0, "1")]
+    drift_max: Annotated[float, Range(0.0, 10.0, "1/s")]
+    """A motion without oscillation along a led direction may grow at this rate: with the encoder
+    at the motor, the weight's feedforward follows the motor and not the joint."""
+    hands: tuple[
+        tuple[
+            Annotated[float, Range(0.0, 1e5, "N/m")],
+            Annotated[float, Range(0.0, 1e4, "N s/m")],
+            Annotated[float, Range(0.0, 1e4, "N m/rad")],
+            Annotated[float, Range(0.0, 1e3, "N m s/rad")],
+        ],
+        ...,
+    ]
+    """(k_z, b_z, k_pitch, b_pitch) of hands at the harness, the lightest first."""
+
+
 class AssistConfig(Section, frozen=True):
     """Assist force on the operator."""
 
@@ -190,8 +218,6 @@ class JointServiceConfig(Section, frozen=True):
     k_p_max: LocalStiffness
     k_d_max: LocalDamping
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
-    unsteady_age_ms: Milliseconds = 4.5
-    """Mean deviation of command ages at which tau_coupled has faded out; whole up to 2/3 of it."""
 
 
 class PlannerConfig(Section, frozen=True):
@@ -230,6 +256,8 @@ class DriveConfig(Section, frozen=True):
     encoder_period_ms: Annotated[int, Range(1, 100, "ms")]
     heartbeat_period_ms: Annotated[int, Range(1, 10_000, "ms")]
     zero_mark_turns: Annotated[float, Range(0.0, 4096.0, "turns")]
+    encoder_bandwidth: Annotated[float, Range(100.0, 8000.0, "rad/s")] = 2000.0
+    """Of the drives' estimate of position and velocity."""
 
 
 class CanConfig(Section, frozen=True):
@@ -293,6 +321,10 @@ LegGains: TypeAlias = tuple[Stiffness, Stiffness, Stiffness, Stiffness, Stiffnes
 """(ankle phi, theta, knee phi, theta, hip phi, theta), N m/rad; both legs are alike."""
 
 
+Damping: TypeAlias = Annotated[float, Range(0.0, 1e3, "N m s/rad")]
+LegDamping: TypeAlias = tuple[Damping, Damping, Damping, Damping, Damping, Damping]
+
+
 class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Local joint stiffnesses over COM height and torso pitch; made by `shared.gain_schedule`."""
 
@@ -307,3 +339,9 @@ class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Torso pitches of the nodes, rad, rising."""
     D: tuple[tuple[LegGains, ...], ...]
     """Local stiffness at [z][pitch]."""
+    D_B: LegDamping
+    """Local damping, N m s/rad, the same in every pose."""
+    coupling_bandwidth_hz: Annotated[float, Range(0.1, 100.0, "Hz")]
+    """Of the two poles of tau_coupled."""
+    coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]
+    """What tau_coupled fills the damping up to, in shares of B_p."""

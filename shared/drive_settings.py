@@ -203,6 +203,11 @@ AXIS_TABLE: Final[tuple[Setting, ...]] = (
         "every angle would be wrong by the ratio",
     ),
     Setting(
+        "encoder.config.bandwidth",
+        lambda need: need.drive.encoder_bandwidth,
+        "slower, the drive's damping comes late and shakes the rotors; faster, it is noisy",
+    ),
+    Setting(
         "encoder.config.pre_calibrated",
         lambda _: True,
         "after each power-up the motor would have to turn by itself before it arms",

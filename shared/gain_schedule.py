@@ -18,7 +18,7 @@ from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
 from shared.toml_file import check_ranges
 
-VERSION = 1
+VERSION = 2
 """Of the file and of the program that makes it: another one is made again."""
 
 
@@ -36,13 +36,31 @@ def inputs_of(config: RobotConfig) -> dict[str, Any]:
         "law": {
             "K_p": law.K_p,
             "K_0": law.K_0,
+            "B_p": law.B_p,
             "S": law.S,
+            "lead_easing": law.lead_easing,
             "jacobian": law.jacobian,
             "damping_lambda": law.damping_lambda,
             "load_sharing_moment_arms": law.load_sharing_moment_arms,
         },
+        "robustness": msgspec.to_builtins(config.robustness),
+        "stand": {
+            kind: [*gains.k_p, *gains.k_d]
+            for kind, gains in (
+                ("ankle", config.stand.ankle), ("knee", config.stand.knee),
+                ("hip", config.stand.hip),
+            )
+        },
+        "joint": {"armature": config.joint.armature},
+        "planner": {"rate_hz": config.planner.rate_hz},
+        "harness": {"low_pass_hz": config.harness.low_pass_hz},
+        "drive": {"encoder_bandwidth": config.drive.encoder_bandwidth},
         "assist": {"force_max": config.assist.force_max},
-        "joint_service": {"k_p_max": config.joint_service.k_p_max},
+        "joint_service": {
+            "k_p_max": config.joint_service.k_p_max,
+            "rate_hz": config.joint_service.rate_hz,
+            "hold_stiffens_theta": config.joint_service.hold_stiffens_theta,
+        },
         "limits": {
             kind: [*limit.phi, *limit.theta]
             for kind, limit in (
@@ -100,7 +118,8 @@ def write(path: Path, schedule: GainSchedule) -> None:
     """Write a schedule, one node a line; the file is whole or not there."""
     parts = [
         f'"{name}": {msgspec.json.encode(getattr(schedule, name)).decode()}'
-        for name in ("version", "digest", "inputs", "z", "pitch")
+        for name in GainSchedule.__struct_fields__
+        if name != "D"
     ]
     rows = ",\n".join(
         "[" + ",\n ".join(msgspec.json.encode(node).decode() for node in row) + "]"

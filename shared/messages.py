@@ -156,11 +156,6 @@ class JointState(Message, frozen=True):
     """`DriveStatus`."""
     drive_error: int
     """The drives' error bits, both axes or-ed; 0 if none."""
-    coupled_share: float = 1.0
-    """How much of tau_coupled this module would use: 1, and less where its commands' ages are
-    unsteady, down to 0."""
-    coupled_used: float = 1.0
-    """How much of it was used in this cycle, in TRACK; it follows what is wanted in a ramp."""
     braced: bool = False
     """True while this module holds with all of its stand gains, for another may be limp."""
 
@@ -183,8 +178,8 @@ class JointCommand(Message, frozen=True):
     dtau_ff: Pair
     """N m/s"""
     tau_coupled: Pair
-    """(K_q - D)(q_ref - q) + (B_q - D_B)(v_ref - v) in N m; dropped in HOLD. A module uses
-    `coupled_share` of it, or less."""
+    """What the local gains lack of the body's stiffness and damping, low-passed, and the eased
+    lead, in N m; dropped in HOLD."""
     k_p: Pair
     """Local stiffness D in N m/rad."""
     k_d: Pair
@@ -194,9 +189,6 @@ class JointCommand(Message, frozen=True):
     stiffness required, 0 is a fall."""
     margin_onboard: float
     """The same with the joint services gone and the drives' own loops left."""
-    coupled_share: float = 1.0
-    """How much of tau_coupled all six are to use, 0 .. 1: less while they act apart in time. What
-    it does not hold then, HOLD's gains do."""
     brace: bool = False
     """True while another may be limp: this module in HOLD is to rise to all its stand gains."""
 
@@ -275,8 +267,6 @@ class PlannerStatus(Message, frozen=True):
     """Assist that the operator asked for, N, as this tick took it."""
     state_age_ns: Modules
     """Time since each module's newest state arrived, by the planner's clock; -1 if none yet."""
-    coupled_share: float = 1.0
-    """Of the commands."""
     wait_s: float = 0.0
     """Until it may lead again after drop-outs, s; 0 if nothing is waited for."""
 

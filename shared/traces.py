@@ -83,6 +83,8 @@ class SimState(Message, frozen=True):
     """N m s/turn"""
     counts_from: tuple[float, ...]
     """What each encoder counts at the true zero."""
+    hidden: tuple[float, ...]
+    """Of the plant: the person, the rotors and torques on their way, as `World.hidden`."""
 
 
 class LinkEvent(Message, frozen=True):

@@ -98,7 +98,7 @@ def bits(message: Message) -> bytes:
 def test_joint_command_round_trips_bit_exactly(command: Message) -> None:
     decoded = Decoder(JointCommand).decode(encode(command))
     assert decoded == command
-    assert len(bits(command)) == 17 * 8
+    assert len(bits(command)) == 16 * 8
     assert bits(decoded) == bits(command)
 
 

@@ -40,11 +40,11 @@ def changed(robot: RobotConfig, **sections: dict[str, object]) -> RobotConfig:
 
 
 def nudged(value: Any) -> Any:
-    """Return a value a little off; of a row, with its last number off."""
-    if isinstance(value, list):
-        return [*value[:-1], nudged(value[-1])]
+    """Return a value a little off; of a row, with its first number off."""
+    if isinstance(value, (list, tuple)):
+        return [nudged(value[0]), *value[1:]]
     if isinstance(value, str):
-        return {"load_sharing": "average"}[value]
+        return {"load_sharing": "average", "ankle": "knee"}[value]
     return 1 - value if value in (0, 1) else value * 1.0625
 
 
@@ -55,10 +55,10 @@ def with_input_nudged(robot: RobotConfig, key: str) -> RobotConfig:
     if section == "limits":
         low_high = table["limits"][name]["theta"]
         table["limits"][name]["theta"] = [low_high[0], nudged(low_high[1])]
+    elif section == "stand":
+        table["stand"][name]["k_d"] = nudged(table["stand"][name]["k_d"])
     else:
-        table[section][name] = nudged(
-            list(v) if isinstance(v := table[section][name], tuple) else v
-        )
+        table[section][name] = nudged(table[section][name])
     return msgspec.convert(table, RobotConfig)
 
 
@@ -203,8 +203,8 @@ def test_mass_lengths_stiffness_and_limits_are_among_the_inputs() -> None:
 def test_what_the_schedule_does_not_depend_on_leaves_it_fitting(robot: RobotConfig) -> None:
     other = changed(
         robot,
-        law={"B_p": (1.0,) * 6, "split": "certified", "recentre_s": 9.0},
-        planner={"rate_hz": 100.0},
+        law={"split": "certified", "recentre_s": 9.0},
+        planner={"state_stale_ms": 100.0},
         harness={"tare_s": 9.0},
         joint={"friction_loss": 9.0},
     )
@@ -224,7 +224,7 @@ def test_a_schedule_whose_inputs_were_edited_by_hand_is_stale(
 def test_another_version_is_stale(robot: RobotConfig, schedule: GainSchedule) -> None:
     older = msgspec.structs.replace(schedule, version=gain_schedule.VERSION + 1)
     other = msgspec.structs.replace(robot, gain_schedule=older)
-    assert "version 2, not 1" in gain_schedule.why_stale(other)
+    assert "version 3, not 2" in gain_schedule.why_stale(other)
 
 
 def test_only_the_certified_split_requires_a_schedule(robot: RobotConfig) -> None:

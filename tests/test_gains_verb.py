@@ -45,7 +45,8 @@ def assert_one_line_error(done: subprocess.CompletedProcess[str]) -> None:
 def unladen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Return a robot file with no payload, its schedule made, and what was said."""
     path = robot_file(tmp_path_factory.mktemp("unladen"), "payload", "0.0")
-    done = gains("--config", str(path))
+    beside = str(ROBOT_FILE.with_name("robot.gains.json"))
+    done = gains("--config", str(path), "--damping-of", beside)
     assert done.returncode == 0, done.stderr
     return path, done.stdout
 

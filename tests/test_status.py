@@ -53,10 +53,8 @@ def test_a_planner_that_is_not_heard_is_said_so() -> None:
     assert "each module holds" in lead_in_words(None)
 
 
-def test_why_the_planner_does_not_lead_yet_and_what_ages_cost_is_told() -> None:
-    good = LeadStatus("LEADING", wait_s=0.0, coupled_share=1.0, margin=1.2)
+def test_why_the_planner_does_not_lead_yet_is_told() -> None:
+    good = LeadStatus("LEADING", wait_s=0.0, margin=1.2)
     assert lead_in_words(good) == "planner LEADING, margin 1.20"
-    waits = lead_in_words(LeadStatus("ALIGNING", wait_s=12.3, coupled_share=1.0, margin=1.2))
+    waits = lead_in_words(LeadStatus("ALIGNING", wait_s=12.3, margin=1.2))
     assert "leads again in 12 s" in waits
-    uneven = lead_in_words(LeadStatus("LEADING", wait_s=0.0, coupled_share=0.25, margin=1.2))
-    assert "tau_coupled 25 %" in uneven

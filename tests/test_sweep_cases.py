@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from services.planner.kinematics import Kinematics
+from services.simulator.body import body_of
+from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared import scenario
 from shared.config import GRAVITY, RobotConfig
@@ -184,7 +186,9 @@ def test_a_robot_on_its_way_down_at_the_end_does_not_stand(
     robot: RobotConfig, com: tuple[float, float], tilt: float, tipping: bool
 ) -> None:
     """The soles end 0.127 m before and behind the ankles, and 0.41 m to the sides."""
-    row = World(robot, cases.story_of(robot, cases.draw(robot, 1, 0))).truth(0, 1.0, 0.0)
+    row = World(body_of(robot, IDEAL), cases.story_of(robot, cases.draw(robot, 1, 0))).truth(
+        0, 1.0, 0.0
+    )
     row = msgspec.structs.replace(row, com=(*com, 0.8), foot_right_tilt=tilt, foot_left_tilt=0.0)
     assert is_tipping(row, robot) is tipping
 

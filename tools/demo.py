@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from services.simulator.plant import plant_from
 from shared import topics
 from shared.bus import Session
 from shared.config import SERVICES, RobotConfig
@@ -36,6 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl demo --kill planner@3.1:STOP --restart planner@7
         xrl demo --scenario crawl --kill planner@8
         xrl demo --jacobian average
+        xrl demo --plant drivetrain.stiffness=3000
         xrl demo --duration 8 --push 4:0.3:40,0,0
         """,
     )
@@ -55,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
     console = Console()
     robot, story = experiment.make_robot(args), experiment.make_scenario(args)
+    plant_from(args.plant)  # refused before anything is started
     out = experiment.make_out(args.out, "demo")
     console.print(f"[bold]{story.name}[/]: {story.about}{experiment.in_words(story)}")
     for other in procfs.fleets():
@@ -96,6 +99,7 @@ def lead_run(
         lead,
         verb="demo",
         seed=args.seed,
+        true_plant=plant_from(args.plant),
         no_restart=SERVICES if args.no_restart else {kill.service for kill in story.kill},
     )
 

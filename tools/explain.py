@@ -225,7 +225,6 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, console: Console) ->
     )
     words = moment.modules_in_words(tick.states)
     console.print(f"modules, and how old their commands were: {words}", style="dim")
-    console.print(f"share of tau_coupled: {100.0 * status.coupled_share:.0f} %", style="dim")
     at_ns = status.t_ns if at_s is None else course.zero_ns + round(at_s * 1e9)
     late_s = (at_ns - status.t_ns) / 1e9
     if late_s > AWAY_S:
@@ -287,11 +286,11 @@ def in_words(weakest: Weakest) -> str:
 def _gains(found: Account) -> Table:
     table = _table(
         "Gains, N m/rad and N m s/rad",
-        ("K_q", "D: service", "rest: planner", "B_q", "D_B: service"),
+        ("K_q", "D: service", "B_q", "D_B: service"),
     )
     K_q, B_q, local = found.K_q.diagonal(), found.B_q.diagonal(), found.local
     for index, joint in enumerate(JOINTS):
-        stiffness = np.array((K_q[index], local.D[index], K_q[index] - local.D[index]))
+        stiffness = np.array((K_q[index], local.D[index]))
         damping = np.array((B_q[index], local.D_B[index]))
         table.add_row(joint, *_numbers(stiffness, 0), *_numbers(damping, 1))
     return table
@@ -300,7 +299,7 @@ def _gains(found: Account) -> Table:
 def _torques(found: Account) -> Table:
     table = _table(
         "Torques by origin, N m",
-        ("gravity", "assist", "local PD", "coupled", "eased lead", "total"),
+        ("gravity", "assist", "local PD", "coupled", "low-pass", "total"),
     )
     rows = (found.gravity, found.assist, found.local_pd, found.coupled, found.eased, found.total)
     for joint, torques in zip(JOINTS, np.array(rows).T, strict=True):

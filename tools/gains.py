@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from shared import config_file, gain_schedule
 from shared.config import RobotConfig
 from shared.config_sections import GainSchedule
+from shared.exceptions import ConfigError
 from tools.verbs import Subparsers, add_config, add_verb
 
 SHOWN = 6
@@ -25,10 +27,18 @@ def add_parser(subparsers: Subparsers) -> None:
         """
         xrl gains
         xrl gains --config lab.toml
+        xrl gains --config lab.toml --damping-of deploy/robot.gains.json
         xrl gains --check
         """,
     )
     add_config(parser)
+    parser.add_argument(
+        "--damping-of",
+        type=Path,
+        metavar="FILE",
+        help="take damping and coupling from another schedule, such as deploy/robot.gains.json, "
+        "and hold them to the dynamic certificate; without it they are searched for (two minutes)",
+    )
     parser.add_argument(
         "--check", action="store_true", help="only say whether the schedule fits the robot"
     )
@@ -43,29 +53,44 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"{path}: {stale or 'fits the robot'}", soft_wrap=True)
         return 1 if stale else 0
     robot = config_file.load_without_schedule(args.config)
-    schedule = compute(robot, console)
+    schedule = compute(robot, console, args.damping_of)
     gain_schedule.write(path, schedule)
     _show(robot, schedule, console)
     console.print(f"written to {path}", style="dim", soft_wrap=True)
     return 0
 
 
-def compute(robot: RobotConfig, console: Console) -> GainSchedule:
+def compute(robot: RobotConfig, console: Console, damping_of: Path | None = None) -> GainSchedule:
     """Solve the schedule with a progress bar.
+
+    Args:
+        robot: the robot.
+        console: to print on.
+        damping_of: schedule to take damping and coupling from; None: they are searched for.
 
     Raises:
         RunError: no local gains meet the certificate somewhere.
     """
     from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
 
+    design = None
+    if damping_of is not None:
+        other = gain_schedule.read(damping_of)
+        if other is None:
+            raise ConfigError(str(damping_of), "(file)", "not found", "a schedule by `xrl gains`")
+        design = split_program.design_of(other)
     bar = Progress(
-        TextColumn("gain schedule"), BarColumn(), TextColumn("{task.completed} of {task.total}"),
-        TimeRemainingColumn(), console=console, transient=True,
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
+        console=console, transient=True,
     )  # fmt: skip
     with bar as progress:
-        task = progress.add_task("", total=None)
+        task = progress.add_task("poses of the gain schedule", total=None)
+        search = progress.add_task("", total=None, visible=False)
         return split_program.solve(
-            robot, lambda done, total: progress.update(task, completed=done, total=total)
+            robot,
+            lambda done, total: progress.update(task, completed=done, total=total),
+            lambda text: progress.update(search, description=text, visible=True),
+            design,
         )
 
 

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from services.recorder import provenance
 from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
+from services.simulator.plant import PlantConfig, plant_from
 from shared import topics
 from shared.codec import encode
 from shared.config import RobotConfig
@@ -71,6 +72,8 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl sim --delay 5 --jitter 5 --loss 0.1 --seed 3
         xrl sim --scenario crawl --kill planner@8
         xrl sim --delay 50 --control centralised
+        xrl sim --plant drivetrain.stiffness=3000 --plant drivetrain.play=0.01
+        xrl sim --plant ideal
         xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
         xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
         """,
@@ -103,11 +106,12 @@ def run(args: argparse.Namespace) -> int:
         raise RunError("--delay and --jitter must be at least 0 ms, --loss from 0 to 1")
     console = Console()
     robot, story = experiment.make_robot(args), experiment.make_scenario(args)
+    true_plant = plant_from(args.plant)
     network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
     out = experiment.make_out(args.out, "sim")
     console.print(f"[bold]{story.name}[/]: {story.about}{experiment.in_words(story)}")
     begin = time.monotonic()
-    simulated_s = simulate(robot, story, network, args.seed, out, console, args.control)
+    simulated_s = simulate(robot, story, network, args.seed, out, console, args.control, true_plant)
     factor = simulated_s / (time.monotonic() - begin)
     log = read_run(out / "run.mcap")
     summary = verdict.summarise(log, story.duration)
@@ -127,11 +131,13 @@ def simulate(
     out: Path,
     console: Console,
     control: str = SHIPPED,
+    true_plant: PlantConfig | None = None,
 ) -> float:
     """Run lockstep into a log with a progress bar; return the time simulated, s."""
-    inputs = experiment.write_inputs(out, robot, story)
+    true_plant = true_plant or PlantConfig()
+    inputs = experiment.write_inputs(out, robot, story, true_plant)
     outbox = Outbox(robot.name)
-    fleet = CONTROLS[control](robot, story, network, seed=seed, record=outbox.put)
+    fleet = CONTROLS[control](robot, story, network, seed=seed, record=outbox.put, plant=true_plant)
     bar = Progress(
         BarColumn(), TextColumn("{task.completed:5.1f} of {task.total:g} s"),
         TimeRemainingColumn(), console=console, transient=True,

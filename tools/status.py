@@ -73,9 +73,6 @@ def lead_in_words(lead: LeadStatus | None) -> str:
     words = f"planner {lead.mode}, margin {lead.margin:.2f}"
     if lead.wait_s > 0.0:
         words += f"; leads again in {lead.wait_s:.0f} s at the earliest, for links have dropped out"
-    if lead.coupled_share < 1.0:
-        share = f"{100 * lead.coupled_share:.0f} %"
-        words += f"; ages are uneven: tau_coupled {share}, the rest is held by stiffer modules"
     return words
 
 

@@ -6,10 +6,11 @@ import argparse
 import time
 from pathlib import Path
 
+from services.simulator.plant import plant_from
 from shared import config_file, gain_schedule
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from tools.runs.experiment import make_out, scenario_file
+from tools.runs.experiment import add_plant, make_out, scenario_file
 from tools.supervision.fleet import check_known, load_table
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
@@ -46,6 +47,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="what the simulated operator does once the robot stands: a file, or a name from "
         "deploy/scenarios (its kills are left to you)",
     )
+    add_plant(parser)
     parser.add_argument(
         "--no-sim",
         action="store_true",
@@ -121,6 +123,10 @@ def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:
         path = str(scenario_file(args.scenario))
         overrides["simulator"] = ["--scenario", path, "--autostart", str(SETTLE_S)]
         overrides["recorder"] += ["--scenario", path, "--scenario-text", args.scenario]
+    if args.plant:
+        plant_from(args.plant)  # refused before anything is started
+        words = [word for given in args.plant for word in ("--plant", _absolute(given))]
+        overrides["simulator"] = [*overrides.get("simulator", []), *words]
     return overrides
 
 
@@ -139,6 +145,7 @@ def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
         absent |= {"simulator", "recorder", "planner", *MODULES} - set(only)
     for option, is_given, service in (
         ("--scenario", args.scenario is not None, "simulator"),
+        ("--plant", bool(args.plant), "simulator"),
         ("--snapshot", args.snapshot is not None, "recorder"),
         ("--injectable", args.injectable, "planner"),
     ):
@@ -148,6 +155,11 @@ def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
     if only is not None and args.injectable:
         return (*only, "injector")
     return only
+
+
+def _absolute(word: str) -> str:
+    """Return a word of `--plant`; a file's path as it is from anywhere."""
+    return str(Path(word).absolute()) if word.endswith(".toml") and "=" not in word else word
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from services.simulator.plant import PlantConfig
 from shared import scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES
@@ -20,6 +21,7 @@ from tools.counterfactual import picture
 from tools.counterfactual.moments import moments_of
 from tools.counterfactual.run import Fate, Task, fate_of
 from tools.explain import robot_of
+from tools.runs.experiment import PLANT_FILE
 from tools.runs.run_log import RunLog, read_run
 from tools.sweeps.pool import cores, results
 from tools.verbs import RUN_HELP, Subparsers, add_verb
@@ -74,7 +76,8 @@ def run(args: argparse.Namespace) -> int:
     robot, story = robot_of(log), story_of(log)
     moments = moments_of(log, robot, args.every)
     kill = tuple(dict.fromkeys(args.kill))
-    tasks = [Task(robot, story, moment, kill, args.for_s) for moment in moments]
+    true_plant = plant_of(log)
+    tasks = [Task(robot, story, true_plant, moment, kill, args.for_s) for moment in moments]
     fates: list[Fate] = []
     bar = Progress(
         TextColumn("{task.fields[fell]}"), BarColumn(), MofNCompleteColumn(),
@@ -119,6 +122,18 @@ def story_of(log: RunLog) -> Scenario:
     story = parse_toml(text.decode(), f"{log.path}: scenario.toml", Scenario)
     scenario.check(str(log.path), story)
     return story
+
+
+def plant_of(log: RunLog) -> PlantConfig:
+    """Return the plant that a run was simulated with.
+
+    Raises:
+        RunError: the log does not hold it.
+    """
+    text = log.attachments.get(PLANT_FILE)
+    if text is None:
+        raise RunError(f"{log.path}: holds no {PLANT_FILE}; a run of `xrl sim` or `demo` has one")
+    return parse_toml(text.decode(), f"{log.path}: {PLANT_FILE}", PlantConfig)
 
 
 def show(fates: list[Fate], names: str, for_s: float, console: Console) -> None:

@@ -64,10 +64,6 @@ class JointController:
         self._samples = Samples(config.joint.gear_ratio)
         self._found_tau: Pair | None = None
         """What a drive that was found armed carries, N m: it is taken over without a step."""
-        self._share = 1.0
-        """Of tau_coupled, used in the last cycle in TRACK."""
-        self._share_up = 1e3 / (service.rate_hz * service.blend_ms)
-        self._share_down = 1e3 / (service.rate_hz * service.coupled_ramp_ms)
         self._residual: Pair = law.ZERO
         """What the drive carried beyond the law as the service went on after a gap, N m."""
         self._resumed_ns = 0
@@ -200,8 +196,6 @@ class JointController:
             refused=failsafe.refused,
             drive=int(samples.status),
             drive_error=samples.error,
-            coupled_share=failsafe.share,
-            coupled_used=self._share,
             braced=self._braced_ns > 0,
         )
 
@@ -224,7 +218,6 @@ class JointController:
             self._states,
             self._residual,
             self._resumed_ns,
-            self._share,
             self._braced_ns,
         )
 
@@ -238,7 +231,7 @@ class JointController:
         self._found_tau, self._cause, self.tau = m.found_tau, m.cause, m.tau
         self._damp_stop = -math.inf if m.damp_stop is None else m.damp_stop
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
-        self._residual, self._resumed_ns, self._share = m.residual, m.resumed_ns, m.share
+        self._residual, self._resumed_ns = m.residual, m.resumed_ns
         self._braced_ns = m.braced_ns
 
     def inside_limits(self) -> bool:
@@ -293,10 +286,7 @@ class JointController:
             command = self.failsafe.command
             assert command is not None  # noqa: S101 - TRACK is entered on fresh commands only
             age_s = (now_ns - command.echo_t_ns) / NS_PER_S
-            share = self._slewed(min(command.coupled_share, self.failsafe.share))
-            fresh = law.aged(command, min(age_s, self._aging_max_s), share)
-            if share < 1.0:
-                fresh = law.stiffened(fresh, self._hold_k_p, self._hold_k_d, 1.0 - share)
+            fresh = law.aged(command, min(age_s, self._aging_max_s))
             if since_ns >= self._blend_ns:
                 return fresh
             return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
@@ -314,14 +304,6 @@ class JointController:
             risen = min(1.0, (now_ns - self._braced_ns) / self._blend_ns)
             return law.stiffened(held, self._stand_k_p, self._stand_k_d, risen)
         return held
-
-    def _slewed(self, share: float) -> float:
-        """Return the share of this cycle: let go of in `coupled_ramp_ms`, back in `blend_ms`.
-
-        One message can change it by most of its range: at once that was a step of 20 N m.
-        """
-        self._share = min(self._share + self._share_up, max(self._share - self._share_down, share))
-        return self._share
 
     def _held(self, since_ns: int) -> Setpoint:
         """Return HOLD's law: the anchor frozen; some gains rise to the stand gains."""

@@ -74,7 +74,6 @@ class Timing(msgspec.Struct, frozen=True):
     dropout_forget_ns: int
     dropouts_max: int
     """As many double the wait to its maximum; more would only be slower to forget."""
-    unsteady_age_ns: int
     k_p_max: float
     k_d_max: float
     v_max: float
@@ -90,7 +89,6 @@ def timing_of(config: RobotConfig) -> Timing:
         engage_after_max_ns=round(service.engage_after_max_ms * NS_PER_MS),
         dropout_forget_ns=round(service.dropout_forget_s * NS_PER_S),
         dropouts_max=math.ceil(math.log2(service.engage_after_max_ms / service.engage_after_ms)),
-        unsteady_age_ns=round(service.unsteady_age_ms * NS_PER_MS),
         k_p_max=service.k_p_max,
         k_d_max=service.k_d_max,
         v_max=service.v_max,
@@ -110,11 +108,6 @@ class Refusal(IntEnum):
 
 
 RETIRED_SESSIONS_KEPT: Final = 256
-AGES_AVERAGED: Final = 32
-"""Commands over which the mean age and its deviation are taken: 0.13 s at 250 Hz. A robot that
-incoherent torques shake takes seconds to fall."""
-STEADY_SHARE: Final = 2.0 / 3.0
-"""Of `unsteady_age`: up to this deviation tau_coupled stays whole."""
 
 
 class Failsafe(msgspec.Struct):
@@ -134,12 +127,6 @@ class Failsafe(msgspec.Struct):
     steady_since_ns: int = 0
     """Since when nothing has dropped out or been forgotten."""
     refused: int = 0
-    age_mean_ns: float = -1.0
-    """Running mean of the ages at which commands came; -1 before the first."""
-    age_deviation_ns: float = 0.0
-    """Running mean of how far from that mean they were."""
-    share: float = 1.0
-    """`coupled_share` as of the newest command taken."""
 
     def offer(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
         """Take a command if it is usable; count it if not."""
@@ -152,8 +139,6 @@ class Failsafe(msgspec.Struct):
                 self.retired = (*self.retired[-RETIRED_SESSIONS_KEPT + 1 :], self.session)
             self.session = command.session
             self.fresh_since_ns = -1
-        self._watch_age(now_ns - command.echo_t_ns)
-        self.share = self.coupled_share(timing)
         self.command = command
         return refusal
 
@@ -161,18 +146,6 @@ class Failsafe(msgspec.Struct):
     def asks_to_brace(self) -> bool:
         """True in HOLD if the newest command taken says that another module may be limp."""
         return self.mode is Mode.HOLD and self.command is not None and self.command.brace
-
-    def coupled_share(self, timing: Timing) -> float:
-        """Return how much of tau_coupled may be used: 1 while ages are steady, 0 if not.
-
-        It is feedback from all six modules, and right only if all six act on the same tick:
-        with ages of 4 to 46 ms, all within the rule, the six acted on different ticks, and
-        the robot shook until it fell. Late by always the same it harms nobody: 50 ms each way
-        stood through pushes.
-        """
-        limit = timing.unsteady_age_ns
-        share = (limit - self.age_deviation_ns) / (limit * (1.0 - STEADY_SHARE))
-        return min(1.0, max(0.0, share))
 
     def age_ns(self, now_ns: int) -> int:
         """Return the age of the newest command taken, by this module's clock; -1 if none."""
@@ -247,13 +220,6 @@ class Failsafe(msgspec.Struct):
             self.dropouts -= 1
             self.steady_since_ns = now_ns
 
-    def _watch_age(self, age_ns: int) -> None:
-        if self.age_mean_ns < 0.0:
-            self.age_mean_ns = age_ns
-        off_ns = age_ns - self.age_mean_ns
-        self.age_mean_ns += off_ns / AGES_AVERAGED
-        self.age_deviation_ns += (abs(off_ns) - self.age_deviation_ns) / AGES_AVERAGED
-
     def _judge(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
         age = now_ns - command.echo_t_ns
         if age < 0:
@@ -274,8 +240,6 @@ def within_limits(command: JointCommand, timing: Timing) -> bool:
 
     Written so that a NaN fails: every comparison with it is false.
     """
-    if not 0.0 <= command.coupled_share <= 1.0:
-        return False
     for axis in (0, 1):
         if not (
             0.0 <= command.k_p[axis] <= timing.k_p_max

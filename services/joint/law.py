@@ -46,20 +46,19 @@ def torque(setpoint: Setpoint, q: Pair, v: Pair) -> Pair:
     )
 
 
-def aged(command: JointCommand, age_s: float, coupled_share: float = 1.0) -> Setpoint:
+def aged(command: JointCommand, age_s: float) -> Setpoint:
     """Return the command's law at this age: references moved on by their rates.
 
     Args:
         command: references and rates at age zero.
         age_s: age in s, already capped by `joint_service.command_aging_max_ms`.
-        coupled_share: how much of tau_coupled is used, 0 .. 1.
     """
-    c, share = command, coupled_share
+    c = command
     return Setpoint(
         (c.q_ref[0] + c.v_ref[0] * age_s, c.q_ref[1] + c.v_ref[1] * age_s),
         c.v_ref,
         (c.tau_ff[0] + c.dtau_ff[0] * age_s, c.tau_ff[1] + c.dtau_ff[1] * age_s),
-        (c.tau_coupled[0] * share, c.tau_coupled[1] * share),
+        c.tau_coupled,
         c.k_p,
         c.k_d,
     )

@@ -36,7 +36,6 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     states: int
     residual: Pair = law.ZERO
     resumed_ns: int = 0
-    share: float = 1.0
     braced_ns: int = 0
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.certificate import Certificate, Weakest, motor_mean
+from services.planner.coupling import Missing
 from services.planner.gains import GainLaw
 from services.planner.kinematics import Kinematics
 from services.planner.split import GainSplit, LocalGains
@@ -44,8 +45,10 @@ class Account(NamedTuple):
     assist: Array
     local_pd: Array
     coupled: Array
+    """What the planner adds, before its low-pass."""
     eased: Array
-    """What eases the operator's lead: not computed here, for the log has no filtered wrench."""
+    """What the low-pass takes off that, and what eases the operator's lead: not computed here,
+    for the log holds neither filter."""
 
     @property
     def total(self) -> Array:
@@ -78,26 +81,29 @@ def account(
     F_O[2] = config.total_mass * GRAVITY
     F = law.K_p * (at_ref.p - measured.p) + law.B_p * (at_ref.J @ v_ref - pdot) + F_O
     hessian_O = at_ref.hessian_times(F_O, F_assist).copy()
-    K_q, B_q = law.gains(at_ref, at_ref.hessian_times(F, F_assist))
+    body = law.gains(at_ref, at_ref.hessian_times(F, F_assist))
     T = per_unit_of_p(at_ref)
-    local = split.split(K_q, B_q, float(at_ref.p[2]), float(at_ref.p[4]), T, hessian_O)
+    local = split.split(lambda: body, float(at_ref.p[2]), float(at_ref.p[4]), T, hessian_O)
     certificate: Certificate = split.certificate
-    e_q, e_v = q_ref - q, v_ref - v
+    missing = Missing(law.K_p, law.B_p, law.S, split.coupling.damping)
+    K_fail = certificate.failsafe_stiffness(local.D)
+    K_c, B_c = missing.at(K_fail, (T.T * local.D_B) @ T)
+    e_q, e_v, e_pdot = q_ref - q, v_ref - v, at_ref.J @ v_ref - pdot
     return Account(
         p=measured.p,
         pdot=pdot,
         p_ref=at_ref.p,
         F=F,
         singular_values=np.asarray(np.linalg.svd(at_ref.J, compute_uv=False), float),
-        K_q=K_q,
-        B_q=B_q,
+        K_q=body.K_q,
+        B_q=body.B_q,
         local=local,
         weakest=certificate.weakest(local.D),
         weakest_onboard=certificate.weakest(motor_mean(local.D)),
         gravity=F_O @ at_ref.J,
         assist=F_assist @ at_ref.J_harness,
         local_pd=local.D * e_q + local.D_B * e_v,
-        coupled=K_q @ e_q - local.D * e_q + B_q @ e_v - local.D_B * e_v,
+        coupled=(K_c @ (at_ref.p - measured.p) + B_c @ e_pdot) @ at_ref.J,
         eased=np.zeros(12),
     )
 

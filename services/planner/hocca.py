@@ -10,8 +10,9 @@ One tick, in the paper's letters:
     T                    [J; C] T = [I; 0] at q_ref, so v_ref = T (S J v + S_perp pdot_C)
     K_q, B_q             at q_ref
     D, D_B               what the joint services hold alone: schedule and certificate
+    K_c, B_c             what these lack of K_p and B_p
     tau_ff  = J^T (m g z) + J_harness^T F_assist
-    tau_coupled = (K_q - D)(q_ref - q) + (B_q - D_B)(v_ref - v)
+    tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot)] }
 
 Pure: no clock, bus or thread.
 """
@@ -24,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still
-from services.planner.gains import GainLaw
+from services.planner.coupling import CouplingFilter, Missing
+from services.planner.gains import GainLaw, JointGains
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
 from services.planner.memory import LawMemory
@@ -43,6 +45,8 @@ class LawOutput(NamedTuple):
     tau_ff: Array
     dtau_ff: Array
     tau_coupled: Array
+    tau_missing: Array
+    """J^T [K_c e + B_c e'], before its low-pass."""
     local: LocalGains
     """D and D_B, certified."""
     p: Array
@@ -67,6 +71,9 @@ class Hocca:
         self._gains = GainLaw(config)
         self._split = GainSplit(config)
         self._S = self._gains.S
+        coupling = self._split.coupling
+        self._missing = Missing(self._gains.K_p, self._gains.B_p, self._S, coupling.damping)
+        self._coupling = CouplingFilter(coupling.bandwidth_hz)
         self._S_perp = 1.0 - self._S
         self._F_O: Array = np.zeros(6)
         self._F_O[2] = config.total_mass * GRAVITY
@@ -139,12 +146,19 @@ class Hocca:
         tau_ff = self._F_O @ at_ref.J + self._F_assist @ at_ref.J_harness
         hessian_O = at_ref.hessian_times(self._F_O, self._F_assist).copy()
         dtau_ff = hessian_O @ v_ref + at_ref.J_harness[2] * assist_rate
-        F = gains.K_p * (p_ref - measured.p) + gains.B_p * (pdot_ref - pdot) + self._F_O
-        K_q, B_q = gains.gains(at_ref, at_ref.hessian_times(F, self._F_assist))
-        local = self._split.split(K_q, B_q, at_ref.p[2], at_ref.p[4], T, hessian_O)
-        e_q, e_v = q_ref - q, v_ref - v
-        tau_coupled = K_q @ e_q - local.D * e_q + B_q @ e_v - local.D_B * e_v
-        # the eased lead goes where HOLD drops it: in tau_ff it would outlive the hand
+        e_p, e_pdot = p_ref - measured.p, pdot_ref - pdot
+
+        def body_gains() -> JointGains:
+            F = gains.K_p * e_p + gains.B_p * e_pdot + self._F_O
+            return gains.gains(at_ref, at_ref.hessian_times(F, self._F_assist))
+
+        local = self._split.split(body_gains, at_ref.p[2], at_ref.p[4], T, hessian_O)
+        K_fail = self._split.certificate.failsafe_stiffness(local.D)
+        K_c, B_c = self._missing.at(K_fail, (T.T * local.D_B) @ T)
+        tau_missing = (K_c @ e_p + B_c @ e_pdot) @ at_ref.J
+        tau_coupled = self._coupling.advance(tau_missing, dt)
+        # the eased lead goes where HOLD drops it: in tau_ff it would outlive the hand. It is a
+        # force fed forward, not joints' rates fed back: the harness filter is all that it needs
         tau_coupled += ease_z * at_ref.J_harness[2] + ease_pitch * at_ref.J[4]
         return LawOutput(
             q_ref,
@@ -152,6 +166,7 @@ class Hocca:
             tau_ff,
             dtau_ff,
             tau_coupled,
+            tau_missing,
             local,
             measured.p.copy(),
             pdot,
@@ -172,6 +187,7 @@ class Hocca:
             self._assist.remember(),
             self._easing.remember(),
             self._has_led,
+            self._coupling.remember(),
         )
 
     def recall(self, memory: LawMemory) -> None:
@@ -182,9 +198,11 @@ class Hocca:
         self._ik.q[:] = memory.q
         self._assist.recall(memory.assist)
         self._easing.recall(memory.easing)
+        self._coupling.recall(memory.coupling)
 
     def _align(self, q: Array) -> None:
         self._aligned = True
+        self._coupling.reset()
         self._p_C0 = self._measured.p * (0.0 if self._has_led else self._S_perp)
         self._since_align_s = 0.0
         self._ik.q[:] = q

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 
 from services.planner.bracing import Bracing
-from services.planner.coherence import Coherence
 from services.planner.engagement import Engagement
+from shared.joints import N_JOINTS
 from shared.messages import JointState, Pair, SplitSource, Wrench
 
 
@@ -45,6 +45,8 @@ class LawMemory(msgspec.Struct, frozen=True):
     assist: AssistMemory
     easing: EasingMemory
     has_led: bool = False
+    coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS)
+    """Of `CouplingFilter`, N m."""
 
 
 class TickMemory(msgspec.Struct, frozen=True):
@@ -62,6 +64,4 @@ class TickMemory(msgspec.Struct, frozen=True):
     engagement: Engagement
     overload: OverloadMemory
     law: LawMemory
-    coherence: Coherence = msgspec.field(default_factory=Coherence)
-    """Not in logs before it was there: then as at the start. So is the next."""
     bracing: Bracing = msgspec.field(default_factory=Bracing)

@@ -78,3 +78,35 @@ def leg_geometry(config: RobotConfig) -> tuple[LegGeometry, LegGeometry]:
 def _joint(model: pin.Model, kind: str, side: str) -> int:
     name = f"{kind}_{side}_theta"
     return next(i for i, joint in enumerate(model.names) if joint.endswith(name))
+
+
+class BodyInertia:
+    """Inertia of the body along p with both feet where they are, without the rotors."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Load the model."""
+        self._model = load_pinocchio(config)
+        self._model.armature = np.zeros(self._model.nv)
+        self._data = self._model.createData()
+        self._foot = _joint(self._model, "ankle", SIDES[0])
+
+    def at(self, q: Array, T: Array) -> Array:
+        """Return M (6, 6): kinetic energy is p'^T M p' / 2.
+
+        Args:
+            q: joint angles (12,), rad, at which the legs agree.
+            T: joint rates per unit of p along the closed chain (12, 6).
+        """
+        model, data = self._model, self._data
+        full = q_tree(q, model)
+        M = pin.crba(model, data, full)
+        M = np.triu(M) + np.triu(M, 1).T
+        pin.computeJointJacobians(model, data, full)
+        J_foot = pin.getJointJacobian(
+            model, data, self._foot, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )
+        rates = np.zeros((model.nv, 6))
+        rates[6 + _TREE_OF_LEG.ravel()] = T
+        # the torso moves so that the foot does not; by T the other one does not either
+        rates[:6] = -np.linalg.solve(J_foot[:, :6], J_foot[:, 6:] @ rates[6:])
+        return np.asarray(rates.T @ M @ rates, float)

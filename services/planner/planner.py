@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from services.planner.assist import Overload
 from services.planner.bracing import Brace, Bracing
 from services.planner.certificate import Margins
-from services.planner.coherence import Coherence
 from services.planner.engagement import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.memory import TickMemory
@@ -76,8 +75,6 @@ class Planner:
             round(harness.overload_after_ms * NS_PER_MS),
             round(harness.overload_release_s * NS_PER_S),
         )
-        self._coherence = Coherence()
-        self._coupled_share = 1.0
         self._bracing = Bracing()
         self._brace = Brace.NONE
         self._wrench_seq = -1
@@ -153,8 +150,6 @@ class Planner:
             wrench=self._usable_wrench(now_ns),
         )
         self._source = self._output.local.source
-        self._coherence.take([state.age_ns for state in states])
-        self._coupled_share = self._coherence.share(state.coupled_share for state in states)
         self._seq += 1
         return self._commands(now_ns, states, self._output)
 
@@ -173,7 +168,6 @@ class Planner:
             msgspec.structs.replace(self._engagement),
             self._overload.remember(),
             self._law.remember(),
-            msgspec.structs.replace(self._coherence),
             msgspec.structs.replace(self._bracing),
         )
 
@@ -187,7 +181,6 @@ class Planner:
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
         self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
         self._engagement = msgspec.structs.replace(m.engagement)
-        self._coherence = msgspec.structs.replace(m.coherence)
         self._bracing = msgspec.structs.replace(m.bracing)
         self._overload.recall(m.overload)
         self._law.recall(m.law)
@@ -235,7 +228,6 @@ class Planner:
             self.session,
             self._hold(),
             output.local.margins,
-            self._coupled_share,
         )
         brace = self._brace
         return [
@@ -275,7 +267,6 @@ class Planner:
             wrench_seq=self._wrench_seq,
             assist_wanted_n=self._assist_wanted,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
-            coupled_share=self._coupled_share,
             wait_s=0.0 if leads else self._engagement.wait_ns(now_ns) / NS_PER_S,
         )
 
@@ -288,7 +279,6 @@ class _Common(NamedTuple):
     session: int
     hold: bool
     margins: Margins
-    coupled_share: float
 
 
 def _command(
@@ -310,7 +300,6 @@ def _command(
         k_d=pairs[6],
         margin=common.margins.service,
         margin_onboard=common.margins.onboard,
-        coupled_share=common.coupled_share,
         brace=brace,
     )
 

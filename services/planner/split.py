@@ -9,12 +9,14 @@ and the robot is to hold. Pure.
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.certificate import Certificate, Margins
+from services.planner.gains import JointGains
 from shared import gain_schedule
 from shared.config import RobotConfig
 from shared.config_sections import GainSchedule
@@ -39,6 +41,18 @@ class LocalGains(NamedTuple):
     source: SplitSource
 
 
+class CouplingGains(NamedTuple):
+    """How much the planner may add, and how fast (`services.planner.coupling`)."""
+
+    bandwidth_hz: float
+    damping: float
+    """c, in shares of B_p."""
+
+
+UNCERTIFIED_COUPLING: Final = CouplingGains(4.0, 1.0)
+"""Of a robot without a schedule: the paper's split, or averaged legs, for comparison."""
+
+
 class ScheduledGains:
     """D over COM height and pitch: bilinear between nodes, held beyond the last."""
 
@@ -47,6 +61,8 @@ class ScheduledGains:
         self._z, self._pitch = schedule.z, schedule.pitch
         table = np.array(schedule.D)
         self._table: Array = np.concatenate((table, table), axis=2)
+        self.D_B: Array = np.tile(schedule.D_B, 2)
+        """(12,) N m s/rad, in every pose."""
 
     def at(self, z: float, pitch: float) -> Array:
         """Return D (12,), N m/rad, at a COM height (m) and a torso pitch (rad)."""
@@ -78,11 +94,14 @@ class GainSplit:
         """
         self.certificate = Certificate(config)
         self._schedule: ScheduledGains | None = None
+        self.coupling = UNCERTIFIED_COUPLING
         if config.law.split == "certified":
             stale = gain_schedule.why_stale(config)
             if stale or config.gain_schedule is None:
                 raise ConfigError("robot", "law.split", stale, "run `xrl gains --config FILE`")
             self._schedule = ScheduledGains(config.gain_schedule)
+            made = config.gain_schedule
+            self.coupling = CouplingGains(made.coupling_bandwidth_hz, made.coupling_damping)
         limits = config.certificate
         self._margins_min = Margins(limits.margin_min, limits.onboard_margin_min)
         self._k_q_share_max = limits.k_q_share_max
@@ -93,13 +112,17 @@ class GainSplit:
         self._stand: Array = np.array(stand).ravel()
 
     def split(
-        self, K_q: Array, B_q: Array, z: float, pitch: float, T: Array, hessian_O: Array
+        self,
+        body_gains: Callable[[], JointGains],
+        z: float,
+        pitch: float,
+        T: Array,
+        hessian_O: Array,
     ) -> LocalGains:
         """Return the local gains at a reference pose.
 
         Args:
-            K_q: whole-body stiffness (12, 12), N m/rad.
-            B_q: whole-body damping (12, 12), N m s/rad.
+            body_gains: K_q and B_q there; asked for only where the schedule does not do.
             z: COM height, m.
             pitch: of the torso, rad.
             T: joint rates per unit of p along the closed chain (12, 6).
@@ -107,17 +130,28 @@ class GainSplit:
         """
         certificate = self.certificate
         certificate.at(T, hessian_O)
-        diagonal = np.minimum(np.maximum(np.diagonal(K_q), 0.0), self._k_max)
-        D = diagonal if self._schedule is None else self._schedule.at(z, pitch)
-        margins = certificate.margins(D)
-        source = SplitSource.DIAGONAL if self._schedule is None else SplitSource.SCHEDULE
-        if not self._enough(margins):
-            D, margins, source = self._stiffened(D, diagonal, margins)
-        # damping as the stiffness: what K_q gives up to tau_coupled, B_q gives up too
-        share = self._damping_share * D / np.maximum(diagonal, 1.0)
-        share = np.minimum(share, self._k_q_share_max * self._damping_share)
-        D_B = np.minimum(np.maximum(share * np.diagonal(B_q), 0.0), self._d_max)
+        schedule = self._schedule
+        if schedule is not None:
+            D = schedule.at(z, pitch)
+            margins = certificate.margins(D)
+            if self._enough(margins):
+                return LocalGains(D, schedule.D_B, margins, SplitSource.SCHEDULE)
+            diagonal, D_B = self._of_body(body_gains())[0], schedule.D_B
+        else:
+            diagonal, D_B = self._of_body(body_gains())
+            D, margins = diagonal, certificate.margins(diagonal)
+            if self._enough(margins):
+                return LocalGains(D, D_B, margins, SplitSource.DIAGONAL)
+        D, margins, source = self._stiffened(D, diagonal, margins)
         return LocalGains(D, D_B, margins, source)
+
+    def _of_body(self, body: JointGains) -> tuple[Array, Array]:
+        """Return diag(K_q) and the configured share of diag(B_q), as far as they are allowed."""
+        own = self._damping_share * np.diagonal(body.B_q)
+        return (
+            np.minimum(np.maximum(np.diagonal(body.K_q), 0.0), self._k_max),
+            np.minimum(np.maximum(own, 0.0), self._d_max),
+        )
 
     def _enough(self, margins: Margins) -> bool:
         least = self._margins_min

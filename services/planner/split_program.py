@@ -15,63 +15,66 @@ assist (K_geo is linear in it, so every assist in between is covered).
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from typing import Final
 
 import cvxpy as cp
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from services.planner import design_program
 from services.planner.certificate import Certificate, Margins
-from services.planner.gains import GainLaw
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics
-from services.planner.split import ScheduledGains
-from shared.config import GRAVITY, RobotConfig
+from services.planner.dynamic_certificate import Design, nodes_of
+from services.planner.dynamic_certificate import Node as DynamicNode
+from services.planner.poses import Node, Poses
+from services.planner.split import CouplingGains, ScheduledGains
+from shared.config import RobotConfig
 from shared.config_sections import GainSchedule, LegGains
 from shared.exceptions import RunError
 from shared.gain_schedule import VERSION, digest_of, inputs_of
-from shared.joints import N_JOINTS, N_LEG
-from shared.robot_model import stand_pose
+from shared.joints import N_LEG
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 """Told how many nodes are done, of how many."""
 
 N_HEIGHTS: Final = 25
+DYNAMIC_HEIGHTS: Final = 5
+DYNAMIC_PITCHES: Final = (0.0, 1.2)
+"""rad"""
 PITCHES: Final = (-0.4, 0.0, 0.4, 0.8, 1.2, 1.5)
 """rad"""
-REACH_STEP: Final = 0.005
-"""m; how finely the ends of the height range are told."""
-MID_HEIGHT: Final = 0.8
-"""Of the straight leg: a stand from where every other pose is walked to."""
 FULL_SCALE: Final = 1000.0
 """N m/rad; D in the program is in units of this, so that the solver sees numbers near 1."""
 
 
-class Node(NamedTuple):
-    """The certificate's ingredients at a pose."""
-
-    T: Array
-    """(12, 6)"""
-    hessians: tuple[Array, Array]
-    """`hessian_times` without and with the full assist (12, 12), N m/rad."""
-    D_max: Array
-    """(6,) N m/rad"""
-
-
-def solve(config: RobotConfig, progress: Progress = lambda _done, _of: None) -> GainSchedule:
+def solve(
+    config: RobotConfig,
+    progress: Progress = lambda _done, _of: None,
+    tell: Callable[[str], None] = lambda _text: None,
+    design: Design | None = None,
+    *,
+    check: bool = True,
+) -> GainSchedule:
     """Return the schedule of a robot.
+
+    Args:
+        config: the robot.
+        progress: told about the poses.
+        tell: told in words how the search for damping goes.
+        design: damping and coupling to take as they are; None: searched for.
+        check: whether a design that is taken is held to the dynamic certificate here.
 
     Raises:
         RunError: at a pose no local gains meet the certificate; says which.
     """
-    poses = _Poses(config)
+    poses = Poses(config)
     z_nodes = np.linspace(*poses.reach(), N_HEIGHTS)
     found: dict[tuple[int, int], Array] = {}
     done, total = 0, N_HEIGHTS * len(PITCHES)
     for i, z in enumerate(z_nodes):
-        for j, pitch in poses.outwards(z):
+        for j, pitch in poses.outwards(z, PITCHES):
             node = poses.node(z, pitch)
             if node is not None:
                 found[i, j] = _program(config, node, z, pitch)
@@ -82,14 +85,40 @@ def solve(config: RobotConfig, progress: Progress = lambda _done, _of: None) -> 
         for i in range(N_HEIGHTS)
     ]
     inputs = inputs_of(config)
-    return GainSchedule(
+    stiffness = GainSchedule(
         version=VERSION,
         digest=digest_of(inputs),
         inputs=inputs,
         z=tuple(round(float(z), 6) for z in z_nodes),
         pitch=PITCHES,
         D=tuple(rows),
+        D_B=_rounded(np.zeros(N_LEG)),
+        coupling_bandwidth_hz=1.0,
+        coupling_damping=0.0,
     )
+    if design is None:
+        design = design_program.choose(config, dynamic_nodes(config, stiffness), tell)
+    elif check:
+        design_program.check(config, dynamic_nodes(config, stiffness), design, tell)
+    return msgspec.structs.replace(
+        stiffness,
+        D_B=_rounded(np.array(design.D_B)),
+        coupling_bandwidth_hz=round(design.coupling.bandwidth_hz, 3),
+        coupling_damping=round(design.coupling.damping, 3),
+    )
+
+
+def dynamic_nodes(config: RobotConfig, schedule: GainSchedule) -> list[DynamicNode]:
+    """Return the poses that the dynamic certificate is asked about."""
+    z = np.array(schedule.z)
+    heights = z[np.linspace(0, len(z) - 1, DYNAMIC_HEIGHTS).round().astype(int)]
+    return nodes_of(config, ScheduledGains(schedule).at, heights, np.array(DYNAMIC_PITCHES))
+
+
+def design_of(schedule: GainSchedule) -> Design:
+    """Return what a schedule says of damping and coupling."""
+    coupling = CouplingGains(schedule.coupling_bandwidth_hz, schedule.coupling_damping)
+    return Design(schedule.D_B, coupling)
 
 
 def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
@@ -99,7 +128,7 @@ def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
         config: the robot.
         schedule: to be checked.
     """
-    poses, certificate, scheduled = _Poses(config), Certificate(config), ScheduledGains(schedule)
+    poses, certificate, scheduled = Poses(config), Certificate(config), ScheduledGains(schedule)
     service = onboard = np.inf
     z_nodes, pitches = np.array(schedule.z), np.array(schedule.pitch)
     for z in _with_middles(z_nodes):
@@ -116,71 +145,6 @@ def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
 
 def _with_middles(nodes: Array) -> Array:
     return np.sort(np.concatenate((nodes, 0.5 * (nodes[1:] + nodes[:-1]))))
-
-
-class _Poses:
-    """Upright and pitched stands of a robot, COM over the ankles."""
-
-    def __init__(self, config: RobotConfig) -> None:
-        self._config = config
-        self._kinematics = Kinematics(config)
-        self._ik = InverseKinematics(self._kinematics, np.array(config.joint_limits()))
-        self._gains = GainLaw(config)
-        self._F_O: Array = np.zeros(6)
-        self._F_O[2] = config.total_mass * GRAVITY
-        self._no_assist, self._assist = np.zeros(3), np.array([0.0, 0.0, config.assist.force_max])
-        reach = config.geometry.l1 + config.geometry.l2
-        self._ik.q[:] = stand_pose(config, MID_HEIGHT * reach)
-        self._kinematics.update(self._ik.q)
-        self._middle = float(self._kinematics.p[2])
-
-    def _stands(self, z: float, pitch: float) -> bool:
-        """Walk to a pose; return False, the last pose kept, if it cannot be reached."""
-        before = self._ik.q.copy()
-        p_ref = np.array([0.0, 0.0, z, 0.0, pitch, 0.0])
-        if self._ik.solve(p_ref, iterations_max=50).converged:
-            return True
-        if self._ik.solve_from_anywhere(p_ref).converged:
-            return True
-        self._ik.q[:] = before
-        return False
-
-    def reach(self) -> tuple[float, float]:
-        """Return the lowest and the highest COM height of an upright stand, m."""
-        ends = []
-        for step in (-REACH_STEP, REACH_STEP):
-            z = self._middle
-            self._stands(z, 0.0)
-            while self._stands(z + step, 0.0):
-                z += step
-            ends.append(z)
-        return ends[0], ends[1]
-
-    def outwards(self, z: float) -> Iterator[tuple[int, float]]:
-        """Yield (index, pitch), each next to one before it, from upright on."""
-        upright = PITCHES.index(0.0)
-        for direction in (range(upright, len(PITCHES)), range(upright - 1, -1, -1)):
-            self._stands(z, 0.0)
-            for j in direction:
-                yield j, PITCHES[j]
-
-    def node(self, z: float, pitch: float) -> Node | None:
-        """Return the node, or None if the pose cannot be reached."""
-        if not self._stands(z, pitch):
-            return None
-        kinematics = self._kinematics
-        kinematics.update(self._ik.q)
-        A = np.vstack((kinematics.J, kinematics.C))
-        T = np.asarray(np.linalg.solve(A, np.eye(N_JOINTS)[:, :6]), float)
-        hessians = [
-            kinematics.hessian_times(self._F_O, force).copy()
-            for force in (self._no_assist, self._assist)
-        ]
-        diagonals = [np.diagonal(self._gains.gains(kinematics, h).K_q) for h in hessians]
-        K_q: Array = np.max(diagonals, axis=0)
-        share = self._config.certificate.k_q_share_max
-        D_max = np.clip(share * K_q[:N_LEG], 0.0, self._config.joint_service.k_p_max)
-        return Node(T, (hessians[0], hessians[1]), np.asarray(D_max, float))
 
 
 def _program(config: RobotConfig, node: Node, z: float, pitch: float) -> Array:

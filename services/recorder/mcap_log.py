@@ -38,7 +38,7 @@ from services.recorder.syncer import Syncer
 from shared.exceptions import RunError
 from shared.topics import Topic
 
-SCHEMA_VERSION: Final = "2"
+SCHEMA_VERSION: Final = "3"
 """Of the layout above and of the messages in `shared/messages.py`."""
 
 FILE_NAME: Final = files.FIRST

@@ -7,12 +7,14 @@ from pathlib import Path
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_settings import plant
+from services.simulator.body import body_of
 from services.simulator.cansimple_front import CanSimpleFront
 from services.simulator.fibre_endpoints import Board
 from services.simulator.fibre_front import FibreFront
 from services.simulator.fibre_port import FibreHub, FibrePort
 from services.simulator.harness_front import HarnessFront
 from services.simulator.loop import Ports, SimulatorLoop
+from services.simulator.plant import plant_from
 from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
 from shared import config_file, log, scenario, topics
@@ -58,11 +60,20 @@ def main() -> int:
         help="a setting that a drive has kept, as knee_left.axis0.controller.config.vel_limit=2; "
         "may be given several times",
     )
+    parser.add_argument(
+        "--plant",
+        action="append",
+        default=[],
+        metavar="NAME|FILE|KEY=VALUE",
+        help="how the true robot differs from the robot file: realistic (default), ideal, a TOML "
+        "file, or one value; may be given several times",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
     arguments = parser.parse_args()
     logger = log.setup("simulator")
     robot = config_file.load(arguments.config)
     story = scenario.load(arguments.scenario)
+    true_plant = plant_from(arguments.plant)
     stop = StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
     with ExitStack() as stack:
@@ -92,7 +103,7 @@ def main() -> int:
             bank.calibration.restart(axis)
         usb = open_usb(robot, bank, arguments.run_dir, stack)
         harness = HarnessFront(robot, hubs[robot.harness.bus], arguments.seed)
-        world = World(robot, story)
+        world = World(body_of(robot, true_plant), story)
         logger.info("up, %s, scenario %s", granted, story.name)
         freeze_garbage()
         loop = SimulatorLoop(robot, world, bank, front, usb, harness, ports)

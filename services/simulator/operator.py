@@ -1,7 +1,7 @@
 """The simulated operator: a hand that leads, and weight rested on the harness.
 
 The hand is a clipped spring-damper between a path and the harness point, in height and
-pitch (design section 8). Pure.
+pitch (design section 8). Behind it is a person with a mass. Pure.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from shared.config import RobotConfig
+from services.simulator.plant import Person
+from shared.config_sections import OperatorConfig
+from shared.messages import Vector3
 from shared.scenario import Lead
 
 
@@ -22,13 +24,49 @@ class HandForce(NamedTuple):
     """N m about the torso's pitch axis."""
 
 
+class Wearer:
+    """The person's own mass behind the hand: it gives way to what the hand meets.
+
+    d is how far the person is above the path:  m d'' = -m w^2 d - 2 zeta m w d' - f
+    """
+
+    def __init__(self, person: Person) -> None:
+        """Take the person; without a mass the path is followed exactly."""
+        w = 2.0 * math.pi * person.leg_frequency_hz
+        self._per_mass = 1.0 / person.mass if person.mass > 0.0 else 0.0
+        self._k, self._b = w * w, 2.0 * person.leg_damping_ratio * w
+        self._load_scale, self._load_lag_s = person.load_scale, person.load_lag_s
+        self.above = 0.0
+        """m"""
+        self.rate = 0.0
+        """m/s"""
+        self.load_n = 0.0
+        """What rests on the harness, N."""
+
+    def step(self, dt: float, force_on_robot: float, assist: float) -> None:
+        """Move on.
+
+        Args:
+            dt: step, s.
+            force_on_robot: of the hand, N, up.
+            assist: that the person asked for, N: rested later, and not all of it.
+        """
+        if self._per_mass:
+            acceleration = -self._per_mass * force_on_robot - self._k * self.above
+            self.rate = (self.rate + dt * acceleration) / (1.0 + dt * self._b)
+            self.above += dt * self.rate
+        wanted = self._load_scale * assist
+        lag = self._load_lag_s
+        self.load_n += (wanted - self.load_n) * (min(1.0, dt / lag) if lag > 0.0 else 1.0)
+
+
 class Operator:
     """The hand's spring-damper."""
 
-    def __init__(self, config: RobotConfig) -> None:
-        """Take the spring-damper and the harness point."""
-        self._hand = config.simulation.operator
-        self._point = config.geometry.harness_point
+    def __init__(self, hand: OperatorConfig, harness_point: Vector3) -> None:
+        """Take the spring-damper and where on the torso it acts, m, torso axes."""
+        self._hand = hand
+        self._point = harness_point
 
     def force(
         self, wanted: Lead, height: float, rate: float, pitch: float, pitch_rate: float

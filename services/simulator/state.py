@@ -44,6 +44,7 @@ def taken(world: World, bank: AxisBank, t_ns: int, seq: int) -> SimState:
         pos_gain=inputs[3],
         vel_gain=inputs[4],
         counts_from=inputs[5],
+        hidden=world.hidden(),
     )
 
 
@@ -57,7 +58,9 @@ def restored(world: World, bank: AxisBank, state: SimState) -> None:
         bank: new, of the same robot; not stepped yet.
         state: of a run.
     """
-    world.go_on(state.qpos, state.qvel, state.warmstart, state.scenario_s, state.hoist)
+    world.go_on(
+        state.qpos, state.qvel, state.warmstart, state.scenario_s, state.hoist, state.hidden
+    )
     bank.counts_from[:] = state.counts_from
     bank.step(world.time, *world.motor_turns())
     for axis in range(N_JOINTS):

@@ -1,7 +1,7 @@
 """The physical world in MuJoCo: the robot on free feet, the operator, pushes, the hoist.
 
-The only owner of MuJoCo. Knows no bus and no clock: `step` takes motor torques and moves
-on by one time step.
+Steps the true robot (`services.simulator.body`), and knows no robot file, bus or clock: `step`
+takes motor torques and moves on by one time step.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from services.simulator.operator import HandForce, Operator
-from shared.config import GRAVITY, RobotConfig
-from shared.joints import JOINTS, MODULES, N_LEG, SIDES
+from services.simulator.actuation import Actuation
+from services.simulator.body import Body
+from services.simulator.operator import HandForce, Operator, Wearer
+from shared.joints import JOINTS, N_LEG, SIDES
 from shared.messages import SimTruth, Vector3
-from shared.robot_model import ankle_positions, mjcf, stand_pose
 from shared.scenario import Lead, Scenario, lead, push_at
 
 Array = NDArray[np.float64]
@@ -42,30 +42,35 @@ STAND_ITERATIONS: Final = 8
 class World:
     """The simulated robot and what acts on it."""
 
-    def __init__(self, config: RobotConfig, scenario: Scenario) -> None:
+    def __init__(self, body: Body, scenario: Scenario) -> None:
         """Put the robot on its feet at the stand height, held by the hoist."""
         self._scenario = scenario
-        self.model = mujoco.MjModel.from_xml_string(mjcf(config))
+        self.model = body.model
         self.data = mujoco.MjData(self.model)
-        self.timestep: float = self.model.opt.timestep
-        self._operator = Operator(config)
-        self._weight = config.total_mass * GRAVITY
+        self.timestep = body.timestep
+        self._steps = body.steps
+        self._operator = Operator(body.hand, body.harness_point)
+        self._wearer = Wearer(body.person)
+        self._weight = body.weight
         joints = [self.model.joint(name) for name in JOINTS]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])
         self._v_index = np.array([joint.dofadr[0] for joint in joints])
-        signs = np.array(config.motor_signs())[:, None]
-        motor = signs * _motor_from_joint(config.joint.gear_ratio)
-        self._motor_from_q: Array = np.zeros((len(JOINTS), self.model.nq))
-        self._motor_from_q[:, self._q_index] = motor
-        self._motor_from_v: Array = np.zeros((len(JOINTS), self.model.nv))
-        self._motor_from_v[:, self._v_index] = motor
-        # power is the same on both sides: tau = (d motor angle / d joint angle)^T torque
-        self._tau_from_motor: Array = 2.0 * math.pi * self._motor_from_v.T.copy()
+        self._actuation = Actuation(body, self.model.opt.timestep)
+        self._joint_damping = self.model.dof_damping[self._v_index].copy()
         self._torso = self.model.body("torso").id
         self._feet = [self.model.body(f"foot_{side}").id for side in SIDES]
-        self._harness_point = config.geometry.harness_point
-        self._ankles_wanted = np.array(ankle_positions(config))
-        self._hoist_time = config.simulation.hoist_s
+        data = self.data  # views of its memory: to ask it for an array costs a microsecond
+        self._qpos, self._qvel, self._applied = data.qpos, data.qvel, data.qfrc_applied
+        self._torso_rotation, self._torso_wrench = (
+            data.xmat[self._torso],
+            data.xfrc_applied[self._torso],
+        )
+        self._torso_rates = data.qvel[:6]
+        self._damping = self.model.dof_damping
+        self._dt: float = self.model.opt.timestep
+        self._harness_point = body.harness_point
+        self._ankles_wanted, self._foot_yaws = body.ankles, body.foot_yaws
+        self._hoist_time = body.hoist_s
         self.hoist = 1.0
         self._releasing = False
         self.time = 0.0
@@ -80,15 +85,16 @@ class World:
         self.harness_moment: Vector3 = (0.0, 0.0, 0.0)
         """N m, torso axes."""
         self._truths = 0
-        self._place(config)
+        self._place(body)
 
-    def _place(self, config: RobotConfig) -> None:
+    def _place(self, body: Body) -> None:
         """Stand the robot: torso level at the stand height, soles flat, COM over the ankles."""
         data, model = self.data, self.model
-        data.qpos[self._q_index] = stand_pose(config, config.simulation.stand_height)
+        data.qpos[self._q_index] = body.stand_q
         mujoco.mj_kinematics(model, data)
         data.qpos[0] -= data.xpos[self._feet[0]][0]
         self._flatten_soles()
+        self._actuation.settle(data.qpos[self._q_index])
         self._hoist_position = data.qpos[:3].copy()
 
     def stand_at(self, q: Array) -> None:
@@ -106,6 +112,7 @@ class World:
         mujoco.mju_mat2Quat(data.qpos[3:7], rotation_sole_torso.ravel())
         data.qvel[:] = 0.0
         self._flatten_soles()
+        self._actuation.settle(data.qpos[self._q_index])
         self.hoist = 0.0
 
     def go_on(
@@ -115,8 +122,9 @@ class World:
         warmstart: Sequence[float],
         scenario_s: float,
         hoist: float,
+        hidden: Sequence[float],
     ) -> None:
-        """Go on from the state of another world of the same robot and scenario.
+        """Go on from the state of another world of the same robot, plant and scenario.
 
         Args:
             qpos: MuJoCo's position.
@@ -124,6 +132,7 @@ class World:
             warmstart: its qacc_warmstart.
             scenario_s: scenario time; negative: it has not begun.
             hoist: share of its support.
+            hidden: as `hidden` returned it.
         """
         data = self.data
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, qvel, warmstart
@@ -134,6 +143,14 @@ class World:
         kept = data.qacc_warmstart.copy()
         mujoco.mj_forward(self.model, data)
         data.qacc_warmstart[:] = kept
+        wearer = self._wearer
+        wearer.above, wearer.rate, wearer.load_n = hidden[:3]
+        self._actuation.restore(hidden[3:])
+
+    def hidden(self) -> tuple[float, ...]:
+        """Return what MuJoCo does not hold: the person, the drivetrain, torques on their way."""
+        wearer = self._wearer
+        return (wearer.above, wearer.rate, wearer.load_n, *self._actuation.state())
 
     def _flatten_soles(self) -> None:
         """Move the legs until both ankles are in their places, soles flat."""
@@ -146,6 +163,7 @@ class World:
                 columns = self._v_index[leg * N_LEG : (leg + 1) * N_LEG]
                 mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], foot)
                 r = data.xmat[foot].reshape(3, 3)
+                r = _turned_back(r, self._foot_yaws[leg])
                 turn = 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
                 error = np.concatenate((wanted[leg] - data.xpos[foot], -turn))
                 step = np.linalg.solve(jacobian[:, columns], error)
@@ -180,19 +198,21 @@ class World:
 
         Order: axis0, axis1 of each module in `MODULES` order.
         """
-        data = self.data
-        return (
-            self._motor_from_q @ data.qpos,
-            self._motor_from_v @ data.qvel,
+        return self._actuation.encoders(
+            self._qpos.take(self._q_index), self._qvel.take(self._v_index)
         )
 
     def step(self, motor_torque: Array) -> None:
         """Move on by one time step under motor torques (12,) in N m."""
-        data = self.data
-        np.matmul(self._tau_from_motor, motor_torque, out=data.qfrc_applied)
-        self._apply_outside_forces()
-        mujoco.mj_step(self.model, data)
-        self.time += self.timestep
+        actuation, v_index = self._actuation, self._v_index
+        for _ in range(self._steps):
+            q, v = self._qpos.take(self._q_index), self._qvel.take(v_index)
+            self._applied[v_index] = actuation.torque(motor_torque, q, v)
+            if actuation.flexible is not None:
+                self._damping[v_index] = self._joint_damping + actuation.flexible.damping
+            self._apply_outside_forces()
+            mujoco.mj_step(self.model, self.data)
+            self.time += self._dt
 
     def lead(self) -> Lead:
         """Return what the operator wants now."""
@@ -204,28 +224,30 @@ class World:
         In plain numbers: this runs at every step, and numpy's calls on three numbers
         would cost more than the physics.
         """
-        data = self.data
         t = self.scenario_s
         wanted = lead(self._scenario, t)
-        r = data.xmat[self._torso].tolist()  # row by row
+        r = self._torso_rotation.tolist()  # row by row
         x, y, z = self._harness_point
         arm_x = r[0] * x + r[1] * y + r[2] * z
         arm_y = r[3] * x + r[4] * y + r[5] * z
         self.hand = HandForce(0.0, 0.0)
         if self._hand_on and self.hoist == 0.0:
-            height = float(data.qpos[2]) + r[6] * x + r[7] * y + r[8] * z
-            _, _, v_z, w_x, w_y, w_z = data.qvel[:6].tolist()  # omega in torso axes
+            height = float(self._qpos[2]) + r[6] * x + r[7] * y + r[8] * z
+            _, _, v_z, w_x, w_y, w_z = self._torso_rates.tolist()  # omega in torso axes
             omega_x = r[0] * w_x + r[1] * w_y + r[2] * w_z
             omega_y = r[3] * w_x + r[4] * w_y + r[5] * w_z
             rate = v_z + omega_x * arm_y - omega_y * arm_x
+            wearer = self._wearer
+            height, rate = height - wearer.above, rate - wearer.rate
             self.hand = self._operator.force(wanted, height, rate, math.atan2(-r[6], r[8]), w_y)
-        self.load_n = wanted.assist
+        self._wearer.step(self._dt, self.hand.force_z, wanted.assist)
+        self.load_n = self._wearer.load_n
         self.push = push_at(self._scenario, t) if t >= 0.0 else (0.0, 0.0, 0.0)
         f, m = self.hand.force_z - self.load_n, self.hand.moment_pitch
         # in torso axes, as the harness sensor feels it: f along world z, m about torso y
         self.harness_force = (r[6] * f, r[7] * f, r[8] * f)
         self.harness_moment = (0.0, m, 0.0)
-        wrench = data.xfrc_applied[self._torso]
+        wrench = self._torso_wrench
         wrench[:] = (
             self.push[0],
             self.push[1],
@@ -240,7 +262,7 @@ class World:
     def _apply_hoist(self, wrench: Array) -> None:
         """Hold the torso by a spring-damper and carry the weight, by the hoist's share."""
         if self._releasing:
-            self.hoist = max(0.0, self.hoist - self.timestep / self._hoist_time)
+            self.hoist = max(0.0, self.hoist - self._dt / self._hoist_time)
         data = self.data
         rotation = data.xmat[self._torso].reshape(3, 3)
         k_lin, k_ang = HOIST_STIFFNESS
@@ -299,13 +321,12 @@ class World:
         )
 
 
-def _motor_from_joint(gear_ratio: float) -> Array:
-    """Return the differential (12, 12): motor turns from joint angles in rad.
-
-    Per module, m1 = N (q_theta + q_phi), m2 = N (q_theta - q_phi), in turns.
-    """
-    pair = np.array([[1.0, 1.0], [-1.0, 1.0]]) * gear_ratio / (2.0 * math.pi)
-    return np.asarray(np.kron(np.eye(len(MODULES)), pair), float)
+def _turned_back(rotation: Array, yaw: float) -> Array:
+    """Return Rz(yaw)^T rotation: how a foot is turned against its place, small."""
+    if yaw == 0.0:
+        return rotation
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.asarray(np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotation, float)
 
 
 def _vector(values: Array) -> Vector3:

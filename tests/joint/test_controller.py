@@ -56,7 +56,7 @@ def test_power_up_holds_the_measured_pose_without_a_planner(bench: Bench) -> Non
     assert (result.event.mode_before, result.event.mode_after) == (Mode.DISARMED, Mode.HOLD)
     assert result.event.cause == Cause.DRIVE_ARMED
     bench.q, bench.v = (0.11, -1.52), (0.1, -0.2)
-    expected = (-900.0 * 0.01 - 60.0 * 0.1, 1500.0 * 0.02 + 30.0 * 0.2)
+    expected = (-900.0 * 0.01 - 45.0 * 0.1, 1500.0 * 0.02 + 25.0 * 0.2)
     assert bench.run(20)[-1].tau == pytest.approx(expected)
 
 

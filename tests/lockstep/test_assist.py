@@ -6,6 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from services.simulator.body import body_of
+from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared.config import RobotConfig
 from shared.messages import Cause, Mode, SimTruth
@@ -24,7 +26,7 @@ def truths(robot: RobotConfig, scenario: Scenario, payload_error: float) -> list
     """Run with a payload that the planner does not know of, kg."""
     fleet = Lockstep(robot, scenario)
     mass = msgspec.structs.replace(robot.mass, payload=robot.mass.payload + payload_error)
-    fleet.world = World(msgspec.structs.replace(robot, mass=mass), scenario)
+    fleet.world = World(body_of(msgspec.structs.replace(robot, mass=mass), IDEAL), scenario)
     return [truth for truth in fleet.run() if truth.scenario_s >= 0.0]
 
 

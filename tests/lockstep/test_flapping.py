@@ -10,18 +10,16 @@ from __future__ import annotations
 import functools
 import random
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.failsafe import AGES_AVERAGED, Failsafe, Refusal, timing_of
 from services.planner.engagement import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.messages import Cause, Mode, PlannerMode, SimTruth
 from shared.scenario import Inject, Keyframe, Scenario
-from tests.joint.helpers import T0, command
+from tests.joint.helpers import T0
 from tools.runs.lockstep import Lockstep
 
 TICK_NS = 4 * NS_PER_MS
@@ -144,57 +142,7 @@ def test_random_cuts_make_at_most_six_drop_outs_in_any_minute(seed: int, share: 
         assert seventh - first >= 60 * NS_PER_S
 
 
-# ---- what a module does with ages that stray
-
-
-def fed(robot: RobotConfig, ages_ms: list[float], **changes: object) -> Failsafe:
-    """Return a failsafe that has taken commands of these ages, 4 ms apart."""
-    failsafe, timing = Failsafe(mode=Mode.TRACK), timing_of(robot)
-    for n, age_ms in enumerate(ages_ms):
-        now_ns = T0 + n * TICK_NS
-        sent = command(seq=n + 1, echo_t_ns=now_ns - round(age_ms * NS_PER_MS), **changes)
-        assert failsafe.offer(sent, now_ns, timing) is Refusal.NONE
-    return failsafe
-
-
-@pytest.mark.parametrize("age_ms", [0.0, 4.0, 24.0, 50.0])
-def test_a_steady_age_leaves_the_coupled_torque_whole_however_old(
-    age_ms: float, robot: RobotConfig
-) -> None:
-    assert fed(robot, [age_ms] * 100).coupled_share(timing_of(robot)) == 1.0
-
-
-@pytest.mark.parametrize(
-    ("spread_ms", "least", "most"), [(10.0, 1.0, 1.0), (15.0, 0.2, 0.8), (40.0, 0.0, 0.0)]
-)
-def test_the_coupled_torque_fades_as_ages_stray(
-    spread_ms: float, least: float, most: float, robot: RobotConfig
-) -> None:
-    """Evenly spread ages stray from their mean by a quarter of the spread."""
-    dice = random.Random(1)
-    shares = []
-    for _ in range(20):
-        ages = [dice.uniform(4.0, 4.0 + spread_ms) for _ in range(6 * AGES_AVERAGED)]
-        shares.append(fed(robot, ages).coupled_share(timing_of(robot)))
-    assert least <= float(np.median(shares)) <= most
-
-
-def test_steady_again_the_coupled_torque_comes_back(robot: RobotConfig) -> None:
-    failsafe = fed(robot, [4.0, 44.0] * 100 + [4.0] * 6 * AGES_AVERAGED)
-    assert failsafe.coupled_share(timing_of(robot)) == 1.0
-
-
-@given(ages=st.lists(st.floats(0.0, 50.0), min_size=1, max_size=80))
-def test_the_coupled_torque_is_never_more_than_was_sent(
-    robot: RobotConfig, ages: list[float]
-) -> None:
-    failsafe = fed(robot, ages, tau_coupled=(10.0, -10.0))
-    assert failsafe.command is not None
-    phi, theta = failsafe.command.tau_coupled
-    assert 0.0 <= phi == -theta <= 10.0
-
-
-# ---- both of it, in a robot
+# ---- in a robot
 
 
 def squats(seconds: float) -> tuple[Keyframe, ...]:

@@ -55,6 +55,5 @@ class Stand:
 
     def split(self, split: GainSplit) -> LocalGains:
         """Return the local gains that a split chooses here."""
-        K_q, B_q = self.gains()
         z, pitch = float(self.p[2]), float(self.p[4])
-        return split.split(K_q, B_q, z, pitch, self.T, self.hessian_O)
+        return split.split(self.gains, z, pitch, self.T, self.hessian_O)

@@ -34,10 +34,10 @@ def q(request: pytest.FixtureRequest, closed: Closed) -> Array:
 
 
 def torque(output: LawOutput, q: Array, v: Array = STILL) -> Array:
-    """Return what the joint services apply from a command that is not aged."""
+    """Return what the joint services apply from a command that is not aged, once it settles."""
     spring = output.local.D * (output.q_ref - q)
     damper = output.local.D_B * (output.v_ref - v)
-    return np.asarray(output.tau_ff + output.tau_coupled + spring + damper, float)
+    return np.asarray(output.tau_ff + output.tau_missing + spring + damper, float)
 
 
 def gravity(robot: RobotConfig, q: Array) -> Array:
@@ -128,11 +128,11 @@ def test_a_motion_in_the_open_directions_is_not_damped(
     assert np.abs(pull[[2, 4]]).max() < 0.1
 
 
-@pytest.mark.parametrize(("index", "share"), [(0, 0.06), (1, 0.06), (3, 0.25)])
-def test_a_displacement_in_x_y_or_roll_is_pushed_back_by_k_p(
-    robot: RobotConfig, law: Hocca, ik: InverseKinematics, q: Array, index: int, share: float
+@pytest.mark.parametrize("index", [0, 1, 3])
+def test_a_displacement_in_x_y_or_roll_is_pushed_back_by_k_p_or_more(
+    robot: RobotConfig, law: Hocca, ik: InverseKinematics, q: Array, index: int
 ) -> None:
-    """Within `share`: what K_0 adds along p, for T leaves the range of J."""
+    """More where the local gains alone are stiffer: the planner softens nothing."""
     law.tick(q, STILL, 0.0, DT, align=True)
     for _ in range(2 * round(robot.law.recentre_s / DT)):
         law._closed_loop_reference(DT)  # the reference has glided to zero
@@ -141,16 +141,33 @@ def test_a_displacement_in_x_y_or_roll_is_pushed_back_by_k_p(
     output = law.tick(q_moved, STILL, 0.0, DT)
     T = oracle.feasible(robot, q_moved)
     pull = T.T @ (torque(output, q_moved) - gravity(robot, q_moved))
-    assert pull[index] == pytest.approx(-robot.law.K_p[index] * by, rel=share)
+    assert pull[index] < -0.94 * robot.law.K_p[index] * by
 
 
-def test_a_motion_in_x_is_damped_by_b_p(robot: RobotConfig, law: Hocca, q: Array) -> None:
+def test_a_motion_in_x_is_damped_by_its_share_of_b_p(
+    robot: RobotConfig, law: Hocca, q: Array
+) -> None:
     law.tick(q, STILL, 0.0, DT, align=True)
     T = oracle.feasible(robot, q)
     v = T @ np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     output = law.tick(q, v, 0.0, DT)
     pull = T.T @ (torque(output, q, v) - gravity(robot, q))
-    assert pull[0] == pytest.approx(-robot.law.B_p[0] * 0.1, rel=0.06)
+    assert robot.gain_schedule is not None
+    share = robot.gain_schedule.coupling_damping
+    assert pull[0] == pytest.approx(-share * robot.law.B_p[0] * 0.1, rel=0.06)
+
+
+def test_coupled_torques_come_slowly_and_ease_at_once(
+    robot: RobotConfig, law: Hocca, ik: InverseKinematics, q: Array
+) -> None:
+    law.tick(q, STILL, 0.0, DT, align=True)
+    q_moved = moved(robot, ik, q, 1, 0.01)
+    first = law.tick(q_moved, STILL, 0.0, DT)
+    assert np.abs(first.tau_missing).max() > 1.0
+    assert np.abs(first.tau_coupled).max() < 0.05 * np.abs(first.tau_missing).max()
+    for _ in range(250):
+        output = law.tick(q_moved, STILL, 0.0, DT)
+    np.testing.assert_allclose(output.tau_coupled, output.tau_missing, atol=0.02)
 
 
 def test_align_makes_no_step(law: Hocca, closed: Closed) -> None:

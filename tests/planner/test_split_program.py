@@ -6,8 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner import split_program
+from services.planner import design_program, split_program
 from services.planner.certificate import Margins
+from services.planner.dynamic_certificate import DynamicCertificate
 from services.planner.inverse_kinematics import InverseKinematics
 from shared import gain_schedule
 from shared.config import RobotConfig
@@ -31,7 +32,13 @@ def progress() -> list[tuple[int, int]]:
 
 @pytest.fixture(scope="session")
 def solved(robot: RobotConfig, progress: list[tuple[int, int]]) -> GainSchedule:
-    return split_program.solve(robot, lambda done, total: progress.append((done, total)))
+    assert robot.gain_schedule is not None
+    return split_program.solve(
+        robot,
+        lambda done, total: progress.append((done, total)),
+        design=split_program.design_of(robot.gain_schedule),
+        check=False,
+    )
 
 
 @pytest.fixture(scope="module", params=NODES, ids=lambda n: f"node{n[0]}-{n[1]}")
@@ -159,3 +166,27 @@ def test_the_schedule_is_fresh_for_the_robot_it_was_made_for(
 ) -> None:
     fitting = msgspec.structs.replace(robot, gain_schedule=solved)
     assert gain_schedule.why_stale(fitting) == ""
+
+
+def test_the_shipped_damping_meets_the_dynamic_certificate_everywhere(robot: RobotConfig) -> None:
+    """Every pose, drivetrain, hand and delay of [robustness], with 6 dB and twice the delay."""
+    assert robot.gain_schedule is not None
+    nodes = split_program.dynamic_nodes(robot, robot.gain_schedule)
+    design_program.check(robot, nodes, split_program.design_of(robot.gain_schedule))
+
+
+def test_damping_that_shakes_the_rotors_is_refused_with_the_case(robot: RobotConfig) -> None:
+    assert robot.gain_schedule is not None
+    nodes = split_program.dynamic_nodes(robot, robot.gain_schedule)[:2]
+    stiff = split_program.design_of(robot.gain_schedule)._replace(D_B=(150.0,) * 6)
+    with pytest.raises(RunError, match=r"COM 0\.\d+ m.*grows by"):
+        design_program.check(robot, nodes, stiff)
+
+
+def test_the_search_starts_from_what_is_stable_and_ends_cheaper(robot: RobotConfig) -> None:
+    assert robot.gain_schedule is not None
+    nodes = split_program.dynamic_nodes(robot, robot.gain_schedule)
+    few = DynamicCertificate(design_program._rough(robot), design_program._few(nodes)[1:2])
+    found = design_program._descend(few, design_program.START, lambda _text: None)
+    assert few.worst_in_track(found).stable
+    assert design_program._cost(few, found) < design_program._cost(few, design_program.START)

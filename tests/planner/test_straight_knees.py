@@ -144,9 +144,9 @@ def test_the_local_gains_go_through_straight_knees_without_a_jump(
     for q in leaning.q:
         T = per_p(ik, q)
         hessian_F = ik.kinematics.hessian_times(WEIGHT, ASSIST).copy()
-        K_q, B_q = gain_law.gains(ik.kinematics, hessian_F)
+        body = gain_law.gains(ik.kinematics, hessian_F)
         p = ik.kinematics.p
-        local = splitting.split(K_q, B_q, float(p[2]), float(p[4]), T, hessian_F)
+        local = splitting.split(lambda body=body: body, float(p[2]), float(p[4]), T, hessian_F)
         D.append(local.D)
         D_B.append(local.D_B)
     for values, slope in ((D, 4000.0), (D_B, 400.0)):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from services.simulator.plant import PlantConfig
 from shared import topics
 from shared.config import RobotConfig
 from shared.exceptions import RunError
@@ -57,7 +58,7 @@ def test_moments_are_as_far_apart_as_asked_and_have_everybody_in_them(
 def test_gone_on_with_unchanged_it_comes_out_as_it_was(
     robot: RobotConfig, log: RunLog, moments: list[Moment], story: Scenario
 ) -> None:
-    fate = fate_of(Task(robot_of(log), story, moments[2], (), 1.5))
+    fate = fate_of(Task(robot_of(log), story, PlantConfig(), moments[2], (), 1.5))
     truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
     late = [row for row in truth if moments[2].at_s <= row.scenario_s < moments[2].at_s + 1.5]
     assert fate.stood
@@ -67,7 +68,7 @@ def test_gone_on_with_unchanged_it_comes_out_as_it_was(
 def test_a_kill_in_a_counterfactual_is_the_kill_in_a_run(
     robot: RobotConfig, log: RunLog, moments: list[Moment], story: Scenario
 ) -> None:
-    fate = fate_of(Task(robot_of(log), story, moments[2], ("planner",), 1.5))
+    fate = fate_of(Task(robot_of(log), story, PlantConfig(), moments[2], ("planner",), 1.5))
     killed = run(robot, still(2.5, height=1.1, push=story.push, kill=kill(moments[2].at_s + 1e-3)))
     after = killed.com_mm[killed.t >= moments[2].at_s]
     assert fate.stood
@@ -78,7 +79,9 @@ def test_a_kill_in_a_counterfactual_is_the_kill_in_a_run(
 def test_a_joint_service_can_die_in_it_too(
     log: RunLog, moments: list[Moment], story: Scenario
 ) -> None:
-    assert fate_of(Task(robot_of(log), story, moments[1], ("planner", "knee_left"), 2.0)).stood
+    assert fate_of(
+        Task(robot_of(log), story, PlantConfig(), moments[1], ("planner", "knee_left"), 2.0)
+    ).stood
 
 
 def test_a_fall_is_a_fall_there_as_well(

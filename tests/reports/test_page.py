@@ -29,7 +29,6 @@ PLOTS = {
     "The legs' disagreement, position": ("x", "y", "z"),
     "The legs' disagreement, angle": ("roll", "pitch", "yaw"),
     "Certificate margin": ("joint services alone", "drives alone"),
-    "Share of tau_coupled": ("given to all six",),
     "Torque of each module against its limit": MODULES,
     "Harness force": ("x", "y", "z"),
     "Harness moment": ("x", "y", "z"),
@@ -42,7 +41,7 @@ BARS = (
     "Harness sensor",
 )  # fmt: skip
 ORIGINS = {
-    "total, after the gate", "tau_ff", "tau_coupled, as used", "local PD",
+    "total, after the gate", "tau_ff", "tau_coupled", "local PD",
     "taken off by the service",
 }  # fmt: skip
 

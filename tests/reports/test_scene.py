@@ -168,7 +168,9 @@ def test_a_log_without_a_world_has_its_robot_stand_on_its_feet(
     for pose in poses[:: len(poses) // 20]:
         found = in_world(scene.frames(robot, pose))
         for side in SIDES:
-            assert np.abs(found[f"ankle_{side}"][0] - ankles[side]).max() < 0.01
+            assert (
+                np.abs(found[f"ankle_{side}"][0] - ankles[side]).max() < 0.015
+            )  # drivetrains stretch
             assert found[f"ankle_{side}"][1][2, 2] > 0.99
 
 

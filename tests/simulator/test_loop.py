@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from services.simulator.axis_bank import AxisBank
+from services.simulator.body import body_of
 from services.simulator.cansimple_front import CanSimpleFront
 from services.simulator.harness_front import HarnessFront
 from services.simulator.loop import Ports, SimulatorLoop
+from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared.cansimple import AxisState, ControlMode, InputMode
 from shared.config import RobotConfig
@@ -37,7 +39,7 @@ def make_loop(robot: RobotConfig, *faults: Fault) -> tuple[SimulatorLoop, World,
         keyframe=(Keyframe(at=0.0, height=robot.simulation.stand_height),),
         fault=faults,
     )
-    world = World(robot, stand)
+    world = World(body_of(robot, IDEAL), stand)
     bank = AxisBank(
         robot.drive,
         encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,

@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from services.simulator.operator import Operator
+from services.simulator.operator import Operator, Wearer
+from services.simulator.plant import IDEAL, Person
 from shared.config import RobotConfig
 from shared.scenario import Lead
 
@@ -15,7 +16,7 @@ LEVEL = Lead(height=1.1, height_rate=0.0, pitch=0.0, pitch_rate=0.0, assist=0.0)
 
 @pytest.fixture
 def operator(robot: RobotConfig) -> Operator:
-    return Operator(robot)
+    return Operator(robot.simulation.operator, robot.geometry.harness_point)
 
 
 def harness_height(robot: RobotConfig, height: float, pitch: float) -> float:
@@ -62,3 +63,28 @@ def test_the_hand_is_no_stronger_than_a_person(
     hand = robot.simulation.operator
     got = operator.force(LEVEL, 1.1 - sign * far, 0.0, -2 * sign * far, 0.0)
     assert got == (sign * hand.force_max, sign * hand.moment_max)
+
+
+def worn(person: Person, force: float, assist: float = 0.0, seconds: float = 5.0) -> Wearer:
+    wearer = Wearer(person)
+    for _ in range(round(seconds / 1e-3)):
+        wearer.step(1e-3, force, assist)
+    return wearer
+
+
+def test_a_person_gives_way_to_what_the_hand_meets_by_its_weight_on_springs() -> None:
+    person = Person(mass=80.0, leg_frequency_hz=2.5)
+    stiffness = 80.0 * (2.0 * math.pi * 2.5) ** 2
+    assert worn(person, -60.0).above == pytest.approx(60.0 / stiffness, rel=1e-3)
+    assert worn(person, 0.0).above == 0.0
+
+
+def test_a_person_without_a_mass_follows_the_path_exactly() -> None:
+    assert worn(IDEAL.person, 150.0).above == 0.0
+
+
+def test_weight_comes_later_and_less_than_what_was_asked_for() -> None:
+    person = Person(load_scale=0.9, load_lag_s=0.2)
+    assert worn(person, 0.0, 200.0, 0.2).load_n == pytest.approx(0.9 * 200.0 * 0.632, rel=0.01)
+    assert worn(person, 0.0, 200.0).load_n == pytest.approx(180.0, rel=1e-3)
+    assert worn(IDEAL.person, 0.0, 200.0, 1e-3).load_n == 200.0

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.simulator.body import body_of
+from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared.config import GRAVITY, RobotConfig
 from shared.joints import JOINTS, SIDES
@@ -28,7 +30,7 @@ STAND = Scenario(
 
 
 def world_of(robot: RobotConfig, **changes: object) -> World:
-    return World(robot, msgspec.structs.replace(STAND, **changes))
+    return World(body_of(robot, IDEAL), msgspec.structs.replace(STAND, **changes))
 
 
 def seen(world: World) -> SimTruth:
@@ -44,7 +46,8 @@ def powers(world: World, torque: Array) -> tuple[float, float]:
     """Return power at the joints and at the motors, W, at the present rates."""
     _, turns_per_s = world.motor_turns()
     at_motors = float(torque @ turns_per_s) * 2 * math.pi
-    return float(world._tau_from_motor @ torque @ world.data.qvel), at_motors
+    at_joints = world._actuation._tau_from_motor @ torque @ world.data.qvel[world._v_index]
+    return float(at_joints), at_motors
 
 
 def test_at_the_start_the_soles_lie_flat_on_the_floor(robot: RobotConfig) -> None:
@@ -257,7 +260,7 @@ def test_two_worlds_stepped_alike_are_the_same_to_the_bit(robot: RobotConfig) ->
     scenario = msgspec.structs.replace(
         STAND, hand=True, push=(Push(at=0.2, duration=0.1, force=(40.0, 10.0, 0.0)),)
     )
-    worlds = [World(robot, scenario) for _ in range(2)]
+    worlds = [World(body_of(robot, IDEAL), scenario) for _ in range(2)]
     torques = 0.5 * np.random.default_rng(3).normal(size=(2000, 12))
     for world in worlds:
         world.start()

@@ -12,7 +12,7 @@ The modules hand it to the drives unchanged until the next one comes. Pure.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 
@@ -21,7 +21,6 @@ from services.joint.differential import motor_torque
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.gate import diamond
 from services.joint.module import Module, Obstacle, Order, Step
-from services.planner.coherence import Coherence
 from services.planner.engagement import Engagement
 from services.planner.planner import Planner
 from shared.clock import NS_PER_MS
@@ -46,14 +45,6 @@ class LeadsOn(Engagement):
         return super().advance(now_ns, fresh, ready, modes, forbidden)
 
 
-class Undivided(Coherence):
-    """Gives all of tau_coupled however far apart the modules act: there are no local gains."""
-
-    def share(self, wanted: Iterable[float]) -> float:  # noqa: ARG002 - whatever they want
-        """Return 1."""
-        return 1.0
-
-
 class CentralPlanner(Planner):
     """The shipped planner, whose commands are whole torques."""
 
@@ -61,7 +52,6 @@ class CentralPlanner(Planner):
         """Take the robot and the session, as the shipped planner does."""
         super().__init__(config, session)
         self._engagement = LeadsOn()
-        self._coherence = Undivided()
 
     def tick(self, now_ns: int) -> list[JointCommand]:
         """Run the law; return six commands, `tau_ff` of which is all of a joint's torque."""

@@ -7,6 +7,7 @@ from typing import Final
 
 import msgspec
 
+from services.simulator.plant import PlantConfig
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.scenario import Scenario
@@ -35,9 +36,12 @@ class CentralisedLockstep(Lockstep):
         *,
         seed: int = 0,
         record: Record = forget,
+        plant: PlantConfig | None = None,
     ) -> None:
         """Put the robot on the hoist; arguments as for `Lockstep`."""
-        super().__init__(torques_only(config), scenario, network, seed=seed, record=record)
+        super().__init__(
+            torques_only(config), scenario, network, seed=seed, record=record, plant=plant
+        )
 
 
 SHIPPED: Final = "distributed"

@@ -6,6 +6,7 @@ from typing import Final
 
 import msgspec
 
+from services.simulator.plant import PlantConfig
 from shared.config import RobotConfig
 from shared.messages import SimTruth
 from shared.scenario import Kill, Scenario
@@ -21,6 +22,7 @@ class Task(msgspec.Struct, frozen=True):
 
     robot: RobotConfig
     story: Scenario
+    plant: PlantConfig
     moment: Moment
     kill: tuple[str, ...]
     for_s: float
@@ -58,7 +60,7 @@ def fate_of(task: Task) -> Fate:
     """Go on from the moment, and judge."""
     moment = task.moment
     story = story_from(task.story, moment.at_s, task.kill, task.for_s)
-    fleet = Lockstep(task.robot, story, BASE)
+    fleet = Lockstep(task.robot, story, BASE, plant=task.plant)
     fleet.go_on(moment.state, moment.modules, moment.planner)
     fell_at_s = None
     rows: list[SimTruth] = []

@@ -10,6 +10,7 @@ from typing import Final
 
 import msgspec
 
+from services.simulator.plant import PlantConfig
 from shared import topics
 from shared.bus import Session
 from shared.codec import Decoder
@@ -58,7 +59,15 @@ class Witness:
                 self.events.append((self._modules[sample[0]], event))
 
 
-def run_case(case: Case, robot: RobotConfig, out: Path, show: Show, *, seed: int = 0) -> Outcome:
+def run_case(
+    case: Case,
+    robot: RobotConfig,
+    out: Path,
+    show: Show,
+    *,
+    seed: int = 0,
+    true_plant: PlantConfig | None = None,
+) -> Outcome:
     """Run a case, a second time if the first was disturbed.
 
     Args:
@@ -67,6 +76,7 @@ def run_case(case: Case, robot: RobotConfig, out: Path, show: Show, *, seed: int
         out: the case's folder; made here.
         show: sees the run as it goes on.
         seed: of the sensors' noise.
+        true_plant: how the simulated robot differs from `robot`; None: the default.
     """
     begin_s = time.monotonic()
     tries = 0
@@ -74,7 +84,7 @@ def run_case(case: Case, robot: RobotConfig, out: Path, show: Show, *, seed: int
         tries += 1
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
-        outcome = _run_once(case, robot, out, show, seed)
+        outcome = _run_once(case, robot, out, show, seed, true_plant or PlantConfig())
         if outcome.in_real_time and outcome.verdict is not Verdict.UNJUDGED:
             break
     wall_s = time.monotonic() - begin_s
@@ -85,7 +95,9 @@ def run_case(case: Case, robot: RobotConfig, out: Path, show: Show, *, seed: int
     return outcome
 
 
-def _run_once(case: Case, robot: RobotConfig, out: Path, show: Show, seed: int) -> Outcome:
+def _run_once(
+    case: Case, robot: RobotConfig, out: Path, show: Show, seed: int, true_plant: PlantConfig
+) -> Outcome:
     story = story_of(case)
     down = {row.service for row in story.kill}
 
@@ -105,6 +117,7 @@ def _run_once(case: Case, robot: RobotConfig, out: Path, show: Show, seed: int) 
             lead,
             verb="crash",
             seed=seed,
+            true_plant=true_plant,
             no_restart=down,
         )
     except (RunError, FleetError) as error:

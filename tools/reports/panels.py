@@ -216,16 +216,6 @@ def add_certificate(source: Source, sheet: Sheet) -> None:
         note="What stands if the planner is gone: 1 is the stiffness required, 0 is a fall.",
         otherwise=NO_PLANNER,
     )  # fmt: skip
-    mode, share = source.columns(topics.PLANNER_STATUS, "", "mode", "coupled_share")
-    share[mode != PlannerMode.LEADING] = np.nan
-    sheet.plot(
-        "Share of tau_coupled", "",
-        [Line("given to all six", t, share, 0)],
-        limits=[Limit(0.0, "none"), Limit(1.0, "all")],
-        note="Less where the modules act on commands of unsteady or unlike ages, while led; what "
-        "it does not hold, stiffer local gains do.",
-        otherwise=NO_PLANNER,
-    )  # fmt: skip
 
 
 def _truth(source: Source, *names: str) -> list[Array]:

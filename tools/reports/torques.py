@@ -97,7 +97,6 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
     found = Origins(*(np.full(shape, np.nan) for _ in range(4)))
     blend_ns = robot.joint_service.blend_ms * NS_PER_MS
     aging_max_s = robot.joint_service.command_aging_max_ms / 1e3
-    stiffest = robot.hold_gains(module)
     tracking_since_ns: int | None = None
     for index, state in enumerate(states):
         if state.mode != Mode.TRACK:
@@ -109,8 +108,7 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
         if command is None or state.t_ns - tracking_since_ns < blend_ns or state.age_ns < 0:
             continue
         age_s = min(state.age_ns / NS_PER_S, aging_max_s)
-        share = state.coupled_used
-        used = law.stiffened(law.aged(command, age_s, share), *stiffest, 1.0 - share)
+        used = law.aged(command, age_s)
         found.feedforward[index] = used.tau_ff
         found.coupled[index] = used.tau_coupled
         found.local[index] = law.torque(used, state.q, state.v)
@@ -125,7 +123,7 @@ def _torques(t: Array, tau: Array, found: Origins | None, axis: int) -> list[Lin
     if found is not None:
         lines += [
             Line("tau_ff", t, found.feedforward[:, axis], 1),
-            Line("tau_coupled, as used", t, found.coupled[:, axis], 2),
+            Line("tau_coupled", t, found.coupled[:, axis], 2),
             Line("local PD", t, found.local[:, axis], 3),
             Line("taken off by the service", t, found.taken_off[:, axis], 5, hidden=True),
         ]

@@ -13,6 +13,8 @@ from typing import TypeVar, get_args, get_type_hints
 
 import msgspec
 
+from services.simulator import plant
+from services.simulator.plant import NAMED, PlantConfig
 from shared import config_file, gain_schedule, scenario
 from shared.config import SERVICES, RobotConfig
 from shared.config_sections import LawConfig
@@ -26,6 +28,9 @@ from tools.verbs import add_config
 E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
 
 SCENARIOS = DEFAULT_CONFIG.parent / "scenarios"
+
+PLANT_FILE = "plant.toml"
+"""Name of the plant among a run's results and in its log."""
 
 UNJUDGED = ("simulator", "recorder")
 """A run cannot be judged without their part of it."""
@@ -91,6 +96,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "scenario time; `xrl inject --help` explains each word, and which of several counts; "
         "replaces the scenario's; may be repeated",
     )
+    add_plant(parser)
     parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
     parser.add_argument(
         "--jacobian",
@@ -103,6 +109,19 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         help="of the sensors' noise, and of what the network loses and how late it is",
+    )
+
+
+def add_plant(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that says how the simulated robot differs from its robot file."""
+    parser.add_argument(
+        "--plant",
+        action="append",
+        default=[],
+        metavar="NAME|FILE|KEY=VALUE",
+        help=f"the true robot: {', '.join(NAMED)} (default: realistic), a TOML file, or one value "
+        "such as drivetrain.stiffness=5000 or floor.slope=[0.03,0.0]; may be repeated, each laid "
+        "over those before; no controller sees it (deploy/plants/README.md)",
     )
 
 
@@ -268,17 +287,21 @@ def make_out(out: Path | None, verb: str) -> Path:
     return out
 
 
-def write_inputs(out: Path, robot: RobotConfig, story: Scenario) -> tuple[Path, ...]:
+def write_inputs(
+    out: Path, robot: RobotConfig, story: Scenario, true_plant: PlantConfig
+) -> tuple[Path, ...]:
     """Write what the run is made from beside its results.
 
     Returns:
-        The files: robot, scenario and, if the robot has one, its gain schedule.
+        The files: robot, scenario, plant and, if the robot has one, its gain schedule.
     """
     robot_path, scenario_path = out / "robot.toml", out / "scenario.toml"
+    plant_path = out / PLANT_FILE
+    plant_path.write_text(plant.to_toml(true_plant), encoding="utf-8")
     robot_path.write_text(config_file.to_toml(robot), encoding="utf-8")
     scenario_path.write_text(scenario.to_toml(story), encoding="utf-8")
     if robot.gain_schedule is None:
-        return robot_path, scenario_path
+        return robot_path, scenario_path, plant_path
     schedule_path = gain_schedule.path_beside(robot_path)
     gain_schedule.write(schedule_path, robot.gain_schedule)
-    return robot_path, scenario_path, schedule_path
+    return robot_path, scenario_path, plant_path, schedule_path

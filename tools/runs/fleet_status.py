@@ -85,8 +85,6 @@ class LeadStatus(msgspec.Struct, frozen=True):
     """Name of its `PlannerMode`."""
     wait_s: float
     """Until it may lead again after drop-outs, s."""
-    coupled_share: float
-    """How much of tau_coupled the modules are to use, 0 .. 1."""
     margin: float
     """Failsafe certificate of the gains; 1 is what is required."""
 
@@ -234,7 +232,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
     if not isinstance(message, PlannerStatus):
         return None
     mode = PlannerMode(message.mode).name
-    return LeadStatus(mode, message.wait_s, message.coupled_share, message.margin)
+    return LeadStatus(mode, message.wait_s, message.margin)
 
 
 def _listen(

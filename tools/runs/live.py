@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from services.simulator.plant import PlantConfig
 from shared.bus import Session, open_session
 from shared.config import RobotConfig
 from shared.robot_model import mjcf
 from shared.scenario import Scenario
 from tools.runs import experiment
+from tools.runs.experiment import PLANT_FILE
 from tools.supervision.supervise import Fleet
 
 T = TypeVar("T")
@@ -26,6 +28,7 @@ def run_live(
     *,
     verb: str,
     seed: int,
+    true_plant: PlantConfig,
     no_restart: Collection[str],
 ) -> T:
     """Start a fleet, have it led, stop it; return what `lead` returns.
@@ -39,12 +42,15 @@ def run_live(
         lead: leads the run; it is given the fleet and a session on its bus.
         verb: of the command line; names the run directory and the session.
         seed: of the sensors' noise.
+        true_plant: how the simulated robot differs from `robot`.
         no_restart: services that the supervisor leaves down when they end.
 
     Raises:
         FleetError: the fleet cannot be started or stopped.
     """
-    robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, story)
+    robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
+        out, robot, story, true_plant
+    )
     model_path = out / "model.xml"
     model_path.write_text(mjcf(robot), encoding="utf-8")
     run_dir = Path(tempfile.mkdtemp(prefix=f"xrl-{verb}-", dir="/tmp"))
@@ -53,8 +59,14 @@ def run_live(
             robot_path.absolute(),
             run_dir,
             overrides={
-                "recorder": _recorder_arguments(out, story, scenario_path, model_path),
-                "simulator": ["--scenario", str(scenario_path.absolute()), "--seed", str(seed)],
+                "recorder": _recorder_arguments(
+                    out, story, scenario_path, {"model.xml": model_path, PLANT_FILE: plant_path}
+                ),
+                "simulator": [
+                    *("--scenario", str(scenario_path.absolute())),
+                    *("--plant", str(plant_path.absolute())),
+                    *("--seed", str(seed)),
+                ],
                 **({"injector": ["--seed", str(seed)]} if story.inject else {}),
             },
             no_restart=frozenset(no_restart),
@@ -74,7 +86,7 @@ def run_live(
 
 
 def _recorder_arguments(
-    out: Path, story: Scenario, scenario_path: Path, model_path: Path
+    out: Path, story: Scenario, scenario_path: Path, attached: Mapping[str, Path]
 ) -> list[str]:
     return [
         "--out",
@@ -83,6 +95,9 @@ def _recorder_arguments(
         str(scenario_path.absolute()),
         "--scenario-text",
         story.name,
-        "--attach",
-        f"model.xml={model_path.absolute()}",
+        *(
+            word
+            for name, path in attached.items()
+            for word in ("--attach", f"{name}={path.absolute()}")
+        ),
     ]

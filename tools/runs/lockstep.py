@@ -18,7 +18,9 @@ from services.planner.memory import TickMemory
 from services.planner.planner import Planner
 from services.planner.remembrance import Remembrance
 from services.simulator.axis_bank import AxisBank
+from services.simulator.body import body_of
 from services.simulator.fault_injector import FaultInjector
+from services.simulator.plant import PlantConfig
 from services.simulator.state import restored, taken
 from services.simulator.world import World
 from shared import topics
@@ -75,11 +77,12 @@ class Lockstep:
         seed: int = 0,
         record: Record = forget,
         clocks: Mapping[str, HostClock] | None = None,
+        plant: PlantConfig | None = None,
     ) -> None:
         """Put the robot on the hoist, drives idle.
 
         Args:
-            config: the robot.
+            config: the robot as its controllers take it to be.
             scenario: what happens; kills and restarts of the planner and, with the onboard
                 loop, of joint services.
             network: what every link does by itself, each way; None is 1 ms. What the
@@ -87,6 +90,7 @@ class Lockstep:
             seed: of the network and of the harness sensor's noise.
             record: takes every message.
             clocks: by service, of a host whose clock is not virtual time; not the simulator's.
+            plant: how the true robot differs from `config`; None: the realistic default.
 
         Raises:
             RunError: the scenario kills what has no process here.
@@ -101,7 +105,8 @@ class Lockstep:
                 )
         self.config = config
         self.scenario = scenario
-        self.world = World(config, scenario)
+        self.plant = plant or PlantConfig()
+        self.world = World(body_of(config, self.plant), scenario)
         self._modules = [self.module_type(config, module) for module in MODULES]
         self._traces = self.traced and record is not forget
         self._tracers = [Tracer(module) for module in self._modules]

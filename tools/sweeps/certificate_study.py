@@ -29,6 +29,8 @@ from services.planner.certificate import Certificate, Weakest
 from services.planner.gains import GainLaw
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
+from services.simulator.body import body_of
+from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared.config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
@@ -255,7 +257,7 @@ def world_of(robot: RobotConfig, case: Case, nudge_share: float, *, rigid: bool)
         hand=False,
         push=(Push(at=NUDGE_AT, duration=NUDGE_S, force=force),),
     )
-    world = World(with_payload(robot, posture.payload), scenario)
+    world = World(body_of(with_payload(robot, posture.payload), IDEAL), scenario)
     if rigid:
         world.model.geom_solref[:, 0] = RIGID_STEPS * world.timestep
     world.stand_at(posture.q)

@@ -12,10 +12,10 @@ from rich.console import Console
 from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
-from tools.sweeps import cases, picture, report, study
+from tools.sweeps import cases, picture, plants, report, study
 from tools.sweeps.cases import Case
 from tools.sweeps.figures import ENDINGS, Ending
-from tools.sweeps.outcome import Outcome, run_case
+from tools.sweeps.outcome import Outcome, plant_of, run_case
 from tools.sweeps.prepare import needs_schedule, prepare
 from tools.sweeps.record import run_alone
 from tools.sweeps.table import Table, code_digest, code_of
@@ -122,6 +122,7 @@ def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> 
         args.out,
         {"lockstep": words},
         console,
+        plant_of(case),
     )
 
 
@@ -146,6 +147,7 @@ def _inputs(seed: int, robot: RobotConfig) -> dict[str, str]:
         "study": "kill",
         "seed": str(seed),
         "robot": study.digest_of(robot),
+        "ranges": plants.digest(),
         "code": code_digest(CODE),
     }
 

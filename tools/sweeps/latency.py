@@ -16,7 +16,7 @@ from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from shared.toml_file import check_ranges
 from tools.runs import experiment
-from tools.sweeps import latency_picture, latency_report, study
+from tools.sweeps import latency_picture, latency_report, plants, study
 from tools.sweeps.figures import ENDINGS, Ending
 from tools.sweeps.latency_trial import (
     CONTROLS,
@@ -25,6 +25,7 @@ from tools.sweeps.latency_trial import (
     Outcome,
     Trial,
     plain,
+    plant_of,
     robot_of,
     run_trial,
 )
@@ -207,7 +208,13 @@ def _run_one(
     study.show(f"Trial {trial.number}", row_of(trial), console)
     facts = {"lockstep": f"{_command(args)} --only {trial.number}", "control": trial.control}
     return run_alone(
-        partial(run_trial, trial, robot), trial.story(robot), robot, args.out, facts, console
+        partial(run_trial, trial, robot),
+        trial.story(robot),
+        robot,
+        args.out,
+        facts,
+        console,
+        plant_of(trial),
     )
 
 
@@ -252,6 +259,7 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
         "loss": _joined(args.loss),
         "control": ",".join(args.control),
         "robot": study.digest_of(robot),
+        "ranges": plants.digest(),
         "code": code_digest(CODE),
     }
 

@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from services.simulator.plant import PlantConfig
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.impairment import Impairment
@@ -34,6 +35,7 @@ from shared.scenario import Inject, Keyframe, Push, Scenario
 from shared.topics import Topic
 from tools.centralised.fleet import CentralisedLockstep
 from tools.runs.lockstep import Lockstep, Record
+from tools.sweeps import plants
 from tools.sweeps.figures import (
     Ended,
     Ending,
@@ -214,7 +216,19 @@ def fleet_of(trial: Trial, robot: RobotConfig, record: Record) -> Lockstep:
     """
     fleet_type = CONTROLS[trial.control].fleet
     seed = trial.draw.fleet_seed
-    return fleet_type(robot, trial.story(robot), Impairment(), seed=seed, record=record)
+    return fleet_type(
+        robot,
+        trial.story(robot),
+        Impairment(),
+        seed=seed,
+        record=record,
+        plant=plant_of(trial),
+    )
+
+
+def plant_of(trial: Trial) -> PlantConfig:
+    """Return the trial's true robot: all errors drawn, the same for each control."""
+    return plants.draw(f"latency {trial.draw.fleet_seed}")
 
 
 def run_trial(

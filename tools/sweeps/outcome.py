@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from services.simulator.plant import PlantConfig
 from services.simulator.world import World
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
@@ -19,6 +20,7 @@ from shared.messages import (
 )
 from shared.topics import Topic
 from tools.runs.lockstep import Lockstep, Record
+from tools.sweeps import plants
 from tools.sweeps.cases import Case, network_of, story_of
 from tools.sweeps.figures import (
     Ended,
@@ -88,6 +90,11 @@ class Ear:
             self._on_to(topic, module, message)
 
 
+def plant_of(case: Case) -> PlantConfig:
+    """Return the case's true robot: all errors drawn."""
+    return plants.draw(f"kill {case.seed} {case.number}")
+
+
 def run_case(
     case: Case,
     robot: RobotConfig,
@@ -106,7 +113,14 @@ def run_case(
         after_fall_s: how long to go on after a fall; what is measured ends with it.
     """
     ear = Ear(record)
-    fleet = Lockstep(robot, story_of(robot, case), network_of(case), seed=case.number, record=ear)
+    fleet = Lockstep(
+        robot,
+        story_of(robot, case),
+        network_of(case),
+        seed=case.number,
+        record=ear,
+        plant=plant_of(case),
+    )
     feet = FootLoads(fleet.world)
     rows: list[SimTruth] = []
     loads: list[float] = []

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from services.recorder import provenance
 from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
+from services.simulator.plant import PlantConfig
 from shared import topics
 from shared.config import RobotConfig
 from shared.messages import SimTruth
@@ -52,6 +53,7 @@ def run_alone(
     out: Path | None,
     facts: dict[str, str],
     console: Console,
+    true_plant: PlantConfig,
 ) -> int:
     """Run a case under a progress bar and print its figures.
 
@@ -62,6 +64,7 @@ def run_alone(
         out: folder for its log; None: no log.
         facts: for the log, as for `record_run`.
         console: to print on.
+        true_plant: that `run` simulates.
 
     Returns:
         0 if the robot stood, else 1.
@@ -86,6 +89,7 @@ def run_alone(
                 facts,
                 lambda record, look: run(record=record, watch=look, after_fall_s=AFTER_FALL_S),
                 watch,
+                true_plant,
             )
     study.show("Measured", msgspec.structs.asdict(outcome), console)
     if out is not None:
@@ -101,6 +105,7 @@ def record_run(
     facts: dict[str, str],
     run: Callable[[Record, Watch], Outcome],
     watch: Watch,
+    true_plant: PlantConfig,
 ) -> tuple[Outcome, Summary]:
     """Run a case into `run.mcap`, with `summary.json` and `run.png` beside it.
 
@@ -111,6 +116,7 @@ def record_run(
         facts: for the log, beside robot and scenario: `lockstep` with the command, at least.
         run: runs the case; it is given who takes every message, and who sees the world.
         watch: sees the world at its rate.
+        true_plant: that `run` simulates.
 
     Returns:
         What `run` returned, and the log's summary.
@@ -118,7 +124,7 @@ def record_run(
     Raises:
         RunError: the log cannot be written, or holds nothing to judge.
     """
-    inputs = experiment.write_inputs(out, robot, story)
+    inputs = experiment.write_inputs(out, robot, story, true_plant)
     outbox = Outbox(robot.name)
     recorded = {key: topic for key, topic in topics.all_keys(robot.name).items() if topic.recorded}
     run_facts = {

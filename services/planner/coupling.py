@@ -1,0 +1,115 @@
+"""The coupled torque: what the planner adds to the local gains, low-passed. Pure.
+
+Local gains stand alone with K_fail = T^T D T + K_geo (`services.planner.certificate`) and damp
+with T^T D_B T. Of the body's K_p and B_p (paper, section IV) that leaves, in the closed rows of p,
+
+    K_c = (K_p - K_fail)+        B_c = (c B_p - T^T D_B T)+        c: `coupling_damping`
+
+(.)+ keeps the positive part: the planner only ever adds stiffness and damping. It asks for
+
+    tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot)] }
+
+through two poles at `coupling_bandwidth_hz`. The feedback is some milliseconds old and meets the
+bare rotors of a flexible drivetrain: unfiltered, the robot shook below 40 000 N m/rad and fell.
+Which bandwidth and damping are safe is computed (`services.planner.dynamic_certificate`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.joints import N_JOINTS
+
+Array = NDArray[np.float64]
+
+
+LEAST = 1e-9
+"""Of a body's gain: a smaller one is none."""
+
+
+class Missing:
+    """K_c and B_c: what local gains lack of the body's stiffness and damping."""
+
+    def __init__(self, K_p: Array, B_p: Array, S: Array, damping: float) -> None:
+        """Take the body's gains.
+
+        Args:
+            K_p: (6,) N/m and N m/rad.
+            B_p: (6,) N s/m and N m s/rad.
+            S: (6,), 1 where the person leads: nothing is added there.
+            damping: c, in shares of B_p.
+        """
+        self._closed = np.flatnonzero(S == 0.0)
+        self._rows = np.ix_(self._closed, self._closed)
+        self._K_p, self._B_p = K_p[self._closed], damping * B_p[self._closed]
+        self._K_scale, self._B_scale = (
+            np.sqrt(np.where(diagonal > LEAST, diagonal, 1.0))
+            for diagonal in (self._K_p, self._B_p)
+        )
+
+    def at(self, K_fail: Array, B_local: Array) -> tuple[Array, Array]:
+        """Return K_c and B_c (6, 6), symmetric and not negative.
+
+        Args:
+            K_fail: stiffness that the local gains leave, along p (6, 6).
+            B_local: T^T D_B T (6, 6).
+        """
+        K_c, B_c = np.zeros((6, 6)), np.zeros((6, 6))
+        K_c[self._rows] = _positive_part(np.diag(self._K_p) - K_fail[self._rows], self._K_scale)
+        B_c[self._rows] = _positive_part(np.diag(self._B_p) - B_local[self._rows], self._B_scale)
+        return K_c, B_c
+
+
+def _scale(diagonal: Array) -> Array:
+    return np.asarray(np.sqrt(np.where(diagonal > LEAST, diagonal, 1.0)), float)
+
+
+def _positive_part(A: Array, scale: Array) -> Array:
+    """Return A without its negative directions; `scale` makes metres and radians comparable."""
+    scaled = A / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    kept = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return np.asarray(np.outer(scale, scale) * kept, float)
+
+
+def follow(bandwidth_hz: float, dt: float) -> float:
+    """Return how far a pole of this bandwidth goes towards its input in dt (s), 0 .. 1."""
+    return 1.0 - math.exp(-2.0 * math.pi * bandwidth_hz * dt)
+
+
+class CouplingFilter:
+    """Two equal poles."""
+
+    def __init__(self, bandwidth_hz: float) -> None:
+        """Start at rest."""
+        self._bandwidth_hz = bandwidth_hz
+        self._first: Array = np.zeros(N_JOINTS)
+        self._second: Array = np.zeros(N_JOINTS)
+
+    def advance(self, tau: Array, dt: float) -> Array:
+        """Return the filtered torque (12,), N m.
+
+        Args:
+            tau: unfiltered (12,), N m.
+            dt: since the last tick, s.
+        """
+        share = follow(self._bandwidth_hz, dt)
+        self._first += share * (tau - self._first)
+        self._second += share * (self._first - self._second)
+        return self._second.copy()
+
+    def reset(self) -> None:
+        """Forget what was asked for."""
+        self._first[:] = 0.0
+        self._second[:] = 0.0
+
+    def remember(self) -> tuple[float, ...]:
+        """Return both poles' states (24,), N m."""
+        return (*self._first.tolist(), *self._second.tolist())
+
+    def recall(self, state: tuple[float, ...]) -> None:
+        """Go on from a state that `remember` returned."""
+        self._first[:], self._second[:] = state[:N_JOINTS], state[N_JOINTS:]

@@ -1,0 +1,314 @@
+"""The dynamic certificate: does the sampled-data loop stand on joints that flex? Offline and pure.
+
+Beside the static certificate (`services.planner.certificate`), which asks for stiffness, this asks
+that no motion of `services.planner.sampled_loop` grows: at every pose of the schedule, for every
+drivetrain from `robustness.stiffness`, hand and delay of the robot file,
+
+- with every feedback torque, and with tau_coupled alone, `gain_margin` times what it is;
+- with `delay_margin` times the delay;
+- in HOLD with the services, and with the drives alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner.certificate import motor_mean
+from services.planner.coupling import Missing
+from services.planner.model import BodyInertia
+from services.planner.poses import Poses
+from services.planner.sampled_loop import (
+    NO_HAND,
+    NOMINAL,
+    Drivetrain,
+    Feedback,
+    Gains,
+    Growth,
+    Hand,
+    SampledLoop,
+    Stand,
+    Timing,
+    halves,
+)
+from services.planner.split import CouplingGains
+from shared.config import RobotConfig
+from shared.joints import MODULES
+
+Array = NDArray[np.float64]
+
+LEAST_DELAY_S: Final = 2e-3
+"""From a sample to the first use of its command, over a bus of no delay."""
+DRIVE_STEP_S: Final = 1e-3
+"""The drives' loop is taken as slow as the simulated one; the firmware's 8 kHz is kinder."""
+DRIFT_HZ: Final = 0.05
+"""Slower than this it is no oscillation: the person who leads is part of it."""
+HALF_NAMES: Final = ("fore and aft", "sideways")
+
+
+class Design(NamedTuple):
+    """What is chosen by this certificate, one set for all poses."""
+
+    D_B: tuple[float, ...]
+    """(6,) local damping of a leg, N m s/rad."""
+    coupling: CouplingGains
+
+
+class Node(NamedTuple):
+    """A pose of the schedule with its local stiffness."""
+
+    z: float
+    pitch: float
+    stand: Stand
+    D: Array
+    """(12,) N m/rad"""
+
+
+class Condition(NamedTuple):
+    """One case that the loop has to fade in."""
+
+    mode: str
+    """TRACK, HOLD, or drives alone."""
+    node: Node
+    half: int
+    stiffness: float
+    delay_s: float
+    hand: Hand
+    gains: Gains
+
+    def words(self) -> str:
+        """Return the case in words."""
+        parts = [
+            f"{self.mode}, COM {self.node.z:.2f} m, pitch {self.node.pitch:.1f} rad",
+            f"k = {self.stiffness:g} N m/rad",
+            f"{1e3 * self.delay_s:g} ms",
+        ]
+        if self.hand != NO_HAND:
+            parts.append(f"hand {self.hand.k_z:g} N/m")
+        if self.gains.coupling != 1.0:
+            parts.append(f"tau_coupled x{self.gains.coupling:g}")
+        if self.gains.torque != 1.0:
+            parts.append(f"all feedback x{self.gains.torque:g}")
+        return f"{HALF_NAMES[self.half]}: " + ", ".join(parts)
+
+
+class Verdict(NamedTuple):
+    """The worst case that was found."""
+
+    growth: Growth
+    condition: Condition
+    excess: float
+    """1/s: the rate, less what is allowed of a drift."""
+
+    @property
+    def stable(self) -> bool:
+        """True if it fades, or is no more than a drift where the person leads."""
+        return self.excess < 0.0
+
+    def words(self) -> str:
+        """Return the case and what happens in it, in words."""
+        g = self.growth
+        what = "grows" if g.rate > 0.0 else "fades"
+        return f"{self.condition.words()}: {what} by {abs(g.rate):.2f}/s at {g.frequency_hz:.1f} Hz"
+
+
+def nodes_of(
+    config: RobotConfig, D_at: Callable[[float, float], Array], heights: Array, pitches: Array
+) -> list[Node]:
+    """Return the poses that can be reached, linearised, without and with the full assist.
+
+    Args:
+        config: the robot.
+        D_at: local stiffness (12,) of a COM height (m) and a pitch (rad).
+        heights: of the COM, m.
+        pitches: of the torso, rad.
+    """
+    poses, inertia = Poses(config), BodyInertia(config)
+    S = np.array(config.law.S, float)
+    found = []
+    for z in heights:
+        for pitch in pitches:
+            node = poses.node(float(z), float(pitch))
+            if node is None:
+                continue
+            M = inertia.at(poses.q, node.T)
+            kinematics = poses.kinematics
+            for hessian in node.hessians:
+                K_geo = node.T.T @ hessian @ node.T
+                stand = Stand(
+                    M,
+                    0.5 * (K_geo + K_geo.T),
+                    node.T,
+                    kinematics.J.copy(),
+                    kinematics.J_harness.copy(),
+                    hessian,
+                    S,
+                )
+                found.append(Node(float(z), float(pitch), stand, D_at(float(z), float(pitch))))
+    return found
+
+
+class DynamicCertificate:
+    """The conditions of a robot, and the loop in each of them."""
+
+    def __init__(self, config: RobotConfig, nodes: list[Node]) -> None:
+        """Take the robot and its poses."""
+        self._config = config
+        self._nodes = nodes
+        law, wanted = config.law, config.robustness
+        self._wanted = wanted
+        S = np.array(law.S, float)
+        self._K_p, self._B_p = (np.array(gain) * (1.0 - S) for gain in (law.K_p, law.B_p))
+        self._S = S
+        self._hands = [Hand(*hand) for hand in wanted.hands]
+        self._halves = halves()
+        self._hold = _hold_gains(config)
+
+    def feedback(self, node: Node, design: Design) -> Feedback:
+        """Return what services and planner do in TRACK at a pose."""
+        T, J = node.stand.T, node.stand.J
+        D_B = np.tile(design.D_B, 2)
+        missing = Missing(self._K_p, self._B_p, self._S, design.coupling.damping)
+        K_fail = T.T @ (node.D[:, np.newaxis] * T) + node.stand.K_geo
+        K_c, B_c = missing.at(K_fail, (T.T * D_B) @ T)
+        # tau_coupled = C_q e_q + C_v e_v, with J e_q = p_ref - p in the closed rows
+        return Feedback(
+            node.D,
+            D_B,
+            J.T @ K_c @ J,
+            J.T @ B_c @ J,
+            design.coupling.bandwidth_hz,
+            self._config.law.lead_easing,
+            self._config.harness.low_pass_hz,
+        )
+
+    def held(self, node: Node, design: Design, *, onboard: bool) -> Feedback:
+        """Return what holds in HOLD, by the services or by the drives alone."""
+        k_p, k_d = self._hold
+        D, D_B = np.maximum(node.D, k_p), np.maximum(np.tile(design.D_B, 2), k_d)
+        if onboard:
+            D, D_B = motor_mean(D), motor_mean(D_B)
+        nothing = np.zeros((len(D), len(D)))
+        return Feedback(D, D_B, nothing, nothing, 1.0)
+
+    def loop(self, condition: Condition, design: Design) -> SampledLoop:
+        """Return the loop of a condition."""
+        c = condition
+        stand, half = c.node.stand, self._halves[c.half]
+        if c.mode == "TRACK":
+            feedback = self.feedback(c.node, design)
+        else:
+            feedback = self.held(c.node, design, onboard=c.mode == "drives alone")
+            stand = stand._replace(S=np.zeros(6))
+        drivetrain, timing = self._drivetrain(c.stiffness), self._timing(c.delay_s)
+        return SampledLoop(stand, half, feedback, drivetrain, timing, c.hand)
+
+    def conditions(self, *, margins: bool = True) -> Iterator[Condition]:
+        """Yield every condition; without margins only as it is meant to run."""
+        yield from self._cases(self._in_track, margins=margins)
+        yield from self._cases(self._in_hold, margins=margins)
+
+    def worst(self, design: Design, *, margins: bool = True) -> Verdict:
+        """Return the condition that fades most slowly."""
+        return self._worst(self.conditions(margins=margins), design, np.inf)
+
+    def worst_in_track(
+        self, design: Design, *, margins: bool = True, enough: float = np.inf
+    ) -> Verdict:
+        """Return the worst while the planner leads; stop at the first above `enough`, 1/s."""
+        return self._worst(self._cases(self._in_track, margins=margins), design, enough)
+
+    def worst_in_hold(self, design: Design, *, margins: bool = True) -> Verdict:
+        """Return the worst without a planner, with the services and with the drives alone."""
+        return self._worst(self._cases(self._in_hold, margins=margins), design, np.inf)
+
+    def led(self, stiffness: float) -> Iterator[Condition]:
+        """Yield the upright poses without a hand, at the least and at the designed delay."""
+        for node in self._nodes:
+            if node.pitch == 0.0:
+                for delay in (LEAST_DELAY_S, self._wanted.delay_ms / 1e3):
+                    yield Condition("TRACK", node, 0, stiffness, delay, NO_HAND, NOMINAL)
+
+    def sway(self, design: Design) -> float:
+        """Return the rate (1/s, negative) of the oscillation that fades most slowly in TRACK."""
+        cases = self._cases(self._in_track, margins=False)
+        return max(self.loop(c, design).growth(c.gains, DRIFT_HZ).rate for c in cases)
+
+    def judge(self, condition: Condition, design: Design) -> Verdict:
+        """Return what the loop does in a condition."""
+        growth = self.loop(condition, design).growth(condition.gains)
+        drifts = condition.half == 0 and growth.frequency_hz < DRIFT_HZ
+        allowed = self._wanted.drift_max if drifts and condition.mode == "TRACK" else 0.0
+        return Verdict(growth, condition, growth.rate - allowed)
+
+    def _worst(self, conditions: Iterable[Condition], design: Design, enough: float) -> Verdict:
+        worst: Verdict | None = None
+        for condition in conditions:
+            verdict = self.judge(condition, design)
+            if worst is None or verdict.excess > worst.excess:
+                worst = verdict
+                if verdict.excess > enough:
+                    break
+        assert worst is not None  # noqa: S101 - there is always a pose
+        return worst
+
+    def _cases(
+        self, cases_of: Callable[..., Iterator[Condition]], *, margins: bool
+    ) -> Iterator[Condition]:
+        for node in self._nodes:
+            for stiffness in self._wanted.stiffness:
+                for half in range(len(self._halves)):
+                    yield from cases_of(node, stiffness, half, margins=margins)
+
+    def _in_track(
+        self, node: Node, stiffness: float, half: int, *, margins: bool
+    ) -> Iterator[Condition]:
+        wanted = self._wanted
+        delay = wanted.delay_ms / 1e3
+        hands = self._hands if half == 0 else self._hands[:1]
+        for hand in hands:
+            case = Condition("TRACK", node, half, stiffness, LEAST_DELAY_S, hand, NOMINAL)
+            yield case
+            yield case._replace(delay_s=delay)
+            if margins:
+                yield case._replace(delay_s=wanted.delay_margin * delay)
+                yield case._replace(delay_s=delay, gains=Gains(coupling=wanted.gain_margin))
+                yield case._replace(gains=Gains(torque=wanted.gain_margin))
+                yield case._replace(delay_s=delay, gains=Gains(torque=wanted.gain_margin))
+
+    def _in_hold(
+        self, node: Node, stiffness: float, half: int, *, margins: bool
+    ) -> Iterator[Condition]:
+        for mode in ("HOLD", "drives alone"):
+            case = Condition(mode, node, half, stiffness, LEAST_DELAY_S, NO_HAND, NOMINAL)
+            yield case
+            if margins:
+                yield case._replace(gains=Gains(torque=self._wanted.gain_margin))
+
+    def _drivetrain(self, stiffness: float) -> Drivetrain:
+        joint, wanted = self._config.joint, self._wanted
+        return Drivetrain(
+            stiffness,
+            wanted.damping_s * stiffness,
+            joint.armature,
+            lag_s=wanted.torque_lag_ms / 1e3,
+            encoder_bandwidth=self._config.drive.encoder_bandwidth,
+        )
+
+    def _timing(self, delay_s: float) -> Timing:
+        service = self._config.joint_service
+        return Timing(
+            1.0 / service.rate_hz, 1.0 / self._config.planner.rate_hz, delay_s, DRIVE_STEP_S
+        )
+
+
+def _hold_gains(config: RobotConfig) -> tuple[Array, Array]:
+    """Return (k_p, k_d) (12,) that every module rises to in HOLD."""
+    pairs = [config.hold_gains(module) for module in MODULES]
+    return (
+        np.array([k_p for k_p, _ in pairs]).ravel(),
+        np.array([k_d for _, k_d in pairs]).ravel(),
+    )

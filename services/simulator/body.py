@@ -1,0 +1,170 @@
+"""The true robot: what the robot file says, with the plant's errors laid over it.
+
+The world steps this and nothing else: it holds no robot file, so what a controller believes and
+what is true can differ in every number. The one generated model (`shared.robot_model`) is the
+nominal one; masses, friction, floor and feet are changed on it here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from services.simulator.plant import (
+    RIGID,
+    DriveErrors,
+    Drivetrain,
+    EncoderErrors,
+    Person,
+    PlantConfig,
+)
+from shared.config import GRAVITY, RobotConfig
+from shared.config_sections import OperatorConfig
+from shared.joints import JOINTS, MODULES, SIDES
+from shared.messages import Vector3
+from shared.robot_model import ankle_positions, mjcf, stand_pose
+
+Array = NDArray[np.float64]
+
+
+class Body(NamedTuple):
+    """The true robot and what stands behind its harness."""
+
+    model: mujoco.MjModel
+    timestep: float
+    """Of one call of `World.step`, s; the model's own is a `steps`th of it."""
+    steps: int
+    weight: float
+    """N"""
+    stand_height: float
+    """m, torso origin above the ankles at the start."""
+    stand_q: Array
+    """(12,) rad, close to that stand."""
+    ankles: Array
+    """(2, 3) m, right and left, where they stand."""
+    foot_yaws: tuple[float, float]
+    """rad"""
+    harness_point: Vector3
+    hoist_s: float
+    hand: OperatorConfig
+    motor_from_joint: Array
+    """(12, 12) turns/rad, with the motors' signs."""
+    counts_per_turn: int
+    """Of the encoders."""
+    drivetrain: Drivetrain
+    drive: DriveErrors
+    encoder: EncoderErrors
+    person: Person
+    seed: int
+
+
+def body_of(config: RobotConfig, plant: PlantConfig) -> Body:
+    """Return the true robot.
+
+    Args:
+        config: what the controllers believe.
+        plant: how the truth differs.
+    """
+    spec = mujoco.MjSpec.from_string(mjcf(config))
+    spec.option.timestep = config.simulation.timestep / plant.steps
+    _set_gravity(spec, plant)
+    _set_masses(spec, config, plant)
+    _set_joints(spec, plant)
+    ankles, yaws = _feet(config, plant)
+    _set_floor(spec, config, plant, ankles)
+    model = spec.compile()
+    signs = np.array(config.motor_signs())[:, None]
+    return Body(
+        model=model,
+        timestep=config.simulation.timestep,
+        steps=plant.steps,
+        weight=float(model.body_mass.sum()) * GRAVITY,
+        stand_height=config.simulation.stand_height,
+        stand_q=np.array(stand_pose(config, config.simulation.stand_height)),
+        ankles=ankles,
+        foot_yaws=yaws,
+        harness_point=config.geometry.harness_point,
+        hoist_s=config.simulation.hoist_s,
+        hand=config.simulation.operator,
+        motor_from_joint=signs * _motor_from_joint(config.joint.gear_ratio),
+        counts_per_turn=config.joint.encoder_counts_per_turn,
+        drivetrain=plant.drivetrain,
+        drive=plant.drive,
+        encoder=plant.encoder,
+        person=plant.person,
+        seed=plant.seed,
+    )
+
+
+def _set_gravity(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
+    """Lean gravity: a floor that rises along x by a pulls the robot towards -x."""
+    x, y = (math.sin(angle) for angle in plant.floor.slope)
+    spec.option.gravity = [-GRAVITY * x, -GRAVITY * y, -GRAVITY * math.sqrt(1.0 - x * x - y * y)]
+
+
+def _set_masses(spec: mujoco.MjSpec, config: RobotConfig, plant: PlantConfig) -> None:
+    errors = plant.body
+    torso = spec.body("torso")
+    true = config.torso_mass + (errors.payload_scale - 1.0) * config.mass.payload
+    scale = true / config.torso_mass
+    torso.mass *= scale
+    torso.inertia = torso.inertia * scale
+    torso.ipos = torso.ipos + np.array(errors.com_offset)
+    for body in spec.bodies:
+        body.mass *= errors.mass_scale
+        body.inertia = body.inertia * errors.mass_scale
+
+
+def _set_joints(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
+    drivetrain = plant.drivetrain
+    rigid = drivetrain.stiffness == RIGID
+    friction, damping = drivetrain.joint_friction, drivetrain.joint_damping
+    for name in JOINTS:
+        joint = spec.joint(name)
+        joint.armature = drivetrain.rotor_inertia if rigid else 0.0
+        joint.frictionloss = friction + (drivetrain.motor_friction if rigid else 0.0)
+        joint.damping[0] = damping + (drivetrain.motor_damping if rigid else 0.0)
+
+
+def _feet(config: RobotConfig, plant: PlantConfig) -> tuple[Array, tuple[float, float]]:
+    ankles = np.array(ankle_positions(config))
+    offsets = (plant.feet.offset_right, plant.feet.offset_left)
+    for leg, (x, y, _) in enumerate(offsets):
+        ankles[leg, :2] += (x, y)
+    ankles[SIDES.index("right"), 2] += plant.floor.step
+    return ankles, (offsets[0][2], offsets[1][2])
+
+
+def _set_floor(spec: mujoco.MjSpec, config: RobotConfig, plant: PlantConfig, ankles: Array) -> None:
+    floor = plant.floor
+    touching = [spec.geom("floor"), *(spec.geom(f"sole_{side}") for side in SIDES)]
+    step = floor.step
+    if step != 0.0:
+        # the lower foot stands on the plane, the higher one on a block
+        low, high = (1, 0) if step > 0.0 else (0, 1)
+        plane = touching[0]
+        plane.pos = [0.0, 0.0, float(ankles[low, 2]) - config.geometry.foot_height]
+        top = float(ankles[high, 2]) - config.geometry.foot_height
+        half = [0.5, 0.25, abs(step) / 2.0]
+        block = spec.worldbody.add_geom(
+            name="step", type=mujoco.mjtGeom.mjGEOM_BOX, size=half,
+            pos=[float(ankles[high, 0]), float(ankles[high, 1]), top - half[2]],
+        )  # fmt: skip
+        block.contype = block.conaffinity = 1
+        touching.append(block)
+    for geom in touching:
+        geom.friction[0] = floor.friction
+        geom.solref[0] = floor.contact_time
+
+
+def _motor_from_joint(gear_ratio: float) -> Array:
+    """Return the differential (12, 12): motor turns from joint angles in rad.
+
+    Per module, m1 = N (q_theta + q_phi), m2 = N (q_theta - q_phi), in turns.
+    """
+    pair = np.array([[1.0, 1.0], [-1.0, 1.0]]) * gear_ratio / (2.0 * math.pi)
+    return np.asarray(np.kron(np.eye(len(MODULES)), pair), float)

@@ -1,0 +1,85 @@
+"""The coupled torque: it only adds, only where the person does not lead, and slowly."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.planner.coupling import CouplingFilter, Missing, follow
+
+K_P = np.array([2810.0, 2810.0, 0.0, 800.0, 0.0, 400.0])
+B_P = np.array([300.0, 300.0, 0.0, 60.0, 0.0, 40.0])
+S = np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
+CLOSED = np.ix_([0, 1, 3, 5], [0, 1, 3, 5])
+
+
+def symmetric(seed: int, scale: float) -> np.ndarray:
+    A = np.random.default_rng(seed).normal(size=(6, 6))
+    return scale * 0.5 * (A + A.T)
+
+
+def missing(damping: float = 1.0) -> Missing:
+    return Missing(K_P, B_P, S, damping)
+
+
+def test_what_is_missing_fills_up_to_the_body_s_gains() -> None:
+    K_fail, B_local = np.diag([1200.0, 800.0, 500.0, 300.0, 30.0, 150.0]), 100.0 * np.eye(6)
+    K_c, B_c = missing(2.0).at(K_fail, B_local)
+    np.testing.assert_allclose(np.diag(K_c), [1610.0, 2010.0, 0.0, 500.0, 0.0, 250.0], rtol=1e-9)
+    np.testing.assert_allclose(np.diag(B_c), [500.0, 500.0, 0.0, 20.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_gains_that_are_stiffer_than_the_body_s_are_not_softened() -> None:
+    K_c, B_c = missing().at(np.diag([5000.0] * 6), np.diag([1000.0] * 6))
+    np.testing.assert_allclose(K_c, 0.0, atol=1e-9)
+    np.testing.assert_allclose(B_c, 0.0, atol=1e-9)
+
+
+@given(st.integers(0, 10_000), st.floats(1.0, 1e5), st.floats(0.0, 4.0))
+def test_it_is_symmetric_never_negative_and_zero_where_the_person_leads(
+    seed: int, scale: float, damping: float
+) -> None:
+    for matrix in missing(damping).at(symmetric(seed, scale), symmetric(seed + 1, scale)):
+        np.testing.assert_allclose(matrix, matrix.T, rtol=1e-9, atol=1e-9 * scale)
+        assert np.linalg.eigvalsh(matrix).min() > -1e-8 * max(scale, 1e4)
+        assert not matrix[[2, 4]].any()
+        assert not matrix[:, [2, 4]].any()
+
+
+@given(st.integers(0, 10_000), st.floats(1.0, 1e4))
+def test_with_it_the_closed_rows_are_as_stiff_as_asked(seed: int, scale: float) -> None:
+    K_fail = symmetric(seed, scale)
+    K_c, _ = missing().at(K_fail, np.zeros((6, 6)))
+    left = (K_fail + K_c)[CLOSED] - np.diag(K_P[[0, 1, 3, 5]])
+    assert np.linalg.eigvalsh(left).min() > -1e-6 * max(scale, 1e4)
+
+
+def test_a_step_comes_through_two_poles_and_all_of_it() -> None:
+    filtered, share = CouplingFilter(4.0), follow(4.0, 0.004)
+    course = [filtered.advance(np.ones(12), 0.004)[0] for _ in range(250)]
+    assert course[0] == share * share
+    assert (np.diff(course) > 0.0).all()
+    np.testing.assert_allclose(course[-1], 1.0, atol=1e-6)
+
+
+def test_above_its_bandwidth_it_falls_with_the_square() -> None:
+    gains = []
+    for hz in (20.0, 40.0):
+        filtered = CouplingFilter(2.0)
+        t = np.arange(2000) * 1e-3
+        out = [filtered.advance(np.full(12, np.sin(2 * np.pi * hz * s)), 1e-3)[0] for s in t]
+        gains.append(np.abs(out[1000:]).max())
+    assert 3.5 < gains[0] / gains[1] < 4.5
+
+
+def test_it_goes_on_from_what_it_remembers_and_forgets_on_reset() -> None:
+    one, other = CouplingFilter(3.0), CouplingFilter(3.0)
+    for step in range(20):
+        one.advance(np.full(12, float(step)), 0.004)
+    other.recall(one.remember())
+    np.testing.assert_array_equal(
+        one.advance(np.ones(12), 0.004), other.advance(np.ones(12), 0.004)
+    )
+    one.reset()
+    np.testing.assert_array_equal(one.advance(np.zeros(12), 0.004), 0.0)

@@ -1,0 +1,279 @@
+"""The linearised loop against two others: an independent one, and the simulated world itself."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+
+from services.planner.dynamic_certificate import (
+    Condition,
+    DynamicCertificate,
+    Node,
+    nodes_of,
+)
+from services.planner.model import BodyInertia
+from services.planner.sampled_loop import (
+    NO_HAND,
+    Drivetrain,
+    Feedback,
+    Gains,
+    Hand,
+    SampledLoop,
+    Stand,
+    Timing,
+    whole,
+)
+from services.planner.split import ScheduledGains
+from services.planner.split_program import design_of
+from services.simulator.body import body_of
+from services.simulator.plant import IDEAL, PlantConfig, changed
+from services.simulator.world import World
+from shared.config import RobotConfig
+from tests.lockstep.runs import still
+from tests.planner import loop_oracle
+from tools.runs.lockstep import Lockstep
+
+
+@pytest.fixture(scope="module")
+def nodes(robot: RobotConfig) -> list[Node]:
+    schedule = robot.gain_schedule
+    assert schedule is not None
+    heights = np.array([schedule.z[2], schedule.z[12], schedule.z[22]])
+    return nodes_of(robot, ScheduledGains(schedule).at, heights, np.array([0.0, 1.2]))
+
+
+@pytest.fixture(scope="module")
+def certificate(robot: RobotConfig, nodes: list[Node]) -> DynamicCertificate:
+    return DynamicCertificate(robot, nodes)
+
+
+def oracle_of(
+    stand: Stand, feedback: Feedback, drivetrain: Drivetrain, timing: Timing, hand: Hand
+) -> loop_oracle.Loop:
+    return loop_oracle.Loop(
+        M=stand.M, K_geo=stand.K_geo, T=stand.T, J=stand.J, J_harness=stand.J_harness,
+        H=stand.H, S=stand.S, D=feedback.D, D_B=feedback.D_B,
+        C_q=feedback.C_q, C_v=feedback.C_v, bandwidth_hz=feedback.bandwidth_hz,
+        lead_easing=feedback.lead_easing, easing_bandwidth_hz=feedback.easing_bandwidth_hz,
+        k=drivetrain.stiffness, b=drivetrain.damping, I=drivetrain.rotor_inertia,
+        d_motor=drivetrain.motor_damping, d_joint=drivetrain.joint_damping,
+        lag_s=drivetrain.lag_s, encoder_bandwidth=drivetrain.encoder_bandwidth,
+        hand=tuple(hand), joint_period=timing.joint_period,
+        planner_period=timing.planner_period, delay=timing.delay,
+        drive_step=timing.drive_step, write_delay=timing.write_delay,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_its_eigenvalues_are_those_of_an_independent_implementation(
+    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate, seed: int
+) -> None:
+    """Another formulation (all joints, queues, events) and another integrator (RK4), to 1 %."""
+    dice = np.random.default_rng(seed)
+    assert robot.gain_schedule is not None
+    design = design_of(robot.gain_schedule)
+    design = design._replace(
+        D_B=tuple(dice.uniform(3.0, 60.0, 6)),
+        coupling=design.coupling._replace(bandwidth_hz=float(dice.uniform(2.0, 8.0))),
+    )
+    node = nodes[int(dice.integers(len(nodes)))]
+    hand = Hand(1500.0, 150.0, 200.0, 20.0) if seed % 2 else NO_HAND
+    delay = float(dice.choice([0.002, 0.01, 0.016]))
+    stiffness = float(dice.choice([2000.0, 5000.0, 15000.0]))
+    condition = Condition("TRACK", node, 0, stiffness, delay, hand, Gains())
+    feedback = certificate.feedback(node, design)
+    drivetrain = certificate._drivetrain(condition.stiffness)
+    timing = certificate._timing(delay)
+    gains = Gains(coupling=float(dice.uniform(0.5, 2.0)), torque=float(dice.uniform(0.7, 1.5)))
+    own = SampledLoop(node.stand, whole(), feedback, drivetrain, timing, hand)
+    mine = np.linalg.eigvals(own.period_map(gains)[0])
+    theirs = np.linalg.eigvals(
+        loop_oracle.monodromy(
+            oracle_of(node.stand, feedback, drivetrain, timing, hand), gains.coupling, gains.torque
+        )
+    )
+    mine, theirs = (sorted(values, key=abs, reverse=True)[:24] for values in (mine, theirs))
+    np.testing.assert_allclose(np.abs(mine), np.abs(theirs), rtol=1e-3)
+    for value in mine:
+        assert min(abs(value - other) for other in theirs) < 0.01 * abs(value)
+
+
+def test_the_two_halves_together_are_the_whole(
+    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+) -> None:
+    assert robot.gain_schedule is not None
+    design = design_of(robot.gain_schedule)
+    node = nodes[0]
+    halves = [
+        certificate.loop(
+            Condition("TRACK", node, half, 5000.0, 0.01, NO_HAND, Gains()), design
+        ).eigenvalues()
+        for half in (0, 1)
+    ]
+    feedback = certificate.feedback(node, design)
+    loop = SampledLoop(
+        node.stand, whole(), feedback, certificate._drivetrain(5000.0), certificate._timing(0.01)
+    )
+    together = np.sort(np.abs(np.concatenate(halves)))[::-1][:30]
+    np.testing.assert_allclose(together, np.sort(np.abs(loop.eigenvalues()))[::-1][:30], rtol=1e-6)
+
+
+def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
+    """Frequencies and damping by finite differences of the MuJoCo world on its soft floor."""
+    plant = changed(
+        PlantConfig(),
+        {
+            "drivetrain.stiffness": 5000.0, "drivetrain.play": 0.0, "drivetrain.cogging": 0.0,
+            "drivetrain.motor_friction": 0.0, "drivetrain.joint_friction": 0.0,
+            "encoder.noise_counts": 0.0, "person.mass": 0.0, "steps": 16,
+        },
+    )  # fmt: skip
+    fleet = Lockstep(robot, still(3.0, hand=False), plant=plant)
+    fleet.planner = None
+    for _ in range(5000):
+        fleet.advance()
+    world = fleet.world
+    simulated = modes(simulated_transition(world, fleet._torque.copy()), world.model.opt.timestep)
+    stand = stand_at(robot, world._actuation.flexible.theta)
+    nothing = np.zeros((12, 12))
+    drivetrain = Drivetrain(5000.0, 10.0, 0.15)
+    loop = SampledLoop(
+        stand, whole(), Feedback(np.zeros(12), np.zeros(12), nothing, nothing, 1.0),
+        drivetrain, Timing(2e-3, 4e-3, 2e-3),
+    )  # fmt: skip
+    mechanical = np.r_[0:36]  # p, p', rotors: neither torques nor estimates
+    modelled = modes_of(np.linalg.eigvals(loop.A[np.ix_(mechanical, mechanical)]))
+    # the feet's own modes on the soft floor are below 5 Hz and hardly a vibration
+    simulated = simulated[simulated[:, 0] > 10.0]
+    assert len(simulated) == len(modelled) == 12
+    np.testing.assert_allclose(simulated[:, 0], modelled[:, 0], rtol=0.035)
+    np.testing.assert_allclose(simulated[:, 1], modelled[:, 1], atol=0.03)
+
+
+def stand_at(robot: RobotConfig, q: np.ndarray) -> Stand:
+    from services.planner.poses import Poses  # noqa: PLC0415 - only its constants are wanted
+
+    poses = Poses(robot)
+    kinematics = poses.kinematics
+    kinematics.update(q)
+    T = np.linalg.solve(np.vstack((kinematics.J, kinematics.C)), np.eye(12)[:, :6])
+    F_O = np.zeros(6)
+    F_O[2] = robot.total_mass * 9.81
+    H = kinematics.hessian_times(F_O, np.zeros(3)).copy()
+    K_geo = T.T @ H @ T
+    return Stand(
+        BodyInertia(robot).at(q, T), 0.5 * (K_geo + K_geo.T), T, kinematics.J.copy(),
+        kinematics.J_harness.copy(), H, np.array(robot.law.S, float),
+    )  # fmt: skip
+
+
+def simulated_transition(world: World, torque: np.ndarray) -> np.ndarray:
+    """Return d state+ / d state (60, 60) of one step: body and rotors, torque held."""
+    model, data, rotors = world.model, world.data, world._actuation.flexible
+    assert rotors is not None
+    world._steps = 1
+    tau, warm = world._actuation._tau.copy(), data.qacc_warmstart.copy()
+    qpos, theta = data.qpos.copy(), rotors.theta.copy()
+
+    def step(dx: np.ndarray) -> np.ndarray:
+        moved = qpos.copy()
+        mujoco.mj_integratePos(model, moved, dx[:18], 1.0)
+        data.qpos[:], data.qvel[:] = moved, dx[18:36]
+        rotors.theta[:], rotors.rate[:] = theta + dx[36:48], dx[48:]
+        data.qacc_warmstart[:] = warm
+        world._actuation._tau[:] = tau
+        world.step(torque)
+        dq = np.zeros(18)
+        mujoco.mj_differentiatePos(model, dq, 1.0, qpos, data.qpos)
+        return np.concatenate([dq, data.qvel, rotors.theta - theta, rotors.rate])
+
+    h = 1e-6
+    columns = [(step(h * e) - step(-h * e)) / (2.0 * h) for e in np.eye(60)]
+    return np.array(columns).T
+
+
+def modes(transition: np.ndarray, dt: float) -> np.ndarray:
+    return modes_of(np.log(np.linalg.eigvals(transition).astype(complex)) / dt)
+
+
+def modes_of(values: np.ndarray) -> np.ndarray:
+    """Return (frequency in Hz, damping ratio) of each oscillation, fastest first."""
+    oscillating = [v for v in values if v.imag > 1.0]
+    pairs = [(v.imag / (2.0 * math.pi), -v.real / abs(v)) for v in oscillating]
+    return np.array(sorted(pairs, reverse=True))
+
+
+def test_inertia_along_p_is_that_of_the_simulated_body(robot: RobotConfig) -> None:
+    """Kinetic energy of a motion with both feet still, by MuJoCo's own mass matrix."""
+    world = World(body_of(robot, changed(IDEAL, {"drivetrain.rotor_inertia": 0.01})), still(1.0))
+    q = world.data.qpos[world._q_index].copy()
+    stand = stand_at(robot, q)
+    M = np.zeros((18, 18))
+    mujoco.mj_fullM(world.model, world.data, M)
+    M[world._v_index, world._v_index] -= 0.01  # the rotors
+    rates = np.zeros((18, 6))
+    rates[world._v_index] = stand.T
+    foot = np.zeros((6, 18))
+    mujoco.mj_jacBody(world.model, world.data, foot[:3], foot[3:], world._feet[0])
+    rates[:6] = -np.linalg.solve(foot[:, :6], foot[:, 6:] @ rates[6:])
+    np.testing.assert_allclose(rates.T @ M @ rates, stand.M, rtol=2e-3, atol=2e-2)
+
+
+def test_a_hand_that_moves_it_feels_little_more_than_its_mass(
+    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+) -> None:
+    assert robot.gain_schedule is not None
+    design = design_of(robot.gain_schedule)
+    node = next(node for node in nodes if node.pitch == 0.0 and node.z > 0.75)
+    loop = certificate.loop(Condition("TRACK", node, 0, 20000.0, 2e-3, NO_HAND, Gains()), design)
+    w = 2.0 * math.pi * 1.0
+    led = np.ix_([2, 4], [2, 4])  # height and pitch give way, the rest hardly does
+    mass = (node.stand.M + 0.15 * node.stand.T.T @ node.stand.T)[led]
+    up = (node.stand.J_harness[2] @ node.stand.T)[[2, 4]]
+    felt = 1.0 / (up @ np.linalg.solve(mass, up))
+    assert abs(loop.impedance_z(w)) == pytest.approx(felt * w, rel=0.4)
+
+
+def test_the_shipped_design_is_stable_at_its_poses(
+    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+) -> None:
+    assert robot.gain_schedule is not None
+    verdict = certificate.worst(design_of(robot.gain_schedule), margins=False)
+    assert verdict.stable, verdict.words()
+
+
+def test_yesterday_s_coupling_is_called_unstable(
+    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+) -> None:
+    """Hardly filtered, with little damping at the joints: it fell below 20 000 N m/rad."""
+    assert robot.gain_schedule is not None
+    design = design_of(robot.gain_schedule)
+    soft = design._replace(
+        D_B=(3.4, 21.0, 0.6, 2.5, 1.4, 0.7),
+        coupling=design.coupling._replace(bandwidth_hz=100.0, damping=1.0),
+    )
+    node = nodes[0]
+    for stiffness in (2000.0, 8000.0, 20000.0):
+        growth = certificate.loop(
+            Condition("TRACK", node, 1, stiffness, 2e-3, NO_HAND, Gains()), soft
+        ).growth()
+        assert growth.rate > 10.0
+        assert growth.frequency_hz > 5.0
+
+
+def test_a_motion_that_hardly_grows_is_a_drift_only_where_the_person_leads(
+    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+) -> None:
+    assert robot.gain_schedule is not None
+    design = design_of(robot.gain_schedule)
+    robust = msgspec.structs.replace(robot.robustness, drift_max=0.0)
+    strict = DynamicCertificate(msgspec.structs.replace(robot, robustness=robust), nodes)
+    condition = Condition("TRACK", nodes[0], 0, 2000.0, 2e-3, NO_HAND, Gains())
+    drifting = strict.judge(condition, design)
+    assert drifting.growth.rate > 0.0
+    assert not drifting.stable
+    assert certificate.judge(condition, design).stable

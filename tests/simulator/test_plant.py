@@ -1,0 +1,148 @@
+"""The plant: realistic by default, read and refused like a robot file, hidden from controllers."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.simulator.body import body_of
+from services.simulator.plant import IDEAL, PlantConfig, changed, load, plant_from, to_toml
+from services.simulator.world import World
+from shared.config import RobotConfig
+from shared.exceptions import ConfigError
+from tests.lockstep.runs import story
+from tools.runs.lockstep import Lockstep
+from tools.sweeps import plants
+
+WRONG = {
+    "body.payload_scale": 0.85,
+    "body.com_offset": [0.015, -0.01, 0.02],
+    "encoder.zero_errors": [0.008] * 12,
+    "floor.slope": [0.02, -0.01],
+    "floor.step": 0.003,
+    "drive.torque_scale": 0.95,
+}
+
+
+def test_the_default_plant_flexes_plays_and_lags() -> None:
+    plant = PlantConfig()
+    assert plant.drivetrain.stiffness == 8000.0
+    assert plant.drivetrain.play > 0.0
+    assert plant.drive.lag_s > 0.0
+    assert plant.person.mass == 80.0
+
+
+def test_a_plant_written_as_toml_is_read_back(tmp_path: Path) -> None:
+    plant = changed(PlantConfig(), WRONG)
+    file = tmp_path / "plant.toml"
+    file.write_text(to_toml(plant), encoding="utf-8")
+    assert load(file) == plant
+    file.write_text(to_toml(IDEAL), encoding="utf-8")
+    assert load(file) == IDEAL  # a rigid drivetrain has an infinite stiffness
+
+
+def test_words_are_laid_over_one_another() -> None:
+    plant = plant_from(["ideal", "drivetrain.play=0.01", "floor.slope=[0.02, 0.0]"])
+    assert plant.drivetrain.stiffness == np.inf
+    assert plant.drivetrain.play == 0.01
+    assert plant.floor.slope == (0.02, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("perfect", "realistic"),
+        ("drivetrain.stifness=3000", "drivetrain.stiffness"),
+        ("drivetrain.stiffness=3", "500"),
+        ("encoder.zero_errors=[0.1]", "12"),
+        ("floor.friction=slippery", "TOML"),
+        ("nothing.toml", "not found"),
+    ],
+)
+def test_what_is_no_plant_is_refused_with_what_would_be_right(word: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        plant_from([word])
+
+
+def test_the_world_takes_no_robot_file() -> None:
+    """What is true and what is believed share no configuration object."""
+    annotations = inspect.get_annotations(World.__init__, eval_str=False)
+    assert annotations["body"] == "Body"
+    assert not any("RobotConfig" in str(kind) for kind in annotations.values())
+
+
+def test_the_world_keeps_nothing_of_the_robot_file(robot: RobotConfig) -> None:
+    world = World(body_of(robot, PlantConfig()), story("stand"))
+    parts = [*vars(world).values(), *vars(world._actuation).values()]
+    assert not any(isinstance(part, RobotConfig) for part in parts)
+
+
+def test_no_controller_sees_the_plant(robot: RobotConfig) -> None:
+    """Planner and joint services are made of the robot file alone, whatever the plant."""
+    right, wrong = (
+        Lockstep(robot, story("stand"), plant=plant)
+        for plant in (PlantConfig(), changed(PlantConfig(), WRONG))
+    )
+    assert right.planner is not None
+    assert wrong.planner is not None
+    assert msgspec.json.encode(right.planner.remember()) == msgspec.json.encode(
+        wrong.planner.remember()
+    )
+    for name in ("ankle_left", "knee_right"):
+        assert right.memory_of(name) == wrong.memory_of(name)
+    assert right.config is wrong.config is robot
+
+
+def test_errors_change_the_true_robot_and_not_the_file(robot: RobotConfig) -> None:
+    true, believed = (body_of(robot, plant) for plant in (changed(IDEAL, WRONG), IDEAL))
+    lighter = 0.15 * robot.mass.payload * 9.81
+    assert believed.weight - true.weight == pytest.approx(lighter, rel=1e-6)
+    torso = true.model.body("torso").id
+    np.testing.assert_allclose(
+        true.model.body_ipos[torso] - believed.model.body_ipos[torso], [0.015, -0.01, 0.02]
+    )
+    assert true.model.opt.gravity[0] == pytest.approx(-9.81 * np.sin(0.02))
+    assert np.linalg.norm(true.model.opt.gravity) == pytest.approx(9.81)
+
+
+def test_wrong_zeros_show_in_what_the_encoders_tell(robot: RobotConfig) -> None:
+    errors = np.linspace(-0.01, 0.01, 12)
+    plant = changed(IDEAL, {"encoder.zero_errors": errors.tolist()})
+    wrong, right = (World(body_of(robot, one), story("stand")) for one in (plant, IDEAL))
+    told = wrong.motor_turns()[0] - right.motor_turns()[0]
+    joints = np.linalg.solve(body_of(robot, IDEAL).motor_from_joint, told)
+    np.testing.assert_allclose(joints, errors, atol=1e-9)
+
+
+def test_a_foot_on_a_step_stands_flat_on_it(robot: RobotConfig) -> None:
+    for step in (0.01, -0.01):
+        world = World(body_of(robot, changed(IDEAL, {"floor.step": step})), story("stand"))
+        truth = world.truth(0, 1.0, 0.0)
+        assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
+        right, left = (world.data.body(f"foot_{side}").xpos[2] for side in ("right", "left"))
+        assert right - left == pytest.approx(step, abs=1e-3)
+
+
+def test_drawn_plants_stay_in_their_ranges_and_repeat() -> None:
+    ranges = plants.shipped().error
+    for number in range(50):
+        plant = plants.draw(f"test {number}")
+        assert plant == plants.draw(f"test {number}")
+        table = msgspec.to_builtins(plant)
+        for row in ranges:
+            section, _, name = row.key.partition(".")
+            value = table[section][name]
+            for one in value if isinstance(value, (list, tuple)) else (value,):
+                assert row.low - 1e-9 <= one <= row.high * (1 + 1e-5)
+    assert plants.draw("test 1") != plants.draw("test 2")
+
+
+def test_beyond_widens_every_range_about_its_middle() -> None:
+    wide = [plants.errors_of(plants.draw(f"wide {n}", beyond=2.0)) for n in range(100)]
+    assert max(row["drivetrain.play"] for row in wide) > 0.0044
+    assert min(row["drivetrain.stiffness"] for row in wide) < 3000.0
+    assert min(row["drivetrain.play"] for row in wide) >= 0.0
