@@ -9,7 +9,6 @@ from shared.config_sections import (
     BusConfig,
     CanConfig,
     CertificateConfig,
-    ContactConfig,
     DriveConfig,
     GainSchedule,
     GeometryConfig,
@@ -46,7 +45,6 @@ class RobotConfig(Section, frozen=True):
     mass: MassConfig
     geometry: GeometryConfig
     joint: JointConfig
-    contact: ContactConfig
     limits: LimitsConfig
     module: tuple[ModuleConfig, ...]
     law: LawConfig

@@ -50,16 +50,8 @@ class JointConfig(Section, frozen=True):
 
     gear_ratio: Annotated[float, Range(1.0, 200.0, "1")]
     armature: Annotated[float, Range(0.001, 5.0, "kg m^2")]
-    damping: Annotated[float, Range(0.0, 50.0, "N m s/rad")]
-    friction_loss: Annotated[float, Range(0.0, 20.0, "N m")]
     encoder_counts_per_turn: Annotated[int, Range(64, 1 << 24, "counts")]
     tau_module_max: Annotated[float, Range(1.0, 1000.0, "N m")]
-
-
-class ContactConfig(Section, frozen=True):
-    """Sole on floor."""
-
-    friction: Annotated[float, Range(0.05, 2.0, "1")]
 
 
 class LimitConfig(Section, frozen=True):
@@ -343,5 +335,7 @@ class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Local damping, N m s/rad, the same in every pose."""
     coupling_bandwidth_hz: Annotated[float, Range(0.1, 100.0, "Hz")]
     """Of the two poles of tau_coupled."""
+    lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
+    """Up to this the loop is stable; less is always safe."""
     coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]
     """What tau_coupled fills the damping up to, in shares of B_p."""

@@ -38,7 +38,6 @@ def inputs_of(config: RobotConfig) -> dict[str, Any]:
             "K_0": law.K_0,
             "B_p": law.B_p,
             "S": law.S,
-            "lead_easing": law.lead_easing,
             "jacobian": law.jacobian,
             "damping_lambda": law.damping_lambda,
             "load_sharing_moment_arms": law.load_sharing_moment_arms,
@@ -141,6 +140,9 @@ def why_stale(config: RobotConfig) -> str:
     schedule = config.gain_schedule
     if schedule is None:
         return "there is no gain schedule"
+    if schedule.version == VERSION and config.law.lead_easing > schedule.lead_easing:
+        most, asked = schedule.lead_easing, config.law.lead_easing
+        return f"the gain schedule was made for law.lead_easing up to {most}, not {asked}"
     if schedule.version != VERSION:
         return f"the gain schedule is of version {schedule.version}, not {VERSION}"
     inputs = inputs_of(config)

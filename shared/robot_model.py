@@ -47,13 +47,12 @@ def mjcf(config: RobotConfig) -> str:
   <option gravity="0 0 -{GRAVITY}" timestep="{config.simulation.timestep}"
           integrator="implicitfast" cone="elliptic" impratio="10"/>
   <default>
-    <joint type="hinge" damping="{config.joint.damping}" armature="{config.joint.armature}"
-           frictionloss="{config.joint.friction_loss}"/>
+    <joint type="hinge" armature="{config.joint.armature}"/>
     <geom contype="0" conaffinity="0" density="0"/>
   </default>
   <worldbody>
     <geom name="floor" type="plane" size="5 5 0.1" pos="0 0 -{geometry.foot_height}"
-          contype="1" conaffinity="1" friction="{config.contact.friction} 0.005 0.0001"/>
+          contype="1" conaffinity="1"/>
     <body name="torso" pos="0 0 {config.simulation.stand_height}">
       <freejoint name="torso"/>
       {_inertial(config.torso_mass, _box_inertia(config.torso_mass, geometry.torso_size))}
@@ -73,7 +72,6 @@ def _leg(config: RobotConfig, side: str) -> str:
     half_at_knee = _inertial(half, _ball_inertia(half), f"0 0 -{geometry.l1}")
     sole = _numbers(geometry.l_foot / 2, geometry.w_foot / 2, geometry.foot_height / 4)
     sole_z = -0.75 * geometry.foot_height
-    friction = config.contact.friction
     return f"""
       <body name="thigh_{side}" pos="{hip}">{_joints(config, "hip", side)}
         {half_at_knee}
@@ -84,7 +82,7 @@ def _leg(config: RobotConfig, side: str) -> str:
           <body name="foot_{side}" pos="0 0 -{geometry.l2}">{_joints(config, "ankle", side)}
             {module}
             <geom name="sole_{side}" type="box" size="{sole}" pos="0 0 {sole_z}"
-                  contype="1" conaffinity="1" friction="{friction} 0.005 0.0001"/>
+                  contype="1" conaffinity="1"/>
           </body>
         </body>
       </body>"""

@@ -139,6 +139,7 @@ LONG_FILES = {
     "services/planner/sampled_loop.py": "one model: what it is made of, and one period of it",
     "shared/bus.py": "the only file that knows Zenoh",
     "tests/planner/loop_oracle.py": "one model, written a second time",
+    "tools/sweeps/certificate_study.py": "one study: its cases, their world, the judgement",
     "tests/test_bus.py": "one claim after the other about one module",
     "tests/test_config.py": "one claim after the other about one module",
     "tests/test_odrive_can.py": "one claim after the other about one module",

@@ -206,7 +206,7 @@ def test_what_the_schedule_does_not_depend_on_leaves_it_fitting(robot: RobotConf
         law={"split": "certified", "recentre_s": 9.0},
         planner={"state_stale_ms": 100.0},
         harness={"tare_s": 9.0},
-        joint={"friction_loss": 9.0},
+        joint={"encoder_counts_per_turn": 4096},
     )
     assert gain_schedule.why_stale(other) == ""
 

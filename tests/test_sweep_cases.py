@@ -143,7 +143,7 @@ def test_the_feet_carry_the_robot(diagonal: RobotConfig) -> None:
     story = Scenario(
         name="stand", about="", duration=0.5, keyframe=(Keyframe(at=0.0, height=1.188),)
     )
-    fleet = Lockstep(diagonal, story)
+    fleet = Lockstep(diagonal, story, plant=IDEAL)
     feet = FootLoads(fleet.world)
     last = list(fleet.run())[-1]
     weight = diagonal.total_mass * GRAVITY - last.operator_force[2]

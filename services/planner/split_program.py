@@ -95,6 +95,7 @@ def solve(
         D_B=_rounded(np.zeros(N_LEG)),
         coupling_bandwidth_hz=1.0,
         coupling_damping=0.0,
+        lead_easing=config.law.lead_easing,
     )
     if design is None:
         design = design_program.choose(config, dynamic_nodes(config, stiffness), tell)

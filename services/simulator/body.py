@@ -31,6 +31,10 @@ from shared.robot_model import ankle_positions, mjcf, stand_pose
 Array = NDArray[np.float64]
 
 
+MINOR_FRICTION = (0.005, 0.0001)
+"""m; of a contact's torsion and rolling."""
+
+
 class Body(NamedTuple):
     """The true robot and what stands behind its harness."""
 
@@ -157,7 +161,7 @@ def _set_floor(spec: mujoco.MjSpec, config: RobotConfig, plant: PlantConfig, ank
         block.contype = block.conaffinity = 1
         touching.append(block)
     for geom in touching:
-        geom.friction[0] = floor.friction
+        geom.friction = [floor.friction, *MINOR_FRICTION]
         geom.solref[0] = floor.contact_time
 
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from services.simulator.plant import PlantConfig
 from shared import scenario
 from shared.config import RobotConfig
 from shared.impairment import Impairment
@@ -71,9 +72,14 @@ def still(duration: float, height: float = 1.188, **changes: object) -> Scenario
     return story("stand", duration=duration, keyframe=frames, **changes)
 
 
-def run(robot: RobotConfig, scenario: Scenario, delay_ms: float = 1.0) -> Run:
+def run(
+    robot: RobotConfig,
+    scenario: Scenario,
+    delay_ms: float = 1.0,
+    plant: PlantConfig | None = None,
+) -> Run:
     """Run to the end, or to a fall."""
-    lockstep = Lockstep(robot, scenario, Impairment(delay_ms=delay_ms))
+    lockstep = Lockstep(robot, scenario, Impairment(delay_ms=delay_ms), plant=plant)
     rows = []
     for row in lockstep.run():
         if row.scenario_s >= 0.0:

@@ -13,6 +13,7 @@ from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.module import Order, Step
 from services.planner.planner import Planner
+from services.simulator.plant import IDEAL, PlantConfig
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.impairment import Impairment
@@ -32,8 +33,14 @@ CYCLE_NS = 2 * NS_PER_MS
 TAU: Pair = (3.0, -41.0)
 
 
-def run(control: str, robot: RobotConfig, scenario: Scenario, delay_ms: float) -> list[SimTruth]:
-    fleet = CONTROLS[control](robot, scenario, Impairment(delay_ms=delay_ms))
+def run(
+    control: str,
+    robot: RobotConfig,
+    scenario: Scenario,
+    delay_ms: float,
+    plant: PlantConfig | None = None,
+) -> list[SimTruth]:
+    fleet = CONTROLS[control](robot, scenario, Impairment(delay_ms=delay_ms), plant=plant)
     rows = []
     for row in fleet.run():
         if row.scenario_s >= 0.0:
@@ -52,13 +59,13 @@ def beginning() -> Scenario:
 @pytest.fixture(scope="module")
 def distributed(robot: RobotConfig, beginning: Scenario) -> list[SimTruth]:
     """Torques only there as well, from joint services that have the law."""
-    return run("distributed", torques_only(robot), beginning, 0.0)
+    return run("distributed", torques_only(robot), beginning, 0.0, IDEAL)
 
 
 def test_without_delay_it_does_what_the_distributed_control_does(
     robot: RobotConfig, beginning: Scenario, distributed: list[SimTruth]
 ) -> None:
-    centralised = run("centralised", robot, beginning, 0.0)
+    centralised = run("centralised", robot, beginning, 0.0, IDEAL)
     assert len(centralised) == len(distributed)
     for name, unit, far in (("com", 1e3, 1.0), ("torso", 1e3, 1.0), ("angles", 1.0, 0.002)):
         a, b = (
@@ -211,22 +218,6 @@ def test_a_command_is_all_that_the_shipped_planner_asks_for_as_one_torque(
             assert whole.margin == whole.margin_onboard == 0.0
             assert max(map(abs, parts.tau_coupled)) > 0.0
             assert whole.echo_t_ns == parts.echo_t_ns
-
-
-def test_torques_stay_whole_however_far_apart_in_time_the_modules_act(robot: RobotConfig) -> None:
-    """The shipped planner gives no tau_coupled then; here nothing would be left of the law."""
-    planners = Planner(robot, 1), CentralPlanner(robot, 1), CentralPlanner(robot, 1)
-    now = NS_PER_S
-    heard = states(robot, now, 1)
-    for _ in range(100):
-        now += 4 * NS_PER_MS
-        for planner, late_ns in zip(planners, (60 * NS_PER_MS, 60 * NS_PER_MS, 0), strict=True):
-            for index, state in enumerate(heard):
-                age_ns = late_ns if index == 0 else 0
-                planner.hear_state(index, msgspec.structs.replace(state, age_ns=age_ns), now)
-        shipped, apart, together = (planner.tick(now) for planner in planners)
-    assert all(command.coupled_share == 0.0 for command in shipped)
-    assert apart == together
 
 
 def test_once_it_leads_the_planner_leads_whatever_it_hears(robot: RobotConfig) -> None:

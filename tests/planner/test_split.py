@@ -82,7 +82,7 @@ def made_of(function: object, z: list[float], pitch: list[float]) -> GainSchedul
     D = tuple(tuple(tuple(function(a, b)) for b in pitch) for a in z)
     return GainSchedule(
         version=1, digest="", inputs={}, z=tuple(z), pitch=tuple(pitch), D=D,
-        D_B=(1.0,) * 6, coupling_bandwidth_hz=1.0, coupling_damping=1.0,
+        D_B=(1.0,) * 6, coupling_bandwidth_hz=1.0, coupling_damping=1.0, lead_easing=0.6,
     )  # fmt: skip
 
 

@@ -153,7 +153,7 @@ def test_each_centre_of_pressure_stays_inside_its_sole(
                 nearest = min(nearest, *room)
                 assert min(room) > 0.0, (height, pitch, assist, x, y)
                 assert force[2] > 0.3 * oracle.masses(robot)[1] * oracle.GRAVITY
-                assert np.hypot(force[0], force[1]) < robot.contact.friction * force[2]
+                assert np.hypot(force[0], force[1]) < 0.5 * force[2]  # rubber on a poor floor
     print(f"nearest to an edge: {1e3 * nearest:.1f} mm")  # noqa: T201  # shown by pytest -rP
     assert nearest > 0.01
 

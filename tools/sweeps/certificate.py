@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 from rich.console import Console
 
 from services.planner.certificate import DIRECTIONS
+from services.simulator.plant import IDEAL, PlantConfig
 from shared import config_file
 from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
@@ -39,6 +40,7 @@ class Batch(NamedTuple):
     seed: int
     numbers: tuple[int, ...]
     rigid: bool
+    plant: PlantConfig
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -61,15 +63,16 @@ def run(args: argparse.Namespace) -> int:
     study.check_least(("--n", args.n, 1))
     crew = study.crew_of(args, CODE)
     robot = config_file.load(args.config)
-    if not args.friction:
-        robot = certificate_study.without_friction(robot)
+    plant = IDEAL if args.friction else certificate_study.FRICTIONLESS
     console = Console()
     out = study.folder(args.out, "certificate")
-    first = row_of(certificate_study.run(robot, Cases(robot).draw(args.seed, 0), rigid=args.rigid))
+    first = row_of(
+        certificate_study.run(robot, Cases(robot).draw(args.seed, 0), rigid=args.rigid, plant=plant)
+    )
     with Table(out, TABLE, tuple(first), _inputs(args, robot), WORDS) as table:
         missing = [number for number in range(args.n) if number not in table.numbers]
         batches = [
-            Batch(robot, args.seed, tuple(missing[start : start + BATCH]), args.rigid)
+            Batch(robot, args.seed, tuple(missing[start : start + BATCH]), args.rigid, plant)
             for start in range(0, len(missing), BATCH)
         ]
         with study.resumable(table, out, _command(args), crew, console):
@@ -121,7 +124,9 @@ def row_of(outcome: Outcome) -> dict[str, object]:
 def _run_batch(batch: Batch) -> list[Outcome]:
     cases = Cases(batch.robot)
     return [
-        certificate_study.run(batch.robot, cases.draw(batch.seed, number), rigid=batch.rigid)
+        certificate_study.run(
+            batch.robot, cases.draw(batch.seed, number), rigid=batch.rigid, plant=batch.plant
+        )
         for number in batch.numbers
     ]
 
@@ -155,6 +160,7 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
         "study": "certificate",
         "seed": str(args.seed),
         "rigid": str(args.rigid),
+        "friction": str(args.friction),
         "robot": study.digest_of(robot),
         "code": code_digest(CODE),
     }

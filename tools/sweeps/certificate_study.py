@@ -30,7 +30,7 @@ from services.planner.gains import GainLaw
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
 from services.simulator.body import body_of
-from services.simulator.plant import IDEAL
+from services.simulator.plant import IDEAL, PlantConfig, changed
 from services.simulator.world import World
 from shared.config import GRAVITY, RobotConfig
 from shared.exceptions import RunError
@@ -148,10 +148,10 @@ class Confusion(NamedTuple):
     fall_fell: int
 
 
-def without_friction(robot: RobotConfig) -> RobotConfig:
-    """Return the robot without dry friction, which holds up what is but a little too soft."""
-    joint = msgspec.structs.replace(robot.joint, friction_loss=0.0)
-    return msgspec.structs.replace(robot, joint=joint)
+FRICTIONLESS: Final = changed(
+    IDEAL, {"drivetrain.motor_friction": 0.0, "drivetrain.joint_friction": 0.0}
+)
+"""Dry friction holds up what is but a little too soft."""
 
 
 def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
@@ -242,7 +242,14 @@ class _Module:
         return differential.motor_torque(self._tau, self._gear_ratio)
 
 
-def world_of(robot: RobotConfig, case: Case, nudge_share: float, *, rigid: bool) -> World:
+def world_of(
+    robot: RobotConfig,
+    case: Case,
+    nudge_share: float,
+    *,
+    rigid: bool,
+    plant: PlantConfig = FRICTIONLESS,
+) -> World:
     """Return the world with the robot in the case's posture, the nudge to come.
 
     The payload is the case's. `rigid`: the floor is hard, as the certificate has it.
@@ -257,7 +264,7 @@ def world_of(robot: RobotConfig, case: Case, nudge_share: float, *, rigid: bool)
         hand=False,
         push=(Push(at=NUDGE_AT, duration=NUDGE_S, force=force),),
     )
-    world = World(body_of(with_payload(robot, posture.payload), IDEAL), scenario)
+    world = World(body_of(with_payload(robot, posture.payload), plant), scenario)
     if rigid:
         world.model.geom_solref[:, 0] = RIGID_STEPS * world.timestep
     world.stand_at(posture.q)
@@ -266,10 +273,15 @@ def world_of(robot: RobotConfig, case: Case, nudge_share: float, *, rigid: bool)
 
 
 def run(
-    robot: RobotConfig, case: Case, nudge_share: float = 1.0, *, rigid: bool = False
+    robot: RobotConfig,
+    case: Case,
+    nudge_share: float = 1.0,
+    *,
+    rigid: bool = False,
+    plant: PlantConfig = FRICTIONLESS,
 ) -> Outcome:
     """Simulate a case; arguments as for `world_of`."""
-    world = world_of(robot, case, nudge_share, rigid=rigid)
+    world = world_of(robot, case, nudge_share, rigid=rigid, plant=plant)
     modules = [_Module(robot, case, index) for index in range(len(MODULES))]
     steps = round(1.0 / (robot.joint_service.rate_hz * world.timestep))
     motor = np.zeros(N_JOINTS)

@@ -1,0 +1,77 @@
+"""The robustness study: trials that repeat, a ranking that finds the cause, a robot that stands."""
+
+from __future__ import annotations
+
+import argparse
+import random
+from pathlib import Path
+
+import pytest
+
+from shared.config import RobotConfig
+from tools import cli
+from tools.sweeps import plants, robust
+from tools.sweeps.figures import Ending
+from tools.sweeps.robust_trial import KINDS, draw, row_of, run_trial, story_of
+
+
+def rows_by(cause: str, n: int = 60) -> list[dict[str, object]]:
+    """Return made-up rows in which one error alone moves the COM."""
+    dice = random.Random(cause)
+    rows = []
+    for number in range(n):
+        row = row_of(draw(1, number))
+        far = 100.0 * abs(float(row[cause])) + dice.uniform(0.0, 1e-3)
+        rows.append(row | {"ending": Ending.STOOD, "com_led_max_mm": far})
+    return rows
+
+
+def test_a_trial_follows_from_seed_and_number_alone() -> None:
+    assert draw(3, 17) == draw(3, 17)
+    assert draw(3, 17) != draw(4, 17)
+    assert {draw(1, number).kind for number in range(3)} == set(KINDS)
+
+
+def test_every_trial_is_a_scenario_that_ends_after_its_kill(robot: RobotConfig) -> None:
+    for number in range(30):
+        trial = draw(1, number)
+        story = story_of(robot, trial)
+        assert story.duration > trial.kill_s + 2.0
+        assert all(push.at + push.duration < story.duration for push in story.push)
+
+
+@pytest.mark.parametrize("cause", ["body.com_offset", "drive.lag_s", "floor.slope"])
+def test_the_ranking_finds_the_error_that_moves_the_com(cause: str) -> None:
+    ranked = robust.ranking(rows_by(cause))
+    assert ranked[0][0] == cause
+    assert ranked[0][1] > 0.9
+    assert abs(ranked[1][1]) < 0.6
+
+
+def test_a_picture_is_drawn_and_falls_are_in_it(tmp_path: Path) -> None:
+    rows = rows_by("drive.lag_s")
+    rows[3] |= {"ending": Ending.FELL, "com_led_max_mm": None}
+    robust._draw(rows, argparse.Namespace(beyond=1.0, seed=1), tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 20_000
+
+
+def test_an_impossible_width_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["sweep", "robust", "--n", "0"]) == 2
+    assert "--n 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
+    robot: RobotConfig, number: int
+) -> None:
+    """A squat and a crawl, of the 500 that `xrl sweep robust --n 500` runs."""
+    outcome = run_trial(draw(1, number), robot)
+    assert outcome.stood
+    assert outcome.operator_peak_n is not None
+    assert outcome.operator_peak_n < 80.0
+
+
+def test_errors_are_told_as_one_number_each() -> None:
+    errors = plants.errors_of(plants.draw("one"))
+    assert set(errors) == {row.key for row in plants.shipped().error}
+    assert "drivetrain.stiffness" in plants.ranges_words(errors)
