@@ -25,6 +25,8 @@ INTERFACES: Final = (
 )  # fmt: skip
 """What python-can brings itself, and this package; other packages may declare more."""
 
+LEADABLE: Final = (2, 4)
+"""Of p: height and pitch."""
 _POWER_UP_TURNS: Final = 1.0
 """An encoder that has just got power knows its motor within a turn."""
 
@@ -144,6 +146,9 @@ def _check_physics(file: str, config: RobotConfig) -> None:
         found = f"{geometry.l1:g} m is not below l2 = {geometry.l2:g} m"
         raise ConfigError(file, "geometry.l1", found, "a thigh shorter than the shin")
     for index, selected in enumerate(config.law.S):
+        if selected and index not in LEADABLE:
+            found = "1: nobody would balance this direction"
+            raise ConfigError(file, f"law.S[{index}]", found, "0; only z and pitch can be led")
         if not selected and config.law.K_p[index] <= 0.0:
             where = f"law.K_p[{index}]"
             raise ConfigError(file, where, "0 in a direction the robot balances", "positive")

@@ -85,6 +85,7 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (setting("module.1.node_ids", [2, 3, 4]), "module[1].node_ids", "[2, 3, 4]", "length 2"),
     (setting("module.1.node_ids.1", "x"), "module[1].node_ids[1]", "'x'", "int"),
     (setting("law.S.2", 7), "law.S[2]", "7", "one of 0, 1"),
+    (setting("law.S.0", 1), "law.S[0]", "nobody would balance", "only z and pitch"),
     # ranges
     (setting("mass.battery", -0.9), "mass.battery", "-0.9", "0 to 200 kg"),
     (setting("mass.module", 0.0), "mass.module", "0.0", "0.1 to 50 kg"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from rich.console import Console
@@ -15,6 +16,10 @@ from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
 from tools.verbs import Subparsers, add_config, add_verb
 
+ROOM_EVERY = 5
+"""Of the poses, for the printed margins."""
+RIGID_FROM = 1e6
+"""N m/rad"""
 SHOWN = 6
 """Heights in the printed table."""
 
@@ -28,6 +33,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl gains
         xrl gains --config lab.toml
         xrl gains --config lab.toml --damping-of deploy/robot.gains.json
+        xrl gains --picture damping.png
         xrl gains --check
         """,
     )
@@ -38,6 +44,12 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="FILE",
         help="take damping and coupling from another schedule, such as deploy/robot.gains.json, "
         "and hold them to the dynamic certificate; without it they are searched for (two minutes)",
+    )
+    parser.add_argument(
+        "--picture",
+        type=Path,
+        metavar="FILE.png",
+        help="draw how each motion decays, over the drivetrain's stiffness",
     )
     parser.add_argument(
         "--check", action="store_true", help="only say whether the schedule fits the robot"
@@ -56,6 +68,9 @@ def run(args: argparse.Namespace) -> int:
     schedule = compute(robot, console, args.damping_of)
     gain_schedule.write(path, schedule)
     _show(robot, schedule, console)
+    if args.picture is not None:
+        draw_damping(robot, schedule, args.picture)
+        console.print(f"drawn to {args.picture}", style="dim", soft_wrap=True)
     console.print(f"written to {path}", style="dim", soft_wrap=True)
     return 0
 
@@ -108,8 +123,48 @@ def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
         row = schedule.D[i][upright]
         table.add_row(f"{schedule.z[i]:.3f}", *(f"{value:.0f}" for value in row))
     console.print(table)
+    _show_damping(robot, schedule, console)
     margins = split_program.smallest_margins(robot, schedule)
     console.print(
         f"smallest margin, nodes and half way between: {margins.service:.2f} of what is "
         f"required with the joint services alone, {margins.onboard:.2f} with the drives alone"
     )
+
+
+def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
+    """Print what was chosen by the dynamic certificate, and what it leaves in hand."""
+    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
+    from services.planner.dynamic_certificate import DynamicCertificate  # noqa: PLC0415
+
+    D_B = ", ".join(f"{value:.1f}" for value in schedule.D_B)
+    console.print(
+        f"local damping of a leg, ankle to hip, phi and theta: {D_B} N m s/rad; tau_coupled: two "
+        f"poles at {schedule.coupling_bandwidth_hz:g} Hz, damping up to "
+        f"{schedule.coupling_damping:g} B_p"
+    )
+    nodes = split_program.dynamic_nodes(robot, schedule)[::ROOM_EVERY]
+    certificate, design = DynamicCertificate(robot, nodes), split_program.design_of(schedule)
+    table = Table(title="In hand before any motion grows (TRACK, HOLD, drives alone)")
+    for heading in ("drivetrain N m/rad", "all feedback", "tau_coupled", "delay ms"):
+        table.add_column(heading, justify="right")
+    for room in certificate.room(design):
+        name = "rigid" if room.stiffness >= RIGID_FROM else f"{room.stiffness:g}"
+        table.add_row(
+            name, _decibels(room.torque), _decibels(room.coupling), f">= {1e3 * room.delay_s:.0f}"
+        )
+    console.print(table)
+    fades = certificate.sway(design)
+    console.print(f"slowest oscillation while led fades with {-fades:.2f}/s")
+
+
+def draw_damping(robot: RobotConfig, schedule: GainSchedule, path: Path) -> None:
+    """Draw the eigenvalue paths of a schedule into a PNG file."""
+    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
+    from tools.runs import damping_picture  # noqa: PLC0415 - and so does matplotlib
+
+    nodes = [node for node in split_program.dynamic_nodes(robot, schedule) if node.pitch == 0.0]
+    damping_picture.draw(robot, nodes, split_program.design_of(schedule), path)
+
+
+def _decibels(factor: float) -> str:
+    return "none" if factor == 0.0 else f">= {20.0 * math.log10(factor):.0f} dB"

@@ -37,6 +37,10 @@ from shared.messages import Wrench
 Array = NDArray[np.float64]
 
 
+GLIDES = np.array([True, True, False, True, False, True])
+"""Rows of p whose closed-loop reference is brought to zero: COM over the ankles, no roll or yaw."""
+
+
 class LawOutput(NamedTuple):
     """What one tick asks of the twelve joints, (12,) where not said otherwise."""
 
@@ -110,10 +114,11 @@ class Hocca:
             dt: time since the last tick, s.
             align: start from the measured pose, so that taking over makes no step: p_C is
                 where the robot is, and glides to zero (COM over the ankles, no roll, no
-                yaw) in `law.recentre_s` of ticks without `align`. A planner that has led
-                before starts from zero: where it finds the robot is a sway, and were it lost
-                again, HOLD would stay where the sway was. A robot held off centre by 25 mm so
-                fell at the second push; the modules' blend makes no step of it.
+                yaw; height and pitch stay) in `law.recentre_s` of ticks without `align`. A
+                planner that has led before starts from zero: where it finds the robot is a
+                sway, and if it is lost again, HOLD would stay where the sway was. A robot
+                held off centre by 25 mm fell at the second push; the modules' blend makes
+                no step of it.
             wrench: of the operator on the torso, if it is fresh and valid.
         """
         measured, ik = self._measured, self._ik
@@ -203,14 +208,18 @@ class Hocca:
     def _align(self, q: Array) -> None:
         self._aligned = True
         self._coupling.reset()
-        self._p_C0 = self._measured.p * (0.0 if self._has_led else self._S_perp)
+        begins_at = np.where(GLIDES & self._has_led, 0.0, self._S_perp)
+        self._p_C0 = self._measured.p * begins_at
         self._since_align_s = 0.0
         self._ik.q[:] = q
 
     def _closed_loop_reference(self, dt: float) -> tuple[Array, Array]:
-        """Return p_C and its rate: from where `align` found the robot to zero, min-jerk."""
+        """Return p_C and its rate: from where `align` found the robot to zero, min-jerk.
+
+        Height and pitch stay where they were found, if they are closed: zero is no stand.
+        """
         self._since_align_s += dt
         s = min(1.0, self._since_align_s / self._recentre_s)
         left = 1.0 - s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
         rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / self._recentre_s
-        return self._p_C0 * left, self._p_C0 * rate
+        return self._p_C0 * np.where(GLIDES, left, 1.0), self._p_C0 * np.where(GLIDES, rate, 0.0)

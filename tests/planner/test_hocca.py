@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -213,6 +214,25 @@ def test_after_align_the_reference_glides_to_the_centre(
         before = p_ref[shut]
     np.testing.assert_allclose(before, 0.0, atol=1e-9)
     np.testing.assert_allclose(p_ref[[2, 4]], p[[2, 4]], atol=1e-8)  # where the person leads
+
+
+def test_a_height_and_a_pitch_that_are_closed_stay_where_they_were_found(
+    robot: RobotConfig, closed: Closed
+) -> None:
+    """They glided to a COM on the floor once: zero is no stand."""
+    law = msgspec.structs.replace(
+        robot.law, S=(0,) * 6, K_p=(2810.0, 2810.0, 3000.0, 800.0, 300.0, 400.0), split="diagonal"
+    )
+    closing = Hocca(msgspec.structs.replace(robot, law=law))
+    q = closed(1.0, x=0.02, pitch=0.3)
+    p = oracle.pose(robot, q)
+    closing.tick(q, STILL, 0.0, DT, align=True)
+    for _ in range(2 * round(robot.law.recentre_s / DT)):
+        output = closing.tick(q, STILL, 0.0, DT)
+    np.testing.assert_allclose(output.p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
+    np.testing.assert_allclose(output.p_ref[[0, 1, 3, 5]], 0.0, atol=1e-9)
+    closing.tick(q, STILL, 0.0, DT, align=True)  # and again, after it has led
+    np.testing.assert_allclose(closing.tick(q, STILL, 0.0, DT).p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
 
 
 def test_reference_rates_keep_the_legs_together_and_follow_the_person(
