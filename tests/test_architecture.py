@@ -52,7 +52,11 @@ VENDORS = {
     "mujoco": ["services/simulator/world.py", "services/simulator/body.py"],
     "pinocchio": ["services/planner/model.py"],
     "cvxpy": ["services/planner/split_program.py"],
-    "casadi": ["services/planner/symbolic.py", "services/planner/kinematics.py"],
+    "casadi": [
+        "services/planner/symbolic.py",
+        "services/simulator/drivetrain.py",
+        "shared/compiled_graph.py",
+    ],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
     "mcap": ["services/recorder/mcap_log.py", "tools/reexecution/rewritten.py"],
     "foxglove": ["tools/reports/foxglove.py"],

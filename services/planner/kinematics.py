@@ -8,43 +8,15 @@ equations stand in `services.planner.symbolic`.
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner import symbolic
 from services.planner.model import leg_geometry
+from shared.compiled_graph import CompiledGraph
 from shared.config import RobotConfig
 
 Array = NDArray[np.float64]
-
-
-class Compiled:
-    """A graph with fixed memory for its arguments and results: a call allocates nothing.
-
-    `arguments` are written, the object is called, `results` are read; all are arrays of
-    the graph's shapes, column-major.
-    """
-
-    def __init__(self, function: ca.Function) -> None:
-        buffer, self._call = function.buffer()
-        self._buffer = buffer
-        self.arguments = [_room(function.size_in(i)) for i in range(function.n_in())]
-        self.results = [_room(function.size_out(i)) for i in range(function.n_out())]
-        for index, array in enumerate(self.arguments):
-            buffer.set_arg(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
-        for index, array in enumerate(self.results):
-            buffer.set_res(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
-
-    def __call__(self) -> None:
-        """Compute the results from the arguments."""
-        self._call()
-
-
-def _room(shape: tuple[int, int]) -> Array:
-    """Return zeros, column-major; a column is a vector."""
-    rows, columns = shape
-    return np.zeros(rows) if columns == 1 else np.zeros((rows, columns), order="F")
 
 
 class Kinematics:
@@ -63,9 +35,9 @@ class Kinematics:
     def __init__(self, config: RobotConfig) -> None:
         """Build the graphs from the generated model."""
         graphs = symbolic.build(config, leg_geometry(config))
-        self._sharing = Compiled(graphs.sharing)
-        self._pose = Compiled(graphs.pose)
-        self._hessian = Compiled(graphs.hessian)
+        self._sharing = CompiledGraph(graphs.sharing)
+        self._pose = CompiledGraph(graphs.pose)
+        self._hessian = CompiledGraph(graphs.hessian)
         self.D_left = self._sharing.results[0]
         (
             self.p,

@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import math
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.plant import Drivetrain
+from shared.compiled_graph import CompiledGraph
 from shared.joints import N_JOINTS
 
 Array = NDArray[np.float64]
@@ -41,22 +43,9 @@ class FlexibleDrivetrain:
             motor_from_joint: motor turns per joint angle (12, 12), turns/rad.
             dt: step, s.
         """
-        n = N_JOINTS
-        self._k, self._b = config.stiffness, config.damping_s * config.stiffness
-        self._half_play = 0.5 * config.play
-        self._dt = dt
-        self._per_inertia = dt / config.rotor_inertia
-        self._friction_step = config.motor_friction * self._per_inertia
-        self._own_damping = config.motor_damping * self._per_inertia
-        self._spring_damping = self._b * self._per_inertia
-        self._cogging_angle = 2.0 * math.pi * config.cogging_periods * motor_from_joint
-        self._cogging: Array = config.cogging * np.sign(motor_from_joint.T)
-        self._has_cogging = config.cogging > 0.0
-        self.theta: Array = np.zeros(n)
-        self.rate: Array = np.zeros(n)
-        self.damping: Array = np.zeros(n)
-        self._stretch, self._inside = np.zeros(n), np.zeros(n)
-        self._tau, self._work = np.zeros(n), np.zeros(n)
+        self._graph = CompiledGraph(_step_graph(config, motor_from_joint, dt))
+        self.theta, self.rate, *self._arguments = self._graph.arguments
+        self._theta_next, self._rate_next, self._tau, self.damping = self._graph.results
 
     def settle(self, q: Array) -> None:
         """Put the rotors where the joints (12,), rad, are, at rest."""
@@ -66,44 +55,41 @@ class FlexibleDrivetrain:
     def step(self, tau_motor: Array, q: Array, v: Array) -> Array:
         """Move the rotors on by one step; return what the springs give the joints (12,), N m.
 
-        Without `damping` times v, which is for the body's integrator.
+        Without `damping` times v, which is for the body's integrator. Overwritten by the next.
 
         Args:
             tau_motor: motor torques at the joints (12,), N m.
             q: joint angles (12,), rad.
             v: joint rates (12,), rad/s.
         """
-        stretch, inside, tau, work, rate = (
-            self._stretch, self._inside, self._tau, self._work, self.rate,
-        )  # fmt: skip
-        np.subtract(self.theta, q, out=stretch)
-        if self._half_play > 0.0:
-            np.minimum(stretch, self._half_play, out=inside)
-            np.maximum(inside, -self._half_play, out=inside)
-            stretch -= inside
-            np.not_equal(stretch, 0.0, out=work)
-            np.multiply(work, self._b, out=self.damping)
-            np.multiply(work, self._spring_damping, out=work)
-        else:
-            self.damping.fill(self._b)
-            work.fill(self._spring_damping)
-        np.multiply(stretch, self._k, out=tau)
-        # backward Euler in the dampers: (1 + dt b / I + dt d / I) w_new = w + dt / I (...)
-        np.subtract(tau_motor, tau, out=inside)
-        if self._has_cogging:
-            inside -= self._cogging @ np.sin(self._cogging_angle @ self.theta)
-        inside *= self._per_inertia
-        rate += inside
-        np.multiply(work, v, out=inside)
-        rate += inside
-        work += 1.0 + self._own_damping
-        rate /= work
-        # dry friction takes off what it can and stops there
-        np.minimum(rate, self._friction_step, out=inside)
-        np.maximum(inside, -self._friction_step, out=inside)
-        rate -= inside
-        np.multiply(rate, self._dt, out=inside)
-        self.theta += inside
-        np.multiply(self.damping, rate, out=inside)
-        tau += inside
-        return tau
+        tau_now, q_now, v_now = self._arguments
+        tau_now[:], q_now[:], v_now[:] = tau_motor, q, v
+        self._graph()
+        self.theta[:], self.rate[:] = self._theta_next, self._rate_next
+        return self._tau
+
+
+def _step_graph(config: Drivetrain, motor_from_joint: Array, dt: float) -> ca.Function:
+    """Return (theta, w, tau_motor, q, q') -> (theta, w, tau_spring + b w, b): one step."""
+    theta, rate, tau_motor, q, v = (ca.SX.sym(name, N_JOINTS) for name in "trmqv")
+    k, b = config.stiffness, config.damping_s * config.stiffness
+    half = 0.5 * config.play
+    inside = ca.fmin(ca.fmax(theta - q, -half), half)
+    stretch = theta - q - inside
+    damping = b * (ca.fabs(theta - q) > half) if config.play > 0.0 else b * ca.SX.ones(N_JOINTS)
+    angle = 2.0 * math.pi * config.cogging_periods * (ca.DM(motor_from_joint) @ theta)
+    cogging = config.cogging * (ca.DM(np.sign(motor_from_joint.T)) @ ca.sin(angle))
+    per_inertia = dt / config.rotor_inertia
+    # backward Euler in the dampers: (1 + dt b / I + dt d / I) w_new = w + dt / I (...)
+    driven = rate + per_inertia * (tau_motor - k * stretch - cogging + damping * v)
+    free = driven / (1.0 + per_inertia * (damping + config.motor_damping))
+    # dry friction takes off what it can and stops there
+    most = config.motor_friction * per_inertia
+    rate_next = free - ca.fmin(ca.fmax(free, -most), most)
+    tau = k * stretch + damping * rate_next
+    return ca.Function(
+        "drivetrain",
+        [theta, rate, tau_motor, q, v],
+        [ca.densify(x) for x in (theta + dt * rate_next, rate_next, tau, damping)],
+        {"cse": True},
+    )

@@ -164,7 +164,7 @@ def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
 
 
 def test_live_and_lockstep_agree_that_averaging_the_legs_falls(tmp_path: Path) -> None:
-    flags = ("--jacobian", "average", "--duration", "6")
+    flags = ("--jacobian", "average", "--duration", "10")
     falls = [summary_of(verb, tmp_path / verb, *flags) for verb in ("demo", "sim")]
     assert [code for code, _ in falls] == [1, 1]
     assert [summary["stood"] for _, summary in falls] == [False, False]
