@@ -97,6 +97,7 @@ LAWS = [
     "services/planner/dynamic_certificate.py",
     "services/planner/poses.py",
     "services/planner/sampled_loop.py",
+    "services/planner/stability_room.py",
     "services/planner/certificate.py",
     "services/planner/engagement.py",
     "services/planner/gains.py",

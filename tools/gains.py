@@ -135,6 +135,7 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     """Print what was chosen by the dynamic certificate, and what it leaves in hand."""
     from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
     from services.planner.dynamic_certificate import DynamicCertificate  # noqa: PLC0415
+    from services.planner.stability_room import room_of  # noqa: PLC0415
 
     D_B = ", ".join(f"{value:.1f}" for value in schedule.D_B)
     console.print(
@@ -147,7 +148,7 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     table = Table(title="In hand before any motion grows (TRACK, HOLD, drives alone)")
     for heading in ("drivetrain N m/rad", "all feedback", "tau_coupled", "delay ms"):
         table.add_column(heading, justify="right")
-    for room in certificate.room(design):
+    for room in room_of(certificate, design):
         name = "rigid" if room.stiffness >= RIGID_FROM else f"{room.stiffness:g}"
         table.add_row(
             name, _decibels(room.torque), _decibels(room.coupling), f">= {1e3 * room.delay_s:.0f}"

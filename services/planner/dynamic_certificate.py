@@ -95,22 +95,6 @@ class Condition(NamedTuple):
         return f"{HALF_NAMES[self.half]}: " + ", ".join(parts)
 
 
-class Room(NamedTuple):
-    """How far parts of the loop may go with one drivetrain before anything grows."""
-
-    stiffness: float
-    """N m/rad"""
-    torque: float
-    """Factor on every feedback torque, up to the last of `LADDER`."""
-    coupling: float
-    """Factor on tau_coupled."""
-    delay_s: float
-    """From sample to use."""
-
-
-LADDER: Final = (1.0, 1.41, 2.0, 2.82, 4.0, 5.64, 8.0)
-
-
 class Verdict(NamedTuple):
     """The worst case that was found."""
 
@@ -248,51 +232,15 @@ class DynamicCertificate:
                 for delay in (LEAST_DELAY_S, self._wanted.delay_ms / 1e3):
                     yield Condition("TRACK", node, 0, stiffness, delay, NO_HAND, NOMINAL)
 
-    def room(self, design: Design) -> list[Room]:
-        """Return what each drivetrain leaves in hand, over all poses, hands and modes."""
-        found = []
-        for stiffness in self._wanted.stiffness:
-            nominal = [c for c in self.conditions(margins=False) if c.stiffness == stiffness]
-            led = [c for c in nominal if c.mode == "TRACK"]
-            found.append(
-                Room(
-                    stiffness,
-                    self._last_stable(
-                        nominal, design, lambda c, f: c._replace(gains=Gains(torque=f))
-                    ),
-                    self._last_stable(
-                        led, design, lambda c, f: c._replace(gains=Gains(coupling=f))
-                    ),
-                    LEAST_DELAY_S
-                    * self._last_stable(
-                        [c for c in led if c.delay_s == LEAST_DELAY_S],
-                        design,
-                        lambda c, f: c._replace(delay_s=LEAST_DELAY_S * f),
-                        (1.0, 5.0, 10.0, 15.0, 20.0, 24.0),
-                    ),
-                )
-            )
-        return found
-
-    def _last_stable(
-        self,
-        conditions: list[Condition],
-        design: Design,
-        changed: Callable[[Condition, float], Condition],
-        ladder: tuple[float, ...] = LADDER,
-    ) -> float:
-        """Return the largest factor of the ladder up to which all conditions are stable."""
-        last = 0.0
-        for factor in ladder:
-            if not all(self.judge(changed(c, factor), design).stable for c in conditions):
-                break
-            last = factor
-        return last
-
     def sway(self, design: Design) -> float:
         """Return the rate (1/s, negative) of the oscillation that fades most slowly in TRACK."""
         cases = self._cases(self._in_track, margins=False)
         return max(self.loop(c, design).growth(c.gains, DRIFT_HZ).rate for c in cases)
+
+    @property
+    def stiffnesses(self) -> tuple[float, ...]:
+        """Drivetrains that are asked about, N m/rad."""
+        return self._wanted.stiffness
 
     def judge(self, condition: Condition, design: Design) -> Verdict:
         """Return what the loop does in a condition."""
