@@ -24,7 +24,7 @@ from typing import Final, Generic, Self, TypeAlias, TypeVar
 import zenoh
 
 from shared import linger
-from shared.clock import now_ns
+from shared.clock import keep_pace, now_ns
 from shared.codec import Decoder, encode
 from shared.config import SERVICES, RobotConfig, expand
 from shared.exceptions import BusError, NonFiniteError
@@ -325,7 +325,8 @@ def open_session(
     """Join the bus and return without waiting for anybody; links form as peers come up.
 
     Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the
-    priority of the process before: Zenoh's thread inherits it.
+    priority of the process before: Zenoh's thread inherits it. From then on the process goes by
+    the clock of the fleet in `run_dir` (`shared.clock.keep_pace`).
 
     Args:
         config: the robot; `config.bus` holds the endpoints and the lease.
@@ -340,6 +341,7 @@ def open_session(
         BusError: the name cannot be used, or the endpoint is taken, too long or not
             possible. The socket that a killed process left behind is no obstacle.
     """
+    keep_pace(run_dir)
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
     own = [config.bus.endpoints[name]] if name in SERVICES else []

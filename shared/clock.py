@@ -1,21 +1,68 @@
-"""The monotonic clock, in one place so that laws never read it."""
+"""The fleet's clock, in one place so that laws never read it.
+
+CLOCK_MONOTONIC, one for all processes of a host. A simulated fleet may run in slow motion
+(`keep_pace`): on cores that do not carry ten services in real time the clock of all of them goes
+slower, and control, physics and log are what they would be on a faster machine. Only what waits
+has to know (`machine_s`, `sleep_until`).
+"""
 
 from __future__ import annotations
 
 import time
+from pathlib import Path
+
+from shared.exceptions import FleetError
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
 NS_PER_US = 1_000
 
+PACE_FILE = "pace"
+"""In the run directory of a fleet in slow motion."""
+
+_pace = 1.0
+
 
 def now_ns() -> int:
-    """Return CLOCK_MONOTONIC in ns: one clock for all processes of one host."""
-    return time.monotonic_ns()
+    """Return the fleet's time in ns: one clock for all processes of one host."""
+    now = time.monotonic_ns()
+    return now if _pace == 1.0 else int(now * _pace)
 
 
 def sleep_until(deadline_ns: int) -> None:
-    """Sleep until a moment of the monotonic clock; return at once if it has passed."""
-    remaining_ns = deadline_ns - time.monotonic_ns()
+    """Sleep until a moment of the fleet's clock; return at once if it has passed."""
+    remaining_ns = deadline_ns - now_ns()
     if remaining_ns > 0:
-        time.sleep(remaining_ns / NS_PER_S)
+        time.sleep(machine_s(remaining_ns / NS_PER_S))
+
+
+def machine_s(fleet_s: float) -> float:
+    """Return how long seconds of the fleet's clock last on the machine's: to wait for."""
+    return fleet_s / _pace
+
+
+def pace() -> float:
+    """Return how fast the fleet's clock goes, in seconds a second."""
+    return _pace
+
+
+def keep_pace(run_dir: Path) -> None:
+    """Go by the clock of the fleet in a run directory from now on; before any time is read.
+
+    Raises:
+        FleetError: the file that tells its pace tells none.
+    """
+    global _pace  # noqa: PLW0603 - a process has one clock, as it has one CLOCK_MONOTONIC
+    path = run_dir / PACE_FILE
+    try:
+        text = path.read_text(encoding="ascii")
+    except (FileNotFoundError, NotADirectoryError):
+        _pace = 1.0
+        return
+    try:
+        found = float(text)
+    except ValueError:
+        found = 0.0
+    if not 0.0 < found <= 1.0:
+        raise FleetError(f"{path}: {text.strip()!r} is no pace; above 0 and up to 1 is right")
+    _pace = found

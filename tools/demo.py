@@ -20,6 +20,7 @@ from tools.runs.live import run_live
 from tools.runs.live_view import LiveView
 from tools.runs.run_log import read_run
 from tools.supervision import procfs
+from tools.supervision.pace import add_pace
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_verb
 
@@ -39,9 +40,11 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl demo --jacobian average
         xrl demo --plant drivetrain.stiffness=3000
         xrl demo --duration 8 --push 4:0.3:40,0,0
+        xrl demo --pace 0.5
         """,
     )
     experiment.add_flags(parser)
+    add_pace(parser)
     parser.add_argument(
         "--no-restart",
         action="store_true",
@@ -100,6 +103,8 @@ def lead_run(
         verb="demo",
         seed=args.seed,
         true_plant=plant_from(args.plant),
+        pace=args.pace,
+        tell=lambda text: console.print(f"[yellow]{text}[/]", highlight=False, soft_wrap=True),
         no_restart=SERVICES if args.no_restart else {kill.service for kill in story.kill},
     )
 

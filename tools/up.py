@@ -12,6 +12,7 @@ from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.runs.experiment import add_plant, make_out, scenario_file
 from tools.supervision.fleet import check_known, load_table
+from tools.supervision.pace import add_pace
 from tools.supervision.supervise import Fleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
 
@@ -48,6 +49,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "deploy/scenarios (its kills are left to you)",
     )
     add_plant(parser)
+    add_pace(parser)
     parser.add_argument(
         "--no-sim",
         action="store_true",
@@ -102,6 +104,7 @@ def run(args: argparse.Namespace) -> int:
         asleep=("planner",) if asleep else (),
         simulation=not args.no_sim,
         injected=args.injectable,
+        pace=args.pace,
     )
     up = len(fleet.manifest.services) - asleep
     record = f", record: {out}" if "recorder" in fleet.manifest.services else ""

@@ -7,7 +7,7 @@ from typing import Final
 from services.injector.orders import Orders
 from services.injector.relay import Relay
 from services.injector.watch import Watch
-from shared.clock import NS_PER_S, now_ns
+from shared.clock import NS_PER_S, machine_s, now_ns
 from shared.injections import Injections
 from shared.process import StopFlag
 
@@ -34,5 +34,5 @@ def _patience_s(relay: Relay, injections: Injections) -> float:
     """Return how long there is nothing to do."""
     at_ns = now_ns()
     due_ns = relay.next_ns()
-    waits_s = LOOK_S if due_ns is None else min(LOOK_S, (due_ns - at_ns) / NS_PER_S)
-    return max(0.0, min(waits_s, (injections.next_due - at_ns) / NS_PER_S))
+    next_ns = injections.next_due if due_ns is None else min(due_ns, injections.next_due)
+    return max(0.0, min(LOOK_S, machine_s((next_ns - at_ns) / NS_PER_S)))

@@ -27,7 +27,7 @@ from services.recorder.snapshot import Snapshot
 from services.recorder.space import MIB
 from shared import gain_schedule, log, topics
 from shared.bus import open_session
-from shared.clock import now_ns
+from shared.clock import keep_pace, now_ns, pace
 from shared.config_file import load
 from shared.config_sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
@@ -69,6 +69,7 @@ def main() -> int:
     logger = log.setup("recorder")
     arguments = _arguments()
     config = load(arguments.config)
+    keep_pace(arguments.run_dir)
     attachments = _attachments(arguments)
     metadata = _metadata(config.name, arguments, config.recorder)
     recorded = {key: t for key, t in topics.all_keys(config.name).items() if t.recorded}
@@ -215,6 +216,7 @@ def _metadata(
         "schema_version": SCHEMA_VERSION,
         "robot": robot,
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "pace": f"{pace():g}",
         "scenario": arguments.scenario_text,
         "scenario_file": arguments.scenario.name if arguments.scenario else "",
     }

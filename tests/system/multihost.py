@@ -24,6 +24,7 @@ from typing import Any, Final
 import msgspec
 import tomli_w
 
+from services.simulator.plant import PlantConfig
 from shared import scenario
 from shared.bus import open_session
 from shared.clock import now_ns
@@ -181,7 +182,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
     network.allow_foreign_addresses()
     robot = spread(experiment.load_robot(DEFAULT_CONFIG), network)
     told = story()
-    robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, told)
+    robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, told, PlantConfig())
     started = Fleet.start(
         robot_path,
         run_dir,

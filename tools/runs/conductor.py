@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from shared import topics
 from shared.bus import Latest, Session
-from shared.clock import NS_PER_S, now_ns
+from shared.clock import NS_PER_S, machine_s, now_ns, pace
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.messages import (
@@ -29,10 +29,14 @@ from shared.messages import (
 from shared.scenario import Fault, Inject, Kill, Push, Restart, Scenario
 from tools.runs.injector_client import InjectorClient
 from tools.supervision import procfs
+from tools.supervision.pace import IDLE_LEAST, CoresFullError, IdleMeter
 from tools.supervision.supervise import Fleet
 
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
+PATIENCE_S: Final = 10.0
+"""Whether the cores carry the fleet is asked for after this long: to start, it needs them all."""
+IDLE_EVERY_S: Final = 0.5
 SETTLE_S: Final = 2.0
 """All six modules track for so long before the scenario starts."""
 AFTER_FALL_S: Final = 1.0
@@ -133,6 +137,8 @@ class Conductor:
         None if the robot fell before the scenario could begin.
 
         Raises:
+            CoresFullError: the cores do not carry the fleet at its pace, so it does not come to
+                stand.
             RunError: the robot did not come to stand, or the simulated world went silent.
             FleetError: a service that was to be restarted could not be.
         """
@@ -188,11 +194,23 @@ class Conductor:
 
         Returns False if the robot falls first: that is a finding, not an error.
         """
-        deadline = time.monotonic() + READY_TIMEOUT_S
+        begin_s = time.monotonic()
+        deadline, next_look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s
+        meter = IdleMeter()
         since = None
         self._note = "waiting for six modules to track"
-        while since is None or time.monotonic() - since < SETTLE_S:
+        while since is None or time.monotonic() - since < machine_s(SETTLE_S):
             self._listen()
+            if time.monotonic() >= next_look_s:
+                next_look_s += IDLE_EVERY_S
+                idle = meter.look()
+                late = time.monotonic() - begin_s >= PATIENCE_S
+                if late and idle is not None and idle < IDLE_LEAST:
+                    raise CoresFullError(
+                        f"the cores do not carry ten services at {pace():g} of real time: "
+                        f"{100 * idle:.0f} % idle, and not all six modules track "
+                        f"({self._modes_in_words()}); `--pace {pace() / 2:g}` asks for half of it"
+                    )
             tracking = [self._modes.get(module) == Mode.TRACK for module in MODULES]
             standing = self._truth is not None and self._truth.hoist == 0.0
             if self._truth is not None and self._truth.fallen:
@@ -284,7 +302,7 @@ class Conductor:
         tracking = list(self._modes.values()).count(Mode.TRACK)
         self._dropped_out |= tracking == 0
         if self._dropped_out and tracking >= self._chase.modules:
-            self._chase_at_s = min(self._chase_at_s, now_s + self._chase.after_s)
+            self._chase_at_s = min(self._chase_at_s, now_s + machine_s(self._chase.after_s))
         if now_s >= self._chase_at_s:
             service, self._chase = self._chase.service, None
             self._act(Kill(service=service, at=scenario_s))

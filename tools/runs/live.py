@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Mapping
@@ -15,6 +16,7 @@ from shared.robot_model import mjcf
 from shared.scenario import Scenario
 from tools.runs import experiment
 from tools.runs.experiment import PLANT_FILE
+from tools.supervision.pace import PACE_MIN, PACE_VARIABLE, SLOWER, CoresFullError, usual_pace
 from tools.supervision.supervise import Fleet
 
 T = TypeVar("T")
@@ -30,6 +32,8 @@ def run_live(
     seed: int,
     true_plant: PlantConfig,
     no_restart: Collection[str],
+    pace: float | None = None,
+    tell: Callable[[str], None] = lambda _text: None,
 ) -> T:
     """Start a fleet, have it led, stop it; return what `lead` returns.
 
@@ -44,10 +48,44 @@ def run_live(
         seed: of the sensors' noise.
         true_plant: how the simulated robot differs from `robot`.
         no_restart: services that the supervisor leaves down when they end.
+        pace: how fast the fleet's clock goes. None: as usual, and where the cores turn out not to
+            carry that, again at a slower one, which is then the usual one of this process.
+        tell: is told when that happens.
 
     Raises:
+        CoresFullError: they do not carry it at any pace, or at the one asked for.
         FleetError: the fleet cannot be started or stopped.
     """
+    while True:
+        at_pace = pace if pace is not None else usual_pace()
+        try:
+            return _run_once(
+                out, robot, story, lead,
+                verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, pace=at_pace,
+            )  # fmt: skip
+        except CoresFullError as error:
+            slower = round(SLOWER * at_pace, 2)
+            if pace is not None or slower < PACE_MIN:
+                raise
+            for record in out.glob("run*.mcap"):
+                record.unlink()  # of a robot that stood and waited
+            os.environ[PACE_VARIABLE] = f"{slower:g}"
+            tell(f"{error}; again in slow motion, at {slower:g}")
+
+
+def _run_once(
+    out: Path,
+    robot: RobotConfig,
+    story: Scenario,
+    lead: Callable[[Fleet, Session], T],
+    *,
+    verb: str,
+    seed: int,
+    true_plant: PlantConfig,
+    no_restart: Collection[str],
+    pace: float,
+) -> T:
+    """Run at one pace."""
     robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
         out, robot, story, true_plant
     )
@@ -71,6 +109,7 @@ def run_live(
             },
             no_restart=frozenset(no_restart),
             injected=bool(story.inject),
+            pace=pace,
             leashed=True,
         )
         try:

@@ -113,6 +113,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
             (float(s) for s, row in zip(t, truth, strict=True) if row.fallen), None
         ),
         "duration_s": float(t[-1]),
+        "pace": float(log.metadata.get("run", {}).get("pace", "1")),
         "real_time_factor": last.real_time_factor,
         "world_time_lost_s": last.late_s,
         "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,

@@ -37,6 +37,12 @@ def show(summary: Summary, console: Console) -> None:
     console.print(table)
     for line in network(summary):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if summary.get("pace", 1.0) != 1.0:
+        console.print(
+            f"In slow motion: the fleet's clock went at {summary['pace']:g} of real time.",
+            style="dim",
+            highlight=False,
+        )
     if not summary["in_real_time"]:
         console.print(
             f"[yellow]The machine was too slow for real time: real-time factor "

@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 
 from services.joint import will
+from shared.clock import PACE_FILE
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.supervision.fleet import SUPERVISOR_SOCKET, UNIX, Plan, is_listening
@@ -40,6 +41,7 @@ class RunDir:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(os.path.abspath(path))  # noqa: PTH100 - no symlink resolved: paths stay short
+        self.pace = self.path / PACE_FILE
         self.supervisor_socket = self.path / SUPERVISOR_SOCKET
         self.supervisor_config = self.path / "supervisord.conf"
         self.supervisor_pid = self.path / "supervisord.pid"
@@ -91,8 +93,11 @@ class RunDir:
         except FileNotFoundError:
             return False
 
-    def prepare(self, plan: Plan) -> None:
-        """Start with empty logs and no dead sockets, and write the manifest."""
+    def prepare(self, plan: Plan, pace: float = 1.0) -> None:
+        """Start with empty logs and no dead sockets; write the manifest and the clock's pace."""
+        self.pace.unlink(missing_ok=True)
+        if pace != 1.0:
+            self.pace.write_text(f"{pace:g}\n", encoding="ascii")
         shutil.rmtree(self.logs, ignore_errors=True)
         self.logs.mkdir()
         sockets = [item.endpoint for item in plan.listeners if item.endpoint.startswith(UNIX)]
@@ -127,7 +132,7 @@ class RunDir:
             _remove_socket(Path(path))
         _remove_socket(self.supervisor_socket)
         self._remove_wills()
-        for file in (self.supervisor_config, self.supervisor_pid, self.manifest):
+        for file in (self.supervisor_config, self.supervisor_pid, self.manifest, self.pace):
             file.unlink(missing_ok=True)
         if not keep_logs:
             shutil.rmtree(self.logs, ignore_errors=True)

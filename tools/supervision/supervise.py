@@ -20,6 +20,7 @@ from services.joint import will
 from services.simulator import usb_standin
 from shared.exceptions import FleetError
 from tools.supervision import fleet, procfs
+from tools.supervision.pace import check_pace, usual_pace
 from tools.supervision.run_dir import Manifest, RunDir, supervisor_config
 from tools.supervision.supervisor_client import RefusedError, ServiceInfo, Supervisor
 
@@ -50,6 +51,7 @@ class Fleet:
         asleep: Collection[str] = (),
         simulation: bool = True,
         injected: bool = False,
+        pace: float | None = None,
         leashed: bool = False,
         table_path: Path = fleet.TABLE,
         timeout_s: float = 30.0,
@@ -67,6 +69,8 @@ class Fleet:
             asleep: of these, which wait for `start_service`.
             simulation: False leaves the simulator out; where all drives are real it always is.
             injected: with the injector on the links of planner, joints and harness.
+            pace: how fast the clock of a simulated fleet goes; None: `usual_pace` where it is
+                simulated, else as the machine's.
             leashed: stop the fleet if this process dies.
             table_path: the process table.
             timeout_s: time in which every service has to be up.
@@ -89,10 +93,13 @@ class Fleet:
             table_path=table_path,
         )
         fleet.check_known(no_restart, list(plan.commands))
+        simulated = "simulator" in plan.commands
+        clock_pace = pace if pace is not None else usual_pace() if simulated else 1.0
+        check_pace(clock_pace, simulated=simulated)
         lock = started.run.claim()
         try:
             fleet.check_free(plan.listeners)
-            started.run.prepare(plan)
+            started.run.prepare(plan, clock_pace)
             text = supervisor_config(started.run, plan, no_restart)
             started.run.supervisor_config.write_text(text, encoding="utf-8")
             environment = dict(plan.environment)

@@ -27,7 +27,7 @@ from services.joint.drivers.odrive_frames import Frames
 from shared import cansimple
 from shared.cansimple import AxisState, Command
 from shared.cansimple_06 import Command06
-from shared.clock import NS_PER_MS, NS_PER_S, now_ns
+from shared.clock import NS_PER_MS, NS_PER_S, machine_s, now_ns
 from shared.config_sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
 from shared.messages import Pair
@@ -155,10 +155,10 @@ class OdriveCan:
         now = now_ns()
         deadline = now + int(timeout_s * NS_PER_S)
         if not self._link.is_open and not self._connect():
-            time.sleep(max(0.0, timeout_s))
+            time.sleep(max(0.0, machine_s(timeout_s)))
             return self._silence(now_ns())
         while True:
-            self._pump((deadline - now) / NS_PER_S)
+            self._pump(machine_s((deadline - now) / NS_PER_S))
             now = now_ns()
             if self._encoders.complete():
                 self._sample_ns = now

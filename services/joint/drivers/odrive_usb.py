@@ -30,7 +30,7 @@ from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_v3 import OdriveV3
 from shared import log
 from shared.cansimple import AxisState
-from shared.clock import NS_PER_MS, now_ns
+from shared.clock import NS_PER_MS, machine_s, now_ns
 from shared.config_sections import DriveConfig
 from shared.exceptions import DriveError
 from shared.messages import Pair
@@ -133,7 +133,7 @@ class OdriveUsb:
         A reading with status LOST repeats the last sample and its time.
         """
         wait_s = max(timeout_s, PATIENCE * self._period_s) if timeout_s > 0.0 else 0.0
-        if self._fresh.wait(wait_s):
+        if self._fresh.wait(machine_s(wait_s)):
             self._fresh.clear()
             self._silent_s = 0.0
             sample = self._sample
@@ -261,7 +261,7 @@ class OdriveUsb:
         due = loop.time()
         while not (self._closing and self._is_carried_out()):
             await self._exchange(board)
-            due = max(due + self._period_s, loop.time())
+            due = max(due + machine_s(self._period_s), loop.time())
             await asyncio.sleep(due - loop.time())
 
     def _is_carried_out(self) -> bool:
