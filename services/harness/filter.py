@@ -98,6 +98,11 @@ def initial_state() -> FilterState:
     )
 
 
+def tared_state(offset: Array) -> FilterState:
+    """Return the state of a sensor whose tare found these leg forces (6,), N, as zero."""
+    return msgspec.structs.replace(initial_state(), tare=Tare.DONE, offset=offset)
+
+
 def start_tare(state: FilterState) -> FilterState:
     """Return the state with the tare begun, unless it runs already."""
     return state if state.tare is not Tare.DONE else _begin_tare(state, Tare.RUNNING)

@@ -10,12 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.plant import PlantConfig
+from services.simulator.plant import to_toml as plant_to_toml
+from services.simulator.state import taken
 from shared import scenario
 from shared.config import RobotConfig
+from shared.config_file import to_toml
 from shared.impairment import Impairment
+from shared.joints import MODULES
 from shared.messages import SimTruth
 from shared.scenario import Keyframe, Kill, Push, Restart, Scenario
 from tools.runs.lockstep import Lockstep
+from tools.runs.network import BASE
+from tools.runs.partial import Start
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 
@@ -72,14 +78,41 @@ def still(duration: float, height: float = 1.188, **changes: object) -> Scenario
     return story("stand", duration=duration, keyframe=frames, **changes)
 
 
+def standing(robot: RobotConfig, plant: PlantConfig) -> Start:
+    """Return the moment at which a scenario begins; a robot is stood up once in this process."""
+    schedule = robot.gain_schedule
+    key = (to_toml(robot), plant_to_toml(plant), schedule.digest if schedule else "")
+    if key not in _standing:
+        fleet = Lockstep(robot, still(1.0), BASE, plant=plant)
+        assert any(row.scenario_s >= 0.0 for row in fleet.run()), "it stands and tracks"
+        assert fleet.planner is not None
+        _standing[key] = Start(
+            taken(fleet.world, fleet.bank, fleet.now_ns, 0),
+            {module: fleet.memory_of(module) for module in MODULES},
+            (fleet.planner.session, fleet.planner.remember()),
+        )
+    return _standing[key]
+
+
+_standing: dict[tuple[str, str, str], Start] = {}
+
+
 def run(
     robot: RobotConfig,
     scenario: Scenario,
-    delay_ms: float = 1.0,
+    delay_ms: float = BASE.delay_ms,
     plant: PlantConfig | None = None,
+    *,
+    stands: bool = True,
 ) -> Run:
-    """Run to the end, or to a fall."""
+    """Run to the end, or to a fall.
+
+    On the network of the stand-up it begins standing, unless that is not to be taken for granted.
+    """
     lockstep = Lockstep(robot, scenario, Impairment(delay_ms=delay_ms), plant=plant)
+    if stands and delay_ms == BASE.delay_ms:
+        start = standing(robot, lockstep.plant)
+        lockstep.go_on(start.state, start.modules, start.planner)
     rows = []
     for row in lockstep.run():
         if row.scenario_s >= 0.0:

@@ -107,7 +107,10 @@ def test_a_stiff_drivetrain_is_the_rigid_one(robot: RobotConfig) -> None:
 def test_one_step_of_a_millisecond_does_as_well_as_four(
     robot: RobotConfig, stiffness: float
 ) -> None:
-    """The rest of a lockstep run on the realistic plant hangs on this."""
+    """The rest of a lockstep run on the realistic plant hangs on this.
+
+    Within 3 mm: dry friction lets the robot rest anywhere in a band, and the soles no longer creep.
+    """
     coms = []
     for steps in (1, 4):
         plant = changed(PlantConfig(), {"drivetrain.stiffness": stiffness, "steps": steps})
@@ -115,4 +118,4 @@ def test_one_step_of_a_millisecond_does_as_well_as_four(
         coms.append(np.array([row.com for row in fleet.run() if row.scenario_s > 0.0]))
         assert fleet.world.scenario_s > 1.4
     n = min(map(len, coms))
-    np.testing.assert_allclose(coms[0][:n], coms[1][:n], atol=1e-3)
+    np.testing.assert_allclose(coms[0][:n], coms[1][:n], atol=3e-3)

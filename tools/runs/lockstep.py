@@ -205,6 +205,7 @@ class Lockstep:
             self.planner.recall(planner[1])
         for drive in self._drives:
             drive.heard(self.now_ns)
+        self.harness.go_on()
         self._todo = [row for row in self._todo if row.at >= self.world.scenario_s]
 
     def run(self) -> Iterator[SimTruth]:

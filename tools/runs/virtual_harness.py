@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from services.harness.filter import WrenchFilter
+from services.harness.filter import WrenchFilter, tared_state
 from services.harness.loop import HarnessLoop
 from services.simulator.harness_front import HarnessFront
 from services.simulator.world import World
@@ -78,6 +78,10 @@ class VirtualHarness:
         """Sample what acts on the torso, and run one cycle of the service."""
         self._front.send(world.harness_force, world.harness_moment)
         self._loop.cycle(now_ns)
+
+    def go_on(self) -> None:
+        """Take it that the tare is done: in the middle of a run the operator's load is on it."""
+        self._loop.state = tared_state(self._front.bias)
 
     def tare(self, request: TareRequest) -> None:
         """Ask for a new zero, from the next cycle on."""

@@ -266,7 +266,7 @@ def world_of(
     )
     world = World(body_of(with_payload(robot, posture.payload), plant), scenario)
     if rigid:
-        world.model.geom_solref[:, 0] = RIGID_STEPS * world.timestep
+        world.model.pair_solref[:, 0] = RIGID_STEPS * world.timestep
     world.stand_at(posture.q)
     world.start()
     return world
