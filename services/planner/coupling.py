@@ -42,13 +42,13 @@ class Missing:
             S: (6,), 1 where the person leads: nothing is added there.
             damping: c, in shares of B_p.
         """
-        self._closed = np.flatnonzero(S == 0.0)
-        self._rows = np.ix_(self._closed, self._closed)
-        self._K_p, self._B_p = K_p[self._closed], damping * B_p[self._closed]
-        self._K_scale, self._B_scale = (
-            np.sqrt(np.where(diagonal > LEAST, diagonal, 1.0))
-            for diagonal in (self._K_p, self._B_p)
-        )
+        closed = np.flatnonzero(S == 0.0)
+        self._rows = np.ix_(closed, closed)
+        body = np.array((K_p[closed], damping * B_p[closed]))
+        self._body: Array = body[:, :, np.newaxis] * np.eye(len(closed))
+        root = np.sqrt(np.where(body > LEAST, body, 1.0))
+        self._scale: Array = root[:, :, np.newaxis] * root[:, np.newaxis, :]
+        """(2, closed, closed): makes metres and radians comparable, of K and of B."""
 
     def at(self, K_fail: Array, B_local: Array) -> tuple[Array, Array]:
         """Return K_c and B_c (6, 6), symmetric and not negative.
@@ -57,22 +57,14 @@ class Missing:
             K_fail: stiffness that the local gains leave, along p (6, 6).
             B_local: T^T D_B T (6, 6).
         """
+        local = np.array((K_fail[self._rows], B_local[self._rows]))
+        scaled = (self._body - local) / self._scale
+        values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
+        kept = (vectors * np.maximum(values, 0.0)[:, np.newaxis]) @ vectors.transpose(0, 2, 1)
+        kept *= self._scale
         K_c, B_c = np.zeros((6, 6)), np.zeros((6, 6))
-        K_c[self._rows] = _positive_part(np.diag(self._K_p) - K_fail[self._rows], self._K_scale)
-        B_c[self._rows] = _positive_part(np.diag(self._B_p) - B_local[self._rows], self._B_scale)
+        K_c[self._rows], B_c[self._rows] = kept
         return K_c, B_c
-
-
-def _scale(diagonal: Array) -> Array:
-    return np.asarray(np.sqrt(np.where(diagonal > LEAST, diagonal, 1.0)), float)
-
-
-def _positive_part(A: Array, scale: Array) -> Array:
-    """Return A without its negative directions; `scale` makes metres and radians comparable."""
-    scaled = A / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    kept = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(np.outer(scale, scale) * kept, float)
 
 
 def follow(bandwidth_hz: float, dt: float) -> float:

@@ -1,0 +1,232 @@
+"""How hard a push a stand bears before a sole tips, a motor saturates or a foot slides. Pure.
+
+The stiffness certificate (`services.planner.certificate`) is linear: it knows no limits. This
+module adds them, for a constant horizontal push F u at the torso's origin:
+
+1. Held by local gains D, references at rest, and while the planner leads by K_c beside them
+   (`services.planner.coupling`). The body moves to dp and every torque changes:
+
+       (K_fail + K_c) dp = F pi,   pi = (dr_torso/dp)^T u,   dtau = -D T dp - J^T K_c dp
+
+2. Whatever the control does, the joints where they are: a linear program over how the two legs
+   share weight and push. No gains bear more at that pose.
+
+Leg i carries the wrench W_i of the torso, tau_i = J_i^T W_i + the weight of its knee. Its sole
+carries W_i moved to the ankle, and the leg's weight. W_i changes by J_i^T dW_i = dtau_i - (H T dp)_i.
+Every limit is linear in tau and in the soles' wrenches, so the first one met gives the force.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from services.planner.kinematics import Kinematics
+from shared.config import GRAVITY, RobotConfig
+from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
+from shared.robot_model import ankle_positions
+
+Array = NDArray[np.float64]
+
+FRICTION: Final = 0.5
+"""Coefficient of the soles on a poor floor."""
+DIRECTIONS: Final = {
+    "forwards": (1.0, 0.0),
+    "back": (-1.0, 0.0),
+    "sideways": (0.0, 1.0),
+}
+"""World x and y of a push; left and right are alike."""
+_SLOPE_MIN: Final = 1e-12
+_LEGS: Final = (slice(0, N_LEG), slice(N_LEG, N_JOINTS))
+
+
+class PushLimit(NamedTuple):
+    """The hardest push along one direction."""
+
+    force_n: float
+    """0: it does not stand without a push either."""
+    part: str
+    """What gives way first, such as "left sole's outer edge"."""
+
+
+class Response(NamedTuple):
+    """What a push of 1 N does once the body has come to rest."""
+
+    dp: Array
+    """(6,) m and rad."""
+    dtau: Array
+    """(12,) N m at the joints."""
+    soles: Array
+    """(12,): force and moment at each ankle, N and N m, right leg first."""
+
+
+class _Limit(NamedTuple):
+    """row @ (tau, soles) <= bound; tau (12,) in N m, soles (12,) as force and moment at ankles."""
+
+    part: str
+    row: Array
+    bound: float
+
+
+class LoadedStand:
+    """One pose under its own weight: torques and wrenches, and how they change with a push."""
+
+    def __init__(self, config: RobotConfig, kinematics: Kinematics, T: Array, H: Array) -> None:
+        """Take the pose.
+
+        Args:
+            config: the robot.
+            kinematics: updated at the pose.
+            T: joint rates per unit of p along the closed chain (12, 6).
+            H: `Kinematics.hessian_times` of the weight (12, 12), N m/rad.
+        """
+        self._T, self._H = T.copy(), H.copy()
+        self._K_geo: Array = self._T.T @ self._H @ self._T
+        self._J_body = kinematics.J.copy()
+        C = kinematics.C
+        self._J = (-C[:, :N_LEG], C[:, N_LEG:].copy())
+        """Torso's twist per joint rate of each leg (6, 6), linear before angular."""
+        D_left = kinematics.D_left
+        weight = config.torso_mass * GRAVITY
+        self._W = [weight * shares[:, 2] for shares in (np.eye(6) - D_left, D_left)]
+        """Torso's wrench on each leg (6,), N and N m at its origin."""
+        F_O = np.zeros(6)
+        F_O[2] = config.total_mass * GRAVITY
+        self._tau: Array = F_O @ kinematics.J
+        self._tau_knees = self._tau - self._joint_torques(self._W)
+        """Torques of the knees' own weight (12,), N m."""
+        self._arms = [kinematics.r_torso - ankle for ankle in np.array(ankle_positions(config))]
+        self._leg_weights = [
+            # the knee's weight turns the ankle by what the ankle's torque says
+            np.array([0.0, 0.0, 2.0 * config.mass.module * GRAVITY, *self._tau_knees[leg][:2], 0.0])
+            for leg in _LEGS
+        ]
+        self._limits = _limits(config)
+
+    def response(
+        self, D: Array, direction: tuple[float, float], K_c: Array | None = None
+    ) -> Response | None:
+        """Return what a constant push of 1 N does, None if the gains do not stand at all.
+
+        Args:
+            D: local stiffnesses (12,), N m/rad; on a drivetrain that flexes with k, D k / (D + k).
+            direction: world x and y, a unit vector.
+            K_c: what the planner adds along p (6, 6); None: it is dead.
+        """
+        T = self._T
+        K = T.T @ (D[:, np.newaxis] * T) + self._K_geo + (0.0 if K_c is None else K_c)
+        K = 0.5 * (K + K.T)
+        if np.linalg.eigvalsh(K)[0] <= 0.0:
+            return None
+        torso_per_p = self._J[0] @ T[:N_LEG]
+        dp = np.linalg.solve(K, torso_per_p.T @ _horizontal(direction))
+        dq = T @ dp
+        dtau: Array = -D * dq
+        if K_c is not None:
+            dtau -= self._J_body.T @ (K_c @ dp)
+        turned = dtau - self._H @ dq
+        dW: list[Array] = [
+            np.asarray(np.linalg.solve(J.T, turned[leg]), float)
+            for J, leg in zip(self._J, _LEGS, strict=True)
+        ]
+        soles = self._soles(dW) - np.concatenate(self._leg_weights)
+        moved = (self._J[0] @ dq[_LEGS[0]])[:3]
+        for leg, W in enumerate(self._W):  # the torso's weight moves with it
+            soles[6 * leg + 3 : 6 * leg + 6] += np.cross(moved, W[:3])
+        return Response(dp, dtau, soles)
+
+    def limit_held(
+        self, D: Array, direction: tuple[float, float], K_c: Array | None = None
+    ) -> PushLimit:
+        """Return the hardest constant push that the gains hold; arguments as for `response`."""
+        response = self.response(D, direction, K_c)
+        if response is None:
+            return PushLimit(0.0, "the stiffness")
+        begin = np.concatenate((self._tau, self._soles(self._W)))
+        per_newton = np.concatenate((response.dtau, response.soles))
+        found = PushLimit(math.inf, "nothing")
+        for part, row, bound in self._limits:
+            slope = float(row @ per_newton)
+            if slope > _SLOPE_MIN:
+                force = max(0.0, (bound - float(row @ begin)) / slope)
+                found = min(found, PushLimit(force, part))
+        return found
+
+    def limit_of_body(self, direction: tuple[float, float]) -> PushLimit:
+        """Return the hardest push that soles and motors bear at this pose, whatever the control.
+
+        Args:
+            direction: world x and y, a unit vector.
+        """
+        total, unit = self._W[0] + self._W[1], _horizontal(direction)
+
+        def loads(x: Array) -> Array:
+            """Return (tau, soles): the right leg carries x[:6], the push is x[6]."""
+            W = [x[:6], total - x[6] * unit - x[:6]]
+            return np.concatenate((self._joint_torques(W) + self._tau_knees, self._soles(W)))
+
+        begin = loads(np.zeros(7))
+        slopes = np.array([loads(e) - begin for e in np.eye(7)]).T
+        rows = np.array([limit.row for limit in self._limits])
+        bounds = np.array([limit.bound for limit in self._limits]) - rows @ begin
+        found = scipy.optimize.linprog(
+            -np.eye(7)[6],
+            A_ub=rows @ slopes,
+            b_ub=bounds,
+            bounds=[(None, None)] * 6 + [(0.0, None)],
+        )
+        if not found.success:
+            return PushLimit(0.0, "the pose itself")
+        tightest = int(np.argmin(bounds - rows @ slopes @ found.x))
+        return PushLimit(float(found.x[6]), self._limits[tightest].part)
+
+    def _joint_torques(self, W: list[Array]) -> Array:
+        """Return the torques (12,), N m, that carry the torso's wrench on each leg."""
+        return np.concatenate([J.T @ wrench for J, wrench in zip(self._J, W, strict=True)])
+
+    def _soles(self, W: list[Array]) -> Array:
+        """Return both soles' wrenches (12,), N and N m at the ankles."""
+        wrenches = []
+        for wrench, arm, own in zip(W, self._arms, self._leg_weights, strict=True):
+            moment = wrench[3:] + np.cross(arm, wrench[:3])
+            wrenches.append(np.concatenate((wrench[:3], moment)) + own)
+        return np.concatenate(wrenches)
+
+
+def _horizontal(direction: tuple[float, float]) -> Array:
+    return np.array([*direction, 0.0, 0.0, 0.0, 0.0])
+
+
+def _limits(config: RobotConfig) -> list[_Limit]:
+    """Return the limits of every motor pair, sole edge and sole's friction."""
+    limits = []
+    for index, module in enumerate(MODULES):
+        for phi in (-1.0, 1.0):
+            for theta in (-1.0, 1.0):
+                row = np.zeros(24)
+                row[2 * index : 2 * index + 2] = phi, theta
+                limits.append(_Limit(f"torque of {module}", row, config.joint.tau_module_max))
+    geometry = config.geometry
+    l_x, l_y, h = geometry.l_foot / 2, geometry.w_foot / 2, geometry.foot_height
+    for leg, side in enumerate(SIDES):
+        f_x, f_y, f_z, m_x, m_y = (N_JOINTS + 6 * leg + part for part in range(5))
+        outer = -1.0 if side == "right" else 1.0
+        for sign, edge in ((1.0, "toe"), (-1.0, "heel")):
+            row = np.zeros(24)  # centre of pressure: x = (-m_y - h f_x) / f_z
+            row[m_y], row[f_x], row[f_z] = -sign, -sign * h, -l_x
+            limits.append(_Limit(f"{side} sole's {edge}", row, 0.0))
+        for sign in (outer, -outer):
+            row = np.zeros(24)  # centre of pressure: y = (m_x - h f_y) / f_z
+            row[m_x], row[f_y], row[f_z] = sign, -sign * h, -l_y
+            edge = "outer edge" if sign == outer else "inner edge"
+            limits.append(_Limit(f"{side} sole's {edge}", row, 0.0))
+        for axis in (f_x, f_y):
+            for sign in (1.0, -1.0):
+                row = np.zeros(24)  # a square inside the friction cone
+                row[axis], row[f_z] = sign, -FRICTION / math.sqrt(2.0)
+                limits.append(_Limit(f"{side} sole's friction", row, 0.0))
+    return limits

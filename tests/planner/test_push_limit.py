@@ -1,0 +1,123 @@
+"""How hard a push a stand bears: against MuJoCo at rest, and against what no gains can beat."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from services.planner.poses import Poses
+from services.planner.push_limit import DIRECTIONS, LoadedStand
+from services.simulator.body import body_of
+from services.simulator.plant import NAMED, changed
+from services.simulator.world import World
+from shared.config import RobotConfig
+from shared.joints import N_JOINTS, N_LEG
+from shared.scenario import Keyframe, Push, Scenario
+
+Array = NDArray[np.float64]
+
+HEIGHTS = (0.7, 0.8, 0.9)
+STIFF = np.tile([900.0, 1500.0, 900.0, 1500.0, 900.0, 900.0], 2)
+DAMPING = 60.0
+PUSH_N = 15.0
+FLOOR_S = 0.004
+"""Contact time of a floor that hardly gives: the soles' own roll is not in the formula."""
+SETTLE_S = 4.0
+
+
+class Posed(NamedTuple):
+    stand: LoadedStand
+    q: Array
+    tau: Array
+    """Of the weight at rest (12,), N m."""
+
+
+@pytest.fixture(scope="module")
+def poses(robot: RobotConfig) -> dict[float, Posed]:
+    at, found = Poses(robot), {}
+    weight = np.zeros(6)
+    weight[2] = robot.total_mass * 9.81
+    for z in HEIGHTS:
+        node = at.node(z, 0.0)
+        assert node is not None
+        stand = LoadedStand(robot, at.kinematics, node.T, node.hessians[0])
+        found[z] = Posed(stand, at.q, weight @ at.kinematics.J)
+    return found
+
+
+def torques_at_rest(robot: RobotConfig, posed: Posed, force: Array) -> Array:
+    """Return the torques (12,), N m, of springs at the joints that hold a pose under a push."""
+    story = Scenario(
+        name="push", about="", duration=60.0, hand=False,
+        keyframe=(Keyframe(at=0.0, height=1.0),),
+        push=(Push(at=0.0, duration=60.0, force=(float(force[0]), float(force[1]), 0.0)),),
+    )  # fmt: skip
+    body = body_of(robot, changed(NAMED["ideal"], {"floor.contact_time": FLOOR_S}))
+    world = World(body, story)
+    world.stand_at(posed.q)
+    world.start()
+    to_motor = np.linalg.inv(2.0 * np.pi * body.motor_from_joint.T)
+    q_index, v_index = world._q_index, world._v_index
+    begin_q = world.data.qpos[q_index].copy()
+    tau = posed.tau
+    for _ in range(round(SETTLE_S / world.timestep)):
+        q, v = world.data.qpos[q_index], world.data.qvel[v_index]
+        tau = posed.tau + STIFF * (begin_q - q) - DAMPING * v
+        world.step(to_motor @ tau)
+    assert np.abs(world.data.qvel).max() < 1e-3, "it rests"
+    return np.asarray(tau, float)
+
+
+@pytest.mark.parametrize("z", HEIGHTS)
+@pytest.mark.parametrize("name", DIRECTIONS)
+def test_the_joints_carry_a_push_as_in_the_simulated_world(
+    robot: RobotConfig, poses: dict[float, Posed], z: float, name: str
+) -> None:
+    posed, direction = poses[z], DIRECTIONS[name]
+    response = posed.stand.response(STIFF, direction)
+    assert response is not None
+    unpushed, pushed = (
+        torques_at_rest(robot, posed, force * np.array(direction)) for force in (0.0, PUSH_N)
+    )
+    dtau = pushed - unpushed
+    assert dtau == pytest.approx(PUSH_N * response.dtau, abs=0.05 * np.abs(dtau).max() + 0.05)
+
+
+@settings(max_examples=60)
+@given(
+    z=st.sampled_from(HEIGHTS),
+    name=st.sampled_from(list(DIRECTIONS)),
+    logs=st.lists(st.floats(1.5, 3.7), min_size=N_LEG, max_size=N_LEG),
+)
+def test_no_local_gains_hold_more_than_soles_and_motors_bear(
+    poses: dict[float, Posed], z: float, name: str, logs: list[float]
+) -> None:
+    stand, direction = poses[z].stand, DIRECTIONS[name]
+    D = np.tile(10.0 ** np.array(logs), 2)
+    assert stand.limit_held(D, direction).force_n <= stand.limit_of_body(direction).force_n + 1e-6
+
+
+def test_left_and_right_are_alike(poses: dict[float, Posed]) -> None:
+    other = {"left": "right", "right": "left"}
+    for posed in poses.values():
+        left, right = (posed.stand.limit_held(STIFF, (0.0, side)) for side in (1.0, -1.0))
+        assert left.force_n == pytest.approx(right.force_n, rel=1e-6)
+        assert left.part == " ".join(other.get(word, word) for word in right.part.split())
+
+
+def test_gains_that_do_not_stand_bear_no_push(poses: dict[float, Posed]) -> None:
+    limit = poses[0.8].stand.limit_held(np.full(N_JOINTS, 1.0), (0.0, 1.0))
+    assert limit == (0.0, "the stiffness")
+
+
+def test_the_planner_adds_to_what_is_held(robot: RobotConfig, poses: dict[float, Posed]) -> None:
+    K_c = np.diag([2000.0, 2000.0, 0.0, 500.0, 0.0, 500.0])
+    for posed in poses.values():
+        alone = posed.stand.limit_held(STIFF, (0.0, 1.0))
+        led = posed.stand.limit_held(STIFF, (0.0, 1.0), K_c)
+        assert led.force_n > alone.force_n
