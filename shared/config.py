@@ -87,12 +87,13 @@ class RobotConfig(Section, frozen=True):
     def hold_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return (k_p, k_d) that a module's gains rise to where no tau_coupled holds it.
 
-        The stand gains of the ankles and of every phi, zero elsewhere; (phi, theta), N m/rad and
+        The stand gains of ankles, knees and every phi, zero elsewhere; (phi, theta), N m/rad and
         N m s/rad. With gains as they were (design section 4), the operator's 60 N m of pitch
         moment in the crawl leaned the COM back by 42 mm and the soles tipped, and pushes from the
-        side tipped them in 15 of 500 random cases. Not the theta of hips and knees: a torso that
-        does not follow a hand that leads on hands all of its moment to the soles, and 6 of 300
-        fell.
+        side tipped them in 15 of 500 random cases. With the knees' theta soft, one leg gave under a
+        lasting push from the side: 25 N for 3 s stood, now 60 N. The hips' theta stays soft: a
+        torso that does not follow a hand that leads on hands all of its moment to the soles, and
+        6 of 300 fell.
 
         In TRACK without tau_coupled the same: the certified gains are stiff enough to stand, but
         sway damped by 0.055 only; two pushes of 40 N from the side, 2 s apart, made it fall.

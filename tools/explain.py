@@ -19,6 +19,7 @@ from services.planner.certificate import Weakest
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.inverse_kinematics import in_words as in_words_of_reach
 from services.planner.kinematics import Kinematics
+from services.planner.push_limit import PushLimits
 from shared import config_file, gain_schedule, topics
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
@@ -264,6 +265,8 @@ def show(robot: RobotConfig, found: Account, console: Console) -> None:
         ("joint services alone", found.weakest), ("drives alone", found.weakest_onboard),
     ):  # fmt: skip
         console.print(f"margin, {who}: {in_words(weakest)}")
+    for name, limits in found.pushes.items():
+        console.print(f"push {name}: {describe_limits(limits)}", highlight=False, soft_wrap=True)
     console.print()
     console.print(_torques(found))
 
@@ -280,6 +283,15 @@ def in_words(weakest: Weakest) -> str:
         f"{weakest.margin:.2f}{outcome}; weakest: {weakest.direction}, "
         f"{weakest.stiffness:.0f} {weakest.unit} of {weakest.required:.0f} "
         f"(as a motion in m and rad: {parts})"
+    )
+
+
+def describe_limits(limits: PushLimits) -> str:
+    """Return for example "led 72 N (left sole's toe), planner dead 56 N (...), ..."."""
+    who = ("led", "planner dead", "drives alone", "soles and motors bear")
+    return ", ".join(
+        f"{name} {limit.force_n:.0f} N ({limit.part})"
+        for name, limit in zip(who, limits, strict=True)
     )
 
 

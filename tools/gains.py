@@ -6,10 +6,12 @@ import argparse
 import math
 from pathlib import Path
 
+import msgspec
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from services.planner.push_limit import DIRECTIONS
 from shared import config_file, gain_schedule
 from shared.config import RobotConfig
 from shared.config_sections import GainSchedule
@@ -20,6 +22,7 @@ ROOM_EVERY = 5
 """Of the poses, for the printed margins."""
 RIGID_FROM = 1e6
 """N m/rad"""
+PUSH_HEIGHTS = 4
 SHOWN = 6
 """Heights in the printed table."""
 
@@ -124,10 +127,30 @@ def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
         table.add_row(f"{schedule.z[i]:.3f}", *(f"{value:.0f}" for value in row))
     console.print(table)
     _show_damping(robot, schedule, console)
+    _show_pushes(robot, schedule, console)
     margins = split_program.smallest_margins(robot, schedule)
     console.print(
         f"smallest margin, nodes and half way between: {margins.service:.2f} of what is "
         f"required with the joint services alone, {margins.onboard:.2f} with the drives alone"
+    )
+
+
+def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
+    """Print how hard a constant push each tier holds, upright."""
+    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
+
+    table = Table(title="Hardest constant push, N: led / planner dead / drives alone / body")
+    table.add_column("COM m", justify="right")
+    for name in DIRECTIONS:
+        table.add_column(name, justify="right")
+    table.add_column("what gives way sideways, planner dead")
+    ready = msgspec.structs.replace(robot, gain_schedule=schedule)
+    for z, limits in split_program.push_limits(ready, PUSH_HEIGHTS):
+        cells = [" / ".join(f"{limit.force_n:.0f}" for limit in row) for row in limits.values()]
+        table.add_row(f"{z:.3f}", *cells, limits["sideways"].held.part)
+    console.print(table)
+    console.print(
+        "body: what soles and motors bear at that pose, whatever the control", style="dim"
     )
 
 

@@ -13,6 +13,7 @@ STUDIES: Final = {
     "certificate": ("tools.sweeps.certificate", "is the sign of K_fail right, in simulation?"),
     "kill": ("tools.sweeps.kill", "kill the planner in random postures, under random pushes"),
     "latency": ("tools.sweeps.latency", "three controls over bad networks: who falls, who leads"),
+    "push": ("tools.sweeps.push", "the hardest push by direction, duration, pose and mode"),
     "robust": (
         "tools.sweeps.robust",
         "every error of the plant at once: who falls, and why",

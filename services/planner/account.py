@@ -15,6 +15,7 @@ from services.planner.certificate import Certificate, Weakest, motor_mean
 from services.planner.coupling import Missing
 from services.planner.gains import GainLaw
 from services.planner.kinematics import Kinematics
+from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import GainSplit, LocalGains
 from shared.config import GRAVITY, RobotConfig
 
@@ -41,6 +42,8 @@ class Account(NamedTuple):
     """With the joint services alone."""
     weakest_onboard: Weakest
     """With the drives alone."""
+    pushes: dict[str, PushLimits]
+    """The hardest constant push along each direction, without assist."""
     gravity: Array
     assist: Array
     local_pd: Array
@@ -81,6 +84,7 @@ def account(
     F_O[2] = config.total_mass * GRAVITY
     F = law.K_p * (at_ref.p - measured.p) + law.B_p * (at_ref.J @ v_ref - pdot) + F_O
     hessian_O = at_ref.hessian_times(F_O, F_assist).copy()
+    hessian_weight = at_ref.hessian_times(F_O, np.zeros(3)).copy()
     body = law.gains(at_ref, at_ref.hessian_times(F, F_assist))
     T = per_unit_of_p(at_ref)
     local = split.split(lambda: body, float(at_ref.p[2]), float(at_ref.p[4]), T, hessian_O)
@@ -100,6 +104,7 @@ def account(
         local=local,
         weakest=certificate.weakest(local.D),
         weakest_onboard=certificate.weakest(motor_mean(local.D)),
+        pushes=limits_at(config, at_ref, T, hessian_weight, local.D, local.D_B),
         gravity=F_O @ at_ref.J,
         assist=F_assist @ at_ref.J_harness,
         local_pd=local.D * e_q + local.D_B * e_v,

@@ -12,7 +12,7 @@ module adds them, for a constant horizontal push F u at the torso's origin:
    share weight and push. No gains bear more at that pose.
 
 Leg i carries the wrench W_i of the torso, tau_i = J_i^T W_i + the weight of its knee. Its sole
-carries W_i moved to the ankle, and the leg's weight. W_i changes by J_i^T dW_i = dtau_i - (H T dp)_i.
+carries W_i moved to the ankle, and the leg's weight. J_i^T dW_i = dtau_i - (H T dp)_i.
 Every limit is linear in tau and in the soles' wrenches, so the first one met gives the force.
 """
 
@@ -25,6 +25,8 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
+from services.planner.certificate import motor_mean
+from services.planner.coupling import Missing
 from services.planner.kinematics import Kinematics
 from shared.config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
@@ -51,6 +53,19 @@ class PushLimit(NamedTuple):
     """0: it does not stand without a push either."""
     part: str
     """What gives way first, such as "left sole's outer edge"."""
+
+
+class PushLimits(NamedTuple):
+    """The hardest constant push along one direction, by who holds."""
+
+    led: PushLimit
+    """TRACK: the joint services and the planner."""
+    held: PushLimit
+    """HOLD: the planner is dead."""
+    drives: PushLimit
+    """The joint services are dead as well."""
+    body: PushLimit
+    """Soles and motors, whatever the control."""
 
 
 class Response(NamedTuple):
@@ -107,6 +122,15 @@ class LoadedStand:
         ]
         self._limits = _limits(config)
 
+    def along_p(self, gains: Array) -> Array:
+        """Return T^T diag(gains) T (6, 6): joint gains (12,) as the body feels them."""
+        return np.asarray((self._T.T * gains) @ self._T, float)
+
+    def stiffness(self, D: Array) -> Array:
+        """Return K_fail (6, 6) of local stiffnesses D (12,), N m/rad."""
+        K = self.along_p(D) + self._K_geo
+        return np.asarray(0.5 * (K + K.T), float)
+
     def response(
         self, D: Array, direction: tuple[float, float], K_c: Array | None = None
     ) -> Response | None:
@@ -118,14 +142,13 @@ class LoadedStand:
             K_c: what the planner adds along p (6, 6); None: it is dead.
         """
         T = self._T
-        K = T.T @ (D[:, np.newaxis] * T) + self._K_geo + (0.0 if K_c is None else K_c)
-        K = 0.5 * (K + K.T)
+        K = self.stiffness(D) + (0.0 if K_c is None else K_c)
         if np.linalg.eigvalsh(K)[0] <= 0.0:
             return None
         torso_per_p = self._J[0] @ T[:N_LEG]
-        dp = np.linalg.solve(K, torso_per_p.T @ _horizontal(direction))
+        dp: Array = np.asarray(np.linalg.solve(K, torso_per_p.T @ _horizontal(direction)), float)
         dq = T @ dp
-        dtau: Array = -D * dq
+        dtau: Array = np.asarray(-D * dq, float)
         if K_c is not None:
             dtau -= self._J_body.T @ (K_c @ dp)
         turned = dtau - self._H @ dq
@@ -195,6 +218,42 @@ class LoadedStand:
             moment = wrench[3:] + np.cross(arm, wrench[:3])
             wrenches.append(np.concatenate((wrench[:3], moment)) + own)
         return np.concatenate(wrenches)
+
+
+def limits_at(
+    config: RobotConfig, kinematics: Kinematics, T: Array, H: Array, D: Array, D_B: Array
+) -> dict[str, PushLimits]:
+    """Return the limits of a pose along each of `DIRECTIONS`; arguments as for the two below."""
+    stand = LoadedStand(config, kinematics, T, H)
+    return {
+        name: limits_along(stand, config, D, D_B, direction)
+        for name, direction in DIRECTIONS.items()
+    }
+
+
+def limits_along(
+    stand: LoadedStand, config: RobotConfig, D: Array, D_B: Array, direction: tuple[float, float]
+) -> PushLimits:
+    """Return the limits along one direction, on rigid joints.
+
+    Args:
+        stand: the pose.
+        config: the robot, with its gain schedule.
+        D: local stiffnesses in TRACK (12,), N m/rad.
+        D_B: local damping in TRACK (12,), N m s/rad.
+        direction: world x and y, a unit vector.
+    """
+    law, schedule = config.law, config.gain_schedule
+    damping = 0.0 if schedule is None else schedule.coupling_damping
+    missing = Missing(np.array(law.K_p), np.array(law.B_p), np.array(law.S), damping)
+    K_c, _ = missing.at(stand.stiffness(D), stand.along_p(D_B))
+    in_hold = np.maximum(D, np.ravel([config.hold_gains(module)[0] for module in MODULES]))
+    return PushLimits(
+        stand.limit_held(D, direction, K_c),
+        stand.limit_held(in_hold, direction),
+        stand.limit_held(motor_mean(in_hold), direction),
+        stand.limit_of_body(direction),
+    )
 
 
 def _horizontal(direction: tuple[float, float]) -> Array:

@@ -15,7 +15,7 @@ assist (K_geo is linear in it, so every assist in between is covered).
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import cvxpy as cp
@@ -28,6 +28,7 @@ from services.planner.certificate import Certificate, Margins
 from services.planner.dynamic_certificate import Design, nodes_of
 from services.planner.dynamic_certificate import Node as DynamicNode
 from services.planner.poses import Node, Poses
+from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import CouplingGains, ScheduledGains
 from shared.config import RobotConfig
 from shared.config_sections import GainSchedule, LegGains
@@ -142,6 +143,24 @@ def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
                 service = min(service, margins.service)
                 onboard = min(onboard, margins.onboard)
     return Margins(service, onboard)
+
+
+def push_limits(config: RobotConfig, heights: int) -> Iterator[tuple[float, dict[str, PushLimits]]]:
+    """Yield COM heights, m, and how hard a push is held there, upright.
+
+    Args:
+        config: the robot, with its gain schedule.
+        heights: how many, over the schedule's range.
+    """
+    schedule = config.gain_schedule
+    assert schedule is not None  # noqa: S101 - the caller has just made it
+    poses, scheduled = Poses(config), ScheduledGains(schedule)
+    for z in np.linspace(schedule.z[0], schedule.z[-1], heights):
+        node = poses.node(float(z), 0.0)
+        if node is not None:
+            D = scheduled.at(float(z), 0.0)
+            kinematics, (H, _) = poses.kinematics, node.hessians
+            yield float(z), limits_at(config, kinematics, node.T, H, D, scheduled.D_B)
 
 
 def _with_middles(nodes: Array) -> Array:

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 MINOR_FRICTION = (0.005, 0.0001)
 """m; of a contact's torsion and rolling."""
 STICTION_TIME = 0.004
-"""Time constant of the friction between sole and floor, s: twice MuJoCo's smallest at a step of 1 ms.
+"""Time constant of the friction between sole and floor, s: twice the least at a 1 ms step.
 
 MuJoCo leaves the term dJ/dt v out of a contact's acceleration. A sole under a turning leg therefore
 creeps, by the leg's centripetal acceleration times about half of this time. With the contact's own

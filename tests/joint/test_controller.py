@@ -15,7 +15,7 @@ from shared.messages import Cause, JointCommand, Mode, Pair
 from tests.joint.helpers import SESSION, T0, Bench, command, with_service
 
 K_P_STAND, K_D_STAND = (900.0, 1500.0), (30.0, 30.0)
-"""[stand.knee] of the shipped robot, as the bench is a knee."""
+"""[stand.knee] of this folder's robot, as the bench is a knee."""
 
 
 @pytest.fixture

@@ -1,0 +1,24 @@
+"""A robot whose knees hold on gains of their own: what is tested here is no matter of tuning."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from shared import config_file
+from shared.config import RobotConfig
+from tests.conftest import ROBOT_FILE
+
+
+@pytest.fixture(scope="session")
+def robot() -> RobotConfig:
+    """Return the shipped robot with a soft knee, whose theta HOLD does not stiffen."""
+    shipped = config_file.load(ROBOT_FILE)
+    knee = msgspec.structs.replace(shipped.stand.knee, k_p=(900.0, 1500.0), k_d=(45.0, 25.0))
+    return msgspec.structs.replace(
+        shipped,
+        stand=msgspec.structs.replace(shipped.stand, knee=knee),
+        joint_service=msgspec.structs.replace(
+            shipped.joint_service, hold_stiffens_theta=("ankle",)
+        ),
+    )
