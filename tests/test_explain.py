@@ -109,6 +109,7 @@ def test_the_torques_by_origin_of_every_joint_are_printed(
         assert sum(parts) == pytest.approx(total, abs=0.04)
     assert "planner LEADING" in shown
     assert re.search(r"margin, joint services alone: \d\.\d\d; weakest: \w+", shown)
+    assert re.search(r"push sideways: led \d+ N \(.+\), planner dead \d+ N", shown)
 
 
 def test_a_pose_is_explained_without_a_log(

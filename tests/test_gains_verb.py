@@ -76,6 +76,14 @@ def test_the_printed_margins_are_above_what_the_planner_asks_for(
     assert float(found[2]) > certificate.onboard_margin_min
 
 
+def test_the_hardest_push_of_each_tier_is_printed(unladen: tuple[Path, str]) -> None:
+    _, said = unladen
+    rows = re.findall(r"│ \d\.\d{3} │(.*)", said.split("Hardest constant push")[1])
+    assert rows
+    for row in rows:
+        assert re.search(r"\d+ / \d+", row), row
+
+
 def test_a_lighter_robot_is_held_more_softly(unladen: tuple[Path, str]) -> None:
     light, full = (
         config_file.load(unladen[0]).gain_schedule,

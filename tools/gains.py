@@ -142,13 +142,16 @@ def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -
     table = Table(title="Hardest constant push, N: led / planner dead / drives alone / body")
     table.add_column("COM m", justify="right")
     for name in DIRECTIONS:
-        table.add_column(name, justify="right")
-    table.add_column("what gives way sideways, planner dead")
+        table.add_column(name, justify="right", no_wrap=True)
+    parts = list[str]()
     ready = msgspec.structs.replace(robot, gain_schedule=schedule)
     for z, limits in split_program.push_limits(ready, PUSH_HEIGHTS):
         cells = [" / ".join(f"{limit.force_n:.0f}" for limit in row) for row in limits.values()]
-        table.add_row(f"{z:.3f}", *cells, limits["sideways"].held.part)
+        table.add_row(f"{z:.3f}", *cells)
+        parts += [row.held.part for row in limits.values()]
     console.print(table)
+    first = ", ".join(dict.fromkeys(parts))
+    console.print(f"gives way first, with the planner dead: {first}", style="dim")
     console.print(
         "body: what soles and motors bear at that pose, whatever the control", style="dim"
     )

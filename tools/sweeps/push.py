@@ -36,6 +36,7 @@ TABLE: Final = "pushes.csv"
 PICTURE: Final = "pushes.png"
 CODE: Final = code_of("tools.sweeps.push_trial")
 COLOURS: Final = {"led": "#1f5f8b", "dead": "#c0392b"}
+SHORT: Final = {"led": "leads", "dead": "dead"}
 WORDS_OF: Final = {"led": "planner leads", "dead": "planner dead"}
 Task: TypeAlias = "tuple[Trial, RobotConfig, PlantConfig]"
 
@@ -132,8 +133,11 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         ):
             points = sorted((int(row["angle_deg"]), float(row[key])) for row in dead)
             _curve(axis, points, colour, words, "--")
+        axis.set_thetagrids(
+            range(0, 360, 45), [f"{(a + 135) % 360 - 135}" for a in range(0, 360, 45)]
+        )  # type: ignore[attr-defined]  # of polar axes
         axis.set_title(f"{pose}, {float(duration):g} s, N")
-    figure.axes[0].legend(loc="lower left", bbox_to_anchor=(-0.3, -0.25), fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     figure.suptitle("Hardest push that it stood, by direction (up: forwards)", x=0.01, ha="left")
     figure.savefig(path)
 
@@ -157,8 +161,8 @@ def _curve(
 def _show(rows: Sequence[Row], console: Console) -> None:
     """Print the weakest direction of each pose, duration and mode."""
     printed = Printed(title="Hardest push that it stood, N", title_justify="left")
-    for heading in ("pose", "s", "mode", *(f"{a} deg" for a in _angles(rows)), "first to give way"):
-        printed.add_column(heading)
+    for heading in ("pose", "s", "planner", *(f"{a} deg" for a in _angles(rows)), "gives way"):
+        printed.add_column(heading, no_wrap=True)
     groups = dict.fromkeys((row["pose"], row["duration_s"], row["mode"]) for row in rows)
     for pose, duration, mode in groups:
         some = [
@@ -167,7 +171,7 @@ def _show(rows: Sequence[Row], console: Console) -> None:
         ]  # fmt: skip
         weakest = some[int(np.argmin([float(row["stood_n"]) for row in some]))]
         printed.add_row(
-            pose, duration, WORDS_OF[mode], *(row["stood_n"] for row in some), weakest["held_part"]
+            pose, duration, SHORT[mode], *(row["stood_n"] for row in some), weakest["held_part"]
         )
     console.print(printed)
 
