@@ -31,6 +31,8 @@ mpl.use("Agg")
 
 ANGLES_DEG: Final = (0, 45, 90, 135, 180)
 """Left and right are alike."""
+SIDES_DEG: Final = ("0", "45", "90", "135", "180", "-135", "-90", "-45")
+"""As a push to the right is told."""
 DURATIONS_S: Final = (0.3, 3.0)
 TABLE: Final = "pushes.csv"
 PICTURE: Final = "pushes.png"
@@ -133,9 +135,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         ):
             points = sorted((int(row["angle_deg"]), float(row[key])) for row in dead)
             _curve(axis, points, colour, words, "--")
-        axis.set_thetagrids(
-            range(0, 360, 45), [f"{(a + 135) % 360 - 135}" for a in range(0, 360, 45)]
-        )  # type: ignore[attr-defined]  # of polar axes
+        axis.set_thetagrids(range(0, 360, 45), SIDES_DEG)  # type: ignore[attr-defined]  # polar
         axis.set_title(f"{pose}, {float(duration):g} s, N")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     figure.suptitle("Hardest push that it stood, by direction (up: forwards)", x=0.01, ha="left")
