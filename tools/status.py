@@ -126,8 +126,11 @@ def tables(status: FleetStatus) -> Group:
         )
     way_out = "kill injector" if SILENT_INJECTOR in status.network else "inject --clear"
     said = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
-    lead = f" {lead_in_words(status.lead)}"
-    return Group(services, modules, lead, *([said] if status.network else []))
+    slow = f" in slow motion: the fleet's clock goes at {status.pace:g} of real time"
+    lines = [f" {lead_in_words(status.lead)}"]
+    lines += [slow] if status.pace != 1.0 else []
+    lines += [said] if status.network else []
+    return Group(services, modules, *lines)
 
 
 def _watch(fleet: Fleet, ears: Mapping[str, Ear]) -> None:

@@ -35,7 +35,7 @@ from tools.supervision.supervise import Fleet
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
 PATIENCE_S: Final = 10.0
-"""Whether the cores carry the fleet is asked for after this long: to start, it needs them all."""
+"""Start-up uses all cores, so the idle fraction is checked only after this time."""
 IDLE_EVERY_S: Final = 0.5
 SETTLE_S: Final = 2.0
 """All six modules track for so long before the scenario starts."""

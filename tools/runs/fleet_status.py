@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from shared.bus import Latest, Session
-from shared.clock import NS_PER_S, now_ns
+from shared.clock import NS_PER_S, now_ns, pace
 from shared.exceptions import FleetError
 from shared.fault_table import recovery_of
 from shared.joints import MODULES
@@ -100,6 +100,8 @@ class FleetStatus(msgspec.Struct, frozen=True):
     """None if no planner is heard now."""
     network: tuple[str, ...] = ()
     """What the injector does to links now, in words."""
+    pace: float = 1.0
+    """How fast the fleet's clock goes; below 1 it is in slow motion."""
 
 
 class Ear:
@@ -191,7 +193,7 @@ def look(fleet: Fleet, ears: Mapping[str, Ear]) -> FleetStatus:
     }
     lead = lead_status(ears[PLANNER].newest if PLANNER in fresh else None)
     config, network = fleet.manifest.config, impairments(fleet)
-    return FleetStatus(str(fleet.run.path), config, services, modules, lead, network)
+    return FleetStatus(str(fleet.run.path), config, services, modules, lead, network, pace())
 
 
 def impairments(fleet: Fleet) -> tuple[str, ...]:

@@ -48,9 +48,9 @@ def run_live(
         seed: of the sensors' noise.
         true_plant: how the simulated robot differs from `robot`.
         no_restart: services that the supervisor leaves down when they end.
-        pace: how fast the fleet's clock goes. None: as usual, and where the cores turn out not to
-            carry that, again at a slower one, which is then the usual one of this process.
-        tell: is told when that happens.
+        pace: clock rate of the fleet. None: the default, lowered step by step while the cores are
+            full; the pace found becomes the default of this process.
+        tell: takes a line of text each time the pace is lowered.
 
     Raises:
         CoresFullError: they do not carry it at any pace, or at the one asked for.

@@ -1,4 +1,4 @@
-"""How fast the clock of a simulated fleet goes, on cores that may not carry it in real time."""
+"""Slow motion: the pace of a simulated fleet's clock on cores that are too slow for real time."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from typing import Final
 from shared.exceptions import FleetError
 
 PACE_VARIABLE: Final = "XRL_PACE"
-"""Environment variable: the pace at which fleets are started where none is asked for."""
+"""Environment variable: default pace of a simulated fleet."""
 PACE_MIN: Final = 0.1
 SLOWER: Final = 0.7
-"""A fleet that the cores do not carry is started again at so much of its pace."""
+"""Factor on the pace when the cores are full."""
 IDLE_LEAST: Final = 0.08
-"""Share of all cores: with less of it idle they are full. A fleet that is carried leaves a
-quarter."""
+"""Below this idle fraction the cores count as full. A fleet in real time leaves about 0.25."""
 WINDOW_S: Final = 5.0
-"""The share is taken over so long."""
+"""Window of the idle fraction."""
 
 
 class CoresFullError(FleetError):
@@ -33,14 +32,14 @@ def add_pace(parser: argparse.ArgumentParser) -> None:
         "--pace",
         type=float,
         metavar="X",
-        help="how fast the simulated fleet's clock goes: 0.5 is slow motion at half speed, in "
-        "which all is as in real time on a machine twice as fast (default: "
-        f"${PACE_VARIABLE}, else 1, and where the cores do not carry that {SLOWER:g} of it)",
+        help="clock rate of a simulated fleet: 0.5 is slow motion at half speed, as on a machine "
+        f"twice as fast (default: ${PACE_VARIABLE}, else 1; `demo` and `crashtest` lower it by "
+        f"{SLOWER:g} while the cores are full)",
     )
 
 
 def usual_pace() -> float:
-    """Return the pace of fleets for which none is asked."""
+    """Return the default pace."""
     text = os.environ.get(PACE_VARIABLE, "1")
     try:
         return float(text)
@@ -61,15 +60,15 @@ def check_pace(pace: float, *, simulated: bool) -> None:
 
 
 class IdleMeter:
-    """Share of the cores that was idle in the last `WINDOW_S`."""
+    """Idle fraction of all cores over the last `WINDOW_S`."""
 
     def __init__(self) -> None:
-        """Begin to look."""
+        """Take the first sample."""
         self._looks: deque[tuple[float, int, int]] = deque()
         self.look()
 
     def look(self) -> float | None:
-        """Look again; return the share, or None before the window is full."""
+        """Sample; return the idle fraction, or None until the window is full."""
         now_s = time.monotonic()
         self._looks.append((now_s, *idle_and_total()))
         while len(self._looks) > 1 and now_s - self._looks[1][0] >= WINDOW_S:
