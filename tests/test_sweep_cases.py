@@ -157,7 +157,8 @@ def test_the_hand_is_off_from_when_the_case_says(diagonal: RobotConfig, drawn: l
     run_case(case, cases.with_payload(diagonal, case.payload_kg), watch=rows.append)
     on = [row.operator_force[2] for row in rows if 0.6 < row.scenario_s < 0.79]
     off = [row.operator_force[2] for row in rows if row.scenario_s > 0.82]
-    assert min(abs(force) for force in on) > 1.0
+    assert max(abs(force) for force in on) > 1.0
+    assert 0.0 not in on
     assert set(off) == {0.0}
 
 

@@ -31,7 +31,7 @@ def test_all_six_services_dead_at_any_phase_of_a_squat_stand_through_pushes(
     assert np.abs(result.com_mm[after, :2]).max() < 80.0
 
 
-@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_left"])
 def test_one_dead_service_stands_and_its_successor_leads_again(
     robot: RobotConfig, module: str
 ) -> None:

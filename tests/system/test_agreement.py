@@ -163,13 +163,6 @@ def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
     assert shares == pytest.approx([0.05, 0.05], abs=0.015)
 
 
-def test_live_and_lockstep_agree_that_averaging_the_legs_falls(tmp_path: Path) -> None:
-    flags = ("--jacobian", "average", "--duration", "10")
-    falls = [summary_of(verb, tmp_path / verb, *flags) for verb in ("demo", "sim")]
-    assert [code for code, _ in falls] == [1, 1]
-    assert [summary["stood"] for _, summary in falls] == [False, False]
-
-
 # ---- the network alone: the injector between two sessions, against the object that decides
 
 LATE, NEAR = "knee_left", "knee_right"
