@@ -101,11 +101,11 @@ def test_where_the_cores_are_full_the_fleet_runs_slower_and_so_do_those_after_it
     machine, told = Machine(carries=0.5), list[str]()
     (tmp_path / "run.mcap").touch()
     assert run_live(machine, monkeypatch, tmp_path, None, told) == "led"
-    assert machine.paces == [1.0, 0.7, 0.49]
+    assert machine.paces == [1.0, 0.6, 0.36]
     assert len(told) == 2
     assert not (tmp_path / "run.mcap").exists(), "nothing of the tries is left"
     run_live(machine, monkeypatch, tmp_path, None, told)
-    assert machine.paces[3:] == [0.49]
+    assert machine.paces[3:] == [0.36]
 
 
 def test_a_pace_that_was_asked_for_is_kept_or_refused(

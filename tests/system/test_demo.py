@@ -102,7 +102,7 @@ def test_a_frozen_planner_is_survived_and_taken_back(tmp_path: Path) -> None:
 
 
 def test_a_robot_that_cannot_stand_is_a_finding_and_not_an_error(tmp_path: Path) -> None:
-    result = demo(tmp_path, "--jacobian", "average", "--duration", "6")
+    result = demo(tmp_path, "--push", "1:3:0,250,0", "--duration", "6")
     assert result.returncode == 1, result.stdout + result.stderr
     assert "FELL" in result.stdout
     assert json.loads((tmp_path / "summary.json").read_text())["stood"] is False

@@ -66,7 +66,7 @@ def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
     assert code == 0
     assert said.count("ruff called") == 2
     assert said.count("mypy called") == 1
-    assert said.count("pytest called") == 2
+    assert said.count("pytest called") == 3
 
 
 @pytest.mark.parametrize("status", [1, 2], ids=["a failure", "a file that cannot be imported"])
@@ -75,7 +75,7 @@ def test_what_failed_is_said_last_and_the_other_parts_are_run(root: Path, status
     write_tool(root, "pytest", f"echo ERROR tests/test_x.py; echo one of $*; exit {status}")
     code, said = run(root)
     assert code == 1
-    assert said.count("== pytest -m") == 2
+    assert said.count("== pytest -m") == 3
     last = said[said.index("== failed:") :]
     assert "== failed: mypy" in last
     assert last.count("== failed: ERROR tests/test_x.py") == 2

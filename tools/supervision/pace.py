@@ -14,7 +14,7 @@ from shared.exceptions import FleetError
 PACE_VARIABLE: Final = "XRL_PACE"
 """Environment variable: default pace of a simulated fleet."""
 PACE_MIN: Final = 0.1
-SLOWER: Final = 0.7
+SLOWER: Final = 0.6
 """Factor on the pace when the cores are full."""
 IDLE_LEAST: Final = 0.08
 """Below this idle fraction the cores count as full. A fleet in real time leaves about 0.25."""
