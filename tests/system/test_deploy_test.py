@@ -78,7 +78,7 @@ def test_what_failed_is_said_last_and_the_other_parts_are_run(root: Path, status
     assert said.count("== pytest -m") == 3
     last = said[said.index("== failed:") :]
     assert "== failed: mypy" in last
-    assert last.count("== failed: ERROR tests/test_x.py") == 2
+    assert last.count("== failed: ERROR tests/test_x.py") == 3
 
 
 @pytest.mark.parametrize("part", ["mypy", "pytest"])
