@@ -196,7 +196,7 @@ class Conductor:
         """
         begin_s = time.monotonic()
         deadline, next_look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s
-        meter = IdleMeter()
+        meter, idle = IdleMeter(), None
         since = None
         self._note = "waiting for six modules to track"
         while since is None or time.monotonic() - since < machine_s(SETTLE_S):
@@ -205,12 +205,8 @@ class Conductor:
                 next_look_s += IDLE_EVERY_S
                 idle = meter.look()
                 late = time.monotonic() - begin_s >= PATIENCE_S
-                if late and idle is not None and idle < IDLE_LEAST:
-                    raise CoresFullError(
-                        f"the cores do not carry ten services at {pace():g} of real time: "
-                        f"{100 * idle:.0f} % idle, and not all six modules track "
-                        f"({self._modes_in_words()}); `--pace {pace() / 2:g}` asks for half of it"
-                    )
+                if late:
+                    self._check_cores(idle)
             tracking = [self._modes.get(module) == Mode.TRACK for module in MODULES]
             standing = self._truth is not None and self._truth.hoist == 0.0
             if self._truth is not None and self._truth.fallen:
@@ -226,8 +222,18 @@ class Conductor:
                     f"{self._modes_in_words()}; the services' logs tell more"
                 )
             time.sleep(POLL_S)
+        self._check_cores(idle)  # tracking for a moment is not being carried through a scenario
         self._note = ""
         return True
+
+    def _check_cores(self, idle: float | None) -> None:
+        """Raise CoresFullError if the idle fraction of the cores is known and too small."""
+        if idle is not None and idle < IDLE_LEAST:
+            raise CoresFullError(
+                f"the cores do not carry ten services at {pace():g} of real time: "
+                f"{100 * idle:.0f} % idle; modules: {self._modes_in_words()}; "
+                f"`--pace {pace() / 2:g}` asks for half of it"
+            )
 
     def _modes_in_words(self) -> str:
         return ", ".join(
