@@ -34,7 +34,7 @@ class Posed(NamedTuple):
     stand: LoadedStand
     q: Array
     tau: Array
-    """Of the weight at rest (12,), N m."""
+    """Joint torques that carry the weight at rest (12,), N m."""
 
 
 @pytest.fixture(scope="module")

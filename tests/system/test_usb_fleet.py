@@ -18,7 +18,7 @@ from tools.supervision.pace import PACE_VARIABLE, usual_pace
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 
 BESIDE_CAN = 0.7
-"""Of the pace of a fleet on CAN."""
+"""Factor on the pace of a fleet on CAN."""
 ROOT = Path(__file__).resolve().parents[2]
 
 

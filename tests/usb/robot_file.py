@@ -18,7 +18,7 @@ RATES: Final = (
     ("simulation", "encoder_rate_hz", "200.0"),
     ("drive", "encoder_period_ms", "5"),
 )
-"""A v3 board's USB gives 200 Hz (design section 5)."""
+"""A v3 board's USB carries 200 Hz."""
 
 
 def write(folder: Path) -> Path:

@@ -34,11 +34,11 @@ POSES: Final = {"stand": (1.188, 0.0), "squat": (0.95, 0.0), "crawl": (0.79, 1.2
 MODES: Final = ("led", "dead")
 """While the planner leads, and with the planner dead."""
 REACHED_S: Final = 2.5
-"""Of the scenario: the pose is reached."""
+"""Scenario time at which the pose is reached."""
 LEFT_S: Final = 3.5
-"""The planner is killed."""
+"""Scenario time of the planner's kill."""
 BEGIN_S: Final = 4.5
-"""The push begins."""
+"""Scenario time at which the push begins."""
 REST_S: Final = 2.0
 """So long after the push a robot that is to fall has fallen, or is tipping."""
 FORCE_MAX_N: Final = 240.0
@@ -51,7 +51,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
     number: int
     pose: str
     angle_deg: int
-    """Of the push: 0 forwards, 90 to the left."""
+    """Direction of the push: 0 forwards, 90 to the left."""
     duration_s: float
     mode: str
 
