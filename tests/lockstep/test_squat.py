@@ -29,7 +29,7 @@ def test_the_operator_leads_the_height_by_hand(squat: Run) -> None:
     height = np.array([row.torso[2] for row in squat.rows])[alive]
     assert height.min() < 0.97
     assert height.max() > 1.17
-    assert np.abs(squat.operator_n[alive]).max() <= 40.0
+    assert np.abs(squat.operator_n[alive]).max() <= 22.0
 
 
 def test_the_robot_stands_through_pushes_with_the_planner_dead(squat: Run) -> None:
