@@ -24,6 +24,9 @@ from shared.config import RobotConfig
 from shared.joints import kind_of
 from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Pair
 
+LEFT_SHARE = {"ankle": 1.0, "knee": 0.25, "hip": 0.0}
+"""How far a drive's gains rise to HOLD's while its service leads; `left_holding` says why."""
+
 
 class CycleResult(NamedTuple):
     """What one cycle decided."""
@@ -48,7 +51,7 @@ class JointController:
         self._damp_k_d = service.damp_k_d
         self._sinks = (False, kind_of(module) in service.damp_sinks)
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
-        self._leaves_hold_gains = kind_of(module) == "ankle" and self._hold_k_p[1] > 0.0
+        self._left_share = LEFT_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
         knee = kind_of(module) == "knee"
         self._damp_stop = service.damp_knee_stop if knee else -math.inf
         self._gear_ratio = config.joint.gear_ratio
@@ -161,17 +164,18 @@ class JointController:
     def left_holding(self) -> Setpoint:
         """The law that the drive is to go on with should this service die now: HOLD's gains.
 
-        Of the ankles only. On TRACK's own, with no more than 4 N m s/rad on an ankle's phi, a
-        push from the side rang on by 0.72 each half swing with all six services dead, and 7 of
-        26 pairs of pushes in step with it fell. A knee or hip whose phi alone is stiff would
-        have half of that on its theta, where the other leg's is soft. A knee's drive on HOLD's
-        gains in TRACK, with the service taking them off again 2 ms late, is felt by the hand: 26 N
-        in the squat in place of 18. In DAMP a drive that is
-        left goes on sinking.
+        An ankle's gains rise to all of HOLD's. On TRACK's own, with no more than 4 N m s/rad on
+        its phi, a push from the side rang on by 0.72 each half swing with all six services dead,
+        and 7 of 26 pairs of pushes in step with it fell. A knee's rise to a quarter of HOLD's.
+        With none, a knee whose service froze was soft while the other leg's was stiff, and the
+        robot fell (450 mm); with a quarter it moves by 22 mm. With all of it the hand feels the
+        drive's gains that the service takes off 2 ms late: 26 N in the squat for 18, with a
+        quarter 20. One whose phi alone is stiff is left as it is: half of that is on its theta.
+        In DAMP a drive that is left goes on sinking.
         """
-        if self.failsafe.mode is Mode.DAMP or not self._leaves_hold_gains:
+        if self.failsafe.mode is Mode.DAMP:
             return self._setpoint
-        return law.stiffened(self._setpoint, self._hold_k_p, self._hold_k_d, 1.0)
+        return law.stiffened(self._setpoint, self._hold_k_p, self._hold_k_d, self._left_share)
 
     def state(self, now_ns: int) -> JointState:
         """Return the module's state message.

@@ -112,7 +112,7 @@ def test_hosts_that_count_from_different_moments_change_not_one_bit(
 def test_clocks_that_drift_200_ppm_apart_change_nothing_that_matters(
     robot: RobotConfig, plain: Run
 ) -> None:
-    """Not bit for bit: ages and periods are read 0.04 % longer or shorter."""
+    """Not bit for bit: ages and periods are read 0.04 % longer or shorter; play adds to it."""
     clocks = {host: HostClock(HOUR_NS, 200.0 * (-1) ** n) for n, host in enumerate(HOSTS)}
     other = squat(robot, 1.2, clocks)
     apart = [
@@ -120,7 +120,7 @@ def test_clocks_that_drift_200_ppm_apart_change_nothing_that_matters(
         for mine, row in zip(other.rows, plain.rows, strict=True)
         for a, b in zip(mine.com, row.com, strict=True)
     ]
-    assert max(apart) < 1e-4
+    assert max(apart) < 1e-3
     assert other.left_track() == {}
     assert all(not controller.failsafe.refused for controller in other.fleet.controllers)
 
