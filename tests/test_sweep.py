@@ -120,29 +120,24 @@ def test_the_papers_split_needs_no_schedule(robot: RobotConfig) -> None:
     assert prepare([other], 2) == [other]
 
 
-def test_the_same_seed_gives_the_same_table_with_any_number_of_workers(tmp_path: Path) -> None:
-    for name, workers in (("a", "1"), ("b", "2")):
-        sweep("--n", "2", "--workers", workers, "--out", str(tmp_path / name))
-        assert (tmp_path / name / "cases.png").stat().st_size > 20_000
-    a, b = ((tmp_path / name / "cases.csv").read_bytes() for name in "ab")
-    assert a == b
-    assert a.count(b"\n") == 3
-
-
-def test_a_study_is_gone_on_with_and_another_one_is_refused(
+def test_the_same_seed_gives_the_same_table_gone_on_with_and_with_any_number_of_workers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = ("--out", str(tmp_path))
-    sweep("--n", "1", *out)
-    first = rows_of(tmp_path / "cases.csv")
+    a, b = (("--out", str(tmp_path / name)) for name in "ab")
+    sweep("--n", "1", "--workers", "1", *a)
+    first = rows_of(tmp_path / "a" / "cases.csv")
     capsys.readouterr()
-    sweep("--n", "2", *out)
+    sweep("--n", "2", "--workers", "1", *a)
     assert "1 of 2 cases are done already" in capsys.readouterr().out
-    both = rows_of(tmp_path / "cases.csv")
+    both = rows_of(tmp_path / "a" / "cases.csv")
     assert both[0] == first[0]
     assert [row["number"] for row in both] == ["0", "1"]
-    assert sweep("--n", "2", "--seed", "2", *out) == 2
+    assert sweep("--n", "2", "--seed", "2", *a) == 2
     assert "another seed" in capsys.readouterr().err
+    sweep("--n", "2", "--workers", "2", *b)
+    tables = [(tmp_path / name / "cases.csv").read_bytes() for name in "ab"]
+    assert tables[0] == tables[1]
+    assert all((tmp_path / name / "cases.png").stat().st_size > 20_000 for name in "ab")
 
 
 def test_one_case_alone_is_the_case_of_the_study_and_its_log_says_the_same(tmp_path: Path) -> None:

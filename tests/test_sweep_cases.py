@@ -15,10 +15,12 @@ from services.simulator.body import body_of
 from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared import scenario
+from shared.clock import NS_PER_S
 from shared.config import GRAVITY, RobotConfig
 from shared.messages import SimTruth
 from shared.robot_model import stand_pose
 from shared.scenario import Keyframe, Push, Scenario, lead
+from tools.runs import lockstep
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import cases
 from tools.sweeps.cases import Case
@@ -217,8 +219,11 @@ class _Until4s(Case, frozen=True, kw_only=True):
         return 4.0
 
 
-def test_a_robot_that_never_tracks_is_no_stand(diagonal: RobotConfig, drawn: list[Case]) -> None:
+def test_a_robot_that_never_tracks_is_no_stand(
+    diagonal: RobotConfig, drawn: list[Case], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At 30 ms each way every command is older than 50 ms: it holds, and nothing can begin."""
+    monkeypatch.setattr(lockstep, "READY_NS", 6 * NS_PER_S)
     case = msgspec.structs.replace(drawn[0], delay_ms=30.0)
     outcome = run_case(case, cases.with_payload(diagonal, case.payload_kg))
     assert outcome.ending == Ending.UNREADY

@@ -17,7 +17,7 @@ from tools.runs.lockstep import Lockstep
 
 RESTING = story(
     "stand",
-    duration=30.0,
+    duration=19.0,
     keyframe=(Keyframe(at=0.0, height=1.1), Keyframe(at=4.0, height=1.0, assist=200.0)),
 )
 
@@ -36,7 +36,7 @@ def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
     off = msgspec.structs.replace(robot.assist, integral_max=0.0)
     open_loop = msgspec.structs.replace(robot, assist=off)
     given = [
-        np.mean([t.harness_force_z for t in truths(r, RESTING, -2.0) if t.scenario_s > 28.0])
+        np.mean([t.harness_force_z for t in truths(r, RESTING, -2.0) if t.scenario_s > 17.0])
         for r in (robot, open_loop)
     ]
     assert given[0] == pytest.approx(200.0, abs=10.0)
