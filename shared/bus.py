@@ -77,18 +77,18 @@ _TCP: Final = ("tcp/", "tls/")
 _ALIVE_TIMEOUT_S: Final = 0.2
 
 
-def peers_of(name: str) -> tuple[str, ...]:
-    """Return the services that a process dials; it is dialled by all others it talks to.
+def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
+    """Return which of a fleet's services a process dials; it is dialled by all others it talks to.
 
     Each pair is linked once. Joint services dial nobody: they have nothing to say to one
     another, and the tier that must outlive the others spends no time on absent ones. The
-    other services dial the joints and those before them in `SERVICES`; a tool dials all.
+    other services dial the joints and those before them in `services`; a tool dials all.
     """
     if name in MODULES:
         return ()
-    if name not in SERVICES:
-        return SERVICES
-    central = [service for service in SERVICES if service not in MODULES]
+    if name not in services:
+        return tuple(services)
+    central = [service for service in services if service not in MODULES]
     return (*MODULES, *central[: central.index(name)])
 
 
@@ -349,7 +349,7 @@ def open_session(
         endpoint_through(Pair(name, peer))
         if injected and Pair(name, peer) in PAIRS
         else config.bus.endpoints[peer]
-        for peer in peers_of(name)
+        for peer in peers_of(name, config.services)
     ]
     listening = [_endpoint(text, run_dir) for text in (*own, *listen)]
     dialling = [_endpoint(text, run_dir) for text in (*peers, *connect)]

@@ -10,9 +10,9 @@ from shared.config_sections import (
     CanConfig,
     CertificateConfig,
     DriveConfig,
-    GainSchedule,
     GeometryConfig,
     HarnessConfig,
+    ImuConfig,
     JointConfig,
     JointServiceConfig,
     LawConfig,
@@ -27,11 +27,14 @@ from shared.config_sections import (
     StandConfig,
     StandGains,
 )
+from shared.gain_table import GainSchedule
 from shared.joints import MODULES, kind_of
 from shared.toml_file import Section
 
-SERVICES = ("planner", "harness", "recorder", "simulator", *MODULES)
-"""Every service of the fleet; each has an endpoint on the bus."""
+SERVICES = ("planner", "harness", "imu", "recorder", "simulator", *MODULES)
+"""Every service that a fleet can have; each has an endpoint on the bus."""
+OPTIONAL = ("imu",)
+"""Those that not every robot has: `RobotConfig.services`."""
 
 GRAVITY = 9.81
 """m/s^2"""
@@ -55,6 +58,7 @@ class RobotConfig(Section, frozen=True):
     joint_service: JointServiceConfig
     planner: PlannerConfig
     harness: HarnessConfig
+    imu: ImuConfig
     drive: DriveConfig
     can: dict[str, CanConfig]
     bus: BusConfig
@@ -62,6 +66,17 @@ class RobotConfig(Section, frozen=True):
     simulation: SimulationConfig
     gain_schedule: GainSchedule | None = None
     """Not in this file but beside it; None if it has not been made."""
+
+    @property
+    def services(self) -> tuple[str, ...]:
+        """Every service of this robot's fleet."""
+        return tuple(name for name in SERVICES if name not in OPTIONAL or self.imu.fitted)
+
+    @property
+    def buses(self) -> tuple[str, ...]:
+        """Names of the CAN buses that this robot uses, each once."""
+        names = [module.bus for module in self.module] + [self.harness.bus]
+        return tuple(dict.fromkeys([*names, *([self.imu.bus] if self.imu.fitted else [])]))
 
     def module_named(self, name: str) -> ModuleConfig:
         """Return a module by its name."""

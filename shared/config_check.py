@@ -5,14 +5,14 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from importlib.metadata import entry_points
 from typing import Any, Final
 
 import msgspec
 
 from shared.can_load import check_buses
-from shared.config import RobotConfig
+from shared.config import SERVICES, RobotConfig
 from shared.config_sections import LimitConfig
 from shared.drive_settings import CURRENT_RANGE
 from shared.exceptions import ConfigError
@@ -31,18 +31,17 @@ _POWER_UP_TURNS: Final = 1.0
 """An encoder that has just got power knows its motor within a turn."""
 
 
-def check(file: str, config: RobotConfig, services: Sequence[str]) -> None:
+def check(file: str, config: RobotConfig) -> None:
     """Check what no single number shows: duplicates, crossings, dangling names.
 
     Args:
         file: for the error.
         config: the robot, each of its values in range.
-        services: that need an endpoint on the bus.
 
     Raises:
         ConfigError: naming the file, the key, what stands there and what would be right.
     """
-    _check_names(file, config, services)
+    _check_names(file, config)
     _check_interfaces(file, config)
     _check_physics(file, config)
     _check_drive(file, config)
@@ -50,7 +49,7 @@ def check(file: str, config: RobotConfig, services: Sequence[str]) -> None:
     check_buses(file, config)
 
 
-def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> None:
+def _check_names(file: str, config: RobotConfig) -> None:
     if not re.fullmatch(r"[A-Za-z0-9_-]+", config.name):
         raise ConfigError(file, "name", f"{config.name!r}", "use letters, digits, _ and - only")
     names = [module.name for module in config.module]
@@ -77,7 +76,8 @@ def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> Non
     if config.harness.bus not in config.can:
         buses = _words(config.can)
         raise ConfigError(file, "harness.bus", f"{config.harness.bus!r}", f"one of {buses}")
-    _check_endpoints(file, config.bus.endpoints, services)
+    _check_imu(file, config)
+    _check_endpoints(file, config)
     table = msgspec.to_builtins(config)
     for index, key in enumerate(config.assumed):
         value: Any = table
@@ -85,6 +85,20 @@ def _check_names(file: str, config: RobotConfig, services: Sequence[str]) -> Non
             value = value.get(part) if isinstance(value, dict) else None
         if value is None:
             raise ConfigError(file, f"assumed[{index}]", f"{key!r} is no key", "a dotted key")
+
+
+def _check_imu(file: str, config: RobotConfig) -> None:
+    imu = config.imu
+    if not imu.fitted:
+        return
+    if imu.bus not in config.can:
+        raise ConfigError(file, "imu.bus", f"{imu.bus!r}", f"one of {_words(config.can)}")
+    channel = config.can[imu.bus].channel
+    for module in config.module:
+        if config.can[module.bus].channel == channel:
+            found = f"{imu.bus!r} is {module.name}'s bus too"
+            right = "one without drives: the IMU's frames 0x11, 0x21 and 0x32 are nodes 0 and 1"
+            raise ConfigError(file, "imu.bus", found, right)
 
 
 def _check_serial_numbers(file: str, config: RobotConfig) -> None:
@@ -103,15 +117,16 @@ def _check_serial_numbers(file: str, config: RobotConfig) -> None:
         seen.add(serial)
 
 
-def _check_endpoints(file: str, endpoints: dict[str, str], services: Sequence[str]) -> None:
-    for service in services:
+def _check_endpoints(file: str, config: RobotConfig) -> None:
+    endpoints = config.bus.endpoints
+    for service in config.services:
         if service not in endpoints:
             raise ConfigError(file, f"bus.endpoints.{service}", "missing", "one for each service")
     seen: dict[str, str] = {}
     for service, endpoint in endpoints.items():
         where = f"bus.endpoints.{service}"
-        if service not in services:
-            raise ConfigError(file, where, "no such service", f"one of {_words(services)}")
+        if service not in SERVICES:
+            raise ConfigError(file, where, "no such service", f"one of {_words(SERVICES)}")
         if not re.match(r"(unixsock-stream|tcp|tls)/.", endpoint):
             right = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
             raise ConfigError(file, where, f"{endpoint!r}", right)

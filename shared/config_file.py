@@ -12,7 +12,7 @@ import msgspec
 import tomli_w
 
 from shared import config_check, gain_schedule
-from shared.config import SERVICES, RobotConfig
+from shared.config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.toml_file import parse_toml, read_toml
 
@@ -50,7 +50,7 @@ def _checked(config: RobotConfig, file: str) -> RobotConfig:
     if config.gain_schedule is not None:
         right = "remove it: the schedule is a file of its own, made by `xrl gains`"
         raise ConfigError(file, "gain_schedule", "unknown key", right)
-    config_check.check(file, config, SERVICES)
+    config_check.check(file, config)
     return config
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, TypeAlias
-
-import msgspec
+from typing import Annotated, Literal
 
 from shared.toml_file import Range, Section
 
@@ -237,6 +235,22 @@ class HarnessConfig(Section, frozen=True):
     overload_release_s: Seconds
 
 
+class ImuConfig(Section, frozen=True):
+    """The IMU on the torso, which tells the planner how the floor slopes."""
+
+    fitted: bool = False
+    """False: the robot has none, its service is not started, and the floor is taken as level."""
+    bus: str = "imu"
+    rate_hz: Rate = 100.0
+    """Of the sensor's samples, and of the service."""
+    mounting: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    """Roll, pitch and yaw of the sensor on the torso, rad: R = Rz(yaw) Rx(roll) Ry(pitch)."""
+    stale_ms: Milliseconds = 100.0
+    """An older sample says nothing; the slope stays as it was."""
+    levelling_s: Annotated[float, Range(0.05, 60.0, "s")] = 1.0
+    """Time constant with which the slope is followed."""
+
+
 class DriveConfig(Section, frozen=True):
     """ODrive settings that the joint service relies on (design section 5)."""
 
@@ -306,36 +320,3 @@ class SimulationConfig(Section, frozen=True):
     operator: OperatorConfig
     can_dialect: Literal["0.5", "0.6"] = "0.5"
     """Firmware whose CANSimple the emulated drives speak; the services find out by themselves."""
-
-
-Stiffness: TypeAlias = Annotated[float, Range(0.0, 1e4, "N m/rad")]
-LegGains: TypeAlias = tuple[Stiffness, Stiffness, Stiffness, Stiffness, Stiffness, Stiffness]
-"""(ankle phi, theta, knee phi, theta, hip phi, theta), N m/rad; both legs are alike."""
-
-
-Damping: TypeAlias = Annotated[float, Range(0.0, 1e3, "N m s/rad")]
-LegDamping: TypeAlias = tuple[Damping, Damping, Damping, Damping, Damping, Damping]
-
-
-class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Local joint stiffnesses over COM height and torso pitch; made by `shared.gain_schedule`."""
-
-    version: int
-    digest: str
-    """SHA-256 of the inputs."""
-    inputs: dict[str, Any]
-    """What the robot was when this was made, by dotted key."""
-    z: tuple[float, ...]
-    """COM heights of the nodes, m above the ankles, rising."""
-    pitch: tuple[float, ...]
-    """Torso pitches of the nodes, rad, rising."""
-    D: tuple[tuple[LegGains, ...], ...]
-    """Local stiffness at [z][pitch]."""
-    D_B: LegDamping
-    """Local damping, N m s/rad, the same in every pose."""
-    coupling_bandwidth_hz: Annotated[float, Range(0.1, 100.0, "Hz")]
-    """Of the two poles of tau_coupled."""
-    lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
-    """Up to this the loop is stable; less is always safe."""
-    coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]
-    """What tau_coupled fills the damping up to, in shares of B_p."""

@@ -142,6 +142,12 @@ LOSSES: Final[dict[str, Loss]] = {
         "harness/wrench: not valid",
         "by itself",
     ),
+    "IMU lost, where one is fitted": Loss(
+        "nothing",
+        "the planner leads on, and takes the floor to slope as it last did",
+        "imu/attitude: not valid",
+        "by itself",
+    ),
     "recorder lost": Loss(
         "nothing",
         "nothing",

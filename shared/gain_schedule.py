@@ -14,8 +14,8 @@ from typing import Any
 import msgspec
 
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
+from shared.gain_table import GainSchedule
 from shared.toml_file import check_ranges
 
 VERSION = 2

@@ -30,12 +30,17 @@ class Pair(NamedTuple):
         return f"{self.listens}->{self.dials}"
 
 
-PAIRS: Final = (*(Pair("planner", module) for module in MODULES), Pair("harness", "planner"))
+PAIRS: Final = (
+    *(Pair("planner", module) for module in MODULES),
+    Pair("harness", "planner"),
+    Pair("imu", "planner"),
+)
 
 COMMANDS: Final = tuple(f"planner->{module}" for module in MODULES)
 STATES: Final = tuple(f"{module}->planner" for module in MODULES)
 WRENCHES: Final = "harness->planner"
-DIRECTIONS: Final = (*COMMANDS, *STATES, WRENCHES)
+ATTITUDES: Final = "imu->planner"
+DIRECTIONS: Final = (*COMMANDS, *STATES, WRENCHES, ATTITUDES)
 """Every direction that control or states pass."""
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -70,5 +75,5 @@ def directions_of(link: str, file: str = "--link", key: str = "link") -> tuple[s
         return GROUPS[link]
     if link in DIRECTIONS:
         return (link,)
-    right = f"one of {', '.join(GROUPS)}, planner->MODULE, MODULE->planner, {WRENCHES}"
+    right = f"one of {', '.join(GROUPS)}, planner->MODULE, MODULE->planner, {WRENCHES}, {ATTITUDES}"
     raise ConfigError(file, key, repr(link), right)

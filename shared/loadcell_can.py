@@ -20,6 +20,7 @@ from typing import Final
 
 import msgspec
 
+from shared.frame_group import FrameGroup
 from shared.messages import Vector6
 
 FIRST_ID: Final = 0x300
@@ -28,7 +29,6 @@ FRAME_BYTES: Final = 8
 
 _SAMPLE: Final = struct.Struct("<6f")
 _FLOAT32: Final = struct.Struct("<f")
-_LAST: Final = len(FRAME_IDS) - 1
 
 
 class LegSample(msgspec.Struct, frozen=True, gc=False):
@@ -56,39 +56,27 @@ def pack(forces: Sequence[float]) -> list[tuple[int, bytes]]:
 
 
 class SampleAssembler:
-    """Puts the three frames of a sample together; never mixes frames across a gap."""
+    """Makes samples of frames."""
 
     def __init__(self) -> None:
-        self.malformed = 0
+        self._group = FrameGroup([(can_id, FRAME_BYTES) for can_id in FRAME_IDS])
+
+    @property
+    def malformed(self) -> int:
         """Frames of the sensor that were of the wrong length or out of order."""
-        self._data = bytearray(_SAMPLE.size)
-        self._next = 0
+        return self._group.malformed
 
     def add(self, can_id: int, data: bytes | bytearray) -> Vector6 | None:
         """Take one frame; return six leg forces in N if it completes a sample.
 
         Frames of other ids are ignored.
         """
-        index = can_id - FIRST_ID
-        if not 0 <= index <= _LAST:
+        sample = self._group.add(can_id, data)
+        if sample is None:
             return None
-        if len(data) != FRAME_BYTES:
-            self.malformed += 1
-            self._next = 0
-            return None
-        if index != self._next:
-            self.malformed += 1
-            if index != 0:
-                self._next = 0
-                return None
-        self._data[FRAME_BYTES * index : FRAME_BYTES * (index + 1)] = data
-        if index < _LAST:
-            self._next = index + 1
-            return None
-        self._next = 0
-        forces: Vector6 = _SAMPLE.unpack(self._data)
+        forces: Vector6 = _SAMPLE.unpack(sample)
         return forces
 
     def reset(self) -> None:
         """Forget a sample that is not complete: its rest belongs to another link."""
-        self._next = 0
+        self._group.reset()

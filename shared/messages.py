@@ -14,6 +14,7 @@ import msgspec
 Pair = tuple[float, float]
 """(phi, theta) of one module."""
 Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 Modules = tuple[int, int, int, int, int, int]
 """One integer for each module, in `shared.joints.MODULES` order."""
@@ -229,6 +230,20 @@ class Wrench(Message, frozen=True):
     """Age of the sensor sample, by the harness service's clock."""
 
 
+class Attitude(Message, frozen=True):
+    """Which way is up, as the IMU on the torso has it."""
+
+    up: Vector3
+    """Unit vector against gravity, torso axes."""
+    rate: Vector3
+    """Of the torso, rad/s, torso axes."""
+    valid: bool
+    """False while the sensor is silent or says that it does not know: the numbers are then the
+    last good ones."""
+    age_ns: int
+    """Age of the sensor's sample, by the IMU service's clock; -1 before the first."""
+
+
 class TareRequest(Message, frozen=True):
     """Asks the harness service for a new zero: what acts now is to read as nothing."""
 
@@ -269,6 +284,10 @@ class PlannerStatus(Message, frozen=True):
     """Time since each module's newest state arrived, by the planner's clock; -1 if none yet."""
     wait_s: float = 0.0
     """Until it may lead again after drop-outs, s; 0 if nothing is waited for."""
+    attitude_seq: int = -1
+    """Sequence number of the attitude that this tick knew; -1: none yet."""
+    slope: Pair = (0.0, 0.0)
+    """Rise of the floor along x and y that the law reckons with, rad."""
 
 
 class OperatorIntent(Message, frozen=True):
@@ -318,6 +337,14 @@ class SimTruth(Message, frozen=True):
     """Simulated time over wall time since the scenario started."""
     late_s: float
     """World time lost so far because the machine was too slow, s."""
+    lean: Pair = (0.0, 0.0)
+    """How far up leans against the floor's normal along x and y, m/m: on a slope not zero."""
+
+    @property
+    def over(self) -> Pair:
+        """Where the COM is over by gravity, at the ankles' height: x and y, m, world."""
+        x, y, z = self.com
+        return x - self.lean[0] * z, y - self.lean[1] * z
 
 
 class SimControl(Message, frozen=True):

@@ -89,6 +89,14 @@ WRENCH: Final = Topic(
     recorded=True,
     why="what the operator does to the torso",
 )
+ATTITUDE: Final = Topic(
+    name="imu/attitude",
+    type=messages.Attitude,
+    rate_hz=100.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="which way is up, where an IMU is fitted",
+)
 HARNESS_TARE: Final = Topic(
     name="harness/tare",
     type=messages.TareRequest,
@@ -168,6 +176,7 @@ TOPICS: Final = (
     JOINT_EVENT,
     JOINT_TRACE,
     WRENCH,
+    ATTITUDE,
     HARNESS_TARE,
     PLANNER_STATUS,
     PLANNER_MEMORY,

@@ -468,6 +468,7 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.PLANNER_MEMORY: (("planner",), ("recorder",)),
     topics.SIM_STATE: (("simulator",), ("recorder",)),
     topics.WRENCH: (("harness",), ("planner", "recorder", TOOL)),
+    topics.ATTITUDE: (("imu",), ("planner", "recorder", TOOL)),
     topics.HARNESS_TARE: ((TOOL,), ("harness", "recorder")),
     topics.PLANNER_STATUS: (("planner",), ("recorder", TOOL)),
     topics.OPERATOR_INTENT: (("simulator", TOOL), ("planner", "recorder", TOOL)),

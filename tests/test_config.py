@@ -106,6 +106,13 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (lambda raw: raw["module"].append(RAW["module"][0]), "module[6].name", "twice", "once"),
     (setting("module.4.bus", "can9"), "module[4].bus", "'can9'", "one of ankle_right"),
     (setting("harness.bus", "can9"), "harness.bus", "'can9'", "one of ankle_right"),
+    (lambda raw: raw["imu"].update(fitted=True, bus="can9"), "imu.bus", "'can9'", "one of ankle"),
+    (
+        lambda raw: raw["imu"].update(fitted=True, bus="hip_left"),
+        "imu.bus",
+        "'hip_left' is hip_left's bus too",
+        "one without drives",
+    ),
     (setting("module.1.node_ids", [2, 2]), "module[1].node_ids", "node 2", "free"),
     (on_one_bus, "module[1].node_ids", "node 1", "free"),
     (without("bus.endpoints.planner"), "bus.endpoints.planner", "missing", "each service"),

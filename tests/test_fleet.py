@@ -49,7 +49,7 @@ def test_the_injector_stands_between_those_that_dial_only_where_it_is_asked_for(
     assert "injector" not in plain.commands
     assert [name for name, words in plain.commands.items() if "--injected" in words] == []
     dialling = {name for name, words in injected.commands.items() if "--injected" in words}
-    assert dialling == {"planner", "harness"}
+    assert dialling == {"planner", "harness"}, "no IMU is fitted"
     new = {item.endpoint for item in injected.listeners} - {i.endpoint for i in plain.listeners}
     assert len(new) == len(PAIRS) + 1, "a socket for each pair, and its own"
     names = [row.name for row in injected.processes]
@@ -79,6 +79,34 @@ def test_drives_on_socketcan_are_no_simulation(tmp_path: Path) -> None:
     real.write_text(text.replace('"xrl_unix"', '"socketcan"'), encoding="utf-8")
     assert fleet.is_simulated(load(DEFAULT_CONFIG))
     assert not fleet.is_simulated(load(real))
+
+
+def test_a_bus_of_an_imu_that_is_not_fitted_makes_no_simulation(tmp_path: Path) -> None:
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+    real, emulated = tmp_path / "real.toml", '[can.imu]\ninterface = "xrl_unix"'
+    others = text.replace(emulated, "(imu)").replace('"xrl_unix"', '"socketcan"')
+    real.write_text(others.replace("(imu)", emulated), encoding="utf-8")
+    assert not fleet.is_simulated(load(real))
+
+
+def test_the_imus_service_is_started_on_a_robot_that_has_one_and_by_the_injectors_way(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    fitted = tmp_path / "robot.toml"
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+    fitted.write_text(text.replace("fitted = false", "fitted = true"), encoding="utf-8")
+    assert "imu" not in plan(run_dir).commands
+    told = fleet.make_plan(
+        fitted,
+        run_dir,
+        overrides={},
+        services=None,
+        simulation=True,
+        injected=True,
+        table_path=fleet.TABLE,
+    )
+    assert "--injected" in told.commands["imu"]
+    assert set(load(fitted).services) <= set(told.commands)
 
 
 @pytest.mark.parametrize("changes", [{"services": ["plannr"]}, {"overrides": {"plannr": []}}])

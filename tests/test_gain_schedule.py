@@ -16,9 +16,9 @@ import tomli_w
 
 from shared import config_file, gain_schedule
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
 from shared.gain_schedule import digest_of, inputs_of
+from shared.gain_table import GainSchedule
 from tests.conftest import ROBOT_FILE
 
 INPUTS = inputs_of(config_file.load(ROBOT_FILE))

@@ -11,7 +11,7 @@ from rich.console import Console
 from services.simulator.plant import plant_from
 from shared import topics
 from shared.bus import Session
-from shared.config import SERVICES, RobotConfig
+from shared.config import RobotConfig
 from shared.messages import PlannerStatus
 from shared.scenario import Scenario
 from tools.runs import experiment, figure, verdict, verdict_table
@@ -85,7 +85,7 @@ def lead_run(
     the scenario never began.
     """
     console.print(
-        "starting ten services; modes below: right ankle, knee, hip, then left; "
+        f"starting {len(robot.services)} services; modes below: right ankle, knee, hip, then left; "
         "D disarmed, H hold, T track, F fault, - silent",
         style="dim",
     )
@@ -105,7 +105,7 @@ def lead_run(
         true_plant=plant_from(args.plant),
         pace=args.pace,
         tell=lambda text: console.print(f"[yellow]{text}[/]", highlight=False, soft_wrap=True),
-        no_restart=SERVICES if args.no_restart else {kill.service for kill in story.kill},
+        no_restart=robot.services if args.no_restart else {kill.service for kill in story.kill},
     )
 
 

@@ -23,8 +23,8 @@ from services.planner.push_limit import PushLimits
 from shared import config_file, gain_schedule, topics
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule
 from shared.exceptions import RunError
+from shared.gain_table import GainSchedule
 from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.messages import JointCommand, JointState, PlannerMode, PlannerStatus, SplitSource
 from shared.robot_model import stand_pose

@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from services.planner.push_limit import DIRECTIONS
+from services.planner.push_limit import DIRECTIONS, slope_of
 from shared import config_file, gain_schedule
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
+from shared.gain_table import GainSchedule
 from tools.verbs import Subparsers, add_config, add_verb
 
 ROOM_EVERY = 5
@@ -144,14 +144,21 @@ def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -
     for name in DIRECTIONS:
         table.add_column(name, justify="right", no_wrap=True)
     parts = list[str]()
+    held = dict.fromkeys(DIRECTIONS, math.inf)
     ready = msgspec.structs.replace(robot, gain_schedule=schedule)
     for z, limits in split_program.push_limits(ready, PUSH_HEIGHTS):
         cells = [" / ".join(f"{limit.force_n:.0f}" for limit in row) for row in limits.values()]
         table.add_row(f"{z:.3f}", *cells)
         parts += [row.held.part for row in limits.values()]
+        for name, row in limits.items():
+            held[name] = min(held[name], row.held.force_n, row.led.force_n)
     console.print(table)
     first = ", ".join(dict.fromkeys(parts))
     console.print(f"gives way first, with the planner dead: {first}", style="dim")
+    slopes = ", ".join(
+        f"{math.degrees(slope_of(robot, least)):.1f} degrees {name}" for name, least in held.items()
+    )
+    console.print(f"slope without an IMU, planner dead or led: {slopes}", style="dim")
     console.print(
         "body: what soles and motors bear at that pose, whatever the control", style="dim"
     )

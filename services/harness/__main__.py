@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from services.harness.filter import WrenchFilter
-from services.harness.loop import HarnessLoop, run
+from services.harness.loop import HarnessLoop
 from services.harness.sensor import CanHarnessSensor
 from shared import bus, log, process, topics
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -13,6 +13,7 @@ from shared.config import RobotConfig, expand
 from shared.config_file import load
 from shared.messages import TareRequest, Wrench
 from shared.priority import raise_priority
+from shared.sensor_loop import run
 
 FIFO_PRIORITY = 10
 """Below the joint services and the planner: both stand and lead without it."""

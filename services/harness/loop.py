@@ -7,7 +7,6 @@ from typing import Protocol
 from services.harness import filter as wrench_filter
 from services.harness.filter import FilterState, WrenchFilter
 from services.harness.sensor import HarnessSensor
-from shared import clock
 from shared.messages import TareRequest, Wrench
 
 
@@ -23,13 +22,6 @@ class Requests(Protocol):
 
     def take(self) -> TareRequest | None:
         """Return the newest request that came since the last call, or None; never blocks."""
-
-
-class Stop(Protocol):
-    """Something that becomes true when the loop is to end."""
-
-    def __bool__(self) -> bool:
-        """Return True to stop."""
 
 
 class HarnessLoop:
@@ -76,20 +68,3 @@ class HarnessLoop:
         self.unsent += not self._publisher.put(message)
         self.cycles += 1
         return message
-
-
-def next_deadline(deadline_ns: int, period_ns: int, now_ns: int) -> tuple[int, int]:
-    """Return the next deadline after now on the grid of periods, and how many were missed."""
-    missed = max(0, (now_ns - deadline_ns) // period_ns)
-    return deadline_ns + (missed + 1) * period_ns, missed
-
-
-def run(loop: HarnessLoop, rate_hz: float, stop: Stop) -> None:
-    """Run cycles at `rate_hz` until told to stop; missed ones are skipped, not piled up."""
-    period_ns = round(clock.NS_PER_S / rate_hz)
-    deadline_ns = clock.now_ns()
-    while not stop:
-        loop.cycle(clock.now_ns())
-        deadline_ns, missed = next_deadline(deadline_ns, period_ns, clock.now_ns())
-        loop.skipped += missed
-        clock.sleep_until(deadline_ns)

@@ -9,7 +9,14 @@ from services.planner.planner import Planner
 from shared import config_file, gain_schedule, log, topics
 from shared.bus import open_session
 from shared.joints import MODULES
-from shared.messages import JointCommand, JointState, OperatorIntent, PlannerStatus, Wrench
+from shared.messages import (
+    Attitude,
+    JointCommand,
+    JointState,
+    OperatorIntent,
+    PlannerStatus,
+    Wrench,
+)
 from shared.priority import raise_priority
 from shared.process import (
     StopFlag,
@@ -40,6 +47,7 @@ def main() -> int:
         ports = Ports(
             states=[session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES],
             wrench=session.latest(topics.WRENCH, Wrench),
+            attitude=session.latest(topics.ATTITUDE, Attitude),
             intent=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
             commands=[session.publisher(topics.JOINT_COMMAND, JointCommand, m) for m in MODULES],
             status=session.publisher(topics.PLANNER_STATUS, PlannerStatus),

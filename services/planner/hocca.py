@@ -11,7 +11,7 @@ One tick, in the paper's letters:
     K_q, B_q             at q_ref
     D, D_B               what the joint services hold alone: schedule and certificate
     K_c, B_c             what these lack of K_p and B_p
-    tau_ff  = J^T (m g z) + J_harness^T F_assist
+    tau_ff  = J^T (m g up) + J_harness^T F_assist up
     tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot)] }
 
 Pure: no clock, bus or thread.
@@ -29,16 +29,18 @@ from services.planner.coupling import CouplingFilter, Missing
 from services.planner.gains import GainLaw, JointGains
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
+from services.planner.levelling import Levelling
 from services.planner.memory import LawMemory
 from services.planner.split import GainSplit, LocalGains
 from shared.config import GRAVITY, RobotConfig
-from shared.messages import Wrench
+from shared.messages import Pair, Vector3, Wrench
 
 Array = NDArray[np.float64]
 
 
 GLIDES = np.array([True, True, False, True, False, True])
-"""Rows of p whose closed-loop reference is brought to zero: COM over the ankles, no roll or yaw."""
+"""Rows of p whose closed-loop reference is brought to zero: no roll or yaw, and the COM over the
+ankles by gravity: off them by its height times the slope of the floor."""
 
 
 class LawOutput(NamedTuple):
@@ -60,6 +62,8 @@ class LawOutput(NamedTuple):
     closure: Array
     assist: float
     """N"""
+    slope: Pair
+    """Of the floor along x and y, rad."""
     ik_iterations: int
     ik_residual: float
 
@@ -79,8 +83,9 @@ class Hocca:
         self._missing = Missing(self._gains.K_p, self._gains.B_p, self._S, coupling.damping)
         self._coupling = CouplingFilter(coupling.bandwidth_hz)
         self._S_perp = 1.0 - self._S
+        self._levelling = Levelling(config.imu.levelling_s)
+        self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
-        self._F_O[2] = config.total_mass * GRAVITY
         assist = config.assist
         self._assist = AssistLaw(
             assist.force_max, assist.rate_max, assist.integral_max, assist.integral_s
@@ -103,6 +108,7 @@ class Hocca:
         *,
         align: bool = False,
         wrench: Wrench | None = None,
+        up_torso: Vector3 | None = None,
     ) -> LawOutput:
         """Run the law once.
 
@@ -120,25 +126,32 @@ class Hocca:
                 held off centre by 25 mm fell at the second push; the modules' blend makes
                 no step of it.
             wrench: of the operator on the torso, if it is fresh and valid.
+            up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
         measured, ik = self._measured, self._ik
         measured.update(q)
+        self._levelling.advance(up_torso, measured.p[3:], dt)
+        up = self._levelling.up
+        self._F_O[:3] = self._weight * up
         if align or not self._aligned:
             self._align(q)
         else:
             self._has_led = True
         pdot = measured.J @ v
         p_C, pdot_C = self._closed_loop_reference(dt)
+        lean = up[:2] / up[2]
+        p_C[:2] += lean * measured.p[2]
+        pdot_C[:2] += lean * pdot[2]
         p_ref = self._S_perp * p_C + self._S * measured.p
         pdot_ref = self._S_perp * pdot_C + self._S * pdot
-        up, moment_pitch = None, 0.0
+        force, moment_pitch = None, 0.0
         if wrench is not None:
-            up = force_up(wrench.force, measured.p[3], measured.p[4])
+            force = force_up(wrench.force, measured.p[3], measured.p[4])
             moment_pitch = wrench.moment[1]
         still = not align and is_still(pdot[2], pdot[4])
-        given = None if up is None else -up
+        given = None if force is None else -force
         assist_rate = self._assist.advance(assist_wanted, given, dt, still=still)
-        ease_z, ease_pitch = self._easing.ease(up, moment_pitch, self._assist.assist, dt)
+        ease_z, ease_pitch = self._easing.ease(force, moment_pitch, self._assist.assist, dt)
 
         result = ik.solve(p_ref, measured.D_left)
         q_ref = ik.q.copy()
@@ -146,11 +159,11 @@ class Hocca:
         v_ref = T @ pdot_ref
 
         at_ref = ik.kinematics
-        self._F_assist[2] = self._assist.assist
+        self._F_assist[:] = self._assist.assist * up
         gains = self._gains
         tau_ff = self._F_O @ at_ref.J + self._F_assist @ at_ref.J_harness
         hessian_O = at_ref.hessian_times(self._F_O, self._F_assist).copy()
-        dtau_ff = hessian_O @ v_ref + at_ref.J_harness[2] * assist_rate
+        dtau_ff = hessian_O @ v_ref + (up @ at_ref.J_harness) * assist_rate
         e_p, e_pdot = p_ref - measured.p, pdot_ref - pdot
 
         def body_gains() -> JointGains:
@@ -178,6 +191,7 @@ class Hocca:
             p_ref,
             measured.closure.copy(),
             self._assist.assist,
+            self._levelling.slope,
             result.iterations,
             result.residual,
         )
@@ -193,6 +207,7 @@ class Hocca:
             self._easing.remember(),
             self._has_led,
             self._coupling.remember(),
+            self._levelling.remember(),
         )
 
     def recall(self, memory: LawMemory) -> None:
@@ -204,12 +219,15 @@ class Hocca:
         self._assist.recall(memory.assist)
         self._easing.recall(memory.easing)
         self._coupling.recall(memory.coupling)
+        self._levelling.recall(memory.levelling)
 
     def _align(self, q: Array) -> None:
         self._aligned = True
         self._coupling.reset()
         begins_at = np.where(GLIDES & self._has_led, 0.0, self._S_perp)
-        self._p_C0 = self._measured.p * begins_at
+        p = self._measured.p.copy()
+        p[:2] -= self._levelling.up[:2] / self._levelling.up[2] * p[2]
+        self._p_C0 = p * begins_at
         self._since_align_s = 0.0
         self._ik.q[:] = q
 

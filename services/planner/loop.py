@@ -11,7 +11,14 @@ from services.planner.remembrance import Remembrance
 from shared.bus import Latest, Publisher
 from shared.clock import NS_PER_S, NS_PER_US, now_ns, sleep_until
 from shared.config import RobotConfig
-from shared.messages import JointCommand, JointState, OperatorIntent, PlannerStatus, Wrench
+from shared.messages import (
+    Attitude,
+    JointCommand,
+    JointState,
+    OperatorIntent,
+    PlannerStatus,
+    Wrench,
+)
 from shared.process import StopFlag
 from shared.traces import PlannerMemory
 
@@ -21,6 +28,7 @@ class Ports(msgspec.Struct, frozen=True):
 
     states: Sequence[Latest[JointState]]
     wrench: Latest[Wrench]
+    attitude: Latest[Attitude]
     intent: Latest[OperatorIntent]
     commands: Sequence[Publisher[JointCommand]]
     status: Publisher[PlannerStatus]
@@ -67,6 +75,9 @@ class PlannerLoop:
         wrench = ports.wrench.take()
         if wrench is not None:
             planner.hear_wrench(wrench, now)
+        attitude = ports.attitude.take()
+        if attitude is not None:
+            planner.hear_attitude(attitude, now)
         intent = ports.intent.take()
         if intent is not None:
             planner.hear_assist(intent.assist_n)

@@ -7,7 +7,7 @@ import msgspec
 from services.planner.bracing import Bracing
 from services.planner.engagement import Engagement
 from shared.joints import N_JOINTS
-from shared.messages import JointState, Pair, SplitSource, Wrench
+from shared.messages import Attitude, JointState, Pair, SplitSource, Wrench
 
 
 class AssistMemory(msgspec.Struct, frozen=True):
@@ -47,6 +47,8 @@ class LawMemory(msgspec.Struct, frozen=True):
     has_led: bool = False
     coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS)
     """Of `CouplingFilter`, N m."""
+    levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
+    """Of `Levelling`, rad."""
 
 
 class TickMemory(msgspec.Struct, frozen=True):
@@ -65,3 +67,6 @@ class TickMemory(msgspec.Struct, frozen=True):
     overload: OverloadMemory
     law: LawMemory
     bracing: Bracing = msgspec.field(default_factory=Bracing)
+    attitude: Attitude | None = None
+    attitude_ns: int = 0
+    attitude_seq: int = -1

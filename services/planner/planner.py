@@ -23,12 +23,14 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_MODULES
 from shared.messages import (
+    Attitude,
     JointCommand,
     JointState,
     Pair,
     PlannerMode,
     PlannerStatus,
     SplitSource,
+    Vector3,
     Vector6,
     Wrench,
 )
@@ -69,6 +71,10 @@ class Planner:
         self._wrench_ns = 0
         harness = config.harness
         self._wrench_stale_ns = round(harness.stale_ms * NS_PER_MS)
+        self._attitude: Attitude | None = None
+        self._attitude_ns = 0
+        self._attitude_seq = -1
+        self._attitude_stale_ns = round(config.imu.stale_ms * NS_PER_MS)
         self._overload = Overload(
             harness.overload_force,
             harness.overload_moment,
@@ -98,6 +104,11 @@ class Planner:
         self._wrench_seq = wrench.seq
         self._wrench, self._wrench_ns = wrench, now_ns
         self._overload.hear(wrench, now_ns)
+
+    def hear_attitude(self, attitude: Attitude, now_ns: int) -> None:
+        """Take the IMU's newest attitude."""
+        self._attitude_seq = attitude.seq
+        self._attitude, self._attitude_ns = attitude, now_ns
 
     def hear_assist(self, assist: float) -> None:
         """Take the assist force that the operator asks for, N."""
@@ -148,6 +159,7 @@ class Planner:
             dt,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
+            up_torso=self._usable_up(now_ns),
         )
         self._source = self._output.local.source
         self._seq += 1
@@ -169,6 +181,9 @@ class Planner:
             self._overload.remember(),
             self._law.remember(),
             msgspec.structs.replace(self._bracing),
+            self._attitude,
+            self._attitude_ns,
+            self._attitude_seq,
         )
 
     def recall(self, memory: TickMemory) -> None:
@@ -179,6 +194,8 @@ class Planner:
                 self.hear_state(module, state, arrived_ns)
         self._assist_wanted = m.assist_wanted
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
+        self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
+        self._attitude_seq = m.attitude_seq
         self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
         self._engagement = msgspec.structs.replace(m.engagement)
         self._bracing = msgspec.structs.replace(m.bracing)
@@ -191,6 +208,13 @@ class Planner:
         if wrench is None or not wrench.valid or now_ns - self._wrench_ns > self._wrench_stale_ns:
             return None
         return wrench
+
+    def _usable_up(self, now_ns: int) -> Vector3 | None:
+        """Return where up is, torso axes, or None if the newest is not valid or too old."""
+        attitude = self._attitude
+        if attitude is None or not attitude.valid:
+            return None
+        return attitude.up if now_ns - self._attitude_ns <= self._attitude_stale_ns else None
 
     def _forbidden(self) -> PlannerMode | None:
         """Return why the planner may not lead, by what the last tick found; None if it may."""
@@ -268,6 +292,8 @@ class Planner:
             assist_wanted_n=self._assist_wanted,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
             wait_s=0.0 if leads else self._engagement.wait_ns(now_ns) / NS_PER_S,
+            attitude_seq=self._attitude_seq,
+            slope=output.slope if output is not None else (0.0, 0.0),
         )
 
 

@@ -256,6 +256,15 @@ def limits_along(
     )
 
 
+def slope_of(config: RobotConfig, force_n: float) -> float:
+    """Return the floor's slope, rad, that pulls the weight along it as hard as a push (N).
+
+    Without an IMU the planner stands along the floor's normal, and the weight leans on the gains
+    like a push at the torso: somewhat less, for a third of the mass hangs lower.
+    """
+    return math.asin(min(1.0, force_n / (config.total_mass * GRAVITY)))
+
+
 def _horizontal(direction: tuple[float, float]) -> Array:
     return np.array([*direction, 0.0, 0.0, 0.0, 0.0])
 

@@ -19,8 +19,8 @@ from services.planner.certificate import Certificate, Margins
 from services.planner.gains import JointGains
 from shared import gain_schedule
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
+from shared.gain_table import GainSchedule
 from shared.joints import MODULES
 from shared.messages import SplitSource
 

@@ -31,9 +31,9 @@ from services.planner.poses import Node, Poses
 from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import CouplingGains, ScheduledGains
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule, LegGains
 from shared.exceptions import RunError
 from shared.gain_schedule import VERSION, digest_of, inputs_of
+from shared.gain_table import GainSchedule, LegGains
 from shared.joints import N_LEG
 
 Array = NDArray[np.float64]

@@ -13,6 +13,7 @@ from services.simulator.fibre_endpoints import Board
 from services.simulator.fibre_front import FibreFront
 from services.simulator.fibre_port import FibreHub, FibrePort
 from services.simulator.harness_front import HarnessFront
+from services.simulator.imu_front import ImuFront
 from services.simulator.loop import Ports, SimulatorLoop
 from services.simulator.plant import plant_from
 from services.simulator.usb_standin import FOLDER
@@ -103,10 +104,13 @@ def main() -> int:
             bank.calibration.restart(axis)
         usb = open_usb(robot, bank, arguments.run_dir, stack)
         harness = HarnessFront(robot, hubs[robot.harness.bus], arguments.seed)
+        imu = None
+        if robot.imu.fitted:
+            imu = ImuFront(true_plant.imu, hubs[robot.imu.bus], arguments.seed)
         world = World(body_of(robot, true_plant), story)
         logger.info("up, %s, scenario %s", granted, story.name)
         freeze_garbage()
-        loop = SimulatorLoop(robot, world, bank, front, usb, harness, ports)
+        loop = SimulatorLoop(robot, world, bank, front, usb, (harness, imu), ports)
         loop.autostart_s = arguments.autostart
         loop.run(stop)
     logger.info("stopped")
@@ -127,6 +131,7 @@ def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, 
     """Return the CAN buses of the robot, simulated, by name."""
     run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     names = [*drive_buses(robot), robot.harness.bus]
+    names += [robot.imu.bus] if robot.imu.fitted else []
     return {
         name: stack.enter_context(UnixCanHub(Path(expand(robot.can[name].channel, run_dir))))
         for name in dict.fromkeys(names)

@@ -11,6 +11,7 @@ from services.simulator.cansimple_front import CanSimpleFront
 from services.simulator.fault_injector import FaultInjector
 from services.simulator.fibre_port import FibreHub
 from services.simulator.harness_front import HarnessFront
+from services.simulator.imu_front import ImuFront
 from services.simulator.state import taken
 from services.simulator.world import World
 from shared.bus import Latest, Publisher
@@ -49,11 +50,11 @@ class SimulatorLoop:
         bank: AxisBank,
         front: CanSimpleFront,
         usb: Sequence[FibreHub],
-        harness: HarnessFront,
+        sensors: tuple[HarnessFront, ImuFront | None],
         ports: Ports,
     ) -> None:
         self._world, self._bank, self._front = world, bank, front
-        self._harness, self._ports = harness, ports
+        (self._harness, self._imu), self._ports = sensors, ports
         self._usb = usb
         self._faults = FaultInjector(world.scenario.fault, bank)
         simulation = config.simulation
@@ -61,6 +62,7 @@ class SimulatorLoop:
         self._step_ns = round(simulation.timestep * NS_PER_S)
         self._encoder_every = max(1, round(rate / simulation.encoder_rate_hz))
         self._harness_every = max(1, round(rate / config.harness.rate_hz))
+        self._imu_every = max(1, round(rate / config.imu.rate_hz))
         self._truth_every = max(1, round(rate / simulation.truth_rate_hz))
         self._intent_every = max(1, round(rate / INTENT_RATE_HZ))
         self._state_every = max(1, round(rate / STATE_RATE_HZ))
@@ -111,6 +113,8 @@ class SimulatorLoop:
         steps = self._steps
         if steps % self._harness_every == 0:
             self._harness.send(world.harness_force, world.harness_moment)
+        if self._imu is not None and steps % self._imu_every == 0:
+            self._imu.send(world)
         if steps % self._truth_every == 0:
             self._publish_truth()
         if steps % self._state_every == 0:

@@ -77,6 +77,16 @@ class EncoderErrors(Section, frozen=True):
     """Told less true angle, each of the 12 joints, rad."""
 
 
+class ImuErrors(Section, frozen=True):
+    """What the IMU tells wrongly, where one is fitted."""
+
+    tilt: tuple[Angle, Angle] = (0.005, -0.005)
+    """Roll and pitch of what it tells against the truth, rad: its own error (0.2 to 0.5 degrees of
+    an MTi 630) and its mounting's."""
+    noise: Annotated[float, Range(0.0, 0.1, "rad")] = 0.001
+    """Standard deviation about each axis."""
+
+
 class BodyErrors(Section, frozen=True):
     """Masses and their places against the robot file's."""
 
@@ -128,6 +138,7 @@ class PlantConfig(Section, frozen=True):
     drivetrain: Drivetrain = Drivetrain()
     drive: DriveErrors = DriveErrors()
     encoder: EncoderErrors = EncoderErrors()
+    imu: ImuErrors = ImuErrors()
     body: BodyErrors = BodyErrors()
     floor: Floor = Floor()
     feet: Feet = Feet()
@@ -142,6 +153,7 @@ IDEAL: Final = PlantConfig(
     drivetrain=Drivetrain(stiffness=RIGID, play=0.0, cogging=0.0),
     drive=DriveErrors(lag_s=0.0),
     encoder=EncoderErrors(noise_counts=0.0),
+    imu=ImuErrors(tilt=(0.0, 0.0), noise=0.0),
     floor=Floor(friction=0.9),
     person=Person(mass=0.0, load_scale=1.0, load_lag_s=0.0),
 )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from services.simulator.actuation import Actuation
 from services.simulator.body import Body
+from services.simulator.hoist import Hoist
 from services.simulator.operator import HandForce, Operator, Wearer
 from shared.joints import JOINTS, N_LEG, SIDES
 from shared.messages import SimTruth, Vector3
@@ -29,12 +30,6 @@ FALLEN_ANGLE: Final = 0.6
 """rad of roll or yaw."""
 FALLEN_TILT: Final = 0.6
 """rad of a sole against the floor."""
-HOIST_STIFFNESS: Final = (2e4, 2e3)
-"""N/m and N m/rad of the hoist while it holds the torso."""
-HOIST_DAMPING: Final = (2e3, 2e2)
-"""N s/m and N m s/rad."""
-HOIST_WEIGHT_SHARE: Final = 0.75
-"""Part of the weight the hoist takes: the soles stay on the floor."""
 STAND_ITERATIONS: Final = 8
 """Newton steps from `stand_pose` to soles that are flat to rounding."""
 
@@ -51,7 +46,6 @@ class World:
         self._steps = body.steps
         self._operator = Operator(body.hand, body.harness_point)
         self._wearer = Wearer(body.person)
-        self._weight = body.weight
         joints = [self.model.joint(name) for name in JOINTS]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])
         self._v_index = np.array([joint.dofadr[0] for joint in joints])
@@ -70,9 +64,7 @@ class World:
         self._dt: float = self.model.opt.timestep
         self._harness_point = body.harness_point
         self._ankles_wanted, self._foot_yaws = body.ankles, body.foot_yaws
-        self._hoist_time = body.hoist_s
-        self.hoist = 1.0
-        self._releasing = False
+        self._hoist = Hoist(body.weight, body.hoist_s)
         self.time = 0.0
         self._start_time = math.inf
         self._fallen = False
@@ -85,17 +77,28 @@ class World:
         self.harness_moment: Vector3 = (0.0, 0.0, 0.0)
         """N m, torso axes."""
         self._truths = 0
+        self._level = _turn_between(-self.model.opt.gravity, np.array((0.0, 0.0, 1.0)))
+        """Quaternion: turns the floor's axes into axes whose z is up."""
+        x, y, z = self.model.opt.gravity.tolist()
+        self._lean = (x / z, y / z)
         self._place(body)
 
     def _place(self, body: Body) -> None:
-        """Stand the robot: torso level at the stand height, soles flat, COM over the ankles."""
+        """Stand the robot: soles flat, torso along the floor, COM over the ankles by gravity.
+
+        The hoist hangs from above: on a slope it holds the torso aside of the floor's normal.
+        """
         data, model = self.data, self.model
         data.qpos[self._q_index] = body.stand_q
         mujoco.mj_kinematics(model, data)
-        data.qpos[0] -= data.xpos[self._feet[0]][0]
+        mujoco.mj_comPos(model, data)
+        ankle, lean = data.xpos[self._feet[0]], self._lean
+        height = data.subtree_com[0][2] - ankle[2]
+        data.qpos[0] += lean[0] * height - ankle[0]
+        data.qpos[1] += lean[1] * height
         self._flatten_soles()
         self._actuation.settle(data.qpos[self._q_index])
-        self._hoist_position = data.qpos[:3].copy()
+        self._hoist.position = data.qpos[:3].copy()
 
     def stand_at(self, q: Array) -> None:
         """Stand the robot still, soles flat, at joint angles q (12,), rad; no hoist.
@@ -113,7 +116,7 @@ class World:
         data.qvel[:] = 0.0
         self._flatten_soles()
         self._actuation.settle(data.qpos[self._q_index])
-        self.hoist = 0.0
+        self.let_off_hoist()
 
     def go_on(
         self,
@@ -138,8 +141,7 @@ class World:
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = qpos, qvel, warmstart
         if scenario_s >= 0.0:
             self._start_time = self.time - scenario_s
-        self.hoist = hoist
-        self._releasing = hoist < 1.0
+        self._hoist.go_on(hoist)
         kept = data.qacc_warmstart.copy()
         mujoco.mj_forward(self.model, data)
         data.qacc_warmstart[:] = kept
@@ -189,9 +191,18 @@ class World:
         """Let the operator take the hand off."""
         self._hand_on = False
 
+    @property
+    def hoist(self) -> float:
+        """Share of the hoist's support: 1 hanging, 0 free."""
+        return self._hoist.share
+
+    def let_off_hoist(self) -> None:
+        """Take the hoist away at once."""
+        self._hoist.share = 0.0
+
     def release_hoist(self) -> None:
         """Let the hoist down."""
-        self._releasing = True
+        self._hoist.releasing = True
 
     def motor_turns(self) -> tuple[Array, Array]:
         """Return motor positions (12,) in turns and rates (12,) in turn/s.
@@ -201,6 +212,18 @@ class World:
         return self._actuation.encoders(
             self._qpos.take(self._q_index), self._qvel.take(self._v_index)
         )
+
+    def torso_against_gravity(self) -> list[float]:
+        """Return the quaternion (w, x, y, z) that turns torso axes into axes whose z is up."""
+        told = np.zeros(4)
+        mujoco.mju_mulQuat(told, self._level, self._qpos[3:7])
+        quaternion: list[float] = told.tolist()
+        return quaternion
+
+    def torso_rates(self) -> list[float]:
+        """Return the torso's angular velocity (3,), rad/s, torso axes."""
+        rates: list[float] = self._torso_rates[3:].tolist()
+        return rates
 
     def step(self, motor_torque: Array) -> None:
         """Move on by one time step under motor torques (12,) in N m."""
@@ -231,7 +254,7 @@ class World:
         arm_x = r[0] * x + r[1] * y + r[2] * z
         arm_y = r[3] * x + r[4] * y + r[5] * z
         self.hand = HandForce(0.0, 0.0)
-        if self._hand_on and self.hoist == 0.0:
+        if self._hand_on and self._hoist.share == 0.0:
             height = float(self._qpos[2]) + r[6] * x + r[7] * y + r[8] * z
             _, _, v_z, w_x, w_y, w_z = self._torso_rates.tolist()  # omega in torso axes
             omega_x = r[0] * w_x + r[1] * w_y + r[2] * w_z
@@ -256,29 +279,9 @@ class World:
             r[4] * m - arm_x * f,
             r[7] * m,
         )
-        if self.hoist > 0.0:
-            self._apply_hoist(wrench)
-
-    def _apply_hoist(self, wrench: Array) -> None:
-        """Hold the torso by a spring-damper and carry the weight, by the hoist's share."""
-        if self._releasing:
-            self.hoist = max(0.0, self.hoist - self._dt / self._hoist_time)
-        data = self.data
-        rotation = data.xmat[self._torso].reshape(3, 3)
-        k_lin, k_ang = HOIST_STIFFNESS
-        b_lin, b_ang = HOIST_DAMPING
-        error = self._hoist_position - data.qpos[:3]
-        turn = 0.5 * np.array(
-            [
-                rotation[2, 1] - rotation[1, 2],
-                rotation[0, 2] - rotation[2, 0],
-                rotation[1, 0] - rotation[0, 1],
-            ]
-        )
-        omega = rotation @ data.qvel[3:6]
-        wrench[:3] += self.hoist * (k_lin * error - b_lin * data.qvel[:3])
-        wrench[3:] += self.hoist * (-k_ang * turn - b_ang * omega)
-        wrench[2] += self.hoist * HOIST_WEIGHT_SHARE * self._weight
+        if self._hoist.share > 0.0:
+            rotation = self.data.xmat[self._torso].reshape(3, 3)
+            wrench += self._hoist.wrench(self._qpos[:3], rotation, self._torso_rates, self._dt)
 
     def truth(self, t_ns: int, real_time_factor: float, late_s: float) -> SimTruth:
         """Return the world as it is, for the log and the verdict."""
@@ -314,10 +317,11 @@ class World:
             foot_right_tilt=tilts[0],
             foot_left_tilt=tilts[1],
             feet_slip=slip,
-            hoist=self.hoist,
+            hoist=self._hoist.share,
             fallen=self._fallen,
             real_time_factor=real_time_factor,
             late_s=late_s,
+            lean=self._lean,
         )
 
 
@@ -327,6 +331,13 @@ def _turned_back(rotation: Array, yaw: float) -> Array:
         return rotation
     c, s = math.cos(yaw), math.sin(yaw)
     return np.asarray(np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotation, float)
+
+
+def _turn_between(start: Array, end: Array) -> Array:
+    """Return the quaternion (w, x, y, z) of the shortest turn of one direction into another."""
+    a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
+    turn = np.concatenate(([1.0 + a @ b], np.cross(a, b)))
+    return np.asarray(turn / np.linalg.norm(turn), float)
 
 
 def _vector(values: Array) -> Vector3:

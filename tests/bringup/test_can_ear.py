@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shared import cansimple, loadcell_can
+from shared import cansimple, imu_can, loadcell_can
 from shared.cansimple import AxisState, Command, Heartbeat, arbitration_id
 from shared.cansimple_06 import Command06, Version, pack_version
 from shared.config_sections import CanConfig
@@ -82,6 +82,29 @@ def test_heartbeats_estimates_and_load_cells_are_taken_in(bus: Bus) -> None:
     assert heard.samples[0] == (1.0, 2.0, 3.0, 4.0, 5.0, -6.0)
     assert heard.malformed == 0
     assert sorted(heard.nodes) == [NODE, STRANGER], "load cells are no nodes"
+
+
+def test_an_imu_is_heard_where_there_is_one(tmp_path: Path) -> None:
+    frames = imu_can.pack([1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0], valid=True)
+    config = CanConfig(interface="xrl_unix", channel=str(tmp_path / "can.sock"))
+    done = threading.Event()
+    with UnixCanHub(tmp_path / "can.sock") as hub:
+
+        def speak() -> None:
+            while not done.is_set():
+                hub.poll()
+                hub.broadcast(frames)
+                time.sleep(0.002)
+
+        speaker = threading.Thread(target=speak)
+        speaker.start()
+        heard = listen(config, (), ask=False, imu=True)
+        done.set()
+        speaker.join()
+    assert heard.attitudes[0].rate == (0.0, 0.5, 0.0)
+    assert heard.attitudes[0].valid
+    assert len(heard.attitudes) == len(heard.attitudes_s) > 3
+    assert heard.nodes == {}, "its frames are no nodes"
 
 
 def test_nothing_is_sent_where_nothing_is_to_be_asked(bus: Bus) -> None:

@@ -12,6 +12,8 @@ from shared.cansimple import AxisState, Heartbeat
 from shared.cansimple_06 import Version
 from shared.config import RobotConfig
 from shared.config_sections import CanConfig
+from shared.imu_can import ImuSample
+from tests.imu.robots import with_imu
 from tools.bringup import check_can
 from tools.bringup.can_ear import BusHeard, NodeHeard, long_enough, period_ms
 from tools.bringup.rows import Row, Verdict
@@ -179,6 +181,32 @@ def test_it_listens_for_some_heartbeats_but_not_for_ever(period: int, seconds: f
 
 def test_every_bus_of_the_robot_is_listened_to(robot: RobotConfig) -> None:
     nodes = check_can.bus_nodes(robot)
-    assert sorted(nodes) == sorted(robot.can)
+    assert sorted(nodes) == sorted(robot.buses)
     assert nodes[MODULE] == NODES
     assert nodes[robot.harness.bus] == ()
+
+
+def imu_heard(*, valid: bool = True, period_s: float = 0.01) -> BusHeard:
+    sample = ImuSample((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), valid)
+    return BusHeard(frames=150, attitudes=[sample] * 50, attitudes_s=times(period_s, 50))
+
+
+@pytest.mark.parametrize(
+    ("heard", "wrong"),
+    [
+        (imu_heard(), []),
+        (imu_heard(period_s=0.02), [("IMU", "samples", Verdict.WARNING)]),
+        (imu_heard(valid=False), [("IMU", "orientation valid", Verdict.WRONG)]),
+        (BusHeard(frames=7), [("IMU", "samples", Verdict.WRONG)]),
+        (BusHeard(trouble="no such device"), [("IMU", "CAN bus", Verdict.WRONG)]),
+    ],
+)
+def test_an_imu_is_judged_by_its_rate_and_by_what_it_says_of_itself(
+    robot: RobotConfig, heard: BusHeard, wrong: list[tuple[str, str, Verdict]]
+) -> None:
+    assert bad(check_can.imu_rows(robot, heard)) == wrong
+
+
+def test_a_bus_is_listened_to_for_an_imu_only_where_one_is_fitted(robot: RobotConfig) -> None:
+    assert "imu" not in check_can.bus_nodes(robot)
+    assert check_can.bus_nodes(with_imu(robot))["imu"] == ()

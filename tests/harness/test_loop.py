@@ -13,14 +13,15 @@ import pytest
 
 from services.harness.__main__ import make_sensor
 from services.harness.filter import WrenchFilter
-from services.harness.loop import HarnessLoop, next_deadline, run
+from services.harness.loop import HarnessLoop
 from services.simulator.harness_front import BIAS_MAX, HarnessFront
-from shared import clock
+from shared import sensor_loop
 from shared.clock import NS_PER_MS
 from shared.codec import Decoder
 from shared.config_sections import CanConfig
 from shared.loadcell_can import SampleAssembler, pack
 from shared.messages import Wrench
+from shared.sensor_loop import next_deadline, run
 from shared.unix_can_hub import UnixCanHub
 from tests.harness.helpers import (
     HARNESS,
@@ -153,8 +154,8 @@ def test_a_long_cycle_is_followed_by_one_cycle_and_not_by_many(
         nonlocal now_ns
         now_ns = max(now_ns, deadline_ns)
 
-    monkeypatch.setattr(clock, "now_ns", lambda: now_ns)
-    monkeypatch.setattr(clock, "sleep_until", sleep_until)
+    monkeypatch.setattr(sensor_loop, "now_ns", lambda: now_ns)
+    monkeypatch.setattr(sensor_loop, "sleep_until", sleep_until)
     loop = HarnessLoop(ScriptedSensor(), WrenchFilter(HARNESS), SlowOnce(), Asked())
     run(loop, HARNESS.rate_hz, StopAfterSix())
     assert [(t_ns - T0) // PERIOD_NS for t_ns in times] == [0, 1, 2, 3, 14, 15]

@@ -8,8 +8,9 @@ from pathlib import Path
 import can
 import pytest
 
-from services.harness.sensor import DRAIN_MAX, RETRY_NS, CanHarnessSensor
+from services.harness.sensor import CanHarnessSensor
 from shared import loadcell_can
+from shared.can_sensor import DRAIN_MAX, RETRY_NS
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import ConfigError
 from shared.unix_can_hub import UnixCanHub

@@ -16,9 +16,9 @@ from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
 from services.planner.split import GainSplit, ScheduledGains
 from shared.config import GRAVITY, RobotConfig
-from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
 from shared.gain_schedule import digest_of, inputs_of
+from shared.gain_table import GainSchedule
 from shared.messages import SplitSource
 from shared.robot_model import stand_pose
 from tests.planner.conftest import Closed

@@ -12,8 +12,8 @@ from services.planner.dynamic_certificate import DynamicCertificate
 from services.planner.inverse_kinematics import InverseKinematics
 from shared import gain_schedule
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule
 from shared.exceptions import RunError
+from shared.gain_table import GainSchedule
 from shared.robot_model import stand_pose
 from tests.planner.conftest import at_pose, com_height
 from tests.planner.oracle import Array

@@ -10,11 +10,13 @@ import msgspec
 import pytest
 from rich.console import Console
 
+from services.simulator.plant import PlantConfig, changed
 from shared import topics
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.joints import MODULES
 from shared.scenario import Fault, Kill, Restart
+from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tools import resim, sim
 from tools.explain import robot_of
@@ -24,7 +26,7 @@ from tools.runs.run_log import RunLog, read_run
 
 @pytest.fixture(scope="module")
 def recorded(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record a run with a dead planner, a dead joint service and a fault in it."""
+    """Record a run with a dead planner, a dead joint service and a fault in it, on a slope."""
     story = still(
         5.0,
         height=1.1,
@@ -34,7 +36,13 @@ def recorded(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Pa
     )
     folder = tmp_path_factory.mktemp("resim")
     sim.simulate(
-        robot, story, Impairment(delay_ms=1.0, jitter_ms=0.5), 3, folder, Console(quiet=True)
+        with_imu(robot),
+        story,
+        Impairment(delay_ms=1.0, jitter_ms=0.5),
+        3,
+        folder,
+        Console(quiet=True),
+        true_plant=changed(PlantConfig(), {"floor.slope": [0.03, -0.02]}),
     )
     return folder / "run.mcap"
 
@@ -68,6 +76,20 @@ def test_every_tick_of_a_run_with_restarts_holds_and_a_fault_is_equal_bit_for_bi
     restarted = name in ("planner", "knee_left")
     assert outcome.starts == (2 if restarted else 1)
     assert outcome.comparison.compared > outcome.ticks // 3
+
+
+def test_the_planner_of_the_record_knew_the_slope(log: RunLog) -> None:
+    assert log.messages(topics.PLANNER_STATUS)[-1].slope == pytest.approx((0.03, -0.02), abs=0.02)
+
+
+def test_an_attitude_that_the_log_lacks_is_told(log: RunLog) -> None:
+    key = topics.ATTITUDE.key(log.robot)
+    second = [row for row in log.messages(topics.PLANNER_STATUS) if row.session != 1]
+    taken = second[300].attitude_seq
+    edited(log, key, [row for row in log.messages(topics.ATTITUDE) if row.seq != taken])
+    outcome = execute(log, robot_of(log), "planner")
+    assert outcome.lost_inputs == 1
+    assert outcome.comparison.first is None
 
 
 def test_one_bit_in_one_recorded_command_is_found_where_it_was_taken(log: RunLog) -> None:

@@ -50,7 +50,7 @@ def make_loop(robot: RobotConfig, *faults: Fault) -> tuple[SimulatorLoop, World,
         "Ports", msgspec.defstruct("Fake", ["truth", "intent", "control", "state"])(*[Silent()] * 4)
     )
     harness = cast("HarnessFront", cast("Any", Silent()))
-    return SimulatorLoop(robot, world, bank, front, [], harness, ports), world, bank
+    return SimulatorLoop(robot, world, bank, front, [], (harness, None), ports), world, bank
 
 
 def count_steps(loop: SimulatorLoop, bank: AxisBank, monkeypatch: pytest.MonkeyPatch) -> int:

@@ -169,7 +169,7 @@ def test_a_push_moves_a_free_body_by_its_impulse(robot: RobotConfig) -> None:
     """In the air, hoist gone: the momentum gained is the impulse."""
     push = Push(at=0.0, duration=0.1, force=(40.0, 0.0, 0.0))
     world = world_of(robot, push=(push,))
-    world.hoist = 0.0
+    world.let_off_hoist()
     world.data.qpos[2] += 5.0
     world.start()
     run(world, 0.1)
@@ -197,7 +197,7 @@ def test_the_hand_waits_for_the_hoist_and_keeps_within_its_strength(robot: Robot
     world = world_of(robot, hand=True, keyframe=(Keyframe(at=0.0, height=2.0, pitch=1.5),))
     run(world, 0.01)
     assert world.hand == (0.0, 0.0)
-    world.hoist = 0.0
+    world.let_off_hoist()
     hand, strongest = robot.simulation.operator, [0.0, 0.0]
     for _ in range(500):
         world.step(IDLE)
@@ -210,7 +210,7 @@ def test_the_harness_feels_hand_and_load_in_torso_axes(robot: RobotConfig, pitch
     """Hand up, load down, along world z; turned into the torso, the hand's moment about its y."""
     lead = Keyframe(at=0.0, height=1.25, pitch=pitch + 0.1, assist=120.0)
     world = world_of(robot, hand=True, keyframe=(lead,))
-    world.hoist = 0.0
+    world.let_off_hoist()
     world.data.qpos[3:7] = (math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0)
     run(world, 0.002)
     R = world.data.body("torso").xmat.reshape(3, 3)
@@ -229,7 +229,7 @@ def test_what_the_harness_feels_is_what_acts_on_the_torso(robot: RobotConfig) ->
     """Same wrench: at the harness point in torso axes, and at the torso's centre in world's."""
     lead = Keyframe(at=0.0, height=1.3, pitch=0.5, assist=80.0)
     world = world_of(robot, hand=True, keyframe=(lead,))
-    world.hoist = 0.0
+    world.let_off_hoist()
     world.data.qpos[3:7] = (math.cos(0.3), math.sin(0.3) * 0.6, math.sin(0.3) * 0.8, 0.0)
     world.data.qvel[:] = 0.0
     world.step(IDLE)  # the pose set above is known to the world from its next step on

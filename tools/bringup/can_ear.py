@@ -20,6 +20,8 @@ from shared import cansimple
 from shared.cansimple import Command, Heartbeat
 from shared.cansimple_06 import Command06, Version, unpack_version
 from shared.config_sections import CanConfig
+from shared.imu_can import IDS as IMU_IDS
+from shared.imu_can import ImuAssembler, ImuSample
 from shared.loadcell_can import FRAME_IDS, SampleAssembler
 from shared.messages import Vector6
 
@@ -66,6 +68,10 @@ class BusHeard(msgspec.Struct):
     """When they came."""
     malformed: int = 0
     """Load-cell frames that were out of order or too short."""
+    attitudes: list[ImuSample] = []
+    """Of the IMU."""
+    attitudes_s: list[float] = []
+    """When they came."""
 
 
 def listen(
@@ -74,6 +80,7 @@ def listen(
     *,
     ask: bool,
     cells: bool = False,
+    imu: bool = False,
     seconds: float = LISTEN_S,
 ) -> BusHeard:
     """Listen to a bus for a while.
@@ -83,6 +90,7 @@ def listen(
         nodes: of the axes that should be on it.
         ask: whether to ask them; not where services are up.
         cells: whether the load cells are on it.
+        imu: whether the IMU is on it.
         seconds: how long.
     """
     heard = BusHeard(nodes={node: NodeHeard() for node in nodes})
@@ -91,7 +99,7 @@ def listen(
             if ask:
                 for message in _questions(nodes):
                     bus.send(message, timeout=_WAIT_S)
-            _take_in(bus, heard, seconds, cells=cells)
+            _take_in(bus, heard, seconds, cells=cells, imu=imu)
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:
         heard.trouble = str(error) or type(error).__name__
     return heard
@@ -132,8 +140,8 @@ def _questions(nodes: Iterable[int]) -> list[can.Message]:
     ]
 
 
-def _take_in(bus: can.BusABC, heard: BusHeard, seconds: float, *, cells: bool) -> None:
-    assembler = SampleAssembler()
+def _take_in(bus: can.BusABC, heard: BusHeard, seconds: float, *, cells: bool, imu: bool) -> None:
+    assembler, orientation = SampleAssembler(), ImuAssembler()
     begun = time.monotonic()
     while (left := begun + seconds - time.monotonic()) > 0.0:
         message = bus.recv(min(left, _WAIT_S))
@@ -148,6 +156,11 @@ def _take_in(bus: can.BusABC, heard: BusHeard, seconds: float, *, cells: bool) -
                 if sample is not None:
                     heard.samples.append(sample)
                     heard.samples_s.append(message.timestamp)
+            elif imu and message.arbitration_id in IMU_IDS:
+                attitude = orientation.add(message.arbitration_id, message.data)
+                if attitude is not None:
+                    heard.attitudes.append(attitude)
+                    heard.attitudes_s.append(message.timestamp)
             elif len(message.data) == _FRAME_BYTES:
                 _of_node(message, heard.nodes)
     heard.seconds = time.monotonic() - begun

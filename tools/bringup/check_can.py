@@ -84,6 +84,31 @@ def harness_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
     return rows
 
 
+def imu_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
+    """Judge the IMU by what came on its bus."""
+    subject, imu = "IMU", robot.imu
+    wanted = f"{imu.rate_hz:g} Hz"
+    if heard.trouble:
+        fix = _how_to_open(robot.can[imu.bus], heard.trouble)
+        return [wrong(subject, "CAN bus", heard.trouble, "open", fix)]
+    why = "the floor is taken as level"
+    if not heard.attitudes:
+        fix = "its supply and wires, its CAN output; its frames are in shared/imu_can.py"
+        return [wrong(subject, "samples", f"{heard.frames} other frames", wanted, fix, why)]
+    period = period_ms(heard.attitudes_s, 1e3 / imu.rate_hz)
+    rate_hz = 1e3 / period if period else 0.0
+    near = abs(rate_hz / imu.rate_hz - 1.0) <= RATE_SHARE
+    fix = "its output rate, or `imu.rate_hz`"
+    found = f"{rate_hz:.0f} Hz"
+    rows = [judged(near, subject, "samples", found, wanted, fix, otherwise=Verdict.WARNING)]
+    known = sum(sample.valid for sample in heard.attitudes)
+    found = f"{known} of {len(heard.attitudes)} samples"
+    fix = "leave it still for a minute; its status word says that its filter has not settled"
+    good = known == len(heard.attitudes)
+    rows.append(judged(good, subject, "orientation valid", found, "all", fix, why))
+    return rows
+
+
 def positions(robot: RobotConfig, module: str, heard: BusHeard) -> tuple[float, float] | None:
     """Return both motors' positions in turns, as the drive counts them; None if not heard.
 
@@ -104,9 +129,9 @@ def _turns(heard: NodeHeard, counts_per_turn: int) -> float | None:
 
 def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
     """Return the nodes that should be on each bus, also where there are none."""
-    nodes: dict[str, tuple[int, ...]] = {robot.harness.bus: ()}
+    nodes: dict[str, tuple[int, ...]] = dict.fromkeys(robot.buses, ())
     for module in robot.module:
-        nodes[module.bus] = (*nodes.get(module.bus, ()), *module.node_ids)
+        nodes[module.bus] = (*nodes[module.bus], *module.node_ids)
     return nodes
 
 

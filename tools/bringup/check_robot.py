@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from shared import gain_schedule
-from shared.config import SERVICES, RobotConfig, expand
+from shared.config import RobotConfig, expand
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.bringup.rows import Row, judged, ok, warning, wrong
@@ -39,7 +39,7 @@ def services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
     """Return the services that listen on their endpoints, whoever started them."""
     return tuple(
         service
-        for service in SERVICES
+        for service in robot.services
         if fleet.is_listening(expand(robot.bus.endpoints[service], run_dir))
     )
 
@@ -53,7 +53,7 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
     """Check that the endpoints of the bus are free, or the fleet's."""
     up = services_up(robot, run_dir)
     if fleet_is_up:
-        found = f"{len(up)} of {len(SERVICES)} listen"
+        found = f"{len(up)} of {len(robot.services)} listen"
         if len(joint_services(up)) in (0, len(MODULES)):
             return [ok("bus", "endpoints", found, "the fleet's")]
         silent = [module for module in MODULES if module not in up]

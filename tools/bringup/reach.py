@@ -76,7 +76,7 @@ def refuse_half_emulated(robot: RobotConfig) -> None:
     Raises:
         FleetError: naming the buses.
     """
-    used = sorted({robot.harness.bus, *(module.bus for module in robot.module)})
+    used = sorted(robot.buses)
     emulated = [name for name in used if robot.can[name].interface == SIMULATED_CAN]
     if emulated and len(emulated) < len(used):
         real = [name for name in used if name not in emulated]

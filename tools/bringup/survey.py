@@ -27,7 +27,8 @@ ROBOT: Final = "robot file and bus"
 CAN: Final = "CAN"
 DRIVES: Final = "drives, over USB"
 HARNESS: Final = "harness"
-GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS)
+IMU: Final = "IMU"
+GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS, IMU)
 
 
 def survey(
@@ -73,6 +74,8 @@ def survey(
             )
         ]
     groups[HARNESS] = check_can.harness_rows(robot, heard[robot.harness.bus])
+    if robot.imu.fitted:
+        groups[IMU] = check_can.imu_rows(robot, heard[robot.imu.bus])
     return {name: groups[name] for name in GROUPS if name in groups}
 
 
@@ -83,7 +86,7 @@ def _listen(
     heard = {}
     on_usb = robot.joint_service.driver == "odrive_usb"
     for name, nodes in check_can.bus_nodes(robot).items():
-        if on_usb and name != robot.harness.bus:
+        if on_usb and name not in (robot.harness.bus, robot.imu.bus):
             continue
         say(f"CAN bus {name}")
         bus = robot.can[name]
@@ -92,6 +95,7 @@ def _listen(
             nodes,
             ask=not services_up,
             cells=name == robot.harness.bus,
+            imu=robot.imu.fitted and name == robot.imu.bus,
             seconds=long_enough(robot.drive.heartbeat_period_ms if nodes else 0),
         )
     return heard

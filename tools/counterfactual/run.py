@@ -73,8 +73,8 @@ def fate_of(task: Task) -> Fate:
         at_s=moment.at_s,
         stood=fell_at_s is None,
         fell_after_s=None if fell_at_s is None else fell_at_s - moment.at_s,
-        com_x_max_mm=1e3 * max((abs(row.com[0]) for row in rows), default=0.0),
-        com_y_max_mm=1e3 * max((abs(row.com[1]) for row in rows), default=0.0),
+        com_x_max_mm=1e3 * max((abs(row.over[0]) for row in rows), default=0.0),
+        com_y_max_mm=1e3 * max((abs(row.over[1]) for row in rows), default=0.0),
         sole_tilt_max_rad=max(
             (max(row.foot_right_tilt, row.foot_left_tilt) for row in rows), default=0.0
         ),

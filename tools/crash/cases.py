@@ -12,7 +12,7 @@ from typing import Final
 
 import msgspec
 
-from shared.config import SERVICES
+from shared.config import OPTIONAL, SERVICES
 from shared.fault_table import DRIVE_FAULTS
 from shared.joints import MODULES, kind_of
 from shared.scenario import FAULT_KINDS, Fault, FaultKind, Keyframe, Kill, Push, Restart, Scenario
@@ -37,7 +37,7 @@ PUSHES: Final = (
     Push(at=4.2, duration=0.3, force=(0.0, 30.0, 0.0)),
 )
 
-CRASHED: Final = tuple(service for service in SERVICES if service != "simulator")
+CRASHED: Final = tuple(name for name in SERVICES if name not in ("simulator", *OPTIONAL))
 """Services that are killed. The simulator is the world and the drives: no robot has it."""
 
 

@@ -125,7 +125,7 @@ def measure(case: Case, heard: Heard, robot: RobotConfig) -> Outcome:
         remarks.append(f"does not lead again: {''.join(heard.modes)}")
     tracks = [e.t_ns for _, e in later if e.mode_after == Mode.TRACK]
     backs = [row.t_ns for row in heard.said if _is(row, RunEventKind.RESTARTED, REQUEST_S)]
-    x, y = ([1e3 * row.com[axis] for row in standing] for axis in (0, 1))
+    x, y = ([1e3 * row.over[axis] for row in standing] for axis in (0, 1))
     return Outcome(
         verdict=verdict,
         fell_after_s=None if fell_at is None else fell_at - crash_s,
@@ -208,7 +208,7 @@ def _is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
     """Return True if the robot is beyond what it can come back from."""
     geometry = robot.geometry
     return (
-        abs(row.com[0]) > geometry.l_foot / 2
-        or abs(row.com[1]) > (geometry.w_base + geometry.w_foot) / 2
+        abs(row.over[0]) > geometry.l_foot / 2
+        or abs(row.over[1]) > (geometry.w_base + geometry.w_foot) / 2
         or max(row.foot_right_tilt, row.foot_left_tilt) > TIPPING_RAD
     )

@@ -12,8 +12,8 @@ import tomli_w
 
 from shared import config_file, gain_schedule
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule
 from shared.exceptions import ConfigError
+from shared.gain_table import GainSchedule
 
 DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Names of the six rows of K_p and B_p."""

@@ -33,6 +33,7 @@ class PlannerExecution:
         self._memories = {(memory.session, memory.t_ns): memory for memory in memories}
         self._states = [BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
         self._wrenches = BySeq(log.messages(topics.WRENCH))
+        self._attitudes = BySeq(log.messages(topics.ATTITUDE))
         self._commands: dict[tuple[str, int, int], JointCommand] = {
             (name, command.session, command.seq): command
             for name in MODULES
@@ -41,6 +42,7 @@ class PlannerExecution:
         self._planner: Planner | None = None
         self._state_seq: list[int] = []
         self._wrench_seq = -1
+        self._attitude_seq = -1
 
     def run(self) -> Iterator[tuple[str, Message]]:
         """Execute every tick that can be; yield module (or "") and what comes out."""
@@ -71,6 +73,7 @@ class PlannerExecution:
         self._planner.recall(known)
         self._state_seq = [-1 if state is None else state.seq for state in known.states]
         self._wrench_seq = known.wrench_seq
+        self._attitude_seq = known.attitude_seq
         self._outcome.starts += 1
 
     def _hear(self, planner: Planner, status: PlannerStatus) -> bool:
@@ -92,6 +95,13 @@ class PlannerExecution:
                 return False
             planner.hear_wrench(wrench, status.t_ns)
             self._wrench_seq = status.wrench_seq
+        if status.attitude_seq != self._attitude_seq:
+            attitude = self._attitudes.at(status.attitude_seq, status.t_ns)
+            if attitude is None:
+                self._outcome.lost_inputs += 1
+                return False
+            planner.hear_attitude(attitude, status.t_ns)
+            self._attitude_seq = status.attitude_seq
         planner.hear_assist(status.assist_wanted_n)
         return True
 

@@ -230,7 +230,7 @@ class Conductor:
         """Raise CoresFullError if the idle fraction of the cores is known and too small."""
         if idle is not None and idle < IDLE_LEAST:
             raise CoresFullError(
-                f"the cores do not carry ten services at {pace():g} of real time: "
+                f"the cores do not carry the fleet at {pace():g} of real time: "
                 f"{100 * idle:.0f} % idle; modules: {self._modes_in_words()}; "
                 f"`--pace {pace() / 2:g}` asks for half of it"
             )

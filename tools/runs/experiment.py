@@ -97,6 +97,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "replaces the scenario's; may be repeated",
     )
     add_plant(parser)
+    add_imu(parser)
     parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
     parser.add_argument(
         "--jacobian",
@@ -109,6 +110,16 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         help="of the sensors' noise, and of what the network loses and how late it is",
+    )
+
+
+def add_imu(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that fits an IMU."""
+    parser.add_argument(
+        "--imu",
+        action="store_true",
+        help="with an IMU on the torso, and its service: the robot stands on slopes "
+        "(imu.fitted of the robot file)",
     )
 
 
@@ -252,14 +263,15 @@ def make_robot(args: argparse.Namespace) -> RobotConfig:
     }
     if changes.get("jacobian") == "average" and "split" not in changes:
         changes["split"] = "diagonal"  # no local gains certify it: there is no schedule
-    return load_robot(args.config, **changes)
+    return load_robot(args.config, imu=args.imu, **changes)
 
 
-def load_robot(path: Path, **law: str) -> RobotConfig:
+def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
     """Return the robot of a file, ready to run.
 
     Args:
         path: the robot file.
+        imu: fit one, whatever the file says.
         law: keys of `[law]` to change, and their values.
 
     Raises:
@@ -267,6 +279,8 @@ def load_robot(path: Path, **law: str) -> RobotConfig:
     """
     robot = config_file.load(path)
     robot = msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **law))
+    if imu:
+        robot = msgspec.structs.replace(robot, imu=msgspec.structs.replace(robot.imu, fitted=True))
     gain_schedule.require(robot, path)
     return robot
 

@@ -64,8 +64,8 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     axes = figure.subplots(
         len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}, squeeze=False
     )[:, 0]
-    com = np.array([row.com for row in rows]) * 1e3
-    _lines(axes[0], t, com[:, :2], ("x", "y"), "COM in mm")
+    com = np.array([row.over for row in rows]) * 1e3
+    _lines(axes[0], t, com, ("x", "y"), "COM in mm")
     height = np.array([row.torso[2] for row in rows])
     _lines(axes[1], t, height[:, None], ("torso height",), "height in m")
     angles = np.array([row.angles for row in rows])

@@ -103,7 +103,7 @@ def _line(snapshot: Snapshot, note: str) -> str:
     truth = snapshot.truth
     assert truth is not None  # noqa: S101 - `show` has looked
     clock = f"{truth.scenario_s:6.2f} s" if truth.scenario_s >= 0.0 else "   --  s"
-    x, y = truth.com[0] * 1e3, truth.com[1] * 1e3
+    x, y = (1e3 * part for part in truth.over)
     return (
         f"{clock}  height {truth.torso[2]:.3f} m  COM {x:+5.1f} {y:+5.1f} mm  "
         f"hand {truth.operator_force[2]:+6.1f} N  modes {''.join(snapshot.modes)}  {note}"

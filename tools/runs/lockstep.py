@@ -40,11 +40,12 @@ from shared.messages import (
 )
 from shared.scenario import Kill, Push, Restart, Scenario
 from shared.topics import Topic
-from shared.traces import LinkEvent, SimState
-from tools.runs.host_clock import HostClock, HostLink
+from shared.traces import SimState
+from tools.runs.host_clock import HostClock
 from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
+from tools.runs.virtual_imu import VirtualImu
 from tools.runs.virtual_network import VirtualNetwork
 
 SETTLE_NS = NS_PER_S
@@ -132,15 +133,11 @@ class Lockstep:
         clock_of = clocks or {}
         self._clocks = [clock_of.get(module, HostClock()) for module in MODULES]
         self._planner_clock = clock_of.get("planner", HostClock())
-        self._harness_clock = clock_of.get("harness", HostClock())
-        self._harness_link = HostLink(self._wrenches)
-        self.harness = VirtualHarness(
-            config,
-            self._harness_link,
-            lambda wrench: record(topics.WRENCH, "", wrench),
-            seed,
-        )
-        self._harness_ns = round(NS_PER_S / config.harness.rate_hz)
+        clock = clock_of.get("harness", HostClock())
+        self.harness = VirtualHarness(config, self._wrenches, record, seed, clock)
+        self._attitudes = self.network.attitudes()
+        clock = clock_of.get("imu", HostClock())
+        self._imu = VirtualImu(config.imu, self.plant.imu, self._attitudes, record, seed, clock)
         self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
         joint = config.joint_service
         self._state_every = round(joint.rate_hz / joint.state_rate_hz)
@@ -240,9 +237,8 @@ class Lockstep:
             self._cycle_joints(now)
         elif self.bank.regulates:
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
-        if now % self._harness_ns == 0:
-            self._harness_link.now_ns = now
-            self.harness.advance(self.world, self._harness_clock.read(now))
+        self.harness.advance(self.world, now)
+        self._imu.advance(self.world, now)
         if self.planner is not None and "planner" not in self._frozen:
             self._advance_planner(self.planner, now)
         self._begin_when_tracking(now)
@@ -277,9 +273,6 @@ class Lockstep:
         self._modules[index] = self.module_type(self.config, service)
         self._tracers[index] = Tracer(self._modules[index])
         self._drives[index].serve_anew()
-
-    def _tell_link(self, event: LinkEvent) -> None:
-        self._record(topics.LINK_EVENT, "", event)
 
     def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
         self._said += 1
@@ -325,6 +318,9 @@ class Lockstep:
         wrench = self._wrenches.take(now)
         if wrench is not None:
             planner.hear_wrench(wrench, host_ns)
+        attitude = self._attitudes.take(now)
+        if attitude is not None:
+            planner.hear_attitude(attitude, host_ns)
         planner.hear_assist(self.world.lead().assist)
         for index, command in enumerate(planner.tick(host_ns)):
             self._commands[index].put(now, command)

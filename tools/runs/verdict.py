@@ -119,7 +119,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
     }
     alive = leading(log, np.array([row.t_ns for row in truth]))
-    poses = np.array([(*row.com, *row.angles) for row in truth])
+    poses = np.array([(*row.over, row.com[2], *row.angles) for row in truth])
     for prefix, mask in (("", t >= 0.0), ("alive_", alive), ("hold_", ~alive)):
         summary |= _extent(prefix, poses[mask])
     heights = [row.torso[2] for row in truth]

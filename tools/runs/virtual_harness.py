@@ -7,15 +7,18 @@ publishes to a modelled link and to the log (design section 7).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from services.harness.filter import WrenchFilter, tared_state
 from services.harness.loop import HarnessLoop
 from services.simulator.harness_front import HarnessFront
 from services.simulator.world import World
+from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.loadcell_can import LegSample, SampleAssembler
-from shared.messages import TareRequest, Vector6, Wrench
+from shared.messages import Message, TareRequest, Vector6, Wrench
+from shared.topics import WRENCH, Topic
+from tools.runs.host_clock import HostClock, HostLink
+from tools.runs.network import Link
 
 
 class Cells:
@@ -42,42 +45,41 @@ class Cells:
         """Do nothing: there is no link."""
 
 
-class Sender(Protocol):
-    """Where wrenches go: a link, or what stands for one."""
-
-    def put(self, now_ns: int, message: Wrench, /) -> None:
-        """Send."""
-
-
 class VirtualHarness:
     """Sensor and service in one; both begin with a tare, while the hoist holds."""
 
     def __init__(
         self,
         config: RobotConfig,
-        wrenches: Sender,
-        record: Callable[[Wrench], None],
+        wrenches: Link[Wrench],
+        record: Callable[[Topic, str, Message], None],
         seed: int,
+        clock: HostClock,
     ) -> None:
         """Draw the cells' zero offsets.
 
         Args:
             config: the robot.
             wrenches: the link to the planner.
-            record: takes every wrench.
+            record: takes every message.
             seed: of the cells' offsets and noise.
+            clock: of the service's host.
         """
         cells = Cells()
         self._front = HarnessFront(config, cells, seed)
         self._loop = HarnessLoop(cells, WrenchFilter(config.harness), self, self)
-        self._wrenches = wrenches
-        self._record = record
+        self._link, self._record = HostLink(wrenches), record
+        self._period_ns = round(NS_PER_S / config.harness.rate_hz)
+        self._clock = clock
         self._request: TareRequest | None = None
 
     def advance(self, world: World, now_ns: int) -> None:
-        """Sample what acts on the torso, and run one cycle of the service."""
+        """If it is time, sample what acts on the torso, and run one cycle of the service."""
+        if now_ns % self._period_ns:
+            return
+        self._link.now_ns = now_ns
         self._front.send(world.harness_force, world.harness_moment)
-        self._loop.cycle(now_ns)
+        self._loop.cycle(self._clock.read(now_ns))
 
     def go_on(self) -> None:
         """Take it that the tare is done: in the middle of a run the operator's load is on it."""
@@ -89,8 +91,8 @@ class VirtualHarness:
 
     def put(self, message: Wrench) -> bool:
         """Send a wrench to the planner and the log."""
-        self._wrenches.put(message.t_ns, message)
-        self._record(message)
+        self._link.put(message.t_ns, message)
+        self._record(WRENCH, "", message)
         return True
 
     def take(self) -> TareRequest | None:

@@ -8,8 +8,8 @@ from typing import Any
 from shared.impairment import Impairment
 from shared.injections import Injections
 from shared.joints import MODULES
-from shared.links import DIRECTIONS, WRENCHES
-from shared.messages import JointCommand, JointState, Wrench
+from shared.links import ATTITUDES, DIRECTIONS, WRENCHES
+from shared.messages import Attitude, JointCommand, JointState, Wrench
 from shared.scenario import Inject
 from shared.traces import LinkEvent
 from tools.runs.network import Link
@@ -51,6 +51,10 @@ class VirtualNetwork:
     def wrenches(self) -> Link[Wrench]:
         """Return the link from the harness to the planner."""
         return self._links[WRENCHES]
+
+    def attitudes(self) -> Link[Attitude]:
+        """Return the link from the IMU to the planner."""
+        return self._links[ATTITUDES]
 
     def advance(self, scenario_s: float, now_ns: int) -> None:
         """Begin and end what is due, and let out what was held until then."""

@@ -43,7 +43,7 @@ class Process(Section, frozen=True):
 
     name: str
     """Service name, or `{module}` for one service per module."""
-    kind: Literal["joint", "planner", "harness", "recorder", "simulator", "injector"]
+    kind: Literal["joint", "planner", "harness", "imu", "recorder", "simulator", "injector"]
     command: tuple[str, ...]
     """Arguments with the placeholders {python}, {config}, {run} and {module}."""
     autostart: bool
@@ -55,9 +55,9 @@ class Process(Section, frozen=True):
     settle_s: Annotated[int, Range(1, 60, "s")]
     """A start that ends sooner has failed, and the next one is delayed."""
     why: str
-    only: Literal["", "simulation", "injected"] = ""
+    only: Literal["", "simulation", "injected", "imu"] = ""
     """`simulation`: not started where the drives are real; `injected`: only where the network is
-    to be impaired."""
+    to be impaired; `imu`: only on a robot that has one."""
     topic: str = ""
     """Topic that it publishes steadily, as in `shared.topics`; empty if there is none."""
 
@@ -115,7 +115,9 @@ def make_plan(
     config = load(path)
     table = load_table(table_path)
     emulated = simulation and is_simulated(config)
-    rows = select(table, simulation=emulated, injected=injected, services=services)
+    rows = select(
+        table, simulation=emulated, injected=injected, imu=config.imu.fitted, services=services
+    )
     check_known([*overrides, *asleep], [row.name for row in rows])
     rows = tuple(
         msgspec.structs.replace(row, autostart=row.autostart and row.name not in asleep)
@@ -162,10 +164,10 @@ def load_table(path: Path = TABLE) -> Table:
 def is_simulated(config: RobotConfig) -> bool:
     """Return True if any drive of this robot file is an emulated one.
 
-    The CAN buses say so, also of drives on USB: all of a real robot's are real ones, or it is
-    started with `simulation=False` (`xrl up --no-sim`). Then a service looks on the real USB.
+    The CAN buses in use say so, also of drives on USB: all of a real robot's are real ones, or it
+    is started with `simulation=False` (`xrl up --no-sim`). Then a service looks on the real USB.
     """
-    return any(bus.interface == SIMULATED_CAN for bus in config.can.values())
+    return any(config.can[name].interface == SIMULATED_CAN for name in config.buses)
 
 
 def select(
@@ -173,6 +175,7 @@ def select(
     *,
     simulation: bool,
     injected: bool = False,
+    imu: bool = False,
     services: Collection[str] | None = None,
 ) -> tuple[Process, ...]:
     """Return the rows of a fleet.
@@ -181,13 +184,14 @@ def select(
         table: from `load_table`.
         simulation: False leaves out the rows that are for a simulated robot only.
         injected: False leaves out those that impair the network.
+        imu: False leaves out those of the IMU.
         services: names; each is then started at once, whatever its row says. None for all.
 
     Raises:
         FleetError: a name is not in the table.
     """
     check_known(services or (), [row.name for row in table.process])
-    wanted = {"": True, "simulation": simulation, "injected": injected}
+    wanted = {"": True, "simulation": simulation, "injected": injected, "imu": imu}
     rows = [row for row in table.process if wanted[row.only]]
     if services is None:
         return tuple(rows)

@@ -86,15 +86,15 @@ def is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
     """Return True if the robot is beyond what it can come back from."""
     geometry = robot.geometry
     return (
-        abs(row.com[0]) > geometry.l_foot / 2
-        or abs(row.com[1]) > (geometry.w_base + geometry.w_foot) / 2
+        abs(row.over[0]) > geometry.l_foot / 2
+        or abs(row.over[1]) > (geometry.w_base + geometry.w_foot) / 2
         or max(row.foot_right_tilt, row.foot_left_tilt) > TIPPING_RAD
     )
 
 
 def com_max_mm(rows: Sequence[SimTruth]) -> float:
     """Return the largest horizontal distance of the COM from the middle of the ankles, mm."""
-    return 1e3 * max(math.hypot(*row.com[:2]) for row in rows)
+    return 1e3 * max(math.hypot(*row.over) for row in rows)
 
 
 def operator_peak_n(rows: Sequence[SimTruth]) -> float:

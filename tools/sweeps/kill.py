@@ -48,6 +48,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jacobian", choices=experiment.choices("jacobian"), help="how the legs share the load"
     )
+    experiment.add_imu(parser)
     parser.add_argument(
         "--only",
         type=int,
@@ -160,4 +161,5 @@ def _command(args: argparse.Namespace) -> str:
     flags += [
         f"--{name} {getattr(args, name)}" for name in ("split", "jacobian") if getattr(args, name)
     ]
+    flags += ["--imu"] if args.imu else []
     return " ".join(["xrl sweep kill", *flags])

@@ -209,7 +209,7 @@ def _before(rows: list[SimTruth]) -> dict[str, float]:
 
 
 def _after(rows: list[SimTruth]) -> dict[str, float]:
-    x, y = 1e3 * np.array([row.com[:2] for row in rows]).T
+    x, y = 1e3 * np.array([row.over for row in rows]).T
     return {
         "kill_height_m": rows[0].torso[2],
         "kill_pitch_rad": rows[0].angles[1],

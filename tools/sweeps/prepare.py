@@ -12,7 +12,7 @@ import msgspec
 
 from shared import gain_schedule
 from shared.config import RobotConfig
-from shared.config_sections import GainSchedule
+from shared.gain_table import GainSchedule
 from tools.sweeps import pool
 
 Progress = Callable[[int, int], None]

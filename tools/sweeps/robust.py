@@ -17,6 +17,7 @@ from rich.table import Table as Printed
 from scipy.stats import spearmanr
 
 from shared.config import RobotConfig
+from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.sweeps import plants, study
@@ -38,6 +39,7 @@ from tools.verbs import add_config
 mpl.use("Agg")
 
 N: Final = 100
+SLOPE_MAX_DEG: Final = 15.0
 TABLE: Final = "trials.csv"
 PICTURE: Final = "trials.png"
 CODE: Final = code_of("tools.sweeps.robust_trial")
@@ -57,6 +59,7 @@ EXAMPLES: Final = """
     xrl sweep robust
     xrl sweep robust --n 500 --out out/robust
     xrl sweep robust --beyond 2
+    xrl sweep robust --slope 5 --imu
     xrl sweep robust --only 17 --out out/trial17
 """
 
@@ -73,6 +76,15 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         help="widen every range of deploy/plants/ranges.toml F times about its middle (1)",
     )
     parser.add_argument(
+        "--slope",
+        type=float,
+        default=0.0,
+        metavar="DEG",
+        help="a floor that slopes by DEG degrees in a drawn direction (default: up to 1 degree, as "
+        "in the ranges)",
+    )
+    experiment.add_imu(parser)
+    parser.add_argument(
         "--only",
         type=int,
         metavar="TRIAL",
@@ -85,14 +97,16 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one trial of it; 1 if any fell."""
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
+    if not 0.0 <= args.slope <= SLOPE_MAX_DEG:
+        raise RunError(f"--slope {args.slope:g}: 0 to {SLOPE_MAX_DEG:g} degrees")
     crew = study.crew_of(args, CODE)
-    robot = experiment.load_robot(args.config)
+    robot = experiment.load_robot(args.config, imu=args.imu)
     plants.draw("check", beyond=args.beyond)
     console = Console()
     if args.only is not None:
         return _run_one(args, robot, console)
     out = study.folder(args.out, "robust")
-    drawn = [draw(args.seed, number, args.beyond) for number in range(args.n)]
+    drawn = [draw(args.seed, number, args.beyond, args.slope) for number in range(args.n)]
     rows_begin = [row_of(trial) for trial in drawn]
     columns = [*rows_begin[0], *Outcome.__struct_fields__]
     with Table(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
@@ -109,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> int:
-    trial = draw(args.seed, args.only, args.beyond)
+    trial = draw(args.seed, args.only, args.beyond, args.slope)
     study.show(f"Trial {trial.number}, drawn", row_of(trial), console)
     return run_alone(
         partial(run_trial, trial, robot),
@@ -225,6 +239,7 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
         "study": "robust",
         "seed": str(args.seed),
         "beyond": f"{args.beyond:g}",
+        "slope": f"{args.slope:g}",
         "robot": study.digest_of(robot),
         "ranges": plants.digest(),
         "code": code_digest(CODE),
@@ -236,6 +251,10 @@ def _command(args: argparse.Namespace) -> str:
     flags = [f"--seed {args.seed}"]
     if args.beyond != 1.0:
         flags.append(f"--beyond {args.beyond:g}")
+    if args.slope != 0.0:
+        flags.append(f"--slope {args.slope:g}")
+    if args.imu:
+        flags.append("--imu")
     if args.config != DEFAULT_CONFIG:
         flags.append(f"--config {args.config}")
     return " ".join(["xrl sweep robust", *flags])

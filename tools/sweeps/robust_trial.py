@@ -9,7 +9,7 @@ from typing import Final
 
 import msgspec
 
-from services.simulator.plant import PlantConfig
+from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import SimTruth
@@ -48,6 +48,8 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     beyond: float
     """Times the ranges of `deploy/plants/ranges.toml`."""
+    slope_deg: float
+    """Of the floor, in a direction that is drawn; 0: as the ranges have it."""
     kind: str
     kill_s: float
     delay_ms: float
@@ -68,7 +70,7 @@ class Outcome(Ended, frozen=True, kw_only=True):
     """Largest step of a joint's torque at a change of mode after the start."""
 
 
-def draw(seed: int, number: int, beyond: float = 1.0) -> Trial:
+def draw(seed: int, number: int, beyond: float = 1.0, slope_deg: float = 0.0) -> Trial:
     """Return one trial; no other trial has to be drawn for it."""
     dice = random.Random(f"robust {seed} {number}")
     kind = KINDS[number % len(KINDS)]
@@ -81,6 +83,7 @@ def draw(seed: int, number: int, beyond: float = 1.0) -> Trial:
         number=number,
         seed=seed,
         beyond=beyond,
+        slope_deg=slope_deg,
         kind=kind,
         kill_s=kill,
         delay_ms=_uniform(dice, 0.5, DELAY_MAX_MS),
@@ -100,7 +103,14 @@ def _uniform(dice: random.Random, low: float, high: float) -> float:
 
 def plant_of(trial: Trial) -> PlantConfig:
     """Return the trial's true robot."""
-    return plants.draw(f"robust {trial.seed} {trial.number}", beyond=trial.beyond)
+    seed = f"robust {trial.seed} {trial.number}"
+    plant = plants.draw(seed, beyond=trial.beyond)
+    if trial.slope_deg == 0.0:
+        return plant
+    angle = _uniform(random.Random(f"slope {seed}"), -math.pi, math.pi)
+    slope = math.radians(trial.slope_deg)
+    towards = [round(slope * part, 6) for part in (math.cos(angle), math.sin(angle))]
+    return changed(plant, {"floor.slope": towards})
 
 
 def story_of(robot: RobotConfig, trial: Trial) -> Scenario:
@@ -184,6 +194,7 @@ def row_of(trial: Trial) -> dict[str, object]:
         "number": trial.number,
         "seed": trial.seed,
         "beyond": trial.beyond,
+        "slope_deg": trial.slope_deg,
         "kind": trial.kind,
         "kill_s": trial.kill_s,
         "delay_ms": trial.delay_ms,

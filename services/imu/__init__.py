@@ -1,0 +1,1 @@
+"""The IMU service: the sensor's orientation in, which way is up out."""

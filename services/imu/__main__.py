@@ -1,0 +1,64 @@
+"""`python -m services.imu`: the service of the IMU on the torso."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from services.imu.attitude import AttitudeLaw
+from services.imu.loop import ImuLoop
+from shared import bus, log, process, topics
+from shared.can_sensor import CanSensor
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig, expand
+from shared.config_file import load
+from shared.imu_can import ImuAssembler, ImuSample
+from shared.messages import Attitude
+from shared.priority import raise_priority
+from shared.sensor_loop import run
+
+FIFO_PRIORITY = 10
+"""Below the joint services and the planner: both stand and lead without it."""
+
+
+def main() -> int:
+    """Run the service until SIGTERM or SIGINT; return the exit code."""
+    parser = process.service_parser(__doc__ or "", "python -m services.imu")
+    process.add_injected(parser)
+    arguments = parser.parse_args()
+    logger = log.setup("imu")
+    config = load(arguments.config)
+    sensor = make_sensor(config, arguments.run_dir)
+    law = AttitudeLaw(config.imu)
+    stop = process.StopFlag()
+    granted = raise_priority(FIFO_PRIORITY)
+    with bus.open_session(config, "imu", arguments.run_dir, injected=arguments.injected) as session:
+        loop = ImuLoop(sensor, law, session.publisher(topics.ATTITUDE, Attitude))
+        logger.info("started at %g Hz, priority %s", config.imu.rate_hz, granted)
+        process.freeze_garbage()
+        run(loop, config.imu.rate_hz, stop)
+    sensor.close()
+    logger.info(
+        "stopped: %d cycles, %d skipped, %d unsent, link opened %d times; "
+        "samples not of unit length %d, frames malformed %d",
+        loop.cycles,
+        loop.skipped,
+        loop.unsent,
+        sensor.opened,
+        law.refused,
+        sensor.malformed,
+    )
+    return 0
+
+
+def make_sensor(config: RobotConfig, run_dir: Path) -> CanSensor[ImuSample]:
+    """Return the sensor on the bus that the robot file names."""
+    imu = config.imu
+    link = config.can[imu.bus]
+    # At a low rate every read comes later than stale_ms: two periods are no pause.
+    pause_ns = max(imu.stale_ms * NS_PER_MS, 2.0 * NS_PER_S / imu.rate_hz)
+    channel = expand(link.channel, run_dir)
+    return CanSensor(link.interface, channel, ImuAssembler(), pause_ns=round(pause_ns))
+
+
+if __name__ == "__main__":
+    process.run_service(main)

@@ -1,0 +1,100 @@
+"""From the IMU's orientation to which way is up, seen from the torso. Pure.
+
+A quaternion that turns sensor axes into axes whose z is up has, as the third row of its rotation,
+up in sensor axes; the heading, which a magnet beside steel gets wrong, drops out. The mounting
+turns sensor axes into torso axes.
+
+A sample is refused and counted, as if it never came, if its quaternion is not of unit length: then
+the frames do not mean what they are taken for.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+from shared.clock import NS_PER_MS
+from shared.config_sections import ImuConfig
+from shared.imu_can import ImuSample
+from shared.messages import Vector3, Vector4
+
+UNIT_TOLERANCE: Final = 0.02
+"""Of a quaternion's length; rounding to 2^-15 makes 6e-5."""
+
+Rotation = tuple[Vector3, Vector3, Vector3]
+"""Rows."""
+
+
+class Reading(NamedTuple):
+    """What is known at one moment."""
+
+    up: Vector3
+    """Unit vector against gravity, torso axes."""
+    rate: Vector3
+    """rad/s, torso axes."""
+    valid: bool
+    """True if fresh, and the sensor says that it knows; otherwise the numbers are the last good
+    ones."""
+    age_ns: int
+    """Age of the newest sample; -1 before the first."""
+
+
+class AttitudeLaw:
+    """The mounting, the last good sample and its age."""
+
+    def __init__(self, config: ImuConfig) -> None:
+        """Take how the sensor is mounted and how old a sample may be."""
+        self.refused = 0
+        """Samples whose quaternion was not of unit length."""
+        self._mounting = rotation(*config.mounting)
+        self._stale_ns = round(config.stale_ms * NS_PER_MS)
+        self._up: Vector3 = (0.0, 0.0, 1.0)
+        self._rate: Vector3 = (0.0, 0.0, 0.0)
+        self._knows = False
+        self._sample_ns: int | None = None
+
+    def step(self, now_ns: int, sample: ImuSample | None) -> Reading:
+        """Take the newest sample, or None if there is none, and say what holds now."""
+        if sample is not None and not _is_unit(sample.quaternion):
+            self.refused += 1
+            sample = None
+        if sample is not None:
+            self._sample_ns = now_ns
+            self._knows = sample.valid
+            if sample.valid:
+                self._up = _turned(self._mounting, up_in_sensor(sample.quaternion))
+                self._rate = _turned(self._mounting, sample.rate)
+        if self._sample_ns is None:
+            return Reading(self._up, self._rate, valid=False, age_ns=-1)
+        age_ns = now_ns - self._sample_ns
+        fresh = age_ns <= self._stale_ns
+        return Reading(self._up, self._rate, fresh and self._knows, age_ns)
+
+
+def up_in_sensor(quaternion: Vector4) -> Vector3:
+    """Return up in sensor axes: the third row of the quaternion's rotation, of unit length."""
+    w, x, y, z = quaternion
+    up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z)
+    length = math.hypot(*up)
+    return (up[0] / length, up[1] / length, up[2] / length)
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> Rotation:
+    """Return Rz(yaw) Rx(roll) Ry(pitch), the project's order of angles (rad)."""
+    cr, sr = math.cos(roll), math.sin(roll)
+    cp, sp = math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return (
+        (cy * cp - sy * sr * sp, -sy * cr, cy * sp + sy * sr * cp),
+        (sy * cp + cy * sr * sp, cy * cr, sy * sp - cy * sr * cp),
+        (-cr * sp, sr, cr * cp),
+    )
+
+
+def _is_unit(quaternion: Vector4) -> bool:
+    return abs(math.hypot(*quaternion) - 1.0) <= UNIT_TOLERANCE
+
+
+def _turned(rows: Rotation, vector: Vector3) -> Vector3:
+    x, y, z = (row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2] for row in rows)
+    return (x, y, z)

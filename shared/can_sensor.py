@@ -1,0 +1,147 @@
+"""A sensor on a CAN bus: the newest sample, without waiting for it."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Final, Generic, Protocol, TypeVar
+
+import can
+
+from shared.clock import NS_PER_MS
+from shared.exceptions import ConfigError
+
+S = TypeVar("S")
+S_co = TypeVar("S_co", covariant=True)
+
+RETRY_NS: Final = 200 * NS_PER_MS
+"""Shortest time between two attempts to open the link."""
+
+DRAIN_MAX: Final = 1024
+"""Most frames taken in one read, so that a flooded bus cannot hold up the loop."""
+
+
+class Assembler(Protocol[S_co]):
+    """Makes samples of a sensor's frames."""
+
+    @property
+    def malformed(self) -> int:
+        """Frames of the sensor that were of the wrong length or out of order."""
+
+    def add(self, can_id: int, data: bytes | bytearray, /) -> S_co | None:
+        """Take one frame; return the sample that it completes, or None."""
+
+    def reset(self) -> None:
+        """Forget a sample that is not complete."""
+
+
+class CanSensor(Generic[S]):
+    """A sensor through python-can; opens the link again by itself when it goes away."""
+
+    def __init__(
+        self, interface: str, channel: str, assembler: Assembler[S], *, pause_ns: int
+    ) -> None:
+        """Prepare; the link is opened by the first `read`.
+
+        Args:
+            interface: python-can's name of the interface.
+            channel: as that interface takes it.
+            assembler: makes samples of its frames.
+            pause_ns: after a longer time between two reads, what waited on the link is
+                of unknown age (this process was stopped, and a full queue keeps the
+                oldest frames) and is thrown away.
+
+        Raises:
+            ConfigError: python-can knows no such interface.
+        """
+        if interface not in can.VALID_INTERFACES:
+            raise _unusable(interface, "not known to python-can")
+        self.opened = 0
+        """Times the link was opened."""
+        self.discarded = 0
+        """Reads whose samples were of unknown age: after a pause, or a queue too long."""
+        self._interface = interface
+        self._channel = channel
+        self._pause_ns = pause_ns
+        self._bus: can.BusABC | None = None
+        self._assembler = assembler
+        self._backlog = False
+        self._retry_ns: int | None = None
+        self._last_read_ns: int | None = None
+
+    @property
+    def connected(self) -> bool:
+        """True while the link is open, as far as the last read could tell."""
+        return self._bus is not None
+
+    @property
+    def malformed(self) -> int:
+        """Frames of the sensor that were of the wrong length or out of order."""
+        return self._assembler.malformed
+
+    def newest(self, now_ns: int) -> S | None:
+        """Return the newest sample that came since the last call, or None; never blocks.
+
+        Never raises for a lost link: that is None until it is back.
+        """
+        last_ns, self._last_read_ns = self._last_read_ns, now_ns
+        if self._bus is None:
+            self._bus = self._open(now_ns)
+        if self._bus is None:
+            return None
+        sample, emptied = self._drain(self._bus)
+        paused = last_ns is not None and now_ns - last_ns > self._pause_ns
+        of_unknown_age = paused or self._backlog or not emptied
+        self._backlog = not emptied
+        if of_unknown_age:
+            self.discarded += 1
+            self._assembler.reset()
+            return None
+        return sample
+
+    def close(self) -> None:
+        """Release the link; a later `read` would open it again."""
+        if self._bus is not None:
+            # The link may be the very thing that is broken.
+            with contextlib.suppress(can.CanError, OSError):
+                self._bus.shutdown()
+        self._bus = None
+        self._assembler.reset()
+
+    def _open(self, now_ns: int) -> can.BusABC | None:
+        """Return the link, or None if it is not there or was tried a moment ago.
+
+        Raises:
+            ConfigError: the interface cannot be used on this machine, now or later.
+        """
+        if self._retry_ns is not None and now_ns < self._retry_ns:
+            return None
+        self._retry_ns = now_ns + RETRY_NS
+        try:
+            link = can.Bus(interface=self._interface, channel=self._channel, ignore_config=True)
+        except can.CanInterfaceNotImplementedError as error:
+            raise _unusable(self._interface, str(error)) from None
+        except (can.CanError, OSError):
+            return None
+        self.opened += 1
+        return link
+
+    def _drain(self, link: can.BusABC) -> tuple[S | None, bool]:
+        """Return the newest complete sample, and True if nothing is left behind it."""
+        newest: S | None = None
+        for _ in range(DRAIN_MAX):
+            try:
+                frame = link.recv(timeout=0.0)
+            except (can.CanError, OSError):
+                self.close()
+                return newest, True
+            if frame is None:
+                return newest, True
+            if frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id:
+                continue
+            newest = self._assembler.add(frame.arbitration_id, frame.data) or newest
+        return newest, False
+
+
+def _unusable(interface: str, why: str) -> ConfigError:
+    right = f"one of {', '.join(sorted(can.VALID_INTERFACES))}"
+    return ConfigError("robot file", "can.*.interface", f"{interface!r}: {why}", right)

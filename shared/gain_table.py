@@ -1,0 +1,41 @@
+"""The gain schedule's own table: what `xrl gains` writes beside the robot file."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeAlias
+
+import msgspec
+
+from shared.toml_file import Range
+
+Stiffness: TypeAlias = Annotated[float, Range(0.0, 1e4, "N m/rad")]
+LegGains: TypeAlias = tuple[Stiffness, Stiffness, Stiffness, Stiffness, Stiffness, Stiffness]
+"""(ankle phi, theta, knee phi, theta, hip phi, theta), N m/rad; both legs are alike."""
+
+
+Damping: TypeAlias = Annotated[float, Range(0.0, 1e3, "N m s/rad")]
+LegDamping: TypeAlias = tuple[Damping, Damping, Damping, Damping, Damping, Damping]
+
+
+class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Local joint stiffnesses over COM height and torso pitch; made by `shared.gain_schedule`."""
+
+    version: int
+    digest: str
+    """SHA-256 of the inputs."""
+    inputs: dict[str, Any]
+    """What the robot was when this was made, by dotted key."""
+    z: tuple[float, ...]
+    """COM heights of the nodes, m above the ankles, rising."""
+    pitch: tuple[float, ...]
+    """Torso pitches of the nodes, rad, rising."""
+    D: tuple[tuple[LegGains, ...], ...]
+    """Local stiffness at [z][pitch]."""
+    D_B: LegDamping
+    """Local damping, N m s/rad, the same in every pose."""
+    coupling_bandwidth_hz: Annotated[float, Range(0.1, 100.0, "Hz")]
+    """Of the two poles of tau_coupled."""
+    lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
+    """Up to this the loop is stable; less is always safe."""
+    coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]
+    """What tau_coupled fills the damping up to, in shares of B_p."""

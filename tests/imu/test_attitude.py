@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from services.imu.attitude import AttitudeLaw, rotation, up_in_sensor
+from services.imu.loop import ImuLoop
+from shared.clock import NS_PER_MS
+from shared.config_sections import ImuConfig
+from shared.imu_can import ImuSample
+from shared.messages import Attitude, Vector4
+
+ROBOT_IMU = ImuConfig(fitted=True, stale_ms=100.0)
+STALE_NS = round(100.0 * NS_PER_MS)
+T0 = 7_000_000_000
+angles = st.floats(-1.2, 1.2)
+
+
+def sample(turned: Rotation, *, valid: bool = True) -> ImuSample:
+    x, y, z, w = turned.as_quat().tolist()
+    return ImuSample((w, x, y, z), (0.1, 0.2, 0.3), valid)
+
+
+@given(angles, angles, st.floats(-math.pi, math.pi))
+def test_up_is_the_vertical_in_torso_axes_whatever_the_heading(
+    roll: float, pitch: float, heading: float
+) -> None:
+    """By scipy: the torso is turned, the mounting and the sensor's own yaw drop out."""
+    torso = Rotation.from_euler("ZXY", (0.0, roll, pitch))
+    mounted = Rotation.from_euler("ZXY", (0.3, -0.2, 0.5))  # sensor axes to torso axes
+    told = Rotation.from_euler("Z", heading) * torso * mounted
+    law = AttitudeLaw(msgspec.structs.replace(ROBOT_IMU, mounting=(-0.2, 0.5, 0.3)))
+    reading = law.step(T0, sample(told))
+    assert reading.valid
+    np.testing.assert_allclose(reading.up, torso.inv().apply((0.0, 0.0, 1.0)), atol=1e-12)
+    np.testing.assert_allclose(reading.rate, mounted.apply((0.1, 0.2, 0.3)), atol=1e-12)
+
+
+@given(angles, angles, angles)
+def test_the_mountings_rotation_is_the_projects_order_of_angles(
+    roll: float, pitch: float, yaw: float
+) -> None:
+    want = Rotation.from_euler("ZXY", (yaw, roll, pitch)).as_matrix()
+    np.testing.assert_allclose(rotation(roll, pitch, yaw), want, atol=1e-12)
+
+
+@pytest.mark.parametrize(("late_ns", "valid"), [(0, True), (STALE_NS, True), (STALE_NS + 1, False)])
+def test_a_sample_is_good_up_to_its_age_and_the_numbers_stay(late_ns: int, valid: bool) -> None:
+    law = AttitudeLaw(ROBOT_IMU)
+    first = law.step(T0, sample(Rotation.from_euler("X", 0.1)))
+    later = law.step(T0 + late_ns, None)
+    assert (later.valid, later.age_ns, later.up) == (valid, late_ns, first.up)
+
+
+def test_before_the_first_sample_nothing_is_known() -> None:
+    reading = AttitudeLaw(ROBOT_IMU).step(T0, None)
+    assert not reading.valid
+    assert reading.age_ns == -1
+
+
+def test_a_sensor_that_says_it_does_not_know_is_believed_and_its_numbers_are_not() -> None:
+    law = AttitudeLaw(ROBOT_IMU)
+    first = law.step(T0, sample(Rotation.identity()))
+    lost = law.step(T0 + 1, sample(Rotation.from_euler("X", 1.0), valid=False))
+    assert first.valid
+    assert not lost.valid
+    assert lost.up == first.up
+
+
+@pytest.mark.parametrize(
+    "quaternion", [(0.0, 0.0, 0.0, 0.0), (0.5, 0.5, 0.5, 0.0), (1.0, 1.0, 0.0, 0.0)]
+)
+def test_a_quaternion_that_is_none_is_refused_as_if_it_never_came(quaternion: Vector4) -> None:
+    law = AttitudeLaw(ROBOT_IMU)
+    good = law.step(T0, sample(Rotation.identity()))
+    bad = law.step(T0 + STALE_NS, ImuSample(quaternion, (0.0, 0.0, 0.0), valid=True))
+    assert law.refused == 1
+    assert bad.up == good.up
+    assert bad.age_ns == STALE_NS
+    assert not law.step(T0 + STALE_NS + 1, None).valid
+
+
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
+def test_up_in_sensor_axes_is_of_unit_length(quaternion: Vector4) -> None:
+    assert math.hypot(*up_in_sensor(quaternion)) == pytest.approx(1.0)
+
+
+def test_the_loop_publishes_every_cycle_and_counts_what_could_not_be_sent() -> None:
+    waiting = [sample(Rotation.identity()), None, sample(Rotation.from_euler("Y", 0.1))]
+    sent: list[Attitude] = []
+
+    class Sensor:
+        def newest(self, _now_ns: int) -> ImuSample | None:
+            return waiting.pop(0)
+
+    class Bus:
+        def put(self, message: Attitude) -> bool:
+            sent.append(message)
+            return len(sent) != 2
+
+    loop = ImuLoop(Sensor(), AttitudeLaw(ROBOT_IMU), Bus())
+    for cycle in range(3):
+        loop.cycle(T0 + cycle * 10 * NS_PER_MS)
+    assert [message.seq for message in sent] == [0, 1, 2]
+    assert [message.age_ns for message in sent] == [0, 10 * NS_PER_MS, 0]
+    assert sent[2].up == pytest.approx((-math.sin(0.1), 0.0, math.cos(0.1)))
+    assert loop.unsent == 1
