@@ -22,9 +22,10 @@ from shared.robot_model import stand_pose
 from shared.scenario import Keyframe, Push, Scenario, lead
 from tools.runs import lockstep
 from tools.runs.lockstep import Lockstep
+from tools.runs.tipping import is_tipping
 from tools.sweeps import cases
 from tools.sweeps.cases import Case
-from tools.sweeps.figures import Ending, is_tipping
+from tools.sweeps.figures import Ending
 from tools.sweeps.outcome import FootLoads, run_case
 
 

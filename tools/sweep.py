@@ -11,6 +11,7 @@ from tools.verbs import Subparsers, add_verb
 
 STUDIES: Final = {
     "certificate": ("tools.sweeps.certificate", "is the sign of K_fail right, in simulation?"),
+    "dynamics": ("tools.sweeps.dynamics", "does anything grow that is said to fade?"),
     "kill": ("tools.sweeps.kill", "kill the planner in random postures, under random pushes"),
     "latency": ("tools.sweeps.latency", "three controls over bad networks: who falls, who leads"),
     "push": ("tools.sweeps.push", "the hardest push by direction, duration, pose and mode"),

@@ -13,7 +13,7 @@ import pytest
 from shared import topics
 from shared.config import RobotConfig
 from shared.joints import MODULES
-from shared.messages import Wrench
+from shared.messages import PlannerStatus, Wrench
 from tests.system.stalls import stalled_before_it_began
 from tools.runs.run_log import read_run
 from tools.supervision import procfs
@@ -63,7 +63,8 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
 ) -> None:
     before = set(fleet_processes())
     flags = ("--duration", "8", "--kill", "planner@2.2", "--restart", "planner@4")
-    result = demo(tmp_path, *flags, "--push", "3:0.3:30,0,0")
+    uphill = ("--imu", "--plant", "floor.slope=[0.05,0.0]")
+    result = demo(tmp_path, *flags, *uphill, "--push", "3:0.3:30,0,0")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "STOOD" in result.stdout
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -84,6 +85,8 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
     ]
     assert not silent
     assert log.metadata["run"]["scenario"] == "squat"
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    assert statuses[-1].slope == pytest.approx((0.05, 0.0), abs=0.02), "the IMU was heard"
     wrenches: list[Wrench] = log.messages(topics.WRENCH)
     felt = max(abs(wrench.force[2]) for wrench in wrenches if wrench.valid)
     given = max(abs(row.operator_force[2]) for row in log.messages(topics.SIM_TRUTH))

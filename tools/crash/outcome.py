@@ -15,13 +15,12 @@ from shared.config import RobotConfig
 from shared.messages import JointEvent, Mode, RunEvent, RunEventKind, SimTruth
 from shared.scenario import lead
 from tools.crash.cases import CRASH_S, REQUEST_S, Case, Verdict, story_of
+from tools.runs.tipping import is_tipping
 from tools.runs.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
 
 SANK_M: Final = 0.05
 """So far below where the torso was, and where the hand led, a robot has sunk. HOLD's springs
 and the hand give way by 0.01 m."""
-TIPPING_RAD: Final = 0.05
-"""A sole tilted more than this at the end does not lie down again by itself."""
 END_TOLERANCE_S: Final = 0.1
 UNSAFE: Final = (Mode.FAULT, Mode.DAMP, Mode.DISARMED)
 """What no module that was not hit may come to."""
@@ -113,7 +112,7 @@ def measure(case: Case, heard: Heard, robot: RobotConfig) -> Outcome:
         verdict = Verdict.FELL
     elif last.scenario_s < story.duration - END_TOLERANCE_S:
         return unjudged(f"ended at {last.scenario_s:.1f} s of {story.duration:g} s")
-    elif _is_tipping(last, robot):
+    elif is_tipping(last, robot):
         verdict = Verdict.FELL
         remarks.append("not down yet at the end, but tipping")
     elif sank > SANK_M:
@@ -202,13 +201,3 @@ def _remarks(
 
 def _step(event: JointEvent) -> float:
     return max(abs(b - a) for a, b in zip(event.tau_before, event.tau_after, strict=True))
-
-
-def _is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
-    """Return True if the robot is beyond what it can come back from."""
-    geometry = robot.geometry
-    return (
-        abs(row.over[0]) > geometry.l_foot / 2
-        or abs(row.over[1]) > (geometry.w_base + geometry.w_foot) / 2
-        or max(row.foot_right_tilt, row.foot_left_tilt) > TIPPING_RAD
-    )

@@ -11,12 +11,11 @@ import msgspec
 
 from shared.config import RobotConfig
 from shared.messages import JointEvent, SimTruth
+from tools.runs.tipping import is_tipping
 
 Watch: TypeAlias = Callable[[SimTruth], None]
 
 END_TOLERANCE_S: Final = 0.1
-TIPPING_RAD: Final = 0.05
-"""A sole tilted more than this at the end does not lie down again by itself."""
 
 
 class Ending(StrEnum):
@@ -80,16 +79,6 @@ def ending_of(last: SimTruth, end_s: float, robot: RobotConfig) -> Ending:
     if last.fallen or last.scenario_s < end_s - END_TOLERANCE_S:
         return Ending.FELL
     return Ending.TIPPING if is_tipping(last, robot) else Ending.STOOD
-
-
-def is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
-    """Return True if the robot is beyond what it can come back from."""
-    geometry = robot.geometry
-    return (
-        abs(row.over[0]) > geometry.l_foot / 2
-        or abs(row.over[1]) > (geometry.w_base + geometry.w_foot) / 2
-        or max(row.foot_right_tilt, row.foot_left_tilt) > TIPPING_RAD
-    )
 
 
 def com_max_mm(rows: Sequence[SimTruth]) -> float:
