@@ -58,12 +58,12 @@ class RobotConfig(Section, frozen=True):
     joint_service: JointServiceConfig
     planner: PlannerConfig
     harness: HarnessConfig
-    imu: ImuConfig
     drive: DriveConfig
     can: dict[str, CanConfig]
     bus: BusConfig
     recorder: RecorderConfig
     simulation: SimulationConfig
+    imu: ImuConfig = ImuConfig()
     gain_schedule: GainSchedule | None = None
     """Not in this file but beside it; None if it has not been made."""
 
