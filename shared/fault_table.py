@@ -144,7 +144,8 @@ LOSSES: Final[dict[str, Loss]] = {
     ),
     "IMU lost, where one is fitted": Loss(
         "nothing",
-        "the planner leads on, and takes the floor to slope as it last did",
+        "the planner leads on, and takes the floor to slope as it last did; a new planner takes "
+        "it as level",
         "imu/attitude: not valid",
         "by itself",
     ),

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from shared import scenario
-from shared.config import SERVICES
+from shared.config import OPTIONAL, SERVICES
 from shared.joints import MODULES
 from shared.scenario import FAULT_KINDS, Fault, FaultKind, Kill
 from tools import crashtest
@@ -28,7 +28,7 @@ def test_every_service_but_the_world_itself_is_lost_alone(signal: str) -> None:
         for row in case.crash
         if alone(case) and isinstance(row, Kill) and row.signal == signal
     }
-    assert lost == set(SERVICES) - {"simulator"}
+    assert lost == set(SERVICES) - {"simulator", *OPTIONAL}
 
 
 @pytest.mark.parametrize("kind", ["disarmed", "link_lost", "encoder"])

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from services.planner.push_limit import DIRECTIONS, slope_of
+from services.planner.push_limit import DIRECTIONS, slope_pulling
 from shared import config_file, gain_schedule
 from shared.config import RobotConfig
 from shared.exceptions import ConfigError
@@ -144,19 +144,20 @@ def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -
     for name in DIRECTIONS:
         table.add_column(name, justify="right", no_wrap=True)
     parts = list[str]()
-    held = dict.fromkeys(DIRECTIONS, math.inf)
+    least = dict.fromkeys(DIRECTIONS, math.inf)
     ready = msgspec.structs.replace(robot, gain_schedule=schedule)
     for z, limits in split_program.push_limits(ready, PUSH_HEIGHTS):
         cells = [" / ".join(f"{limit.force_n:.0f}" for limit in row) for row in limits.values()]
         table.add_row(f"{z:.3f}", *cells)
         parts += [row.held.part for row in limits.values()]
         for name, row in limits.items():
-            held[name] = min(held[name], row.held.force_n, row.led.force_n)
+            least[name] = min(least[name], row.held.force_n, row.led.force_n)
     console.print(table)
     first = ", ".join(dict.fromkeys(parts))
     console.print(f"gives way first, with the planner dead: {first}", style="dim")
     slopes = ", ".join(
-        f"{math.degrees(slope_of(robot, least)):.1f} degrees {name}" for name, least in held.items()
+        f"{math.degrees(slope_pulling(robot, force_n)):.1f} degrees {name}"
+        for name, force_n in least.items()
     )
     console.print(f"slope without an IMU, planner dead or led: {slopes}", style="dim")
     console.print(

@@ -76,7 +76,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--injectable",
         action="store_true",
-        help="with the injector on the links between planner, joints and harness, for `xrl inject`",
+        help="with the injector on the links between planner, joints and sensors, for `xrl inject`",
     )
     parser.add_argument(
         "--readonly",

@@ -1,4 +1,4 @@
-"""`python -m services.injector`: a bad network on purpose, between planner, joints and harness.
+"""`python -m services.injector`: a bad network on purpose, between planner, joints and sensors.
 
 They dial it (`--injected`) in place of one another; `xrl inject` says what it is to do.
 """

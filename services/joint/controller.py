@@ -24,7 +24,7 @@ from shared.config import RobotConfig
 from shared.joints import kind_of
 from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Pair
 
-LEFT_SHARE = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
+UNLED_SHARE = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
 """How far a drive's gains rise to HOLD's while its service leads; `left_holding` says why."""
 
 
@@ -51,7 +51,7 @@ class JointController:
         self._damp_k_d = service.damp_k_d
         self._sinks = (False, kind_of(module) in service.damp_sinks)
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
-        self._left_share = LEFT_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
+        self._unled_share = UNLED_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
         knee = kind_of(module) == "knee"
         self._damp_stop = service.damp_knee_stop if knee else -math.inf
         self._gear_ratio = config.joint.gear_ratio
@@ -175,7 +175,7 @@ class JointController:
         """
         if self.failsafe.mode is Mode.DAMP:
             return self._setpoint
-        return law.stiffened(self._setpoint, self._hold_k_p, self._hold_k_d, self._left_share)
+        return law.stiffened(self._setpoint, self._hold_k_p, self._hold_k_d, self._unled_share)
 
     def state(self, now_ns: int) -> JointState:
         """Return the module's state message.

@@ -15,9 +15,11 @@ from services.planner.certificate import Certificate, Weakest, motor_mean
 from services.planner.coupling import Missing
 from services.planner.gains import GainLaw
 from services.planner.kinematics import Kinematics
+from services.planner.levelling import up_of
 from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import GainSplit, LocalGains
 from shared.config import GRAVITY, RobotConfig
+from shared.messages import Pair
 
 Array = NDArray[np.float64]
 
@@ -60,7 +62,13 @@ class Account(NamedTuple):
 
 
 def account(
-    config: RobotConfig, q: Array, v: Array, q_ref: Array, v_ref: Array, assist: float
+    config: RobotConfig,
+    q: Array,
+    v: Array,
+    q_ref: Array,
+    v_ref: Array,
+    assist: float,
+    slope: Pair = (0.0, 0.0),
 ) -> Account:
     """Return the account of a tick.
 
@@ -71,6 +79,7 @@ def account(
         q_ref: references (12,), rad.
         v_ref: their rates (12,), rad/s.
         assist: assist force in the feedforward, N.
+        slope: of the floor along x and y, as the planner took it, rad.
 
     Raises:
         ConfigError: the gain split lacks its schedule.
@@ -80,8 +89,9 @@ def account(
     at_ref.update(q_ref, measured.D_left)
     law, split = GainLaw(config), GainSplit(config)
     pdot = measured.J @ v
-    F_O, F_assist = np.zeros(6), np.array([0.0, 0.0, assist])
-    F_O[2] = config.total_mass * GRAVITY
+    up = np.array(up_of(slope))
+    F_O, F_assist = np.zeros(6), assist * up
+    F_O[:3] = config.total_mass * GRAVITY * up
     F = law.K_p * (at_ref.p - measured.p) + law.B_p * (at_ref.J @ v_ref - pdot) + F_O
     hessian_O = at_ref.hessian_times(F_O, F_assist).copy()
     hessian_weight = at_ref.hessian_times(F_O, np.zeros(3)).copy()

@@ -130,7 +130,7 @@ class Hocca:
         """
         measured, ik = self._measured, self._ik
         measured.update(q)
-        self._levelling.advance(up_torso, measured.p[3:], dt)
+        self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._aligned)
         up = self._levelling.up
         self._F_O[:3] = self._weight * up
         if align or not self._aligned:

@@ -6,12 +6,14 @@ gravity: at a height of 1 m and 5 degrees it is 87 mm off, and the weight pulls 
 
 The IMU says where up is in torso axes, the joints say how the torso stands on the floor:
 
-    up_floor = R_torso(q) up_torso,        followed through one pole of `law.levelling_s`
+    up_floor = R_torso(q) up_torso,        followed through one pole of `imu.levelling_s`
 
-Zero errors of the joints turn R_torso and so up_floor: the COM is led above the ankles all the
-same. Joints that flex are not in q: a sway looks like a floor that tilts, which is why it is
-followed slowly. A floor does not jump, so with no IMU for a while the last slope stands; with none
-ever the floor is level.
+Zero errors of the ankles turn R_torso and so up_floor: the COM is led above the ankles all the
+same. Those of knees and hips do so too, where without an IMU they would not have mattered: half a
+degree at both hips moves the COM by 8 mm. Joints that flex are not in q: a sway looks like a floor
+that tilts, which is why it is followed slowly. A floor does not jump: with no IMU for a while the
+last slope stands, with none since this planner began the floor is level, and an IMU that is first
+heard while the planner leads is followed from level on.
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ from shared.messages import Pair, Vector3
 
 Array = NDArray[np.float64]
 
-SLOPE_MAX: Final = 0.15
-"""rad either way: beyond, it is not believed to be a floor that anybody stands on."""
+SLOPE_MAX: Final = 0.12
+"""rad either way, 7 degrees: beyond it is no floor that this robot stands on, but an IMU that has
+come loose, and what it says is left out."""
 
 
 class Levelling:
@@ -53,19 +56,25 @@ class Levelling:
         """(3,) unit vector against gravity, floor axes."""
         return self._up
 
-    def advance(self, up_torso: Vector3 | None, angles: Array, dt: float) -> None:
+    def advance(
+        self, up_torso: Vector3 | None, angles: Array, dt: float, *, jump: bool = False
+    ) -> None:
         """Take what the IMU says.
 
         Args:
             up_torso: unit vector against gravity, torso axes; None: not known now.
             angles: the torso's roll, pitch and yaw on the floor by the joints, rad.
             dt: since the last call, s.
+            jump: nobody is led: the first that is heard is taken as it is.
         """
         if up_torso is None:
             return
         x, y = slope_of(up_torso, *angles.tolist())
-        share = 1.0 - math.exp(-dt / self._levelling_s) if self._known else 1.0
+        if max(abs(x), abs(y)) > SLOPE_MAX:
+            return
+        whole = jump and not self._known
         self._known = True
+        share = 1.0 if whole else 1.0 - math.exp(-dt / self._levelling_s)
         before = self.slope
         self._stand_on((before[0] + share * (x - before[0]), before[1] + share * (y - before[1])))
 
@@ -80,12 +89,17 @@ class Levelling:
 
     def _stand_on(self, slope: Pair) -> None:
         self.slope = slope
-        x, y = math.sin(slope[0]), math.sin(slope[1])
-        self._up[:] = x, y, math.sqrt(1.0 - x * x - y * y)
+        self._up[:] = up_of(slope)
+
+
+def up_of(slope: Pair) -> Vector3:
+    """Return the unit vector against gravity, floor axes, on a floor with this slope, rad."""
+    x, y = math.sin(slope[0]), math.sin(slope[1])
+    return x, y, math.sqrt(1.0 - x * x - y * y)
 
 
 def slope_of(up_torso: Vector3, roll: float, pitch: float, yaw: float) -> Pair:
-    """Return the floor's rise along x and y, rad, at most `SLOPE_MAX` either way.
+    """Return the floor's rise along x and y, rad; upside down is steeper than any floor.
 
     Args:
         up_torso: unit vector against gravity, torso axes.
@@ -97,9 +111,6 @@ def slope_of(up_torso: Vector3, roll: float, pitch: float, yaw: float) -> Pair:
     x, z = math.cos(pitch) * x + math.sin(pitch) * z, math.cos(pitch) * z - math.sin(pitch) * x
     y, z = math.cos(roll) * y - math.sin(roll) * z, math.cos(roll) * z + math.sin(roll) * y
     x, y = math.cos(yaw) * x - math.sin(yaw) * y, math.cos(yaw) * y + math.sin(yaw) * x
-    return _bounded_angle(x), _bounded_angle(y)
-
-
-def _bounded_angle(sine: float) -> float:
-    most = math.sin(SLOPE_MAX)
-    return math.asin(min(most, max(-most, sine)))
+    if z <= 0.0:
+        return math.pi, math.pi
+    return math.asin(min(1.0, max(-1.0, x))), math.asin(min(1.0, max(-1.0, y)))

@@ -256,7 +256,7 @@ def limits_along(
     )
 
 
-def slope_of(config: RobotConfig, force_n: float) -> float:
+def slope_pulling(config: RobotConfig, force_n: float) -> float:
     """Return the floor's slope, rad, that pulls the weight along it as hard as a push (N).
 
     Without an IMU the planner stands along the floor's normal, and the weight leans on the gains

@@ -106,7 +106,7 @@ def main() -> int:
         harness = HarnessFront(robot, hubs[robot.harness.bus], arguments.seed)
         imu = None
         if robot.imu.fitted:
-            imu = ImuFront(true_plant.imu, hubs[robot.imu.bus], arguments.seed)
+            imu = ImuFront(robot.imu, true_plant.imu, hubs[robot.imu.bus], arguments.seed)
         world = World(body_of(robot, true_plant), story)
         logger.info("up, %s, scenario %s", granted, story.name)
         freeze_garbage()

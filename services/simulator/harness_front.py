@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from services.simulator.frame_hub import FrameHub
 from shared import loadcell_can, stewart
 from shared.config import RobotConfig
 
 BIAS_MAX: Final = 20.0
 """Zero offset of a load cell: uniform within +- this, N; constant, so that tare matters."""
-
-
-class FrameHub(Protocol):
-    """The sensor's end of its simulated CAN bus."""
-
-    def poll(self) -> object:
-        """Admit new clients and take what they sent; never waits."""
-
-    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
-        """Send frames (id, data) to every client, as one packet."""
 
 
 class HarnessFront:

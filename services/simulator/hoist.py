@@ -42,8 +42,8 @@ class Hoist:
         """Take over the share of another run."""
         self.share, self.releasing = share, share < 1.0
 
-    def wrench(self, position: Array, rotation: Array, rates: Array, dt: float) -> Array:
-        """Return force and moment on the torso (6,), N and N m, world, and let down further.
+    def advance(self, position: Array, rotation: Array, rates: Array, dt: float) -> Array:
+        """Let down further; return force and moment on the torso (6,), N and N m, world.
 
         Args:
             position: of the torso (3,), m, world.

@@ -4,49 +4,47 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from services.simulator.frame_hub import FrameHub
 from services.simulator.plant import ImuErrors
 from services.simulator.world import World
 from shared import imu_can
-
-
-class FrameHub(Protocol):
-    """The sensor's end of its simulated CAN bus."""
-
-    def poll(self) -> object:
-        """Admit new clients and take what they sent; never waits."""
-
-    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
-        """Send frames (id, data) to every client, as one packet."""
+from shared.config_sections import ImuConfig
 
 
 class ImuFront:
-    """An IMU on the torso, its axes those of the torso but for its errors."""
+    """An IMU on the torso, mounted as the robot file says but for its errors."""
 
-    def __init__(self, errors: ImuErrors, hub: FrameHub, seed: int) -> None:
-        """Take how wrong the sensor is.
+    def __init__(self, config: ImuConfig, errors: ImuErrors, hub: FrameHub, seed: int) -> None:
+        """Mount the sensor.
 
         Args:
+            config: the robot's: how it sits on the torso.
             errors: of the true plant.
             hub: takes the frames.
             seed: of the noise.
         """
         self._errors, self._hub = errors, hub
         roll, pitch = errors.tilt
-        self._tilt = np.array(_product(_about(0, roll), _about(1, pitch)))
+        tilt = _product(_about(0, roll), _about(1, pitch))
+        roll, pitch, yaw = config.mounting
+        mounting = _product(_about(2, yaw), _product(_about(0, roll), _about(1, pitch)))
+        self._sits = _product(tilt, mounting)
+        """Turns sensor axes into torso axes."""
         self._random = np.random.default_rng((seed, 1))
 
     def send(self, world: World) -> None:
         """Send one sample of how the torso stands against gravity, and turns."""
         noise = self._errors.noise * self._random.standard_normal(2)
-        turned = _product(world.torso_against_gravity(), self._tilt.tolist())
+        turned = _product(world.torso_against_gravity(), self._sits)
         told = _product(turned, _product(_about(0, noise[0]), _about(1, noise[1])))
+        w, x, y, z = self._sits
+        back = (w, -x, -y, -z)
+        _, *rate = _product(back, _product((0.0, *world.torso_rates()), self._sits))
         self._hub.poll()
-        self._hub.broadcast(imu_can.pack(told, world.torso_rates(), valid=True))
+        self._hub.broadcast(imu_can.pack(told, rate, valid=True))
 
 
 def _about(axis: int, angle: float) -> list[float]:
@@ -56,7 +54,7 @@ def _about(axis: int, angle: float) -> list[float]:
     return quaternion
 
 
-def _product(a: Sequence[float] | npt.NDArray[np.float64], b: Sequence[float]) -> list[float]:
+def _product(a: Sequence[float], b: Sequence[float]) -> list[float]:
     """Return the product of two quaternions (w, x, y, z)."""
     w, x, y, z = a
     p, q, r, s = b

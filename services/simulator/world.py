@@ -91,12 +91,13 @@ class World:
         data, model = self.data, self.model
         data.qpos[self._q_index] = body.stand_q
         mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        ankle, lean = data.xpos[self._feet[0]], self._lean
-        height = data.subtree_com[0][2] - ankle[2]
-        data.qpos[0] += lean[0] * height - ankle[0]
-        data.qpos[1] += lean[1] * height
+        data.qpos[0] -= data.xpos[self._feet[0]][0]
         self._flatten_soles()
+        level = data.subtree_com[0][:2].copy()
+        for _ in range(STAND_ITERATIONS if any(self._lean) else 0):
+            com = data.subtree_com[0]  # the legs go less far than the torso
+            data.qpos[:2] += level + np.array(self._lean) * com[2] - com[:2]
+            self._flatten_soles()
         self._actuation.settle(data.qpos[self._q_index])
         self._hoist.position = data.qpos[:3].copy()
 
@@ -281,7 +282,7 @@ class World:
         )
         if self._hoist.share > 0.0:
             rotation = self.data.xmat[self._torso].reshape(3, 3)
-            wrench += self._hoist.wrench(self._qpos[:3], rotation, self._torso_rates, self._dt)
+            wrench += self._hoist.advance(self._qpos[:3], rotation, self._torso_rates, self._dt)
 
     def truth(self, t_ns: int, real_time_factor: float, late_s: float) -> SimTruth:
         """Return the world as it is, for the log and the verdict."""

@@ -9,9 +9,9 @@ import pytest
 
 from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
-from shared.scenario import Inject, Kill
+from shared.scenario import Inject, Keyframe, Kill
 from tests.imu.robots import with_imu
-from tests.lockstep.runs import Run, push, run, still, story
+from tests.lockstep.runs import Run, push, run, story
 
 DEG = math.radians(1.0)
 WRONG = [0.5 * DEG, -0.5 * DEG]
@@ -46,13 +46,15 @@ def test_with_an_imu_it_squats_on_five_degrees_is_pushed_and_stands_when_the_pla
 
 def test_when_the_imu_falls_silent_the_last_slope_stands(robot: RobotConfig) -> None:
     cut = (Inject(link="imu->planner", at=0.5, partition=True),)
-    told = still(4.0, height=1.0, inject=cut, push=(push(2.5, 0.0, 30.0, 0.0),))
+    leans = (Keyframe(at=0.5, height=1.188), Keyframe(at=2.5, height=1.0, pitch=0.4))
+    pushed = (push(2.8, 0.0, 30.0, 0.0),)
+    told = story("stand", duration=4.0, keyframe=leans, inject=cut, push=pushed)
     outcome = run(with_imu(robot), told, plant=sloping(5.0, 0.0))
     assert outcome.stood
     assert over_mm(outcome) < 30.0
     assert outcome.lockstep.planner is not None
     slope = outcome.lockstep.planner.status(outcome.lockstep.now_ns, 0.0).slope
-    assert slope == pytest.approx((5.0 * DEG, 0.0), abs=1.0 * DEG)
+    assert slope == pytest.approx((5.0 * DEG, 0.0), abs=1.0 * DEG), "not 23 degrees: it leans"
 
 
 def test_on_a_level_floor_an_imu_changes_nothing_that_the_hand_feels(robot: RobotConfig) -> None:

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from services.planner.hocca import Hocca
-from services.planner.levelling import SLOPE_MAX, Levelling, slope_of
+from services.planner.levelling import SLOPE_MAX, Levelling, slope_of, up_of
 from shared.config import GRAVITY, RobotConfig
-from shared.messages import Vector3
+from shared.messages import Pair, Vector3
 from tests.imu.robots import with_imu
 from tests.planner import oracle
 from tests.planner.conftest import Closed
@@ -21,12 +21,11 @@ DT = 0.004
 slopes = st.tuples(*[st.floats(-0.14, 0.14)] * 2)
 
 
-def up_of(slope: tuple[float, float], angles: tuple[float, float, float]) -> Vector3:
+def told(slope: Pair, angles: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Vector3:
     """Return what an IMU tells on a floor with this slope, the torso so turned on the floor."""
-    x, y = math.sin(slope[0]), math.sin(slope[1])
-    up = np.array((x, y, math.sqrt(1.0 - x * x - y * y)))
     roll, pitch, yaw = angles
-    a, b, c = Rotation.from_euler("ZXY", (yaw, roll, pitch)).inv().apply(up).tolist()
+    turned_back = Rotation.from_euler("ZXY", (yaw, roll, pitch)).inv()
+    a, b, c = turned_back.apply(up_of(slope)).tolist()
     return a, b, c
 
 
@@ -35,31 +34,43 @@ def test_the_slope_is_found_however_the_torso_stands(
     slope: tuple[float, float], angles: tuple[float, float, float]
 ) -> None:
     """By scipy's rotations."""
-    assert slope_of(up_of(slope, angles), *angles) == pytest.approx(slope, abs=1e-12)
+    assert slope_of(told(slope, angles), *angles) == pytest.approx(slope, abs=1e-12)
 
 
-def test_a_slope_that_nobody_stands_on_is_bounded() -> None:
-    assert slope_of((1.0, 0.0, 0.0), 0.0, 0.0, 0.0) == pytest.approx((SLOPE_MAX, 0.0))
-    assert slope_of((0.0, -1.0, 0.0), 0.0, 0.0, 0.0) == pytest.approx((0.0, -SLOPE_MAX))
-
-
-def test_the_first_word_of_the_imu_is_believed_at_once_and_later_ones_slowly() -> None:
+@pytest.mark.parametrize(
+    "up",
+    [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (math.sin(SLOPE_MAX + 0.01), 0.0, 0.9)],
+)
+def test_what_no_floor_is_like_is_left_out(up: Vector3) -> None:
+    """An IMU that has come loose, or is upside down."""
     levelling = Levelling(1.0)
-    levelling.advance(up_of((0.05, -0.02), (0.0, 0.0, 0.0)), LEVEL, DT)
+    levelling.advance(told((0.05, 0.0)), LEVEL, DT, jump=True)
+    for _ in range(1000):
+        levelling.advance(up, LEVEL, DT, jump=True)
+    assert levelling.slope == pytest.approx((0.05, 0.0))
+
+
+def test_the_first_word_of_the_imu_is_taken_as_it_is_while_nobody_is_led() -> None:
+    levelling = Levelling(1.0)
+    levelling.advance(told((0.05, -0.02)), LEVEL, DT, jump=True)
     assert levelling.slope == pytest.approx((0.05, -0.02))
     for _ in range(round(1.0 / DT)):
-        levelling.advance(up_of((0.0, 0.0), (0.0, 0.0, 0.0)), LEVEL, DT)
+        levelling.advance(told((0.0, 0.0)), LEVEL, DT, jump=True)
     assert levelling.slope == pytest.approx((0.05 / math.e, -0.02 / math.e))
-    assert levelling.up == pytest.approx(
-        (math.sin(levelling.slope[0]), math.sin(levelling.slope[1]), 1.0), abs=1e-3
-    )
+    assert levelling.up == pytest.approx(up_of(levelling.slope))
+
+
+def test_an_imu_first_heard_while_the_robot_is_led_is_followed_slowly() -> None:
+    levelling = Levelling(1.0)
+    levelling.advance(told((0.05, 0.0)), LEVEL, DT)
+    assert 0.0 < levelling.slope[0] < 0.05 * 1.1 * DT
 
 
 def test_without_the_imu_the_last_slope_stands_and_with_none_ever_the_floor_is_level() -> None:
     levelling = Levelling(1.0)
-    levelling.advance(None, LEVEL, DT)
+    levelling.advance(None, LEVEL, DT, jump=True)
     assert levelling.slope == (0.0, 0.0)
-    levelling.advance(up_of((0.05, 0.0), (0.0, 0.0, 0.0)), LEVEL, DT)
+    levelling.advance(told((0.05, 0.0)), LEVEL, DT, jump=True)
     for _ in range(1000):
         levelling.advance(None, LEVEL, DT)
     assert levelling.slope == pytest.approx((0.05, 0.0))
@@ -67,10 +78,10 @@ def test_without_the_imu_the_last_slope_stands_and_with_none_ever_the_floor_is_l
 
 def test_a_memory_goes_on_bit_for_bit() -> None:
     first, second = Levelling(1.0), Levelling(1.0)
-    first.advance(up_of((0.05, 0.01), (0.0, 0.0, 0.0)), LEVEL, DT)
+    first.advance(told((0.05, 0.01)), LEVEL, DT, jump=True)
     second.recall(first.remember())
     for each in (first, second):
-        each.advance(up_of((0.02, 0.0), (0.1, 0.2, 0.0)), np.array((0.1, 0.2, 0.0)), DT)
+        each.advance(told((0.02, 0.0), (0.1, 0.2, 0.0)), np.array((0.1, 0.2, 0.0)), DT)
     assert first.slope == second.slope
     assert np.array_equal(first.up, second.up)
 
@@ -85,11 +96,10 @@ def test_on_a_slope_feedforward_holds_the_weight_along_every_closed_motion(
 ) -> None:
     """Virtual work against the oracle's COM: the weight pulls along the slope too."""
     law, q = Hocca(with_imu(robot)), closed(height, pitch=pitch)
-    up_torso = up_of(slope, tuple(oracle.pose(robot, q)[3:]))
+    up_torso = told(slope, tuple(oracle.pose(robot, q)[3:]))
     output = law.tick(q, np.zeros(12), 0.0, DT, align=True, up_torso=up_torso)
     assert output.slope == pytest.approx(slope)
-    x, y = np.sin(slope)
-    up = np.array((x, y, math.sqrt(1.0 - x * x - y * y)))
+    up = np.array(up_of(slope))
     weight = robot.total_mass * GRAVITY
     com = oracle.derivative(lambda angles: oracle.pose(robot, angles)[:3], q, 1e-5)
     C = oracle.derivative(lambda angles: oracle.closure(robot, angles), q)
@@ -104,11 +114,28 @@ def test_the_com_is_led_to_where_gravity_puts_it_over_the_ankles(
     robot: RobotConfig, closed: Closed, slope: tuple[float, float]
 ) -> None:
     law, q = Hocca(with_imu(robot)), closed(1.0)
-    up_torso = up_of(slope, (0.0, 0.0, 0.0))
+    up_torso = told(slope)
     first = law.tick(q, np.zeros(12), 0.0, DT, align=True, up_torso=up_torso)
     np.testing.assert_allclose(first.p_ref, first.p, atol=1e-7)
     for _ in range(round(robot.law.recentre_s / DT) + 1):
         output = law.tick(q, np.zeros(12), 0.0, DT, up_torso=up_torso)
-    lean = np.sin(slope) / law._levelling.up[2]
+    x, y, z = up_of(slope)
+    lean = np.array((x, y)) / z
     np.testing.assert_allclose(output.p_ref[:2], lean * output.p[2], atol=1e-7)
     assert np.abs(output.p_ref[3:6:2]).max() < 1e-7
+
+
+def test_an_imu_that_comes_up_while_the_robot_is_led_makes_no_step(
+    robot: RobotConfig, closed: Closed
+) -> None:
+    """Taken at once, 5 degrees moved the ankles' reference by 0.08 rad in one tick: 125 N m."""
+    law, q = Hocca(with_imu(robot)), closed(1.0)
+    law.tick(q, np.zeros(12), 0.0, DT, align=True)
+    before = law.tick(q, np.zeros(12), 0.0, DT)
+    largest = 0.0
+    for _ in range(500):
+        output = law.tick(q, np.zeros(12), 0.0, DT, up_torso=told((0.0873, 0.0)))
+        largest = max(largest, float(np.abs(output.q_ref - before.q_ref).max()))
+        before = output
+    assert output.slope[0] > 0.05
+    assert largest < 1e-3

@@ -38,7 +38,7 @@ def ask_ip() -> Links:
 
 
 def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Row]:
-    """Check every interface that the robot file names.
+    """Check every interface that the robot uses.
 
     Args:
         robot: its buses.
@@ -46,7 +46,8 @@ def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Row]:
         links: of `ask_ip`.
     """
     rows = []
-    names = {bus.channel for bus in robot.can.values() if bus.interface == "socketcan"}
+    used = [robot.can[name] for name in robot.buses]
+    names = {bus.channel for bus in used if bus.interface == "socketcan"}
     for name in sorted(names):
         flags = _flags(root, name)
         if flags is None:

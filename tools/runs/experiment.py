@@ -15,7 +15,7 @@ import msgspec
 
 from services.simulator import plant
 from services.simulator.plant import NAMED, PlantConfig
-from shared import config_file, gain_schedule, scenario
+from shared import config_check, config_file, gain_schedule, scenario
 from shared.config import SERVICES, RobotConfig
 from shared.config_sections import LawConfig
 from shared.exceptions import FleetError, RunError
@@ -281,6 +281,7 @@ def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
     robot = msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, **law))
     if imu:
         robot = msgspec.structs.replace(robot, imu=msgspec.structs.replace(robot.imu, fitted=True))
+        config_check.check(str(path), robot)
     gain_schedule.require(robot, path)
     return robot
 

@@ -137,7 +137,7 @@ class Lockstep:
         self.harness = VirtualHarness(config, self._wrenches, record, seed, clock)
         self._attitudes = self.network.attitudes()
         clock = clock_of.get("imu", HostClock())
-        self._imu = VirtualImu(config.imu, self.plant.imu, self._attitudes, record, seed, clock)
+        self._imu = VirtualImu(config, self.plant.imu, self._attitudes, record, seed, clock)
         self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
         joint = config.joint_service
         self._state_every = round(joint.rate_hz / joint.state_rate_hz)

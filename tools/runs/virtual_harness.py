@@ -12,33 +12,24 @@ from services.harness.filter import WrenchFilter, tared_state
 from services.harness.loop import HarnessLoop
 from services.simulator.harness_front import HarnessFront
 from services.simulator.world import World
-from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.loadcell_can import LegSample, SampleAssembler
 from shared.messages import Message, TareRequest, Vector6, Wrench
 from shared.topics import WRENCH, Topic
 from tools.runs.host_clock import HostClock, HostLink
 from tools.runs.network import Link
+from tools.runs.virtual_can import VirtualCan, whole_steps_ns
 
 
-class Cells:
-    """The sensor's CAN bus: what the front sends, the loop reads at once."""
+class Cells(VirtualCan[Vector6]):
+    """The sensor as the live loop has it."""
 
     def __init__(self) -> None:
-        self._assembler = SampleAssembler()
-        self._forces: Vector6 | None = None
-
-    def poll(self) -> None:
-        """Do nothing: nobody has to be let in."""
-
-    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
-        """Take the frames of one sample."""
-        for can_id, data in frames:
-            self._forces = self._assembler.add(can_id, data) or self._forces
+        super().__init__(SampleAssembler())
 
     def read(self, now_ns: int) -> LegSample | None:
         """Return the newest sample since the last read, or None."""
-        forces, self._forces = self._forces, None
+        forces = self.newest(now_ns)
         return None if forces is None else LegSample(now_ns, forces)
 
     def close(self) -> None:
@@ -69,7 +60,7 @@ class VirtualHarness:
         self._front = HarnessFront(config, cells, seed)
         self._loop = HarnessLoop(cells, WrenchFilter(config.harness), self, self)
         self._link, self._record = HostLink(wrenches), record
-        self._period_ns = round(NS_PER_S / config.harness.rate_hz)
+        self._period_ns = whole_steps_ns(config, config.harness.rate_hz)
         self._clock = clock
         self._request: TareRequest | None = None
 

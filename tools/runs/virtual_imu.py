@@ -9,34 +9,13 @@ from services.imu.loop import ImuLoop
 from services.simulator.imu_front import ImuFront
 from services.simulator.plant import ImuErrors
 from services.simulator.world import World
-from shared.clock import NS_PER_S
-from shared.config_sections import ImuConfig
-from shared.imu_can import ImuAssembler, ImuSample
+from shared.config import RobotConfig
+from shared.imu_can import ImuAssembler
 from shared.messages import Attitude, Message
 from shared.topics import ATTITUDE, Topic
 from tools.runs.host_clock import HostClock, HostLink
 from tools.runs.network import Link
-
-
-class _Frames:
-    """The sensor's CAN bus: what the front sends, the loop reads at once."""
-
-    def __init__(self) -> None:
-        self._assembler = ImuAssembler()
-        self._newest: ImuSample | None = None
-
-    def poll(self) -> None:
-        """Do nothing: nobody has to be let in."""
-
-    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
-        """Take the frames of one sample."""
-        for can_id, data in frames:
-            self._newest = self._assembler.add(can_id, data) or self._newest
-
-    def newest(self, _now_ns: int) -> ImuSample | None:
-        """Return the newest sample since the last call, or None."""
-        sample, self._newest = self._newest, None
-        return sample
+from tools.runs.virtual_can import VirtualCan, whole_steps_ns
 
 
 class VirtualImu:
@@ -44,7 +23,7 @@ class VirtualImu:
 
     def __init__(
         self,
-        config: ImuConfig,
+        config: RobotConfig,
         errors: ImuErrors,
         attitudes: Link[Attitude],
         record: Callable[[Topic, str, Message], None],
@@ -54,19 +33,19 @@ class VirtualImu:
         """Mount the sensor, if one is fitted.
 
         Args:
-            config: the robot's.
+            config: the robot.
             errors: the plant's.
             attitudes: the link to the planner.
             record: takes every message.
             seed: of the noise.
             clock: of the service's host.
         """
-        frames = _Frames()
-        self._fitted = config.fitted
-        self._period_ns = round(NS_PER_S / config.rate_hz)
+        frames = VirtualCan(ImuAssembler())
+        self._fitted = config.imu.fitted
+        self._period_ns = whole_steps_ns(config, config.imu.rate_hz)
         self._clock = clock
-        self._front = ImuFront(errors, frames, seed)
-        self._loop = ImuLoop(frames, AttitudeLaw(config), self)
+        self._front = ImuFront(config.imu, errors, frames, seed)
+        self._loop = ImuLoop(frames, AttitudeLaw(config.imu), self)
         self._link, self._record = HostLink(attitudes), record
 
     def advance(self, world: World, now_ns: int) -> None:

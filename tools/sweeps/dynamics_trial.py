@@ -6,7 +6,7 @@ after the tap is compared with that some seconds later. The certificate is asked
 pose, stiffness, drivetrain, delay and hand.
 
 The plant is what the linear model has: no play, dry friction, cogging or noise, a hard floor, a
-hand that follows its path.
+hand that follows its path. But the encoders count, and rounding can keep going what hardly fades.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ DURATION_S: Final = 4.5
 GREW: Final = 1.3
 """Motion late over motion early."""
 STILL_RAD_S: Final = 0.02
-"""Less than this is rounding of the encoders' counts, and no growth."""
+"""Less than this is what the encoders' counts make of standing still."""
 SHAKES_RAD_S: Final = 0.1
 """More than this, long after the tap, has grown at once and is held by the torque limits."""
 ENDINGS: Final = frozenset(("tracked", "left", "fell", "unready"))
