@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from services.planner.account import account
 from services.planner.hocca import Hocca
 from services.planner.levelling import SLOPE_MAX, Levelling, slope_of, up_of
 from shared.config import GRAVITY, RobotConfig
@@ -107,6 +108,15 @@ def test_on_a_slope_feedforward_holds_the_weight_along_every_closed_motion(
     np.testing.assert_allclose(
         closed_motions @ output.tau_ff, closed_motions @ (weight * up @ com), atol=1e-4
     )
+
+
+def test_a_tick_is_laid_open_with_the_slope_that_it_took(
+    robot: RobotConfig, closed: Closed
+) -> None:
+    law, q, still = Hocca(with_imu(robot)), closed(1.0), np.zeros(12)
+    output = law.tick(q, still, 0.0, DT, align=True, up_torso=told((0.0873, -0.03)))
+    found = account(robot, q, still, output.q_ref, output.v_ref, 0.0, output.slope)
+    np.testing.assert_allclose(found.gravity, output.tau_ff, atol=1e-6)
 
 
 @pytest.mark.parametrize("slope", FLOORS)
