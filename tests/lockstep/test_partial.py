@@ -93,7 +93,7 @@ def test_who_tips_at_the_end_or_does_not_come_so_far_has_not_stood(
     changes: dict[str, object], stands: bool, robot: RobotConfig
 ) -> None:
     good = {"scenario_s": partial.END_S, "com": (0.0, 0.0, 1.0), "fallen": False}
-    flat = {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0}
+    flat = {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0, "lean": (0.0, 0.0)}
     row = sample_of(SimTruth, **(good | flat | changes))
     case = Case("links", ())
     fleet = partial.Fleet(robot, partial.story_of(case))

@@ -20,7 +20,7 @@ from tools.playback.selection import LIVE, short
 from tools.supervision.fleet import is_listening
 from tools.supervision.supervise import Fleet
 
-IN_THE_LOOP: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND, topics.WRENCH)
+IN_THE_LOOP: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND, topics.WRENCH, topics.ATTITUDE)
 """What makes a robot move by itself: never put beside a live drive, whatever is forced.
 
 A recorded command is too old for a joint service, until after a restart of the machine its
