@@ -36,7 +36,8 @@ Keys: xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, which no service subscribes 
 --prefix "" it is xrl/<robot>/x itself. What a robot acts on (joint states and commands,
 harness wrench and tare, attitude, operator intent, estop, sim/control) is then refused while a
 joint service is on the bus. --force puts tare, intent, estop and sim/control all the same;
-states, commands, wrenches and attitudes would move the robot, and are never put beside a live drive.
+states, commands, wrenches and attitudes would move the robot, and are never put beside a live
+drive.
 
 Subscribers dial the player at --listen:
   open_session(robot, "mine", run_dir, connect=["{LISTEN}"])
