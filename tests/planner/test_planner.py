@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import msgspec
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import N_MODULES
 from shared.messages import (
-    Attitude,
     DriveStatus,
     JointCommand,
     JointState,
@@ -25,7 +22,6 @@ from shared.messages import (
     Tare,
     Wrench,
 )
-from tests.imu.robots import with_imu
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 
@@ -337,30 +333,3 @@ def test_status_before_anything_was_heard_is_finite(planner: Planner) -> None:
     assert status.wrench_seq == -1
     assert status.state_seq == status.state_age_ns == (-1,) * 6
     assert np.isfinite([*status.p, *status.p_ref, *status.closure]).all()
-
-
-def attitude(roll: float, seq: int, *, valid: bool = True) -> Attitude:
-    up = (0.0, math.sin(roll), math.cos(roll))
-    return Attitude(t_ns=0, seq=seq, up=up, rate=(0.0, 0.0, 0.0), valid=valid, age_ns=0)
-
-
-@pytest.mark.parametrize(
-    ("valid", "late_ms", "heeded"),
-    [(True, 0.0, True), (True, 99.0, True), (True, 101.0, False), (False, 0.0, False)],
-)
-def test_an_attitude_is_heeded_while_it_is_fresh_and_valid(
-    robot: RobotConfig, q: Array, valid: bool, late_ms: float, heeded: bool
-) -> None:
-    planner = Planner(with_imu(robot, stale_ms=100.0), SESSION)
-    hear_all(planner, q, START_NS)
-    planner.hear_attitude(attitude(0.0, 1), START_NS)
-    planner.tick(START_NS)
-    before = planner.status(START_NS, 0.0)
-    assert before.attitude_seq == 1
-    planner.hear_attitude(attitude(0.05, 2, valid=valid), START_NS + 1)
-    later = START_NS + 1 + round(late_ms * NS_PER_MS)
-    hear_all(planner, q, later, seq=2)
-    planner.tick(later)
-    after = planner.status(later, 0.0)
-    assert after.attitude_seq == 2
-    assert (after.slope != before.slope) is heeded
