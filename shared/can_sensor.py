@@ -7,7 +7,7 @@ from typing import Final, Generic, Protocol, TypeVar
 
 import can
 
-from shared.clock import NS_PER_MS
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import ConfigError
 
 S = TypeVar("S")
@@ -18,6 +18,14 @@ RETRY_NS: Final = 200 * NS_PER_MS
 
 DRAIN_MAX: Final = 1024
 """Most frames taken in one read, so that a flooded bus cannot hold up the loop."""
+
+
+def pause_ns(stale_ms: float, rate_hz: float) -> int:
+    """Return the time between two reads that counts as a pause, ns.
+
+    At a low rate every read comes later than `stale_ms`: two periods are no pause.
+    """
+    return round(max(stale_ms * NS_PER_MS, 2.0 * NS_PER_S / rate_hz))
 
 
 class Assembler(Protocol[S_co]):
@@ -40,7 +48,7 @@ class CanSensor(Generic[S]):
     def __init__(
         self, interface: str, channel: str, assembler: Assembler[S], *, pause_ns: int
     ) -> None:
-        """Prepare; the link is opened by the first `read`.
+        """Prepare; the link is opened by the first `newest`.
 
         Args:
             interface: python-can's name of the interface.
@@ -99,7 +107,7 @@ class CanSensor(Generic[S]):
         return sample
 
     def close(self) -> None:
-        """Release the link; a later `read` would open it again."""
+        """Release the link; a later `newest` would open it again."""
         if self._bus is not None:
             # The link may be the very thing that is broken.
             with contextlib.suppress(can.CanError, OSError):

@@ -242,7 +242,7 @@ class ImuConfig(Section, frozen=True):
     """False: the robot has none, its service is not started, and the floor is taken as level."""
     bus: str = "imu"
     rate_hz: Rate = 100.0
-    """Of the sensor's samples, and of the service."""
+    """Rate of the sensor's samples and of the service's cycles."""
     mounting: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
     """Roll, pitch and yaw of the sensor on the torso, rad: R = Rz(yaw) Rx(roll) Ry(pitch)."""
     stale_ms: Milliseconds = 100.0

@@ -34,7 +34,7 @@ class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     D_B: LegDamping
     """Local damping, N m s/rad, the same in every pose."""
     coupling_bandwidth_hz: Annotated[float, Range(0.1, 100.0, "Hz")]
-    """Of the two poles of tau_coupled."""
+    """Bandwidth of the two poles of tau_coupled."""
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
     """Up to this the loop is stable; less is always safe."""
     coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]

@@ -26,7 +26,7 @@ STATUS_ID: Final = 0x11
 QUATERNION_ID: Final = 0x21
 RATE_ID: Final = 0x32
 VALID: Final = 0x2
-"""Of the status word."""
+"""Bit of the status word: the orientation is valid."""
 SELF_TEST_OK: Final = 0x1
 
 _QUATERNION_SCALE: Final = 2.0**15

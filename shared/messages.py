@@ -236,7 +236,7 @@ class Attitude(Message, frozen=True):
     up: Vector3
     """Unit vector against gravity, torso axes."""
     rate: Vector3
-    """Of the torso, rad/s, torso axes."""
+    """Angular velocity of the torso, rad/s, torso axes."""
     valid: bool
     """False while the sensor is silent or says that it does not know: the numbers are then the
     last good ones."""

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import shutil
+from pathlib import Path
 
 import pytest
 
+from shared.exceptions import ConfigError
+from shared.gain_schedule import path_beside
+from shared.process import DEFAULT_CONFIG
 from shared.scenario import FAULT_KINDS, Fault
 from tools.runs import experiment
 
@@ -51,3 +56,14 @@ def test_several_faults_can_be_asked_for() -> None:
         parse("--fault", "knee_left:encoder@1", "--fault", "hip_left:watchdog@2")
     )
     assert [(row.module, row.at) for row in story.fault] == [("knee_left", 1.0), ("hip_left", 2.0)]
+
+
+def test_an_imu_is_not_fitted_to_a_robot_without_a_bus_for_it(tmp_path: Path) -> None:
+    """An older file: its log would hold a robot that nothing reads."""
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8")
+    older = tmp_path / "robot.toml"
+    older.write_text(text.replace("[can.imu]", "[can.spare]"), encoding="utf-8")
+    shutil.copy(path_beside(DEFAULT_CONFIG), path_beside(older))
+    assert not experiment.load_robot(older).imu.fitted
+    with pytest.raises(ConfigError, match=r"imu\.bus"):
+        experiment.load_robot(older, imu=True)

@@ -206,3 +206,8 @@ def test_a_percent_sign_in_a_path_reaches_supervisord_unharmed(run_dir: Path) ->
     text = supervisor_config(RunDir(run_dir), odd, no_restart=frozenset({"recorder"}))
     assert "'50 %% off'" in text
     assert "autorestart=false" in text
+
+
+def test_the_service_of_an_imu_that_is_not_fitted_is_refused(run_dir: Path) -> None:
+    with pytest.raises(FleetError, match="imu: this robot has none"):
+        plan(run_dir, services=["imu"])

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import math
 import random
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from shared.config import RobotConfig
 from tools import cli
 from tools.sweeps import plants, robust
 from tools.sweeps.figures import Ending
-from tools.sweeps.robust_trial import KINDS, draw, row_of, run_trial, story_of
+from tools.sweeps.robust_trial import KINDS, draw, plant_of, row_of, run_trial, story_of
 
 
 def rows_by(cause: str, n: int = 60) -> list[dict[str, object]]:
@@ -75,3 +77,21 @@ def test_errors_are_told_as_one_number_each() -> None:
     errors = plants.errors_of(plants.draw("one"))
     assert set(errors) == {row.key for row in plants.shipped().error}
     assert "drivetrain.stiffness" in plants.ranges_words(errors)
+
+
+def test_an_impossible_slope_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["sweep", "robust", "--slope", "40"]) == 2
+    assert "--slope 40" in capsys.readouterr().err
+
+
+def test_a_slope_that_is_asked_for_has_its_size_and_any_direction_and_all_else_as_drawn() -> None:
+    angles = []
+    for number in range(40):
+        plain, sloping = plant_of(draw(1, number)), plant_of(draw(1, number, 1.0, 5.0))
+        x, y = sloping.floor.slope
+        assert math.hypot(x, y) == pytest.approx(math.radians(5.0), abs=1e-5)
+        angles.append(math.atan2(y, x))
+        floor = msgspec.structs.replace(sloping.floor, slope=plain.floor.slope)
+        assert msgspec.structs.replace(sloping, floor=floor) == plain
+    assert min(angles) < -2.0
+    assert max(angles) > 2.0

@@ -8,7 +8,7 @@ from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
 from services.harness.sensor import CanHarnessSensor
 from shared import bus, log, process, topics
-from shared.clock import NS_PER_MS, NS_PER_S
+from shared.can_sensor import pause_ns
 from shared.config import RobotConfig, expand
 from shared.config_file import load
 from shared.messages import TareRequest, Wrench
@@ -57,9 +57,8 @@ def make_sensor(config: RobotConfig, run_dir: Path) -> CanHarnessSensor:
     """Return the sensor on the bus that the robot file names."""
     harness = config.harness
     link = config.can[harness.bus]
-    # At a low rate every read comes later than stale_ms: two periods are no pause.
-    pause_ns = max(harness.stale_ms * NS_PER_MS, 2.0 * NS_PER_S / harness.rate_hz)
-    return CanHarnessSensor(link.interface, expand(link.channel, run_dir), pause_ns=round(pause_ns))
+    pause = pause_ns(harness.stale_ms, harness.rate_hz)
+    return CanHarnessSensor(link.interface, expand(link.channel, run_dir), pause_ns=pause)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,7 @@ from pathlib import Path
 from services.imu.attitude import AttitudeLaw
 from services.imu.loop import ImuLoop
 from shared import bus, log, process, topics
-from shared.can_sensor import CanSensor
-from shared.clock import NS_PER_MS, NS_PER_S
+from shared.can_sensor import CanSensor, pause_ns
 from shared.config import RobotConfig, expand
 from shared.config_file import load
 from shared.imu_can import ImuAssembler, ImuSample
@@ -54,10 +53,8 @@ def make_sensor(config: RobotConfig, run_dir: Path) -> CanSensor[ImuSample]:
     """Return the sensor on the bus that the robot file names."""
     imu = config.imu
     link = config.can[imu.bus]
-    # At a low rate every read comes later than stale_ms: two periods are no pause.
-    pause_ns = max(imu.stale_ms * NS_PER_MS, 2.0 * NS_PER_S / imu.rate_hz)
-    channel = expand(link.channel, run_dir)
-    return CanSensor(link.interface, channel, ImuAssembler(), pause_ns=round(pause_ns))
+    channel, pause = expand(link.channel, run_dir), pause_ns(imu.stale_ms, imu.rate_hz)
+    return CanSensor(link.interface, channel, ImuAssembler(), pause_ns=pause)
 
 
 if __name__ == "__main__":

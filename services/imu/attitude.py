@@ -19,7 +19,7 @@ from shared.imu_can import ImuSample
 from shared.messages import Vector3, Vector4
 
 UNIT_TOLERANCE: Final = 0.02
-"""Of a quaternion's length; rounding to 2^-15 makes 6e-5."""
+"""How far a quaternion's length may be from 1; rounding to 2^-15 makes 6e-5."""
 
 Rotation = tuple[Vector3, Vector3, Vector3]
 """Rows."""

@@ -173,7 +173,7 @@ class JointController:
         fifth 19.8. One whose phi alone is stiff is left as it is: half of that is on its theta.
         In DAMP a drive that is left goes on sinking.
         """
-        if self.failsafe.mode is Mode.DAMP:
+        if self.failsafe.mode is Mode.DAMP or self._unled_share == 0.0:
             return self._setpoint
         return law.stiffened(self._setpoint, self._hold_k_p, self._hold_k_d, self._unled_share)
 

@@ -63,7 +63,7 @@ class LawOutput(NamedTuple):
     assist: float
     """N"""
     slope: Pair
-    """Of the floor along x and y, rad."""
+    """The floor's rise along x and y, rad."""
     ik_iterations: int
     ik_residual: float
 

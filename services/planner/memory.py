@@ -48,7 +48,7 @@ class LawMemory(msgspec.Struct, frozen=True):
     coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS)
     """Of `CouplingFilter`, N m."""
     levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
-    """Of `Levelling`, rad."""
+    """Whether a slope is known, and the slope, rad: the memory of `Levelling`."""
 
 
 class TickMemory(msgspec.Struct, frozen=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,11 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.planner.poses import Poses
-from services.planner.push_limit import DIRECTIONS, LoadedStand
+from services.planner.push_limit import DIRECTIONS, LoadedStand, slope_pulling
 from services.simulator.body import body_of
 from services.simulator.plant import NAMED, changed
 from services.simulator.world import World
-from shared.config import RobotConfig
+from shared.config import GRAVITY, RobotConfig
 from shared.joints import N_JOINTS, N_LEG
 from shared.scenario import Keyframe, Push, Scenario
 
@@ -121,3 +122,9 @@ def test_the_planner_adds_to_what_is_held(robot: RobotConfig, poses: dict[float,
         alone = posed.stand.limit_held(STIFF, (0.0, 1.0))
         led = posed.stand.limit_held(STIFF, (0.0, 1.0), K_c)
         assert led.force_n > alone.force_n
+
+
+def test_a_slope_pulls_by_its_sine_of_the_weight(robot: RobotConfig) -> None:
+    weight = robot.total_mass * GRAVITY
+    assert slope_pulling(robot, weight * math.sin(0.07)) == pytest.approx(0.07)
+    assert slope_pulling(robot, 2.0 * weight) == pytest.approx(math.pi / 2)

@@ -67,9 +67,9 @@ class BusHeard(msgspec.Struct):
     samples_s: list[float] = []
     """When they came."""
     malformed: int = 0
-    """Load-cell frames that were out of order or too short."""
+    """Frames of a sensor that were out of order or too short."""
     attitudes: list[ImuSample] = []
-    """Of the IMU."""
+    """Samples of the IMU."""
     attitudes_s: list[float] = []
     """When they came."""
 
@@ -164,7 +164,7 @@ def _take_in(bus: can.BusABC, heard: BusHeard, seconds: float, *, cells: bool, i
             elif len(message.data) == _FRAME_BYTES:
                 _of_node(message, heard.nodes)
     heard.seconds = time.monotonic() - begun
-    heard.malformed = assembler.malformed
+    heard.malformed = assembler.malformed + orientation.malformed
 
 
 def _of_node(message: can.Message, nodes: dict[int, NodeHeard]) -> None:

@@ -64,24 +64,14 @@ def harness_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
         fix = "the amplifier's supply and wires; its frames are in shared/loadcell_can.py"
         why = "no assist force, no easing, no stop at overload"
         return [wrong(subject, "load cells", f"{heard.frames} other frames", wanted, fix, why)]
-    period = period_ms(heard.samples_s, 1e3 / harness.rate_hz)
-    rate_hz = 1e3 / period if period else 0.0
-    near = abs(rate_hz / harness.rate_hz - 1.0) <= RATE_SHARE
     fix = "the amplifier's rate, or `harness.rate_hz`"
-    rows = [
-        judged(
-            near, subject, "load cells", f"{rate_hz:.0f} Hz", wanted, fix, otherwise=Verdict.WARNING
-        )
-    ]
+    rows = [_rate_row(subject, "load cells", heard.samples_s, harness.rate_hz, fix)]
     largest = max(abs(force) for sample in heard.samples for force in sample)
     good = largest < harness.leg_force_max  # NaN is not
     fix = "unload the harness; a cell that stays there is broken, or its wire"
     found, limit = f"{largest:.0f} N", f"< {harness.leg_force_max:g} N"
     rows.append(judged(good, subject, "largest force", found, limit, fix, "saturated, not valid"))
-    if heard.malformed:
-        fix = "frames are lost: wires, 120 ohm at both ends"
-        rows.append(warning(subject, "frames out of order", str(heard.malformed), "none", fix))
-    return rows
+    return rows + _lost_frames(subject, heard)
 
 
 def imu_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
@@ -94,19 +84,33 @@ def imu_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
     why = "the floor is taken as level"
     if not heard.attitudes:
         fix = "its supply and wires, its CAN output; its frames are in shared/imu_can.py"
-        return [wrong(subject, "samples", f"{heard.frames} other frames", wanted, fix, why)]
-    period = period_ms(heard.attitudes_s, 1e3 / imu.rate_hz)
-    rate_hz = 1e3 / period if period else 0.0
-    near = abs(rate_hz / imu.rate_hz - 1.0) <= RATE_SHARE
+        found = f"{heard.frames} frames that make none"
+        return [wrong(subject, "samples", found, wanted, fix, why)]
     fix = "its output rate, or `imu.rate_hz`"
-    found = f"{rate_hz:.0f} Hz"
-    rows = [judged(near, subject, "samples", found, wanted, fix, otherwise=Verdict.WARNING)]
+    rows = [_rate_row(subject, "samples", heard.attitudes_s, imu.rate_hz, fix)]
     known = sum(sample.valid for sample in heard.attitudes)
     found = f"{known} of {len(heard.attitudes)} samples"
     fix = "leave it still for a minute; its status word says that its filter has not settled"
     good = known == len(heard.attitudes)
     rows.append(judged(good, subject, "orientation valid", found, "all", fix, why))
-    return rows
+    return rows + _lost_frames(subject, heard)
+
+
+def _rate_row(subject: str, what: str, times_s: list[float], wanted_hz: float, fix: str) -> Row:
+    """Judge the rate at which a sensor's samples came."""
+    period = period_ms(times_s, 1e3 / wanted_hz)
+    rate_hz = 1e3 / period if period else 0.0
+    near = abs(rate_hz / wanted_hz - 1.0) <= RATE_SHARE
+    found, wanted = f"{rate_hz:.0f} Hz", f"{wanted_hz:g} Hz"
+    return judged(near, subject, what, found, wanted, fix, otherwise=Verdict.WARNING)
+
+
+def _lost_frames(subject: str, heard: BusHeard) -> list[Row]:
+    """Tell of a sensor's frames that were out of order: others were lost."""
+    if not heard.malformed:
+        return []
+    fix = "frames are lost: wires, 120 ohm at both ends"
+    return [warning(subject, "frames out of order", str(heard.malformed), "none", fix)]
 
 
 def positions(robot: RobotConfig, module: str, heard: BusHeard) -> tuple[float, float] | None:

@@ -188,9 +188,11 @@ def select(
         services: names; each is then started at once, whatever its row says. None for all.
 
     Raises:
-        FleetError: a name is not in the table.
+        FleetError: a name is not in the table, or the IMU's on a robot without one.
     """
     check_known(services or (), [row.name for row in table.process])
+    if "imu" in (services or ()) and not imu:
+        raise FleetError("imu: this robot has none; `fitted` of [imu] in the robot file says so")
     wanted = {"": True, "simulation": simulation, "injected": injected, "imu": imu}
     rows = [row for row in table.process if wanted[row.only]]
     if services is None:

@@ -43,7 +43,7 @@ DELAY_MAX_MS: Final = 12
 DAMPING: Final = (0.1, 6.0)
 """Factor on each joint's D_B, log-uniform, the legs alike."""
 BANDWIDTH_HZ: Final = (1.0, 20.0)
-"""Of tau_coupled, log-uniform."""
+"""Bandwidth of tau_coupled, log-uniform."""
 COUPLING: Final = (0.3, 6.0)
 """What tau_coupled fills the damping up to, in shares of B_p, log-uniform."""
 
@@ -94,7 +94,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     late_rad_s: float
     ended: str
     """tracked, left (a module left TRACK), fell, or unready: it did not stand and track with the
-    shipped gains, and nothing was tried."""
+    shipped gains where the certificate could be asked, and nothing was tried."""
 
     @property
     def said_stable(self) -> bool:
@@ -210,6 +210,8 @@ def run_trial(trial: Trial, robot: RobotConfig) -> Outcome:
                 return UNREADY
         if said is None and row.scenario_s >= TAKEN_OVER_S:
             said = _said(fleet, other, trial)
+            if said is None:
+                return UNREADY
             _take_over(fleet, other)
         if row.scenario_s >= TAP_S + TAP_LASTS_S:
             rates.append(float(np.mean([np.square(c.samples.v) for c in fleet.controllers])))
@@ -240,8 +242,8 @@ def _take_over(fleet: Lockstep, robot: RobotConfig) -> None:
     fleet.planner.recall(before.remember())
 
 
-def _said(fleet: Lockstep, robot: RobotConfig, trial: Trial) -> Outcome:
-    """Ask the certificate about where the robot is now."""
+def _said(fleet: Lockstep, robot: RobotConfig, trial: Trial) -> Outcome | None:
+    """Ask the certificate about where the robot is now; None: no level stand is near."""
     assert fleet.planner is not None  # noqa: S101 - nobody kills it
     schedule = robot.gain_schedule
     assert schedule is not None  # noqa: S101 - `load_robot` has seen to it
@@ -249,7 +251,10 @@ def _said(fleet: Lockstep, robot: RobotConfig, trial: Trial) -> Outcome:
     z, pitch = status.p[2], status.p[4]
     commands = [controller.failsafe.command for controller in fleet.controllers]
     D = np.ravel([command.k_p for command in commands if command is not None])
-    node = nodes_of(robot, lambda _z, _pitch: D, np.array([z]), np.array([pitch]))[0]
+    nodes = nodes_of(robot, lambda _z, _pitch: D, np.array([z]), np.array([pitch]))
+    if not nodes:
+        return None
+    node = nodes[0]
     hand = robot.simulation.operator
     certificate = DynamicCertificate(robot, [node])
     verdicts = [

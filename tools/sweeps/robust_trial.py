@@ -49,7 +49,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
     beyond: float
     """Times the ranges of `deploy/plants/ranges.toml`."""
     slope_deg: float
-    """Of the floor, in a direction that is drawn; 0: as the ranges have it."""
+    """The floor's slope, in a direction that is drawn; 0: as the ranges have it."""
     kind: str
     kill_s: float
     delay_ms: float
