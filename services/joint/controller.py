@@ -24,7 +24,7 @@ from shared.config import RobotConfig
 from shared.joints import kind_of
 from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Pair
 
-UNLED_SHARE = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
+UNLED_SHARE = {"ankle": 1.0, "knee": 0.11, "hip": 0.0}
 """How far a drive's gains rise to HOLD's while its service leads; `left_holding` says why."""
 
 
@@ -52,6 +52,7 @@ class JointController:
         self._sinks = (False, kind_of(module) in service.damp_sinks)
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
         self._unled_share = UNLED_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
+        self._hold_slip = config.hold_slip(module)
         knee = kind_of(module) == "knee"
         self._damp_stop = service.damp_knee_stop if knee else -math.inf
         self._gear_ratio = config.joint.gear_ratio
@@ -73,6 +74,8 @@ class JointController:
         self._resumed_ns = 0
         self._braced_ns = 0
         """Since when HOLD rises to all stand gains, for another may be limp; 0: it does not."""
+        self._loosened_ns = 0
+        """Since when a hip lets go what HOLD adds to its theta; 0: it does not."""
         self._cause = 0
         self.tau: Pair = law.ZERO
         self.cycle = 0
@@ -116,6 +119,8 @@ class JointController:
             self._enter(now_ns, before)
         if not self._braced_ns and failsafe.asks_to_brace:
             self._braced_ns = now_ns
+        if not self._loosened_ns and failsafe.asks_to_loosen:
+            self._loosened_ns = now_ns
         self._setpoint = self._evaluate(now_ns)
         tau_before = self.tau
         if failsafe.mode in (Mode.DISARMED, Mode.FAULT):
@@ -226,6 +231,7 @@ class JointController:
             self._residual,
             self._resumed_ns,
             self._braced_ns,
+            self._loosened_ns,
         )
 
     def recall(self, memory: ControllerMemory) -> None:
@@ -239,7 +245,7 @@ class JointController:
         self._damp_stop = -math.inf if m.damp_stop is None else m.damp_stop
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
         self._residual, self._resumed_ns = m.residual, m.resumed_ns
-        self._braced_ns = m.braced_ns
+        self._braced_ns, self._loosened_ns = m.braced_ns, m.loosened_ns
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""
@@ -267,7 +273,7 @@ class JointController:
     def _enter(self, now_ns: int, before: Mode) -> None:
         """Take the anchor of the new mode: what was in force until now, frozen."""
         self._changed_ns = now_ns
-        self._braced_ns = 0
+        self._braced_ns = self._loosened_ns = 0
         k_p, k_d = self._stand_k_p, self._stand_k_d
         if before is Mode.DISARMED and self._found_tau is not None:
             q, v = self._samples.q, self._samples.v
@@ -296,7 +302,7 @@ class JointController:
             fresh = law.aged(command, min(age_s, self._aging_max_s))
             if since_ns >= self._blend_ns:
                 return fresh
-            return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
+            return law.blend(self._held(now_ns), fresh, since_ns / self._blend_ns)
         if mode is Mode.DAMP:
             share = max(0.0, 1.0 - since_ns / self._damp_fade_ns)
             risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
@@ -306,18 +312,31 @@ class JointController:
             if self._samples.q[1] < self._damp_stop:
                 return law.caught(sunk, self._damp_stop, self._stand_k_p[1], self._stand_k_d[1])
             return sunk
-        held = self._held(since_ns)
+        held = self._held(now_ns)
         if self._braced_ns:
             risen = min(1.0, (now_ns - self._braced_ns) / self._blend_ns)
             return law.stiffened(held, self._stand_k_p, self._stand_k_d, risen)
         return held
 
-    def _held(self, since_ns: int) -> Setpoint:
-        """Return HOLD's law: the anchor frozen; some gains rise to the stand gains."""
+    def _held(self, now_ns: int) -> Setpoint:
+        """Return HOLD's law: the anchor frozen; some gains rise to the stand gains, hips slip."""
+        since_ns = now_ns - self._changed_ns
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._blend_ns)
-        frozen = law.held(self._anchor, moving)
-        return law.stiffened(frozen, self._hold_k_p, self._hold_k_d, risen)
+        k_p, k_d = self._hold_k_p, self._hold_k_d
+        if self._loosened_ns:
+            left = max(0.0, 1.0 - (now_ns - self._loosened_ns) / self._blend_ns)
+            k_p, k_d = (k_p[0], left * k_p[1]), (k_d[0], left * k_d[1])
+        held = law.stiffened(law.held(self._anchor, moving), k_p, k_d, risen)
+        slips = self._hold_slip > 0.0 and self.failsafe.mode is Mode.HOLD
+        if not slips or self._braced_ns:  # a strut's hip does not slip
+            return held
+        # from all that a motor gives, for what it carried as it came to HOLD is not to jump
+        slip = self._hold_slip + (1.0 - risen) * self._limits.tau_module_max
+        slipped = law.slipped(held, self._samples.q[1], slip)
+        if slipped is not held:
+            self._anchor = msgspec.structs.replace(self._anchor, q_ref=slipped.q_ref)
+        return slipped
 
     def _event(self, now_ns: int, before: Mode, cause: Cause, tau_before: Pair) -> JointEvent:
         self._events += 1

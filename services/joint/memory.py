@@ -37,6 +37,7 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     residual: Pair = law.ZERO
     resumed_ns: int = 0
     braced_ns: int = 0
+    loosened_ns: int = 0
 
 
 class ModuleMemory(msgspec.Struct, frozen=True):

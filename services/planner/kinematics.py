@@ -8,6 +8,8 @@ equations stand in `services.planner.symbolic`.
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,8 +17,14 @@ from services.planner import symbolic
 from services.planner.model import leg_geometry
 from shared.compiled_graph import CompiledGraph
 from shared.config import RobotConfig
+from shared.config_sections import GeometryConfig, LawConfig, MassConfig
 
 Array = NDArray[np.float64]
+
+
+_GRAPHS: Final[dict[tuple[MassConfig, GeometryConfig, LawConfig], symbolic.Graphs]] = {}
+"""A process builds the graphs of a robot once: that takes a tenth of a second."""
+_GRAPHS_KEPT: Final = 16
 
 
 class Kinematics:
@@ -34,7 +42,7 @@ class Kinematics:
 
     def __init__(self, config: RobotConfig) -> None:
         """Build the graphs from the generated model."""
-        graphs = symbolic.build(config, leg_geometry(config))
+        graphs = _graphs_of(config)
         self._sharing = CompiledGraph(graphs.sharing)
         self._pose = CompiledGraph(graphs.pose)
         self._hessian = CompiledGraph(graphs.hessian)
@@ -83,3 +91,12 @@ class Kinematics:
         at_harness[:] = F_harness
         self._hessian()
         return self._hessian.results[0]
+
+
+def _graphs_of(config: RobotConfig) -> symbolic.Graphs:
+    key = (config.mass, config.geometry, config.law)
+    if key not in _GRAPHS:
+        if len(_GRAPHS) == _GRAPHS_KEPT:
+            del _GRAPHS[next(iter(_GRAPHS))]
+        _GRAPHS[key] = symbolic.build(config, leg_geometry(config))
+    return _GRAPHS[key]

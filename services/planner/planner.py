@@ -255,7 +255,7 @@ class Planner:
         )
         brace = self._brace
         return [
-            _command(common, state.t_ns, rows, brace=brace.of(module))
+            _command(common, state.t_ns, rows, brace=brace.of(module), loosen=brace.loosens(module))
             for module, state, rows in zip(MODULES, states, by_module, strict=True)
         ]
 
@@ -308,7 +308,7 @@ class _Common(NamedTuple):
 
 
 def _command(
-    common: _Common, echo_t_ns: int, rows: list[list[float]], *, brace: bool
+    common: _Common, echo_t_ns: int, rows: list[list[float]], *, brace: bool, loosen: bool
 ) -> JointCommand:
     pairs: list[Pair] = [(row[0], row[1]) for row in rows]
     return JointCommand(
@@ -327,6 +327,7 @@ def _command(
         margin=common.margins.service,
         margin_onboard=common.margins.onboard,
         brace=brace,
+        loosen=loosen,
     )
 
 
