@@ -91,6 +91,10 @@ Stiffness6 = tuple[
 Selection = Literal[0, 1]
 
 
+ShiftLength = Annotated[float, Range(0.0, 0.1, "m")]
+ShiftAngle = Annotated[float, Range(0.0, 0.3, "rad")]
+
+
 class LawConfig(Section, frozen=True):
     """Gains and choices of the law (design section 3)."""
 
@@ -106,6 +110,7 @@ class LawConfig(Section, frozen=True):
     load_sharing_moment_arms: tuple[Share, Share, Annotated[float, Range(0.001, 0.5, "m")]]
     recentre_s: Seconds
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
+    shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
 
 
 RequiredStiffness6 = tuple[

@@ -16,6 +16,8 @@ Pair = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
+STRAIGHT: Vector4 = (0.0, 0.0, 0.0, 0.0)
+"""No shift of x, y, roll and yaw."""
 Modules = tuple[int, int, int, int, int, int]
 """One integer for each module, in `shared.joints.MODULES` order."""
 
@@ -290,6 +292,8 @@ class PlannerStatus(Message, frozen=True):
     """Sequence number of the attitude that this tick knew; -1: none yet."""
     slope: Pair = (0.0, 0.0)
     """Rise of the floor along x and y that the law reckons with, rad."""
+    shift_wanted: Vector4 = STRAIGHT
+    """What the operator asked for, as this tick took it: x, y, m, roll, yaw, rad."""
 
 
 class OperatorIntent(Message, frozen=True):
@@ -297,6 +301,9 @@ class OperatorIntent(Message, frozen=True):
 
     assist_n: float
     """Upward force wanted at the harness, N."""
+    shift: Vector4 = STRAIGHT
+    """Where the closed directions are wanted, off a straight stand: COM x and y, m, the torso's
+    roll and yaw, rad."""
 
 
 class Estop(Message, frozen=True):

@@ -19,10 +19,13 @@ from shared.exceptions import ConfigError
 from shared.impairment import Impairment
 from shared.joints import MODULES
 from shared.links import directions_of
+from shared.messages import STRAIGHT, Vector4
 from shared.toml_file import Range, Section, check_ranges, read_toml
 
 Time = Annotated[float, Range(0.0, 86_400.0, "s")]
 Force = Annotated[float, Range(-2000.0, 2000.0, "N")]
+
+Shift = Annotated[float, Range(-0.3, 0.3, "m or rad")]
 
 SIGNALS = ("KILL", "STOP", "TERM", "INT")
 """What a kill can send; STOP freezes the process instead."""
@@ -36,6 +39,8 @@ class Keyframe(Section, frozen=True):
     pitch: Annotated[float, Range(-1.5, 1.5, "rad")] = 0.0
     assist: Annotated[float, Range(0.0, 500.0, "N")] = 0.0
     """Weight that the operator rests on the harness and asks the robot to carry, N."""
+    shift: tuple[Shift, Shift, Shift, Shift] = STRAIGHT
+    """Where the operator asks COM x and y, m, and the torso's roll and yaw, rad, to be."""
 
 
 class Push(Section, frozen=True):
@@ -154,6 +159,8 @@ class Lead(NamedTuple):
     pitch_rate: float
     assist: float
     """N"""
+    shift: Vector4
+    """x, y, m; roll, yaw, rad."""
 
 
 def lead(scenario: Scenario, t: float) -> Lead:
@@ -161,7 +168,7 @@ def lead(scenario: Scenario, t: float) -> Lead:
     frames = scenario.keyframe
     if t <= frames[0].at:
         first = frames[0]
-        return Lead(first.height, 0.0, first.pitch, 0.0, first.assist)
+        return Lead(first.height, 0.0, first.pitch, 0.0, first.assist, first.shift)
     for a, b in pairwise(frames):
         if t < b.at:
             span = b.at - a.at
@@ -174,9 +181,17 @@ def lead(scenario: Scenario, t: float) -> Lead:
                 a.pitch + (b.pitch - a.pitch) * s,
                 (b.pitch - a.pitch) * s_rate,
                 a.assist + (b.assist - a.assist) * s,
+                _eased(a.shift, b.shift, s),
             )
     last = frames[-1]
-    return Lead(last.height, 0.0, last.pitch, 0.0, last.assist)
+    return Lead(last.height, 0.0, last.pitch, 0.0, last.assist, last.shift)
+
+
+def _eased(a: Vector4, b: Vector4, s: float) -> Vector4:
+    if a == b:
+        return a
+    x, y, roll, yaw = (start + (end - start) * s for start, end in zip(a, b, strict=True))
+    return x, y, roll, yaw
 
 
 def push_at(scenario: Scenario, t: float) -> tuple[float, float, float]:

@@ -119,7 +119,7 @@ OPERATOR_INTENT: Final = Topic(
     rate_hz=50.0,
     priority=Priority.DATA,
     recorded=True,
-    why="the assist the person asks for",
+    why="the assist that the person asks for, and where the robot is to lean or turn",
 )
 ESTOP: Final = Topic(
     name="estop",

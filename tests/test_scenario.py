@@ -29,6 +29,7 @@ from tests.conftest import ROBOT_FILE
 SHIPPED = sorted((ROBOT_FILE.parent / "scenarios").glob("*.toml"))
 SQUAT = ROBOT_FILE.parent / "scenarios" / "squat.toml"
 CRAWL = ROBOT_FILE.parent / "scenarios" / "crawl.toml"
+SHIFT = ROBOT_FILE.parent / "scenarios" / "shift.toml"
 
 Table = dict[str, Any]
 RAW: Table = {
@@ -157,23 +158,25 @@ def test_lead_passes_through_every_keyframe_at_rest(path: Path) -> None:
         at = lead(shipped, frame.at)
         assert (at.height, at.pitch) == pytest.approx((frame.height, frame.pitch))
         assert at.assist == pytest.approx(frame.assist)
+        assert at.shift == pytest.approx(frame.shift)
         assert (at.height_rate, at.pitch_rate) == pytest.approx((0.0, 0.0), abs=1e-12)
 
 
-@pytest.mark.parametrize("path", [SQUAT, CRAWL], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [SQUAT, CRAWL, SHIFT], ids=lambda path: path.stem)
 def test_lead_and_its_rates_are_continuous_and_fit_each_other(path: Path) -> None:
     shipped = scenario.load(path)
     dt = 1e-4
     times = np.arange(-1.0, shipped.duration + 1.0, dt)
-    rows = np.array([lead(shipped, t) for t in times])
-    height, height_rate, pitch, pitch_rate, assist = rows.T
+    rows = np.array([(*lead(shipped, t)[:5], *lead(shipped, t).shift) for t in times])
+    height, height_rate, pitch, pitch_rate, assist, *shift = rows.T
     for value, rate in ((height, height_rate), (pitch, pitch_rate)):
         assert np.abs(rate).max() > 0.0 or not np.ptp(value)
         middle = 0.5 * (rate[1:] + rate[:-1])
         np.testing.assert_allclose(np.diff(value) / dt, middle, atol=1e-6)
         assert np.abs(np.diff(rate)).max() < 10.0 * dt
     assert np.abs(np.diff(assist)).max() < 200.0 * dt
-    assert np.ptp(height) > 0.2
+    assert np.abs(np.diff(shift)).max() < 0.2 * dt
+    assert np.ptp(height) > 0.1
 
 
 def test_squat_is_the_cosine_of_the_reference_scenario() -> None:
@@ -201,7 +204,7 @@ def test_squat_kills_the_planner_and_pushes_as_in_the_reference_scenario() -> No
 def test_crawl_is_the_reference_scenarios() -> None:
     crawl = scenario.load(CRAWL)
     for t in (5.0, 7.5, 10.0):
-        assert lead(crawl, t) == pytest.approx((0.79, 0.0, 1.2, 0.0, 200.0), abs=1e-12)
+        assert lead(crawl, t)[:5] == pytest.approx((0.79, 0.0, 1.2, 0.0, 200.0), abs=1e-12)
     assert lead(crawl, 15.0).height == pytest.approx(1.188)
 
 
@@ -209,9 +212,9 @@ def test_lead_waits_at_the_first_keyframe_and_stays_at_the_last() -> None:
     frames = (Keyframe(at=1.0, height=1.1), Keyframe(at=3.0, height=0.9, pitch=0.4))
     two = Scenario(name="two", about="", duration=10.0, keyframe=frames)
     for t in (-5.0, 0.0, 1.0):
-        assert lead(two, t) == (1.1, 0.0, 0.0, 0.0, 0.0)
+        assert lead(two, t)[:5] == (1.1, 0.0, 0.0, 0.0, 0.0)
     for t in (3.0, 100.0):
-        assert lead(two, t) == (0.9, 0.0, 0.4, 0.0, 0.0)
+        assert lead(two, t)[:5] == (0.9, 0.0, 0.4, 0.0, 0.0)
 
 
 def test_one_keyframe_is_a_stand() -> None:

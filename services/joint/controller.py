@@ -48,7 +48,7 @@ class JointController:
         self.timing = timing_of(config)
         self._limits = limits_of(config, module)
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
-        self._damp_k_d = service.damp_k_d
+        self._damp_k_d, self._damp_fade_ns = service.damp_k_d, service.damp_fade_s * NS_PER_S
         self._sinks = (False, kind_of(module) in service.damp_sinks)
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
         self._unled_share = UNLED_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
@@ -59,7 +59,6 @@ class JointController:
         self._aging_max_s = service.command_aging_max_ms / 1e3
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
         self._blend_ns = service.blend_ms * NS_PER_MS
-        self._damp_fade_ns = service.damp_fade_s * NS_PER_S
         self._period_late_ns = round(2 * NS_PER_S / service.rate_hz)
         self._anchor: Setpoint = law.stand(law.ZERO, self._stand_k_p, self._stand_k_d)
         """The setpoint at the last change of state: what HOLD holds and TRACK blends from."""
@@ -171,11 +170,10 @@ class JointController:
 
         An ankle's gains rise to all of HOLD's. On TRACK's own, with no more than 4 N m s/rad on
         its phi, a push from the side rang on by 0.72 each half swing with all six services dead,
-        and 7 of 26 pairs of pushes in step with it fell. A knee's rise to a fifth of HOLD's.
+        and 7 of 26 pairs of pushes in step with it fell. A knee's rise to a ninth of HOLD's.
         With none, a knee whose service froze was soft while the other leg's was stiff, and the
-        robot fell (450 mm); with a fifth it moves by 23 mm. With all of it the hand feels the
-        drive's gains that the service takes off 2 ms late: 26 N in the squat for 18, with a
-        fifth 19.8. One whose phi alone is stiff is left as it is: half of that is on its theta.
+        robot fell (450 mm). With all of it the hand feels the drive's gains that the service takes
+        off 2 ms late. One whose phi alone is stiff is left as it is: half of that is on its theta.
         In DAMP a drive that is left goes on sinking.
         """
         if self.failsafe.mode is Mode.DAMP or self._unled_share == 0.0:
@@ -321,16 +319,15 @@ class JointController:
     def _held(self, now_ns: int) -> Setpoint:
         """Return HOLD's law: the anchor frozen; some gains rise to the stand gains, hips slip."""
         since_ns = now_ns - self._changed_ns
-        moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._blend_ns)
         k_p, k_d = self._hold_k_p, self._hold_k_d
         if self._loosened_ns:
             left = max(0.0, 1.0 - (now_ns - self._loosened_ns) / self._blend_ns)
             k_p, k_d = (k_p[0], left * k_p[1]), (k_d[0], left * k_d[1])
-        held = law.stiffened(law.held(self._anchor, moving), k_p, k_d, risen)
-        slips = self._hold_slip > 0.0 and self.failsafe.mode is Mode.HOLD
-        if not slips or self._braced_ns:  # a strut's hip does not slip
-            return held
+        frozen = law.held(self._anchor, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
+        held = law.stiffened(frozen, k_p, k_d, risen)
+        if self._hold_slip == 0.0 or self._braced_ns or self.failsafe.mode is not Mode.HOLD:
+            return held  # braced, it is what a strut stands on
         # from all that a motor gives, for what it carried as it came to HOLD is not to jump
         slip = self._hold_slip + (1.0 - risen) * self._limits.tau_module_max
         slipped = law.slipped(held, self._samples.q[1], slip)

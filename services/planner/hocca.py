@@ -31,9 +31,10 @@ from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
 from services.planner.levelling import Levelling
 from services.planner.memory import LawMemory
+from services.planner.shift import ShiftReference
 from services.planner.split import GainSplit, LocalGains
 from shared.config import GRAVITY, RobotConfig
-from shared.messages import Pair, Vector3, Wrench
+from shared.messages import STRAIGHT, Pair, Vector3, Vector4, Wrench
 
 Array = NDArray[np.float64]
 
@@ -84,6 +85,7 @@ class Hocca:
         self._coupling = CouplingFilter(coupling.bandwidth_hz)
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
+        self._shift = ShiftReference(config.law.shift_max)
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
         assist = config.assist
@@ -106,6 +108,7 @@ class Hocca:
         assist_wanted: float,
         dt: float,
         *,
+        shift_wanted: Vector4 = STRAIGHT,
         align: bool = False,
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
@@ -118,13 +121,14 @@ class Hocca:
             assist_wanted: assist force that the operator asks for, N; rate limited here,
                 but for the first tick, which takes over what HOLD carries.
             dt: time since the last tick, s.
+            shift_wanted: where x, y (m), roll and yaw (rad) are asked to be; limited here.
             align: start from the measured pose, so that taking over makes no step: p_C is
                 where the robot is, and glides to zero (COM over the ankles, no roll, no
                 yaw; height and pitch stay) in `law.recentre_s` of ticks without `align`. A
                 planner that has led before starts from zero: where it finds the robot is a
                 sway, and if it is lost again, HOLD would stay where the sway was. A robot
                 held off centre by 25 mm fell at the second push; the modules' blend makes
-                no step of it.
+                no step of it. Where it was asked to be (`shift_wanted`) it stays.
             wrench: of the operator on the torso, if it is fresh and valid.
             up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
@@ -135,10 +139,14 @@ class Hocca:
         self._F_O[:3] = self._weight * up
         if align or not self._aligned:
             self._align(q)
+            shift, shift_rate = self._shift.rest()
         else:
             self._has_led = True
+            shift, shift_rate = self._shift.advance(shift_wanted, dt)
         pdot = measured.J @ v
         p_C, pdot_C = self._closed_loop_reference(dt)
+        p_C += shift
+        pdot_C += shift_rate
         lean = up[:2] / up[2]
         p_C[:2] += lean * measured.p[2]
         pdot_C[:2] += lean * pdot[2]
@@ -208,6 +216,7 @@ class Hocca:
             self._has_led,
             self._coupling.remember(),
             self._levelling.remember(),
+            self._shift.remember(),
         )
 
     def recall(self, memory: LawMemory) -> None:
@@ -220,6 +229,7 @@ class Hocca:
         self._easing.recall(memory.easing)
         self._coupling.recall(memory.coupling)
         self._levelling.recall(memory.levelling)
+        self._shift.recall(memory.shift)
 
     def _align(self, q: Array) -> None:
         self._aligned = True

@@ -81,6 +81,7 @@ class PlannerLoop:
         intent = ports.intent.take()
         if intent is not None:
             planner.hear_assist(intent.assist_n)
+            planner.hear_shift(intent.shift)
         for publisher, command in zip(ports.commands, planner.tick(now), strict=False):
             publisher.put(command)
         ports.status.put(planner.status(now, (now_ns() - now) / NS_PER_US))

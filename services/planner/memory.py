@@ -7,7 +7,15 @@ import msgspec
 from services.planner.bracing import Bracing
 from services.planner.engagement import Engagement
 from shared.joints import N_JOINTS
-from shared.messages import Attitude, JointState, Pair, SplitSource, Wrench
+from shared.messages import (
+    STRAIGHT,
+    Attitude,
+    JointState,
+    Pair,
+    SplitSource,
+    Vector4,
+    Wrench,
+)
 
 
 class AssistMemory(msgspec.Struct, frozen=True):
@@ -34,6 +42,13 @@ class OverloadMemory(msgspec.Struct, frozen=True):
     hold: bool
 
 
+class ShiftMemory(msgspec.Struct, frozen=True):
+    """Of `ShiftReference`: x, y in m, roll, yaw in rad, and their rates."""
+
+    at: Vector4 = STRAIGHT
+    rate: Vector4 = STRAIGHT
+
+
 class LawMemory(msgspec.Struct, frozen=True):
     """Of `Hocca`."""
 
@@ -49,6 +64,7 @@ class LawMemory(msgspec.Struct, frozen=True):
     """Of `CouplingFilter`, N m."""
     levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
     """Whether a slope is known, and the slope, rad: the memory of `Levelling`."""
+    shift: ShiftMemory = ShiftMemory()
 
 
 class TickMemory(msgspec.Struct, frozen=True):
@@ -70,3 +86,4 @@ class TickMemory(msgspec.Struct, frozen=True):
     attitude: Attitude | None = None
     attitude_ns: int = 0
     attitude_seq: int = -1
+    shift_wanted: Vector4 = STRAIGHT

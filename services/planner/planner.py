@@ -6,6 +6,7 @@ re-execution from a log.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_MODULES
 from shared.messages import (
+    STRAIGHT,
     Attitude,
     JointCommand,
     JointState,
@@ -31,6 +33,7 @@ from shared.messages import (
     PlannerStatus,
     SplitSource,
     Vector3,
+    Vector4,
     Vector6,
     Wrench,
 )
@@ -67,6 +70,7 @@ class Planner:
         self._q: Array = np.zeros(N_JOINTS)
         self._v: Array = np.zeros(N_JOINTS)
         self._assist_wanted = 0.0
+        self._shift_wanted = STRAIGHT
         self._wrench: Wrench | None = None
         self._wrench_ns = 0
         harness = config.harness
@@ -114,6 +118,11 @@ class Planner:
         """Take the assist force that the operator asks for, N."""
         self._assist_wanted = assist
 
+    def hear_shift(self, shift: Vector4) -> None:
+        """Take where the operator asks x, y (m), roll and yaw (rad) to be."""
+        if all(math.isfinite(each) for each in shift):
+            self._shift_wanted = shift
+
     def is_due(self, now_ns: int) -> bool:
         """Return True if it is time to tick: as soon as all six have a new state.
 
@@ -157,6 +166,7 @@ class Planner:
             self._v,
             self._assist_wanted,
             dt,
+            shift_wanted=self._shift_wanted,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -184,6 +194,7 @@ class Planner:
             self._attitude,
             self._attitude_ns,
             self._attitude_seq,
+            self._shift_wanted,
         )
 
     def recall(self, memory: TickMemory) -> None:
@@ -192,7 +203,7 @@ class Planner:
         for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
             if state is not None:
                 self.hear_state(module, state, arrived_ns)
-        self._assist_wanted = m.assist_wanted
+        self._assist_wanted, self._shift_wanted = m.assist_wanted, m.shift_wanted
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
         self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
         self._attitude_seq = m.attitude_seq
@@ -294,6 +305,7 @@ class Planner:
             wait_s=0.0 if leads else self._engagement.wait_ns(now_ns) / NS_PER_S,
             attitude_seq=self._attitude_seq,
             slope=output.slope if output is not None else (0.0, 0.0),
+            shift_wanted=self._shift_wanted,
         )
 
 

@@ -122,7 +122,10 @@ class SimulatorLoop:
             ports.state.put(taken(world, self._bank, now_ns(), self._states))
         if steps % self._intent_every == 0:
             self._intents += 1
-            intent = OperatorIntent(t_ns=now_ns(), seq=self._intents, assist_n=world.lead().assist)
+            wanted = world.lead()
+            intent = OperatorIntent(
+                t_ns=now_ns(), seq=self._intents, assist_n=wanted.assist, shift=wanted.shift
+            )
             ports.intent.put(intent)
 
     def _publish_truth(self) -> None:

@@ -103,6 +103,7 @@ class PlannerExecution:
             planner.hear_attitude(attitude, status.t_ns)
             self._attitude_seq = status.attitude_seq
         planner.hear_assist(status.assist_wanted_n)
+        planner.hear_shift(status.shift_wanted)
         return True
 
     def _tick(self, planner: Planner, status: PlannerStatus) -> Iterator[tuple[str, Message]]:

@@ -321,7 +321,9 @@ class Lockstep:
         attitude = self._attitudes.take(now)
         if attitude is not None:
             planner.hear_attitude(attitude, host_ns)
-        planner.hear_assist(self.world.lead().assist)
+        wanted = self.world.lead()
+        planner.hear_assist(wanted.assist)
+        planner.hear_shift(wanted.shift)
         for index, command in enumerate(planner.tick(host_ns)):
             self._commands[index].put(now, command)
             self._record(topics.JOINT_COMMAND, MODULES[index], command)

@@ -1,0 +1,39 @@
+"""The robot leans and turns as it is asked to, and stands there when the planner dies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from shared.config import RobotConfig
+from shared.messages import Vector4
+from shared.scenario import Keyframe
+from tests.lockstep.runs import kill, push, run, story
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, -1, 1)])
+def test_it_comes_to_the_farthest_corner_and_stands_pushed_there_without_a_planner(
+    robot: RobotConfig, signs: tuple[int, ...]
+) -> None:
+    x, y, roll, yaw = (sign * most for sign, most in zip(signs, robot.law.shift_max, strict=True))
+    asked: Vector4 = (x, y, 2.0 * roll, yaw)  # beyond the limit: the limit
+    outcome = run(
+        robot,
+        story(
+            "stand",
+            duration=6.5,
+            keyframe=(
+                Keyframe(at=0.0, height=1.188),
+                Keyframe(at=2.0, height=1.0, shift=asked),
+            ),
+            kill=kill(3.8),
+            push=(push(4.2, 30.0, 0.0, 0.0), push(5.2, 0.0, 30.0, 0.0)),
+        ),
+    )
+    there = int(np.searchsorted(outcome.t, 3.7))
+    np.testing.assert_allclose(outcome.com_mm[there, :2], [1e3 * x, 1e3 * y], atol=6.0)
+    assert outcome.angles[there, 0] == pytest.approx(roll, abs=0.01)
+    assert outcome.angles[there, 2] == pytest.approx(yaw, abs=0.01)
+    assert np.abs(outcome.operator_n[outcome.t < 3.7]).max() < 30.0, "the hand leads on"
+    assert outcome.stood
+    assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in outcome.rows) < 0.05

@@ -1,0 +1,87 @@
+"""Where the closed directions are asked to be: followed without a jump, within limits."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.planner.memory import ShiftMemory
+from services.planner.planner import Planner
+from services.planner.shift import ROWS, SHIFT_S, ShiftReference
+from shared.config import RobotConfig
+from shared.messages import STRAIGHT, Vector4
+
+LARGEST = (0.03, 0.04, 0.06, 0.12)
+DT = 0.004
+asked = st.tuples(*[st.floats(-1e6, 1e6) | st.floats(-0.15, 0.15)] * 4)
+
+
+@given(course=st.lists(st.tuples(asked, st.sampled_from([DT, 2 * DT, 0.02])), max_size=60))
+def test_neither_shift_nor_rate_is_ever_beyond_its_limit(
+    course: list[tuple[Vector4, float]],
+) -> None:
+    follower, last = ShiftReference(LARGEST), np.zeros(6)
+    for wanted, dt in course:
+        shift, rate = follower.advance(wanted, dt)
+        assert np.all(np.abs(shift[ROWS]) <= np.multiply(LARGEST, 1.0 + 1e-9))
+        assert np.all(np.abs(rate[ROWS]) <= np.divide(LARGEST, SHIFT_S) + 1e-12)
+        np.testing.assert_allclose(shift - last, dt * rate, atol=1e-12)
+        assert not shift[[2, 4]].any(), "height and pitch are the hand's"
+        last = shift
+
+
+@given(wanted=asked)
+def test_it_comes_to_what_is_asked_or_as_near_as_it_may(wanted: Vector4) -> None:
+    follower = ShiftReference(LARGEST)
+    for _ in range(1200):
+        shift, rate = follower.advance(wanted, DT)
+    np.testing.assert_allclose(
+        shift[ROWS], np.clip(wanted, np.negative(LARGEST), LARGEST), atol=1e-5
+    )
+    assert np.abs(rate).max() < 1e-4
+
+
+def test_a_robot_file_without_limits_stands_straight() -> None:
+    follower = ShiftReference(STRAIGHT)
+    for _ in range(100):
+        shift, rate = follower.advance((0.1, 0.1, 0.1, 0.1), DT)
+    assert not shift.any()
+    assert not rate.any()
+
+
+def test_it_rests_where_it_is_while_nobody_is_led() -> None:
+    follower = ShiftReference(LARGEST)
+    for _ in range(100):
+        there, _ = follower.advance((0.03, 0.0, 0.0, 0.1), DT)
+    shift, rate = follower.rest()
+    np.testing.assert_array_equal(shift, there)
+    assert not rate.any()
+
+
+def test_a_follower_that_goes_on_from_its_memory_goes_on_bit_for_bit() -> None:
+    follower, twin = ShiftReference(LARGEST), ShiftReference(LARGEST)
+    for _ in range(40):
+        follower.advance((0.03, -0.04, 0.0, 0.1), DT)
+    text = msgspec.json.encode(follower.remember())
+    twin.recall(msgspec.json.decode(text, type=ShiftMemory))
+    for _ in range(40):
+        for mine, other in zip(
+            follower.advance(STRAIGHT, DT), twin.advance(STRAIGHT, DT), strict=True
+        ):
+            np.testing.assert_array_equal(mine, other)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_planner_does_not_take_what_is_no_number(robot: RobotConfig, bad: float) -> None:
+    planner = Planner(robot, 1)
+    planner.hear_shift((0.01, 0.0, 0.0, 0.02))
+    planner.hear_shift((0.01, bad, 0.0, 0.0))
+    assert planner.status(0, 0.0).shift_wanted == (0.01, 0.0, 0.0, 0.02)
+    twin = Planner(robot, 1)
+    twin.recall(planner.remember())
+    assert twin.status(0, 0.0).shift_wanted == (0.01, 0.0, 0.0, 0.02)
