@@ -12,11 +12,20 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from services.planner.shift import ROWS
 from shared import topics
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import RunError
 from shared.joints import MODULES
-from shared.messages import JointEvent, JointState, Mode, RunEvent, RunEventKind, SimTruth
+from shared.messages import (
+    JointEvent,
+    JointState,
+    Mode,
+    PlannerStatus,
+    RunEvent,
+    RunEventKind,
+    SimTruth,
+)
 from tools.runs.impaired import Impaired, impairments, touches
 from tools.runs.run_log import RunLog
 
@@ -118,10 +127,12 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "world_time_lost_s": last.late_s,
         "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
     }
-    alive = leading(log, np.array([row.t_ns for row in truth]))
+    times_ns = np.array([row.t_ns for row in truth])
+    alive = leading(log, times_ns)
     poses = np.array([(*row.over, row.com[2], *row.angles) for row in truth])
-    for prefix, mask in (("", t >= 0.0), ("alive_", alive), ("hold_", ~alive)):
+    for prefix, mask in (("", t >= 0.0), ("hold_", ~alive)):
         summary |= _extent(prefix, poses[mask])
+    summary |= _extent("alive_", (poses - _asked(log, times_ns))[alive])
     heights = [row.torso[2] for row in truth]
     summary["torso_height_min_m"] = min(heights)
     summary["torso_height_max_m"] = max(heights)
@@ -157,6 +168,21 @@ def _extent(prefix: str, poses: Array) -> Summary:
         for column, (name, scale) in enumerate(zip(names, scales, strict=True))
         if name
     }
+
+
+def _asked(log: RunLog, times_ns: NDArray[np.int64]) -> Array:
+    """Return where the operator asked the closed directions to be, as the planner's reference went.
+
+    (n, 6) COM x, y, z, roll, pitch, yaw; zeros where nothing was asked of them.
+    """
+    asked = np.zeros((len(times_ns), 6))
+    rows: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    if not any(any(row.shift_wanted) for row in rows):
+        return asked
+    t, p_ref = [row.t_ns for row in rows], np.array([row.p_ref for row in rows])
+    for row in ROWS:
+        asked[:, row] = np.interp(times_ns, t, p_ref[:, row])
+    return asked
 
 
 def _max(values: Array) -> float | None:
