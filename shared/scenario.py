@@ -159,7 +159,7 @@ class Lead(NamedTuple):
     pitch_rate: float
     assist: float
     """N"""
-    shift: Vector4
+    shift: Vector4 = STRAIGHT
     """x, y, m; roll, yaw, rad."""
 
 
