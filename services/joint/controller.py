@@ -75,6 +75,8 @@ class JointController:
         """Since when HOLD rises to all stand gains, for another may be limp; 0: it does not."""
         self._loosened_ns = 0
         """Since when a hip lets go what HOLD adds to its theta; 0: it does not."""
+        self._carried = 0.0
+        """What theta's spring gave as the mode last changed, N m."""
         self._cause = 0
         self.tau: Pair = law.ZERO
         self.cycle = 0
@@ -230,6 +232,7 @@ class JointController:
             self._resumed_ns,
             self._braced_ns,
             self._loosened_ns,
+            self._carried,
         )
 
     def recall(self, memory: ControllerMemory) -> None:
@@ -244,6 +247,7 @@ class JointController:
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
         self._residual, self._resumed_ns = m.residual, m.resumed_ns
         self._braced_ns, self._loosened_ns = m.braced_ns, m.loosened_ns
+        self._carried = m.carried
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""
@@ -288,6 +292,7 @@ class JointController:
             self._anchor = law.carrying(self._setpoint, self._sinks, q)
         else:
             self._anchor = self._setpoint
+        self._carried = abs(self._anchor.k_p[1] * (self._anchor.q_ref[1] - self._samples.q[1]))
 
     def _evaluate(self, now_ns: int) -> Setpoint:
         """Return the setpoint of this instant."""
@@ -322,18 +327,29 @@ class JointController:
         risen = min(1.0, since_ns / self._blend_ns)
         k_p, k_d = self._hold_k_p, self._hold_k_d
         if self._loosened_ns:
-            left = max(0.0, 1.0 - (now_ns - self._loosened_ns) / self._blend_ns)
-            k_p, k_d = (k_p[0], left * k_p[1]), (k_d[0], left * k_d[1])
+            k_p, k_d = self._loosened(now_ns, risen)
         frozen = law.held(self._anchor, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
         held = law.stiffened(frozen, k_p, k_d, risen)
-        if self._hold_slip == 0.0 or self._braced_ns or self.failsafe.mode is not Mode.HOLD:
-            return held  # braced, it is what a strut stands on
-        # from all that a motor gives, for what it carried as it came to HOLD is not to jump
-        slip = self._hold_slip + (1.0 - risen) * self._limits.tau_module_max
+        if self._hold_slip == 0.0 or self._braced_ns:  # braced, it is what a strut stands on
+            return held
+        # what it carried beyond that as the mode changed is not to jump
+        slip = self._hold_slip + (1.0 - risen) * max(0.0, self._carried - self._hold_slip)
         slipped = law.slipped(held, self._samples.q[1], slip)
         if slipped is not held:
             self._anchor = msgspec.structs.replace(self._anchor, q_ref=slipped.q_ref)
         return slipped
+
+    def _loosened(self, now_ns: int, risen: float) -> tuple[Pair, Pair]:
+        """Return what the gains rise to: theta's go back from where they were as it was told."""
+        had = min(1.0, (self._loosened_ns - self._changed_ns) / self._blend_ns)
+        left = max(0.0, 1.0 - (now_ns - self._loosened_ns) / self._blend_ns)
+        share = left * had / risen if risen > 0.0 else 0.0
+        (phi_p, theta_p), (phi_d, theta_d) = self._hold_k_p, self._hold_k_d
+        own_p, own_d = self._anchor.k_p[1], self._anchor.k_d[1]
+        return (
+            (phi_p, own_p + share * max(0.0, theta_p - own_p)),
+            (phi_d, own_d + share * max(0.0, theta_d - own_d)),
+        )
 
     def _event(self, now_ns: int, before: Mode, cause: Cause, tau_before: Pair) -> JointEvent:
         self._events += 1

@@ -140,3 +140,35 @@ def test_what_a_braced_hip_carries_does_not_jump_as_hold_comes_back(robot: Robot
         assert abs(bench.controller.tau[1] - last) < 1.5
         last = bench.controller.tau[1]
     assert abs(last) == pytest.approx(robot.hold_slip("hip_left"))
+
+
+@pytest.mark.parametrize("then", ["held", "led again"])
+def test_a_hand_that_leads_on_meets_no_more_than_the_slip_as_the_mode_changes(
+    robot: RobotConfig, then: str
+) -> None:
+    """Springs that rose while the hand went on had come to 80 N m a hip."""
+    bench = Bench(robot, "hip_left")
+    bench.q = UPRIGHT["hip"]
+    told = {"k_p": LED_P, "k_d": LED_D, "tau_ff": (0.0, 0.0)}
+    bench.to_track(q_ref=bench.q, **told)
+    bench.run(1, fresh=True, hold=True, q_ref=bench.q, **told)
+    if then == "led again":
+        bench.run(2 * blended(bench, robot), fresh=True, hold=True, q_ref=bench.q, **told)
+        while bench.mode is Mode.HOLD:
+            bench.run(1, fresh=True, q_ref=bench.q, **told)
+    for _ in range(blended(bench, robot)):
+        bench.q = (bench.q[0], bench.q[1] + 0.001)
+        bench.run(1, fresh=True, hold=then == "held", q_ref=bench.q, **told)
+        assert abs(bench.controller.tau[1]) <= robot.hold_slip("hip_left") + 1e-9
+
+
+def test_told_to_loosen_as_it_comes_to_hold_it_never_stiffens(robot: RobotConfig) -> None:
+    """An ankle's fault asks for both in one command."""
+    bench = Bench(robot, "hip_left")
+    bench.q = UPRIGHT["hip"]
+    told = {"q_ref": bench.q, "k_p": LED_P, "k_d": LED_D}
+    bench.to_track(**told)
+    for _ in range(2 * blended(bench, robot)):
+        bench.run(1, fresh=True, hold=True, loosen=True, **told)
+        assert bench.controller.setpoint.k_p[1] == LED_P[1]
+        assert bench.controller.setpoint.k_d[1] == LED_D[1]
