@@ -1,10 +1,10 @@
 """Which modules are to hold with all they have, because another one may be limp. Pure.
 
-HOLD leaves the theta of hips and knees as soft as the planner had them, for the hand leads on
-(`RobotConfig.hold_gains`). On these a leg whose knee is limp folds: it fell at every phase of the
-squat. With every gain at its stand gain the thigh is fixed to the torso and the leg stands as a
-strut: none fell (`tests/lockstep/test_limp.py`), nor through pushes of 30 N. In the crawl, under
-the hand's 60 N m of pitch, it stands, with little left for a push forwards: 20 N stood, 30 N fell.
+In HOLD the hips slip (`RobotConfig.hold_slip`), for the hand leads on. On hips that give, a leg
+whose knee is limp folds: it fell at every phase of the squat. With every gain at its stand gain the
+thigh is fixed to the torso and the leg stands as a strut: none fell
+(`tests/lockstep/test_limp.py`), nor through pushes of 30 N. In the crawl, under the hand's 60 N m
+of pitch, it stands, with little left for a push forwards: 20 N stood, 30 N fell.
 
 A limp ankle leaves one sole to stand on. Stiff hips would hand it the hand's 60 N m of pitch, even
 if they slip as they do in HOLD (`RobotConfig.hold_slip`): they loosen. Stiff knees alone keep the

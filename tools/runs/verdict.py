@@ -127,12 +127,11 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
         "world_time_lost_s": last.late_s,
         "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
     }
-    times_ns = np.array([row.t_ns for row in truth])
-    alive = leading(log, times_ns)
+    alive = leading(log, np.array([row.t_ns for row in truth]))
     poses = np.array([(*row.over, row.com[2], *row.angles) for row in truth])
     for prefix, mask in (("", t >= 0.0), ("hold_", ~alive)):
         summary |= _extent(prefix, poses[mask])
-    summary |= _extent("alive_", (poses - _asked(log, times_ns))[alive])
+    summary |= _extent("alive_", (poses - _asked(log, truth))[alive])
     heights = [row.torso[2] for row in truth]
     summary["torso_height_min_m"] = min(heights)
     summary["torso_height_max_m"] = max(heights)
@@ -170,18 +169,21 @@ def _extent(prefix: str, poses: Array) -> Summary:
     }
 
 
-def _asked(log: RunLog, times_ns: NDArray[np.int64]) -> Array:
+def _asked(log: RunLog, truth: Sequence[SimTruth]) -> Array:
     """Return where the operator asked the closed directions to be, as the planner's reference went.
 
-    (n, 6) COM x, y, z, roll, pitch, yaw; zeros where nothing was asked of them.
+    (n, 6) COM x, y over the floor by gravity, z, roll, pitch, yaw; zeros where nothing was asked.
     """
-    asked = np.zeros((len(times_ns), 6))
+    asked = np.zeros((len(truth), 6))
     rows: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
     if not any(any(row.shift_wanted) for row in rows):
         return asked
     t, p_ref = [row.t_ns for row in rows], np.array([row.p_ref for row in rows])
+    times_ns = [row.t_ns for row in truth]
     for row in ROWS:
         asked[:, row] = np.interp(times_ns, t, p_ref[:, row])
+    # on a slope the reference goes with gravity, as `SimTruth.over` does
+    asked[:, :2] -= [(row.lean[0] * row.com[2], row.lean[1] * row.com[2]) for row in truth]
     return asked
 
 
