@@ -107,7 +107,7 @@ class RobotConfig(Section, frozen=True):
         operator's 60 N m of pitch moment in the crawl leaned the COM back by 42 mm and the soles
         tipped, and pushes from the side tipped them in 15 of 500 random cases. With the knees'
         theta soft, one leg gave under a lasting push from the side of 30 N; with the hips' soft it
-        stood 65 N, and stands 100 N. A hip that would not give at all hands a leading hand's whole
+        stood 65 N. A hip that would not give at all hands a leading hand's whole
         moment to the soles, and 6 of 300 fell: it slips (`hold_slip`).
 
         In TRACK without tau_coupled the same: the certified gains are stiff enough to stand, but

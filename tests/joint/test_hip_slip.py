@@ -22,8 +22,14 @@ UPRIGHT = {"ankle": (0.0, 0.1), "knee": (0.0, -1.0), "hip": (0.0, 0.4)}
 
 @pytest.fixture(scope="module")
 def robot() -> RobotConfig:
-    """Return the shipped robot."""
-    return config_file.load(ROBOT_FILE)
+    """Return the shipped robot with hips that hold stiff, and slip."""
+    shipped = config_file.load(ROBOT_FILE)
+    hip = msgspec.structs.replace(shipped.stand.hip, k_p=(6000.0, 2000.0), k_d=(45.0, 45.0))
+    service = msgspec.structs.replace(
+        shipped.joint_service, hold_stiffens_theta=("ankle", "knee", "hip"), hold_hip_slip=25.0
+    )
+    stand = msgspec.structs.replace(shipped.stand, hip=hip)
+    return msgspec.structs.replace(shipped, stand=stand, joint_service=service)
 
 
 def held(robot: RobotConfig, module: str) -> Bench:
