@@ -102,13 +102,13 @@ class RobotConfig(Section, frozen=True):
     def hold_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return (k_p, k_d) that a module's gains rise to where no tau_coupled holds it.
 
-        The stand gains of every phi and of the theta of `hold_stiffens_theta`, zero elsewhere;
-        (phi, theta), N m/rad and N m s/rad. With gains as they were (design section 4), the
-        operator's 60 N m of pitch moment in the crawl leaned the COM back by 42 mm and the soles
-        tipped, and pushes from the side tipped them in 15 of 500 random cases. With the knees'
-        theta soft, one leg gave under a lasting push from the side of 30 N; with the hips' soft it
-        stood 65 N. A hip that would not give at all hands a leading hand's whole
-        moment to the soles, and 6 of 300 fell: it slips (`hold_slip`).
+        The stand gains of ankles, knees and every phi, zero elsewhere; (phi, theta), N m/rad and
+        N m s/rad. With gains as they were (design section 4), the operator's 60 N m of pitch
+        moment in the crawl leaned the COM back by 42 mm and the soles tipped, and pushes from the
+        side tipped them in 15 of 500 random cases. With the knees' theta soft, one leg gave under a
+        lasting push from the side: 25 N for 3 s stood, now 60 N. The hips' theta stays soft: a
+        torso that does not follow a hand that leads on hands all of its moment to the soles, and
+        6 of 300 fell.
 
         In TRACK without tau_coupled the same: the certified gains are stiff enough to stand, but
         sway damped by 0.055 only; two pushes of 40 N from the side, 2 s apart, made it fall.
@@ -116,15 +116,6 @@ class RobotConfig(Section, frozen=True):
         stand = self.stand_gains(module)
         theta = float(kind_of(module) in self.joint_service.hold_stiffens_theta)
         return (stand.k_p[0], theta * stand.k_p[1]), (stand.k_d[0], theta * stand.k_d[1])
-
-    def hold_slip(self, module: str) -> float:
-        """Return the torque at which theta's spring slips in HOLD, N m; 0: it never does.
-
-        A hip holds like a brake: a sway meets a stiff joint; a hand that leads the torso's pitch on
-        takes the spring's rest along, and hands each leg no more than this and the damping. Not
-        while braced; and a drive whose service is dead goes on without it.
-        """
-        return self.joint_service.hold_hip_slip if kind_of(module) == "hip" else 0.0
 
     @property
     def torso_mass(self) -> float:

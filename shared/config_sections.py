@@ -213,7 +213,6 @@ class JointServiceConfig(Section, frozen=True):
     k_p_max: LocalStiffness
     k_d_max: LocalDamping
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
-    hold_hip_slip: Annotated[float, Range(0.0, 100.0, "N m")] = 0.0
 
 
 class PlannerConfig(Section, frozen=True):

@@ -59,8 +59,6 @@ def inputs_of(config: RobotConfig) -> dict[str, Any]:
             "k_p_max": config.joint_service.k_p_max,
             "rate_hz": config.joint_service.rate_hz,
             "hold_stiffens_theta": config.joint_service.hold_stiffens_theta,
-            # a schedule from before there was any does not name it
-            **({"hold_hip_slip": slip} if (slip := config.joint_service.hold_hip_slip) else {}),
         },
         "limits": {
             kind: [*limit.phi, *limit.theta]

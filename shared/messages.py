@@ -194,8 +194,6 @@ class JointCommand(Message, frozen=True):
     """The same with the joint services gone and the drives' own loops left."""
     brace: bool = False
     """True while another may be limp: this module in HOLD is to rise to all its stand gains."""
-    loosen: bool = False
-    """True while an ankle may be limp: this hip in HOLD is to be as soft as it was led."""
 
 
 class JointEvent(Message, frozen=True):

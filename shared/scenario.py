@@ -25,7 +25,8 @@ from shared.toml_file import Range, Section, check_ranges, read_toml
 Time = Annotated[float, Range(0.0, 86_400.0, "s")]
 Force = Annotated[float, Range(-2000.0, 2000.0, "N")]
 
-Shift = Annotated[float, Range(-0.3, 0.3, "m or rad")]
+ShiftLength = Annotated[float, Range(-0.1, 0.1, "m")]
+ShiftAngle = Annotated[float, Range(-0.3, 0.3, "rad")]
 
 SIGNALS = ("KILL", "STOP", "TERM", "INT")
 """What a kill can send; STOP freezes the process instead."""
@@ -39,7 +40,7 @@ class Keyframe(Section, frozen=True):
     pitch: Annotated[float, Range(-1.5, 1.5, "rad")] = 0.0
     assist: Annotated[float, Range(0.0, 500.0, "N")] = 0.0
     """Weight that the operator rests on the harness and asks the robot to carry, N."""
-    shift: tuple[Shift, Shift, Shift, Shift] = STRAIGHT
+    shift: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = STRAIGHT
     """Where the operator asks COM x and y, m, and the torso's roll and yaw, rad, to be."""
 
 

@@ -168,8 +168,9 @@ def test_the_hand_is_off_from_when_the_case_says(diagonal: RobotConfig, drawn: l
 def test_a_robot_that_falls_before_it_can_begin_has_fallen(
     diagonal: RobotConfig, drawn: list[Case]
 ) -> None:
-    joint = msgspec.structs.replace(diagonal.joint, tau_module_max=20.0)  # knees carry 40 N m
-    outcome = run_case(drawn[0], msgspec.structs.replace(diagonal, joint=joint))
+    law = msgspec.structs.replace(diagonal.law, jacobian="average")
+    average = msgspec.structs.replace(diagonal, law=law)
+    outcome = run_case(drawn[0], average)
     assert outcome.ending == Ending.FELL
     assert not outcome.stood
 

@@ -147,11 +147,6 @@ class Failsafe(msgspec.Struct):
         """True in HOLD if the newest command taken says that another module may be limp."""
         return self.mode is Mode.HOLD and self.command is not None and self.command.brace
 
-    @property
-    def asks_to_loosen(self) -> bool:
-        """True in HOLD if the newest command taken says that a hip is not to be stiff."""
-        return self.mode is Mode.HOLD and self.command is not None and self.command.loosen
-
     def age_ns(self, now_ns: int) -> int:
         """Return the age of the newest command taken, by this module's clock; -1 if none."""
         return now_ns - self.command.echo_t_ns if self.command is not None else -1

@@ -7,8 +7,6 @@ stays one law at every moment of a hand-over. Pure.
 
 from __future__ import annotations
 
-import math
-
 import msgspec
 
 from shared.messages import JointCommand, Pair
@@ -112,22 +110,6 @@ def stiffened(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoin
             s.k_d[1] + share * max(0.0, k_d[1] - s.k_d[1]),
         ),
     )
-
-
-def slipped(setpoint: Setpoint, theta: float, slip: float) -> Setpoint:
-    """Return a setpoint whose theta spring gives no more than a torque: its rest follows the joint.
-
-    Args:
-        setpoint: what holds.
-        theta: where the joint is, rad.
-        slip: the most that the spring is to give, N m.
-    """
-    s = setpoint
-    k_p, rest = s.k_p[1], s.q_ref[1]
-    if k_p * abs(rest - theta) <= slip:
-        return s
-    reach = math.copysign(slip / k_p, rest - theta)
-    return Setpoint((s.q_ref[0], theta + reach), s.v_ref, s.tau_ff, s.tau_coupled, s.k_p, s.k_d)
 
 
 def carrying(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:

@@ -37,9 +37,6 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     residual: Pair = law.ZERO
     resumed_ns: int = 0
     braced_ns: int = 0
-    loosened_ns: int = 0
-    carried: float = 0.0
-    """N m"""
 
 
 class ModuleMemory(msgspec.Struct, frozen=True):

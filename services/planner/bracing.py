@@ -1,14 +1,13 @@
 """Which modules are to hold with all they have, because another one may be limp. Pure.
 
-In HOLD the hips slip (`RobotConfig.hold_slip`), for the hand leads on. On hips that give, a leg
-whose knee is limp folds: it fell at every phase of the squat. With every gain at its stand gain the
-thigh is fixed to the torso and the leg stands as a strut: none fell
-(`tests/lockstep/test_limp.py`), nor through pushes of 30 N. In the crawl, under the hand's 60 N m
-of pitch, it stands, with little left for a push forwards: 20 N stood, 30 N fell.
+HOLD leaves the theta of hips and knees as soft as the planner had them, for the hand leads on
+(`RobotConfig.hold_gains`). On these a leg whose knee is limp folds: it fell at every phase of the
+squat. With every gain at its stand gain the thigh is fixed to the torso and the leg stands as a
+strut: none fell (`tests/lockstep/test_limp.py`), nor through pushes of 30 N. In the crawl, under
+the hand's 60 N m of pitch, it stands, with little left for a push forwards: 20 N stood, 30 N fell.
 
-A limp ankle leaves one sole to stand on. Stiff hips would hand it the hand's 60 N m of pitch, even
-if they slip as they do in HOLD (`RobotConfig.hold_slip`): they loosen. Stiff knees alone keep the
-legs from giving. Fell, of 12 each with and without pushes of 30 N:
+A limp ankle leaves one sole to stand on. Stiff hips would hand it the hand's 60 N m of pitch; stiff
+knees alone keep the legs from giving. Fell, of 12 each with and without pushes of 30 N:
 
     braced              none  knees  all
     squat, ankle limp      4      2    0
@@ -43,10 +42,6 @@ class Brace(IntEnum):
     def of(self, module: str) -> bool:
         """Return True if this module is to brace."""
         return self is Brace.ALL or (self is Brace.KNEES and kind_of(module) == "knee")
-
-    def loosens(self, module: str) -> bool:
-        """Return True if this module is a hip that is to be as soft as the planner had it."""
-        return self is Brace.KNEES and kind_of(module) == "hip"
 
 
 _FOR: Final = {"ankle": Brace.KNEES, "knee": Brace.ALL, "hip": Brace.NONE}

@@ -6,7 +6,7 @@ drivetrain from `robustness.stiffness`, hand and delay of the robot file,
 
 - with every feedback torque, and with tau_coupled alone, `gain_margin` times what it is;
 - with `delay_margin` times the delay;
-- in HOLD with the services, the hips holding or slipping, and with the drives alone.
+- in HOLD with the services, and with the drives alone.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Condition(NamedTuple):
     """One case that the loop has to fade in."""
 
     mode: str
-    """TRACK, HOLD, HOLD slipping, or drives alone."""
+    """TRACK, HOLD, or drives alone."""
     node: Node
     half: int
     stiffness: float
@@ -166,9 +166,6 @@ class DynamicCertificate:
         self._hands = [Hand(*hand) for hand in wanted.hands]
         self._halves = halves()
         self._hold = _hold_gains(config)
-        slips = [(False, config.hold_slip(module) > 0.0) for module in MODULES]
-        self._slips = np.ravel(slips)
-        """(12,) True for a joint whose spring may slip in HOLD."""
 
     def feedback(self, node: Node, design: Design) -> Feedback:
         """Return what services and planner do in TRACK at a pose."""
@@ -188,16 +185,11 @@ class DynamicCertificate:
             self._config.harness.low_pass_hz,
         )
 
-    def held(self, node: Node, design: Design, mode: str) -> Feedback:
-        """Return what holds without a planner, in `HOLD`, `HOLD slipping` or `drives alone`.
-
-        A joint that slips gives one torque at all angles: it is taken to be as soft as it was led.
-        """
+    def held(self, node: Node, design: Design, *, onboard: bool) -> Feedback:
+        """Return what holds in HOLD, by the services or by the drives alone."""
         k_p, k_d = self._hold
         D, D_B = np.maximum(node.D, k_p), np.maximum(np.tile(design.D_B, 2), k_d)
-        if mode == "HOLD slipping":
-            D = np.where(self._slips, node.D, D)
-        if mode == "drives alone":
+        if onboard:
             D, D_B = motor_mean(D), motor_mean(D_B)
         nothing = np.zeros((len(D), len(D)))
         return Feedback(D, D_B, nothing, nothing, 1.0)
@@ -209,7 +201,7 @@ class DynamicCertificate:
         if c.mode == "TRACK":
             feedback = self.feedback(c.node, design)
         else:
-            feedback = self.held(c.node, design, c.mode)
+            feedback = self.held(c.node, design, onboard=c.mode == "drives alone")
             stand = stand._replace(S=np.zeros(6))
         drivetrain, timing = self._drivetrain(c.stiffness), self._timing(c.delay_s)
         return SampledLoop(stand, half, feedback, drivetrain, timing, c.hand)
@@ -295,9 +287,7 @@ class DynamicCertificate:
     def _in_hold(
         self, node: Node, stiffness: float, half: int, *, margins: bool
     ) -> Iterator[Condition]:
-        for mode in ("HOLD", "HOLD slipping", "drives alone"):
-            if mode == "HOLD slipping" and not self._slips.any():
-                continue
+        for mode in ("HOLD", "drives alone"):
             case = Condition(mode, node, half, stiffness, LEAST_DELAY_S, NO_HAND, NOMINAL)
             yield case
             if margins:

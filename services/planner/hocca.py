@@ -139,14 +139,13 @@ class Hocca:
         self._F_O[:3] = self._weight * up
         if align or not self._aligned:
             self._align(q)
-            shift, shift_rate = self._shift.rest()
+            self._shift.rest()
         else:
             self._has_led = True
-            shift, shift_rate = self._shift.advance(shift_wanted, dt)
+            self._shift.advance(shift_wanted, dt)
         pdot = measured.J @ v
         p_C, pdot_C = self._closed_loop_reference(dt)
-        p_C += shift
-        pdot_C += shift_rate
+        self._shift.add_to(p_C, pdot_C)
         lean = up[:2] / up[2]
         p_C[:2] += lean * measured.p[2]
         pdot_C[:2] += lean * pdot[2]

@@ -43,7 +43,7 @@ class OverloadMemory(msgspec.Struct, frozen=True):
 
 
 class ShiftMemory(msgspec.Struct, frozen=True):
-    """Of `ShiftReference`: x, y in m, roll, yaw in rad, and their rates."""
+    """State of `ShiftReference`: x, y in m, roll, yaw in rad, and their rates."""
 
     at: Vector4 = STRAIGHT
     rate: Vector4 = STRAIGHT

@@ -266,7 +266,7 @@ class Planner:
         )
         brace = self._brace
         return [
-            _command(common, state.t_ns, rows, brace=brace.of(module), loosen=brace.loosens(module))
+            _command(common, state.t_ns, rows, brace=brace.of(module))
             for module, state, rows in zip(MODULES, states, by_module, strict=True)
         ]
 
@@ -320,7 +320,7 @@ class _Common(NamedTuple):
 
 
 def _command(
-    common: _Common, echo_t_ns: int, rows: list[list[float]], *, brace: bool, loosen: bool
+    common: _Common, echo_t_ns: int, rows: list[list[float]], *, brace: bool
 ) -> JointCommand:
     pairs: list[Pair] = [(row[0], row[1]) for row in rows]
     return JointCommand(
@@ -339,7 +339,6 @@ def _command(
         margin=common.margins.service,
         margin_onboard=common.margins.onboard,
         brace=brace,
-        loosen=loosen,
     )
 
 

@@ -8,8 +8,6 @@ module adds them, for a constant horizontal push F u at the torso's origin:
 
        (K_fail + K_c) dp = F pi,   pi = (dr_torso/dp)^T u,   dtau = -D T dp - J^T K_c dp
 
-   In HOLD the hips slip at some torque; from there on they are taken to be as soft as led.
-
 2. Whatever the control does, the joints where they are: a linear program over how the two legs
    share weight and push. No gains bear more at that pose.
 
@@ -79,15 +77,6 @@ class Response(NamedTuple):
     """(12,) N m at the joints."""
     soles: Array
     """(12,): force and moment at each ankle, N and N m, right leg first."""
-
-
-class Slip(NamedTuple):
-    """Joints whose springs slip (`RobotConfig.hold_slip`)."""
-
-    D: Array
-    """(12,) what is left of the local gains once any of them has slipped, N m/rad."""
-    torque: float
-    """At which any of them slips, N m."""
 
 
 class _Limit(NamedTuple):
@@ -174,46 +163,19 @@ class LoadedStand:
         return Response(dp, dtau, soles)
 
     def limit_held(
-        self,
-        D: Array,
-        direction: tuple[float, float],
-        K_c: Array | None = None,
-        slip: Slip | None = None,
+        self, D: Array, direction: tuple[float, float], K_c: Array | None = None
     ) -> PushLimit:
-        """Return the hardest constant push that the gains hold.
-
-        Args:
-            D: as for `response`.
-            direction: world x and y, a unit vector.
-            K_c: as for `response`.
-            slip: what becomes of D under torque; None: nothing.
-        """
+        """Return the hardest constant push that the gains hold; arguments as for `response`."""
         response = self.response(D, direction, K_c)
         if response is None:
             return PushLimit(0.0, "the stiffness")
-        loads = np.concatenate((self._tau, self._soles(self._W)))
-        found = self._first_met(loads, response)
-        if slip is None:
-            return found
-        per_newton = float(np.abs((D - slip.D) * (self._T @ response.dp)).max())
-        slips_at = slip.torque / max(per_newton, _SLOPE_MIN)
-        if found.force_n <= slips_at:
-            return found
-        loads += slips_at * np.concatenate((response.dtau, response.soles))
-        softer = self.response(slip.D, direction, K_c)
-        if softer is None:
-            return PushLimit(slips_at, "the stiffness")
-        found = self._first_met(loads, softer)
-        return found._replace(force_n=slips_at + found.force_n)
-
-    def _first_met(self, loads: Array, response: Response) -> PushLimit:
-        """Return how much harder a push may become than the one that gives these loads (24,)."""
+        begin = np.concatenate((self._tau, self._soles(self._W)))
         per_newton = np.concatenate((response.dtau, response.soles))
         found = PushLimit(math.inf, "nothing")
         for part, row, bound in self._limits:
             slope = float(row @ per_newton)
             if slope > _SLOPE_MIN:
-                force = max(0.0, (bound - float(row @ loads)) / slope)
+                force = max(0.0, (bound - float(row @ begin)) / slope)
                 found = min(found, PushLimit(force, part))
         return found
 
@@ -286,11 +248,9 @@ def limits_along(
     missing = Missing(np.array(law.K_p), np.array(law.B_p), np.array(law.S), damping)
     K_c, _ = missing.at(stand.stiffness(D), stand.along_p(D_B))
     in_hold = np.maximum(D, np.ravel([config.hold_gains(module)[0] for module in MODULES]))
-    slips = np.ravel([(0.0, config.hold_slip(module)) for module in MODULES])
-    slip = Slip(np.where(slips > 0.0, D, in_hold), float(slips.max())) if slips.any() else None
     return PushLimits(
         stand.limit_held(D, direction, K_c),
-        stand.limit_held(in_hold, direction, slip=slip),
+        stand.limit_held(in_hold, direction),
         stand.limit_held(motor_mean(in_hold), direction),
         stand.limit_of_body(direction),
     )

@@ -12,7 +12,7 @@ from tests.conftest import ROBOT_FILE
 
 @pytest.fixture(scope="session")
 def robot() -> RobotConfig:
-    """Return the shipped robot with a soft knee; of theta HOLD stiffens the ankles' alone."""
+    """Return the shipped robot with a soft knee, whose theta HOLD does not stiffen."""
     shipped = config_file.load(ROBOT_FILE)
     knee = msgspec.structs.replace(shipped.stand.knee, k_p=(900.0, 1500.0), k_d=(45.0, 25.0))
     return msgspec.structs.replace(

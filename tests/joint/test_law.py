@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -49,17 +48,6 @@ def test_blend_of_two_laws_gives_the_blended_torque_everywhere(
 def test_blend_of_two_laws_has_no_negative_gain(a: Setpoint, b: Setpoint, share: float) -> None:
     blended = law.blend(a, b, share)
     assert min(*blended.k_p, *blended.k_d) >= 0.0
-
-
-@given(s=setpoints, theta=st.floats(-6.0, 6.0), slip=st.floats(0.1, 100.0))
-def test_a_spring_that_slips_gives_what_it_gave_up_to_its_slip(
-    s: Setpoint, theta: float, slip: float
-) -> None:
-    slipped = law.slipped(s, theta, slip)
-    spring, before = (each.k_p[1] * (each.q_ref[1] - theta) for each in (slipped, s))
-    assert spring == pytest.approx(min(slip, max(-slip, before)), rel=1e-9, abs=1e-9)
-    rest = slipped.q_ref[1]
-    assert slipped == msgspec.structs.replace(s, q_ref=(s.q_ref[0], rest)), "nothing else changes"
 
 
 @given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains), share=shares)

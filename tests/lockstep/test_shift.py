@@ -8,7 +8,7 @@ import pytest
 from shared.config import RobotConfig
 from shared.messages import Vector4
 from shared.scenario import Keyframe
-from tests.lockstep.runs import kill, push, run, story
+from tests.lockstep.runs import kill, push, restart, run, story
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, -1, 1)])
@@ -37,3 +37,19 @@ def test_it_comes_to_the_farthest_corner_and_stands_pushed_there_without_a_plann
     assert np.abs(outcome.operator_n[outcome.t < 3.7]).max() < 30.0, "the hand leads on"
     assert outcome.stood
     assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in outcome.rows) < 0.05
+
+
+def test_a_planner_that_comes_back_to_a_leaning_robot_leads_it_to_the_same_lean(
+    robot: RobotConfig,
+) -> None:
+    asked: Vector4 = (0.02, 0.03, 0.0, 0.08)
+    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=1.1, shift=asked))
+    there_and_back = story(
+        "stand", duration=8.0, keyframe=frames, kill=kill(3.0), restart=restart(3.4), push=()
+    )
+    outcome = run(robot, there_and_back)
+    assert outcome.stood
+    np.testing.assert_allclose(outcome.com_mm[-1, :2], [20.0, 30.0], atol=6.0)
+    assert outcome.angles[-1, 2] == pytest.approx(0.08, abs=0.01)
+    moved = np.abs(np.diff(outcome.com_mm[:, :2], axis=0)).max()
+    assert moved < 2.0, "it goes there, it does not jump"

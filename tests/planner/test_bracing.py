@@ -136,20 +136,6 @@ def test_the_commands_of_those_that_are_to_brace_carry_it_with_the_hold(
     assert told == [(True, asked.of(name)) for name in MODULES]
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_hips_loosen_for_a_limp_ankle_and_for_nothing_else(
-    robot: RobotConfig, q: Array, module: str
-) -> None:
-    planner = Planner(robot, SESSION)
-    now_ns = lead(planner, q) + TICK_NS
-    hear_all(planner, q, now_ns, seq=9)
-    index = MODULE_INDEX[module]
-    gone = state(index, q, 9, mode=int(Mode.FAULT), drive=int(DriveStatus.ERROR))
-    planner.hear_state(index, gone, now_ns)
-    told = [name for name, sent in zip(MODULES, planner.tick(now_ns), strict=True) if sent.loosen]
-    assert told == (list(HIPS) if kind_of(module) == "ankle" else [])
-
-
 def test_knees_are_knees() -> None:
     assert [name for name in MODULES if Brace.KNEES.of(name)] == KNEES
     assert [name for name in MODULES if Brace.ALL.of(name)] == list(MODULES)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.planner.poses import Poses
-from services.planner.push_limit import DIRECTIONS, LoadedStand, Slip, slope_pulling
+from services.planner.push_limit import DIRECTIONS, LoadedStand, slope_pulling
 from services.simulator.body import body_of
 from services.simulator.plant import NAMED, changed
 from services.simulator.world import World
@@ -114,26 +114,6 @@ def test_left_and_right_are_alike(poses: dict[float, Posed]) -> None:
 def test_gains_that_do_not_stand_bear_no_push(poses: dict[float, Posed]) -> None:
     limit = poses[0.8].stand.limit_held(np.full(N_JOINTS, 1.0), (0.0, 1.0))
     assert limit == (0.0, "the stiffness")
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_hips_that_slip_bear_what_stiff_ones_do_and_then_what_soft_ones_do(
-    poses: dict[float, Posed], side: float
-) -> None:
-    soft, direction = STIFF.copy(), (0.0, side)
-    soft[[5, 11]] = 30.0
-    for posed in poses.values():
-
-        def limit(torque: float, stand: LoadedStand = posed.stand) -> float:
-            return stand.limit_held(STIFF, direction, slip=Slip(soft, torque)).force_n
-
-        stiff, softer = (posed.stand.limit_held(D, direction).force_n for D in (STIFF, soft))
-        assert limit(1e6) == stiff
-        assert limit(1e-9) == pytest.approx(softer, rel=1e-6)
-        between = [limit(torque) for torque in (0.2, 1.0, 3.0)]
-        low, high = sorted((stiff, softer))
-        assert all(low - 1e-6 <= each <= high + 1e-6 for each in between)
-        assert sorted(between, reverse=stiff < softer) == between
 
 
 def test_the_planner_adds_to_what_is_held(robot: RobotConfig, poses: dict[float, Posed]) -> None:
