@@ -95,6 +95,11 @@ ShiftLength = Annotated[float, Range(0.0, 0.1, "m")]
 ShiftAngle = Annotated[float, Range(0.0, 0.3, "rad")]
 
 
+StanceLength = Annotated[float, Range(0.0, 0.3, "m")]
+StanceAngle = Annotated[float, Range(0.0, 0.8, "rad")]
+Stance6 = tuple[StanceLength, StanceLength, StanceLength, StanceAngle, StanceAngle, StanceAngle]
+
+
 class LawConfig(Section, frozen=True):
     """Gains and choices of the law (design section 3)."""
 
@@ -111,6 +116,7 @@ class LawConfig(Section, frozen=True):
     recentre_s: Seconds
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
     shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
+    stance_max: Stance6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 RequiredStiffness6 = tuple[

@@ -161,6 +161,12 @@ LOSSES: Final[dict[str, Loss]] = {
         "`xrl status`: DAMP because ESTOP",
         "by starting the joint services again",
     ),
+    "feet astray before the planner leads": Loss(
+        "HOLD",
+        "HOLD",
+        "planner/status: MISPLACED; `xrl status` says which way",
+        "by itself, once the feet stand within `law.stance_max` of the robot file's place",
+    ),
     "overload at the harness": Loss(
         "HOLD",
         "HOLD",

@@ -18,6 +18,8 @@ Vector4 = tuple[float, float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 STRAIGHT: Vector4 = (0.0, 0.0, 0.0, 0.0)
 """No shift of x, y, roll and yaw."""
+AS_CONFIGURED: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""A stance with the feet where the robot file has them."""
 Modules = tuple[int, int, int, int, int, int]
 """One integer for each module, in `shared.joints.MODULES` order."""
 
@@ -77,6 +79,8 @@ class PlannerMode(IntEnum):
     """The harness carries more than it may: `hold` until it has been let go for a while."""
     UNCERTIFIED = 4
     """No local gains stand alone in this pose: `hold`."""
+    MISPLACED = 5
+    """The feet stand farther from where the robot file has them than `law.stance_max`: `hold`."""
 
 
 class SplitSource(IntEnum):
@@ -292,6 +296,11 @@ class PlannerStatus(Message, frozen=True):
     """Rise of the floor along x and y that the law reckons with, rad."""
     shift_wanted: Vector4 = STRAIGHT
     """What the operator asked for, as this tick took it: x, y, m, roll, yaw, rad."""
+    stance: Vector6 = AS_CONFIGURED
+    """The right foot against the left as the law takes them, beyond the robot file: x, y, z in m
+    and a rotation vector in rad, world axes."""
+    why: str = ""
+    """Why it does not lead, in words, where the mode does not say it all."""
 
 
 class OperatorIntent(Message, frozen=True):

@@ -104,7 +104,9 @@ def run(args: argparse.Namespace) -> int:
     _introduce(log, tick, args.at, console)
     q, v = (_joined(tick.states, name) for name in ("q", "v"))
     q_ref, v_ref = (_joined(tick.commands, name) for name in ("q_ref", "v_ref"))
-    found = account(robot, q, v, q_ref, v_ref, tick.status.assist_n, tick.status.slope)
+    found = account(
+        robot, q, v, q_ref, v_ref, tick.status.assist_n, tick.status.slope, tick.status.stance
+    )
     found = found._replace(eased=_joined(tick.commands, "tau_coupled") - found.coupled)
     show(robot, found, console)
     sent = _joined(tick.commands, "tau_ff")

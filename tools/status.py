@@ -73,6 +73,8 @@ def lead_in_words(lead: LeadStatus | None) -> str:
     words = f"planner {lead.mode}, margin {lead.margin:.2f}"
     if lead.wait_s > 0.0:
         words += f"; leads again in {lead.wait_s:.0f} s at the earliest, for links have dropped out"
+    if lead.why:
+        words += f"; {lead.why}"
     return words
 
 

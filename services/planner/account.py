@@ -19,7 +19,7 @@ from services.planner.levelling import up_of
 from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import GainSplit, LocalGains
 from shared.config import GRAVITY, RobotConfig
-from shared.messages import Pair
+from shared.messages import AS_CONFIGURED, Pair, Vector6
 
 Array = NDArray[np.float64]
 
@@ -69,6 +69,7 @@ def account(
     v_ref: Array,
     assist: float,
     slope: Pair = (0.0, 0.0),
+    stance: Vector6 = AS_CONFIGURED,
 ) -> Account:
     """Return the account of a tick.
 
@@ -80,11 +81,14 @@ def account(
         v_ref: their rates (12,), rad/s.
         assist: assist force in the feedforward, N.
         slope: of the floor along x and y, as the planner took it, rad.
+        stance: the right foot against the left, as the planner took it, m and rad.
 
     Raises:
         ConfigError: the gain split lacks its schedule.
     """
     measured, at_ref = Kinematics(config), Kinematics(config)
+    for kinematics in (measured, at_ref):
+        kinematics.stance[:] = stance
     measured.update(q)
     at_ref.update(q_ref, measured.D_left)
     law, split = GainLaw(config), GainSplit(config)

@@ -14,6 +14,8 @@ from typing import Final
 import msgspec
 
 from services.planner.memory import AssistMemory, EasingMemory, OverloadMemory
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config_sections import HarnessConfig
 from shared.messages import Vector3, Wrench
 
 ERROR_MIN: Final = 5.0
@@ -205,6 +207,13 @@ class Overload:
         self._below_since_ns: int | None = None
         self.hold = False
         """True while it lasts."""
+
+    @classmethod
+    def of(cls, harness: HarnessConfig) -> Overload:
+        """Return one with the limits of a robot file."""
+        after_ns = round(harness.overload_after_ms * NS_PER_MS)
+        release_ns = round(harness.overload_release_s * NS_PER_S)
+        return cls(harness.overload_force, harness.overload_moment, after_ns, release_ns)
 
     def remember(self) -> OverloadMemory:
         """Return the memory as it is now."""

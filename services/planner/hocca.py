@@ -2,7 +2,7 @@
 
 One tick, in the paper's letters:
 
-    p, J                 from the measured joints
+    p, J                 from the measured joints, the feet where they stood at the start
     p_ref = S_perp p_C + S p
     q_ref = IK(p_ref)
     v_ref                J v_ref = S J v + S_perp pdot_C, C v_ref = 0
@@ -33,6 +33,7 @@ from services.planner.levelling import Levelling
 from services.planner.memory import LawMemory
 from services.planner.shift import ShiftReference
 from services.planner.split import GainSplit, LocalGains
+from services.planner.stance import Stance
 from shared.config import GRAVITY, RobotConfig
 from shared.messages import STRAIGHT, Pair, Vector3, Vector4, Wrench
 
@@ -65,6 +66,8 @@ class LawOutput(NamedTuple):
     """N"""
     slope: Pair
     """The floor's rise along x and y, rad."""
+    stance: Array
+    """The right foot against the left (6,), beyond the robot file, m and rad."""
     ik_iterations: int
     ik_residual: float
 
@@ -86,6 +89,7 @@ class Hocca:
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
+        self._stance = Stance(config.law.stance_max)
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
         assist = config.assist
@@ -100,6 +104,15 @@ class Hocca:
         self._has_led = False
         self._F_assist: Array = np.zeros(3)
         self._per_p: Array = np.eye(12)[:, :6].copy()
+
+    @property
+    def stance_refused(self) -> bool:
+        """True while the feet stand farther off than the law leads them."""
+        return self._stance.refused
+
+    def stance_refusal(self) -> str:
+        """Return in words why it is refused; "" if it is not."""
+        return self._stance.refusal() if self._stance.refused else ""
 
     def tick(
         self,
@@ -133,6 +146,9 @@ class Hocca:
             up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
         measured, ik = self._measured, self._ik
+        if (align or not self._aligned) and not self._has_led:
+            self._stance.take(measured.stance_at(q))
+            self._stand_as_taken()
         measured.update(q)
         self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._aligned)
         up = self._levelling.up
@@ -199,6 +215,7 @@ class Hocca:
             measured.closure.copy(),
             self._assist.assist,
             self._levelling.slope,
+            self._stance.taken,
             result.iterations,
             result.residual,
         )
@@ -216,6 +233,7 @@ class Hocca:
             self._coupling.remember(),
             self._levelling.remember(),
             self._shift.remember(),
+            self._stance.remember(),
         )
 
     def recall(self, memory: LawMemory) -> None:
@@ -229,6 +247,12 @@ class Hocca:
         self._coupling.recall(memory.coupling)
         self._levelling.recall(memory.levelling)
         self._shift.recall(memory.shift)
+        self._stance.recall(memory.stance)
+        self._stand_as_taken()
+
+    def _stand_as_taken(self) -> None:
+        for kinematics in (self._measured, self._ik.kinematics):
+            kinematics.stance[:] = self._stance.taken
 
     def _align(self, q: Array) -> None:
         self._aligned = True

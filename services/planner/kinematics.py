@@ -38,6 +38,11 @@ class Kinematics:
     - `J_harness` (3, 12): harness point's velocity per joint rate, m/rad, world;
     - `r_torso` (3,), `r_harness` (3,): m, world;
     - `D_left` (6, 6): the left leg's share of a torso wrench; the right's is I - D_left.
+
+    Written from outside:
+
+    - `stance` (6,): where the right foot is against the left, beyond how the robot file has them:
+      x, y, z in m and a rotation vector in rad, world axes. The world is midway between the feet.
     """
 
     def __init__(self, config: RobotConfig) -> None:
@@ -46,6 +51,8 @@ class Kinematics:
         self._sharing = CompiledGraph(graphs.sharing)
         self._pose = CompiledGraph(graphs.pose)
         self._hessian = CompiledGraph(graphs.hessian)
+        self._stance = CompiledGraph(graphs.stance)
+        self.stance: Array = np.zeros(6)
         self.D_left = self._sharing.results[0]
         (
             self.p,
@@ -67,12 +74,20 @@ class Kinematics:
         """
         if D_left is None:
             self._sharing.arguments[0][:] = q
+            self._sharing.arguments[1][:] = self.stance
             self._sharing()
         else:
             self.D_left[:] = D_left
         self._pose.arguments[0][:] = q
-        self._pose.arguments[1][:] = self.D_left
+        self._pose.arguments[1][:] = self.stance
+        self._pose.arguments[2][:] = self.D_left
         self._pose()
+
+    def stance_at(self, q: Array) -> Array:
+        """Return the stance (6,) in which the legs agree at q; overwritten by the next call."""
+        self._stance.arguments[0][:] = q
+        self._stance()
+        return self._stance.results[0]
 
     def hessian_times(self, F: Array, F_harness: Array) -> Array:
         """Return sum_i H_i F_i (12, 12), plus the harness point's for its force, N m/rad.
@@ -84,8 +99,8 @@ class Kinematics:
             F: wrench along p (6,): N, and N m along roll, pitch, yaw.
             F_harness: force at the harness point (3,), N, world.
         """
-        q, D_left, force, at_harness = self._hessian.arguments
-        q[:] = self._pose.arguments[0]
+        q, stance, D_left, force, at_harness = self._hessian.arguments
+        q[:], stance[:] = self._pose.arguments[0], self._pose.arguments[1]
         D_left[:] = self.D_left
         force[:] = F
         at_harness[:] = F_harness

@@ -8,12 +8,14 @@ from services.planner.bracing import Bracing
 from services.planner.engagement import Engagement
 from shared.joints import N_JOINTS
 from shared.messages import (
+    AS_CONFIGURED,
     STRAIGHT,
     Attitude,
     JointState,
     Pair,
     SplitSource,
     Vector4,
+    Vector6,
     Wrench,
 )
 
@@ -65,6 +67,8 @@ class LawMemory(msgspec.Struct, frozen=True):
     levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
     """Whether a slope is known, and the slope, rad: the memory of `Levelling`."""
     shift: ShiftMemory = ShiftMemory()
+    stance: tuple[Vector6, bool] = (AS_CONFIGURED, False)
+    """Memory of `Stance`: what is taken, m and rad, and whether it is refused."""
 
 
 class TickMemory(msgspec.Struct, frozen=True):

@@ -73,18 +73,12 @@ class Planner:
         self._shift_wanted = STRAIGHT
         self._wrench: Wrench | None = None
         self._wrench_ns = 0
-        harness = config.harness
-        self._wrench_stale_ns = round(harness.stale_ms * NS_PER_MS)
+        self._wrench_stale_ns = round(config.harness.stale_ms * NS_PER_MS)
         self._attitude: Attitude | None = None
         self._attitude_ns = 0
         self._attitude_seq = -1
         self._attitude_stale_ns = round(config.imu.stale_ms * NS_PER_MS)
-        self._overload = Overload(
-            harness.overload_force,
-            harness.overload_moment,
-            round(harness.overload_after_ms * NS_PER_MS),
-            round(harness.overload_release_s * NS_PER_S),
-        )
+        self._overload = Overload.of(config.harness)
         self._bracing = Bracing()
         self._brace = Brace.NONE
         self._wrench_seq = -1
@@ -231,6 +225,8 @@ class Planner:
         """Return why the planner may not lead, by what the last tick found; None if it may."""
         if self._overload.hold:
             return PlannerMode.OVERLOADED
+        if self._law.stance_refused:
+            return PlannerMode.MISPLACED
         if self._source is SplitSource.UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
         return None
@@ -280,17 +276,20 @@ class Planner:
             for state, arrived in zip(states, self._arrived_ns, strict=True)
         ]
         leads = self._engagement.mode is PlannerMode.LEADING
-        zero: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        if output is not None:
+            seen = output.p, output.pdot, output.p_ref, output.closure, output.stance
+            p, pdot, p_ref, closure, stance = map(_six, seen)
         return PlannerStatus(
             t_ns=now_ns,
             seq=self._seq,
             session=self.session,
             mode=int(self._engagement.mode) if output is not None else int(PlannerMode.WAITING),
             hold=self._hold(),
-            p=_six(output.p) if output is not None else zero,
-            pdot=_six(output.pdot) if output is not None else zero,
-            p_ref=_six(output.p_ref) if output is not None else zero,
-            closure=_six(output.closure) if output is not None else zero,
+            p=p,
+            pdot=pdot,
+            p_ref=p_ref,
+            closure=closure,
             assist_n=output.assist if output is not None else 0.0,
             margin=output.local.margins.service if output is not None else 0.0,
             margin_onboard=output.local.margins.onboard if output is not None else 0.0,
@@ -306,6 +305,8 @@ class Planner:
             attitude_seq=self._attitude_seq,
             slope=output.slope if output is not None else (0.0, 0.0),
             shift_wanted=self._shift_wanted,
+            stance=stance,
+            why=self._law.stance_refusal(),
         )
 
 

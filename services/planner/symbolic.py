@@ -22,11 +22,22 @@ class Graphs(NamedTuple):
     """The functions of the law; what they return is told in `services.planner.kinematics`."""
 
     sharing: ca.Function
-    """q -> D_L (6, 6), the left leg's share; the right's is I - D_L."""
+    """(q, stance) -> D_L (6, 6), the left leg's share; the right's is I - D_L."""
     pose: ca.Function
-    """(q, D_L) -> p, closure, J, C, J_harness, r_torso, r_harness."""
+    """(q, stance, D_L) -> p, closure, J, C, J_harness, r_torso, r_harness."""
     hessian: ca.Function
-    """(q, D_L, F, F_harness) -> sum_i H_i F_i (12, 12)."""
+    """(q, stance, D_L, F, F_harness) -> sum_i H_i F_i (12, 12)."""
+    stance: ca.Function
+    """q -> the stance (6,) in which the legs agree: where the right foot is against the left."""
+
+
+class _Foot(NamedTuple):
+    """Where a foot stands, world axes."""
+
+    r: ca.SX
+    """Ankle (3,), m."""
+    rotation: ca.SX
+    """Against where the robot file has it (3, 3)."""
 
 
 class _Leg(NamedTuple):
@@ -42,29 +53,65 @@ class _Leg(NamedTuple):
 
 def build(config: RobotConfig, geometry: tuple[LegGeometry, LegGeometry]) -> Graphs:
     """Return the graphs for a robot."""
-    q = ca.SX.sym("q", N_JOINTS)
+    q, stance = ca.SX.sym("q", N_JOINTS), ca.SX.sym("s", 6)
     D_left = ca.SX.sym("D_L", 6, 6)
-    legs = [_chain(leg, q[i * N_LEG : (i + 1) * N_LEG]) for i, leg in enumerate(geometry)]
+    feet = _feet(geometry, stance)
+    legs = _chains(geometry, feet, q)
     pose = _pose(config, legs, D_left)
     F, F_harness = ca.SX.sym("F", 6), ca.SX.sym("F_h", 3)
     hessian = _hessian(config, legs, D_left, pose, F, F_harness)
     return Graphs(
-        sharing=ca.Function("sharing", [q], [_share(config, geometry, legs)]),
+        sharing=ca.Function("sharing", [q, stance], [_share(config, feet, legs)]),
         pose=ca.Function(
             "pose",
-            [q, D_left],
+            [q, stance, D_left],
             [ca.densify(part) for part in pose[:7]],
             {"cse": True},
         ),
         hessian=ca.Function(
-            "hessian", [q, D_left, F, F_harness], [ca.densify(hessian)], {"cse": True}
+            "hessian", [q, stance, D_left, F, F_harness], [ca.densify(hessian)], {"cse": True}
         ),
+        stance=ca.Function("stance", [q], [_stance(geometry, q)], {"cse": True}),
     )
 
 
-def _chain(geometry: LegGeometry, q: ca.SX) -> _Leg:
+def _feet(geometry: tuple[LegGeometry, LegGeometry], stance: ca.SX) -> list[_Foot]:
+    """Return both feet in a stance: half of it is laid on each, so that the world is midway."""
+    return [
+        _Foot(ca.DM(leg.r_foot) + half * stance[:3], _rotation(half * stance[3:]))
+        for leg, half in zip(geometry, (0.5, -0.5), strict=True)
+    ]
+
+
+def _chains(geometry: tuple[LegGeometry, LegGeometry], feet: list[_Foot], q: ca.SX) -> list[_Leg]:
+    return [
+        _chain(leg, foot, q[i * N_LEG : (i + 1) * N_LEG])
+        for i, (leg, foot) in enumerate(zip(geometry, feet, strict=True))
+    ]
+
+
+def _stance(geometry: tuple[LegGeometry, LegGeometry], q: ca.SX) -> ca.SX:
+    """Return the stance in which both legs carry the torso to the same place.
+
+    With the feet as in the robot file they carry it to (R_i, x_i). The feet are then turned by
+    +-phi/2 and shifted by +-d/2:
+
+        Rot(phi) = R_L R_R^T
+        f_R + d/2 + Rot(phi/2) (x_R - f_R) = f_L - d/2 + Rot(-phi/2) (x_L - f_L)
+    """
+    right, left = _chains(geometry, _feet(geometry, ca.SX.zeros(6)), q)
+    phi = _rotation_vector(left.rotation @ right.rotation.T)
+    at_right, at_left = (
+        ca.DM(leg.r_foot) + _rotation(half * phi) @ (chain.r_torso - ca.DM(leg.r_foot))
+        for leg, chain, half in zip(geometry, (right, left), (0.5, -0.5), strict=True)
+    )
+    return ca.densify(ca.vertcat(at_left - at_right, phi))
+
+
+def _chain(geometry: LegGeometry, foot: _Foot, q: ca.SX) -> _Leg:
     """Carry the knee and the torso up one leg: a product of exponentials, foot first."""
-    rotation, shift = ca.SX.eye(3), ca.SX.zeros(3)
+    rotation = foot.rotation
+    shift = foot.r - rotation @ ca.DM(geometry.r_foot)
     axes, points = [], []
     r_knee = ca.SX.zeros(3)
     for joint in range(N_LEG):
@@ -174,15 +221,13 @@ def _by_rotation(config: RobotConfig, rotation: ca.SX, moment: ca.SX, F_harness:
     return ca.substitute(ca.hessian(work, turn)[0], turn, ca.SX.zeros(3))
 
 
-def _share(
-    config: RobotConfig, geometry: tuple[LegGeometry, LegGeometry], legs: list[_Leg]
-) -> ca.SX:
+def _share(config: RobotConfig, feet: list[_Foot], legs: list[_Leg]) -> ca.SX:
     """Return D_L, how much of a torso wrench the left leg takes (design section 3 a).
 
     Leg i can give the torso the wrench X_i w_i, w_i at its foot. Foot moments are dear:
     beyond a few centimetres of lever the sole tips. With W weighting them, the least-
     effort distribution of a torso wrench F is w_i = W X_i^T A^-1 F, A = sum X_i W X_i^T,
-    so leg i's share at the torso is D_i = X_i W X_i^T A^-1.
+    so leg i's share at the torso is D_i = X_i W X_i^T A^-1. Moments are in the foot's axes.
     """
     middle = 0.5 * (legs[0].r_torso + legs[1].r_torso)
     if config.law.jacobian == "average":
@@ -193,9 +238,10 @@ def _share(
     # a moment about x is held over the sole's width, one about y over its length
     W = ca.diag(ca.DM([1.0, 1.0, 1.0, l_y**2, l_x**2, l_z**2]))
     weighted = []
-    for leg in geometry:
+    for foot in feet:
         X = ca.SX.eye(6)
-        X[3:, :3] = ca.skew(ca.DM(leg.r_foot) - middle)
+        X[3:, :3] = ca.skew(foot.r - middle)
+        X[3:, 3:] = foot.rotation
         weighted.append(X @ W @ X.T)
     # both are symmetric: (A^-1 B)^T = B A^-1
     return ca.densify(ca.solve(weighted[0] + weighted[1], weighted[1]).T)

@@ -142,12 +142,12 @@ def _set_joints(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
 
 
 def _feet(config: RobotConfig, plant: PlantConfig) -> tuple[Array, tuple[float, float]]:
+    """Return the ankles (2, 3), m, and how the feet are turned, rad; the world is midway."""
     ankles = np.array(ankle_positions(config))
-    offsets = (plant.feet.offset_right, plant.feet.offset_left)
-    for leg, (x, y, _) in enumerate(offsets):
-        ankles[leg, :2] += (x, y)
+    half = 0.5 * (np.array(plant.feet.offset_right) - np.array(plant.feet.offset_left))
+    ankles[:, :2] += (half[:2], -half[:2])
     ankles[SIDES.index("right"), 2] += plant.floor.step
-    return ankles, (offsets[0][2], offsets[1][2])
+    return ankles, (float(half[2]), float(-half[2]))
 
 
 def _set_floor(spec: mujoco.MjSpec, config: RobotConfig, plant: PlantConfig, ankles: Array) -> None:

@@ -111,7 +111,10 @@ class Floor(Section, frozen=True):
 
 
 class Feet(Section, frozen=True):
-    """Where the feet are put, against where the planner takes them to be."""
+    """Where the feet are put, against where the robot file has them.
+
+    Only the one against the other matters: the world's origin is midway between the ankles.
+    """
 
     offset_right: tuple[Shift, Shift, Angle] = (0.0, 0.0, 0.0)
     """x, y in m, yaw in rad."""

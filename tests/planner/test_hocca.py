@@ -186,17 +186,6 @@ def test_align_makes_no_step_from_any_pose_before(law: Hocca, closed: Closed) ->
     np.testing.assert_allclose(output.q_ref, q, atol=1e-5)
 
 
-def test_align_steps_by_no_more_than_the_legs_disagree(
-    robot: RobotConfig, law: Hocca, closed: Closed
-) -> None:
-    q = closed(1.0, pitch=0.3) + 1e-3 * np.random.default_rng(4).normal(size=12)
-    output = law.tick(q, STILL, 0.0, DT, align=True)
-    opened = np.abs(oracle.closure(robot, q)).max()
-    assert opened > 1e-4
-    assert np.abs(oracle.closure(robot, output.q_ref)).max() < 1e-5
-    assert np.abs(output.q_ref - q).max() < 5 * opened
-
-
 def test_after_align_the_reference_glides_to_the_centre(
     robot: RobotConfig, law: Hocca, closed: Closed
 ) -> None:

@@ -21,6 +21,7 @@ from shared.joints import MODULES
 from shared.messages import (
     JointState,
     Mode,
+    PlannerStatus,
     RunEvent,
     RunEventKind,
     SimControl,
@@ -119,6 +120,7 @@ class Conductor:
         self._states = {
             module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
         }
+        self._leads: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._control = session.publisher(topics.SIM_CONTROL, SimControl)
         self._events = session.publisher(topics.RUN_EVENT, RunEvent)
         self._truth: SimTruth | None = None
@@ -217,9 +219,11 @@ class Conductor:
             else:
                 since = None
             if time.monotonic() > deadline:
+                lead = self._leads.take()
                 raise RunError(
                     f"not all six modules track after {READY_TIMEOUT_S:.0f} s: "
-                    f"{self._modes_in_words()}; the services' logs tell more"
+                    f"{(lead.why if lead else '') or self._modes_in_words()}; "
+                    "the services' logs tell more"
                 )
             time.sleep(POLL_S)
         self._check_cores(idle)  # tracking for a moment is not being carried through a scenario

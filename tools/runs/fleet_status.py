@@ -87,6 +87,8 @@ class LeadStatus(msgspec.Struct, frozen=True):
     """Until it may lead again after drop-outs, s."""
     margin: float
     """Failsafe certificate of the gains; 1 is what is required."""
+    why: str = ""
+    """Why it does not lead, in words, where the mode does not say it all."""
 
 
 class FleetStatus(msgspec.Struct, frozen=True):
@@ -234,7 +236,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
     if not isinstance(message, PlannerStatus):
         return None
     mode = PlannerMode(message.mode).name
-    return LeadStatus(mode, message.wait_s, message.margin)
+    return LeadStatus(mode, message.wait_s, message.margin, message.why)
 
 
 def _listen(

@@ -1,0 +1,81 @@
+"""Where the feet stand, against where the robot file has them. Pure.
+
+The law knows its feet by the joints alone: both legs carry the same torso, so a foot that is
+ahead, turned, or nearer than `geometry.w_base` shows as two places for one torso. Before the
+planner leads for the first time it takes the stance in which the legs agree, and keeps it: then no
+leg works against the other, and each foot is asked for what its own place lets it give. With the
+feet taken as in the file, 0.1 m too wide tipped a sole by 0.18 rad; taken as they stand, by 0.002.
+
+Zero errors of the joints are taken along: they look like feet that are a little off. A stance
+beyond `law.stance_max` is not led: it was not shown to stand, or something is broken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.messages import Vector6
+
+Array = NDArray[np.float64]
+
+_ROWS: Final = (
+    ("ahead of", "behind", "mm"),
+    ("too near", "too far from", "mm"),
+    ("higher than", "lower than", "mm"),
+    ("rolled inwards against", "rolled outwards against", "deg"),
+    ("pitched toes down against", "pitched toes up against", "deg"),
+    ("turned inwards against", "turned outwards against", "deg"),
+)
+"""The right foot against the left, a positive and a negative row of a stance, and its unit."""
+_TO_UNIT: Final = {"mm": 1e3, "deg": 180.0 / math.pi}
+
+
+class Stance:
+    """The stance that the law reckons with.
+
+    Attributes:
+        taken: (6,) the right foot against the left, beyond the robot file: x, y, z in m and a
+            rotation vector in rad, world axes.
+        refused: True while the feet stand farther off than the law leads them.
+    """
+
+    def __init__(self, largest: Sequence[float]) -> None:
+        """Begin with the feet as configured.
+
+        Args:
+            largest: `law.stance_max`, m and rad; zero in a row: it is not taken, nor refused.
+        """
+        self._largest: Array = np.array(largest)
+        self.taken: Array = np.zeros(6)
+        self.refused = False
+
+    def take(self, measured: Array) -> None:
+        """Take the stance (6,) in which the legs agree now."""
+        heeded = self._largest > 0.0
+        self.refused = bool((heeded & (np.abs(measured) > self._largest)).any())
+        self.taken[:] = np.where(heeded, measured, 0.0)
+
+    def refusal(self) -> str:
+        """Return in words what of the stance is beyond what is led; "" if nothing is."""
+        rows = zip(self.taken.tolist(), self._largest.tolist(), _ROWS, strict=True)
+        return "; ".join(
+            f"the right foot is {abs(value) * _TO_UNIT[unit]:.0f} {unit} "
+            f"{more if value > 0.0 else less} the left: "
+            f"at most {most * _TO_UNIT[unit]:.0f} {unit} is led (law.stance_max)"
+            for value, most, (more, less, unit) in rows
+            if 0.0 < most < abs(value)
+        )
+
+    def remember(self) -> tuple[Vector6, bool]:
+        """Return the memory as it is now."""
+        a, b, c, d, e, f = self.taken.tolist()
+        return (a, b, c, d, e, f), self.refused
+
+    def recall(self, memory: tuple[Vector6, bool]) -> None:
+        """Go on from a memory."""
+        self.taken[:], self.refused = memory

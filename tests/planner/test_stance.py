@@ -1,0 +1,202 @@
+"""Where the feet stand is taken from the joints, reckoned with, and refused beyond its limits."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from services.planner.hocca import Hocca
+from services.planner.kinematics import Kinematics
+from services.planner.planner import Planner
+from services.planner.stance import Stance
+from shared.config import RobotConfig
+from shared.messages import PlannerMode
+from tests.planner import oracle
+from tests.planner.conftest import Closed
+from tests.planner.oracle import LEFT, RIGHT, Array
+
+STANCES = (
+    (0.1, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (0.0, -0.12, 0.02, 0.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 0.0, 0.0, 0.3),
+    (-0.1, 0.12, -0.02, 0.02, -0.03, -0.3),
+)
+"""The right foot against the left: ahead, wider and on a step, turned in, and all at once."""
+LARGEST = (0.12, 0.14, 0.04, 0.06, 0.06, 0.33)
+DT = 0.004
+STILL = np.zeros(12)
+
+
+class Standing:
+    """Both legs by the paper's equations, their feet put into a stance."""
+
+    def __init__(self, robot: RobotConfig, q: Array, stance: Array) -> None:
+        self.feet: list[Array] = []
+        self.turns: list[Array] = []
+        self.knees: list[Array] = []
+        self.torsos: list[Array] = []
+        self.rotations: list[Array] = []
+        for side, half in ((RIGHT, 0.5), (LEFT, -0.5)):
+            one = oracle.leg(robot, side, q)
+            turn = pin.exp3(half * stance[3:])
+            foot = one.ankle + half * stance[:3]
+            self.feet.append(foot)
+            self.turns.append(turn)
+            self.knees.append(foot + turn @ (one.knee - one.ankle))
+            self.torsos.append(foot + turn @ (one.torso - one.ankle))
+            self.rotations.append(turn @ one.R)
+
+    @property
+    def closure(self) -> Array:
+        turned = oracle.rotation_vector(self.rotations[LEFT] @ self.rotations[RIGHT].T)
+        return np.concatenate((self.torsos[LEFT] - self.torsos[RIGHT], turned))
+
+
+@pytest.fixture(params=STANCES, ids=("ahead", "wide", "turned", "all"))
+def stance(request: pytest.FixtureRequest) -> Array:
+    return np.array(request.param)
+
+
+@pytest.fixture
+def standing_there(robot: RobotConfig, closed: Closed, stance: Array) -> tuple[Kinematics, Array]:
+    """Return kinematics in a stance, and joint angles with which both legs agree in it."""
+    kinematics, q = Kinematics(robot), closed(1.0, pitch=0.3, yaw=0.04)
+    kinematics.stance[:] = stance
+    for _ in range(8):
+        kinematics.update(q)
+        q = q - np.linalg.lstsq(kinematics.C, kinematics.closure, rcond=None)[0]
+    kinematics.update(q)
+    return kinematics, q
+
+
+def test_the_stance_found_is_the_one_in_which_the_legs_agree(
+    robot: RobotConfig, standing_there: tuple[Kinematics, Array], stance: Array
+) -> None:
+    kinematics, q = standing_there
+    np.testing.assert_allclose(Standing(robot, q, stance).closure, 0.0, atol=1e-6)
+    np.testing.assert_allclose(kinematics.stance_at(q), stance, atol=1e-6)
+
+
+def test_the_pose_is_the_papers_with_the_feet_where_they_stand(
+    robot: RobotConfig, standing_there: tuple[Kinematics, Array], stance: Array
+) -> None:
+    kinematics, q = standing_there
+    there = Standing(robot, q, stance)
+    m_torso, m_total = oracle.masses(robot)
+    weighed = m_torso * there.torsos[RIGHT] + robot.mass.module * sum(there.knees)
+    # the ankles weigh too: their middle is the world's origin
+    np.testing.assert_allclose(sum(there.feet), 0.0, atol=1e-12)
+    np.testing.assert_allclose(kinematics.p[:3], weighed / m_total, atol=1e-6)
+    np.testing.assert_allclose(kinematics.p[3:], oracle.euler(there.rotations[RIGHT]), atol=1e-6)
+
+
+@pytest.mark.parametrize(("matrix", "vector"), [("J", "p"), ("C", "closure")])
+def test_jacobians_are_slopes_in_any_stance(
+    standing_there: tuple[Kinematics, Array], matrix: str, vector: str
+) -> None:
+    kinematics, q = standing_there
+    got = np.array(getattr(kinematics, matrix))
+
+    def value(near: Array) -> Array:
+        kinematics.update(near)
+        return np.array(getattr(kinematics, vector))
+
+    np.testing.assert_allclose(got, oracle.derivative(value, q), atol=3e-6)
+
+
+def test_each_sole_is_asked_for_little_moment_where_it_stands(
+    robot: RobotConfig, standing_there: tuple[Kinematics, Array], stance: Array
+) -> None:
+    """The weight over the middle of the feet: no foot is to bear it on a lever of decimetres."""
+    kinematics, q = standing_there
+    there = Standing(robot, q, stance)
+    weight = np.array([0.0, 0.0, 500.0])
+    for side, share in ((RIGHT, np.eye(6) - kinematics.D_left), (LEFT, kinematics.D_left)):
+        # a weight over the origin, as a wrench at the torso's origin
+        torso = there.torsos[side]
+        at_torso = share @ np.concatenate((weight, np.cross(-torso, weight)))
+        at_foot = at_torso[3:] + np.cross(torso - there.feet[side], at_torso[:3])
+        pitch_moment = (there.turns[side].T @ at_foot)[1]
+        assert abs(pitch_moment) < 0.01 * 500.0, "less than a centimetre of lever"
+
+
+def test_align_makes_no_step_where_the_feet_stand_astray(
+    robot: RobotConfig, closed: Closed
+) -> None:
+    """What the legs disagree by is how the feet stand: it is taken, not fought."""
+    q = closed(1.0, pitch=0.3) + 1e-2 * np.random.default_rng(4).normal(size=12)
+    output = Hocca(robot).tick(q, STILL, 0.0, DT, align=True)
+    assert np.abs(oracle.closure(robot, q)).max() > 1e-2
+    np.testing.assert_allclose(output.q_ref, q, atol=1e-5)
+    np.testing.assert_allclose(output.closure, 0.0, atol=1e-6)
+
+
+def test_once_it_leads_the_references_keep_the_stance_it_began_with(
+    robot: RobotConfig, closed: Closed
+) -> None:
+    """A joint that gives while it is led does not look like a foot that has moved."""
+    q = closed(1.0, pitch=0.3)
+    q[0] += 0.01
+    law = Hocca(robot)
+    began = law.tick(q, STILL, 0.0, DT, align=True).stance.copy()
+    assert np.abs(began).max() > 1e-3
+    bent = q.copy()
+    bent[3] += 0.01
+    for align in (False, True, False):
+        np.testing.assert_array_equal(law.tick(bent, STILL, 0.0, DT, align=align).stance, began)
+
+
+@pytest.mark.parametrize("row", range(6))
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_stance_is_taken_up_to_the_limit_and_refused_beyond_it(row: int, sign: float) -> None:
+    held = Stance(LARGEST)
+    measured = np.zeros(6)
+    measured[row] = sign * LARGEST[row]
+    held.take(measured)
+    assert not held.refused
+    assert held.refusal() == ""
+    np.testing.assert_array_equal(held.taken, measured)
+    measured[row] = np.nextafter(measured[row], sign)
+    held.take(measured)
+    assert held.refused
+    assert "law.stance_max" in held.refusal()
+    held.take(0.5 * measured)
+    assert not held.refused, "put back"
+
+
+@pytest.mark.parametrize(
+    ("row", "value", "words"),
+    [
+        (0, 0.2, "200 mm ahead of the left: at most 120 mm"),
+        (0, -0.2, "200 mm behind the left"),
+        (1, 0.2, "200 mm too near the left"),
+        (1, -0.2, "200 mm too far from the left"),
+        (5, 0.5, "29 deg turned inwards against the left: at most 19 deg"),
+    ],
+)
+def test_a_refusal_says_which_foot_is_where(row: int, value: float, words: str) -> None:
+    held = Stance(LARGEST)
+    measured = np.zeros(6)
+    measured[row] = value
+    held.take(measured)
+    assert words in held.refusal()
+
+
+def test_without_limits_the_feet_are_where_the_robot_file_has_them() -> None:
+    """Logs from before there was a stance are executed again as they were."""
+    held = Stance((0.0,) * 6)
+    held.take(np.full(6, 0.5))
+    assert not held.refused
+    np.testing.assert_array_equal(held.taken, 0.0)
+
+
+def test_a_planner_that_is_recalled_goes_on_in_the_stance_it_had(robot: RobotConfig) -> None:
+    planner, again = Planner(robot, 1), Planner(robot, 1)
+    memory = planner.remember()
+    stance = (0.05, -0.02, 0.0, 0.0, 0.01, 0.1)
+    law = msgspec.structs.replace(memory.law, stance=(stance, False), aligned=True, has_led=True)
+    again.recall(msgspec.structs.replace(memory, law=law))
+    assert again.remember().law.stance == (stance, False)
+    assert again.status(1, 0.0).mode == PlannerMode.WAITING
