@@ -170,7 +170,7 @@ class JointController:
         With none, a knee whose service froze was soft while the other leg's was stiff, and the
         robot fell (450 mm); with 600 N m/rad it moves by 23 mm. With all of it the hand feels the
         drive's gains that the service takes off 2 ms late: 26 N in the squat for 18, with
-        600 N m/rad 19.8. One whose phi alone is stiff is left as it is: half of that is on its theta.
+        600 N m/rad 19.8. One whose phi alone is stiff is left as it is: half is on its theta.
         In DAMP a drive that is left goes on sinking.
         """
         if self.failsafe.mode is Mode.DAMP or self._unled_share == 0.0:

@@ -114,7 +114,8 @@ class LoadedStand:
         self._tau: Array = F_O @ kinematics.J
         self._tau_knees = self._tau - self._joint_torques(self._W)
         """Torques of the knees' own weight (12,), N m."""
-        self._arms = [kinematics.r_torso - ankle for ankle in np.array(ankle_positions(config))]
+        ankles = ankle_positions(config) + np.outer((0.5, -0.5), kinematics.stance[:3])
+        self._arms = [kinematics.r_torso - ankle for ankle in ankles]
         self._leg_weights = [
             # the knee's weight turns the ankle by what the ankle's torque says
             np.array([0.0, 0.0, 2.0 * config.mass.module * GRAVITY, *self._tau_knees[leg][:2], 0.0])

@@ -10,6 +10,8 @@ import pytest
 from services.planner.hocca import Hocca
 from services.planner.kinematics import Kinematics
 from services.planner.planner import Planner
+from services.planner.poses import Poses
+from services.planner.push_limit import LoadedStand
 from services.planner.stance import Stance
 from shared.config import RobotConfig
 from shared.messages import PlannerMode
@@ -146,6 +148,21 @@ def test_once_it_leads_the_references_keep_the_stance_it_began_with(
     bent[3] += 0.01
     for align in (False, True, False):
         np.testing.assert_array_equal(law.tick(bent, STILL, 0.0, DT, align=align).stance, began)
+
+
+def test_a_foot_ahead_lets_it_bear_a_harder_push_forwards(robot: RobotConfig) -> None:
+    """The foremost toe is farther from the COM; without the stance both read 72 N."""
+
+    def limit(ahead: float) -> float:
+        at = Poses(robot)
+        at.kinematics.stance[0] = ahead
+        node = at.node(0.9, 0.0)
+        assert node is not None
+        stand = LoadedStand(robot, at.kinematics, node.T, node.hessians[0])
+        return stand.limit_of_body((1.0, 0.0)).force_n
+
+    together, apart = limit(0.0), limit(0.1)
+    assert apart > together + 4.0
 
 
 @pytest.mark.parametrize("row", range(6))

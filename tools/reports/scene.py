@@ -21,7 +21,7 @@ from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES, SIDES
-from shared.messages import JointState, Mode, SimTruth, Vector3, Wrench
+from shared.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
 from shared.robot_model import MODULE_RADIUS, side_sign
 from tools.reports import foxglove, urdf
 from tools.reports.foxglove import ORIGIN, UPRIGHT, Arrow, Colour, Entity, Placed, Quaternion, Solid
@@ -128,7 +128,7 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
     """Yield the robot at the scene's rate, each time as it was known then.
 
     The torso is where the simulated world says; in a log without one, where the legs say,
-    the feet standing side by side.
+    the feet standing as the planner took them.
 
     Raises:
         RunError: the log does not hold the states of all six modules.
@@ -141,6 +141,8 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
     wrenches: list[Wrench] = log.messages(topics.WRENCH)
     newest = [Newest(rows) for rows in states]
     wrench = Newest(wrenches)
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    status = Newest(statuses)
     kinematics = None if truth else Kinematics(robot)
     # a service that has not heard its drive yet says 0
     first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
@@ -153,6 +155,8 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
         if kinematics is None:
             yield Pose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
             continue
+        if statuses and statuses[0].t_ns <= row.t_ns:
+            kinematics.stance[:] = status.at(row.t_ns).stance
         kinematics.update(np.array(q))
         torso, com, angles = kinematics.r_torso, kinematics.p[:3], kinematics.p[3:]
         yield Pose(
