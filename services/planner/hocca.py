@@ -33,7 +33,7 @@ from services.planner.levelling import Levelling
 from services.planner.memory import LawMemory
 from services.planner.shift import ShiftReference
 from services.planner.split import GainSplit, LocalGains
-from services.planner.stance import Stance
+from services.planner.stance import FOLLOWED_S, Stance
 from shared.config import GRAVITY, RobotConfig
 from shared.messages import STRAIGHT, Pair, Vector3, Vector4, Wrench
 
@@ -146,8 +146,9 @@ class Hocca:
             up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
         measured, ik = self._measured, self._ik
-        if (align or not self._aligned) and not self._has_led:
-            self._stance.take(measured.stance_at(q))
+        if align or not self._aligned:
+            share = min(1.0, dt / FOLLOWED_S) if self._has_led else 1.0
+            self._stance.take(measured.stance_at(q), share)
             self._stand_as_taken()
         measured.update(q)
         self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._aligned)

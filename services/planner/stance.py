@@ -2,8 +2,10 @@
 
 The law knows its feet by the joints alone: both legs carry the same torso, so a foot that is
 ahead, turned, or nearer than `geometry.w_base` shows as two places for one torso. Before the
-planner leads for the first time it takes the stance in which the legs agree, and keeps it: then no
-leg works against the other, and each foot is asked for what its own place lets it give. With the
+planner leads it takes the stance in which the legs agree, and keeps it while it leads: then no leg
+works against the other, and each foot is asked for what its own place lets it give. Between two
+times of leading it follows the joints slowly: feet that were moved in HOLD are found, a sole that
+lifts in a sway is not taken for one. With the
 feet taken as in the file, 0.1 m too wide tipped a sole by 0.18 rad; taken as they stand, by 0.002.
 
 Zero errors of the joints are taken along: they look like feet that are a little off. A stance
@@ -35,6 +37,10 @@ _ROWS: Final = (
 _TO_UNIT: Final = {"mm": 1e3, "deg": 180.0 / math.pi}
 
 
+FOLLOWED_S: Final = 2.0
+"""A planner that has led takes a new stance in about this time, s."""
+
+
 class Stance:
     """The stance that the law reckons with.
 
@@ -52,17 +58,27 @@ class Stance:
         """
         self._largest: Array = np.array(largest)
         self.taken: Array = np.zeros(6)
+        self._measured: Array = np.zeros(6)
         self.refused = False
 
-    def take(self, measured: Array) -> None:
-        """Take the stance (6,) in which the legs agree now."""
+    def take(self, measured: Array, share: float = 1.0) -> None:
+        """Take the stance in which the legs agree now.
+
+        Args:
+            measured: (6,), m and rad.
+            share: of the way there; 1: at once.
+        """
+        if not np.isfinite(measured).all():  # by angles that are none: nothing to follow
+            self.refused = True
+            return
+        self._measured[:] = measured
         heeded = self._largest > 0.0
         self.refused = bool((heeded & (np.abs(measured) > self._largest)).any())
-        self.taken[:] = np.where(heeded, measured, 0.0)
+        self.taken += share * (np.where(heeded, measured, 0.0) - self.taken)
 
     def refusal(self) -> str:
-        """Return in words what of the stance is beyond what is led; "" if nothing is."""
-        rows = zip(self.taken.tolist(), self._largest.tolist(), _ROWS, strict=True)
+        """Return in words what of the stance measured last is beyond what is led, if anything."""
+        rows = zip(self._measured.tolist(), self._largest.tolist(), _ROWS, strict=True)
         return "; ".join(
             f"the right foot is {abs(value) * _TO_UNIT[unit]:.0f} {unit} "
             f"{more if value > 0.0 else less} the left: "

@@ -12,7 +12,7 @@ from services.planner.kinematics import Kinematics
 from services.planner.planner import Planner
 from services.planner.poses import Poses
 from services.planner.push_limit import LoadedStand
-from services.planner.stance import Stance
+from services.planner.stance import FOLLOWED_S, Stance
 from shared.config import RobotConfig
 from shared.messages import PlannerMode
 from tests.planner import oracle
@@ -135,19 +135,26 @@ def test_align_makes_no_step_where_the_feet_stand_astray(
     np.testing.assert_allclose(output.closure, 0.0, atol=1e-6)
 
 
-def test_once_it_leads_the_references_keep_the_stance_it_began_with(
+def test_while_it_leads_it_keeps_the_stance_and_in_hold_it_follows_slowly(
     robot: RobotConfig, closed: Closed
 ) -> None:
-    """A joint that gives while it is led does not look like a foot that has moved."""
+    """A joint that gives is not a foot that has moved; one that stays moved is."""
     q = closed(1.0, pitch=0.3)
-    q[0] += 0.01
     law = Hocca(robot)
     began = law.tick(q, STILL, 0.0, DT, align=True).stance.copy()
-    assert np.abs(began).max() > 1e-3
-    bent = q.copy()
-    bent[3] += 0.01
-    for align in (False, True, False):
-        np.testing.assert_array_equal(law.tick(bent, STILL, 0.0, DT, align=align).stance, began)
+    moved = q.copy()
+    moved[[2, 3]] += 0.01
+    for _ in range(20):
+        np.testing.assert_array_equal(law.tick(moved, STILL, 0.0, DT).stance, began)
+    there = Kinematics(robot).stance_at(moved).copy()
+    away = np.abs(there - began).max()
+    assert away > 5e-3
+    for _ in range(round(0.1 / DT)):
+        taken = law.tick(moved, STILL, 0.0, DT, align=True).stance.copy()
+    assert 0.0 < np.abs(taken - began).max() < 0.1 * away, "a drop-out of 0.1 s"
+    for _ in range(round(4 * FOLLOWED_S / DT)):
+        taken = law.tick(moved, STILL, 0.0, DT, align=True).stance.copy()
+    np.testing.assert_allclose(taken, there, atol=0.05 * away)
 
 
 def test_a_foot_ahead_lets_it_bear_a_harder_push_forwards(robot: RobotConfig) -> None:
@@ -181,6 +188,18 @@ def test_a_stance_is_taken_up_to_the_limit_and_refused_beyond_it(row: int, sign:
     assert "law.stance_max" in held.refusal()
     held.take(0.5 * measured)
     assert not held.refused, "put back"
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_angles_that_are_no_numbers_are_refused_and_leave_no_trace(number: float) -> None:
+    held = Stance(LARGEST)
+    good = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.2])
+    held.take(good)
+    held.take(np.full(6, number), 0.1)
+    assert held.refused
+    np.testing.assert_array_equal(held.taken, good)
+    held.take(good)
+    assert not held.refused
 
 
 @pytest.mark.parametrize(
