@@ -106,7 +106,7 @@ class RobotConfig(Section, frozen=True):
         N m s/rad. With gains as they were (design section 4), the operator's 60 N m of pitch
         moment in the crawl leaned the COM back by 42 mm and the soles tipped, and pushes from the
         side tipped them in 15 of 500 random cases. With the knees' theta soft, one leg gave under a
-        lasting push from the side: 25 N for 3 s stood, now 80 N. The hips' theta stays soft: a
+        lasting push from the side: 25 N for 3 s stood, now 75 N. The hips' theta stays soft: a
         torso that does not follow a hand that leads on hands all of its moment to the soles, and
         6 of 300 fell.
 

@@ -38,7 +38,9 @@ def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(
         name: np.array([getattr(command, name) for command in tick.commands]).ravel()
         for name in ("q_ref", "v_ref", "tau_ff", "k_p", "k_d")
     }
-    found = account(robot, q, v, commands["q_ref"], commands["v_ref"], tick.status.assist_n)
+    status = tick.status
+    q_ref, v_ref = commands["q_ref"], commands["v_ref"]
+    found = account(robot, q, v, q_ref, v_ref, status.assist_n, status.slope, status.stance)
     np.testing.assert_allclose(found.p, tick.status.p, atol=1e-12)
     np.testing.assert_allclose(found.gravity + found.assist, commands["tau_ff"], atol=0.05)
     np.testing.assert_allclose(found.local.D, commands["k_p"], rtol=0.01)

@@ -24,7 +24,7 @@ from shared.config import RobotConfig
 from shared.joints import kind_of
 from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Pair
 
-UNLED_SHARE = {"ankle": 1.0, "knee": 0.13, "hip": 0.0}
+UNLED_SHARE = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
 """How far a drive's gains rise to HOLD's while its service leads; `left_holding` says why."""
 
 
@@ -166,7 +166,7 @@ class JointController:
 
         An ankle's gains rise to all of HOLD's. On TRACK's own, with no more than 4 N m s/rad on
         its phi, a push from the side rang on by 0.72 each half swing with all six services dead,
-        and 7 of 26 pairs of pushes in step with it fell. A knee's rise to an eighth of HOLD's.
+        and 7 of 26 pairs of pushes in step with it fell. A knee's rise to a fifth of HOLD's.
         With none, a knee whose service froze was soft while the other leg's was stiff, and the
         robot fell (450 mm); with 600 N m/rad it moves by 23 mm. With all of it the hand feels the
         drive's gains that the service takes off 2 ms late: 26 N in the squat for 18, with

@@ -42,8 +42,18 @@ def write_tool(root: Path, name: str, body: str) -> None:
     tool.chmod(0o755)
 
 
-def start(root: Path) -> subprocess.Popen[str]:
-    """Start the script as a terminal does: in a process group of its own."""
+def start(root: Path, *, background: bool = False) -> subprocess.Popen[str]:
+    """Start the script as a terminal does: in a process group of its own.
+
+    Args:
+        root: the project.
+        background: as a shell without job control starts it with `&`: Ctrl-C's signal is ignored.
+    """
+
+    def ignore() -> None:
+        if background:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
     return subprocess.Popen(
         ["bash", "deploy/test"],
         cwd=root,
@@ -52,6 +62,7 @@ def start(root: Path) -> subprocess.Popen[str]:
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
+        preexec_fn=ignore,  # noqa: PLW1509 - no thread of this test holds a lock
     )
 
 
@@ -81,11 +92,12 @@ def test_what_failed_is_said_last_and_the_other_parts_are_run(root: Path, status
     assert last.count("== failed: ERROR tests/test_x.py") == 3
 
 
+@pytest.mark.parametrize("background", [False, True])
 @pytest.mark.parametrize("part", ["mypy", "pytest"])
-def test_ctrl_c_ends_all_of_it(root: Path, part: str) -> None:
+def test_ctrl_c_ends_all_of_it(root: Path, part: str, *, background: bool) -> None:
     """Whatever the part that it meets makes of it: pytest ends with 2, and not by the signal."""
     write_tool(root, part, f"trap 'kill $!; exit 2' INT\nsleep 30 &\necho {part} begins\nwait")
-    script = start(root)
+    script = start(root, background=background)
     assert script.stdout is not None
     said = ""
     while f"{part} begins" not in said:
