@@ -2,7 +2,7 @@
 
 One tick, in the paper's letters:
 
-    p, J                 from the measured joints, the feet where they stood at the start
+    p, J                 from the measured joints, the feet as they were taken to stand
     p_ref = S_perp p_C + S p
     q_ref = IK(p_ref)
     v_ref                J v_ref = S J v + S_perp pdot_C, C v_ref = 0

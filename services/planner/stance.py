@@ -39,6 +39,8 @@ _TO_UNIT: Final = {"mm": 1e3, "deg": 180.0 / math.pi}
 
 FOLLOWED_S: Final = 2.0
 """A planner that has led takes a new stance in about this time, s."""
+FOLLOWED: Final = 0.03
+"""m or rad: until the stance taken is so near to the one measured, it is not led."""
 
 
 class Stance:
@@ -73,18 +75,24 @@ class Stance:
             return
         self._measured[:] = measured
         heeded = self._largest > 0.0
-        self.refused = bool((heeded & (np.abs(measured) > self._largest)).any())
-        self.taken += share * (np.where(heeded, measured, 0.0) - self.taken)
+        beyond = bool((heeded & (np.abs(measured) > self._largest)).any())
+        wanted = np.where(heeded, measured, 0.0)
+        if not beyond:  # what is refused is not followed: it may be a broken encoder
+            self.taken += share * (wanted - self.taken)
+        self.refused = beyond or bool((np.abs(wanted - self.taken) > FOLLOWED).any())
 
     def refusal(self) -> str:
         """Return in words what of the stance measured last is beyond what is led, if anything."""
         rows = zip(self._measured.tolist(), self._largest.tolist(), _ROWS, strict=True)
-        return "; ".join(
-            f"the right foot is {abs(value) * _TO_UNIT[unit]:.0f} {unit} "
-            f"{more if value > 0.0 else less} the left: "
-            f"at most {most * _TO_UNIT[unit]:.0f} {unit} is led (law.stance_max)"
-            for value, most, (more, less, unit) in rows
-            if 0.0 < most < abs(value)
+        return (
+            "; ".join(
+                f"the right foot is {abs(value) * _TO_UNIT[unit]:.0f} {unit} "
+                f"{more if value > 0.0 else less} the left: "
+                f"at most {most * _TO_UNIT[unit]:.0f} {unit} is led (law.stance_max)"
+                for value, most, (more, less, unit) in rows
+                if 0.0 < most < abs(value)
+            )
+            or "the feet have moved: wait until their new places are taken"
         )
 
     def remember(self) -> tuple[Vector6, bool]:

@@ -180,7 +180,6 @@ def test_a_stance_is_taken_up_to_the_limit_and_refused_beyond_it(row: int, sign:
     measured[row] = sign * LARGEST[row]
     held.take(measured)
     assert not held.refused
-    assert held.refusal() == ""
     np.testing.assert_array_equal(held.taken, measured)
     measured[row] = np.nextafter(measured[row], sign)
     held.take(measured)
@@ -188,6 +187,22 @@ def test_a_stance_is_taken_up_to_the_limit_and_refused_beyond_it(row: int, sign:
     assert "law.stance_max" in held.refusal()
     held.take(0.5 * measured)
     assert not held.refused, "put back"
+
+
+def test_what_was_refused_for_long_leaves_no_trace_and_a_moved_foot_is_led_once_followed() -> None:
+    held = Stance(LARGEST)
+    held.take(np.zeros(6))
+    for _ in range(1000):
+        held.take(np.full(6, 0.5), 0.01)
+    assert held.refused
+    np.testing.assert_array_equal(held.taken, 0.0)
+    moved = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.2])
+    held.take(moved, 0.01)
+    assert held.refused
+    assert "have moved" in held.refusal()
+    for _ in range(400):
+        held.take(moved, 0.01)
+    assert not held.refused
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
