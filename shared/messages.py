@@ -80,7 +80,8 @@ class PlannerMode(IntEnum):
     UNCERTIFIED = 4
     """No local gains stand alone in this pose: `hold`."""
     MISPLACED = 5
-    """The feet stand farther from where the robot file has them than `law.stance_max`: `hold`."""
+    """The feet stand farther from where the robot file has them than `law.stance_max`, or have just
+    been moved: `hold`."""
 
 
 class SplitSource(IntEnum):

@@ -58,3 +58,5 @@ def test_why_the_planner_does_not_lead_yet_is_told() -> None:
     assert lead_in_words(good) == "planner LEADING, margin 1.20"
     waits = lead_in_words(LeadStatus("ALIGNING", wait_s=12.3, margin=1.2))
     assert "leads again in 12 s" in waits
+    told = lead_in_words(LeadStatus("MISPLACED", wait_s=0.0, margin=1.2, why="a foot is ahead"))
+    assert told == "planner MISPLACED, margin 1.20; a foot is ahead"

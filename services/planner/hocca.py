@@ -107,7 +107,7 @@ class Hocca:
 
     @property
     def stance_refused(self) -> bool:
-        """True while the feet stand farther off than the law leads them."""
+        """True while the feet stand so that the law does not lead them."""
         return self._stance.refused
 
     def stance_refusal(self) -> str:

@@ -3,10 +3,12 @@
 The law knows its feet by the joints alone: both legs carry the same torso, so a foot that is
 ahead, turned, or nearer than `geometry.w_base` shows as two places for one torso. Before the
 planner leads it takes the stance in which the legs agree, and keeps it while it leads: then no leg
-works against the other, and each foot is asked for what its own place lets it give. Between two
-times of leading it follows the joints slowly: feet that were moved in HOLD are found, a sole that
-lifts in a sway is not taken for one. With the
-feet taken as in the file, 0.1 m too wide tipped a sole by 0.18 rad; taken as they stand, by 0.002.
+works against the other, and each foot is asked for what its own place lets it give. With the feet
+taken as in the file, 0.1 m too wide tipped a sole by 0.18 rad; taken as they stand, by 0.002.
+
+Between two times of leading it follows the joints slowly: feet that were moved in HOLD are found,
+and a sole that lifts in a sway is not taken for one. A planner that has not led yet cannot tell the
+two apart: started while a push tips the soles, it keeps what it saw then until it is not led again.
 
 Zero errors of the joints are taken along: they look like feet that are a little off. A stance
 beyond `law.stance_max` is not led: it was not shown to stand, or something is broken.
@@ -29,13 +31,12 @@ _ROWS: Final = (
     ("ahead of", "behind", "mm"),
     ("too near", "too far from", "mm"),
     ("higher than", "lower than", "mm"),
-    ("rolled inwards against", "rolled outwards against", "deg"),
+    ("inner edge up against", "outer edge up against", "deg"),
     ("pitched toes down against", "pitched toes up against", "deg"),
     ("turned inwards against", "turned outwards against", "deg"),
 )
 """The right foot against the left, a positive and a negative row of a stance, and its unit."""
 _TO_UNIT: Final = {"mm": 1e3, "deg": 180.0 / math.pi}
-
 
 FOLLOWED_S: Final = 2.0
 """A planner that has led takes a new stance in about this time, s."""
@@ -49,7 +50,8 @@ class Stance:
     Attributes:
         taken: (6,) the right foot against the left, beyond the robot file: x, y, z in m and a
             rotation vector in rad, world axes.
-        refused: True while the feet stand farther off than the law leads them.
+        refused: True while the feet stand farther off than the law leads them, or have moved and
+            are not followed yet.
     """
 
     def __init__(self, largest: Sequence[float]) -> None:
@@ -70,10 +72,10 @@ class Stance:
             measured: (6,), m and rad.
             share: of the way there; 1: at once.
         """
+        self._measured[:] = measured
         if not np.isfinite(measured).all():  # by angles that are none: nothing to follow
             self.refused = True
             return
-        self._measured[:] = measured
         heeded = self._largest > 0.0
         beyond = bool((heeded & (np.abs(measured) > self._largest)).any())
         wanted = np.where(heeded, measured, 0.0)
@@ -82,7 +84,9 @@ class Stance:
         self.refused = beyond or bool((np.abs(wanted - self.taken) > FOLLOWED).any())
 
     def refusal(self) -> str:
-        """Return in words what of the stance measured last is beyond what is led, if anything."""
+        """Return in words why the stance measured last is not led."""
+        if not np.isfinite(self._measured).all():
+            return "the joints' angles make no stance"
         rows = zip(self._measured.tolist(), self._largest.tolist(), _ROWS, strict=True)
         return (
             "; ".join(

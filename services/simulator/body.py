@@ -142,7 +142,10 @@ def _set_joints(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
 
 
 def _feet(config: RobotConfig, plant: PlantConfig) -> tuple[Array, tuple[float, float]]:
-    """Return the ankles (2, 3), m, and how the feet are turned, rad; the world is midway."""
+    """Return the ankles (2, 3), m, and how the feet are turned, rad.
+
+    The world is midway between them in x and y, and on the left one's floor.
+    """
     ankles = np.array(ankle_positions(config))
     half = 0.5 * (np.array(plant.feet.offset_right) - np.array(plant.feet.offset_left))
     ankles[:, :2] += (half[:2], -half[:2])

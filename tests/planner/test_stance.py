@@ -213,8 +213,21 @@ def test_angles_that_are_no_numbers_are_refused_and_leave_no_trace(number: float
     held.take(np.full(6, number), 0.1)
     assert held.refused
     np.testing.assert_array_equal(held.taken, good)
+    assert "no stance" in held.refusal()
     held.take(good)
     assert not held.refused
+
+
+@pytest.mark.parametrize("joint", range(12))
+@pytest.mark.parametrize("off", [-np.pi, 3.1, 1.8])
+def test_an_encoder_that_is_half_a_turn_off_is_no_stance(
+    kinematics: Kinematics, robot: RobotConfig, closed: Closed, joint: int, off: float
+) -> None:
+    q = closed(1.0, pitch=0.3)
+    q[joint] += off
+    held = Stance(robot.law.stance_max)
+    held.take(kinematics.stance_at(q))
+    assert held.refused
 
 
 @pytest.mark.parametrize(
@@ -236,7 +249,7 @@ def test_a_refusal_says_which_foot_is_where(row: int, value: float, words: str) 
 
 
 def test_without_limits_the_feet_are_where_the_robot_file_has_them() -> None:
-    """Logs from before there was a stance are executed again as they were."""
+    """So are those of logs from before there was a stance."""
     held = Stance((0.0,) * 6)
     held.take(np.full(6, 0.5))
     assert not held.refused

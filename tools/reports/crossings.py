@@ -148,7 +148,7 @@ def _margins(source: Source) -> Iterator[Happening]:
         ("margin of the joint services alone", service, asked.margin_min),
         ("margin of the drives alone", onboard, asked.onboard_margin_min),
     ):
-        told = (values < least) & (mode != PlannerMode.WAITING)
+        told = (values < least) & ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED))
         found = first_beyond(who, t, told)
         if found is not None:
             yield _told([found], f"under {least:g}, down to {values[told].min():.3g}")

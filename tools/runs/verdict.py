@@ -92,8 +92,9 @@ def course(log: RunLog) -> Course:
         return Course(t, scenario, began=True, zero_ns=zero_ns)
     let_go = [row for row in rows if row.hoist < 1.0]
     if not any(row.fallen for row in let_go):
-        why = [row.why for row in log.messages(topics.PLANNER_STATUS) if row.why][-1:]
-        because = f", for the planner did not lead: {why[0]}" if why else ""
+        statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+        why = statuses[-1].why if statuses else ""
+        because = f", for the planner did not lead: {why}" if why else "; nothing to judge"
         raise RunError(f"{log.path}: the scenario never began in this log{because}")
     zero_ns = let_go[0].t_ns
     t = np.array([(row.t_ns - zero_ns) / NS_PER_S for row in let_go])
