@@ -21,6 +21,7 @@ from tools.sweeps import kill, latency, latency_picture
 from tools.sweeps.latency_trial import (
     CONTROLS,
     DURATION_S,
+    PUSH_S,
     Network,
     Trial,
     fleet_of,
@@ -122,9 +123,10 @@ def test_trials_are_paired_over_delays_and_controls_and_independent_at_one_delay
     robot: RobotConfig,
 ) -> None:
     """So that curves over the delay compare like with like, and their bounds are true."""
+    pushes = {trial(control=name).story(robot_of(robot, name)).push for name in CONTROLS}
+    assert len(pushes) == 1
     by_draw: dict[object, set[tuple[float, str]]] = {}
     for t in grid("--trials", "2"):
-        assert t.story(robot_of(robot, t.control)).push == t.draw.pushes
         by_draw.setdefault(t.draw, set()).add((t.network.delay_ms, t.control))
     assert len(by_draw) == 2 * 4
     assert all(len(points) == 7 * 3 for points in by_draw.values())
@@ -179,14 +181,13 @@ def test_no_draw_is_beyond_the_study() -> None:
     for repeat in range(200):
         draw = trial(repeat=repeat).draw
         begins.append(draw.impaired_from_s)
-        for push in draw.pushes:
-            assert 19.9 <= math.hypot(*push.force) <= 40.01
-            assert push.force[2] == 0.0
-            assert push.at >= draw.impaired_from_s - 1e-3
-            assert push.at + push.duration <= DURATION_S - 1.5, "time to fall"
-            angles.append(math.atan2(push.force[1], push.force[0]))
-        assert len(draw.pushes) == 3
-        assert all(b.at >= a.at + a.duration - 2e-3 for a, b in pairwise(draw.pushes))
+        for shove in draw.shoves:
+            assert 0.2 <= shove.share <= 0.75
+            assert shove.at >= draw.impaired_from_s
+            assert shove.at + PUSH_S <= DURATION_S - 1.5, "time to fall"
+            angles.append(shove.angle)
+        assert len(draw.shoves) == 3
+        assert all(b.at >= a.at + PUSH_S for a, b in pairwise(draw.shoves))
     assert {math.floor(2 * angle / math.pi) for angle in angles} == {-2, -1, 0, 1}
     assert min(begins) < 0.3 < 2.3 < max(begins) <= 2.5
 

@@ -82,11 +82,16 @@ class Certificate:
         self._K_geo = 0.5 * (K_geo + K_geo.T)
 
     def margins(self, D: Array) -> Margins:
-        """Return how far local stiffnesses D (12,), N m/rad, are from a fall."""
+        """Return how far local stiffnesses D (12,), N m/rad, are from a fall.
+
+        Zero at angles for which the chain has no rates: nothing is certified there.
+        """
         pair = self._pair
         pair[0, :, 0] = D
         pair[1, :, 0] = motor_mean(D)
         K = self._T_scaled.T @ (pair * self._T_scaled) + self._K_geo
+        if not np.isfinite(K).all():
+            return Margins(0.0, 0.0)
         smallest = np.linalg.eigvalsh(K)[:, 0]
         return Margins(float(smallest[0]), float(smallest[1]))
 

@@ -53,16 +53,20 @@ class Missing:
     def at(self, K_fail: Array, B_local: Array) -> tuple[Array, Array]:
         """Return K_c and B_c (6, 6), symmetric and not negative.
 
+        Zero at angles for which the chain has no rates: nothing can be added there.
+
         Args:
             K_fail: stiffness that the local gains leave, along p (6, 6).
             B_local: T^T D_B T (6, 6).
         """
         local = np.array((K_fail[self._rows], B_local[self._rows]))
         scaled = (self._body - local) / self._scale
+        K_c, B_c = np.zeros((6, 6)), np.zeros((6, 6))
+        if not np.isfinite(scaled).all():
+            return K_c, B_c
         values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
         kept = (vectors * np.maximum(values, 0.0)[:, np.newaxis]) @ vectors.transpose(0, 2, 1)
         kept *= self._scale
-        K_c, B_c = np.zeros((6, 6)), np.zeros((6, 6))
         K_c[self._rows], B_c[self._rows] = kept
         return K_c, B_c
 

@@ -7,8 +7,6 @@ re-execution from a log.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,19 +14,19 @@ from numpy.typing import NDArray
 
 from services.planner.assist import Overload
 from services.planner.bracing import Brace, Bracing
-from services.planner.certificate import Margins
+from services.planner.commands import Common, commands_of
 from services.planner.engagement import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.memory import TickMemory
+from services.planner.plausible import Plausible
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
-from shared.joints import MODULES, N_JOINTS, N_MODULES
+from shared.joints import N_JOINTS, N_MODULES
 from shared.messages import (
     STRAIGHT,
     Attitude,
     JointCommand,
     JointState,
-    Pair,
     PlannerMode,
     PlannerStatus,
     SplitSource,
@@ -62,6 +60,7 @@ class Planner:
         """
         self.session = session
         self._law = Hocca(config)
+        self._plausible = Plausible(config)
         self._engagement = Engagement()
         self._stale_ns = round(config.planner.state_stale_ms * NS_PER_MS)
         self._period_s = 1.0 / config.planner.rate_hz
@@ -90,7 +89,9 @@ class Planner:
         """Where the gains of the last tick came from."""
 
     def hear_state(self, module: int, state: JointState, now_ns: int) -> None:
-        """Take a module's newest state."""
+        """Take a module's newest state, if it can be one."""
+        if not self._plausible.is_state(module, state):
+            return
         self._states[module] = state
         self._arrived_ns[module] = now_ns
         self._new |= 1 << module
@@ -167,7 +168,8 @@ class Planner:
         )
         self._source = self._output.local.source
         self._seq += 1
-        return self._commands(now_ns, states, self._output)
+        common = Common(now_ns, self._seq, self.session, self._hold(), self._output.local.margins)
+        return commands_of(common, states, self._output, self._brace)
 
     def remember(self) -> TickMemory:
         """Return the memory as it is between two ticks; `recall` goes on from there."""
@@ -238,34 +240,6 @@ class Planner:
         """
         return self._engagement.hold or self._forbidden() is not None
 
-    def _commands(
-        self, now_ns: int, states: Sequence[JointState], output: LawOutput
-    ) -> list[JointCommand]:
-        rows = np.array(
-            (
-                output.q_ref,
-                output.v_ref,
-                output.tau_ff,
-                output.dtau_ff,
-                output.tau_coupled,
-                output.local.D,
-                output.local.D_B,
-            )
-        ).reshape(7, N_MODULES, 2)
-        by_module = rows.transpose(1, 0, 2).tolist()
-        common = _Common(
-            now_ns,
-            self._seq,
-            self.session,
-            self._hold(),
-            output.local.margins,
-        )
-        brace = self._brace
-        return [
-            _command(common, state.t_ns, rows, brace=brace.of(module))
-            for module, state, rows in zip(MODULES, states, by_module, strict=True)
-        ]
-
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
         """Return what the last tick saw and decided."""
         output = self._output
@@ -308,39 +282,6 @@ class Planner:
             stance=stance,
             why=self._law.stance_refusal(),
         )
-
-
-class _Common(NamedTuple):
-    """What the six commands of a tick have in common."""
-
-    now_ns: int
-    seq: int
-    session: int
-    hold: bool
-    margins: Margins
-
-
-def _command(
-    common: _Common, echo_t_ns: int, rows: list[list[float]], *, brace: bool
-) -> JointCommand:
-    pairs: list[Pair] = [(row[0], row[1]) for row in rows]
-    return JointCommand(
-        t_ns=common.now_ns,
-        seq=common.seq,
-        session=common.session,
-        echo_t_ns=echo_t_ns,
-        hold=common.hold,
-        q_ref=pairs[0],
-        v_ref=pairs[1],
-        tau_ff=pairs[2],
-        dtau_ff=pairs[3],
-        tau_coupled=pairs[4],
-        k_p=pairs[5],
-        k_d=pairs[6],
-        margin=common.margins.service,
-        margin_onboard=common.margins.onboard,
-        brace=brace,
-    )
 
 
 def _six(values: Array) -> Vector6:

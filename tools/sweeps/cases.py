@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 from typing import Final
 
@@ -12,6 +11,7 @@ from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.robot_model import stand_pose
 from shared.scenario import Keyframe, Kill, Push, Scenario
+from tools.sweeps.push_range import SHARE, PushRange
 
 PAYLOADS: Final = 5
 """Evenly spaced from none to `mass.payload_max`: each needs a gain schedule of its own."""
@@ -34,7 +34,8 @@ STILL_S: Final = (0.3, 1.0)
 """Standing still before the kill, in the cases that are not moving."""
 LET_GO_S: Final = 1.0
 """At most so long before the kill."""
-PUSH_N: Final = (10.0, 40.0)
+PUSH_SHARE: Final = (0.1, 1.0)
+"""Of the hardest that is drawn (`PushRange`)."""
 PUSH_S: Final = 0.3
 PUSHES_MAX: Final = 3
 POSES_MAX: Final = 2
@@ -90,34 +91,53 @@ def payloads(robot: RobotConfig) -> tuple[float, ...]:
     return tuple(round(highest * i / (PAYLOADS - 1), DIGITS) for i in range(PAYLOADS))
 
 
-def draw(robot: RobotConfig, seed: int, number: int) -> Case:
-    """Return one case; no other case has to be drawn for it."""
-    dice = random.Random(f"kill {seed} {number}")
-    payload = dice.choice(payloads(robot))
-    loaded = with_payload(robot, payload)
-    poses = tuple(_draw_pose(dice, loaded) for _ in range(dice.choice((1, 1, POSES_MAX))))
-    pace = _uniform(dice, *PACE)
-    begin, end = _legs(robot, poses, pace)[-1]
-    moving = dice.random() < 0.5
-    kill = _uniform(dice, *((begin, end) if moving else (end + STILL_S[0], end + STILL_S[1])))
-    hand_off = dice.random() < 0.5
-    at_the_kill = dice.random() < 0.5
-    let_go = None
-    if hand_off:
-        let_go = kill if at_the_kill else _uniform(dice, max(0.0, kill - LET_GO_S), kill)
-    return Case(
-        number=number,
-        seed=seed,
-        payload_kg=payload,
-        poses=poses,
-        pace=pace,
-        moving=moving,
-        way_end_s=end,
-        kill_s=kill,
-        let_go_s=let_go,
-        delay_ms=_uniform(dice, 0.0, DELAY_MAX_MS),
-        pushes=tuple(_draw_pushes(dice, kill)),
-    )
+class Cases:
+    """The cases of a robot."""
+
+    def __init__(self, robot: RobotConfig, push: float = SHARE) -> None:
+        """Take the robot; its payload is drawn.
+
+        Args:
+            robot: that is killed.
+            push: share of what soles and motors bear up to which it is pushed.
+        """
+        self._robot, self._push = robot, push
+        self._by_payload: dict[float, tuple[RobotConfig, PushRange]] = {}
+
+    def draw(self, seed: int, number: int) -> Case:
+        """Return one case; no other case has to be drawn for it."""
+        dice = random.Random(f"kill {seed} {number}")
+        payload = dice.choice(payloads(self._robot))
+        loaded, pushes = self._of(payload)
+        poses = tuple(_draw_pose(dice, loaded) for _ in range(dice.choice((1, 1, POSES_MAX))))
+        pace = _uniform(dice, *PACE)
+        begin, end = _legs(self._robot, poses, pace)[-1]
+        moving = dice.random() < 0.5
+        kill = _uniform(dice, *((begin, end) if moving else (end + STILL_S[0], end + STILL_S[1])))
+        hand_off = dice.random() < 0.5
+        at_the_kill = dice.random() < 0.5
+        let_go = None
+        if hand_off:
+            let_go = kill if at_the_kill else _uniform(dice, max(0.0, kill - LET_GO_S), kill)
+        return Case(
+            number=number,
+            seed=seed,
+            payload_kg=payload,
+            poses=poses,
+            pace=pace,
+            moving=moving,
+            way_end_s=end,
+            kill_s=kill,
+            let_go_s=let_go,
+            delay_ms=_uniform(dice, 0.0, DELAY_MAX_MS),
+            pushes=tuple(_draw_pushes(dice, kill, pushes)),
+        )
+
+    def _of(self, payload: float) -> tuple[RobotConfig, PushRange]:
+        if payload not in self._by_payload:
+            loaded = with_payload(self._robot, payload)
+            self._by_payload[payload] = loaded, PushRange(loaded, self._push)
+        return self._by_payload[payload]
 
 
 def _draw_pose(dice: random.Random, robot: RobotConfig) -> Pose:
@@ -132,7 +152,7 @@ def _draw_pose(dice: random.Random, robot: RobotConfig) -> Pose:
     return Pose(height, pitch, _uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0)
 
 
-def _draw_pushes(dice: random.Random, kill_s: float) -> list[Push]:
+def _draw_pushes(dice: random.Random, kill_s: float, drawn_from: PushRange) -> list[Push]:
     """Draw pushes around and after the kill, none over another."""
     count = dice.randint(1, PUSHES_MAX)
     around = dice.random() < 0.3
@@ -140,13 +160,7 @@ def _draw_pushes(dice: random.Random, kill_s: float) -> list[Push]:
     at = _uniform(dice, kill_s + early, kill_s + late)
     pushes = []
     for _ in range(count):
-        force, angle = _uniform(dice, *PUSH_N), _uniform(dice, -math.pi, math.pi)
-        vector = (
-            round(force * math.cos(angle), DIGITS),
-            round(force * math.sin(angle), DIGITS),
-            0.0,
-        )
-        pushes.append(Push(at=at, duration=PUSH_S, force=vector))
+        pushes.append(drawn_from.draw(dice, PUSH_SHARE, at, PUSH_S))
         at = _uniform(dice, at + PUSH_S + 0.2, at + PUSH_S + 0.9)
     return pushes
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
-from tools.sweeps import cases, picture, plants, report, study
+from tools.sweeps import cases, picture, plants, push_range, report, study
 from tools.sweeps.cases import Case
 from tools.sweeps.figures import ENDINGS, Ending
 from tools.sweeps.outcome import Outcome, plant_of, run_case
@@ -48,6 +48,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jacobian", choices=experiment.choices("jacobian"), help="how the legs share the load"
     )
+    push_range.add_flag(parser)
     experiment.add_imu(parser)
     parser.add_argument(
         "--only",
@@ -62,6 +63,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one case of it; 1 if any fell."""
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
+    push_range.words(args)
     crew = study.crew_of(args, CODE)
     robot = experiment.make_robot(args)
     console = Console()
@@ -74,10 +76,11 @@ def _run_all(
     args: argparse.Namespace, robot: RobotConfig, crew: study.Crew, console: Console
 ) -> int:
     out = study.folder(args.out, "kill")
-    drawn = [cases.draw(robot, args.seed, number) for number in range(args.n)]
+    study_of = cases.Cases(robot, args.push)
+    drawn = [study_of.draw(args.seed, number) for number in range(args.n)]
     rows_begin = [cases.row_of(case) for case in drawn]
     columns = [*rows_begin[0], *COLUMNS_OUT]
-    with Table(out, TABLE, columns, _inputs(args.seed, robot), WORDS, rows_begin) as table:
+    with Table(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
         missing = [case for case in drawn if case.number not in table.numbers]
         with study.resumable(table, out, f"{_command(args)} --n {args.n}", crew, console):
             robots = _robots({case.payload_kg for case in missing}, robot, crew.workers, console)
@@ -110,7 +113,7 @@ def _robots(
 
 
 def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> int:
-    case = cases.draw(robot, args.seed, args.only)
+    case = cases.Cases(robot, args.push).draw(args.seed, args.only)
     loaded = _robots({case.payload_kg}, robot, 1, console)[case.payload_kg]
     study.show(f"Case {case.number}, drawn", cases.row_of(case), console)
     words = f"{_command(args)} --only {case.number}; delay {case.delay_ms:g} ms, " + (
@@ -143,10 +146,11 @@ def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
 JOB: Final = study.Job(_run_task, _name, _rows, lambda row: row["ending"] != Ending.STOOD)
 
 
-def _inputs(seed: int, robot: RobotConfig) -> dict[str, str]:
+def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
     return {
         "study": "kill",
-        "seed": str(seed),
+        "seed": str(args.seed),
+        "push": f"{args.push:g}",
         "robot": study.digest_of(robot),
         "ranges": plants.digest(),
         "code": code_digest(CODE),
@@ -155,7 +159,7 @@ def _inputs(seed: int, robot: RobotConfig) -> dict[str, str]:
 
 def _command(args: argparse.Namespace) -> str:
     """Return the command of this study, but for --n, --only and --out."""
-    flags = [f"--seed {args.seed}"]
+    flags = [f"--seed {args.seed}", *push_range.words(args)]
     if args.config != DEFAULT_CONFIG:
         flags.append(f"--config {args.config}")
     flags += [

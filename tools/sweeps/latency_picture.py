@@ -22,7 +22,8 @@ from tools.sweeps.latency_report import (
     values_in,
     without_loss,
 )
-from tools.sweeps.latency_trial import DURATION_S, PUSH_N, PUSHES
+from tools.sweeps.latency_trial import DURATION_S, PUSHES
+from tools.sweeps.push_range import SHARE
 from tools.sweeps.table import Row
 
 mpl.use("Agg")
@@ -88,8 +89,8 @@ def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:
     axis.set_xlabel("delay each way in ms", fontsize=9)
     _draw_shares(figure.add_subplot(grid[-1]), rows)
     figure.suptitle(
-        f"Who falls: {len(rows)} runs of {DURATION_S:g} s, led by hand, {PUSHES} pushes of "
-        f"{PUSH_N[0]:g} to {PUSH_N[1]:g} N in each; {what};\n"
+        f"Who falls: {len(rows)} runs of {DURATION_S:g} s, led by hand, {PUSHES} pushes in "
+        f"each, up to {SHARE:.0%} of what soles and motors bear; {what};\n"
         "all links get bad, both ways, on the way down. Cells: falls/trials, 95 % interval of the "
         "share (Wilson)",
         fontsize=10, x=0.01, ha="left",

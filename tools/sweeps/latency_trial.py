@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -31,7 +31,7 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
-from shared.scenario import Inject, Keyframe, Push, Scenario
+from shared.scenario import Inject, Keyframe, Scenario
 from shared.topics import Topic
 from tools.centralised.fleet import CentralisedLockstep
 from tools.runs.lockstep import Lockstep, Record
@@ -48,13 +48,14 @@ from tools.sweeps.figures import (
     step_nm,
     that_count,
 )
+from tools.sweeps.push_range import SHARE, PushRange
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
 """s, and m below the stand: as in the paper's Fig. 7, at its pace."""
 DURATION_S: Final = 7.0
 IMPAIRED_FROM_S: Final = (0.1, 2.5)
 """On the first way down; the robot that holds from then on holds there."""
-PUSH_N: Final = (20.0, 40.0)
+PUSH_SHARE: Final = (0.2, SHARE)
 PUSH_S: Final = 0.3
 PUSHES: Final = 3
 PUSHED_UNTIL_S: Final = 5.3
@@ -100,11 +101,22 @@ class Network(msgspec.Struct, frozen=True):
     """Share of the messages."""
 
 
+class Shove(NamedTuple):
+    """A push that is drawn."""
+
+    at: float
+    """s"""
+    share: float
+    """Of what soles and motors bear along its direction (`PushRange`)."""
+    angle: float
+    """rad from x (forwards) to y (left)."""
+
+
 class Draw(msgspec.Struct, frozen=True):
     """What is left to chance."""
 
     impaired_from_s: float
-    pushes: tuple[Push, ...]
+    shoves: tuple[Shove, ...]
     fleet_seed: int
     """Of what is lost, of jitter, and of the harness sensor's noise."""
 
@@ -126,18 +138,16 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
         dice = random.Random(f"latency {self.seed} {self.repeat} {jitter} {loss}")
         begin = round(dice.uniform(*IMPAIRED_FROM_S), DIGITS)
         third = (PUSHED_UNTIL_S - begin) / PUSHES
-        pushes = []
+        shoves = []
         for index in range(PUSHES):
             at = begin + index * third + dice.uniform(0.0, third - PUSH_S)
-            force, angle = dice.uniform(*PUSH_N), dice.uniform(-math.pi, math.pi)
-            x, y = (round(force * part, DIGITS) for part in (math.cos(angle), math.sin(angle)))
-            pushes.append(Push(at=round(at, DIGITS), duration=PUSH_S, force=(x, y, 0.0)))
-        return Draw(begin, tuple(pushes), dice.getrandbits(48))
+            shoves.append(Shove(at, dice.uniform(*PUSH_SHARE), dice.uniform(-math.pi, math.pi)))
+        return Draw(begin, tuple(shoves), dice.getrandbits(48))
 
     def story(self, robot: RobotConfig) -> Scenario:
         """Return the trial as a scenario."""
         stand = robot.simulation.stand_height
-        draw = self.draw
+        draw, pushes = self.draw, PushRange(robot)
         fields = msgspec.structs.asdict(self.network)
         bad = Inject(link="all", at=draw.impaired_from_s, **fields)
         return Scenario(
@@ -145,7 +155,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
             about=f"trial {self.number} of `xrl sweep latency --seed {self.seed}`",
             duration=DURATION_S,
             keyframe=tuple(Keyframe(at=at, height=stand - depth) for at, depth in SQUATS),
-            push=draw.pushes,
+            push=tuple(pushes.push(at, PUSH_S, *how) for at, *how in draw.shoves),
             inject=(bad,) if any(fields.values()) else (),
         )
 

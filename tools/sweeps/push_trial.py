@@ -28,6 +28,7 @@ from shared.traces import SimState
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
 from tools.sweeps.figures import Ending, ending_of
+from tools.sweeps.push_range import com_height
 
 POSES: Final = {"stand": (1.188, 0.0), "squat": (0.95, 0.0), "crawl": (0.79, 1.2)}
 """Torso height, m, and pitch, rad."""
@@ -138,7 +139,7 @@ def limits_of(trial: Trial, robot: RobotConfig) -> PushLimits:
         raise RunError("the robot has no gain schedule; run `xrl gains`")
     height, pitch = POSES[trial.pose]
     poses, scheduled = Poses(robot), ScheduledGains(schedule)
-    z = _com_height(poses, height, pitch)
+    z = com_height(poses, height, pitch)
     node = poses.node(z, pitch)
     if node is None:
         raise RunError(f"{trial.pose}: this robot does not reach it")
@@ -147,19 +148,6 @@ def limits_of(trial: Trial, robot: RobotConfig) -> PushLimits:
     angle = math.radians(trial.angle_deg)
     direction = (math.cos(angle), math.sin(angle))
     return limits_along(stand, robot, D, scheduled.D_B, direction)
-
-
-def _com_height(poses: Poses, torso: float, pitch: float) -> float:
-    """Return the COM height, m, at which the torso's origin is so high, by bisection."""
-    low, high = poses.reach()
-    for _ in range(20):
-        z = 0.5 * (low + high)
-        found = poses.node(z, pitch)
-        if found is None or poses.kinematics.r_torso[2] > torso:
-            high = z
-        else:
-            low = z
-    return low
 
 
 def _start_of(trial: Trial, robot: RobotConfig, plant: PlantConfig) -> Start:

@@ -20,8 +20,9 @@ from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
-from tools.sweeps import plants, study
+from tools.sweeps import plants, push_range, study
 from tools.sweeps.figures import ENDINGS, Ending
+from tools.sweeps.push_range import PushRange
 from tools.sweeps.record import run_alone
 from tools.sweeps.robust_trial import (
     Outcome,
@@ -83,6 +84,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         help="a floor that slopes by DEG degrees in a drawn direction (default: up to 1 degree, as "
         "in the ranges)",
     )
+    push_range.add_flag(parser)
     experiment.add_imu(parser)
     parser.add_argument(
         "--only",
@@ -99,6 +101,7 @@ def run(args: argparse.Namespace) -> int:
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
     if not 0.0 <= args.slope <= SLOPE_MAX_DEG:
         raise RunError(f"--slope {args.slope:g}: 0 to {SLOPE_MAX_DEG:g} degrees")
+    push_range.words(args)
     crew = study.crew_of(args, CODE)
     robot = experiment.load_robot(args.config, imu=args.imu)
     plants.draw("check", beyond=args.beyond)
@@ -106,7 +109,8 @@ def run(args: argparse.Namespace) -> int:
     if args.only is not None:
         return _run_one(args, robot, console)
     out = study.folder(args.out, "robust")
-    drawn = [draw(args.seed, number, args.beyond, args.slope) for number in range(args.n)]
+    pushes = PushRange(robot, args.push)
+    drawn = [draw(pushes, args.seed, number, args.beyond, args.slope) for number in range(args.n)]
     rows_begin = [row_of(trial) for trial in drawn]
     columns = [*rows_begin[0], *Outcome.__struct_fields__]
     with Table(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
@@ -123,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> int:
-    trial = draw(args.seed, args.only, args.beyond, args.slope)
+    trial = draw(PushRange(robot, args.push), args.seed, args.only, args.beyond, args.slope)
     study.show(f"Trial {trial.number}, drawn", row_of(trial), console)
     return run_alone(
         partial(run_trial, trial, robot),
@@ -240,6 +244,7 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
         "seed": str(args.seed),
         "beyond": f"{args.beyond:g}",
         "slope": f"{args.slope:g}",
+        "push": f"{args.push:g}",
         "robot": study.digest_of(robot),
         "ranges": plants.digest(),
         "code": code_digest(CODE),
@@ -248,7 +253,7 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
 
 def _command(args: argparse.Namespace) -> str:
     """Return the command of this study, but for --n, --only and --out."""
-    flags = [f"--seed {args.seed}"]
+    flags = [f"--seed {args.seed}", *push_range.words(args)]
     if args.beyond != 1.0:
         flags.append(f"--beyond {args.beyond:g}")
     if args.slope != 0.0:

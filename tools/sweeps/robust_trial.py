@@ -27,15 +27,17 @@ from tools.sweeps.figures import (
     sole_tilt_max_rad,
     that_count,
 )
+from tools.sweeps.push_range import PushRange
 
 KINDS: Final = ("squat", "crawl", "lean")
 DELAY_MAX_MS: Final = 10.0
 LEAD_S: Final = 2.0
 """Each way of a squat; the crawl takes twice that."""
-LEAN_N: Final = (10.0, 25.0)
+LEAN_SHARE: Final = (0.15, 0.4)
 LEAN_S: Final = 1.5
 """A push that lasts, while the planner leads."""
-PUSH_N: Final = (20.0, 50.0)
+PUSH_SHARE: Final = (0.3, 1.0)
+"""Of the hardest that is drawn (`PushRange`)."""
 PUSH_S: Final = 0.3
 AFTER_KILL_S: Final = 2.5
 DIGITS: Final = 3
@@ -70,15 +72,17 @@ class Outcome(Ended, frozen=True, kw_only=True):
     """Largest step of a joint's torque at a change of mode after the start."""
 
 
-def draw(seed: int, number: int, beyond: float = 1.0, slope_deg: float = 0.0) -> Trial:
+def draw(
+    pushes: PushRange, seed: int, number: int, beyond: float = 1.0, slope_deg: float = 0.0
+) -> Trial:
     """Return one trial; no other trial has to be drawn for it."""
     dice = random.Random(f"robust {seed} {number}")
     kind = KINDS[number % len(KINDS)]
     way = 2.0 * LEAD_S
     kill = _uniform(dice, 0.6 * way, 1.2 * way)
-    lasting = LEAN_S if kind == "lean" else PUSH_S
-    led = _push(dice, 1.0, LEAN_N if kind == "lean" else PUSH_N, lasting)
-    held = _push(dice, kill + _uniform(dice, 0.2, 0.8), PUSH_N, PUSH_S)
+    share, lasting = (LEAN_SHARE, LEAN_S) if kind == "lean" else (PUSH_SHARE, PUSH_S)
+    led = pushes.draw(dice, share, 1.0, lasting)
+    held = pushes.draw(dice, PUSH_SHARE, kill + _uniform(dice, 0.2, 0.8), PUSH_S)
     return Trial(
         number=number,
         seed=seed,
@@ -89,12 +93,6 @@ def draw(seed: int, number: int, beyond: float = 1.0, slope_deg: float = 0.0) ->
         delay_ms=_uniform(dice, 0.5, DELAY_MAX_MS),
         pushes=(led, held),
     )
-
-
-def _push(dice: random.Random, at: float, force_n: tuple[float, float], duration: float) -> Push:
-    force, angle = _uniform(dice, *force_n), _uniform(dice, -math.pi, math.pi)
-    x, y = (round(force * part, DIGITS) for part in (math.cos(angle), math.sin(angle)))
-    return Push(at=round(at, DIGITS), duration=duration, force=(x, y, 0.0))
 
 
 def _uniform(dice: random.Random, low: float, high: float) -> float:

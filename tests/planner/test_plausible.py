@@ -1,0 +1,85 @@
+"""States that no joint can have measured: the planner neither uses them nor ends by them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from services.planner.planner import Planner
+from services.planner.plausible import BEYOND_RAD, Plausible
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.joints import N_JOINTS, N_MODULES
+from shared.messages import PlannerMode
+from tests.planner.conftest import Closed
+from tests.planner.test_planner import SESSION, START_NS, hear_all, lead, state
+
+STEP_NS = 4 * NS_PER_MS
+ANY = st.one_of(
+    st.sampled_from([math.nan, math.inf, -math.inf, 1e308, 64.0, -64.0, 0.0, math.pi / 2]),
+    st.floats(-4.0, 4.0),
+)
+
+
+@pytest.mark.parametrize("module", range(N_MODULES))
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_an_angle_is_taken_up_to_half_a_radian_beyond_its_soft_stop(
+    robot: RobotConfig, module: int, joint: int, side: float
+) -> None:
+    plausible, index = Plausible(robot), 2 * module + joint
+    low, high = robot.joint_limits()[index]
+    q = np.zeros(N_JOINTS)
+    for beyond, taken in ((0.99, True), (1.01, False)):
+        q[index] = (high if side > 0.0 else low) + side * beyond * BEYOND_RAD
+        assert plausible.is_state(module, state(module, q)) is taken
+
+
+@pytest.mark.parametrize("speed", [math.nan, math.inf, -math.inf])
+def test_a_speed_that_is_none_is_no_state(robot: RobotConfig, speed: float) -> None:
+    for v in ((speed, 0.0), (0.0, speed)):
+        assert not Plausible(robot).is_state(2, state(2, np.zeros(N_JOINTS), v=v))
+
+
+@pytest.mark.parametrize("angle", [math.nan, 1e308, 64.0])
+def test_a_module_that_tells_only_such_angles_goes_stale_and_the_planner_holds(
+    robot: RobotConfig, closed: Closed, angle: float
+) -> None:
+    planner, q = Planner(robot, SESSION), closed(1.188)
+    now_ns, wrong = lead(planner, q), q.copy()
+    wrong[4] = angle
+    commands = []
+    for seq in range(10, 40):
+        now_ns += STEP_NS
+        hear_all(planner, wrong, now_ns, seq)
+        commands = planner.tick(now_ns)
+    assert all(command.hold for command in commands)
+    status = planner.status(now_ns, 0.0)
+    assert status.mode == PlannerMode.WAITING
+    assert status.state_seq[2] < 10 <= status.state_seq[3]
+    assert all(math.isfinite(value) for command in commands for value in command.q_ref)
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(ANY, min_size=N_JOINTS, max_size=N_JOINTS), st.booleans())
+def test_whatever_angles_come_no_tick_ends_and_it_leads_again_by_good_ones(
+    robot: RobotConfig, closed: Closed, angles: list[float], led: bool
+) -> None:
+    planner, good = Planner(robot, SESSION), closed(1.188)
+    now_ns = lead(planner, good) if led else START_NS
+    for seq in range(10, 14):
+        now_ns += STEP_NS
+        hear_all(planner, np.array(angles), now_ns, seq)
+        planner.tick(now_ns)
+    for seq in range(20, 2600):
+        now_ns += STEP_NS
+        hear_all(planner, good, now_ns, seq)
+        commands = planner.tick(now_ns)
+        if seq > 22 and not commands[0].hold:
+            break
+    assert planner.status(now_ns, 0.0).mode == PlannerMode.LEADING
+    assert all(math.isfinite(value) for command in commands for value in command.tau_coupled)

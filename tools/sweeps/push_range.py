@@ -1,0 +1,109 @@
+"""How hard the studies push: up to what soles and motors bear while the robot stands."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import random
+from typing import Final
+
+from services.planner.poses import Poses
+from services.planner.push_limit import LoadedStand
+from shared.config import RobotConfig
+from shared.exceptions import RunError
+from shared.scenario import Push
+
+DIGITS: Final = 3
+REACHED_M: Final = 1e-4
+
+
+SHARE: Final = 0.75
+"""Of the limit: up to here the studies push unless told otherwise."""
+SHARE_MAX: Final = 3.0
+
+
+class PushRange:
+    """The hardest push that a standing robot bears for ever, by direction: 76 to 158 N.
+
+    It is the physical limit (`LoadedStand.limit_of_body`), whatever the control. Forwards and back
+    it is least in the stand; sideways squat and crawl differ from it by less than a quarter.
+    """
+
+    def __init__(self, robot: RobotConfig, most: float = SHARE) -> None:
+        """Take the stand.
+
+        Args:
+            robot: as its file has it, level floor.
+            most: share of the limit up to which `draw` goes.
+
+        Raises:
+            RunError: the robot does not reach it.
+        """
+        poses = Poses(robot)
+        height = robot.simulation.stand_height
+        z = com_height(poses, height, 0.0)
+        node = poses.node(z, 0.0)
+        if node is None:
+            raise RunError(f"a stand with the torso at {height:g} m: this robot does not reach it")
+        self._most = most
+        self._stand = LoadedStand(robot, poses.kinematics, node.T, node.hessians[0])
+
+    def limit_n(self, angle: float) -> float:
+        """Return the limit, N, along an angle, rad from x (forwards) to y (left)."""
+        return self._stand.limit_of_body((math.cos(angle), math.sin(angle))).force_n
+
+    def push(self, at: float, duration: float, share: float, angle: float) -> Push:
+        """Return a push of a share of the limit along its direction.
+
+        Args:
+            at: s, scenario time at which it begins.
+            duration: s.
+            share: 1 is the limit.
+            angle: rad from x (forwards) to y (left).
+        """
+        force = share * self.limit_n(angle)
+        x, y = (round(force * axis, DIGITS) for axis in (math.cos(angle), math.sin(angle)))
+        return Push(at=round(at, DIGITS), duration=duration, force=(x, y, 0.0))
+
+    def draw(
+        self, dice: random.Random, shares: tuple[float, float], at: float, duration: float
+    ) -> Push:
+        """Return a push in any direction, of a share between the two of the hardest drawn."""
+        share, angle = self._most * dice.uniform(*shares), dice.uniform(-math.pi, math.pi)
+        return self.push(at, duration, share, angle)
+
+
+def add_flag(parser: argparse.ArgumentParser) -> None:
+    """Add `--push`."""
+    parser.add_argument(
+        "--push",
+        type=float,
+        default=SHARE,
+        metavar="SHARE",
+        help="push up to this share of what soles and motors bear, standing, in each direction: 1 "
+        f"is 76 N forwards and 158 N sideways of the shipped robot ({SHARE:g})",
+    )
+
+
+def words(args: argparse.Namespace) -> list[str]:
+    """Return the flag as it was given, if it is not the default.
+
+    Raises:
+        RunError: it is no share that is drawn.
+    """
+    if not 0.0 < args.push <= SHARE_MAX:
+        raise RunError(f"--push {args.push:g}: more than 0, at most {SHARE_MAX:g}")
+    return [] if args.push == SHARE else [f"--push {args.push:g}"]
+
+
+def com_height(poses: Poses, torso: float, pitch: float) -> float:
+    """Return the COM height, m, at which the torso's origin is `torso` high, by bisection."""
+    low, high = poses.reach()
+    while high - low > REACHED_M:
+        z = 0.5 * (low + high)
+        found = poses.node(z, pitch)
+        if found is None or poses.kinematics.r_torso[2] > torso:
+            high = z
+        else:
+            low = z
+    return low
