@@ -10,6 +10,7 @@ from shared.config_sections import (
     CanConfig,
     CertificateConfig,
     DriveConfig,
+    EnvelopeConfig,
     GeometryConfig,
     HarnessConfig,
     ImuConfig,
@@ -64,6 +65,7 @@ class RobotConfig(Section, frozen=True):
     recorder: RecorderConfig
     simulation: SimulationConfig
     imu: ImuConfig = ImuConfig()
+    envelope: EnvelopeConfig = EnvelopeConfig()
     gain_schedule: GainSchedule | None = None
     """Not in this file but beside it; None if it has not been made."""
 

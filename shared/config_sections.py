@@ -221,6 +221,24 @@ class JointServiceConfig(Section, frozen=True):
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
 
 
+class EnvelopeConfig(Section, frozen=True):
+    """What a joint service believes of its planner, beyond `GainSchedule.bounds`."""
+
+    tau_ff_room: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
+    """Beyond the bounds of straight stands: leans, slopes, and feet that stand otherwise."""
+    q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
+    spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 50.0
+    """k_p times the distance."""
+    hold_torque: Annotated[float, Range(1.0, 1e4, "N m")] = 360.0
+    """HOLD's k_p times the distance: it stiffens about the reference that it found."""
+    tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
+    dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
+    torque_step: Annotated[float, Range(0.0, 100.0, "N m")] = 1.0
+    """From one command to the next, at once, and ..."""
+    torque_rate: Annotated[float, Range(1.0, 1e5, "N m/s")] = 1000.0
+    """... for each second between them."""
+
+
 class PlannerConfig(Section, frozen=True):
     """Planner timing."""
 

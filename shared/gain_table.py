@@ -17,6 +17,25 @@ Damping: TypeAlias = Annotated[float, Range(0.0, 1e3, "N m s/rad")]
 LegDamping: TypeAlias = tuple[Damping, Damping, Damping, Damping, Damping, Damping]
 
 
+Bounds: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
+"""Least (phi, theta), largest (phi, theta)."""
+
+
+class ModuleBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Between which a kind of module's commands lie, over all poses and every assist."""
+
+    k_p: Bounds
+    """N m/rad; up to the stand gains, by which a split is stiffened."""
+    k_d: Bounds
+    """N m s/rad"""
+    theta: tuple[float, float]
+    """rad, the joint's own: from here to there `tau_ff` goes, in equal parts."""
+    tau_ff: tuple[Bounds, ...]
+    """N m, by theta; both legs: phi is as far on one side as on the other."""
+    v_ref: tuple[float, float]
+    """rad/s, either way: what the body's fastest motions ask of the joint (`BODY_RATES`)."""
+
+
 class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Local joint stiffnesses over COM height and torso pitch; made by `shared.gain_schedule`."""
 
@@ -39,3 +58,6 @@ class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Up to this the loop is stable; less is always safe."""
     coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]
     """What tau_coupled fills the damping up to, in shares of B_p."""
+    bounds: dict[str, ModuleBounds] | None = None
+    """By kind of module; what a joint service believes (`services.joint.envelope`). None: made by
+    an older `xrl gains`, and not checked."""

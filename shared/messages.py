@@ -49,6 +49,24 @@ class Cause(IntEnum):
     """The drive does not know where its joint is: unzeroed, or its samples jump."""
 
 
+class Outside(IntEnum):
+    """Which number of a command a joint service does not believe (`services.joint.envelope`)."""
+
+    NOTHING = 0
+    K_P = 1
+    K_D = 2
+    TAU_FF = 3
+    DTAU_FF = 4
+    TAU_COUPLED = 5
+    Q_REF = 6
+    """Too far from where the joint is."""
+    V_REF = 7
+    TORQUE_STEP = 8
+    """It would change the torque faster than the law does."""
+    MARGIN = 9
+    """It tells a margin that no gains may leave with."""
+
+
 class DriveStatus(IntEnum):
     """What a module's two axes are, together."""
 
@@ -166,6 +184,8 @@ class JointState(Message, frozen=True):
     """The drives' error bits, both axes or-ed; 0 if none."""
     braced: bool = False
     """True while this module holds with all of its stand gains, for another may be limp."""
+    outside: int = 0
+    """`Outside`: why the newest command was not believed; 0 if it was."""
 
 
 class JointCommand(Message, frozen=True):

@@ -144,6 +144,7 @@ IMPURE = {
 
 LONG_FILES = {
     "services/planner/sampled_loop.py": "one model: what it is made of, and one period of it",
+    "shared/config_sections.py": "the table of all that a robot file says",
     "shared/messages.py": "the table of all that is said on the bus",
     "shared/bus.py": "the only file that knows Zenoh",
     "tests/planner/loop_oracle.py": "one model, written a second time",

@@ -14,6 +14,7 @@ import msgspec
 from services.joint import law
 from services.joint.differential import joint_torque
 from services.joint.drivers.base import DriveReading
+from services.joint.envelope import Envelope
 from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.gate import diamond, gate, limits_of
 from services.joint.law import Setpoint
@@ -22,7 +23,7 @@ from services.joint.samples import Samples
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import kind_of
-from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Pair
+from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Outside, Pair
 
 UNLED_SHARE = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
 """How far a drive's gains rise to HOLD's while its service leads; `left_holding` says why."""
@@ -46,6 +47,7 @@ class JointController:
         stand = config.stand_gains(module)
         self.failsafe = Failsafe()
         self.timing = timing_of(config)
+        self._envelope = Envelope(config, module)
         self._limits = limits_of(config, module)
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
         self._damp_k_d = service.damp_k_d
@@ -108,7 +110,9 @@ class JointController:
             if reading.torque is not None:
                 self._found_tau = joint_torque(reading.torque, self._gear_ratio)
         if command is not None:
-            failsafe.offer(command, now_ns, self.timing)
+            tracked = failsafe.command if failsafe.mode is Mode.TRACK else None
+            outside = self._envelope.judge(command, tracked, samples.q, samples.v)
+            failsafe.offer(command, now_ns, self.timing, outside)
         before = failsafe.mode
         cause = failsafe.advance(now_ns, self.timing, drive, estop)
         if cause is not None:
@@ -204,6 +208,7 @@ class JointController:
             drive=int(samples.status),
             drive_error=samples.error,
             braced=self._braced_ns > 0,
+            outside=int(failsafe.outside),
         )
 
     def remember(self) -> ControllerMemory:
@@ -282,6 +287,10 @@ class JointController:
             q = self._samples.q
             self._damp_stop = min(self._damp_stop, q[1])
             self._anchor = law.carrying(self._setpoint, self._sinks, q)
+        elif self.failsafe.outside is Outside.Q_REF:
+            # to stiffen about a reference that is not believed would pull the joint to it
+            s, old = self._samples, self._setpoint
+            self._anchor = law.taken_over(s.q, s.v, self.tau, old.k_p, old.k_d)
         else:
             self._anchor = self._setpoint
 

@@ -17,7 +17,7 @@ import msgspec
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
-from shared.messages import Cause, JointCommand, Mode
+from shared.messages import Cause, JointCommand, Mode, Outside
 
 
 class Event(IntEnum):
@@ -105,6 +105,7 @@ class Refusal(IntEnum):
     FOREIGN_SESSION = 3
     NOT_NEWER = 4
     OUT_OF_LIMITS = 5
+    OUT_OF_ENVELOPE = 6
 
 
 RETIRED_SESSIONS_KEPT: Final = 256
@@ -127,10 +128,28 @@ class Failsafe(msgspec.Struct):
     steady_since_ns: int = 0
     """Since when nothing has dropped out or been forgotten."""
     refused: int = 0
+    outside: Outside = Outside.NOTHING
+    """Why the newest command of the session that is heard was not believed."""
 
-    def offer(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
-        """Take a command if it is usable; count it if not."""
+    def offer(
+        self,
+        command: JointCommand,
+        now_ns: int,
+        timing: Timing,
+        outside: Outside = Outside.NOTHING,
+    ) -> Refusal:
+        """Take a command if it is usable; count it if not.
+
+        Args:
+            command: what came.
+            now_ns: this module's clock.
+            timing: times and limits.
+            outside: what `services.joint.envelope` says of it.
+        """
         refusal = self._judge(command, now_ns, timing)
+        if refusal is Refusal.NONE:
+            self.outside = outside
+            refusal = Refusal.OUT_OF_ENVELOPE if outside else Refusal.NONE
         if refusal is not Refusal.NONE:
             self.refused += 1
             return refusal

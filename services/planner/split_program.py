@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from services.planner import design_program
 from services.planner.certificate import Certificate, Margins
+from services.planner.command_bounds import BoundsOverPoses
 from services.planner.dynamic_certificate import Design, nodes_of
 from services.planner.dynamic_certificate import Node as DynamicNode
 from services.planner.poses import Node, Poses
@@ -73,12 +74,14 @@ def solve(
     poses = Poses(config)
     z_nodes = np.linspace(*poses.reach(), N_HEIGHTS)
     found: dict[tuple[int, int], Array] = {}
+    bounds = BoundsOverPoses(config)
     done, total = 0, N_HEIGHTS * len(PITCHES)
     for i, z in enumerate(z_nodes):
         for j, pitch in poses.outwards(z, PITCHES):
             node = poses.node(z, pitch)
             if node is not None:
                 found[i, j] = _program(config, node, z, pitch)
+                bounds.add(poses.q, poses.kinematics, node.T, found[i, j])
         done += len(PITCHES)
         progress(done, total)
     rows = [
@@ -107,6 +110,7 @@ def solve(
         D_B=_rounded(np.array(design.D_B)),
         coupling_bandwidth_hz=round(design.coupling.bandwidth_hz, 3),
         coupling_damping=round(design.coupling.damping, 3),
+        bounds=bounds.by_kind(np.array(design.D_B)),
     )
 
 

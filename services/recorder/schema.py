@@ -31,6 +31,7 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.PlannerStatus, "mode"): messages.PlannerMode,
     (messages.PlannerStatus, "split"): messages.SplitSource,
     (messages.JointState, "drive"): messages.DriveStatus,
+    (messages.JointState, "outside"): messages.Outside,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }
 """Fields that are plain integers on the bus and enumerations in the mind."""

@@ -1,4 +1,7 @@
-"""A robot whose knees hold on gains of their own: what is tested here is no matter of tuning."""
+"""A robot whose knees hold on gains of their own: what is tested here is no matter of tuning.
+
+Its joint services believe any command within their limits; `envelope` is tested by itself.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import pytest
 from shared import config_file
 from shared.config import RobotConfig
 from tests.conftest import ROBOT_FILE
+from tests.joint.helpers import believing
 
 
 @pytest.fixture(scope="session")
@@ -16,7 +20,7 @@ def robot() -> RobotConfig:
     shipped = config_file.load(ROBOT_FILE)
     knee = msgspec.structs.replace(shipped.stand.knee, k_p=(900.0, 1500.0), k_d=(45.0, 25.0))
     return msgspec.structs.replace(
-        shipped,
+        believing(shipped),
         stand=msgspec.structs.replace(shipped.stand, knee=knee),
         joint_service=msgspec.structs.replace(
             shipped.joint_service, hold_stiffens_theta=("ankle",)

@@ -45,6 +45,14 @@ def with_service(robot: RobotConfig, **changes: Any) -> RobotConfig:
     return msgspec.structs.replace(robot, joint_service=service)
 
 
+def believing(robot: RobotConfig) -> RobotConfig:
+    """Return the robot whose joint services believe any command within their limits."""
+    schedule = robot.gain_schedule
+    assert schedule is not None
+    unbounded = msgspec.structs.replace(schedule, bounds=None)
+    return msgspec.structs.replace(robot, gain_schedule=unbounded)
+
+
 class Bench:
     """One controller, cycled at its rate; the joint stays where it is put."""
 

@@ -19,6 +19,7 @@ from shared.messages import (
     JointState,
     Message,
     Mode,
+    Outside,
     Pair,
     PlannerMode,
     PlannerStatus,
@@ -76,6 +77,8 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """What a person does to have it track again; empty if nothing has to be done."""
     braced: bool = False
     """It holds with all of its stand gains, for another may be limp."""
+    outside: str = ""
+    """Name of what it does not believe of the newest command (`Outside`); empty if it does."""
 
 
 class LeadStatus(msgspec.Struct, frozen=True):
@@ -224,11 +227,14 @@ def module_status(state: Message | None) -> ModuleStatus:
         way_out = "by itself, with the planner: the drive holds"
     elif mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):
         way_out = f"if it lasts: its log says why; hang the robot, then {RESTART}"
+    outside = Outside(state.outside).name if state.outside else ""
+    if outside and not way_out:
+        way_out = f"the planner's {outside.lower()} is not believed: xrl kill planner, look at it"
     knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
     q = state.q if knows else None
     braced = state.braced and mode is Mode.HOLD
     tier = TIERS.get(mode)
-    return ModuleStatus(mode.name, tier, cause.name, drive.name, q, way_out, braced)
+    return ModuleStatus(mode.name, tier, cause.name, drive.name, q, way_out, braced, outside)
 
 
 def lead_status(message: Message | None) -> LeadStatus | None:

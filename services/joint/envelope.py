@@ -1,0 +1,126 @@
+"""What a joint service believes of its planner. Pure.
+
+A planner may be wrong in any way: gains of zero, a sign, a unit, a bit. Each module compares what
+it is told with what the law can ask of it in any pose (`GainSchedule.bounds`, made by `xrl gains`),
+with where its joint is, and with the command before. What lies outside is refused, counted and told
+(`JointState.outside`); a planner that goes on so is too old soon, and the module holds.
+
+A command with `hold` can only make the module hold. Of its numbers a module that takes its drive
+over uses the gains: these may be as stiff as they like, not softer.
+"""
+
+from __future__ import annotations
+
+import math
+
+from shared.config import RobotConfig
+from shared.gain_table import Bounds, ModuleBounds
+from shared.joints import kind_of
+from shared.messages import JointCommand, Outside, Pair
+
+ROUNDING = 0.02
+"""Of a gain: the schedule is interpolated between rounded nodes."""
+GAP_TICKS = 4
+"""After a longer gap between commands a step may not be larger: it would be a blow, and what is
+wrong at once would be believed after a while."""
+
+
+class Envelope:
+    """The bounds of one module."""
+
+    def __init__(self, config: RobotConfig, module: str) -> None:
+        """Take the bounds; without a schedule that has them everything is believed."""
+        schedule = config.gain_schedule
+        table = schedule.bounds if config.law.split == "certified" and schedule else None
+        self._bounds = table[kind_of(module)] if table else None
+        own, least = config.envelope, config.certificate
+        self._room = own.tau_ff_room
+        self._spring = own.spring_torque
+        held = config.hold_gains(module)[0]
+        self._distance = tuple(
+            min(own.q_ref_distance, own.hold_torque / k_p if k_p > 0.0 else math.inf)
+            for k_p in held
+        )
+        self._coupled, self._dtau_ff = own.tau_coupled, own.dtau_ff
+        self._step, self._rate = own.torque_step, own.torque_rate
+        self._gap_s = GAP_TICKS / config.planner.rate_hz
+        self._margin = (1.0 - ROUNDING) * least.margin_min
+        self._margin_onboard = (1.0 - ROUNDING) * least.onboard_margin_min
+
+    def judge(self, command: JointCommand, last: JointCommand | None, q: Pair, v: Pair) -> Outside:
+        """Return the first number that is not believed.
+
+        Written so that a NaN is outside: every comparison with it is false.
+
+        Args:
+            command: what came.
+            last: what the module tracks, if it does.
+            q: where the joint is, rad.
+            v: its rates, rad/s.
+        """
+        bounds, c = self._bounds, command
+        if bounds is None:
+            return Outside.NOTHING
+        if c.hold:
+            if not _at_least(c.k_p, bounds.k_p):
+                return Outside.K_P
+            return Outside.NOTHING if _at_least(c.k_d, bounds.k_d) else Outside.K_D
+        if not (c.margin >= self._margin and c.margin_onboard >= self._margin_onboard):
+            return Outside.MARGIN
+        if not _within(c.k_p, bounds.k_p):
+            return Outside.K_P
+        if not _within(c.k_d, bounds.k_d):
+            return Outside.K_D
+        lowest, highest = self._tau_ff_at(bounds, q[1])
+        for axis in (0, 1):
+            if not lowest[axis] - self._room <= c.tau_ff[axis] <= highest[axis] + self._room:
+                return Outside.TAU_FF
+            if not abs(c.dtau_ff[axis]) <= self._dtau_ff:
+                return Outside.DTAU_FF
+            if not abs(c.tau_coupled[axis]) <= self._coupled:
+                return Outside.TAU_COUPLED
+            if not abs(c.v_ref[axis]) <= bounds.v_ref[axis]:
+                return Outside.V_REF
+            distance = abs(c.q_ref[axis] - q[axis])
+            if not (distance <= self._distance[axis] and c.k_p[axis] * distance <= self._spring):
+                return Outside.Q_REF
+        if last is None or last.hold or last.session != c.session:
+            return Outside.NOTHING
+        most = self._step + self._rate * min(self._gap_s, max(0.0, 1e-9 * (c.t_ns - last.t_ns)))
+        for axis in (0, 1):
+            step = _torque(c, axis, q[axis], v[axis]) - _torque(last, axis, q[axis], v[axis])
+            if not abs(step) <= most:
+                return Outside.TORQUE_STEP
+        return Outside.NOTHING
+
+    @staticmethod
+    def _tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:
+        """Return the bounds of tau_ff where the joint is."""
+        (low, high), rows = bounds.theta, bounds.tau_ff
+        part = int(len(rows) * (theta - low) / (high - low))
+        return rows[min(len(rows) - 1, max(0, part))]
+
+
+def _within(gains: Pair, bounds: Bounds) -> bool:
+    (phi, theta), (phi_high, theta_high) = gains, bounds[1]
+    return (
+        _at_least(gains, bounds)
+        and phi <= (1.0 + ROUNDING) * phi_high
+        and theta <= (1.0 + ROUNDING) * theta_high
+    )
+
+
+def _at_least(gains: Pair, bounds: Bounds) -> bool:
+    (phi, theta), (phi_low, theta_low) = gains, bounds[0]
+    return phi >= (1.0 - ROUNDING) * phi_low and theta >= (1.0 - ROUNDING) * theta_low
+
+
+def _torque(command: JointCommand, axis: int, q: float, v: float) -> float:
+    """Return what a command asks of an axis at its stamp, N m."""
+    c = command
+    return (
+        c.k_p[axis] * (c.q_ref[axis] - q)
+        + c.k_d[axis] * (c.v_ref[axis] - v)
+        + c.tau_ff[axis]
+        + c.tau_coupled[axis]
+    )

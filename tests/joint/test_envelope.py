@@ -1,0 +1,239 @@
+"""The envelope: each bound from both sides, and everything that is no number."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.joint.controller import JointController
+from services.joint.envelope import Envelope
+from services.joint.failsafe import Failsafe, Refusal, timing_of
+from shared import config_file
+from shared.config import RobotConfig
+from shared.gain_table import Bounds, ModuleBounds
+from shared.joints import MODULES, kind_of
+from shared.messages import JointCommand, Mode, Outside, Pair
+from tests.conftest import ROBOT_FILE
+from tests.joint.helpers import SESSION, T0, believing, command
+
+Q: Pair = (0.02, -1.0)
+V: Pair = (0.01, -0.2)
+MODULE = "knee_right"
+PAIRS = ("q_ref", "v_ref", "tau_ff", "dtau_ff", "tau_coupled", "k_p", "k_d")
+BY_NAME = {
+    "k_p": Outside.K_P,
+    "k_d": Outside.K_D,
+    "tau_ff": Outside.TAU_FF,
+    "dtau_ff": Outside.DTAU_FF,
+    "tau_coupled": Outside.TAU_COUPLED,
+    "q_ref": Outside.Q_REF,
+    "v_ref": Outside.V_REF,
+}
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotConfig:
+    """Return the shipped robot."""
+    return config_file.load(ROBOT_FILE)
+
+
+def bounds_of(robot: RobotConfig, module: str = MODULE) -> ModuleBounds:
+    assert robot.gain_schedule is not None
+    assert robot.gain_schedule.bounds is not None
+    return robot.gain_schedule.bounds[kind_of(module)]
+
+
+def tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:
+    """Return the row of the part in which theta lies, the first or last beyond the ends."""
+    edges = np.linspace(*bounds.theta, len(bounds.tau_ff) + 1)
+    return bounds.tau_ff[int(np.clip(np.searchsorted(edges, theta) - 1, 0, len(edges) - 2))]
+
+
+def middle(robot: RobotConfig, module: str = MODULE, **changes: Any) -> JointCommand:
+    """Return a command in the middle of what is believed."""
+    bounds = bounds_of(robot, module)
+    (low_phi, low_theta), (high_phi, high_theta) = tau_ff_at(bounds, Q[1])
+    fields: dict[str, Any] = {
+        "q_ref": Q,
+        "v_ref": (0.0, 0.0),
+        "tau_ff": (0.5 * (low_phi + high_phi), 0.5 * (low_theta + high_theta)),
+        "k_p": bounds.k_p[0],
+        "k_d": bounds.k_d[0],
+    }
+    return command(**(fields | changes))
+
+
+def judge(
+    robot: RobotConfig, told: JointCommand, last: JointCommand | None = None, module: str = MODULE
+) -> Outside:
+    return Envelope(robot, module).judge(told, last, Q, V)
+
+
+def with_axis(values: Pair, axis: int, value: float) -> Pair:
+    return (value, values[1]) if axis == 0 else (values[0], value)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_command_in_the_middle_is_believed(robot: RobotConfig, module: str) -> None:
+    assert judge(robot, middle(robot, module), module=module) is Outside.NOTHING
+
+
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_no_number_is_never_believed(
+    robot: RobotConfig, name: str, axis: int, value: float
+) -> None:
+    told = middle(robot)
+    told = msgspec.structs.replace(told, **{name: with_axis(getattr(told, name), axis, value)})
+    assert judge(robot, told) is BY_NAME[name]
+
+
+def edges(robot: RobotConfig, module: str, axis: int) -> dict[str, tuple[float, float]]:
+    """Return the least and the largest value of each number that is still believed."""
+    bounds, own = bounds_of(robot, module), robot.envelope
+    held = robot.hold_gains(module)[0][axis]
+    distance = min(own.q_ref_distance, own.hold_torque / held if held > 0.0 else math.inf)
+    k_p = bounds.k_p[0][axis]
+    distance = min(distance, own.spring_torque / k_p if k_p > 0.0 else math.inf)
+    return {
+        "k_p": (0.98 * bounds.k_p[0][axis], 1.02 * bounds.k_p[1][axis]),
+        "k_d": (0.98 * bounds.k_d[0][axis], 1.02 * bounds.k_d[1][axis]),
+        "tau_ff": (
+            tau_ff_at(bounds, Q[1])[0][axis] - own.tau_ff_room,
+            tau_ff_at(bounds, Q[1])[1][axis] + own.tau_ff_room,
+        ),
+        "dtau_ff": (-own.dtau_ff, own.dtau_ff),
+        "tau_coupled": (-own.tau_coupled, own.tau_coupled),
+        "v_ref": (-bounds.v_ref[axis], bounds.v_ref[axis]),
+        "q_ref": (Q[axis] - distance, Q[axis] + distance),
+    }
+
+
+@pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_left"])
+@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_each_number_is_believed_up_to_its_bound_and_not_beyond(
+    robot: RobotConfig, module: str, name: str, axis: int
+) -> None:
+    told = middle(robot, module)
+    low, high = edges(robot, module, axis)[name]
+    small = 1e-6 * max(1.0, abs(low), abs(high))
+    for value, believed in (
+        (low + small, True), (high - small, True), (low - small, False), (high + small, False),
+    ):  # fmt: skip
+        pair = with_axis(getattr(told, name), axis, value)
+        wanted = Outside.NOTHING if believed else BY_NAME[name]
+        changed = msgspec.structs.replace(told, **{name: pair})
+        if name == "k_p" and value > 1e-3:  # stiffer: the reference is at the joint
+            assert changed.q_ref == Q
+        assert judge(robot, changed, module=module) is wanted, value
+
+
+@pytest.mark.parametrize("name", ["margin", "margin_onboard"])
+def test_a_margin_that_no_gains_may_leave_with_is_not_believed(
+    robot: RobotConfig, name: str
+) -> None:
+    limits = robot.certificate
+    least = limits.margin_min if name == "margin" else limits.onboard_margin_min
+    for value, outside in (
+        (0.981 * least, Outside.NOTHING),
+        (0.979 * least, Outside.MARGIN),
+        (0.0, Outside.MARGIN),
+        (-1.0, Outside.MARGIN),
+        (math.nan, Outside.MARGIN),
+    ):
+        assert judge(robot, middle(robot, **{name: value})) is outside
+
+
+@pytest.mark.parametrize("name", ["tau_ff", "tau_coupled"])
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("apart_ms", [0, 4, 16, 48])
+def test_a_torque_that_jumps_is_not_believed(
+    robot: RobotConfig, name: str, axis: int, sign: float, apart_ms: int
+) -> None:
+    last = middle(robot)
+    most = robot.envelope.torque_step + robot.envelope.torque_rate * min(apart_ms, 16) / 1e3
+    value = getattr(last, name)[axis]
+    for step, outside in ((0.999 * most, Outside.NOTHING), (1.001 * most, Outside.TORQUE_STEP)):
+        changed = with_axis(getattr(last, name), axis, value + sign * step)
+        told = msgspec.structs.replace(
+            last, t_ns=T0 + apart_ms * 1_000_000, seq=2, **{name: changed}
+        )
+        assert judge(robot, told, last) is outside
+        assert judge(robot, told) is Outside.NOTHING, "nothing is tracked: there is no step"
+
+
+@pytest.mark.parametrize("theta", [-4.0, -2.9, -2.0, -1.0, -0.31, 0.5])
+def test_the_feedforward_is_that_of_the_joints_own_angle(robot: RobotConfig, theta: float) -> None:
+    """A knee that is bent to a right angle carries more than one that is straight."""
+    (_, low), (_, high) = tau_ff_at(bounds_of(robot), theta)
+    room, envelope = robot.envelope.tau_ff_room, Envelope(robot, MODULE)
+    for tau, outside in (
+        (low - room - 0.01, Outside.TAU_FF),
+        (low - room + 0.01, Outside.NOTHING),
+        (high + room - 0.01, Outside.NOTHING),
+        (high + room + 0.01, Outside.TAU_FF),
+    ):
+        told = middle(robot, q_ref=(0.02, theta), tau_ff=(0.0, tau))
+        assert envelope.judge(told, None, (0.02, theta), V) is outside
+
+
+def test_a_stamp_that_goes_back_leaves_no_more_room_than_none(robot: RobotConfig) -> None:
+    last = middle(robot)
+    phi, theta = last.tau_coupled
+    told = msgspec.structs.replace(
+        last, t_ns=T0 - 10**9, seq=2, tau_coupled=(phi, theta + robot.envelope.torque_step + 0.01)
+    )
+    assert judge(robot, told, last) is Outside.TORQUE_STEP
+
+
+@pytest.mark.parametrize("change", [{"session": SESSION + 1}, {"hold": True}])
+def test_the_step_is_from_what_this_planner_led_with(
+    robot: RobotConfig, change: dict[str, Any]
+) -> None:
+    last = msgspec.structs.replace(middle(robot), **change)
+    assert judge(robot, middle(robot, tau_coupled=(0.0, 40.0), seq=2), last) is Outside.NOTHING
+
+
+def test_a_command_that_holds_may_be_stiff_and_far_but_not_soft(robot: RobotConfig) -> None:
+    stiff, soft = (6000.0, 6000.0), (0.0, 0.0)
+    far = {"hold": True, "q_ref": (0.5, -2.0), "tau_ff": (90.0, -90.0), "margin": 0.0}
+    assert judge(robot, middle(robot, k_p=stiff, **far)) is Outside.NOTHING
+    assert judge(robot, middle(robot, k_p=soft, **far)) is Outside.K_P
+    assert judge(robot, middle(robot, k_d=soft, **far)) is Outside.K_D
+
+
+def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:
+    wild = command(k_p=(0.0, 0.0), tau_ff=(-90.0, 90.0), margin=-1.0)
+    assert judge(believing(robot), wild) is Outside.NOTHING
+    law = msgspec.structs.replace(robot.law, split="diagonal")
+    assert judge(msgspec.structs.replace(robot, law=law), wild) is Outside.NOTHING
+
+
+def test_what_is_not_believed_is_refused_counted_and_told(robot: RobotConfig) -> None:
+    failsafe, timing = Failsafe(), timing_of(robot)
+    told = middle(robot)
+    assert failsafe.offer(told, T0, timing, Outside.K_P) is Refusal.OUT_OF_ENVELOPE
+    assert (failsafe.command, failsafe.refused, failsafe.outside) == (None, 1, Outside.K_P)
+    assert failsafe.offer(told, T0, timing) is Refusal.NONE
+    assert (failsafe.command, failsafe.refused, failsafe.outside) == (told, 1, Outside.NOTHING)
+
+
+def test_what_is_refused_for_another_reason_says_nothing_of_belief(robot: RobotConfig) -> None:
+    failsafe, timing = Failsafe(), timing_of(robot)
+    old = middle(robot, echo_t_ns=T0 - timing.max_command_age_ns - 1)
+    assert failsafe.offer(old, T0, timing, Outside.K_P) is Refusal.TOO_OLD
+    assert failsafe.outside is Outside.NOTHING
+
+
+def test_a_state_tells_what_is_not_believed(robot: RobotConfig) -> None:
+    controller = JointController(robot, MODULE)
+    controller.failsafe.outside = Outside.TAU_FF
+    assert controller.state(T0).outside == Outside.TAU_FF
+    assert controller.failsafe.mode is Mode.DISARMED

@@ -1,0 +1,135 @@
+"""Whatever is wrong with the planner: joint services refuse it or bear it, the robot stands.
+
+Without the envelope 5 of 51 made it fall: references negative, half a radian off or drifting, and
+two modules' commands swapped. By default every 15th of the wrong planners is run, all of them in
+eight minutes of two cores by
+
+    XRL_ALL_WRONG=1 ./deploy/test tests/lockstep/test_wrong_planner.py
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+import pytest
+
+from services.joint.memory import ModuleMemory
+from services.planner.memory import TickMemory
+from services.simulator.state import taken
+from shared.config import RobotConfig
+from shared.joints import MODULES
+from shared.messages import Mode, Outside
+from shared.traces import SimState
+from tests.joint.helpers import believing
+from tests.lockstep.runs import push, story
+from tests.lockstep.wrong_planners import faults, wrong
+from tools.runs.lockstep import Lockstep
+from tools.runs.network import BASE
+
+NAMES: Final = tuple(faults())
+EVERY: Final = 1 if os.environ.get("XRL_ALL_WRONG") else 15
+MOMENTS: Final = (("squat", 1.0), ("stand", 0.5), ("crawl", 3.0))
+"""On the way down, standing, and low with the torso pitched."""
+WRONG_S: Final = 2.0
+STEP_NM: Final = 5.0
+
+
+class Begin(NamedTuple):
+    """A moment at which the planner leads."""
+
+    name: str
+    at: float
+    state: SimState
+    modules: Mapping[str, ModuleMemory]
+    planner: tuple[int, TickMemory]
+
+
+class End(NamedTuple):
+    """How it came out."""
+
+    fell: bool
+    step_nm: float
+    """Largest step of a joint's torque at a change of mode."""
+    outside: set[Outside]
+    modes: set[Mode]
+
+
+@pytest.fixture(scope="module")
+def begins(robot: RobotConfig) -> list[Begin]:
+    return [begin(robot, name, at) for name, at in MOMENTS]
+
+
+def begin(robot: RobotConfig, name: str, at: float) -> Begin:
+    fleet = Lockstep(robot, story(name, duration=20.0, kill=(), push=()), BASE)
+    for row in fleet.run():
+        if row.scenario_s >= at:
+            break
+    assert fleet.planner is not None
+    planner = fleet.planner.session, fleet.planner.remember()
+    modules = {module: fleet.memory_of(module) for module in MODULES}
+    return Begin(name, at, taken(fleet.world, fleet.bank, fleet.now_ns, 0), modules, planner)
+
+
+def end(robot: RobotConfig, moment: Begin, name: str) -> End:
+    """Be wrong for two seconds, pushed from the side after the first."""
+
+    class Fleet(Lockstep):
+        planner_type = wrong(faults()[name])
+
+    at = moment.at
+    pushed = (push(at + 0.8, 0.0, 30.0, 0.0),)
+    fleet = Fleet(robot, story(moment.name, duration=at + WRONG_S, kill=(), push=pushed), BASE)
+    fleet.go_on(moment.state, moment.modules, moment.planner)
+    fell, outside = False, set()
+    for row in fleet.run():
+        fell = row.fallen
+        outside |= {Outside(c.failsafe.outside) for c in fleet.controllers}
+        if fell:
+            break
+    events = [event for _, event in fleet.events if event.t_ns > moment.state.t_ns]
+    steps = [np.abs(np.subtract(e.tau_after, e.tau_before)).max() for e in events]
+    modes = {c.failsafe.mode for c in fleet.controllers}
+    return End(fell, float(max(steps, default=0.0)), outside - {Outside.NOTHING}, modes)
+
+
+def test_there_are_300_wrong_planners() -> None:
+    assert len(NAMES) >= 300
+
+
+@pytest.mark.parametrize("number", range(0, len(NAMES), EVERY))
+def test_it_stands_whatever_its_planner_says(
+    robot: RobotConfig, begins: list[Begin], number: int
+) -> None:
+    ended = end(robot, begins[number % len(begins)], NAMES[number])
+    assert not ended.fell, NAMES[number]
+    assert ended.step_nm < STEP_NM, NAMES[number]
+
+
+@pytest.mark.parametrize(
+    ("name", "outside"),
+    [
+        ("k_p of all zero", Outside.K_P),
+        ("k_d of all zero", Outside.K_D),
+        ("tau_ff of knee_left negative", Outside.TAU_FF),
+        ("q_ref of hip_right theta off by 0.5 rad", Outside.Q_REF),
+        ("tau_coupled noisy", Outside.TORQUE_STEP),
+        ("margin 0", Outside.MARGIN),
+    ],
+)
+def test_it_holds_and_says_what_it_does_not_believe(
+    robot: RobotConfig, begins: list[Begin], name: str, outside: Outside
+) -> None:
+    ended = end(robot, begins[0], name)
+    assert not ended.fell
+    assert outside in ended.outside
+    assert ended.modes == {Mode.HOLD}
+
+
+def test_without_the_envelope_it_falls(robot: RobotConfig, begins: list[Begin]) -> None:
+    """A robot that stands here would prove nothing above."""
+    name = "q_ref of all negative"
+    assert end(believing(robot), begins[0], name).fell
+    assert not end(robot, begins[0], name).fell

@@ -1,0 +1,217 @@
+"""Planners that are wrong: what is done to the six commands of a tick, by name."""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import msgspec
+
+from services.planner.planner import Planner
+from shared.joints import MODULES, N_MODULES
+from shared.messages import JointCommand, Pair
+
+Commands = list[JointCommand]
+Fault = Callable[[Commands, int], Commands]
+"""Commands of a tick as they should be, and the tick's number -> as they are sent."""
+
+PAIRS: Final = ("q_ref", "v_ref", "tau_ff", "dtau_ff", "tau_coupled", "k_p", "k_d")
+SCALES: Final = {
+    "negative": -1.0,
+    "zero": 0.0,
+    "a tenth": 0.1,
+    "double": 2.0,
+    "tenfold": 10.0,
+    "in degrees": 180.0 / math.pi,
+    "in milli": 1e3,
+    "not a number": math.nan,
+    "infinite": math.inf,
+}
+OFFSETS: Final = (-0.5, -0.1, -0.03, 0.03, 0.1, 0.5)
+"""rad, of a joint's reference."""
+DELAYS: Final = (10, 25, 75)
+"""Ticks by which the states used are old, told as if they were new."""
+BITS: Final = (0, 40, 50, 51, 52, 55, 60, 62, 63)
+"""Of a float64: from what nobody notices to the sign."""
+
+
+def faults() -> dict[str, Fault]:
+    """Return every wrong planner by its name."""
+    return dict(_all())
+
+
+def _all() -> Iterator[tuple[str, Fault]]:
+    for name in PAIRS:
+        for words, factor in SCALES.items():
+            yield f"{name} of all {words}", _scaled(name, factor, range(N_MODULES))
+            for index in (0, 4):  # a right ankle, a left knee
+                yield f"{name} of {MODULES[index]} {words}", _scaled(name, factor, [index])
+    yield (
+        "k_p and k_d zero",
+        _both(_scaled("k_p", 0.0, range(N_MODULES)), _scaled("k_d", 0.0, range(N_MODULES))),
+    )
+    for index, module in enumerate(MODULES):
+        for axis, joint in enumerate(("phi", "theta")):
+            for offset in OFFSETS if index < N_MODULES // 2 else OFFSETS[1::2]:
+                yield f"q_ref of {module} {joint} off by {offset:g} rad", _off(index, axis, offset)
+            yield f"q_ref of {module} {joint} drifts", _drifting(index, axis, 0.3)
+    for a, b in ((0, 3), (1, 4), (2, 5), (0, 1), (1, 2), (0, 2)):
+        yield f"{MODULES[a]} and {MODULES[b]} swapped", _swapped(a, b)
+    yield "legs swapped", lambda commands, _tick: [*commands[3:], *commands[:3]]
+    for name in PAIRS:
+        yield f"phi and theta of {name} swapped", _axes_swapped(name)
+        yield f"{name} stuck", _stuck(name)
+    yield "all stuck", _stuck(*PAIRS)
+    for ticks in DELAYS:
+        yield f"states {4 * ticks} ms old", _late(ticks)
+    for name in PAIRS:
+        for bit in BITS:
+            yield f"bit {bit} of {name} flips", _flipped(name, bit)
+    for name in ("q_ref", "k_p", "tau_ff"):
+        yield f"{name} negative in one tick of 25", _now_and_then(_scaled(name, -1.0, range(6)))
+        yield f"{name} zero in every other tick", _every_other(_scaled(name, 0.0, range(6)))
+    for name, size in (("q_ref", 0.02), ("tau_ff", 20.0), ("tau_coupled", 40.0), ("v_ref", 3.0)):
+        yield f"{name} noisy", _noisy(name, size)
+    for margin in (0.0, -1.0, math.nan):
+        yield f"margin {margin:g}", _told_margin(margin)
+
+
+def wrong(fault: Fault) -> type[Planner]:
+    """Return a planner that sends what the fault makes of its commands."""
+
+    class Wrong(Planner):
+        """A planner that is wrong from its first tick on."""
+
+        ticks = 0
+
+        def tick(self, now_ns: int) -> list[JointCommand]:
+            commands = super().tick(now_ns)
+            if not commands:
+                return commands
+            self.ticks += 1
+            return fault(commands, self.ticks)
+
+    return Wrong
+
+
+def _changed(command: JointCommand, name: str, values: Pair) -> JointCommand:
+    return msgspec.structs.replace(command, **{name: values})
+
+
+def _scaled(name: str, factor: float, indices: object) -> Fault:
+    def fault(commands: Commands, _tick: int) -> Commands:
+        return [
+            _changed(c, name, tuple(factor * x for x in getattr(c, name)))  # type: ignore[arg-type]
+            if i in indices  # type: ignore[operator]
+            else c
+            for i, c in enumerate(commands)
+        ]
+
+    return fault
+
+
+def _off(index: int, axis: int, offset: float) -> Fault:
+    return _drifting(index, axis, math.inf, offset)
+
+
+def _drifting(index: int, axis: int, rate: float, most: float = 2.0) -> Fault:
+    """Move a reference away at a rate, rad/s, or at once."""
+
+    def fault(commands: Commands, tick: int) -> Commands:
+        away = math.copysign(min(abs(most), rate * 0.004 * tick), most)
+        q_ref = list(commands[index].q_ref)
+        q_ref[axis] += away
+        changed = list(commands)
+        changed[index] = _changed(commands[index], "q_ref", (q_ref[0], q_ref[1]))
+        return changed
+
+    return fault
+
+
+def _swapped(a: int, b: int) -> Fault:
+    def fault(commands: Commands, _tick: int) -> Commands:
+        rows = list(commands)
+        rows[a], rows[b] = _rows_of(rows[b], rows[a]), _rows_of(rows[a], rows[b])
+        return rows
+
+    return fault
+
+
+def _rows_of(source: JointCommand, onto: JointCommand) -> JointCommand:
+    return msgspec.structs.replace(onto, **{name: getattr(source, name) for name in PAIRS})
+
+
+def _axes_swapped(name: str) -> Fault:
+    return lambda commands, _tick: [
+        _changed(c, name, (getattr(c, name)[1], getattr(c, name)[0])) for c in commands
+    ]
+
+
+def _stuck(*names: str) -> Fault:
+    kept: Commands = []
+
+    def fault(commands: Commands, _tick: int) -> Commands:
+        if not kept:
+            kept.extend(commands)
+        return [
+            msgspec.structs.replace(now, **{name: getattr(first, name) for name in names})
+            for now, first in zip(commands, kept, strict=True)
+        ]
+
+    return fault
+
+
+def _late(ticks: int) -> Fault:
+    past: list[Commands] = []
+
+    def fault(commands: Commands, _tick: int) -> Commands:
+        past.append(commands)
+        old = past[max(0, len(past) - 1 - ticks)]
+        return [_rows_of(then, now) for then, now in zip(old, commands, strict=True)]
+
+    return fault
+
+
+def _flipped(name: str, bit: int) -> Fault:
+    def fault(commands: Commands, tick: int) -> Commands:
+        changed, index, axis = list(commands), tick // 5 % N_MODULES, tick // 30 % 2
+        values = list(getattr(changed[index], name))
+        (whole,) = struct.unpack("<Q", struct.pack("<d", values[axis]))
+        (values[axis],) = struct.unpack("<d", struct.pack("<Q", whole ^ (1 << bit)))
+        changed[index] = _changed(changed[index], name, (values[0], values[1]))
+        return changed
+
+    return fault
+
+
+def _both(first: Fault, second: Fault) -> Fault:
+    return lambda commands, tick: second(first(commands, tick), tick)
+
+
+def _now_and_then(inner: Fault) -> Fault:
+    return lambda commands, tick: commands if tick % 25 else inner(commands, tick)
+
+
+def _every_other(inner: Fault) -> Fault:
+    return lambda commands, tick: commands if tick % 2 else inner(commands, tick)
+
+
+def _noisy(name: str, size: float) -> Fault:
+    dice = random.Random(name)
+
+    def fault(commands: Commands, _tick: int) -> Commands:
+        return [
+            _changed(c, name, tuple(x + dice.gauss(0.0, size) for x in getattr(c, name)))  # type: ignore[arg-type]
+            for c in commands
+        ]
+
+    return fault
+
+
+def _told_margin(margin: float) -> Fault:
+    return lambda commands, _tick: [
+        msgspec.structs.replace(c, margin=margin, margin_onboard=margin) for c in commands
+    ]
