@@ -28,7 +28,8 @@ from tools.supervision.supervisor_client import ServiceInfo
 Show = Callable[[Snapshot], None]
 
 TRIES: Final = 2
-"""A run that was disturbed by the machine, or could not be carried out, is made again."""
+"""A run that was disturbed by the machine, or could not be carried out, is made again; not one in
+which the robot fell: a fall stays a fall, and its log is kept."""
 
 
 class Witness:
@@ -68,7 +69,7 @@ def run_case(
     seed: int = 0,
     true_plant: PlantConfig | None = None,
 ) -> Outcome:
-    """Run a case, a second time if the first was disturbed.
+    """Run a case, a second time if the first was disturbed and the robot stood.
 
     Args:
         case: what dies.
@@ -85,7 +86,8 @@ def run_case(
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
         outcome = _run_once(case, robot, out, show, seed, true_plant or PlantConfig())
-        if outcome.in_real_time and outcome.verdict is not Verdict.UNJUDGED:
+        judged = outcome.in_real_time and outcome.verdict is not Verdict.UNJUDGED
+        if judged or outcome.verdict is Verdict.FELL:
             break
     wall_s = time.monotonic() - begin_s
     outcome = msgspec.structs.replace(outcome, tries=tries, wall_s=wall_s)
