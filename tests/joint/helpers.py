@@ -57,7 +57,7 @@ class Bench:
     """One controller, cycled at its rate; the joint stays where it is put."""
 
     def __init__(self, robot: RobotConfig, module: str = "knee_right") -> None:
-        self.controller = JointController(robot, module)
+        self.controller = JointController(believing(robot), module)
         self.gear_ratio = robot.joint.gear_ratio
         self.cycle_ns = round(NS_PER_S / robot.joint_service.rate_hz)
         self.now_ns = T0
