@@ -233,6 +233,8 @@ class EnvelopeConfig(Section, frozen=True):
     """HOLD's k_p times the distance: it stiffens about the reference that it found."""
     tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
     dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
+    v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0
+    """Where the bound of a pose is more: straight knees turn ever faster."""
     torque_step: Annotated[float, Range(0.0, 100.0, "N m")] = 1.0
     """From one command to the next, at once, and ..."""
     torque_rate: Annotated[float, Range(1.0, 1e5, "N m/s")] = 1000.0

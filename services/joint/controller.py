@@ -111,7 +111,11 @@ class JointController:
                 self._found_tau = joint_torque(reading.torque, self._gear_ratio)
         if command is not None:
             tracked = failsafe.command if failsafe.mode is Mode.TRACK else None
-            outside = self._envelope.judge(command, tracked, samples.q, samples.v)
+            age_s = min(self._aging_max_s, (now_ns - command.echo_t_ns) / NS_PER_S)
+            settled = tracked is not None and now_ns - self._changed_ns >= self._blend_ns
+            outside = self._envelope.judge(
+                command, tracked, samples.q, samples.v, age_s=age_s, settled=settled
+            )
             failsafe.offer(command, now_ns, self.timing, outside)
         before = failsafe.mode
         cause = failsafe.advance(now_ns, self.timing, drive, estop)
@@ -288,9 +292,8 @@ class JointController:
             self._damp_stop = min(self._damp_stop, q[1])
             self._anchor = law.carrying(self._setpoint, self._sinks, q)
         elif self.failsafe.outside is Outside.Q_REF:
-            # to stiffen about a reference that is not believed would pull the joint to it
-            s, old = self._samples, self._setpoint
-            self._anchor = law.taken_over(s.q, s.v, self.tau, old.k_p, old.k_d)
+            # a reference at the edge of what is believed: to stiffen about it would pull the joint
+            self._anchor = law.here(self._setpoint, self._samples.q)
         else:
             self._anchor = self._setpoint
 

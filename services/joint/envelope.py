@@ -6,7 +6,7 @@ with where its joint is, and with the command before. What lies outside is refus
 (`JointState.outside`); a planner that goes on so is too old soon, and the module holds.
 
 A command with `hold` can only make the module hold. Of its numbers a module that takes its drive
-over uses the gains: these may be as stiff as they like, not softer.
+over uses the gains: these may be stiffer, not softer, and no more damped.
 """
 
 from __future__ import annotations
@@ -41,13 +41,22 @@ class Envelope:
             min(own.q_ref_distance, own.hold_torque / k_p if k_p > 0.0 else math.inf)
             for k_p in held
         )
-        self._coupled, self._dtau_ff = own.tau_coupled, own.dtau_ff
+        self._coupled, self._dtau_ff, self._v_ref = own.tau_coupled, own.dtau_ff, own.v_ref
         self._step, self._rate = own.torque_step, own.torque_rate
         self._gap_s = GAP_TICKS / config.planner.rate_hz
         self._margin = (1.0 - ROUNDING) * least.margin_min
         self._margin_onboard = (1.0 - ROUNDING) * least.onboard_margin_min
 
-    def judge(self, command: JointCommand, last: JointCommand | None, q: Pair, v: Pair) -> Outside:
+    def judge(
+        self,
+        command: JointCommand,
+        last: JointCommand | None,
+        q: Pair,
+        v: Pair,
+        *,
+        age_s: float = 0.0,
+        settled: bool = True,
+    ) -> Outside:
         """Return the first number that is not believed.
 
         Written so that a NaN is outside: every comparison with it is false.
@@ -57,6 +66,9 @@ class Envelope:
             last: what the module tracks, if it does.
             q: where the joint is, rad.
             v: its rates, rad/s.
+            age_s: how far the reference is moved on by its rate before it is used, s.
+            settled: TRACK has blended in: before, a robot that was held off centre is still on
+                its way to the reference.
         """
         bounds, c = self._bounds, command
         if bounds is None:
@@ -64,7 +76,7 @@ class Envelope:
         if c.hold:
             if not _at_least(c.k_p, bounds.k_p):
                 return Outside.K_P
-            return Outside.NOTHING if _at_least(c.k_d, bounds.k_d) else Outside.K_D
+            return Outside.NOTHING if _within(c.k_d, bounds.k_d) else Outside.K_D
         if not (c.margin >= self._margin and c.margin_onboard >= self._margin_onboard):
             return Outside.MARGIN
         if not _within(c.k_p, bounds.k_p):
@@ -79,10 +91,11 @@ class Envelope:
                 return Outside.DTAU_FF
             if not abs(c.tau_coupled[axis]) <= self._coupled:
                 return Outside.TAU_COUPLED
-            if not abs(c.v_ref[axis]) <= bounds.v_ref[axis]:
+            if not abs(c.v_ref[axis]) <= min(self._v_ref, bounds.v_ref[axis]):
                 return Outside.V_REF
-            distance = abs(c.q_ref[axis] - q[axis])
-            if not (distance <= self._distance[axis] and c.k_p[axis] * distance <= self._spring):
+            distance = abs(c.q_ref[axis] + age_s * c.v_ref[axis] - q[axis])
+            spring = c.k_p[axis] * distance if settled else 0.0
+            if not (distance <= self._distance[axis] and spring <= self._spring):
                 return Outside.Q_REF
         if last is None or last.hold or last.session != c.session:
             return Outside.NOTHING
@@ -97,7 +110,7 @@ class Envelope:
     def _tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:
         """Return the bounds of tau_ff where the joint is."""
         (low, high), rows = bounds.theta, bounds.tau_ff
-        part = int(len(rows) * (theta - low) / (high - low))
+        part = int(len(rows) * (theta - low) / max(high - low, 1e-9))
         return rows[min(len(rows) - 1, max(0, part))]
 
 

@@ -129,7 +129,7 @@ class Failsafe(msgspec.Struct):
     """Since when nothing has dropped out or been forgotten."""
     refused: int = 0
     outside: Outside = Outside.NOTHING
-    """Why the newest command of the session that is heard was not believed."""
+    """Why the newest command that could have been taken was not believed."""
 
     def offer(
         self,
@@ -147,9 +147,10 @@ class Failsafe(msgspec.Struct):
             outside: what `services.joint.envelope` says of it.
         """
         refusal = self._judge(command, now_ns, timing)
-        if refusal is Refusal.NONE:
+        if refusal in (Refusal.NONE, Refusal.OUT_OF_LIMITS):
             self.outside = outside
-            refusal = Refusal.OUT_OF_ENVELOPE if outside else Refusal.NONE
+        if refusal is Refusal.NONE and outside:
+            refusal = Refusal.OUT_OF_ENVELOPE
         if refusal is not Refusal.NONE:
             self.refused += 1
             return refusal

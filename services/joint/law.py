@@ -112,6 +112,15 @@ def stiffened(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoin
     )
 
 
+def here(setpoint: Setpoint, q: Pair) -> Setpoint:
+    """Return a setpoint with its reference at q, rad, that gives the same torque there.
+
+    What the spring carried becomes feedforward; rates and coupling still fade as HOLD has them.
+    """
+    carried = carrying(setpoint, (True, True), q)
+    return Setpoint(q, carried.v_ref, carried.tau_ff, carried.tau_coupled, carried.k_p, carried.k_d)
+
+
 def carrying(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:
     """Return a setpoint in which the axes that are to sink carry their load as feedforward.
 

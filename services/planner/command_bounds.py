@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
+from services.planner.poses import Node
 from shared.config import GRAVITY, RobotConfig
 from shared.gain_table import Bounds, ModuleBounds
 from shared.joints import MODULES, N_LEG, kind_of
@@ -26,38 +27,40 @@ class BoundsOverPoses:
     """Gathers the bounds while the schedule is made; both legs are alike."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Begin with nothing but the stand gains, by which a split is stiffened."""
+        """Begin with nothing but the stand gains."""
         self._F_O: Array = np.zeros(6)
         self._F_O[2] = config.total_mass * GRAVITY
         self._assist: Array = np.array([0.0, 0.0, config.assist.force_max])
         right = MODULES[: N_LEG // 2]
         self._stand_k_p = np.ravel([config.stand_gains(module).k_p for module in right])
         self._k_p: list[Array] = []
+        self._k_p_max: list[Array] = []
         self._q: list[Array] = []
         self._tau_ff: list[Array] = []
         self._v_ref: list[Array] = []
 
-    def add(self, q: Array, kinematics: Kinematics, T: Array, D: Array) -> None:
+    def add(self, q: Array, kinematics: Kinematics, node: Node, D: Array) -> None:
         """Take a pose.
 
         Args:
             q: joint angles (12,), rad.
             kinematics: updated there.
-            T: joint rates per unit of p along the closed chain (12, 6).
+            node: what the certificate needs of it.
             D: local stiffness (6,), N m/rad.
         """
         self._k_p.append(D)
+        self._k_p_max.append(node.D_max)
         weight = self._F_O @ kinematics.J
         for tau in (weight, weight + self._assist @ kinematics.J_harness):
             self._tau_ff += [tau[:N_LEG].copy(), tau[N_LEG:].copy()]
             self._q += [q[:N_LEG], q[N_LEG:]]
-        rates = np.abs(T) @ np.array(BODY_RATES)
+        rates = np.abs(node.T) @ np.array(BODY_RATES)
         self._v_ref += [rates[:N_LEG], rates[N_LEG:]]
 
     def by_kind(self, D_B: Array) -> dict[str, ModuleBounds]:
         """Return the bounds; `D_B` (6,) is the local damping, N m s/rad."""
         k_p_low = np.min(self._k_p, axis=0)
-        k_p_high = np.maximum(np.max(self._k_p, axis=0), self._stand_k_p)
+        k_p_high = np.max([*self._k_p_max, self._stand_k_p], axis=0)
         v_ref = np.max(self._v_ref, axis=0)
         return {
             kind: ModuleBounds(

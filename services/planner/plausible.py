@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 from shared.config import RobotConfig
@@ -11,6 +10,8 @@ from shared.messages import JointState
 
 BEYOND_RAD: Final = 0.5
 """A joint gives so far beyond its soft stop at most, or its zero is so far off."""
+SPEED_MAX: Final = 100.0
+"""rad/s, five times what a drive lets its motor do."""
 
 
 class Plausible:
@@ -33,5 +34,6 @@ class Plausible:
         return (
             phi_low <= phi <= phi_high
             and theta_low <= theta <= theta_high
-            and math.isfinite(v_phi + v_theta)
+            and abs(v_phi) <= SPEED_MAX
+            and abs(v_theta) <= SPEED_MAX
         )

@@ -81,7 +81,7 @@ def solve(
             node = poses.node(z, pitch)
             if node is not None:
                 found[i, j] = _program(config, node, z, pitch)
-                bounds.add(poses.q, poses.kinematics, node.T, found[i, j])
+                bounds.add(poses.q, poses.kinematics, node, found[i, j])
         done += len(PITCHES)
         progress(done, total)
     rows = [

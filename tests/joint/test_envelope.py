@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from services.joint import law
 from services.joint.controller import JointController
 from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe, Refusal, timing_of
@@ -109,7 +110,7 @@ def edges(robot: RobotConfig, module: str, axis: int) -> dict[str, tuple[float, 
         ),
         "dtau_ff": (-own.dtau_ff, own.dtau_ff),
         "tau_coupled": (-own.tau_coupled, own.tau_coupled),
-        "v_ref": (-bounds.v_ref[axis], bounds.v_ref[axis]),
+        "v_ref": (-min(own.v_ref, bounds.v_ref[axis]), min(own.v_ref, bounds.v_ref[axis])),
         "q_ref": (Q[axis] - distance, Q[axis] + distance),
     }
 
@@ -207,6 +208,34 @@ def test_a_command_that_holds_may_be_stiff_and_far_but_not_soft(robot: RobotConf
     assert judge(robot, middle(robot, k_p=stiff, **far)) is Outside.NOTHING
     assert judge(robot, middle(robot, k_p=soft, **far)) is Outside.K_P
     assert judge(robot, middle(robot, k_d=soft, **far)) is Outside.K_D
+    assert judge(robot, middle(robot, k_d=(400.0, 400.0), **far)) is Outside.K_D
+
+
+def test_the_reference_is_judged_where_it_is_used(robot: RobotConfig) -> None:
+    """Moved on by its rate: a fast one, 30 ms old, is farther than it was told."""
+    told, envelope = middle(robot, v_ref=(0.0, 5.0)), Envelope(robot, MODULE)
+    assert envelope.judge(told, None, Q, V, age_s=0.02) is Outside.NOTHING
+    assert envelope.judge(told, None, Q, V, age_s=0.03) is Outside.Q_REF
+    ran_ahead = (Q[0], Q[1] + 5.0 * 0.03)
+    assert envelope.judge(told, None, ran_ahead, V, age_s=0.03) is Outside.NOTHING
+
+
+def test_while_track_blends_in_the_reference_may_be_as_far_as_it_was_held_off(
+    robot: RobotConfig,
+) -> None:
+    k_p = bounds_of(robot, "ankle_left").k_p[1]
+    told = middle(robot, "ankle_left", k_p=k_p, q_ref=(Q[0], Q[1] + 0.06))
+    envelope = Envelope(robot, "ankle_left")
+    assert envelope.judge(told, None, Q, V) is Outside.Q_REF
+    assert envelope.judge(told, None, Q, V, settled=False) is Outside.NOTHING
+
+
+def test_held_where_it_is_it_gives_the_same_torque(robot: RobotConfig) -> None:
+    setpoint = law.aged(middle(robot, q_ref=(0.1, -1.1), tau_coupled=(4.0, -6.0)), 0.0)
+    moved = law.here(setpoint, Q)
+    assert moved.q_ref == Q
+    assert law.torque(moved, Q, V) == pytest.approx(law.torque(setpoint, Q, V))
+    assert moved.tau_coupled == setpoint.tau_coupled, "it fades, as the rates do"
 
 
 def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:
@@ -223,6 +252,14 @@ def test_what_is_not_believed_is_refused_counted_and_told(robot: RobotConfig) ->
     assert (failsafe.command, failsafe.refused, failsafe.outside) == (None, 1, Outside.K_P)
     assert failsafe.offer(told, T0, timing) is Refusal.NONE
     assert (failsafe.command, failsafe.refused, failsafe.outside) == (told, 1, Outside.NOTHING)
+
+
+def test_what_no_service_takes_is_named_too(robot: RobotConfig) -> None:
+    failsafe, timing = Failsafe(), timing_of(robot)
+    wild = middle(robot, k_p=(math.nan, 0.0))
+    outside = judge(robot, wild)
+    assert failsafe.offer(wild, T0, timing, outside) is Refusal.OUT_OF_LIMITS
+    assert failsafe.outside is Outside.K_P
 
 
 def test_what_is_refused_for_another_reason_says_nothing_of_belief(robot: RobotConfig) -> None:

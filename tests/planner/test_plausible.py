@@ -39,7 +39,7 @@ def test_an_angle_is_taken_up_to_half_a_radian_beyond_its_soft_stop(
         assert plausible.is_state(module, state(module, q)) is taken
 
 
-@pytest.mark.parametrize("speed", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("speed", [math.nan, math.inf, -math.inf, 1e300, -101.0])
 def test_a_speed_that_is_none_is_no_state(robot: RobotConfig, speed: float) -> None:
     for v in ((speed, 0.0), (0.0, speed)):
         assert not Plausible(robot).is_state(2, state(2, np.zeros(N_JOINTS), v=v))
@@ -65,15 +65,15 @@ def test_a_module_that_tells_only_such_angles_goes_stale_and_the_planner_holds(
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(ANY, min_size=N_JOINTS, max_size=N_JOINTS), st.booleans())
+@given(st.lists(ANY, min_size=N_JOINTS, max_size=N_JOINTS), ANY, st.booleans())
 def test_whatever_angles_come_no_tick_ends_and_it_leads_again_by_good_ones(
-    robot: RobotConfig, closed: Closed, angles: list[float], led: bool
+    robot: RobotConfig, closed: Closed, angles: list[float], speed: float, led: bool
 ) -> None:
     planner, good = Planner(robot, SESSION), closed(1.188)
     now_ns = lead(planner, good) if led else START_NS
     for seq in range(10, 14):
         now_ns += STEP_NS
-        hear_all(planner, np.array(angles), now_ns, seq)
+        hear_all(planner, np.array(angles), now_ns, seq, v=(speed, 0.0))
         planner.tick(now_ns)
     for seq in range(20, 2600):
         now_ns += STEP_NS
