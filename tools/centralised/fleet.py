@@ -16,9 +16,15 @@ from tools.runs.lockstep import Lockstep, Record, forget
 
 
 def torques_only(config: RobotConfig) -> RobotConfig:
-    """Return the robot with drives that are sent torques and hold nothing by themselves."""
+    """Return the robot with drives that are sent torques and hold nothing by themselves.
+
+    Its joint services believe any command: gains of zero are what the planner sends here.
+    """
     service = msgspec.structs.replace(config.joint_service, loop="service")
-    return msgspec.structs.replace(config, joint_service=service)
+    schedule = config.gain_schedule
+    if schedule is not None:
+        schedule = msgspec.structs.replace(schedule, bounds=None)
+    return msgspec.structs.replace(config, joint_service=service, gain_schedule=schedule)
 
 
 class CentralisedLockstep(Lockstep):
