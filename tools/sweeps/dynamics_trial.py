@@ -155,6 +155,7 @@ def drawn(robot: RobotConfig, trial: Trial) -> RobotConfig:
         D_B=tuple(D_B),
         coupling_bandwidth_hz=trial.bandwidth_hz,
         coupling_damping=trial.coupling,
+        bounds=None,  # gains that the law would never send are what is tried
     )
     return msgspec.structs.replace(robot, gain_schedule=new)
 
