@@ -227,10 +227,10 @@ class EnvelopeConfig(Section, frozen=True):
     tau_ff_room: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
     """Beyond the bounds of straight stands: leans, slopes, and feet that stand otherwise."""
     q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
-    spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 50.0
+    spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 40.0
     """k_p times the distance."""
-    hold_torque: Annotated[float, Range(1.0, 1e4, "N m")] = 360.0
-    """HOLD's k_p times the distance: it stiffens about the reference that it found."""
+    hold_torque: Annotated[float, Range(1.0, 1e4, "N m")] = 300.0
+    """What HOLD's stiffening may add: an axis so far from its reference holds where it is."""
     tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
     dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
     v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0

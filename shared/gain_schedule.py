@@ -15,7 +15,8 @@ import msgspec
 
 from shared.config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.gain_table import GainSchedule
+from shared.gain_table import GainSchedule, ModuleBounds
+from shared.joints import MODULES, kind_of
 from shared.toml_file import check_ranges
 
 VERSION = 2
@@ -110,7 +111,19 @@ def read(path: Path) -> GainSchedule | None:
     sizes = {len(row) for row in schedule.D}
     if len(schedule.D) != len(schedule.z) or sizes != {len(schedule.pitch)}:
         raise ConfigError(str(path), "D", "does not fit its nodes", again)
+    if schedule.bounds is not None:
+        _check_bounds(path, schedule.bounds, again)
     return schedule
+
+
+def _check_bounds(path: Path, bounds: dict[str, ModuleBounds], again: str) -> None:
+    kinds = sorted(set(map(kind_of, MODULES)))
+    if sorted(bounds) != kinds:
+        found = f"are for {', '.join(sorted(bounds)) or 'nothing'}"
+        raise ConfigError(str(path), "bounds", found, f"for {', '.join(kinds)}; {again}")
+    for kind, row in bounds.items():
+        if not (row.theta[0] < row.theta[1] and row.tau_ff):
+            raise ConfigError(str(path), f"bounds.{kind}", "theta has no parts", again)
 
 
 def write(path: Path, schedule: GainSchedule) -> None:
@@ -154,6 +167,17 @@ def why_stale(config: RobotConfig) -> str:
     return "the gain schedule's digest is not that of its inputs"
 
 
+def believing(config: RobotConfig) -> RobotConfig:
+    """Return the robot whose joint services believe any command within their limits.
+
+    For what the shipped law never sends: another control, or gains that are tried.
+    """
+    if config.gain_schedule is None:
+        return config
+    schedule = msgspec.structs.replace(config.gain_schedule, bounds=None)
+    return msgspec.structs.replace(config, gain_schedule=schedule)
+
+
 def require(config: RobotConfig, robot_file: Path) -> None:
     """Refuse a robot whose gain split needs a schedule that it has not.
 
@@ -163,6 +187,9 @@ def require(config: RobotConfig, robot_file: Path) -> None:
     if config.law.split != "certified":
         return
     stale = why_stale(config)
+    schedule = config.gain_schedule
+    if not stale and schedule is not None and schedule.bounds is None:
+        stale = "has no bounds by which the joint services judge commands"
     if stale:
         right = f"run `xrl gains --config {robot_file}`"
         raise ConfigError(str(path_beside(robot_file)), "(file)", stale, right)

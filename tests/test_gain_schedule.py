@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -225,6 +226,33 @@ def test_another_version_is_stale(robot: RobotConfig, schedule: GainSchedule) ->
     older = msgspec.structs.replace(schedule, version=gain_schedule.VERSION + 1)
     other = msgspec.structs.replace(robot, gain_schedule=older)
     assert "version 3, not 2" in gain_schedule.why_stale(other)
+
+
+def test_a_schedule_without_bounds_is_refused_with_the_command_to_run(robot: RobotConfig) -> None:
+    """One by an older `xrl gains`: its joint services would believe anything."""
+    with pytest.raises(ConfigError, match="no bounds") as refused:
+        gain_schedule.require(gain_schedule.believing(robot), Path("lab.toml"))
+    assert "xrl gains --config lab.toml" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda bounds: bounds.pop("knee"), "bounds"),
+        (lambda bounds: bounds["hip"].update(theta=[1.0, 1.0]), "bounds.hip"),
+        (lambda bounds: bounds["ankle"].update(tau_ff=[]), "bounds.ankle"),
+    ],
+)
+def test_bounds_that_no_joint_service_can_use_are_refused(
+    tmp_path: Path, spoil: Callable[[dict[str, Any]], object], words: str
+) -> None:
+    path = tmp_path / "lab.gains.json"
+    table = json.loads(gain_schedule.path_beside(ROBOT_FILE).read_bytes())
+    spoil(table["bounds"])
+    path.write_text(json.dumps(table), encoding="utf-8")
+    with pytest.raises(ConfigError, match=words) as refused:
+        gain_schedule.read(path)
+    assert "xrl gains" in str(refused.value)
 
 
 def test_only_the_certified_split_requires_a_schedule(robot: RobotConfig) -> None:

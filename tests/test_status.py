@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from itertools import product
 
+import msgspec
 import pytest
 
-from shared.messages import Cause, DriveStatus, JointState, Mode
+from shared.messages import Cause, DriveStatus, JointState, Mode, Outside
 from tools.runs.fleet_status import LeadStatus, lead_status, module_status
 from tools.status import lead_in_words
 
@@ -41,6 +42,16 @@ def test_a_way_out_is_told_where_a_person_has_to_do_something_and_nowhere_else(
 def test_angles_are_told_only_where_the_drive_knows_them(drive: DriveStatus) -> None:
     status = module_status(state(Mode.DISARMED, Cause.NONE, drive))
     assert (status.q is None) is (drive in (DriveStatus.LOST, DriveStatus.UNZEROED))
+
+
+@pytest.mark.parametrize("outside", [each for each in Outside if each])
+def test_what_a_module_does_not_believe_is_named_with_the_way_out(outside: Outside) -> None:
+    fine = state(Mode.HOLD, Cause.COMMAND_STALE, DriveStatus.ARMED)
+    status = module_status(msgspec.structs.replace(fine, outside=int(outside)))
+    assert status.outside == outside.name
+    assert outside.name.lower() in status.way_out
+    assert "xrl kill planner" in status.way_out
+    assert (module_status(fine).outside, module_status(fine).way_out) == ("", "")
 
 
 def test_a_module_that_is_not_heard_is_not_guessed_at() -> None:

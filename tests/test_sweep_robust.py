@@ -61,7 +61,7 @@ def test_the_ranking_finds_the_error_that_moves_the_com(pushes: PushRange, cause
 def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Path) -> None:
     rows = rows_by(pushes, "drive.lag_s")
     rows[3] |= {"ending": Ending.FELL, "com_led_max_mm": None}
-    robust._draw(rows, argparse.Namespace(beyond=1.0, seed=1), tmp_path / "a.png")
+    robust._draw(rows, argparse.Namespace(beyond=1.0, seed=1, push=0.75), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 20_000
 
 

@@ -48,6 +48,7 @@ class JointController:
         self.failsafe = Failsafe()
         self.timing = timing_of(config)
         self._envelope = Envelope(config, module)
+        self._hold_torque = config.envelope.hold_torque
         self._limits = limits_of(config, module)
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
         self._damp_k_d = service.damp_k_d
@@ -212,7 +213,7 @@ class JointController:
             drive=int(samples.status),
             drive_error=samples.error,
             braced=self._braced_ns > 0,
-            outside=int(failsafe.outside),
+            outside=int(failsafe.disbelieves(now_ns, self.timing)),
         )
 
     def remember(self) -> ControllerMemory:
@@ -281,7 +282,8 @@ class JointController:
         if before is Mode.DISARMED and self._found_tau is not None:
             q, v = self._samples.q, self._samples.v
             command = self.failsafe.command
-            if command is not None and self.failsafe.usable(now_ns, self.timing):
+            believed = self.failsafe.outside is Outside.NOTHING
+            if command is not None and believed and self.failsafe.usable(now_ns, self.timing):
                 k_p, k_d = command.k_p, command.k_d  # as soft as the other five
             self._anchor = law.taken_over(q, v, self._found_tau, k_p, k_d)
             self.tau = self._found_tau  # what the gate takes for the last torque
@@ -291,9 +293,9 @@ class JointController:
             q = self._samples.q
             self._damp_stop = min(self._damp_stop, q[1])
             self._anchor = law.carrying(self._setpoint, self._sinks, q)
-        elif self.failsafe.outside is Outside.Q_REF:
-            # a reference at the edge of what is believed: to stiffen about it would pull the joint
-            self._anchor = law.here(self._setpoint, self._samples.q)
+        elif self.failsafe.mode is Mode.HOLD:
+            q, most = self._samples.q, self._hold_torque
+            self._anchor = law.near(self._setpoint, q, self._hold_k_p, most)
         else:
             self._anchor = self._setpoint
 

@@ -5,13 +5,11 @@ it is told with what the law can ask of it in any pose (`GainSchedule.bounds`, m
 with where its joint is, and with the command before. What lies outside is refused, counted and told
 (`JointState.outside`); a planner that goes on so is too old soon, and the module holds.
 
-A command with `hold` can only make the module hold. Of its numbers a module that takes its drive
-over uses the gains: these may be stiffer, not softer, and no more damped.
+A command with `hold` is obeyed all the same, but a module that does not believe its numbers is not
+ready to track (`Failsafe.ready`), so no planner leads by such numbers.
 """
 
 from __future__ import annotations
-
-import math
 
 from shared.config import RobotConfig
 from shared.gain_table import Bounds, ModuleBounds
@@ -19,10 +17,10 @@ from shared.joints import kind_of
 from shared.messages import JointCommand, Outside, Pair
 
 ROUNDING = 0.02
-"""Of a gain: the schedule is interpolated between rounded nodes."""
+"""Share of a gain that is allowed beyond: the schedule interpolates between rounded nodes."""
 GAP_TICKS = 4
-"""After a longer gap between commands a step may not be larger: it would be a blow, and what is
-wrong at once would be believed after a while."""
+"""The step that is allowed grows with the time between commands no longer than so: a wrong torque
+that is refused again and again would be within it in the end."""
 
 
 class Envelope:
@@ -35,12 +33,7 @@ class Envelope:
         self._bounds = table[kind_of(module)] if table else None
         own, least = config.envelope, config.certificate
         self._room = own.tau_ff_room
-        self._spring = own.spring_torque
-        held = config.hold_gains(module)[0]
-        self._distance = tuple(
-            min(own.q_ref_distance, own.hold_torque / k_p if k_p > 0.0 else math.inf)
-            for k_p in held
-        )
+        self._distance, self._spring = own.q_ref_distance, own.spring_torque
         self._coupled, self._dtau_ff, self._v_ref = own.tau_coupled, own.dtau_ff, own.v_ref
         self._step, self._rate = own.torque_step, own.torque_rate
         self._gap_s = GAP_TICKS / config.planner.rate_hz
@@ -73,10 +66,6 @@ class Envelope:
         bounds, c = self._bounds, command
         if bounds is None:
             return Outside.NOTHING
-        if c.hold:
-            if not _at_least(c.k_p, bounds.k_p):
-                return Outside.K_P
-            return Outside.NOTHING if _within(c.k_d, bounds.k_d) else Outside.K_D
         if not (c.margin >= self._margin and c.margin_onboard >= self._margin_onboard):
             return Outside.MARGIN
         if not _within(c.k_p, bounds.k_p):
@@ -95,7 +84,7 @@ class Envelope:
                 return Outside.V_REF
             distance = abs(c.q_ref[axis] + age_s * c.v_ref[axis] - q[axis])
             spring = c.k_p[axis] * distance if settled else 0.0
-            if not (distance <= self._distance[axis] and spring <= self._spring):
+            if not (distance <= self._distance and spring <= self._spring):
                 return Outside.Q_REF
         if last is None or last.hold or last.session != c.session:
             return Outside.NOTHING

@@ -130,6 +130,8 @@ class Failsafe(msgspec.Struct):
     refused: int = 0
     outside: Outside = Outside.NOTHING
     """Why the newest command that could have been taken was not believed."""
+    judged_ns: int = 0
+    """When that was: what is old is told no more."""
 
     def offer(
         self,
@@ -148,8 +150,8 @@ class Failsafe(msgspec.Struct):
         """
         refusal = self._judge(command, now_ns, timing)
         if refusal in (Refusal.NONE, Refusal.OUT_OF_LIMITS):
-            self.outside = outside
-        if refusal is Refusal.NONE and outside:
+            self.outside, self.judged_ns = outside, now_ns
+        if refusal is Refusal.NONE and outside and not command.hold:
             refusal = Refusal.OUT_OF_ENVELOPE
         if refusal is not Refusal.NONE:
             self.refused += 1
@@ -171,6 +173,11 @@ class Failsafe(msgspec.Struct):
         """Return the age of the newest command taken, by this module's clock; -1 if none."""
         return now_ns - self.command.echo_t_ns if self.command is not None else -1
 
+    def disbelieves(self, now_ns: int, timing: Timing) -> Outside:
+        """Return why the newest command was not believed, if it came within the age rule."""
+        old = now_ns - self.judged_ns > timing.max_command_age_ns
+        return Outside.NOTHING if old else self.outside
+
     def usable(self, now_ns: int, timing: Timing) -> bool:
         """Return True if the newest command taken is still young enough."""
         return (
@@ -184,9 +191,10 @@ class Failsafe(msgspec.Struct):
         return min(wait, timing.engage_after_max_ns)
 
     def ready(self, now_ns: int, timing: Timing) -> bool:
-        """Return True if this module can track and commands have been fresh for long enough."""
+        """Return True if this module can track, and fresh commands are believed for long enough."""
         return (
             self.mode in (Mode.HOLD, Mode.TRACK)
+            and self.outside is Outside.NOTHING
             and self.fresh_since_ns >= 0
             and now_ns - self.fresh_since_ns >= self.engage_after_ns(timing)
         )

@@ -112,13 +112,29 @@ def stiffened(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoin
     )
 
 
-def here(setpoint: Setpoint, q: Pair) -> Setpoint:
-    """Return a setpoint with its reference at q, rad, that gives the same torque there.
+def near(setpoint: Setpoint, q: Pair, k_p: Pair, added_max: float) -> Setpoint:
+    """Return a setpoint that may stiffen: no spring then pulls harder by more than `added_max`.
 
-    What the spring carried becomes feedforward; rates and coupling still fade as HOLD has them.
+    An axis that is too far from its reference for that holds where it is: what its spring carries
+    becomes feedforward, the torque stays as it is.
+
+    Args:
+        setpoint: in force until now.
+        q: where the joint is, rad.
+        k_p: to which the gains are going to rise, N m/rad.
+        added_max: N m
     """
-    carried = carrying(setpoint, (True, True), q)
-    return Setpoint(q, carried.v_ref, carried.tau_ff, carried.tau_coupled, carried.k_p, carried.k_d)
+    s = setpoint
+    away = (s.q_ref[0] - q[0], s.q_ref[1] - q[1])
+    far = (
+        (k_p[0] - s.k_p[0]) * abs(away[0]) > added_max,
+        (k_p[1] - s.k_p[1]) * abs(away[1]) > added_max,
+    )
+    if far == (False, False):
+        return s
+    carried = carrying(s, far, q)
+    q_ref = (q[0] if far[0] else s.q_ref[0], q[1] if far[1] else s.q_ref[1])
+    return Setpoint(q_ref, s.v_ref, carried.tau_ff, s.tau_coupled, s.k_p, s.k_d)
 
 
 def carrying(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:

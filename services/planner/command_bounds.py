@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 BODY_RATES: Final = (0.3, 0.3, 1.0, 0.5, 2.0, 0.5)
 """m/s and rad/s along p: faster is no lead but a fall. A squat that is led has 0.3 m/s."""
 PARTS: Final = 12
-"""Of a joint's range of theta."""
+"""Into how many a joint's range of theta is divided."""
 KINDS: Final = {kind_of(module): 2 * i for i, module in enumerate(MODULES[: N_LEG // 2])}
 """Where a kind's phi stands in a leg."""
 

@@ -10,8 +10,8 @@ import pytest
 
 from shared import config_file
 from shared.config import RobotConfig
+from shared.gain_schedule import believing
 from tests.conftest import ROBOT_FILE
-from tests.joint.helpers import believing
 
 
 @pytest.fixture(scope="session")

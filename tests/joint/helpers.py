@@ -12,6 +12,7 @@ from services.joint.differential import motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
+from shared.gain_schedule import believing
 from shared.messages import JointCommand, Mode, Pair
 
 T0 = 1_000 * NS_PER_S
@@ -43,14 +44,6 @@ def with_service(robot: RobotConfig, **changes: Any) -> RobotConfig:
     """Return the robot with some keys of [joint_service] changed."""
     service = msgspec.structs.replace(robot.joint_service, **changes)
     return msgspec.structs.replace(robot, joint_service=service)
-
-
-def believing(robot: RobotConfig) -> RobotConfig:
-    """Return the robot whose joint services believe any command within their limits."""
-    schedule = robot.gain_schedule
-    assert schedule is not None
-    unbounded = msgspec.structs.replace(schedule, bounds=None)
-    return msgspec.structs.replace(robot, gain_schedule=unbounded)
 
 
 class Bench:

@@ -12,14 +12,15 @@ import pytest
 from services.joint import law
 from services.joint.controller import JointController
 from services.joint.envelope import Envelope
-from services.joint.failsafe import Failsafe, Refusal, timing_of
+from services.joint.failsafe import Event, Failsafe, Refusal, timing_of
 from shared import config_file
 from shared.config import RobotConfig
+from shared.gain_schedule import believing
 from shared.gain_table import Bounds, ModuleBounds
 from shared.joints import MODULES, kind_of
 from shared.messages import JointCommand, Mode, Outside, Pair
 from tests.conftest import ROBOT_FILE
-from tests.joint.helpers import SESSION, T0, believing, command
+from tests.joint.helpers import SESSION, T0, command
 
 Q: Pair = (0.02, -1.0)
 V: Pair = (0.01, -0.2)
@@ -97,10 +98,8 @@ def test_what_is_no_number_is_never_believed(
 def edges(robot: RobotConfig, module: str, axis: int) -> dict[str, tuple[float, float]]:
     """Return the least and the largest value of each number that is still believed."""
     bounds, own = bounds_of(robot, module), robot.envelope
-    held = robot.hold_gains(module)[0][axis]
-    distance = min(own.q_ref_distance, own.hold_torque / held if held > 0.0 else math.inf)
     k_p = bounds.k_p[0][axis]
-    distance = min(distance, own.spring_torque / k_p if k_p > 0.0 else math.inf)
+    distance = min(own.q_ref_distance, own.spring_torque / k_p if k_p > 0.0 else math.inf)
     return {
         "k_p": (0.98 * bounds.k_p[0][axis], 1.02 * bounds.k_p[1][axis]),
         "k_d": (0.98 * bounds.k_d[0][axis], 1.02 * bounds.k_d[1][axis]),
@@ -202,22 +201,31 @@ def test_the_step_is_from_what_this_planner_led_with(
     assert judge(robot, middle(robot, tau_coupled=(0.0, 40.0), seq=2), last) is Outside.NOTHING
 
 
-def test_a_command_that_holds_may_be_stiff_and_far_but_not_soft(robot: RobotConfig) -> None:
-    stiff, soft = (6000.0, 6000.0), (0.0, 0.0)
-    far = {"hold": True, "q_ref": (0.5, -2.0), "tau_ff": (90.0, -90.0), "margin": 0.0}
-    assert judge(robot, middle(robot, k_p=stiff, **far)) is Outside.NOTHING
-    assert judge(robot, middle(robot, k_p=soft, **far)) is Outside.K_P
-    assert judge(robot, middle(robot, k_d=soft, **far)) is Outside.K_D
-    assert judge(robot, middle(robot, k_d=(400.0, 400.0), **far)) is Outside.K_D
+@pytest.mark.parametrize("name", ["k_p", "k_d", "q_ref", "tau_ff"])
+def test_who_asks_for_hold_is_obeyed_and_by_numbers_that_are_not_believed_nobody_is_ready(
+    robot: RobotConfig, name: str
+) -> None:
+    failsafe, timing = Failsafe(mode=Mode.HOLD), timing_of(robot)
+    wild = {"tau_ff": (0.5, -90.0), "q_ref": (0.5, -2.0)}.get(name, (0.0, 0.0))
+    for seq in range(2000):
+        now_ns = T0 + seq * 2_000_000
+        told = middle(robot, hold=True, seq=seq, echo_t_ns=now_ns)
+        if seq % 2 or seq < 1000:
+            told = msgspec.structs.replace(told, **{name: wild})
+        outside = judge(robot, told)
+        assert failsafe.offer(told, now_ns, timing, outside) is Refusal.NONE
+        failsafe.advance(now_ns, timing, Event.NONE, estop=False)
+        assert failsafe.mode is Mode.HOLD
+        assert failsafe.ready(now_ns, timing) is (seq >= 1000 and seq % 2 == 0)
 
 
 def test_the_reference_is_judged_where_it_is_used(robot: RobotConfig) -> None:
     """Moved on by its rate: a fast one, 30 ms old, is farther than it was told."""
     told, envelope = middle(robot, v_ref=(0.0, 5.0)), Envelope(robot, MODULE)
-    assert envelope.judge(told, None, Q, V, age_s=0.02) is Outside.NOTHING
-    assert envelope.judge(told, None, Q, V, age_s=0.03) is Outside.Q_REF
-    ran_ahead = (Q[0], Q[1] + 5.0 * 0.03)
-    assert envelope.judge(told, None, ran_ahead, V, age_s=0.03) is Outside.NOTHING
+    assert envelope.judge(told, None, Q, V, age_s=0.039) is Outside.NOTHING
+    assert envelope.judge(told, None, Q, V, age_s=0.041) is Outside.Q_REF
+    ran_ahead = (Q[0], Q[1] + 5.0 * 0.041)
+    assert envelope.judge(told, None, ran_ahead, V, age_s=0.041) is Outside.NOTHING
 
 
 def test_while_track_blends_in_the_reference_may_be_as_far_as_it_was_held_off(
@@ -230,12 +238,14 @@ def test_while_track_blends_in_the_reference_may_be_as_far_as_it_was_held_off(
     assert envelope.judge(told, None, Q, V, settled=False) is Outside.NOTHING
 
 
-def test_held_where_it_is_it_gives_the_same_torque(robot: RobotConfig) -> None:
-    setpoint = law.aged(middle(robot, q_ref=(0.1, -1.1), tau_coupled=(4.0, -6.0)), 0.0)
-    moved = law.here(setpoint, Q)
-    assert moved.q_ref == Q
+def test_hold_stiffens_about_the_joint_where_the_reference_is_too_far(robot: RobotConfig) -> None:
+    """A knee 0.1 rad off was pulled by 300 N m once HOLD had stiffened, and the robot fell."""
+    setpoint = law.aged(middle(robot, q_ref=(0.13, -1.1), tau_coupled=(4.0, -6.0)), 0.0)
+    moved = law.near(setpoint, Q, (3000.0, 0.0), 300.0)
+    assert moved.q_ref == (Q[0], setpoint.q_ref[1])
     assert law.torque(moved, Q, V) == pytest.approx(law.torque(setpoint, Q, V))
     assert moved.tau_coupled == setpoint.tau_coupled, "it fades, as the rates do"
+    assert law.near(setpoint, Q, (2700.0, 3000.0), 400.0) is setpoint
 
 
 def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:
@@ -270,7 +280,9 @@ def test_what_is_refused_for_another_reason_says_nothing_of_belief(robot: RobotC
 
 
 def test_a_state_tells_what_is_not_believed(robot: RobotConfig) -> None:
+    """Until 50 ms have passed in which nothing came: the planner that said it is gone."""
     controller = JointController(robot, MODULE)
-    controller.failsafe.outside = Outside.TAU_FF
-    assert controller.state(T0).outside == Outside.TAU_FF
-    assert controller.failsafe.mode is Mode.DISARMED
+    controller.step(T0, None, middle(robot, k_p=(0.0, 0.0)), estop=False)
+    limit_ns = controller.timing.max_command_age_ns
+    assert controller.state(T0 + limit_ns).outside == Outside.K_P
+    assert controller.state(T0 + limit_ns + 1).outside == Outside.NOTHING

@@ -20,10 +20,10 @@ from services.joint.memory import ModuleMemory
 from services.planner.memory import TickMemory
 from services.simulator.state import taken
 from shared.config import RobotConfig
+from shared.gain_schedule import believing
 from shared.joints import MODULES
 from shared.messages import Mode, Outside
 from shared.traces import SimState
-from tests.joint.helpers import believing
 from tests.lockstep.runs import push, story
 from tests.lockstep.wrong_planners import faults, wrong
 from tools.runs.lockstep import Lockstep

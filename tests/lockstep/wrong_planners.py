@@ -35,7 +35,7 @@ OFFSETS: Final = (-0.5, -0.1, -0.03, 0.03, 0.1, 0.5)
 DELAYS: Final = (10, 25, 75)
 """Ticks by which the states used are old, told as if they were new."""
 BITS: Final = (0, 40, 50, 51, 52, 55, 60, 62, 63)
-"""Of a float64: from what nobody notices to the sign."""
+"""Which bit of a float64 flips: from what nobody notices to the sign."""
 
 
 def faults() -> dict[str, Fault]:

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.system
 
 CONFIG = load(DEFAULT_CONFIG)
 KEY = topics.JOINT_STATE.key(CONFIG.name, "knee_right")
-DEADLINE_S = 20.0
+DEADLINE_S = 40.0
 
 
 class Rig:

@@ -12,10 +12,11 @@ from services.planner.engagement import GRACE_NS, Engagement
 from services.planner.planner import Planner
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
+from shared.gain_schedule import believing
 from shared.joints import MODULES, kind_of
 from shared.messages import Mode, PlannerMode, Wrench
 from shared.robot_model import stand_pose
-from tests.joint.helpers import T0, Bench, believing, command
+from tests.joint.helpers import T0, Bench, command
 from tests.planner.test_planner import START_NS, hear_all, lead
 
 GENTLE = (3.0, -5.0)

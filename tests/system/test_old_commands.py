@@ -19,6 +19,7 @@ from shared import topics
 from shared.bus import open_session
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
+from shared.gain_schedule import believing
 from shared.messages import Estop, JointCommand, JointEvent, JointState, Mode, Pair
 from shared.traces import JointTrace
 from tests.joint.helpers import SESSION, command
@@ -107,7 +108,7 @@ def test_a_live_joint_service_refuses_old_commands_and_takes_a_planners(
     """The same publisher, the same commands but for the stamp that they echo."""
     module = "knee_left"
     with (
-        Serving(robot, module, run_dir) as service,
+        Serving(believing(robot), module, run_dir) as service,
         open_session(robot, "planner", run_dir) as session,
     ):
         commands = session.publisher(topics.JOINT_COMMAND, JointCommand, module)

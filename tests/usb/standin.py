@@ -87,7 +87,7 @@ class UsbRobot:
                 before = now
 
 
-def eventually(claim: Callable[[], bool], within_s: float = 5.0) -> bool:
+def eventually(claim: Callable[[], bool], within_s: float = 20.0) -> bool:
     """Return whether a claim comes true in time."""
     deadline = time.monotonic() + within_s
     while time.monotonic() < deadline:

@@ -9,6 +9,7 @@ import msgspec
 
 from services.simulator.plant import PlantConfig
 from shared.config import RobotConfig
+from shared.gain_schedule import believing
 from shared.impairment import Impairment
 from shared.scenario import Scenario
 from tools.centralised.control import CentralPlanner, PassThrough
@@ -21,10 +22,7 @@ def torques_only(config: RobotConfig) -> RobotConfig:
     Its joint services believe any command: gains of zero are what the planner sends here.
     """
     service = msgspec.structs.replace(config.joint_service, loop="service")
-    schedule = config.gain_schedule
-    if schedule is not None:
-        schedule = msgspec.structs.replace(schedule, bounds=None)
-    return msgspec.structs.replace(config, joint_service=service, gain_schedule=schedule)
+    return msgspec.structs.replace(believing(config), joint_service=service)
 
 
 class CentralisedLockstep(Lockstep):

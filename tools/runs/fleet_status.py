@@ -229,7 +229,8 @@ def module_status(state: Message | None) -> ModuleStatus:
         way_out = f"if it lasts: its log says why; hang the robot, then {RESTART}"
     outside = Outside(state.outside).name if state.outside else ""
     if outside and not way_out:
-        way_out = f"the planner's {outside.lower()} is not believed: xrl kill planner, look at it"
+        told = f"the planner's {outside.lower()} is not believed"
+        way_out = f"{told}: by itself after a push or a stall; if it lasts, xrl kill planner"
     knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
     q = state.q if knows else None
     braced = state.braced and mode is Mode.HOLD

@@ -35,7 +35,7 @@ STILL_S: Final = (0.3, 1.0)
 LET_GO_S: Final = 1.0
 """At most so long before the kill."""
 PUSH_SHARE: Final = (0.1, 1.0)
-"""Of the hardest that is drawn (`PushRange`)."""
+"""Shares of the hardest push that is drawn (`PushRange`)."""
 PUSH_S: Final = 0.3
 PUSHES_MAX: Final = 3
 POSES_MAX: Final = 2

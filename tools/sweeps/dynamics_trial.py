@@ -25,6 +25,7 @@ from services.planner.sampled_loop import NOMINAL, Hand
 from services.planner.split_program import design_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
 from shared.config import RobotConfig
+from shared.gain_schedule import believing
 from shared.gain_table import GainSchedule
 from shared.impairment import Impairment
 from shared.joints import N_LEG
@@ -155,7 +156,6 @@ def drawn(robot: RobotConfig, trial: Trial) -> RobotConfig:
         D_B=tuple(D_B),
         coupling_bandwidth_hz=trial.bandwidth_hz,
         coupling_damping=trial.coupling,
-        bounds=None,  # gains that the law would never send are what is tried
     )
     return msgspec.structs.replace(robot, gain_schedule=new)
 
@@ -190,9 +190,9 @@ UNREADY: Final = Outcome(
 
 
 def run_trial(trial: Trial, robot: RobotConfig) -> Outcome:
-    """Run a trial."""
+    """Run a trial; its joint services believe gains that the law would never send."""
     fleet = Lockstep(
-        robot,
+        believing(robot),
         story_of(robot, trial),
         Impairment(delay_ms=float(trial.delay_ms)),
         plant=plant_of(robot, trial),

@@ -63,7 +63,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one case of it; 1 if any fell."""
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
-    push_range.words(args)
+    push_range.check(args)
     crew = study.crew_of(args, CODE)
     robot = experiment.make_robot(args)
     console = Console()
@@ -88,7 +88,8 @@ def _run_all(
             seconds = study.fill(table, JOB, tasks, crew, args.n, console)
     rows = table.rows(args.n)
     fallen = report.falls(rows)
-    title = f"Planner killed, {len(rows)} random cases, seed {args.seed}: {len(fallen)} fell"
+    title = f"Planner killed, {len(rows)} random cases, seed {args.seed}, "
+    title += f"{push_range.in_words(args)}: {len(fallen)} fell"
     picture.draw(rows, robot, title, out / PICTURE)
     report.show(rows, _command(args), console)
     pace = f"; {seconds:.2f} s a case" if missing else ""
@@ -159,7 +160,7 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
 
 def _command(args: argparse.Namespace) -> str:
     """Return the command of this study, but for --n, --only and --out."""
-    flags = [f"--seed {args.seed}", *push_range.words(args)]
+    flags = [f"--seed {args.seed}", *push_range.flags(args)]
     if args.config != DEFAULT_CONFIG:
         flags.append(f"--config {args.config}")
     flags += [

@@ -89,10 +89,9 @@ def _draw_falls(rows: Sequence[Row], what: str, path: Path) -> None:
     axis.set_xlabel("delay each way in ms", fontsize=9)
     _draw_shares(figure.add_subplot(grid[-1]), rows)
     figure.suptitle(
-        f"Who falls: {len(rows)} runs of {DURATION_S:g} s, led by hand, {PUSHES} pushes in "
-        f"each, up to {SHARE:.0%} of what soles and motors bear; {what};\n"
-        "all links get bad, both ways, on the way down. Cells: falls/trials, 95 % interval of the "
-        "share (Wilson)",
+        f"Who falls: {len(rows)} runs of {DURATION_S:g} s, led by hand; {what}; {PUSHES} pushes "
+        f"in each,\nup to {SHARE:.0%} of what soles and motors bear; all links get bad, both ways, "
+        "on the way down.\nCells: falls/trials, 95 % interval of the share (Wilson)",
         fontsize=10, x=0.01, ha="left",
     )  # fmt: skip
     figure.savefig(path)

@@ -107,7 +107,7 @@ class Shove(NamedTuple):
     at: float
     """s"""
     share: float
-    """Of what soles and motors bear along its direction (`PushRange`)."""
+    """1 is what soles and motors bear along its direction (`PushRange`)."""
     angle: float
     """rad from x (forwards) to y (left)."""
 

@@ -15,18 +15,17 @@ from shared.scenario import Push
 
 DIGITS: Final = 3
 REACHED_M: Final = 1e-4
-
-
 SHARE: Final = 0.75
-"""Of the limit: up to here the studies push unless told otherwise."""
+"""Up to this share of the limit the studies push unless told otherwise."""
 SHARE_MAX: Final = 3.0
 
 
 class PushRange:
-    """The hardest push that a standing robot bears for ever, by direction: 76 to 158 N.
+    """The hardest push that a standing robot bears for ever, by direction.
 
     It is the physical limit (`LoadedStand.limit_of_body`), whatever the control. Forwards and back
     it is least in the stand; sideways squat and crawl differ from it by less than a quarter.
+    The shipped robot's: 76 to 158 N.
     """
 
     def __init__(self, robot: RobotConfig, most: float = SHARE) -> None:
@@ -85,15 +84,24 @@ def add_flag(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def words(args: argparse.Namespace) -> list[str]:
-    """Return the flag as it was given, if it is not the default.
+def check(args: argparse.Namespace) -> None:
+    """Refuse a share that cannot be drawn.
 
     Raises:
-        RunError: it is no share that is drawn.
+        RunError: says which shares can.
     """
     if not 0.0 < args.push <= SHARE_MAX:
         raise RunError(f"--push {args.push:g}: more than 0, at most {SHARE_MAX:g}")
+
+
+def flags(args: argparse.Namespace) -> list[str]:
+    """Return the flag as it was given, if it is not the default."""
     return [] if args.push == SHARE else [f"--push {args.push:g}"]
+
+
+def in_words(args: argparse.Namespace) -> str:
+    """Return how hard a study pushes, for its picture."""
+    return f"pushed with up to {args.push:.0%} of what soles and motors bear"
 
 
 def com_height(poses: Poses, torso: float, pitch: float) -> float:

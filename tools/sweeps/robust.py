@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
     if not 0.0 <= args.slope <= SLOPE_MAX_DEG:
         raise RunError(f"--slope {args.slope:g}: 0 to {SLOPE_MAX_DEG:g} degrees")
-    push_range.words(args)
+    push_range.check(args)
     crew = study.crew_of(args, CODE)
     robot = experiment.load_robot(args.config, imu=args.imu)
     plants.draw("check", beyond=args.beyond)
@@ -183,8 +183,8 @@ def _draw(rows: Sequence[Row], args: argparse.Namespace, path: Path) -> None:
     right.legend()
     fell = sum(row["ending"] != Ending.STOOD for row in rows)
     figure.suptitle(
-        f"{len(rows)} trials, every error drawn, ranges x{args.beyond:g}, seed {args.seed}: "
-        f"{fell} fell",
+        f"{len(rows)} trials, every error drawn, ranges x{args.beyond:g}, seed {args.seed}, "
+        f"{push_range.in_words(args)}: {fell} fell",
         x=0.01,
         ha="left",
     )
@@ -253,7 +253,7 @@ def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
 
 def _command(args: argparse.Namespace) -> str:
     """Return the command of this study, but for --n, --only and --out."""
-    flags = [f"--seed {args.seed}", *push_range.words(args)]
+    flags = [f"--seed {args.seed}", *push_range.flags(args)]
     if args.beyond != 1.0:
         flags.append(f"--beyond {args.beyond:g}")
     if args.slope != 0.0:

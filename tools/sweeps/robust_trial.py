@@ -37,7 +37,7 @@ LEAN_SHARE: Final = (0.15, 0.4)
 LEAN_S: Final = 1.5
 """A push that lasts, while the planner leads."""
 PUSH_SHARE: Final = (0.3, 1.0)
-"""Of the hardest that is drawn (`PushRange`)."""
+"""Shares of the hardest push that is drawn (`PushRange`)."""
 PUSH_S: Final = 0.3
 AFTER_KILL_S: Final = 2.5
 DIGITS: Final = 3

@@ -1,0 +1,145 @@
+"""The shipped planner is believed, whatever happens: none of its commands is outside."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from services.joint.envelope import Envelope
+from services.simulator.plant import PlantConfig, changed
+from shared.config import RobotConfig
+from shared.impairment import Impairment
+from shared.messages import Outside, PlannerMode
+from shared.scenario import Inject, Keyframe, Push, Scenario
+from tests.lockstep.runs import kill, push, restart, story
+from tools.runs.lockstep import Lockstep
+from tools.sweeps import plants
+from tools.sweeps.push_range import PushRange
+
+DOWN = (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=0.95))
+
+
+class Judged:
+    """What the six envelopes said while a planner was tracked."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.leading, self.outside = 0, Counter[str]()
+        judge = Envelope.judge
+
+        def listening(own: Envelope, command, last, *rest, **more):  # type: ignore[no-untyped-def]
+            found = judge(own, command, last, *rest, **more)
+            self.leading += not command.hold
+            if found is not Outside.NOTHING:
+                self.outside[found.name] += 1
+            return found
+
+        monkeypatch.setattr(Envelope, "judge", listening)
+
+
+@pytest.fixture
+def judged(monkeypatch: pytest.MonkeyPatch) -> Judged:
+    return Judged(monkeypatch)
+
+
+def run(
+    robot: RobotConfig, told: Scenario, network: Impairment, plant: PlantConfig | None = None
+) -> Lockstep:
+    fleet = Lockstep(robot, told, network, plant=plant)
+    for row in fleet.run():
+        assert not row.fallen
+    return fleet
+
+
+def believed(judged: Judged) -> None:
+    assert judged.leading > 500, "there was something to believe"
+    assert judged.outside == {}
+
+
+@pytest.mark.parametrize("name", ["squat", "crawl"])
+def test_while_the_hand_leads(robot: RobotConfig, judged: Judged, name: str) -> None:
+    pushes = (push(1.0, 0.0, 40.0, 0.0), push(2.0, 40.0, 0.0, 0.0))
+    run(robot, story(name, duration=5.0, kill=(), push=pushes), Impairment(delay_ms=1.0))
+    believed(judged)
+
+
+def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: Judged) -> None:
+    told = story("squat", duration=5.0, kill=kill(1.0), restart=restart(1.6), push=())
+    fleet = run(robot, told, Impairment(delay_ms=1.0))
+    believed(judged)
+    assert fleet.planner is not None
+    assert fleet.planner.status(fleet.now_ns, 0.0).mode == PlannerMode.LEADING
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        Impairment(delay_ms=10.0, jitter_ms=5.0, loss=0.3),
+        Impairment(delay_ms=5.0, loss=0.5),
+        Impairment(delay_ms=15.0, jitter_ms=8.0),
+    ],
+    ids=lambda network: f"{network.delay_ms:g}-{network.jitter_ms:g}-{network.loss:g}",
+)
+def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairment) -> None:
+    told = story("stand", duration=4.0, keyframe=DOWN, push=(push(1.0, 0.0, 40.0, 0.0),))
+    run(robot, told, network)
+    believed(judged)
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, -1, 1), (-1, -1, 1, -1)])
+def test_at_the_corners_of_a_lean(
+    robot: RobotConfig, judged: Judged, signs: tuple[int, ...]
+) -> None:
+    x, y, roll, yaw = (sign * most for sign, most in zip(signs, robot.law.shift_max, strict=True))
+    leans = (*DOWN, Keyframe(at=3.0, height=1.05, shift=(x, y, roll, yaw)))
+    run(robot, story("stand", duration=4.0, keyframe=leans, push=()), Impairment(delay_ms=1.0))
+    believed(judged)
+
+
+@pytest.mark.parametrize("right", [(0.1, 0.12, -0.3), (-0.1, -0.12, 0.3)])
+def test_at_the_corners_of_a_stance(
+    robot: RobotConfig, judged: Judged, right: tuple[float, float, float]
+) -> None:
+    plant = changed(PlantConfig(), {"feet.offset_right": list(right)})
+    told = story("stand", duration=4.0, keyframe=DOWN, push=())
+    run(robot, told, Impairment(delay_ms=1.0), plant)
+    believed(judged)
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_on_drawn_plants_under_pushes_of_three_quarters_of_the_physical_limit(
+    robot: RobotConfig, judged: Judged, number: int
+) -> None:
+    pushes = PushRange(robot)
+    angles = (0.0, math.pi, math.pi / 2, -2.0)
+    hard: tuple[Push, ...] = (pushes.push(2.0, 0.3, 0.75, angles[number]),)
+    told = story("stand", duration=4.5, keyframe=DOWN, push=hard)
+    run(robot, told, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
+    believed(judged)
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)])
+def test_held_off_centre_it_is_believed_and_leads_again(
+    robot: RobotConfig, judged: Judged, direction: tuple[float, float]
+) -> None:
+    """Cut off as a push has moved it, it holds there; led again it begins from the middle."""
+    x, y = (50.0 * part for part in direction)
+    told = story(
+        "stand",
+        duration=7.0,
+        push=(Push(at=0.5, duration=0.4, force=(x, y, 0.0)),),
+        inject=(Inject(link="planner->joints", at=0.8, partition=True, duration=1.0),),
+    )
+    fleet = Lockstep(robot, told, Impairment(delay_ms=1.0))
+    held = []
+    for row in fleet.run():
+        assert not row.fallen
+        if 0.85 < row.scenario_s < 1.8:
+            held.append(np.hypot(*row.com[:2]))
+    assert max(held) > 0.02, "it was off centre"
+    believed(judged)
+    assert fleet.planner is not None
+    assert fleet.planner.status(fleet.now_ns, 0.0).mode == PlannerMode.LEADING
+    assert np.hypot(*fleet.world.truth(0, 1.0, 0.0).com[:2]) < 0.01
