@@ -27,6 +27,7 @@ from shared.config_sections import (
     SimulationConfig,
     StandConfig,
     StandGains,
+    TripsConfig,
 )
 from shared.gain_table import GainSchedule
 from shared.joints import MODULES, kind_of
@@ -66,6 +67,7 @@ class RobotConfig(Section, frozen=True):
     simulation: SimulationConfig
     imu: ImuConfig = ImuConfig()
     envelope: EnvelopeConfig = EnvelopeConfig()
+    trips: TripsConfig = TripsConfig()
     gain_schedule: GainSchedule | None = None
     """Not in this file but beside it; None if it has not been made."""
 

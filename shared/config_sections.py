@@ -241,6 +241,29 @@ class EnvelopeConfig(Section, frozen=True):
     """... for each second between them."""
 
 
+class TripLimit(Section, frozen=True):
+    """When something trips."""
+
+    limit: Annotated[float, Range(0.0, 1e4, "the trip's own unit")]
+    after_ms: Annotated[float, Range(0.0, 1e4, "ms")] = 0.0
+    """Beyond it for so long, without a break."""
+
+
+class TripsConfig(Section, frozen=True):
+    """What takes the robot out of being led (`shared.trip_table`)."""
+
+    shaking: TripLimit = TripLimit(limit=15.0)
+    torque_limit: TripLimit = TripLimit(limit=1.0, after_ms=1000.0)
+    speed: TripLimit = TripLimit(limit=8.0, after_ms=20.0)
+    legs: TripLimit = TripLimit(limit=0.1, after_ms=50.0)
+    reach: TripLimit = TripLimit(limit=0.02, after_ms=50.0)
+    tracking: TripLimit = TripLimit(limit=0.15, after_ms=50.0)
+    unloaded: TripLimit = TripLimit(limit=20.0, after_ms=60.0)
+    sinking: TripLimit = TripLimit(limit=0.8, after_ms=100.0)
+    turning: TripLimit = TripLimit(limit=2.5, after_ms=100.0)
+    harness: TripLimit = TripLimit(limit=150.0, after_ms=200.0)
+
+
 class PlannerConfig(Section, frozen=True):
     """Planner timing."""
 

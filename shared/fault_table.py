@@ -167,6 +167,12 @@ LOSSES: Final[dict[str, Loss]] = {
         "planner/status: MISPLACED; `xrl status` says which way",
         "by itself, once the feet stand within `law.stance_max` of the robot file's place",
     ),
+    "trouble noticed": Loss(
+        "HOLD: it trips by itself, for what it alone sees (shaking, torque, speed)",
+        "HOLD, by the planner's word; or all six, for what the planner sees",
+        "`xrl status`: because SHAKING, TORQUE_LIMIT, TOO_FAST; planner/status: TRIPPED, and why",
+        "by itself, after a wait that each one lengthens",
+    ),
     "overload at the harness": Loss(
         "HOLD",
         "HOLD",

@@ -47,6 +47,23 @@ class Cause(IntEnum):
     DRIVE_DISARMED = 7
     POSITION_LOST = 8
     """The drive does not know where its joint is: unzeroed, or its samples jump."""
+    SHAKING = 9
+    """It tripped by itself (`shared.trip_table`), as by the two that follow."""
+    TORQUE_LIMIT = 10
+    TOO_FAST = 11
+
+
+class Trip(IntEnum):
+    """What the planner does not lead for (`shared.trip_table`)."""
+
+    NONE = 0
+    LEGS = 1
+    REACH = 2
+    TRACKING = 3
+    UNLOADED = 4
+    SINKING = 5
+    TURNING = 6
+    HARNESS = 7
 
 
 class Outside(IntEnum):
@@ -100,6 +117,8 @@ class PlannerMode(IntEnum):
     MISPLACED = 5
     """The feet stand farther from where the robot file has them than `law.stance_max`, or have just
     been moved: `hold`."""
+    TRIPPED = 6
+    """Something was beyond its limit (`PlannerStatus.trip`): `hold` until all has been calm."""
 
 
 class SplitSource(IntEnum):
@@ -322,6 +341,8 @@ class PlannerStatus(Message, frozen=True):
     and a rotation vector in rad, world axes."""
     why: str = ""
     """Why it does not lead, in words, where the mode does not say it all."""
+    trip: int = 0
+    """`Trip`: what it does not lead for."""
 
 
 class OperatorIntent(Message, frozen=True):

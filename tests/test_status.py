@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from shared.messages import Cause, DriveStatus, JointState, Mode, Outside
+from shared.trip_table import JOINT_TRIPS
 from tools.runs.fleet_status import LeadStatus, lead_status, module_status
 from tools.status import lead_in_words
 
@@ -31,6 +32,7 @@ def test_a_way_out_is_told_where_a_person_has_to_do_something_and_nowhere_else(
         mode in (Mode.FAULT, Mode.DAMP)
         or drive in (DriveStatus.UNZEROED, DriveStatus.HOLDING)
         or (mode is Mode.DISARMED and drive in waits)
+        or (mode is Mode.HOLD and cause in JOINT_TRIPS)
     )
     assert bool(status.way_out) is helpless
     if mode is Mode.FAULT:

@@ -22,7 +22,7 @@ from shared.robot_model import stand_pose
 from shared.scenario import Keyframe, Push, Scenario, lead
 from tools.runs import lockstep
 from tools.runs.lockstep import Lockstep
-from tools.runs.tipping import is_tipping
+from tools.runs.standing import is_tipping
 from tools.sweeps import cases
 from tools.sweeps.cases import Case, Cases
 from tools.sweeps.figures import Ending

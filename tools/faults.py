@@ -6,11 +6,15 @@ import argparse
 
 import msgspec
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from shared.config_file import load
+from shared.config_sections import TripLimit
 from shared.fault_table import DRIVE_FAULTS, LOSSES
 from shared.scenario import FAULT_KINDS
-from tools.verbs import Subparsers, add_verb
+from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
+from tools.verbs import Subparsers, add_config, add_verb
 
 _LABEL_WIDTH = 12
 
@@ -26,15 +30,25 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl sim --fault knee_left:encoder@4     # to see one
         """,
     )
+    add_config(parser)
     parser.add_argument("--json", action="store_true", help="print the table as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the table."""
+    limits = load(args.config).trips
+    trips = {
+        trip.name: (row, getattr(limits, row.key))
+        for trip, row in (*JOINT_TRIPS.items(), *PLANNER_TRIPS.items())
+    }
     if args.json:
         rows = {
             "drive": {kind: row._asdict() for kind, row in DRIVE_FAULTS.items()},
             "fleet": {name: row._asdict() for name, row in LOSSES.items()},
+            "trips": {
+                name: row._asdict() | msgspec.to_builtins(limit)
+                for name, (row, limit) in trips.items()
+            },
         }
         print(msgspec.json.format(msgspec.json.encode(rows)).decode())
         return 0
@@ -58,7 +72,21 @@ def run(args: argparse.Namespace) -> int:
         _say(console, "others", loss.others)
         _say(console, "you see", loss.told)
         _say(console, "it ends", loss.recovery)
+    console.print(
+        "\n[bold]What trips.[/] Noticed while the robot is led, by each module or by the planner: "
+        "all six HOLD, and are led again after a wait that each one lengthens.\n"
+    )
+    for name, (trip, limit) in trips.items():
+        console.print(f"[bold]{name}[/]: {trip.measured}")
+        _say(console, "trips", _limit_in_words(trip, limit))
+        _say(console, "you do", trip.recovery)
     return 0
+
+
+def _limit_in_words(row: TripRow, limit: TripLimit) -> str:
+    beyond = "below" if row.least else "above"
+    lasting = f" for {limit.after_ms:g} ms" if limit.after_ms else ""
+    return f"{beyond} {limit.limit:g} {row.unit}{lasting} (trips.{row.key})"
 
 
 def _say(console: Console, label: str, text: str) -> None:
@@ -66,5 +94,5 @@ def _say(console: Console, label: str, text: str) -> None:
     grid = Table.grid(padding=(0, 1))
     grid.add_column(width=_LABEL_WIDTH, justify="right", style="dim")
     grid.add_column()
-    grid.add_row(label, text)
+    grid.add_row(label, escape(text))
     console.print(grid)

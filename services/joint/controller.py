@@ -20,13 +20,12 @@ from services.joint.gate import diamond, gate, limits_of
 from services.joint.law import Setpoint
 from services.joint.memory import ControllerMemory
 from services.joint.samples import Samples
+from services.joint.trips import Trips
+from services.joint.trips import limits_of as trip_limits_of
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import kind_of
 from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Outside, Pair
-
-UNLED_SHARE = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
-"""How far a drive's gains rise to HOLD's while its service leads; `left_holding` says why."""
 
 
 class CycleResult(NamedTuple):
@@ -50,11 +49,11 @@ class JointController:
         self._envelope = Envelope(config, module)
         self._hold_torque = config.envelope.hold_torque
         self._limits = limits_of(config, module)
+        self._trips, self._trip_limits = Trips(), trip_limits_of(config)
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
         self._damp_k_d = service.damp_k_d
         self._sinks = (False, kind_of(module) in service.damp_sinks)
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
-        self._unled_share = UNLED_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
         knee = kind_of(module) == "knee"
         self._damp_stop = service.damp_knee_stop if knee else -math.inf
         self._gear_ratio = config.joint.gear_ratio
@@ -118,8 +117,12 @@ class JointController:
                 command, tracked, samples.q, samples.v, age_s=age_s, settled=settled
             )
             failsafe.offer(command, now_ns, self.timing, outside)
-        before = failsafe.mode
-        cause = failsafe.advance(now_ns, self.timing, drive, estop)
+        before, trip = failsafe.mode, Event.NONE
+        if before is Mode.TRACK:
+            trip = self._trips.judge(now_ns, self.tau, samples.v, self._trip_limits)
+        else:
+            self._trips.rest(self.tau)
+        cause = failsafe.advance(now_ns, self.timing, drive, estop, trip)
         if cause is not None:
             self._cause = int(cause)
             self._enter(now_ns, before)
@@ -168,23 +171,6 @@ class JointController:
     def setpoint(self) -> Setpoint:
         """The local law of this cycle."""
         return self._setpoint
-
-    @property
-    def left_holding(self) -> Setpoint:
-        """The law that the drive is to go on with should this service die now: HOLD's gains.
-
-        An ankle's gains rise to all of HOLD's. On TRACK's own, with no more than 4 N m s/rad on
-        its phi, a push from the side rang on by 0.72 each half swing with all six services dead,
-        and 7 of 26 pairs of pushes in step with it fell. A knee's rise to a fifth of HOLD's.
-        With none, a knee whose service froze was soft while the other leg's was stiff, and the
-        robot fell (450 mm); with 600 N m/rad it moves by 23 mm. With all of it the hand feels the
-        drive's gains that the service takes off 2 ms late: 26 N in the squat for 18, with
-        600 N m/rad 19.8. One whose phi alone is stiff is left as it is: half is on its theta.
-        In DAMP a drive that is left goes on sinking.
-        """
-        if self.failsafe.mode is Mode.DAMP or self._unled_share == 0.0:
-            return self._setpoint
-        return law.stiffened(self._setpoint, self._hold_k_p, self._hold_k_d, self._unled_share)
 
     def state(self, now_ns: int) -> JointState:
         """Return the module's state message.
@@ -236,6 +222,7 @@ class JointController:
             self._residual,
             self._resumed_ns,
             self._braced_ns,
+            msgspec.structs.replace(self._trips),
         )
 
     def recall(self, memory: ControllerMemory) -> None:
@@ -250,6 +237,7 @@ class JointController:
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
         self._residual, self._resumed_ns = m.residual, m.resumed_ns
         self._braced_ns = m.braced_ns
+        self._trips = msgspec.structs.replace(m.trips)
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""

@@ -27,11 +27,18 @@ class Event(IntEnum):
     DRIVE_LOST = 1
     DRIVE_DISARMED = 2
     POSITION_LOST = 3
-    DRIVE_ARMED = 4
-    COMMAND_STALE = 5
-    HOLD_ASKED = 6
-    READY = 7
-    NONE = 8
+    SHAKING = 4
+    TORQUE_LIMIT = 5
+    TOO_FAST = 6
+    DRIVE_ARMED = 7
+    COMMAND_STALE = 8
+    HOLD_ASKED = 9
+    READY = 10
+    NONE = 11
+
+
+TRIPS: Final = (Event.SHAKING, Event.TORQUE_LIMIT, Event.TOO_FAST)
+"""What a module sees of itself while it tracks (`services.joint.trips`)."""
 
 
 TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
@@ -51,6 +58,9 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
         Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
         Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
         Event.POSITION_LOST: (Mode.FAULT, Cause.POSITION_LOST),
+        Event.SHAKING: (Mode.HOLD, Cause.SHAKING),
+        Event.TORQUE_LIMIT: (Mode.HOLD, Cause.TORQUE_LIMIT),
+        Event.TOO_FAST: (Mode.HOLD, Cause.TOO_FAST),
         Event.COMMAND_STALE: (Mode.HOLD, Cause.COMMAND_STALE),
         Event.HOLD_ASKED: (Mode.HOLD, Cause.HOLD_ALL),
     },
@@ -199,7 +209,14 @@ class Failsafe(msgspec.Struct):
             and now_ns - self.fresh_since_ns >= self.engage_after_ns(timing)
         )
 
-    def advance(self, now_ns: int, timing: Timing, drive: Event, estop: bool) -> Cause | None:
+    def advance(
+        self,
+        now_ns: int,
+        timing: Timing,
+        drive: Event,
+        estop: bool,
+        trip: Event = Event.NONE,
+    ) -> Cause | None:
         """Go one cycle on; return the cause if the mode changed.
 
         Args:
@@ -207,6 +224,7 @@ class Failsafe(msgspec.Struct):
             timing: times and limits.
             drive: DRIVE_LOST, DRIVE_DISARMED, POSITION_LOST, DRIVE_ARMED or NONE.
             estop: the emergency stop is engaged.
+            trip: one of `TRIPS`, or NONE.
         """
         fresh = self.usable(now_ns, timing)
         # a new session took over from a current one that went stale in this very cycle
@@ -215,7 +233,11 @@ class Failsafe(msgspec.Struct):
             self.fresh_since_ns = -1  # what came before the drive was armed does not count
         elif self.fresh_since_ns < 0:
             self.fresh_since_ns = now_ns
+        gone = estop or drive not in (Event.NONE, Event.DRIVE_ARMED)
         event = self._event(now_ns, timing, drive, estop, fresh and not broken)
+        if trip is not Event.NONE and self.mode is Mode.TRACK and not gone:
+            event = trip
+            self.fresh_since_ns = now_ns  # what tripped waits, as after a drop-out
         row = TRANSITIONS[self.mode].get(event)
         self._remember_dropouts(now_ns, timing, event)
         if row is None:
@@ -239,7 +261,7 @@ class Failsafe(msgspec.Struct):
         return Event.READY if self.ready(now_ns, timing) else Event.NONE
 
     def _remember_dropouts(self, now_ns: int, timing: Timing, event: Event) -> None:
-        if self.mode is Mode.TRACK and event is Event.COMMAND_STALE:
+        if self.mode is Mode.TRACK and (event is Event.COMMAND_STALE or event in TRIPS):
             self.dropouts = min(self.dropouts + 1, timing.dropouts_max)
             self.steady_since_ns = now_ns
         elif self.mode is not Mode.TRACK:

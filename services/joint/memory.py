@@ -12,6 +12,7 @@ from services.joint.drivers.base import MotorTarget
 from services.joint.failsafe import Failsafe
 from services.joint.law import Setpoint
 from services.joint.samples import Samples
+from services.joint.trips import Trips
 from services.joint.will import Will
 from shared.messages import Pair
 
@@ -37,6 +38,7 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     residual: Pair = law.ZERO
     resumed_ns: int = 0
     braced_ns: int = 0
+    trips: Trips = msgspec.field(default_factory=Trips)
 
 
 class ModuleMemory(msgspec.Struct, frozen=True):

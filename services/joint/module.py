@@ -15,6 +15,7 @@ import msgspec
 from services.joint.controller import CycleResult, JointController
 from services.joint.differential import motor_torque
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.left_alone import LeftAlone
 from services.joint.memory import ModuleMemory
 from services.joint.onboard import OnboardLaw
 from services.joint.will import Will
@@ -88,6 +89,7 @@ class Module:
         """Take what the service before this one left, if it died; start DISARMED."""
         self.will = will
         self.controller = JointController(config, name)
+        self._left_alone = LeftAlone(config, name)
         self.onboard = config.joint_service.loop == "onboard"
         drive = config.drive
         self._law = OnboardLaw(
@@ -157,7 +159,7 @@ class Module:
         elif mode is not Mode.DISARMED:
             samples = controller.samples
             order = Order.TARGET
-            left = controller.left_holding
+            left = self._left_alone.law(controller.setpoint, mode)
             target = self._law.target(now_ns, left, result.tau, samples.pos, samples.vel)
             self._target = target
         return Step(result.event, order, torque, target, Obstacle.NONE)

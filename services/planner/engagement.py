@@ -61,7 +61,7 @@ class Engagement(msgspec.Struct):
             fresh: per module, a state has come within `planner.state_stale_ms`.
             ready: per module, `JointState.ready`.
             modes: per module, `JointState.mode`.
-            forbidden: OVERLOADED, UNCERTIFIED or MISPLACED while the planner may not lead.
+            forbidden: OVERLOADED, UNCERTIFIED, MISPLACED or TRIPPED while the planner may not lead.
         """
         after = self._next(now_ns, fresh, ready, modes, forbidden)
         self._remember_dropouts(now_ns, after)
@@ -98,7 +98,7 @@ class Engagement(msgspec.Struct):
         """Count what is lost, and forget one after a good time; `after` is the next mode."""
         if self.mode is not PlannerMode.LEADING:
             self.steady_since_ns = now_ns
-        elif after in (PlannerMode.WAITING, PlannerMode.ALIGNING):
+        elif after in (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED):
             self.dropouts = min(self.dropouts + 1, len(WAITS_NS) - 1)
             self.dropped_ns = now_ns
         elif self.dropouts and now_ns - self.steady_since_ns >= FORGET_NS:

@@ -28,7 +28,7 @@ from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still
 from services.planner.coupling import CouplingFilter, Missing
 from services.planner.gains import GainLaw, JointGains
 from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics
+from services.planner.kinematics import Kinematics, leg_loads
 from services.planner.levelling import Levelling
 from services.planner.memory import LawMemory
 from services.planner.shift import ShiftReference
@@ -220,6 +220,16 @@ class Hocca:
             result.iterations,
             result.residual,
         )
+
+    def leg_loads(self, tau: Array) -> tuple[float, float]:
+        """Return the upward force of right and left leg on the torso at the last tick, N.
+
+        NaN for a leg that is straight or folded.
+
+        Args:
+            tau: joint torques (12,), N m.
+        """
+        return leg_loads(self._measured.C, tau)
 
     def remember(self) -> LawMemory:
         """Return the memory as it is now."""

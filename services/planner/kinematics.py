@@ -8,6 +8,7 @@ equations stand in `services.planner.symbolic`.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -25,6 +26,9 @@ Array = NDArray[np.float64]
 _GRAPHS: Final[dict[tuple[MassConfig, GeometryConfig, LawConfig], symbolic.Graphs]] = {}
 """A process builds the graphs of a robot once: that takes a tenth of a second."""
 _GRAPHS_KEPT: Final = 16
+DETERMINANT_MIN: Final = 0.05
+"""Of a leg's Jacobian, m^3: straighter or more folded legs (outside 0.79 to 1.27 m) tell no wrench,
+for a N m of friction would be more than 10 N."""
 
 
 class Kinematics:
@@ -115,3 +119,23 @@ def _graphs_of(config: RobotConfig) -> symbolic.Graphs:
             del _GRAPHS[next(iter(_GRAPHS))]
         _GRAPHS[key] = symbolic.build(config, leg_geometry(config))
     return _GRAPHS[key]
+
+
+def leg_loads(C: Array, tau: Array) -> tuple[float, float]:
+    """Return the upward force of right and left leg on the torso, N; NaN: it is not known.
+
+    Straight and folded legs do not tell (`DETERMINANT_MIN`). A leg's own Jacobian J_leg (6, 6) is
+    its part of the closure's, whose sign is the leg's: J_leg^T W = tau. Of its own weight a leg
+    carries some; it is not taken off.
+
+    Args:
+        C: d closure/dq (6, 12): left minus right.
+        tau: joint torques (12,), N m.
+    """
+    return _load(-C[:, :6], tau[:6]), _load(C[:, 6:], tau[6:])
+
+
+def _load(J_leg: Array, tau: Array) -> float:
+    if not abs(float(np.linalg.det(J_leg))) > DETERMINANT_MIN:
+        return math.nan
+    return float(np.linalg.solve(J_leg.T, tau)[2])

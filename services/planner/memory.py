@@ -14,10 +14,12 @@ from shared.messages import (
     JointState,
     Pair,
     SplitSource,
+    Trip,
     Vector4,
     Vector6,
     Wrench,
 )
+from shared.trip_table import PLANNER_TRIPS
 
 
 class AssistMemory(msgspec.Struct, frozen=True):
@@ -49,6 +51,19 @@ class ShiftMemory(msgspec.Struct, frozen=True):
 
     at: Vector4 = STRAIGHT
     rate: Vector4 = STRAIGHT
+
+
+class TripsMemory(msgspec.Struct, frozen=True):
+    """State of `Trips`."""
+
+    since_ns: tuple[int, ...] = (0,) * len(PLANNER_TRIPS)
+    """Since when each is beyond its limit; 0: it is not."""
+    calm_ns: int = 0
+    """Since when none is."""
+    tripped: Trip = Trip.NONE
+    why: str = ""
+    stands: bool = False
+    """Both legs have been seen to bear the torso since leading began."""
 
 
 class LawMemory(msgspec.Struct, frozen=True):
@@ -91,3 +106,4 @@ class TickMemory(msgspec.Struct, frozen=True):
     attitude_ns: int = 0
     attitude_seq: int = -1
     shift_wanted: Vector4 = STRAIGHT
+    trips: TripsMemory = TripsMemory()

@@ -12,13 +12,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.assist import Overload
+from services.planner.assist import Overload, force_up
 from services.planner.bracing import Brace, Bracing
 from services.planner.commands import Common, commands_of
 from services.planner.engagement import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.memory import TickMemory
 from services.planner.plausible import Plausible
+from services.planner.trips import Trips, values_of
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import N_JOINTS, N_MODULES
@@ -68,6 +69,7 @@ class Planner:
         self._arrived_ns = [0] * N_MODULES
         self._q: Array = np.zeros(N_JOINTS)
         self._v: Array = np.zeros(N_JOINTS)
+        self._tau: Array = np.zeros(N_JOINTS)
         self._assist_wanted = 0.0
         self._shift_wanted = STRAIGHT
         self._wrench: Wrench | None = None
@@ -79,6 +81,7 @@ class Planner:
         self._attitude_stale_ns = round(config.imu.stale_ms * NS_PER_MS)
         self._overload = Overload.of(config.harness)
         self._bracing = Bracing()
+        self._trips = Trips(config)
         self._brace = Brace.NONE
         self._wrench_seq = -1
         self._last_ns = 0
@@ -97,6 +100,7 @@ class Planner:
         self._new |= 1 << module
         self._q[2 * module : 2 * module + 2] = state.q
         self._v[2 * module : 2 * module + 2] = state.v
+        self._tau[2 * module : 2 * module + 2] = state.tau
 
     def hear_wrench(self, wrench: Wrench, now_ns: int) -> None:
         """Take the harness's newest wrench."""
@@ -167,6 +171,9 @@ class Planner:
             up_torso=self._usable_up(now_ns),
         )
         self._source = self._output.local.source
+        loads = self._law.leg_loads(self._tau)
+        values = values_of(self._output, self._q, loads, self._lifted(now_ns))
+        self._trips.advance(now_ns, values, leads=not engagement.hold)
         self._seq += 1
         common = Common(now_ns, self._seq, self.session, self._hold(), self._output.local.margins)
         return commands_of(common, states, self._output, self._brace)
@@ -191,6 +198,7 @@ class Planner:
             self._attitude_ns,
             self._attitude_seq,
             self._shift_wanted,
+            self._trips.remember(),
         )
 
     def recall(self, memory: TickMemory) -> None:
@@ -208,6 +216,7 @@ class Planner:
         self._bracing = msgspec.structs.replace(m.bracing)
         self._overload.recall(m.overload)
         self._law.recall(m.law)
+        self._trips.recall(m.trips)
 
     def _usable_wrench(self, now_ns: int) -> Wrench | None:
         """Return the newest wrench, or None if it is not valid or has come too long ago."""
@@ -215,6 +224,13 @@ class Planner:
         if wrench is None or not wrench.valid or now_ns - self._wrench_ns > self._wrench_stale_ns:
             return None
         return wrench
+
+    def _lifted(self, now_ns: int) -> float | None:
+        """Return the person's upward force on the robot, N, world; None if it is not known now."""
+        wrench, output = self._usable_wrench(now_ns), self._output
+        if wrench is None or output is None:
+            return None
+        return force_up(wrench.force, float(output.p[3]), float(output.p[4]))
 
     def _usable_up(self, now_ns: int) -> Vector3 | None:
         """Return where up is, torso axes, or None if the newest is not valid or too old."""
@@ -231,6 +247,8 @@ class Planner:
             return PlannerMode.MISPLACED
         if self._source is SplitSource.UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
+        if self._trips.tripped:
+            return PlannerMode.TRIPPED
         return None
 
     def _hold(self) -> bool:
@@ -280,7 +298,8 @@ class Planner:
             slope=output.slope if output is not None else (0.0, 0.0),
             shift_wanted=self._shift_wanted,
             stance=stance,
-            why=self._law.stance_refusal(),
+            why=self._law.stance_refusal() or self._trips.why,
+            trip=int(self._trips.tripped),
         )
 
 

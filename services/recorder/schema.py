@@ -32,6 +32,7 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.PlannerStatus, "split"): messages.SplitSource,
     (messages.JointState, "drive"): messages.DriveStatus,
     (messages.JointState, "outside"): messages.Outside,
+    (messages.PlannerStatus, "trip"): messages.Trip,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }
 """Fields that are plain integers on the bus and enumerations in the mind."""

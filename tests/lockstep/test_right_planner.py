@@ -1,19 +1,23 @@
-"""The shipped planner is believed, whatever happens: none of its commands is outside."""
+"""The shipped planner is believed, whatever happens, and nothing trips."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
 
 from services.joint.envelope import Envelope
+from services.joint.failsafe import Failsafe
+from services.planner.trips import Trips
 from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.impairment import Impairment
-from shared.messages import Outside, PlannerMode
+from shared.messages import Cause, Outside, PlannerMode
 from shared.scenario import Inject, Keyframe, Push, Scenario
+from shared.trip_table import JOINT_TRIPS
 from tests.lockstep.runs import kill, push, restart, story
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants
@@ -27,6 +31,8 @@ class Judged:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.leading, self.outside = 0, Counter[str]()
+        self.tripped: list[str] = []
+        advance, seen = Trips.advance, Failsafe.advance
         judge = Envelope.judge
 
         def listening(own: Envelope, command, last, *rest, **more):  # type: ignore[no-untyped-def]
@@ -36,7 +42,20 @@ class Judged:
                 self.outside[found.name] += 1
             return found
 
+        def watching(own: Trips, *rest: Any, **more: Any) -> None:
+            advance(own, *rest, **more)
+            if own.tripped:
+                self.tripped.append(own.why)
+
+        def hearing(own: Failsafe, *rest: Any, **more: Any) -> Cause | None:
+            cause = seen(own, *rest, **more)
+            if cause in JOINT_TRIPS:
+                self.tripped.append(cause.name)
+            return cause
+
         monkeypatch.setattr(Envelope, "judge", listening)
+        monkeypatch.setattr(Trips, "advance", watching)
+        monkeypatch.setattr(Failsafe, "advance", hearing)
 
 
 @pytest.fixture
@@ -56,6 +75,7 @@ def run(
 def believed(judged: Judged) -> None:
     assert judged.leading > 500, "there was something to believe"
     assert judged.outside == {}
+    assert judged.tripped == []
 
 
 @pytest.mark.parametrize("name", ["squat", "crawl"])

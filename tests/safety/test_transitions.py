@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
-from services.joint.failsafe import TRANSITIONS, Event, Failsafe, Timing, timing_of
+from services.joint.failsafe import TRANSITIONS, TRIPS, Event, Failsafe, Timing, timing_of
 from shared.config import RobotConfig
 from shared.messages import Cause, Mode
 from tests.joint.helpers import SESSION, T0, command
@@ -28,6 +28,8 @@ class Situation(NamedTuple):
     hold: bool
     waited: bool
     """Commands have been fresh for long enough."""
+    trip: Event = Event.NONE
+    """What the module saw of itself."""
 
 
 DRIVE_EVENTS = (
@@ -37,10 +39,11 @@ DRIVE_EVENTS = (
     Event.DRIVE_LOST,
     Event.POSITION_LOST,
 )
+TRIP_EVENTS = (Event.NONE, *TRIPS)
 FLAGS = (False, True)
 SITUATIONS = [
-    Situation(mode, drive, *flags)
-    for mode, drive in product(Mode, DRIVE_EVENTS)
+    Situation(mode, drive, *flags, trip)
+    for mode, drive, trip in product(Mode, DRIVE_EVENTS, TRIP_EVENTS)
     for flags in product(FLAGS, FLAGS, FLAGS, FLAGS)
 ]
 
@@ -64,7 +67,7 @@ def section_4(s: Situation) -> Mode:
         return Mode.DAMP
     wanted = s.fresh and not s.hold
     if s.mode is Mode.TRACK:
-        return Mode.TRACK if wanted else Mode.HOLD
+        return Mode.TRACK if wanted and s.trip is Event.NONE else Mode.HOLD
     return Mode.TRACK if wanted and s.waited else Mode.HOLD
 
 
@@ -82,20 +85,20 @@ def placed(s: Situation, timing: Timing) -> Failsafe:
 
 def test_the_sweep_knows_every_state_and_every_event() -> None:
     assert set(TRANSITIONS) == set(Mode)
-    assert set(DRIVE_EVENTS) | {
+    assert {*DRIVE_EVENTS, *TRIPS} | {
         Event.ESTOP,
         Event.COMMAND_STALE,
         Event.HOLD_ASKED,
         Event.READY,
     } == set(Event)
-    assert len(SITUATIONS) == 5 * 5 * 2**4
+    assert len(SITUATIONS) == 5 * 5 * 4 * 2**4
 
 
 @pytest.mark.parametrize("mode", Mode)
 def test_every_situation_leads_where_section_4_says(mode: Mode, timing: Timing) -> None:
     for situation in (s for s in SITUATIONS if s.mode is mode):
         failsafe = placed(situation, timing)
-        cause = failsafe.advance(T0, timing, situation.drive, situation.estop)
+        cause = failsafe.advance(T0, timing, situation.drive, situation.estop, situation.trip)
         assert failsafe.mode is section_4(situation), situation
         assert (cause is None) == (failsafe.mode is mode), situation
 
@@ -111,16 +114,23 @@ def test_advance_follows_the_table_for_every_state_and_event(
         fresh=event is not Event.COMMAND_STALE,
         hold=event is Event.HOLD_ASKED,
         waited=event is Event.READY,
+        trip=event if event in TRIPS else Event.NONE,
     )
     failsafe = placed(situation, timing)
-    cause = failsafe.advance(T0, timing, situation.drive, situation.estop)
+    cause = failsafe.advance(T0, timing, situation.drive, situation.estop, situation.trip)
     assert (failsafe.mode, cause) == TRANSITIONS[mode].get(event, (mode, None))
 
 
 CAUSES = {
     (Mode.DISARMED, Mode.HOLD): {Cause.DRIVE_ARMED},
     (Mode.HOLD, Mode.TRACK): {Cause.COMMANDS_FRESH},
-    (Mode.TRACK, Mode.HOLD): {Cause.COMMAND_STALE, Cause.HOLD_ALL},
+    (Mode.TRACK, Mode.HOLD): {
+        Cause.COMMAND_STALE,
+        Cause.HOLD_ALL,
+        Cause.SHAKING,
+        Cause.TORQUE_LIMIT,
+        Cause.TOO_FAST,
+    },
 }
 
 

@@ -12,6 +12,7 @@ from shared.config import RobotConfig
 from shared.gain_schedule import believing
 from shared.impairment import Impairment
 from shared.scenario import Scenario
+from shared.trip_table import untripped
 from tools.centralised.control import CentralPlanner, PassThrough
 from tools.runs.lockstep import Lockstep, Record, forget
 
@@ -22,7 +23,7 @@ def torques_only(config: RobotConfig) -> RobotConfig:
     Its joint services believe any command: gains of zero are what the planner sends here.
     """
     service = msgspec.structs.replace(config.joint_service, loop="service")
-    return msgspec.structs.replace(believing(config), joint_service=service)
+    return msgspec.structs.replace(untripped(believing(config)), joint_service=service)
 
 
 class CentralisedLockstep(Lockstep):

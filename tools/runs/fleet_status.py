@@ -23,8 +23,10 @@ from shared.messages import (
     Pair,
     PlannerMode,
     PlannerStatus,
+    Trip,
 )
 from shared.topics import JOINT_STATE, PLANNER_STATUS, TOPICS
+from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools.runs.injector_client import InjectorClient
 from tools.supervision.supervise import Fleet
 
@@ -227,6 +229,8 @@ def module_status(state: Message | None) -> ModuleStatus:
         way_out = "by itself, with the planner: the drive holds"
     elif mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):
         way_out = f"if it lasts: its log says why; hang the robot, then {RESTART}"
+    elif mode is Mode.HOLD and cause in JOINT_TRIPS:
+        way_out = f"by itself, after a wait; if again: {JOINT_TRIPS[cause].recovery}"
     outside = Outside(state.outside).name if state.outside else ""
     if outside and not way_out:
         told = f"the planner's {outside.lower()} is not believed"
@@ -243,7 +247,10 @@ def lead_status(message: Message | None) -> LeadStatus | None:
     if not isinstance(message, PlannerStatus):
         return None
     mode = PlannerMode(message.mode).name
-    return LeadStatus(mode, message.wait_s, message.margin, message.why)
+    why = message.why
+    if message.trip:
+        why += f": {PLANNER_TRIPS[Trip(message.trip)].recovery}"
+    return LeadStatus(mode, message.wait_s, message.margin, why)
 
 
 def _listen(

@@ -1,0 +1,109 @@
+"""What a joint service trips on by itself: it then holds, whatever its planner says. Pure.
+
+A robot whose gains do not suit its drivetrain shakes within a tenth of a second of being led, and
+nobody but the six services sees it at 500 Hz. Each looks at its own torque and speed while it
+tracks (`shared.trip_table`; limits: [trips] of the robot file):
+
+    shaking   torque above `SHAKE_ABOVE_HZ`, as the root of its mean square over `SHAKE_S`
+    torque    a motor at the limit of the torque diamond, for long
+    speed     a joint that turns faster than it is ever led
+
+The law's own torques end at some 4 Hz (`GainSchedule.coupling_bandwidth_hz`). Led, pushed with
+75 % of what soles and motors bear and on plants with every error drawn, shaking went to 4 N m; on
+the drivetrains on which the unfiltered law falls it is 55 to 77 N m, and 15 after 20 to 60 ms.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import msgspec
+
+from services.joint.failsafe import Event
+from shared import trip_table
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.messages import Pair
+
+SHAKE_ABOVE_HZ: Final = 8.0
+SHAKE_S: Final = 0.1
+AT_LIMIT: Final = 0.995
+"""Of the diamond: a motor there gives all it has."""
+
+
+class TripLimits(msgspec.Struct, frozen=True):
+    """When a module trips."""
+
+    slow_share: float
+    """How far the slow part of the torque follows it in a cycle."""
+    mean_share: float
+    """And the mean square of the rest."""
+    shaking: float
+    """(N m)^2"""
+    torque: float
+    """N m, of |tau_phi| + |tau_theta|."""
+    torque_ns: int
+    speed: float
+    """rad/s"""
+    speed_ns: int
+
+
+def limits_of(config: RobotConfig) -> TripLimits:
+    """Return the limits from the configuration."""
+    trips, cycle_s = trip_table.limits_of(config), 1.0 / config.joint_service.rate_hz
+    return TripLimits(
+        slow_share=1.0 - math.exp(-2.0 * math.pi * SHAKE_ABOVE_HZ * cycle_s),
+        mean_share=1.0 - math.exp(-cycle_s / SHAKE_S),
+        shaking=trips.shaking.limit**2,
+        torque=AT_LIMIT * trips.torque_limit.limit * config.joint.tau_module_max,
+        torque_ns=round(trips.torque_limit.after_ms * NS_PER_MS),
+        speed=trips.speed.limit,
+        speed_ns=round(trips.speed.after_ms * NS_PER_MS),
+    )
+
+
+class Trips(msgspec.Struct):
+    """What has been seen since the module began to track."""
+
+    slow: Pair = (0.0, 0.0)
+    """Torque below `SHAKE_ABOVE_HZ`, N m."""
+    mean: Pair = (0.0, 0.0)
+    """Mean square of the rest, (N m)^2."""
+    at_limit_ns: int = 0
+    """Since when the torque is at its limit; 0: it is not."""
+    fast_ns: int = 0
+    """Since when the joint turns too fast; 0: it does not."""
+
+    def rest(self, tau: Pair) -> None:
+        """Begin anew with what the drive carries, N m: nothing is judged before TRACK."""
+        self.slow, self.mean = tau, (0.0, 0.0)
+        self.at_limit_ns = self.fast_ns = 0
+
+    def judge(self, now_ns: int, tau: Pair, v: Pair, limits: TripLimits) -> Event:
+        """Take one cycle of TRACK; return SHAKING, TORQUE_LIMIT, TOO_FAST or NONE.
+
+        Args:
+            now_ns: this module's clock.
+            tau: what the drive was told last, N m.
+            v: measured joint rates, rad/s.
+            limits: the module's.
+        """
+        (phi, theta), (slow_phi, slow_theta) = tau, self.slow
+        slow_phi += limits.slow_share * (phi - slow_phi)
+        slow_theta += limits.slow_share * (theta - slow_theta)
+        self.slow = (slow_phi, slow_theta)
+        mean_phi, mean_theta = self.mean
+        mean_phi += limits.mean_share * ((phi - slow_phi) ** 2 - mean_phi)
+        mean_theta += limits.mean_share * ((theta - slow_theta) ** 2 - mean_theta)
+        self.mean = (mean_phi, mean_theta)
+        if max(mean_phi, mean_theta) > limits.shaking:
+            return Event.SHAKING
+        at_limit, fast = abs(phi) + abs(theta) >= limits.torque, max(map(abs, v)) > limits.speed
+        self.at_limit_ns = (self.at_limit_ns or now_ns) if at_limit else 0
+        self.fast_ns = (self.fast_ns or now_ns) if fast else 0
+        if self.at_limit_ns and now_ns - self.at_limit_ns >= limits.torque_ns:
+            return Event.TORQUE_LIMIT
+        if self.fast_ns and now_ns - self.fast_ns >= limits.speed_ns:
+            return Event.TOO_FAST
+        return Event.NONE

@@ -1,0 +1,129 @@
+"""What the planner trips on: it asks all six modules to hold. Pure.
+
+What no joint service can see by itself (`shared.trip_table`; limits: [trips] of the robot file):
+
+    legs       the two legs' estimates of the torso's place differ: a sole tips, or a zero is wrong
+    reach      the inverse kinematics does not reach the reference pose
+    tracking   a joint is far from its reference
+    unloaded   a leg hardly bears the torso any more: J_leg^T W = tau, W its wrench on the torso
+    sinking    COM and torso move faster than a person leads
+    turning
+    harness    the person is carried far otherwise than was asked for
+
+Judged while it leads, `unloaded` once both legs have borne the torso: on the hoist neither does. It
+ends when all of it has been within its limits for `CALM_NS`, and counts
+as a drop-out (`services.planner.engagement`): what trips again and again is led ever more rarely.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner.hocca import LawOutput
+from services.planner.memory import TripsMemory
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig
+from shared.messages import Trip
+from shared.trip_table import PLANNER_TRIPS, limits_of
+
+Array = NDArray[np.float64]
+
+CALM_NS: Final = NS_PER_S
+LOADED: Final = 3.0
+"""Times the least load: a robot both of whose legs bear so much stands."""
+
+_TRIPS: Final = tuple(PLANNER_TRIPS)
+_UNLOADED: Final = _TRIPS.index(Trip.UNLOADED)
+
+
+class Trips:
+    """Judges each tick."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Take the limits."""
+        limits = limits_of(config)
+        rows = [getattr(limits, PLANNER_TRIPS[trip].key) for trip in _TRIPS]
+        self._limits = [row.limit for row in rows]
+        self._after_ns = [round(row.after_ms * NS_PER_MS) for row in rows]
+        self._least = [PLANNER_TRIPS[trip].least for trip in _TRIPS]
+        self._memory = TripsMemory()
+
+    @property
+    def tripped(self) -> Trip:
+        """What the planner may not lead for."""
+        return self._memory.tripped
+
+    @property
+    def why(self) -> str:
+        """The same in words: figure and limit as it tripped."""
+        return self._memory.why
+
+    def remember(self) -> TripsMemory:
+        """Return the memory as it is now."""
+        return self._memory
+
+    def recall(self, memory: TripsMemory) -> None:
+        """Go on from a memory."""
+        self._memory = memory
+
+    def advance(self, now_ns: int, values: tuple[float, ...], *, leads: bool) -> None:
+        """Take one tick.
+
+        Args:
+            now_ns: the planner's clock.
+            values: what `values_of` measured; NaN: not known, and no reason to trip.
+            leads: the planner leads: only then it trips.
+        """
+        memory = self._memory
+        borne = values[_UNLOADED] > LOADED * self._limits[_UNLOADED]
+        stands = (leads or memory.tripped > 0) and (memory.stands or borne)
+        beyond = [
+            value < limit if least else value > limit
+            for value, limit, least in zip(values, self._limits, self._least, strict=True)
+        ]
+        beyond[_UNLOADED] &= stands
+        since_ns = tuple(
+            (since or now_ns) if is_beyond else 0
+            for since, is_beyond in zip(memory.since_ns, beyond, strict=True)
+        )
+        tripped, why = memory.tripped, memory.why
+        calm_ns = 0 if any(beyond) else (memory.calm_ns or now_ns)
+        if tripped and calm_ns and now_ns - calm_ns >= CALM_NS:
+            tripped, why = Trip.NONE, ""
+        if leads and not tripped:
+            for index, since in enumerate(since_ns):
+                if since and now_ns - since >= self._after_ns[index]:
+                    tripped = _TRIPS[index]
+                    row = PLANNER_TRIPS[tripped]
+                    why = f"{row.measured}: {values[index]:.3g} {row.unit}"
+                    why += f" (limit {self._limits[index]:g})"
+                    break
+        self._memory = TripsMemory(since_ns, calm_ns, tripped, why, stands)
+
+
+def values_of(
+    output: LawOutput, q: Array, leg_loads: tuple[float, float], lifted: float | None
+) -> tuple[float, ...]:
+    """Return what is judged, in the order of `PLANNER_TRIPS`.
+
+    Args:
+        output: the law's.
+        q: measured joint angles (12,), rad.
+        leg_loads: N, of right and left leg (`Hocca.leg_loads`).
+        lifted: upward force of the person on the robot, N, world; None: not known.
+    """
+    x, y, z = output.closure[:3].tolist()
+    error = output.q_ref - q
+    return (
+        math.sqrt(x * x + y * y + z * z),
+        output.ik_residual,
+        max(float(error.max()), -float(error.min())),
+        min(leg_loads),
+        abs(float(output.pdot[2])),
+        abs(float(output.pdot[4])),
+        math.nan if lifted is None else abs(lifted + output.assist),
+    )

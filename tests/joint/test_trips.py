@@ -1,0 +1,130 @@
+"""What a joint service trips on by itself: in time, and on nothing that the law does."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.joint.failsafe import TRIPS, Event
+from services.joint.trips import Trips, limits_of
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.messages import Cause, Mode, Pair
+from shared.trip_table import JOINT_TRIPS
+from tests.joint.helpers import T0, Bench
+
+CYCLE_NS = 2 * NS_PER_MS
+STILL: Pair = (0.0, 0.0)
+
+
+def tripped_ms(robot: RobotConfig, taus: list[Pair], v: Pair = STILL) -> tuple[Event, float | None]:
+    """Return the first trip and how long it took, ms, of these torques cycle by cycle."""
+    trips, limits = Trips(), limits_of(robot)
+    trips.rest(taus[0])
+    for cycle, tau in enumerate(taus):
+        event = trips.judge(T0 + cycle * CYCLE_NS, tau, v, limits)
+        if event is not Event.NONE:
+            return event, cycle * CYCLE_NS / NS_PER_MS
+    return Event.NONE, None
+
+
+def sine(amplitude: float, hz: float, axis: int, duration_s: float = 2.0) -> list[Pair]:
+    waves = [
+        amplitude * math.sin(2 * math.pi * hz * 0.002 * i) for i in range(round(duration_s / 0.002))
+    ]
+    return [(wave, 40.0) if axis == 0 else (10.0, 40.0 + wave) for wave in waves]
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("hz", [15.0, 30.0, 60.0, 110.0])
+def test_a_shaking_torque_trips_within_150_ms(robot: RobotConfig, hz: float, axis: int) -> None:
+    event, ms = tripped_ms(robot, sine(35.0, hz, axis))
+    assert event is Event.SHAKING
+    assert ms is not None
+    assert ms < 150.0
+
+
+@given(
+    hz=st.floats(0.05, 2.0),
+    amplitude=st.floats(0.0, 50.0),
+    noise=st.floats(0.0, 5.0),
+)
+def test_what_the_law_does_trips_nothing(
+    robot: RobotConfig, hz: float, amplitude: float, noise: float
+) -> None:
+    """Slow torques, however large, and the little that friction and encoders shake."""
+    slow = sine(amplitude, hz, 0)
+    fast = sine(noise, 37.0, 0)
+    event, _ = tripped_ms(robot, [(a + b, 40.0) for (a, _), (b, _) in zip(slow, fast, strict=True)])
+    assert event is Event.NONE
+
+
+def test_one_step_of_30_nm_does_not_and_ten_of_60_in_half_a_second_do(robot: RobotConfig) -> None:
+    """A state that comes 40 ms late makes a step of 31 N m."""
+    step = [STILL] * 50 + [(31.0, 0.0)] * 500
+    assert tripped_ms(robot, step) == (Event.NONE, None)
+    steps = [(60.0, 0.0) if (cycle // 25) % 2 else STILL for cycle in range(500)]
+    assert tripped_ms(robot, steps)[0] is Event.SHAKING
+
+
+def test_motors_at_their_limit_trip_when_it_lasts_and_not_before(robot: RobotConfig) -> None:
+    most, after_ms = robot.joint.tau_module_max, robot.trips.torque_limit.after_ms
+    at_limit: list[Pair] = [(0.4 * most, -0.6 * most)] * 600
+    assert tripped_ms(robot, at_limit) == (Event.TORQUE_LIMIT, after_ms)
+    cycles = round(after_ms / 2)
+    with_a_break = [*at_limit[: cycles - 1], (0.39 * most, -0.59 * most), *at_limit[:cycles]]
+    assert tripped_ms(robot, with_a_break) == (Event.NONE, None)
+
+
+@pytest.mark.parametrize("v", [(8.1, 0.0), (0.0, -8.1)])
+def test_a_joint_that_turns_too_fast_trips(robot: RobotConfig, v: Pair) -> None:
+    assert tripped_ms(robot, [STILL] * 50, v) == (Event.TOO_FAST, robot.trips.speed.after_ms)
+    assert tripped_ms(robot, [STILL] * 50, (7.9, -7.9)) == (Event.NONE, None)
+
+
+def test_every_trip_has_its_row_and_its_cause() -> None:
+    assert {event.name for event in TRIPS} == {cause.name for cause in JOINT_TRIPS}
+
+
+@pytest.fixture
+def tracking(robot: RobotConfig) -> Bench:
+    bench = Bench(robot)
+    bench.to_track()
+    return bench
+
+
+def test_a_module_that_shakes_holds_and_is_led_again_after_a_wait(tracking: Bench) -> None:
+    failsafe, causes = tracking.controller.failsafe, []
+    for cycle in range(200):
+        tracking.v = (1.2 if cycle % 4 < 2 else -1.2, 0.0)
+        event = tracking.run(1, fresh=True)[-1].event
+        if event is not None:
+            causes.append(event.cause)
+    assert causes[0] == Cause.SHAKING
+    assert failsafe.dropouts >= 1
+    tracking.v = (0.0, 0.0)
+    events = [result.event for result in tracking.run(2000, fresh=True)]
+    assert [event.cause for event in events if event is not None][-1] == Cause.COMMANDS_FRESH
+    assert failsafe.mode is Mode.TRACK
+
+
+def test_in_hold_nothing_trips(robot: RobotConfig) -> None:
+    bench = Bench(robot)
+    bench.to_hold()
+    for cycle in range(400):
+        bench.v = (3.0 if cycle % 4 < 2 else -3.0, 0.0)
+        assert bench.run(1)[-1].event is None
+    assert bench.controller.failsafe.mode is Mode.HOLD
+
+
+def test_what_was_seen_is_remembered(tracking: Bench, robot: RobotConfig) -> None:
+    tracking.v = (0.6, -0.3)
+    tracking.run(3, fresh=True)
+    memory = tracking.controller.remember()
+    other = Bench(robot).controller
+    other.recall(memory)
+    assert other.remember() == memory
+    assert memory.trips.mean != (0.0, 0.0)

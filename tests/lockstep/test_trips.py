@@ -1,0 +1,183 @@
+"""Robots that shook themselves down trip, and stand in HOLD; what a person does trips nothing.
+
+The gains are those of before the dynamic certificate: the coupling unfiltered, a third of the local
+damping. Its joint services believe any command, so that it is the trips that save it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+
+from services.simulator.plant import PlantConfig, changed
+from shared.config import RobotConfig
+from shared.gain_schedule import believing
+from shared.impairment import Impairment
+from shared.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
+from shared.scenario import Keyframe, Push, Scenario
+from shared.trip_table import JOINT_TRIPS, untripped
+from tests.lockstep.runs import still, story
+from tools.runs.lockstep import Lockstep, Record, forget
+
+SMALL_ERRORS = {
+    "encoder.zero_errors": [math.radians(0.5) * (-1) ** i for i in range(12)],
+    "body.payload_scale": 0.85,
+    "body.com_offset": [0.015, 0.0, 0.0],
+    "drive.lag_s": 0.002,
+    "drivetrain.play": math.radians(0.25),
+    "floor.slope": [math.radians(1.0), 0.0],
+    "drive.torque_scale": 0.95,
+}
+PLANTS: dict[str, dict[str, Any]] = {
+    "k 2000": {"drivetrain.stiffness": 2000.0},
+    "k 3000": {"drivetrain.stiffness": 3000.0},
+    "k 5000": {"drivetrain.stiffness": 5000.0},
+    "k 8000": {},
+    "play 0.5 degrees": {"drivetrain.play": math.radians(0.5)},
+    "small errors together": SMALL_ERRORS,
+}
+
+
+def unfiltered(robot: RobotConfig) -> RobotConfig:
+    """Return the robot without what the dynamic certificate brought."""
+    made = robot.gain_schedule
+    assert made is not None
+    weak = msgspec.structs.replace(
+        made,
+        coupling_bandwidth_hz=200.0,
+        coupling_damping=1.0,
+        D_B=tuple(0.3 * each for each in made.D_B),
+    )
+    return believing(msgspec.structs.replace(robot, gain_schedule=weak))
+
+
+def run(
+    robot: RobotConfig,
+    told: Scenario,
+    errors: dict[str, Any],
+    *,
+    record: Record = forget,
+    let_go_s: float = math.inf,
+) -> tuple[Lockstep, list[float], bool]:
+    """Run to the end or a fall; return the fleet, heights from 1 s on, and whether it fell."""
+    plant = changed(PlantConfig(), errors)
+    fleet = Lockstep(robot, told, Impairment(delay_ms=1.0), plant=plant, record=record)
+    heights = []
+    for row in fleet.run():
+        if row.scenario_s > 1.0:
+            heights.append(row.torso[2])
+        if row.scenario_s >= let_go_s:
+            fleet.world.let_go()
+        if row.fallen:
+            return fleet, heights, True
+    return fleet, heights, False
+
+
+def causes(fleet: Lockstep) -> set[Cause]:
+    return {Cause(event.cause) for _, event in fleet.events}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_robot_that_shook_itself_down_stands_in_hold(robot: RobotConfig, name: str) -> None:
+    shaky = unfiltered(robot)
+    told = still(4.0, push=(Push(at=3.0, duration=0.3, force=(20.0, 0.0, 0.0)),))
+    _, _, fell = run(untripped(shaky), told, PLANTS[name])
+    assert fell, "nothing is proved by a robot that would have stood"
+    fleet, _, fell = run(shaky, told, PLANTS[name])
+    assert not fell
+    assert Cause.SHAKING in causes(fleet)
+    led_s = [
+        (leaves.t_ns - enters.t_ns) / 1e9
+        for enters, leaves in _led(fleet)
+        if leaves.cause == Cause.SHAKING
+    ]
+    assert max(led_s) < 0.7, "in time: 0.3 s of it the gains blend in"
+
+
+def _led(fleet: Lockstep) -> list[tuple[Any, Any]]:
+    """Return each module's entries into TRACK with what ended them."""
+    found, entered = [], {}
+    for module, event in fleet.events:
+        if event.mode_after == Mode.TRACK:
+            entered[module] = event
+        elif module in entered:
+            found.append((entered.pop(module), event))
+    return found
+
+
+def test_what_keeps_shaking_is_led_ever_more_rarely(robot: RobotConfig) -> None:
+    fleet, _, fell = run(unfiltered(robot), still(12.0), PLANTS["k 5000"])
+    assert not fell
+    tracked = [(enters.t_ns, (leaves.t_ns - enters.t_ns) / 1e9) for enters, leaves in _led(fleet)]
+    assert sum(led_s for _, led_s in tracked) / 6 < 1.5, "seconds led, of 14"
+    assert fleet.planner is not None
+    assert fleet.planner.status(fleet.now_ns, 0.0).wait_s > 2.0
+
+
+@pytest.mark.parametrize("hand", [True, False])
+def test_a_person_who_sags_is_caught(robot: RobotConfig, hand: bool) -> None:
+    """300 N rest on the harness where 100 were asked for: it went to the knees' stop, 0.76 m."""
+    frames = (
+        Keyframe(at=0.0, height=1.188),
+        Keyframe(at=1.5, height=1.1),
+        Keyframe(at=2.5, height=1.1),
+        Keyframe(at=2.7, height=1.1, assist=100.0),
+    )
+    statuses: list[PlannerStatus] = []
+
+    def record(_topic: object, _module: str, message: object) -> None:
+        if isinstance(message, PlannerStatus):
+            statuses.append(message)
+
+    told = story("stand", duration=6.0, keyframe=frames, kill=(), push=())
+    fleet, heights, fell = run(
+        robot,
+        told,
+        {"person.load_scale": 3.0},
+        record=record,
+        let_go_s=math.inf if hand else 2.4,
+    )
+    assert not fell
+    if hand:  # 150 N of it the hand bears: nothing is amiss
+        assert {row.trip for row in statuses} == {Trip.NONE}
+        return
+    assert min(heights) > 0.82
+    assert Cause.HOLD_ALL in causes(fleet)
+    told_by = [row for row in statuses if row.trip == Trip.HARNESS]
+    assert told_by, "and it says why"
+    assert {row.mode for row in told_by[1:]} <= {PlannerMode.TRIPPED, PlannerMode.WAITING}
+    assert all("otherwise than asked" in row.why for row in told_by)
+
+
+def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
+    """1.2 rad of pitch in 0.6 s; a person takes 2 s."""
+    frames = (
+        Keyframe(at=0.0, height=1.1),
+        Keyframe(at=1.0, height=1.1),
+        Keyframe(at=1.6, height=1.1, pitch=1.2),
+    )
+    fleet, _, fell = run(robot, story("stand", duration=4.0, keyframe=frames, kill=(), push=()), {})
+    assert not fell
+    assert Cause.HOLD_ALL in causes(fleet)
+    assert not causes(fleet) & set(JOINT_TRIPS)
+
+
+@pytest.mark.parametrize(
+    ("height", "pitch", "ways_s"), [(0.85, 0.0, 0.6), (1.29, 0.0, 1.5), (0.7, 0.0, 2.0)]
+)
+def test_a_fast_lead_and_one_beyond_what_legs_reach_are_followed(
+    robot: RobotConfig, height: float, pitch: float, ways_s: float
+) -> None:
+    """0.34 m in 0.6 s; to straight legs; below the knees' stop."""
+    frames = (
+        Keyframe(at=0.0, height=1.188),
+        Keyframe(at=1.0, height=1.188),
+        Keyframe(at=1.0 + ways_s, height=height, pitch=pitch),
+    )
+    told = story("stand", duration=4.0, keyframe=frames, kill=(), push=())
+    fleet, _, fell = run(robot, told, {})
+    assert not fell
+    assert causes(fleet) == {Cause.DRIVE_ARMED, Cause.COMMANDS_FRESH}

@@ -1,0 +1,152 @@
+"""What the planner trips on: in time, for as long as it lasts, and on nothing unknown."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from services.planner.kinematics import Kinematics, leg_loads
+from services.planner.trips import CALM_NS, Trips
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.messages import Trip
+from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from tests.planner.conftest import Closed
+
+T0 = 5_000_000_000
+TICK_NS = 4 * NS_PER_MS
+CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0)
+TRIPS = list(PLANNER_TRIPS)
+
+
+def beyond(robot: RobotConfig, trip: Trip, by: float = 1.001) -> tuple[float, ...]:
+    """Return calm values but one, beyond its limit."""
+    row = PLANNER_TRIPS[trip]
+    limit = getattr(robot.trips, row.key).limit
+    values = list(CALM)
+    values[TRIPS.index(trip)] = limit / by if row.least else limit * by
+    return tuple(values)
+
+
+def led(robot: RobotConfig) -> Trips:
+    """Return the trips of a planner that leads a robot which stands."""
+    trips = Trips(robot)
+    trips.advance(T0 - TICK_NS, CALM, leads=True)
+    return trips
+
+
+def test_table_robot_file_and_enumerations_name_the_same(robot: RobotConfig) -> None:
+    keys = [row.key for row in (*JOINT_TRIPS.values(), *PLANNER_TRIPS.values())]
+    assert sorted(keys) == sorted(robot.trips.__struct_fields__)
+    assert {*PLANNER_TRIPS, Trip.NONE} == set(Trip)
+
+
+@pytest.mark.parametrize("trip", TRIPS)
+def test_each_trips_once_it_has_lasted(robot: RobotConfig, trip: Trip) -> None:
+    trips, values = led(robot), beyond(robot, trip)
+    lasted_ns = round(getattr(robot.trips, PLANNER_TRIPS[trip].key).after_ms * NS_PER_MS)
+    trips.advance(T0, values, leads=True)
+    trips.advance(T0 + lasted_ns - 1, values, leads=True)
+    assert trips.tripped is Trip.NONE
+    trips.advance(T0 + lasted_ns, values, leads=True)
+    assert trips.tripped is trip
+    assert PLANNER_TRIPS[trip].measured in trips.why
+    assert PLANNER_TRIPS[trip].unit in trips.why
+
+
+@pytest.mark.parametrize("trip", TRIPS)
+def test_what_comes_back_in_between_does_not(robot: RobotConfig, trip: Trip) -> None:
+    trips, values = led(robot), beyond(robot, trip)
+    for tick in range(1000):
+        now = CALM if tick % 10 == 9 else values
+        trips.advance(T0 + tick * TICK_NS, now, leads=True)
+    assert trips.tripped is Trip.NONE
+
+
+@pytest.mark.parametrize("trip", TRIPS)
+def test_a_planner_that_does_not_lead_trips_on_nothing(robot: RobotConfig, trip: Trip) -> None:
+    trips = Trips(robot)
+    for tick in range(1000):
+        trips.advance(T0 + tick * TICK_NS, beyond(robot, trip), leads=False)
+    assert trips.tripped is Trip.NONE
+
+
+def test_what_is_not_known_is_no_reason(robot: RobotConfig) -> None:
+    trips = Trips(robot)
+    for tick in range(1000):
+        trips.advance(T0 + tick * TICK_NS, (math.nan,) * len(CALM), leads=True)
+    assert trips.tripped is Trip.NONE
+
+
+@pytest.mark.parametrize("trip", TRIPS)
+def test_it_ends_after_a_second_within_all_limits(robot: RobotConfig, trip: Trip) -> None:
+    trips, values = led(robot), beyond(robot, trip)
+    for tick in range(1000):
+        trips.advance(T0 + tick * TICK_NS, values, leads=trips.tripped is Trip.NONE)
+    assert trips.tripped is trip, "it goes on as long as it lasts"
+    other = beyond(robot, Trip.LEGS if trip is Trip.REACH else Trip.REACH)
+    calm_from = T0 + 1000 * TICK_NS
+    trips.advance(calm_from - TICK_NS, other, leads=False)
+    trips.advance(calm_from, CALM, leads=False)
+    trips.advance(calm_from + CALM_NS - 1, CALM, leads=False)
+    assert trips.tripped is trip
+    trips.advance(calm_from + CALM_NS, CALM, leads=False)
+    assert (trips.tripped, trips.why) == (Trip.NONE, "")
+
+
+def test_on_the_hoist_no_leg_is_missed(robot: RobotConfig) -> None:
+    trips, hanging = Trips(robot), beyond(robot, Trip.UNLOADED)
+    for tick in range(1000):
+        trips.advance(T0 + tick * TICK_NS, hanging, leads=True)
+    assert trips.tripped is Trip.NONE
+
+
+def test_it_goes_on_from_a_memory(robot: RobotConfig) -> None:
+    trips, other, values = Trips(robot), Trips(robot), beyond(robot, Trip.LEGS)
+    for tick in range(11):
+        trips.advance(T0 + tick * TICK_NS, values, leads=True)
+    other.recall(trips.remember())
+    for each in (trips, other):
+        for tick in range(11, 14):
+            each.advance(T0 + tick * TICK_NS, values, leads=True)
+    assert other.remember() == trips.remember()
+    assert other.tripped is Trip.LEGS
+
+
+def test_a_legs_load_is_the_force_that_its_torques_hold(
+    robot: RobotConfig, kinematics: Kinematics, closed: Closed
+) -> None:
+    """J_leg is differenced from the leg's own estimate of the torso, not taken from C."""
+    del robot
+    q = closed(height=0.948)
+    kinematics.update(q)
+    wrench = np.array((5.0, -7.0, 230.0, 3.0, 9.0, -2.0))
+    tau = np.zeros(12)
+    h = 1e-6
+    for joint in range(12):
+        nearby = [np.array(q), np.array(q)]
+        nearby[0][joint] -= h
+        nearby[1][joint] += h
+        low, high = (_closure(kinematics, each) for each in nearby)
+        sign = -1.0 if joint < 6 else 1.0
+        tau[joint] = sign * (high - low) @ wrench / (2.0 * h)
+    kinematics.update(q)
+    right, left = leg_loads(kinematics.C, tau)
+    assert (right, left) == pytest.approx((230.0, 230.0), abs=0.1)
+    tau[6:] = 0.0
+    assert leg_loads(kinematics.C, tau) == pytest.approx((230.0, 0.0), abs=0.1)
+
+
+def _closure(kinematics: Kinematics, q: np.ndarray) -> np.ndarray:
+    kinematics.update(q)
+    return kinematics.closure.copy()
+
+
+def test_a_straight_leg_tells_nothing() -> None:
+    C = np.zeros((6, 12))
+    C[:, 6:] = np.eye(6)
+    right, left = leg_loads(C, np.arange(12.0))
+    assert math.isnan(right)
+    assert left == 8.0
