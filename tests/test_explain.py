@@ -15,6 +15,7 @@ from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.messages import PlannerStatus
 from shared.robot_model import stand_pose
 from tools import cli, explain
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 
 
@@ -32,7 +33,7 @@ def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(
     log: RunLog, at_s: float | None
 ) -> None:
     tick = explain.tick_at(log, at_s)
-    robot = explain.robot_of(log)
+    robot = robot_of(log)
     q, v = (np.array([getattr(s, n) for s in tick.states]).ravel() for n in ("q", "v"))
     commands = {
         name: np.array([getattr(command, name) for command in tick.commands]).ravel()

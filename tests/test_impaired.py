@@ -20,7 +20,8 @@ from tools.runs import verdict_table
 from tools.runs.conductor import Snapshot
 from tools.runs.impaired import impairments, touches
 from tools.runs.live_view import LiveView, in_force, waiting
-from tools.runs.verdict import LIMITS, Summary
+from tools.runs.verdict import Summary
+from tools.runs.verdict_limits import LIMITS
 
 LATE = Impairment(delay_ms=30.0, jitter_ms=10.0)
 CUT = Impairment(partition=True)

@@ -7,7 +7,6 @@ import bisect
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from rich import box
@@ -24,11 +23,11 @@ from shared import config_file, gain_schedule, topics
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.exceptions import RunError
-from shared.gain_table import GainSchedule
 from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.messages import JointCommand, JointState, PlannerMode, PlannerStatus, SplitSource
 from shared.robot_model import stand_pose
 from tools.runs import moment, verdict
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.verbs import RUN_HELP, Subparsers, add_config, add_verb
 
@@ -150,26 +149,6 @@ def at_pose(robot: RobotConfig, text: str) -> Array:
     if not reach.converged:
         raise RunError(in_words_of_reach(reach, p_ref, limits))
     return ik.q
-
-
-def robot_of(log: RunLog) -> RobotConfig:
-    """Return the robot that a log was made with.
-
-    Raises:
-        RunError: the log does not hold it.
-        ConfigError: it is of another version.
-    """
-    try:
-        raw = log.attachments["robot.toml"].decode()
-    except KeyError:
-        raise RunError(f"{log.path}: holds no robot.toml; a run of this project has one") from None
-    robot = config_file.parse(raw, f"{log.path}: robot.toml")
-    schedule = log.attachments.get("robot.gains.json")
-    if schedule is None:
-        return robot
-    return msgspec.structs.replace(
-        robot, gain_schedule=msgspec.json.decode(schedule, type=GainSchedule)
-    )
 
 
 def tick_at(log: RunLog, at_s: float | None) -> Tick:

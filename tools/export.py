@@ -15,9 +15,9 @@ from services.recorder.scene import extended
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
-from tools.explain import robot_of
 from tools.report import write
 from tools.reports import scene
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.verbs import Subparsers, add_verb
 

@@ -18,13 +18,13 @@ from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.messages import JointEvent, JointState, Message, PlannerStatus
-from tools.explain import robot_of
 from tools.reexecution import rewritten
 from tools.reexecution.compare import size
 from tools.reexecution.joint import JointExecution
 from tools.reexecution.outcome import Outcome
 from tools.reexecution.params import with_params
 from tools.reexecution.planner import PlannerExecution
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.verbs import RUN_HELP, Subparsers, add_verb
 

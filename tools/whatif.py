@@ -20,8 +20,8 @@ from shared.toml_file import parse_toml
 from tools.counterfactual import picture
 from tools.counterfactual.moments import moments_of
 from tools.counterfactual.run import Fate, Task, fate_of
-from tools.explain import robot_of
 from tools.runs.experiment import PLANT_FILE
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.sweeps.pool import cores, results
 from tools.verbs import RUN_HELP, Subparsers, add_verb

@@ -14,8 +14,8 @@ from shared import topics
 from shared.joints import MODULES
 from tests.replay.make_golden import TRACED
 from tools import resim
-from tools.explain import robot_of
 from tools.reexecution.outcome import Outcome
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import read_run
 
 GOLDEN = sorted((Path(__file__).parent / "golden").glob("*.mcap"))

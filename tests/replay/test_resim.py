@@ -19,8 +19,8 @@ from shared.scenario import Fault, Kill, Restart
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tools import resim, sim
-from tools.explain import robot_of
 from tools.reexecution.outcome import Outcome
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 
 

@@ -16,9 +16,9 @@ from shared.scenario import Kill, Restart
 from tests.lockstep.runs import still
 from tests.recorder.runs import Queue
 from tools import cli, resim, sim
-from tools.explain import robot_of
 from tools.reexecution.outcome import Outcome
 from tools.runs.network import BASE
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 
 

@@ -18,8 +18,8 @@ from tests.lockstep.runs import kill, push, run, still
 from tools import sim, whatif
 from tools.counterfactual.moments import Moment, moments_of
 from tools.counterfactual.run import Task, fate_of
-from tools.explain import robot_of
 from tools.runs.network import BASE
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 
 HARD = push(2.6, 150.0, 0.0, 0.0)

@@ -15,7 +15,7 @@ from shared.config import RobotConfig
 from shared.messages import JointEvent, Mode, RunEvent, RunEventKind, SimTruth
 from shared.scenario import lead
 from tools.crash.cases import CRASH_S, REQUEST_S, Case, Verdict, story_of
-from tools.runs.tipping import is_tipping
+from tools.runs.standing import is_tipping
 from tools.runs.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
 
 SANK_M: Final = 0.05

@@ -15,7 +15,8 @@ from shared.messages import PlannerMode
 from tools.reports.sheet import Happening
 from tools.reports.signals import Array
 from tools.reports.source import Source
-from tools.runs.verdict import LIMITS, leading
+from tools.runs.verdict import leading
+from tools.runs.verdict_limits import LIMITS
 
 TOGETHER_S: Final = 0.1
 """The same of several modules or joints within this time is told in one line."""

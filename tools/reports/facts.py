@@ -16,7 +16,8 @@ from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from tools.reports.source import Source
 from tools.runs import verdict, verdict_table
-from tools.runs.verdict import LIMITS, Summary
+from tools.runs.verdict import Summary
+from tools.runs.verdict_limits import LIMITS
 
 REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
 """Figures that mean nothing in virtual time."""

@@ -13,7 +13,7 @@ from shared.messages import DriveStatus, Mode, PlannerMode, SplitSource
 from tools.reports.sheet import Limit, Line, Row, Sheet
 from tools.reports.signals import Array
 from tools.reports.source import Source
-from tools.runs.verdict import LIMITS
+from tools.runs.verdict_limits import LIMITS
 
 NO_WORLD: Final = "no sim/truth in this log"
 NO_PLANNER: Final = "no planner/status in this log"

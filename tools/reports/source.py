@@ -13,9 +13,9 @@ from shared.exceptions import XrlError
 from shared.joints import MODULES
 from shared.messages import DriveStatus
 from shared.topics import Topic
-from tools.explain import robot_of
 from tools.reports.signals import Array, Span, seconds
 from tools.runs import verdict
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Course
 

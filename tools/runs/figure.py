@@ -85,7 +85,8 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
         _shade(plots, network, zero_ns, end_s)
     axes[-1].set_xlabel("scenario time in s" if began else "time since the hoist let go in s")
     axes[-1].set_xlim(0.0, end_s)
-    verdict = "stood" if summary["stood"] else "FELL" if summary["fallen_at_s"] else "not finished"
+    fell = summary["fallen_at_s"] is not None or summary["why_not"]
+    verdict = "stood" if summary["stood"] else "FELL" if fell else "not finished"
     figure.suptitle(f"{name}: {verdict}", fontsize=12, x=0.01, ha="left")
     figure.savefig(path)
 

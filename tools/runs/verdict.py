@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from services.planner.shift import ROWS
 from shared import topics
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.exceptions import RunError
+from shared.config import RobotConfig
+from shared.exceptions import ConfigError, RunError
 from shared.joints import MODULES
 from shared.messages import (
     JointEvent,
@@ -27,7 +28,10 @@ from shared.messages import (
     SimTruth,
 )
 from tools.runs.impaired import Impaired, impairments, touches
+from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog
+from tools.runs.soundness import soundness
+from tools.runs.standing import why_not_standing
 
 Array = NDArray[np.float64]
 Summary = dict[str, Any]
@@ -35,35 +39,6 @@ Summary = dict[str, Any]
 REAL_TIME_FACTOR_MIN: Final = 0.99
 LATE_MAX_S: Final = 0.05
 """More world time given up than this: the run was not in real time."""
-
-
-class Limit(NamedTuple):
-    """One row of the verdict table."""
-
-    key: str
-    limit: float
-    unit: str
-    what: str
-
-
-LIMITS: Final = (
-    Limit("alive_com_x_max_mm", 20.0, "mm", "COM x, planner leading"),
-    Limit("alive_com_y_max_mm", 10.0, "mm", "COM y, planner leading"),
-    Limit("alive_roll_max_rad", 0.02, "rad", "roll, planner leading"),
-    Limit("alive_yaw_max_rad", 0.02, "rad", "yaw, planner leading"),
-    Limit("alive_sole_tilt_max_rad", 0.02, "rad", "soles' tilt, planner leading"),
-    Limit("operator_peak_n", 40.0, "N", "operator's force, planner leading"),
-    Limit("assist_error_n", 10.0, "N", "assist force against what was asked"),
-    Limit("hold_com_x_max_mm", 80.0, "mm", "COM x after the kill, or in HOLD"),
-    Limit("hold_com_y_max_mm", 100.0, "mm", "COM y after the kill, or in HOLD"),
-    Limit("handover_max_ms", 65.0, "ms", "kill to HOLD, slowest module"),
-    Limit("handover_torque_step_nm", 5.0, "N m", "torque step at hand-over"),
-    Limit("reengage_s", 1.5, "s", "restart to TRACK, slowest module"),
-    Limit("pd_cycles_late_pct", 0.5, "%", "PD cycles later than two periods"),
-    Limit("fleet_cpu_pct", 160.0, "%", "CPU of all processes, of 200"),
-    Limit("sequence_gaps", 0.0, "", "messages lost on the way to the log"),
-)
-"""Live targets, design section 9 and issue figures. Only `stood` decides the exit code."""
 
 
 class Course(NamedTuple):
@@ -118,8 +93,11 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     last = truth[-1]
     fallen = any(row.fallen for row in truth)
     reached = began and bool(t[-1] >= duration_s - 0.1)
+    robot = _robot_of(log)
+    why_not = why_not_standing(last, robot) if robot is not None and reached else ""
     summary: Summary = {
-        "stood": reached and not fallen,
+        "stood": reached and not fallen and not why_not,
+        "why_not": why_not,
         "began": began,
         "fallen_at_s": next(
             (float(s) for s, row in zip(t, truth, strict=True) if row.fallen), None
@@ -140,6 +118,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary["torso_height_max_m"] = max(heights)
     tilt = np.array([max(row.foot_right_tilt, row.foot_left_tilt) for row in truth])
     summary["sole_tilt_max_rad"] = _max(tilt)
+    summary |= soundness(log, truth, robot) if robot is not None else {}
     summary["alive_sole_tilt_max_rad"] = _max(tilt[alive])
     force = np.array([abs(row.operator_force[2]) for row in truth])
     summary["operator_peak_n"] = _max(force[alive])
@@ -160,6 +139,14 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary["messages_recorded"] = sum(log.count(key) for key in log.keys())  # noqa: SIM118 - not a dict
     summary["sequence_gaps"] = sum(count.missing for count in log.gaps().values())
     return summary
+
+
+def _robot_of(log: RunLog) -> RobotConfig | None:
+    """Return the robot of a log; None if it does not tell, or tells one of another version."""
+    try:
+        return robot_of(log)
+    except (RunError, ConfigError):
+        return None
 
 
 def _extent(prefix: str, poses: Array) -> Summary:

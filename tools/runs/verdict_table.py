@@ -7,7 +7,8 @@ from typing import Final
 from rich.console import Console
 from rich.table import Table
 
-from tools.runs.verdict import LIMITS, Limit, Summary
+from tools.runs.verdict import Summary
+from tools.runs.verdict_limits import LIMITS, Limit
 
 OK: Final = "ok"
 OVER: Final = "over"
@@ -99,4 +100,6 @@ def _sentence(summary: Summary) -> str:
         )
     if summary["fallen_at_s"] is not None:
         return f"[bold red]FELL[/] at {summary['fallen_at_s']:.1f} s"
+    if summary["why_not"]:
+        return f"[bold red]DOES NOT STAND[/] at the end: {summary['why_not']}"
     return f"[bold red]NOT FINISHED[/]: the log ends at {summary['duration_s']:.1f} s"

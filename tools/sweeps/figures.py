@@ -11,7 +11,7 @@ import msgspec
 
 from shared.config import RobotConfig
 from shared.messages import JointEvent, SimTruth
-from tools.runs.tipping import is_tipping
+from tools.runs.standing import is_tipping
 
 Watch: TypeAlias = Callable[[SimTruth], None]
 
