@@ -1,4 +1,4 @@
-"""`xrl estop`: every module to DAMP, now."""
+"""`xrl estop`: every module to DAMP, now, by shared memory and over the bus."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from pathlib import Path
 
 from rich.console import Console
 
+from services.joint.will import ask_stop, has_sunk
 from shared import topics
 from shared.bus import open_session
 from shared.clock import now_ns
+from shared.config import RobotConfig
 from shared.config_file import load
 from shared.exceptions import FleetError
 from shared.joints import MODULES
@@ -33,19 +35,48 @@ def add_parser(subparsers: Subparsers) -> None:
         """
         xrl estop
         xrl estop --run-dir /tmp/lab
+        xrl estop --local       # on the robot's own host: needs no bus
         """,
     )
     add_run_dir(parser)
+    parser.add_argument(
+        "--local",
+        action="store_true",
+        help="by shared memory alone, to the joint services on this host; without it by both ways",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Say it until every module is stopped; a module leaves DAMP by a restart only."""
     fleet = Fleet.attach(args.run_dir)
-    robot = load(Path(fleet.manifest.config))
+    run_dir = fleet.run.path
+    here = [module for module in MODULES if ask_stop(run_dir, module)]  # first: it needs nobody
+    deadline = time.monotonic() + GIVE_UP_S
+    if args.local:
+        going = _wait_here(run_dir, here, deadline)
+    else:
+        going = _say(load(Path(fleet.manifest.config)), run_dir, deadline)
+    if going:
+        raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
+    Console().print("all six modules are stopped: DAMP, a slow sink; `xrl down` ends it")
+    return 0
+
+
+def _wait_here(run_dir: Path, here: list[str], deadline: float) -> list[str]:
+    """Wait for the services on this host; return in words what has not stopped."""
+    while time.monotonic() < deadline and not all(has_sunk(run_dir, module) for module in here):
+        time.sleep(REPEAT_S)
+    elsewhere = [
+        f"{module} has no service on this host" for module in MODULES if module not in here
+    ]
+    return [module for module in here if not has_sunk(run_dir, module)] + elsewhere
+
+
+def _say(robot: RobotConfig, run_dir: Path, deadline: float) -> list[str]:
+    """Say it on the bus until all have stopped, as heard or seen; return what has not."""
     source = f"xrl estop by {getpass.getuser()}"
     modes: dict[str, int] = {}
-    deadline = time.monotonic() + GIVE_UP_S
-    with open_session(robot, "estop", args.run_dir) as session:
+    with open_session(robot, "estop", run_dir) as session:
         publisher = session.publisher(topics.ESTOP, Estop)
         states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
         seq = 0
@@ -56,15 +87,8 @@ def run(args: argparse.Namespace) -> int:
                 state = latest.take()
                 if state is not None:
                     modes[module] = state.mode
-            if all(modes.get(module) in STOPPED for module in MODULES):
-                Console().print(
-                    "all six modules are stopped: DAMP, a slow sink; `xrl down` ends it"
-                )
-                return 0
+            going = [m for m in MODULES if modes.get(m) not in STOPPED and not has_sunk(run_dir, m)]
+            if not going:
+                return []
             time.sleep(REPEAT_S)
-    going = [
-        f"{m} {Mode(modes[m]).name if m in modes else 'silent'}"
-        for m in MODULES
-        if modes.get(m) not in STOPPED
-    ]
-    raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
+    return [f"{m} {Mode(modes[m]).name if m in modes else 'silent'}" for m in going]

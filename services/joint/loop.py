@@ -93,7 +93,9 @@ class JointLoop:
         module, ports, tracer = self._module, self._ports, self._tracer
         reading = self._drive.read(READ_TIMEOUT_S)
         now = now_ns()
-        estop = ports.estops.take() is not None
+        estop = ports.estops.take() is not None or (
+            self._will is not None and self._will.stop_asked
+        )
         command = ports.commands.take()
         step = module.step(now, reading, command, estop)
         self._write(step)

@@ -1,4 +1,6 @@
-"""What a joint service that dies leaves to its successor: one byte of shared memory.
+"""What a joint service is told, and tells, without a bus: two bytes of shared memory.
+
+The first is what a service that dies leaves to its successor.
 
 What has let go of the robot never takes hold of it again by itself (`shared.fault_table`). A
 service that crashes is started again by the supervisor, and a drive may have disarmed in the
@@ -6,7 +8,10 @@ meantime, or an emergency stop be in force: the new service would arm it, and st
 So each writes down what it last was, and a person who asks for the module (`xrl kill`, `xrl start`,
 `xrl up`) wipes it out.
 
-A mapped file: writing it is a store to memory, which the control path may do.
+The second is the emergency stop of whoever is on the robot's own host (`xrl estop`): it is heard
+with the planner dead and every link of the bus cut, and stands until the module is asked for anew.
+
+A mapped file: reading and writing it are loads and stores, which the control path may do.
 """
 
 from __future__ import annotations
@@ -15,6 +20,10 @@ import mmap
 from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
+from typing import Final
+
+_WILL, _STOP = range(2)
+_NEW: Final = bytes(2)
 
 
 class Will(IntEnum):
@@ -40,15 +49,14 @@ class WillFile:
         """Open it, or make it; the directory is there."""
         path = path_of(run_dir, module)
         with path.open("a+b") as file:
-            if file.seek(0, 2) == 0:
-                file.write(bytes([Will.NOTHING]))
-                file.flush()
-            self._memory = mmap.mmap(file.fileno(), 1)
+            file.write(_NEW[file.seek(0, 2) :])
+            file.flush()
+            self._memory = mmap.mmap(file.fileno(), len(_NEW))
         self._written = self.read()
 
     def read(self) -> Will:
         """Return what was left; what is no will is the most careful one that holds."""
-        value = self._memory[0]
+        value = self._memory[_WILL]
         return Will(value) if value in tuple(Will) else Will.HELD
 
     def write(self, will: Will) -> None:
@@ -57,7 +65,12 @@ class WillFile:
         So `forget` stands, and a service that has nothing new to say does not undo it.
         """
         if will is not self._written:
-            self._memory[0] = self._written = will
+            self._memory[_WILL] = self._written = will
+
+    @property
+    def stop_asked(self) -> bool:
+        """True if someone on this host has asked for the emergency stop."""
+        return self._memory[_STOP] != 0
 
 
 def forget(run_dir: Path, module: str) -> None:
@@ -66,4 +79,27 @@ def forget(run_dir: Path, module: str) -> None:
     In place, for a service that runs has the file mapped.
     """
     with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
-        file.write(bytes([Will.NOTHING]))
+        file.write(_NEW)
+
+
+def ask_stop(run_dir: Path, module: str) -> bool:
+    """Stop a module, with or without a bus; return False if it has no service on this host.
+
+    Raises:
+        OSError: the file is there and cannot be written.
+    """
+    path = path_of(run_dir, module)
+    if not path.exists():
+        return False
+    with path.open("r+b") as file:
+        file.seek(_STOP)
+        file.write(b"\x01")
+    return True
+
+
+def has_sunk(run_dir: Path, module: str) -> bool:
+    """Return True if the module's service on this host has gone to DAMP."""
+    try:
+        return path_of(run_dir, module).read_bytes()[:1] == bytes([Will.DAMP])
+    except FileNotFoundError:
+        return False

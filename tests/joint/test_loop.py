@@ -12,6 +12,7 @@ from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.loop import JointLoop, Ports
 from services.joint.module import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS, Module
+from services.joint.will import Will, WillFile
 from shared.config import RobotConfig
 from shared.messages import Estop, JointEvent, JointState, Mode, Pair
 from shared.traces import JointTrace
@@ -84,7 +85,12 @@ class FakeDrive:
 
 
 class Rig:
-    def __init__(self, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(
+        self,
+        robot: RobotConfig,
+        monkeypatch: pytest.MonkeyPatch,
+        will: WillFile | None = None,
+    ) -> None:
         self.now_ns = T0
         self.onboard = robot.joint_service.loop == "onboard"
         self.gear_ratio = robot.joint.gear_ratio
@@ -92,7 +98,7 @@ class Rig:
         self.period_ns = round(1e9 / robot.joint_service.rate_hz)
         monkeypatch.setattr(joint_loop, "now_ns", lambda: self.now_ns)
         self.drive = FakeDrive(self)
-        module = Module(robot, "knee_right")
+        module = Module(robot, "knee_right", will.read() if will else Will.NOTHING)
         self.controller = module.controller
         self.commands, self.estops = Inbox[Any](), Inbox[Estop]()
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
@@ -104,7 +110,7 @@ class Rig:
             events=cast("Any", self.events),
             traces=cast("Any", self.traces),
         )
-        self.loop = JointLoop(robot, module, self.drive, ports)
+        self.loop = JointLoop(robot, module, self.drive, ports, will)
 
     def run(self, cycles: int) -> None:
         for _ in range(cycles):

@@ -8,7 +8,7 @@ from typing import cast
 
 import pytest
 
-from services.joint.will import Will, WillFile, forget, path_of
+from services.joint.will import Will, WillFile, ask_stop, forget, has_sunk, path_of
 from tools import kill
 from tools.supervision import fleet as fleets
 from tools.supervision import procfs, supervise
@@ -94,6 +94,38 @@ def fleet_of(
     monkeypatch.setattr(procfs, "is_suspended", lambda _pid: calls.suspended)
     monkeypatch.setattr(supervise, "os", SimpleNamespace(kill=calls.kill))
     return fleet
+
+
+def test_a_stop_is_seen_by_a_process_that_has_it_mapped_until_it_is_forgotten(
+    tmp_path: Path, file: WillFile
+) -> None:
+    assert not file.stop_asked
+    assert ask_stop(tmp_path, MODULE)
+    assert file.stop_asked
+    assert WillFile(tmp_path, MODULE).stop_asked, "and by whoever is started in its stead"
+    file.write(Will.HELD)
+    assert file.stop_asked, "what the service leaves does not undo it"
+    forget(tmp_path, MODULE)
+    assert not file.stop_asked
+
+
+def test_where_no_service_is_nothing_is_stopped(tmp_path: Path) -> None:
+    assert not ask_stop(tmp_path, MODULE)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("will", list(Will))
+def test_only_what_sank_has_sunk(tmp_path: Path, file: WillFile, will: Will) -> None:
+    file.write(will)
+    ask_stop(tmp_path, MODULE)
+    assert has_sunk(tmp_path, MODULE) is (will is Will.DAMP)
+    assert not has_sunk(tmp_path, "ankle_left")
+
+
+def test_a_file_of_one_byte_is_read_as_before(tmp_path: Path) -> None:
+    path_of(tmp_path, MODULE).write_bytes(bytes([Will.HELD]))
+    old = WillFile(tmp_path, MODULE)
+    assert (old.read(), old.stop_asked) == (Will.HELD, False)
 
 
 def test_a_service_that_is_down_is_started_as_if_none_had_been_before(

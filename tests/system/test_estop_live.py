@@ -1,0 +1,90 @@
+"""The emergency stop by shared memory: joint services and simulator, and nothing else alive."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from services.joint.will import has_sunk
+from shared import topics
+from shared.bus import open_session
+from shared.config import RobotConfig
+from shared.joints import MODULES
+from shared.messages import JointState, Mode
+from shared.process import DEFAULT_CONFIG
+from tools.supervision.supervise import Fleet
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+
+ROOT = DEFAULT_CONFIG.parents[1]
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
+        yield Path(path) / "r"
+
+
+def xrl(*arguments: str, run_dir: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "tools.cli", *arguments, "--run-dir", str(run_dir)],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+
+
+def wait_for_modes(robot: RobotConfig, run_dir: Path, wanted: dict[str, Mode]) -> None:
+    """Wait until each module tells its mode."""
+    with open_session(robot, "test", run_dir) as session:
+        states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
+        modes: dict[str, int] = {}
+        deadline = time.monotonic() + 40.0
+        while {module: modes.get(module) for module in wanted} != wanted:
+            assert time.monotonic() < deadline, (modes, wanted)
+            for module, latest in states.items():
+                state = latest.take()
+                if state is not None:
+                    modes[module] = state.mode
+            time.sleep(0.01)
+
+
+def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
+    run_dir: Path, robot: RobotConfig
+) -> None:
+    """`--local` opens no session: of the bus nothing is used. Asked for anew, a module waits."""
+    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
+    try:
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.HOLD))
+        done = xrl("estop", "--local", run_dir=run_dir)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "all six modules are stopped" in done.stdout
+        assert all(has_sunk(run_dir, module) for module in MODULES)
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.DAMP))
+        assert xrl("kill", "hip_left", run_dir=run_dir).returncode == 0
+        others = {module: Mode.DAMP for module in MODULES if module != "hip_left"}
+        waiting = Mode.DISARMED  # its drive holds, and is taken over once a planner is heard
+        wait_for_modes(robot, run_dir, others | {"hip_left": waiting})
+    finally:
+        fleet.stop()
+
+
+def test_a_module_without_a_service_here_is_named(run_dir: Path, robot: RobotConfig) -> None:
+    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES[:5]])
+    try:
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES[:5], Mode.HOLD))
+        done = xrl("estop", "--local", run_dir=run_dir)
+        assert done.returncode == 2
+        assert f"{MODULES[5]} has no service on this host" in done.stderr
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES[:5], Mode.DAMP))
+    finally:
+        fleet.stop()
