@@ -156,7 +156,8 @@ LOSSES: Final[dict[str, Loss]] = {
         "by itself: a new file; the old one is read as far as it was flushed",
     ),
     "emergency stop": Loss(
-        "DAMP: knees and hips sink slowly, ankles and frontal axes hold",
+        "DAMP: knees sink slowly, hips keep the torso as it stood, ankles and frontal axes hold; "
+        "beside a dead or limp knee, or a limp ankle, it holds where it is",
         "the same",
         "`xrl status`: DAMP because ESTOP",
         "by starting the joint services again",

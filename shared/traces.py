@@ -37,6 +37,12 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     """What the drive was told: 0 nothing, 1 torques, 2 a target, 3 idle, 4 to arm, 5 no zero."""
     tau: Pair
     """Joint torques of this cycle, N m, after the gate."""
+    below: Pair = (0.0, 0.0)
+    """Theta and rate of ankle and knee together, as a hip knew them, rad, rad/s,"""
+    knows_below: bool = False
+    """if this says so."""
+    sinks: bool = True
+    """Of a knee or a hip: nothing that it knew of the others kept it from sinking."""
 
 
 class JointTrace(Message, frozen=True):

@@ -11,6 +11,7 @@ from services.joint.drivers.signed import Signed
 from services.joint.drivers.zeroed import Zeroed
 from services.joint.loop import JointLoop, Ports
 from services.joint.module import Module
+from services.joint.neighbours import Neighbours
 from services.joint.will import Will, WillFile
 from shared import config_file, log, topics
 from shared.bus import open_session
@@ -61,7 +62,8 @@ def main() -> int:
             drive = ReadOnly(drive)
         will = None if arguments.readonly else WillFile(arguments.run_dir, module)
         left = Will.NOTHING if will is None else will.read()
-        loop = JointLoop(robot, Module(robot, module, left), drive, ports, will)
+        neighbours = None if arguments.readonly else Neighbours(arguments.run_dir, module)
+        loop = JointLoop(robot, Module(robot, module, left), drive, ports, will, neighbours)
         logger.info("up, %s%s", granted, ", read-only" if arguments.readonly else "")
         freeze_garbage()
         loop.run(stop)

@@ -19,12 +19,13 @@ from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.gate import diamond, gate, limits_of
 from services.joint.law import Setpoint
 from services.joint.memory import ControllerMemory
+from services.joint.neighbours import NOTHING, Near
 from services.joint.samples import Samples
+from services.joint.sinking import Sinking
 from services.joint.trips import Trips
 from services.joint.trips import limits_of as trip_limits_of
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
-from shared.joints import kind_of
 from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Outside, Pair
 
 
@@ -51,16 +52,12 @@ class JointController:
         self._limits = limits_of(config, module)
         self._trips, self._trip_limits = Trips(), trip_limits_of(config)
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
-        self._damp_k_d = service.damp_k_d
-        self._sinks = (False, kind_of(module) in service.damp_sinks)
+        self._sinking = Sinking(config, module)
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
-        knee = kind_of(module) == "knee"
-        self._damp_stop = service.damp_knee_stop if knee else -math.inf
         self._gear_ratio = config.joint.gear_ratio
         self._aging_max_s = service.command_aging_max_ms / 1e3
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
         self._blend_ns = service.blend_ms * NS_PER_MS
-        self._damp_fade_ns = service.damp_fade_s * NS_PER_S
         self._period_late_ns = round(2 * NS_PER_S / service.rate_hz)
         self._anchor: Setpoint = law.stand(law.ZERO, self._stand_k_p, self._stand_k_d)
         """The setpoint at the last change of state: what HOLD holds and TRACK blends from."""
@@ -75,6 +72,7 @@ class JointController:
         self._resumed_ns = 0
         self._braced_ns = 0
         """Since when HOLD rises to all stand gains, for another may be limp; 0: it does not."""
+        self._near = NOTHING
         self._cause = 0
         self.tau: Pair = law.ZERO
         self.cycle = 0
@@ -90,6 +88,7 @@ class JointController:
         estop: bool,
         *,
         listens: bool = False,
+        near: Near = NOTHING,
     ) -> CycleResult:
         """Run one cycle.
 
@@ -100,8 +99,10 @@ class JointController:
             estop: the emergency stop is engaged.
             listens: the service was frozen, and what the link's buffer kept comes first: samples
                 may jump from where the joint was to where it is.
+            near: what is known of the other modules on this host.
         """
         self._count(now_ns)
+        self._near = near
         failsafe, samples = self.failsafe, self._samples
         drive = Event.NONE
         if reading is not None:
@@ -212,7 +213,7 @@ class JointController:
             self._changed_ns,
             self._last_cycle_ns,
             self._found_tau,
-            self._damp_stop if math.isfinite(self._damp_stop) else None,
+            self._sinking.stop if math.isfinite(self._sinking.stop) else None,
             self._cause,
             self.tau,
             self.cycle,
@@ -223,6 +224,8 @@ class JointController:
             self._resumed_ns,
             self._braced_ns,
             msgspec.structs.replace(self._trips),
+            self._sinking.upright,
+            self._sinking.held,
         )
 
     def recall(self, memory: ControllerMemory) -> None:
@@ -233,11 +236,12 @@ class JointController:
         self._anchor, self._setpoint = m.anchor, m.setpoint
         self._changed_ns, self._last_cycle_ns = m.changed_ns, m.last_cycle_ns
         self._found_tau, self._cause, self.tau = m.found_tau, m.cause, m.tau
-        self._damp_stop = -math.inf if m.damp_stop is None else m.damp_stop
+        self._sinking.stop = -math.inf if m.damp_stop is None else m.damp_stop
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
         self._residual, self._resumed_ns = m.residual, m.resumed_ns
         self._braced_ns = m.braced_ns
         self._trips = msgspec.structs.replace(m.trips)
+        self._sinking.upright, self._sinking.held = m.upright, m.held
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""
@@ -278,9 +282,7 @@ class JointController:
         elif before is Mode.DISARMED:
             self._anchor = law.stand(self._samples.q, k_p, k_d)
         elif self.failsafe.mode is Mode.DAMP:
-            q = self._samples.q
-            self._damp_stop = min(self._damp_stop, q[1])
-            self._anchor = law.carrying(self._setpoint, self._sinks, q)
+            self._anchor = self._sinking.begin(self._setpoint, self._samples.q)
         elif self.failsafe.mode is Mode.HOLD:
             q, most = self._samples.q, self._hold_torque
             self._anchor = law.near(self._setpoint, q, self._hold_k_p, most)
@@ -300,14 +302,7 @@ class JointController:
                 return fresh
             return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
         if mode is Mode.DAMP:
-            share = max(0.0, 1.0 - since_ns / self._damp_fade_ns)
-            risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
-            held = law.held(self._anchor, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
-            held = law.stiffened(held, self._stand_k_p, self._stand_k_d, 1.0 - share)
-            sunk = law.damped(held, self._sinks, self._damp_k_d, share, risen)
-            if self._samples.q[1] < self._damp_stop:
-                return law.caught(sunk, self._damp_stop, self._stand_k_p[1], self._stand_k_d[1])
-            return sunk
+            return self._sinking.law(self._anchor, since_ns, self._samples.q, self._near)
         held = self._held(since_ns)
         if self._braced_ns:
             risen = min(1.0, (now_ns - self._braced_ns) / self._blend_ns)

@@ -9,6 +9,7 @@ import msgspec
 
 from services.joint.drivers.base import Drive
 from services.joint.module import ARM_TRIES, Module, Obstacle, Order, Step
+from services.joint.neighbours import NOTHING, Neighbours, Row
 from services.joint.tracer import Tracer
 from services.joint.will import Will, WillFile
 from shared import log
@@ -58,10 +59,20 @@ class JointLoop:
         drive: Drive,
         ports: Ports,
         will: WillFile | None = None,
+        neighbours: Neighbours | None = None,
     ) -> None:
-        """Take the module's parts; `will` is where it leaves what its successor has to know."""
+        """Take the module's parts.
+
+        Args:
+            config: the robot.
+            module: what it does in a cycle.
+            drive: its drive.
+            ports: its ends of the bus.
+            will: where it leaves what its successor has to know, and hears of a stop.
+            neighbours: what it shares with the other five on this host.
+        """
         service = config.joint_service
-        self._will = will
+        self._will, self._neighbours = will, neighbours
         self._module = module
         self._drive = drive
         self._ports = ports
@@ -97,16 +108,22 @@ class JointLoop:
             self._will is not None and self._will.stop_asked
         )
         command = ports.commands.take()
-        step = module.step(now, reading, command, estop)
+        near = NOTHING
+        if self._neighbours is not None and module.asks_near:
+            near = self._neighbours.near(now)
+        step = module.step(now, reading, command, estop, near)
         self._write(step)
         controller = module.controller
+        if self._neighbours is not None:
+            samples, mode = controller.samples, controller.failsafe.mode
+            self._neighbours.write(Row(samples.believed_ns, samples.q[1], samples.v[1], mode))
         if controller.cycle % self._state_every == 0:
             ports.states.put(controller.state(now))
         if step.event is not None:
             ports.events.put(step.event)
         if self._will is not None:
             self._will.write(module.will)
-        trace = tracer.after(now, reading, command, estop, step)
+        trace = tracer.after(now, reading, command, estop, step, near)
         if trace is not None:
             ports.traces.put(trace)
         if step.event is not None or step.obstacle is not Obstacle.NONE:

@@ -39,6 +39,9 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     resumed_ns: int = 0
     braced_ns: int = 0
     trips: Trips = msgspec.field(default_factory=Trips)
+    upright: float | None = None
+    held: float | None = None
+    """These two of `Sinking`."""
 
 
 class ModuleMemory(msgspec.Struct, frozen=True):

@@ -17,6 +17,7 @@ from services.joint.differential import motor_torque
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.left_alone import LeftAlone
 from services.joint.memory import ModuleMemory
+from services.joint.neighbours import NOTHING, Near
 from services.joint.onboard import OnboardLaw
 from services.joint.will import Will
 from shared.cansimple import AxisError
@@ -110,6 +111,11 @@ class Module:
         """Listening after a gap; 0: not."""
 
     @property
+    def asks_near(self) -> bool:
+        """True while it matters what the neighbours do: in DAMP."""
+        return self.controller.failsafe.mode is Mode.DAMP
+
+    @property
     def leaves_holding(self) -> bool:
         """True if the drive holds the robot by its own loop should the service end now."""
         mode, lost = self.controller.failsafe.mode, self.controller.cause is Cause.DRIVE_LOST
@@ -122,6 +128,7 @@ class Module:
         reading: DriveReading | None,
         command: JointCommand | None,
         estop: bool,
+        near: Near = NOTHING,
     ) -> Step:
         """Run one cycle; arguments as for `JointController.step`, and `estop` is remembered."""
         self._estop = self._estop or estop
@@ -134,7 +141,7 @@ class Module:
         tau_before = controller.tau
         estop = self._estop and not self._is_to_be_taken_over(reading)
         listens = self._listen_until_ns > 0
-        result = controller.step(now_ns, reading, command, estop, listens=listens)
+        result = controller.step(now_ns, reading, command, estop, listens=listens, near=near)
         mode = controller.failsafe.mode
         if result.event is not None:
             self.will = self._new_will(mode)

@@ -12,6 +12,7 @@ import msgspec
 
 from services.joint.drivers.base import DriveReading
 from services.joint.module import Module, Step
+from services.joint.neighbours import NOTHING, Near
 from shared.messages import JointCommand
 from shared.traces import CycleTrace, JointTrace
 
@@ -42,6 +43,7 @@ class Tracer:
         command: JointCommand | None,
         estop: bool,
         step: Step,
+        near: Near = NOTHING,
     ) -> JointTrace | None:
         """Take down a cycle; return a message when it is full."""
         r = reading
@@ -61,6 +63,9 @@ class Tracer:
                 estop,
                 step.order.value,
                 self._module.controller.tau,
+                near.below or _NOTHING,
+                near.below is not None,
+                near.sinks,
             )
         )
         return self.take() if len(self._cycles) == CYCLES else None

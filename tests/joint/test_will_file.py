@@ -8,6 +8,7 @@ from typing import cast
 
 import pytest
 
+from services.joint import neighbours
 from services.joint.will import Will, WillFile, ask_stop, forget, has_sunk, path_of
 from tools import kill
 from tools.supervision import fleet as fleets
@@ -187,6 +188,7 @@ def test_a_fleet_does_not_hear_of_what_held_before_it(
     tmp_path: Path, left: WillFile, ends: str
 ) -> None:
     assert left.read() is Will.HELD
+    neighbours.Neighbours(tmp_path, MODULE)
     if ends == "a new fleet":
         plan = SimpleNamespace(listeners=(), processes=(), config_path=tmp_path / "robot.toml")
         plan.processes = (SimpleNamespace(name=MODULE, topic="", stop_s=1.0),)
@@ -194,3 +196,4 @@ def test_a_fleet_does_not_hear_of_what_held_before_it(
     else:
         RunDir(tmp_path).clear(keep_logs=True)
     assert not path_of(tmp_path, MODULE).exists()
+    assert not neighbours.path_of(tmp_path).exists()

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import msgspec
 import numpy as np
 import pytest
 
+from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
+from shared.joints import MODULES
 from shared.messages import Mode
+from shared.scenario import Fault, Keyframe, Kill
 from tests.lockstep.runs import still
 from tools.runs.lockstep import Lockstep
+from tools.sweeps import plants
 
 
 @pytest.mark.parametrize("height", [1.188, 0.9])
@@ -47,3 +53,97 @@ def test_a_stop_without_a_planner_sinks_as_well(robot: RobotConfig) -> None:
             heights.append(truth.torso[2])
             assert not truth.fallen, f"{step} ms"
     assert (-np.gradient(heights[300:], 0.01)).max() < 0.25
+
+
+COM_BACK_AND_UP = {"body.com_offset": [-0.05, 0.0, 0.1]}
+STOPPED: list[tuple[float, float, dict[str, Any]]] = [
+    (1.188, 0.0, {}),
+    (0.95, 0.0, {}),
+    (0.9, 0.6, {}),
+    (0.79, 1.2, {}),
+    (1.188, 0.0, COM_BACK_AND_UP),
+    (0.95, 0.0, COM_BACK_AND_UP | {"body.payload_scale": 1.2}),
+    (0.79, 1.2, {"body.com_offset": [0.03, 0.0, -0.05], "body.payload_scale": 0.0}),
+    (1.1, 0.3, {"body.payload_scale": 0.0, "drivetrain.stiffness": 3000.0}),
+    (1.0, 0.0, {"drivetrain.stiffness": 2000.0, "drivetrain.play": 0.005}),
+]
+
+
+class Stopped(NamedTuple):
+    """What came of a stop."""
+
+    fell: bool
+    turned: float
+    """Farthest that the torso's pitch went from where it was, rad."""
+    sank: float
+    """m"""
+    speed: float
+    """Fastest way down, m/s."""
+
+
+def stop(
+    robot: RobotConfig,
+    height: float,
+    pitch: float,
+    plant: PlantConfig,
+    kills: tuple[Kill, ...] = (),
+    faults: tuple[Fault, ...] = (),
+) -> Stopped:
+    """Lead to a pose in 3 s, let go and stop at 3.8 s; go on for 10 s."""
+    frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=3.0, height=height, pitch=pitch))
+    told = still(14.0, kill=kills, fault=faults, push=())
+    told = msgspec.structs.replace(told, keyframe=frames)
+    fleet = Lockstep(robot, told, plant=plant)
+    pitches, heights = [], []
+    for truth in fleet.run():
+        if truth.scenario_s >= 3.8 and not fleet.estop:
+            fleet.estop = True
+            fleet.world.let_go()
+        if fleet.estop:
+            pitches.append(truth.angles[1])
+            heights.append(truth.torso[2])
+        if truth.fallen:
+            break
+    turned = np.abs(np.array(pitches) - pitches[0]).max()
+    speed = -np.gradient(heights, 0.01)
+    return Stopped(truth.fallen, turned, heights[0] - heights[-1], speed.max())
+
+
+@pytest.mark.parametrize(("height", "pitch", "errors"), STOPPED)
+def test_with_nobody_holding_on_the_torso_stays_as_it_stood(
+    robot: RobotConfig, height: float, pitch: float, errors: dict[str, Any]
+) -> None:
+    """It turned back by 1.5 to 2.5 rad, and fell with the COM 5 cm back and 10 cm up."""
+    found = stop(robot, height, pitch, changed(PlantConfig(), errors))
+    assert not found.fell
+    assert found.turned < 0.1
+    assert found.speed < 0.25
+    assert found.sank > 0.05 or height < 0.85, "it sinks"
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_so_it_does_on_drawn_plants(robot: RobotConfig, number: int) -> None:
+    found = stop(robot, 0.9 + 0.07 * number, 0.3 * number, plants.draw(f"estop {number}"))
+    assert not found.fell
+    assert found.turned < 0.1
+    assert found.speed < 0.25
+
+
+@pytest.mark.parametrize("dead", ["planner", *MODULES[:3]])
+def test_it_comes_down_on_its_feet_with_one_service_dead(robot: RobotConfig, dead: str) -> None:
+    """A knee that sank beside one that its drive held tipped the robot sideways."""
+    found = stop(robot, 1.0, 0.0, PlantConfig(), kills=(Kill(service=dead, at=3.6),))
+    assert not found.fell
+    assert found.turned < 0.1
+    if dead.startswith("knee"):
+        assert abs(found.sank) < 0.02, "it holds where it is"
+    else:
+        assert found.sank > 0.1
+
+
+@pytest.mark.parametrize("limp", ["ankle_left", "hip_right"])
+def test_it_does_not_fall_with_an_ankle_or_a_hip_limp(robot: RobotConfig, limp: str) -> None:
+    fault = Fault(module=limp, kind="disarmed", at=3.7)
+    found = stop(robot, 1.0, 0.0, PlantConfig(), faults=(fault,))
+    assert not found.fell
+    assert found.turned < 0.1

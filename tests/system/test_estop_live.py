@@ -16,7 +16,7 @@ from shared import topics
 from shared.bus import open_session
 from shared.config import RobotConfig
 from shared.joints import MODULES
-from shared.messages import JointState, Mode
+from shared.messages import JointState, Mode, SimTruth
 from shared.process import DEFAULT_CONFIG
 from tools.supervision.supervise import Fleet
 
@@ -58,6 +58,18 @@ def wait_for_modes(robot: RobotConfig, run_dir: Path, wanted: dict[str, Mode]) -
             time.sleep(0.01)
 
 
+def truth(robot: RobotConfig, run_dir: Path, wait_s: float = 0.0) -> SimTruth:
+    """Return the world after a while."""
+    with open_session(robot, "test", run_dir) as session:
+        truths = session.latest(topics.SIM_TRUTH, SimTruth)
+        until = time.monotonic() + wait_s
+        newest: SimTruth | None = None
+        while newest is None or time.monotonic() < until:
+            newest = truths.take() or newest
+            time.sleep(0.01)
+        return newest
+
+
 def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
     run_dir: Path, robot: RobotConfig
 ) -> None:
@@ -70,6 +82,10 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
         assert "all six modules are stopped" in done.stdout
         assert all(has_sunk(run_dir, module) for module in MODULES)
         wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.DAMP))
+        before, after = truth(robot, run_dir), truth(robot, run_dir, wait_s=6.0)
+        assert not after.fallen
+        assert after.torso[2] < before.torso[2] - 0.05, "it sinks"
+        assert abs(after.angles[1]) < 0.1, "and the hips know of their legs"
         assert xrl("kill", "hip_left", run_dir=run_dir).returncode == 0
         others = {module: Mode.DAMP for module in MODULES if module != "hip_left"}
         waiting = Mode.DISARMED  # its drive holds, and is taken over once a planner is heard

@@ -21,6 +21,7 @@ from services.joint.differential import motor_torque
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.gate import diamond
 from services.joint.module import Module, Obstacle, Order, Step
+from services.joint.neighbours import NOTHING, Near
 from services.planner.engagement import Engagement
 from services.planner.planner import Planner
 from shared.clock import NS_PER_MS
@@ -102,6 +103,7 @@ class PassThrough(Module):
         reading: DriveReading | None,
         command: JointCommand | None,
         estop: bool,
+        near: Near = NOTHING,  # noqa: ARG002 - nothing here sinks
     ) -> Step:
         """Run one cycle; arguments as for the shipped module."""
         amiss = estop or (reading is not None and reading.status is not DriveStatus.ARMED)

@@ -10,6 +10,7 @@ import msgspec
 from services.joint.drivers.base import DriveReading
 from services.joint.memory import ModuleMemory
 from services.joint.module import Module
+from services.joint.neighbours import Near
 from shared import topics
 from shared.config import RobotConfig
 from shared.messages import DriveStatus, JointCommand, JointState, Message
@@ -79,7 +80,8 @@ class JointExecution:
                 outcome.skipped += 1
                 self._module = None
                 return
-        step = module.step(c.now_ns, _reading(c), command, c.estop)
+        near = Near(c.below if c.knows_below else None, c.sinks)
+        step = module.step(c.now_ns, _reading(c), command, c.estop, near)
         controller = module.controller
         outcome.ticks += 1
         mine = msgspec.structs.replace(cycle, order=step.order.value, tau=controller.tau)

@@ -46,6 +46,7 @@ from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
 from tools.runs.virtual_imu import VirtualImu
+from tools.runs.virtual_neighbours import near_to
 from tools.runs.virtual_network import VirtualNetwork
 
 SETTLE_NS = NS_PER_S
@@ -291,8 +292,9 @@ class Lockstep:
             if name in self._frozen:
                 continue
             drive, host_ns = self._drives[index], self._clocks[index].read(now)
-            reading, command = drive.read(host_ns), self._commands[index].take(now)
-            step = module.step(host_ns, reading, command, self.estop)
+            given = (host_ns, drive.read(host_ns), self._commands[index].take(now), self.estop)
+            near = near_to(index, now, self._modules, self._clocks)
+            step = module.step(*given, near)
             drive.carry_out(step, onboard=module.onboard)
             if step.event is not None:
                 self.events.append((name, step.event))
@@ -302,7 +304,7 @@ class Lockstep:
                 self._states[index].put(now, state)
                 self._record(topics.JOINT_STATE, name, state)
             if self._traces:
-                trace = self._tracers[index].after(host_ns, reading, command, self.estop, step)
+                trace = self._tracers[index].after(*given, step, near)
                 if trace is not None:
                     self._record(topics.JOINT_TRACE, name, trace)
 

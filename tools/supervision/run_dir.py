@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from services.joint import will
+from services.joint import neighbours, will
 from shared.clock import PACE_FILE
 from shared.exceptions import FleetError
 from shared.joints import MODULES
@@ -111,12 +111,13 @@ class RunDir:
         self.manifest.write_bytes(msgspec.json.format(msgspec.json.encode(manifest)))
         for path in (*manifest.sockets, str(self.supervisor_socket)):
             _remove_socket(Path(path))
-        self._remove_wills()
+        self._remove_shared_memory()
 
-    def _remove_wills(self) -> None:
+    def _remove_shared_memory(self) -> None:
         """Forget what joint services of another time have left: a fleet is asked for anew."""
         for module in MODULES:
             will.path_of(self.path, module).unlink(missing_ok=True)
+        neighbours.path_of(self.path).unlink(missing_ok=True)
 
     def read_manifest(self) -> Manifest | None:
         """Return the manifest of the fleet that is or was up here, or None."""
@@ -131,7 +132,7 @@ class RunDir:
         for path in manifest.sockets if manifest else ():
             _remove_socket(Path(path))
         _remove_socket(self.supervisor_socket)
-        self._remove_wills()
+        self._remove_shared_memory()
         for file in (self.supervisor_config, self.supervisor_pid, self.manifest, self.pace):
             file.unlink(missing_ok=True)
         if not keep_logs:

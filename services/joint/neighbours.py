@@ -1,0 +1,129 @@
+"""What the six joint services tell each other on their host: shared memory, no bus.
+
+After an emergency stop the knees sink. A torso on hips that only damp is dragged along by the
+thighs: it turned back by 1.5 rad, and with its COM 5 cm back and 10 cm up it threw the robot over.
+A hip that knows how its ankle and its knee have turned holds the torso as it stood. And a knee that
+sinks beside one whose service is dead, or that is limp, tips the robot sideways: it was down in
+4 s. It has to know that the other one does not sink. Beside a limp knee the hips hold, as in HOLD
+(`services.planner.bracing`).
+
+All this with planner and bus dead: so each service writes down where it is in a file that all six
+have mapped, by a store to memory in each cycle, which the control path may do. What runs on another
+host is not known: hips then damp, and knees sink.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from shared.clock import NS_PER_MS
+from shared.joints import MODULES, N_MODULES, kind_of
+from shared.messages import Mode, Pair
+
+STALE_NS: Final = 20 * NS_PER_MS
+"""What is older was written by a service that is no more, or about a drive that is not heard."""
+_ROW: Final = struct.Struct("<QQddQ")
+"""A number that is odd while it is written, time in ns, angle in rad, rate in rad/s, mode."""
+_NUMBER: Final = struct.Struct("<Q")
+_LEG: Final = N_MODULES // 2
+"""From a module to its like of the other leg."""
+_SIZE: Final = N_MODULES * _ROW.size
+_DOWN: Final = (Mode.FAULT, Mode.DISARMED)
+
+
+class Row(NamedTuple):
+    """One module, as its service wrote it."""
+
+    t_ns: int
+    """When its drive's newest believed sample came; 0: never."""
+    theta: float
+    """rad"""
+    rate: float
+    """rad/s"""
+    mode: int
+    """`Mode`."""
+
+
+class Near(NamedTuple):
+    """What a module knows of its neighbours."""
+
+    below: Pair | None = None
+    """Of a hip: theta and rate of ankle and knee together, rad, rad/s; None: not known now."""
+    sinks: bool = True
+    """Of a knee or a hip: False if the robot would tip were it not to hold where it is."""
+
+
+NOTHING: Final = Near()
+
+
+def path_of(run_dir: Path) -> Path:
+    """Return where the six are kept."""
+    return run_dir / "joints.near"
+
+
+def near(module: str, rows: Sequence[Row | None], now_ns: int) -> Near:
+    """Return what a module makes of the rows.
+
+    Args:
+        module: whose service asks.
+        rows: of the six; None while a row is being written.
+        now_ns: the host's monotonic clock.
+    """
+    kind, own = kind_of(module), MODULES.index(module)
+    if kind == "hip":
+        below, knees = (rows[own - 2], rows[own - 1]), (rows[1], rows[1 + _LEG])
+        sinks = not any(map(_is_limp, knees))
+        known = [row for row in below if row is not None and _is_fresh(row, now_ns)]
+        if len(known) < len(below):
+            return Near(sinks=sinks)
+        return Near((sum(row.theta for row in known), sum(row.rate for row in known)), sinks)
+    if kind == "knee":
+        other, ankles = rows[(own + _LEG) % N_MODULES], (rows[0], rows[_LEG])
+        was_known = other is not None and other.t_ns > 0
+        stays = other is not None and (not _is_fresh(other, now_ns) or other.mode in _DOWN)
+        return Near(sinks=not (was_known and stays) and not any(map(_is_limp, ankles)))
+    return NOTHING
+
+
+def _is_fresh(row: Row, now_ns: int) -> bool:
+    return 0 <= now_ns - row.t_ns <= STALE_NS
+
+
+def _is_limp(row: Row | None) -> bool:
+    return row is not None and row.t_ns > 0 and row.mode == Mode.FAULT
+
+
+class Neighbours:
+    """A module's place in the file."""
+
+    def __init__(self, run_dir: Path, module: str) -> None:
+        """Open the file, or make it; the directory is there."""
+        with path_of(run_dir).open("a+b") as file:
+            file.truncate(_SIZE)
+            self._memory = mmap.mmap(file.fileno(), _SIZE)
+        self._module = module
+        self._at = MODULES.index(module) * _ROW.size
+        self._written: int = _ROW.unpack_from(self._memory, self._at)[0] & ~1
+
+    def write(self, row: Row) -> None:
+        """Write down where this module is."""
+        self._written += 2
+        memory, at = self._memory, self._at
+        _ROW.pack_into(memory, at, self._written - 1, *row)
+        _NUMBER.pack_into(memory, at, self._written)  # even again: whole
+
+    def near(self, now_ns: int) -> Near:
+        """Return what this module knows of the others."""
+        if kind_of(self._module) == "ankle":
+            return NOTHING
+        return near(self._module, [self._read(at) for at in range(0, _SIZE, _ROW.size)], now_ns)
+
+    def _read(self, at: int) -> Row | None:
+        number, *row = _ROW.unpack_from(self._memory, at)
+        if number & 1 or _ROW.unpack_from(self._memory, at)[0] != number:
+            return None  # written meanwhile; the next cycle is 2 ms away
+        return Row(*row)

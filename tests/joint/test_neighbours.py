@@ -1,0 +1,100 @@
+"""What joint services tell each other in shared memory, and what they make of it."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from services.joint.neighbours import (
+    NOTHING,
+    STALE_NS,
+    Near,
+    Neighbours,
+    Row,
+    near,
+    path_of,
+)
+from shared.joints import MODULES, kind_of
+from shared.messages import Mode
+from tests.joint.helpers import T0
+
+
+def rows(**changes: Row | None) -> list[Row | None]:
+    """Return six modules that sink, with some replaced."""
+    known = {name: Row(T0, 0.1 * i, 0.01 * i, Mode.DAMP) for i, name in enumerate(MODULES)}
+    return [changes.get(name, row) for name, row in known.items()]
+
+
+def test_a_hip_knows_how_its_own_leg_has_turned() -> None:
+    assert near("hip_right", rows(), T0) == Near(pytest.approx((0.0 + 0.1, 0.0 + 0.01)))
+    assert near("hip_left", rows(), T0) == Near(pytest.approx((0.3 + 0.4, 0.03 + 0.04)))
+
+
+@pytest.mark.parametrize("age_ns", [-1, STALE_NS + 1])
+@pytest.mark.parametrize("kind", ["ankle", "knee"])
+def test_what_is_old_or_of_another_clock_is_not_known(kind: str, age_ns: int) -> None:
+    name = f"{kind}_left"
+    old = rows(**{name: Row(T0 - age_ns, 0.5, 0.0, Mode.DAMP)})
+    assert near("hip_left", old, T0).below is None
+    assert near("hip_right", old, T0).below is not None, "it is no business of the other leg"
+    just = rows(**{name: Row(T0 - STALE_NS, 0.5, 0.0, Mode.DAMP)})
+    assert near("hip_left", just, T0).below is not None
+
+
+@pytest.mark.parametrize("kind", ["ankle", "knee"])
+def test_what_is_being_written_or_never_was_is_not_known(kind: str) -> None:
+    for row in (None, Row(0, 0.0, 0.0, 0)):
+        found = near("hip_left", rows(**{f"{kind}_left": row}), T0)
+        assert found == NOTHING
+    assert near("knee_right", rows(knee_left=Row(0, 0.0, 0.0, 0)), T0).sinks, "on another host"
+
+
+def test_who_holds_beside_whom() -> None:
+    """Each module against each other's mode and age."""
+    for asks, other, mode, dead in product(MODULES, MODULES, Mode, (False, True)):
+        if asks == other:
+            continue
+        t_ns = T0 - STALE_NS - 1 if dead else T0
+        found = near(asks, rows(**{other: Row(t_ns, 0.0, 0.0, mode)}), T0)
+        pair = kind_of(asks), kind_of(other)
+        limp = mode is Mode.FAULT
+        holds = (
+            (pair == ("knee", "knee") and (dead or mode in (Mode.FAULT, Mode.DISARMED)))
+            or (pair == ("knee", "ankle") and limp)
+            or (pair == ("hip", "knee") and limp)
+        )
+        assert found.sinks is not holds, (asks, other, mode, dead)
+
+
+@pytest.fixture
+def six(tmp_path: Path) -> dict[str, Neighbours]:
+    return {name: Neighbours(tmp_path, name) for name in MODULES}
+
+
+def test_what_one_writes_the_others_read(six: dict[str, Neighbours]) -> None:
+    for cycle in range(300):  # the number's low byte goes round
+        for i, name in enumerate(MODULES):
+            six[name].write(Row(T0 + cycle, 0.1 * i + cycle, 0.01 * i, Mode.DAMP))
+        assert six["hip_left"].near(T0 + cycle) == Near(pytest.approx((0.7 + 2 * cycle, 0.07)))
+    assert six["ankle_left"].near(T0) == NOTHING
+    assert six["knee_left"].near(T0 + 299).sinks
+    assert not six["knee_left"].near(T0 + 300 + STALE_NS).sinks, "the others are dead"
+
+
+def test_a_row_that_its_writer_died_over_is_not_read(
+    tmp_path: Path, six: dict[str, Neighbours]
+) -> None:
+    for name in MODULES:
+        six[name].write(Row(T0, 0.1, 0.0, Mode.DAMP))
+    assert six["hip_left"].near(T0).below is not None
+    whole = path_of(tmp_path).read_bytes()
+    row_of_the_knee = len(whole) // 6 * MODULES.index("knee_left")
+    with path_of(tmp_path).open("r+b") as file:
+        file.seek(row_of_the_knee)
+        file.write(bytes([whole[row_of_the_knee] | 1]))
+    assert six["hip_left"].near(T0).below is None
+    successor = Neighbours(tmp_path, "knee_left")
+    successor.write(Row(T0, 0.3, 0.0, Mode.DAMP))
+    assert six["hip_left"].near(T0) == Near(pytest.approx((0.4, 0.0)))
