@@ -157,7 +157,7 @@ LOSSES: Final[dict[str, Loss]] = {
     ),
     "emergency stop": Loss(
         "DAMP: knees sink slowly, hips keep the torso as it stood, ankles and frontal axes hold; "
-        "beside a dead or limp knee, or a limp ankle, it holds where it is",
+        "beside a dead knee or a limp ankle it holds where it is; beside a limp knee it falls",
         "the same",
         "`xrl status`: DAMP because ESTOP",
         "by starting the joint services again",

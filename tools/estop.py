@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import argparse
 import getpass
+import sys
 import time
 from pathlib import Path
 
 from rich.console import Console
 
-from services.joint.will import ask_stop, has_sunk
+from services.joint.neighbours import Neighbours
+from services.joint.will import ask_stop
 from shared import topics
 from shared.bus import open_session
 from shared.clock import now_ns
 from shared.config import RobotConfig
 from shared.config_file import load
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, XrlError
 from shared.joints import MODULES
 from shared.messages import Estop, JointState, Mode
 from tools.supervision.supervise import Fleet
@@ -48,47 +50,67 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Say it until every module is stopped; a module leaves DAMP by a restart only."""
-    fleet = Fleet.attach(args.run_dir)
-    run_dir = fleet.run.path
-    here = [module for module in MODULES if ask_stop(run_dir, module)]  # first: it needs nobody
-    deadline = time.monotonic() + GIVE_UP_S
+    run_dir: Path = args.run_dir
+    here = _ask_here(run_dir)  # first: it needs no bus, no supervisor, nobody
     if args.local:
-        going = _wait_here(run_dir, here, deadline)
+        going = _wait_here(run_dir, here)
     else:
-        going = _say(load(Path(fleet.manifest.config)), run_dir, deadline)
+        try:
+            fleet = Fleet.attach(run_dir)
+            going = _say(load(Path(fleet.manifest.config)), run_dir)
+        except XrlError as error:
+            if not here:
+                raise
+            print(f"xrl: not over the bus: {error}", file=sys.stderr)
+            going = _wait_here(run_dir, here)
     if going:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
     Console().print("all six modules are stopped: DAMP, a slow sink; `xrl down` ends it")
     return 0
 
 
-def _wait_here(run_dir: Path, here: list[str], deadline: float) -> list[str]:
+def _ask_here(run_dir: Path) -> list[str]:
+    """Ask the services on this host by shared memory; return those that are there."""
+    here = []
+    for module in MODULES:
+        try:
+            if ask_stop(run_dir, module):
+                here.append(module)
+        except OSError as error:
+            print(f"xrl: {module} cannot be asked: {error.strerror}", file=sys.stderr)
+    return here
+
+
+def _is_stopped(run_dir: Path, module: str) -> bool:
+    return Neighbours.mode_of(run_dir, module) in STOPPED
+
+
+def _wait_here(run_dir: Path, here: list[str]) -> list[str]:
     """Wait for the services on this host; return in words what has not stopped."""
-    while time.monotonic() < deadline and not all(has_sunk(run_dir, module) for module in here):
+    deadline = time.monotonic() + GIVE_UP_S
+    while time.monotonic() < deadline and not all(_is_stopped(run_dir, m) for m in here):
         time.sleep(REPEAT_S)
-    elsewhere = [
-        f"{module} has no service on this host" for module in MODULES if module not in here
-    ]
-    return [module for module in here if not has_sunk(run_dir, module)] + elsewhere
+    going = [module for module in here if not _is_stopped(run_dir, module)]
+    return going + [f"{m} has no service on this host" for m in MODULES if m not in here]
 
 
-def _say(robot: RobotConfig, run_dir: Path, deadline: float) -> list[str]:
+def _say(robot: RobotConfig, run_dir: Path) -> list[str]:
     """Say it on the bus until all have stopped, as heard or seen; return what has not."""
     source = f"xrl estop by {getpass.getuser()}"
     modes: dict[str, int] = {}
     with open_session(robot, "estop", run_dir) as session:
         publisher = session.publisher(topics.ESTOP, Estop)
         states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
-        seq = 0
-        while time.monotonic() < deadline:
+        seq, deadline, going = 0, time.monotonic() + GIVE_UP_S, list(MODULES)
+        while going and time.monotonic() < deadline:
             seq += 1
             publisher.put(Estop(t_ns=now_ns(), seq=seq, source=source))
+            time.sleep(REPEAT_S)
             for module, latest in states.items():
                 state = latest.take()
                 if state is not None:
                     modes[module] = state.mode
-            going = [m for m in MODULES if modes.get(m) not in STOPPED and not has_sunk(run_dir, m)]
-            if not going:
-                return []
-            time.sleep(REPEAT_S)
+            going = [
+                m for m in going if modes.get(m) not in STOPPED and not _is_stopped(run_dir, m)
+            ]
     return [f"{m} {Mode(modes[m]).name if m in modes else 'silent'}" for m in going]

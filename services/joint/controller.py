@@ -6,7 +6,6 @@ lockstep under virtual time, and in re-execution from a log.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import msgspec
@@ -19,7 +18,7 @@ from services.joint.failsafe import Event, Failsafe, timing_of
 from services.joint.gate import diamond, gate, limits_of
 from services.joint.law import Setpoint
 from services.joint.memory import ControllerMemory
-from services.joint.neighbours import NOTHING, Near
+from services.joint.neighbours import NOTHING, Near, Row
 from services.joint.samples import Samples
 from services.joint.sinking import Sinking
 from services.joint.trips import Trips
@@ -164,6 +163,11 @@ class JointController:
         return self._samples
 
     @property
+    def caught(self) -> bool:
+        """True for a knee in DAMP that does not sink any more for the others' sake."""
+        return self._sinking.caught
+
+    @property
     def cause(self) -> Cause:
         """Why the mode was last changed."""
         return Cause(self._cause)
@@ -213,7 +217,7 @@ class JointController:
             self._changed_ns,
             self._last_cycle_ns,
             self._found_tau,
-            self._sinking.stop if math.isfinite(self._sinking.stop) else None,
+            self._sinking.remember().stop,
             self._cause,
             self.tau,
             self.cycle,
@@ -224,8 +228,7 @@ class JointController:
             self._resumed_ns,
             self._braced_ns,
             msgspec.structs.replace(self._trips),
-            self._sinking.upright,
-            self._sinking.held,
+            self._sinking.remember(),
         )
 
     def recall(self, memory: ControllerMemory) -> None:
@@ -236,12 +239,11 @@ class JointController:
         self._anchor, self._setpoint = m.anchor, m.setpoint
         self._changed_ns, self._last_cycle_ns = m.changed_ns, m.last_cycle_ns
         self._found_tau, self._cause, self.tau = m.found_tau, m.cause, m.tau
-        self._sinking.stop = -math.inf if m.damp_stop is None else m.damp_stop
+        self._sinking.recall(msgspec.structs.replace(m.sinking, stop=m.damp_stop))
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
         self._residual, self._resumed_ns = m.residual, m.resumed_ns
         self._braced_ns = m.braced_ns
         self._trips = msgspec.structs.replace(m.trips)
-        self._sinking.upright, self._sinking.held = m.upright, m.held
 
     def inside_limits(self) -> bool:
         """Return True if the joint was last seen inside its soft stops."""
@@ -328,3 +330,9 @@ class JointController:
             tau_before=tau_before,
             tau_after=self.tau,
         )
+
+
+def row_of(controller: JointController) -> Row:
+    """Return what the module's neighbours are told."""
+    samples, mode = controller.samples, controller.failsafe.mode
+    return Row(samples.believed_ns, samples.q[1], samples.v[1], mode, int(controller.caught))

@@ -7,9 +7,10 @@ from typing import Final
 
 import msgspec
 
+from services.joint.controller import row_of
 from services.joint.drivers.base import Drive
 from services.joint.module import ARM_TRIES, Module, Obstacle, Order, Step
-from services.joint.neighbours import NOTHING, Neighbours, Row
+from services.joint.neighbours import NOTHING, Neighbours
 from services.joint.tracer import Tracer
 from services.joint.will import Will, WillFile
 from shared import log
@@ -115,8 +116,7 @@ class JointLoop:
         self._write(step)
         controller = module.controller
         if self._neighbours is not None:
-            samples, mode = controller.samples, controller.failsafe.mode
-            self._neighbours.write(Row(samples.believed_ns, samples.q[1], samples.v[1], mode))
+            self._neighbours.write(row_of(controller))
         if controller.cycle % self._state_every == 0:
             ports.states.put(controller.state(now))
         if step.event is not None:

@@ -12,6 +12,7 @@ from services.joint.drivers.base import MotorTarget
 from services.joint.failsafe import Failsafe
 from services.joint.law import Setpoint
 from services.joint.samples import Samples
+from services.joint.sinking import SinkingMemory
 from services.joint.trips import Trips
 from services.joint.will import Will
 from shared.messages import Pair
@@ -28,7 +29,7 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     last_cycle_ns: int
     found_tau: Pair | None
     damp_stop: float | None
-    """None: there is no stop (JSON has no infinity)."""
+    """Of logs from before `sinking`, which has it; None: there is none."""
     cause: int
     tau: Pair
     cycle: int
@@ -39,9 +40,7 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     resumed_ns: int = 0
     braced_ns: int = 0
     trips: Trips = msgspec.field(default_factory=Trips)
-    upright: float | None = None
-    held: float | None = None
-    """These two of `Sinking`."""
+    sinking: SinkingMemory = SinkingMemory()
 
 
 class ModuleMemory(msgspec.Struct, frozen=True):

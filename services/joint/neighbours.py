@@ -25,14 +25,15 @@ from shared.joints import MODULES, N_MODULES, kind_of
 from shared.messages import Mode, Pair
 
 STALE_NS: Final = 20 * NS_PER_MS
-"""What is older was written by a service that is no more, or about a drive that is not heard."""
-_ROW: Final = struct.Struct("<QQddQ")
-"""A number that is odd while it is written, time in ns, angle in rad, rate in rad/s, mode."""
+"""Of an angle: what is older says nothing of where the joint is now."""
+GONE_NS: Final = 100 * NS_PER_MS
+"""What is older was written by a service that is no more, or about a drive that is lost."""
+_ROW: Final = struct.Struct("<QQddQQ")
+"""A number that is odd while it is written, then a `Row`."""
 _NUMBER: Final = struct.Struct("<Q")
 _LEG: Final = N_MODULES // 2
 """From a module to its like of the other leg."""
 _SIZE: Final = N_MODULES * _ROW.size
-_DOWN: Final = (Mode.FAULT, Mode.DISARMED)
 
 
 class Row(NamedTuple):
@@ -46,6 +47,8 @@ class Row(NamedTuple):
     """rad/s"""
     mode: int
     """`Mode`."""
+    caught: int = 0
+    """1: a knee that does not sink any more."""
 
 
 class Near(NamedTuple):
@@ -83,14 +86,21 @@ def near(module: str, rows: Sequence[Row | None], now_ns: int) -> Near:
         return Near((sum(row.theta for row in known), sum(row.rate for row in known)), sinks)
     if kind == "knee":
         other, ankles = rows[(own + _LEG) % N_MODULES], (rows[0], rows[_LEG])
-        was_known = other is not None and other.t_ns > 0
-        stays = other is not None and (not _is_fresh(other, now_ns) or other.mode in _DOWN)
-        return Near(sinks=not (was_known and stays) and not any(map(_is_limp, ankles)))
+        stays = other is not None and _stays(other, now_ns)
+        return Near(sinks=not stays and not any(map(_is_limp, ankles)))
     return NOTHING
 
 
 def _is_fresh(row: Row, now_ns: int) -> bool:
-    return 0 <= now_ns - row.t_ns <= STALE_NS
+    """Return True if a row tells of now; it may be newer than the clock was read."""
+    return abs(now_ns - row.t_ns) <= STALE_NS
+
+
+def _stays(row: Row, now_ns: int) -> bool:
+    """Return True if a knee that was heard of once does not sink."""
+    if row.t_ns == 0 or row.t_ns > now_ns + STALE_NS:
+        return False  # of another host, or its clock
+    return now_ns - row.t_ns > GONE_NS or row.mode != Mode.DAMP or row.caught > 0
 
 
 def _is_limp(row: Row | None) -> bool:
@@ -115,6 +125,17 @@ class Neighbours:
         memory, at = self._memory, self._at
         _ROW.pack_into(memory, at, self._written - 1, *row)
         _NUMBER.pack_into(memory, at, self._written)  # even again: whole
+
+    @staticmethod
+    def mode_of(run_dir: Path, module: str) -> Mode | None:
+        """Return what a module's service on this host wrote last; None if there was none."""
+        try:
+            with path_of(run_dir).open("rb") as file:
+                file.seek(MODULES.index(module) * _ROW.size)
+                number, *row = _ROW.unpack(file.read(_ROW.size))
+        except (FileNotFoundError, struct.error):
+            return None
+        return Mode(Row(*row).mode) if number else None
 
     def near(self, now_ns: int) -> Near:
         """Return what this module knows of the others."""

@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import msgspec
+
 from services.joint import law
 from services.joint.law import Setpoint
 from services.joint.neighbours import Near
@@ -20,8 +22,23 @@ from shared.config import RobotConfig
 from shared.joints import kind_of
 from shared.messages import Pair
 
+DOUBT_NS: Final = 100 * NS_PER_MS
+"""A stop does not reach all six in the same cycle, and services pause: a module that holds for the
+others' sake has had reason to for so long."""
 LEVEL_MAX: Final = 0.1
 """rad; a torso that is farther off is brought back no harder than that."""
+
+
+class SinkingMemory(msgspec.Struct, frozen=True):
+    """State of `Sinking`."""
+
+    stop: float | None = None
+    """None: there is no stop (JSON has no infinity)."""
+    upright: float | None = None
+    held: float | None = None
+    below: float | None = None
+    caught: bool = False
+    doubt_ns: int = -1
 
 
 class Sinking:
@@ -31,6 +48,9 @@ class Sinking:
         stop: where a knee is caught, rad; -inf: nowhere.
         upright: how the torso stood as it began, the leg's thetas together, rad; None: not known.
         held: where a hip holds beside a limp knee, rad; None: it does not.
+        below: how ankle and knee had turned when that was known last, rad; None: never.
+        caught: True if a knee does not sink any more for the others' sake.
+        doubt_ns: since when there is reason to, from the beginning on; -1: there is none.
     """
 
     def __init__(self, config: RobotConfig, module: str) -> None:
@@ -48,11 +68,15 @@ class Sinking:
         self.stop = service.damp_knee_stop if kind == "knee" else -math.inf
         self.upright: float | None = None
         self.held: float | None = None
+        self.below: float | None = None
+        self.caught = False
+        self.doubt_ns = -1
 
     def begin(self, setpoint: Setpoint, q: Pair) -> Setpoint:
         """Return what it starts from, of the setpoint in force until now and where the joint is."""
         self.stop = min(self.stop, q[1])
-        self.upright = self.held = None
+        self.upright = self.held = self.below = None
+        self.caught, self.doubt_ns = False, -1
         return law.carrying(setpoint, self._sinks, q)
 
     def law(self, anchor: Setpoint, since_ns: int, q: Pair, near: Near) -> Setpoint:
@@ -64,31 +88,53 @@ class Sinking:
             q: where the joint is, rad.
             near: what is known of the other modules.
         """
+        holds = self._is_to_hold(since_ns, near)
         share = max(0.0, 1.0 - since_ns / self._fade_ns)
         risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
         held = law.held(anchor, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
         held = law.stiffened(held, self._k_p, self._k_d, 1.0 - share)
         sunk = law.damped(held, self._sinks, self._damp_k_d, share, risen)
         if self._levels:
+            if holds and self.held is None:
+                self.held = q[1]
             return self._levelled(sunk, q[1], near, risen)
-        if self._stops and not near.sinks:
-            self.stop = max(self.stop, q[1])
+        if holds and self._stops and not self.caught:
+            self.caught, self.stop = True, max(self.stop, q[1])
         if q[1] < self.stop:
             return law.caught(sunk, self.stop, self._k_p[1], self._k_d[1])
         return sunk
 
+    def remember(self) -> SinkingMemory:
+        """Return the memory as it is now."""
+        stop = self.stop if math.isfinite(self.stop) else None
+        return SinkingMemory(stop, self.upright, self.held, self.below, self.caught, self.doubt_ns)
+
+    def recall(self, memory: SinkingMemory) -> None:
+        """Go on from a memory."""
+        self.stop = -math.inf if memory.stop is None else memory.stop
+        self.upright, self.held, self.below = memory.upright, memory.held, memory.below
+        self.caught, self.doubt_ns = memory.caught, memory.doubt_ns
+
+    def _is_to_hold(self, since_ns: int, near: Near) -> bool:
+        if near.sinks:
+            self.doubt_ns = -1
+            return False
+        if self.doubt_ns < 0:
+            self.doubt_ns = since_ns
+        return since_ns - self.doubt_ns >= DOUBT_NS
+
     def _levelled(self, sunk: Setpoint, theta: float, near: Near, risen: float) -> Setpoint:
-        """Return the law of a hip."""
-        if not near.sinks and self.held is None:
-            self.held = theta
+        """Return the law of a hip; a leg of which nothing is heard any more stays as it is."""
+        rate = 0.0
+        if near.below is not None:
+            self.below, rate = near.below
         if self.held is not None:
             wanted, rate = self.held, 0.0
-        elif near.below is not None:
-            below, its_rate = near.below
+        elif self.below is not None:
             if self.upright is None:
-                self.upright = below + theta
-            wanted, rate = self.upright - below, -its_rate
+                self.upright = self.below + theta
+            wanted = self.upright - self.below
         else:
             return sunk
         wanted = min(theta + LEVEL_MAX, max(theta - LEVEL_MAX, wanted))
-        return law.levelled(sunk, wanted, rate, risen * self._k_p[1])
+        return law.levelled(sunk, wanted, -rate, risen * self._k_p[1])

@@ -95,11 +95,3 @@ def ask_stop(run_dir: Path, module: str) -> bool:
         file.seek(_STOP)
         file.write(b"\x01")
     return True
-
-
-def has_sunk(run_dir: Path, module: str) -> bool:
-    """Return True if the module's service on this host has gone to DAMP."""
-    try:
-        return path_of(run_dir, module).read_bytes()[:1] == bytes([Will.DAMP])
-    except FileNotFoundError:
-        return False

@@ -172,8 +172,9 @@ class Planner:
         )
         self._source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
-        values = values_of(self._output, self._q, loads, self._lifted(now_ns))
-        self._trips.advance(now_ns, values, leads=not engagement.hold)
+        lifted, leads = self._lifted(now_ns), not engagement.hold
+        values = values_of(self._output, self._q, loads, lifted, leads=leads)
+        self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
         common = Common(now_ns, self._seq, self.session, self._hold(), self._output.local.margins)
         return commands_of(common, states, self._output, self._brace)

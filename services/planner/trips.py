@@ -87,7 +87,7 @@ class Trips:
         ]
         beyond[_UNLOADED] &= stands
         since_ns = tuple(
-            (since or now_ns) if is_beyond else 0
+            (since or now_ns) if is_beyond and leads else 0
             for since, is_beyond in zip(memory.since_ns, beyond, strict=True)
         )
         tripped, why = memory.tripped, memory.why
@@ -106,7 +106,12 @@ class Trips:
 
 
 def values_of(
-    output: LawOutput, q: Array, leg_loads: tuple[float, float], lifted: float | None
+    output: LawOutput,
+    q: Array,
+    leg_loads: tuple[float, float],
+    lifted: float | None,
+    *,
+    leads: bool,
 ) -> tuple[float, ...]:
     """Return what is judged, in the order of `PLANNER_TRIPS`.
 
@@ -115,6 +120,7 @@ def values_of(
         q: measured joint angles (12,), rad.
         leg_loads: N, of right and left leg (`Hocca.leg_loads`).
         lifted: upward force of the person on the robot, N, world; None: not known.
+        leads: the planner leads.
     """
     x, y, z = output.closure[:3].tolist()
     error = output.q_ref - q
@@ -122,8 +128,18 @@ def values_of(
         math.sqrt(x * x + y * y + z * z),
         output.ik_residual,
         max(float(error.max()), -float(error.min())),
-        min(leg_loads),
+        math.nan if any(map(math.isnan, leg_loads)) else min(leg_loads),
         abs(float(output.pdot[2])),
         abs(float(output.pdot[4])),
-        math.nan if lifted is None else abs(lifted + output.assist),
+        _otherwise(lifted, output.assist, leads=leads),
     )
+
+
+def _otherwise(lifted: float | None, assist: float, *, leads: bool) -> float:
+    """Return how far the person is carried otherwise than asked, N; NaN: not known.
+
+    In HOLD nobody is given what was asked for: only a load beyond it, or a pull upwards, counts.
+    """
+    if lifted is None:
+        return math.nan
+    return abs(lifted + assist) if leads else max(-lifted - assist, lifted)

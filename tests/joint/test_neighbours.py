@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from services.joint.neighbours import (
+    GONE_NS,
     NOTHING,
     STALE_NS,
     Near,
@@ -32,7 +33,7 @@ def test_a_hip_knows_how_its_own_leg_has_turned() -> None:
     assert near("hip_left", rows(), T0) == Near(pytest.approx((0.3 + 0.4, 0.03 + 0.04)))
 
 
-@pytest.mark.parametrize("age_ns", [-1, STALE_NS + 1])
+@pytest.mark.parametrize("age_ns", [-STALE_NS - 1, STALE_NS + 1])
 @pytest.mark.parametrize("kind", ["ankle", "knee"])
 def test_what_is_old_or_of_another_clock_is_not_known(kind: str, age_ns: int) -> None:
     name = f"{kind}_left"
@@ -52,20 +53,25 @@ def test_what_is_being_written_or_never_was_is_not_known(kind: str) -> None:
 
 
 def test_who_holds_beside_whom() -> None:
-    """Each module against each other's mode and age."""
-    for asks, other, mode, dead in product(MODULES, MODULES, Mode, (False, True)):
+    """Each module against each other's mode, age and whether it is caught."""
+    ages = (-STALE_NS, -1, 0, GONE_NS, GONE_NS + 1)
+    for asks, other, mode, age_ns, caught in product(MODULES, MODULES, Mode, ages, (0, 1)):
         if asks == other:
             continue
-        t_ns = T0 - STALE_NS - 1 if dead else T0
-        found = near(asks, rows(**{other: Row(t_ns, 0.0, 0.0, mode)}), T0)
+        found = near(asks, rows(**{other: Row(T0 - age_ns, 0.0, 0.0, mode, caught)}), T0)
         pair = kind_of(asks), kind_of(other)
         limp = mode is Mode.FAULT
         holds = (
-            (pair == ("knee", "knee") and (dead or mode in (Mode.FAULT, Mode.DISARMED)))
+            (pair == ("knee", "knee") and (age_ns > GONE_NS or mode != Mode.DAMP or caught == 1))
             or (pair == ("knee", "ankle") and limp)
             or (pair == ("hip", "knee") and limp)
         )
-        assert found.sinks is not holds, (asks, other, mode, dead)
+        assert found.sinks is not holds, (asks, other, mode, age_ns, caught)
+
+
+def test_a_clock_far_ahead_is_of_another_host() -> None:
+    ahead = rows(knee_left=Row(T0 + STALE_NS + 1, 0.0, 0.0, Mode.HOLD))
+    assert near("knee_right", ahead, T0).sinks
 
 
 @pytest.fixture
@@ -73,14 +79,16 @@ def six(tmp_path: Path) -> dict[str, Neighbours]:
     return {name: Neighbours(tmp_path, name) for name in MODULES}
 
 
-def test_what_one_writes_the_others_read(six: dict[str, Neighbours]) -> None:
+def test_what_one_writes_the_others_read(tmp_path: Path, six: dict[str, Neighbours]) -> None:
+    assert Neighbours.mode_of(tmp_path, "hip_left") is None
     for cycle in range(300):  # the number's low byte goes round
         for i, name in enumerate(MODULES):
             six[name].write(Row(T0 + cycle, 0.1 * i + cycle, 0.01 * i, Mode.DAMP))
         assert six["hip_left"].near(T0 + cycle) == Near(pytest.approx((0.7 + 2 * cycle, 0.07)))
     assert six["ankle_left"].near(T0) == NOTHING
     assert six["knee_left"].near(T0 + 299).sinks
-    assert not six["knee_left"].near(T0 + 300 + STALE_NS).sinks, "the others are dead"
+    assert not six["knee_left"].near(T0 + 300 + GONE_NS).sinks, "the others are dead"
+    assert Neighbours.mode_of(tmp_path, "hip_left") is Mode.DAMP
 
 
 def test_a_row_that_its_writer_died_over_is_not_read(

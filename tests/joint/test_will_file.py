@@ -9,7 +9,7 @@ from typing import cast
 import pytest
 
 from services.joint import neighbours
-from services.joint.will import Will, WillFile, ask_stop, forget, has_sunk, path_of
+from services.joint.will import Will, WillFile, ask_stop, forget, path_of
 from tools import kill
 from tools.supervision import fleet as fleets
 from tools.supervision import procfs, supervise
@@ -113,14 +113,6 @@ def test_a_stop_is_seen_by_a_process_that_has_it_mapped_until_it_is_forgotten(
 def test_where_no_service_is_nothing_is_stopped(tmp_path: Path) -> None:
     assert not ask_stop(tmp_path, MODULE)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("will", list(Will))
-def test_only_what_sank_has_sunk(tmp_path: Path, file: WillFile, will: Will) -> None:
-    file.write(will)
-    ask_stop(tmp_path, MODULE)
-    assert has_sunk(tmp_path, MODULE) is (will is Will.DAMP)
-    assert not has_sunk(tmp_path, "ankle_left")
 
 
 def test_a_file_of_one_byte_is_read_as_before(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import Mode
-from shared.scenario import Fault, Keyframe, Kill
+from shared.scenario import Fault, Keyframe, Kill, Restart
 from tests.lockstep.runs import still
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants
@@ -88,10 +88,11 @@ def stop(
     plant: PlantConfig,
     kills: tuple[Kill, ...] = (),
     faults: tuple[Fault, ...] = (),
+    restarts: tuple[Restart, ...] = (),
 ) -> Stopped:
     """Lead to a pose in 3 s, let go and stop at 3.8 s; go on for 10 s."""
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=3.0, height=height, pitch=pitch))
-    told = still(14.0, kill=kills, fault=faults, push=())
+    told = still(14.0, kill=kills, restart=restarts, fault=faults, push=())
     told = msgspec.structs.replace(told, keyframe=frames)
     fleet = Lockstep(robot, told, plant=plant)
     pitches, heights = [], []
@@ -147,3 +148,52 @@ def test_it_does_not_fall_with_an_ankle_or_a_hip_limp(robot: RobotConfig, limp: 
     found = stop(robot, 1.0, 0.0, PlantConfig(), faults=(fault,))
     assert not found.fell
     assert found.turned < 0.1
+
+
+@pytest.mark.parametrize("freezes_s", [0.05, 0.3])
+def test_a_knee_that_pauses_on_the_way_down_tips_nothing(
+    robot: RobotConfig, freezes_s: float
+) -> None:
+    """After a long pause both knees hold where they are; after a short one both sink."""
+    pause = (Kill(service="knee_left", at=4.5, signal="STOP"),)
+    goes_on = (Restart(service="knee_left", at=4.5 + freezes_s),)
+    found = stop(robot, 1.0, 0.0, PlantConfig(), kills=pause, restarts=goes_on)
+    assert not found.fell
+    assert found.turned < 0.1
+    assert (found.sank > 0.1) is (freezes_s < 0.1)
+
+
+def test_a_knee_that_crashes_on_the_way_down_and_is_started_again_tips_nothing(
+    robot: RobotConfig,
+) -> None:
+    crash = (Kill(service="knee_left", at=4.5),)
+    again = (Restart(service="knee_left", at=5.2),)
+    found = stop(robot, 1.0, 0.0, PlantConfig(), kills=crash, restarts=again)
+    assert not found.fell
+    assert found.turned < 0.1
+
+
+@pytest.mark.parametrize("dead", ["ankle_left", "knee_right"])
+def test_a_hip_whose_leg_falls_silent_on_the_way_down_goes_on_without_a_step(
+    robot: RobotConfig, dead: str
+) -> None:
+    found = stop(
+        robot,
+        1.0,
+        0.0,
+        changed(PlantConfig(), COM_BACK_AND_UP),
+        kills=(Kill(service=dead, at=6.0),),
+    )
+    assert not found.fell
+    assert found.turned < 0.15
+
+
+def test_a_stop_that_not_all_hear_tips_nothing(robot: RobotConfig) -> None:
+    """One knee sank beside one that held."""
+    fleet = Lockstep(robot, still(10.0, 1.0))
+    for truth in fleet.run():
+        if truth.scenario_s >= 4.0:
+            fleet.world.let_go()
+            for name, module in zip(MODULES, fleet._modules, strict=True):
+                module._estop = name != "knee_left"
+        assert not truth.fallen

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -11,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.will import has_sunk
+from services.joint.neighbours import Neighbours
 from shared import topics
 from shared.bus import open_session
 from shared.config import RobotConfig
@@ -80,7 +82,7 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
         done = xrl("estop", "--local", run_dir=run_dir)
         assert done.returncode == 0, done.stdout + done.stderr
         assert "all six modules are stopped" in done.stdout
-        assert all(has_sunk(run_dir, module) for module in MODULES)
+        assert {Neighbours.mode_of(run_dir, module) for module in MODULES} == {Mode.DAMP}
         wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.DAMP))
         before, after = truth(robot, run_dir), truth(robot, run_dir, wait_s=6.0)
         assert not after.fallen
@@ -91,6 +93,22 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
         waiting = Mode.DISARMED  # its drive holds, and is taken over once a planner is heard
         wait_for_modes(robot, run_dir, others | {"hip_left": waiting})
     finally:
+        fleet.stop()
+
+
+def test_it_needs_no_supervisor(run_dir: Path, robot: RobotConfig) -> None:
+    """With the supervisor hung the bus way ends in an error; by then the six have been asked."""
+    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
+    pid = int(fleet.run.supervisor_pid.read_text(encoding="utf-8"))
+    try:
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.HOLD))
+        os.kill(pid, signal.SIGSTOP)
+        done = xrl("estop", run_dir=run_dir)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "not over the bus" in done.stderr
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.DAMP))
+    finally:
+        os.kill(pid, signal.SIGCONT)
         fleet.stop()
 
 

@@ -293,7 +293,7 @@ class Lockstep:
                 continue
             drive, host_ns = self._drives[index], self._clocks[index].read(now)
             given = (host_ns, drive.read(host_ns), self._commands[index].take(now), self.estop)
-            near = near_to(index, now, self._modules, self._clocks)
+            near = near_to(index, now, self._modules, self._clocks, self._dead)
             step = module.step(*given, near)
             drive.carry_out(step, onboard=module.onboard)
             if step.event is not None:

@@ -19,6 +19,8 @@ from tools.runs.run_log import RunLog
 
 Array = NDArray[np.float64]
 
+BREAK_S: Final = 0.05
+"""Of states: after a longer one nothing is known of what was in between."""
 SINK_OVER_S: Final = 0.1
 """A sole's touch or a blow is faster, and no sinking."""
 _HELD: Final = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
@@ -64,6 +66,8 @@ def shaking_of(t_ns: NDArray[np.int64], tau: Array) -> Array:
     found = np.zeros_like(tau)
     dts = np.diff(t_ns, prepend=t_ns[0]) / NS_PER_S
     for index, (dt, now) in enumerate(zip(dts, tau, strict=True)):
+        if dt > BREAK_S:
+            slow, mean = now.copy(), np.zeros(2)
         slow += (1.0 - math.exp(-2.0 * math.pi * SHAKE_ABOVE_HZ * dt)) * (now - slow)
         mean += (1.0 - math.exp(-dt / SHAKE_S)) * ((now - slow) ** 2 - mean)
         found[index] = mean
@@ -72,10 +76,12 @@ def shaking_of(t_ns: NDArray[np.int64], tau: Array) -> Array:
 
 def _longest_s(t_ns: NDArray[np.int64], true: NDArray[np.bool_]) -> float:
     """Return the longest time without a break, s."""
-    longest_ns, since_ns = 0, -1
+    longest_ns, since_ns, last_ns = 0, -1, 0
     for at_ns, is_true in zip(t_ns.tolist(), true.tolist(), strict=True):
-        if not is_true:
+        broken, last_ns = at_ns - last_ns > BREAK_S * NS_PER_S, at_ns
+        if broken or not is_true:
             since_ns = -1
+        if not is_true:
             continue
         since_ns = at_ns if since_ns < 0 else since_ns
         longest_ns = max(longest_ns, at_ns - since_ns)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
+from services.joint.controller import row_of
 from services.joint.module import Module
-from services.joint.neighbours import NOTHING, Near, Row, near
+from services.joint.neighbours import NOTHING, Near, near
 from shared.joints import MODULES
 from tools.runs.host_clock import HostClock
 
 
 def near_to(
-    index: int, now_ns: int, modules: Sequence[Module], clocks: Sequence[HostClock]
+    index: int,
+    now_ns: int,
+    modules: Sequence[Module],
+    clocks: Sequence[HostClock],
+    dead: Container[str],
 ) -> Near:
     """Return what a module knows of the others.
 
@@ -20,13 +25,13 @@ def near_to(
         now_ns: virtual time.
         modules: all six; one whose service is dead has no new samples.
         clocks: of their hosts: each writes virtual time, as if all six were on one.
+        dead: services that are no more, though their rows are still there.
     """
     if not modules[index].asks_near:
         return NOTHING
     rows = []
-    for module, clock in zip(modules, clocks, strict=True):
-        controller = module.controller
-        samples, late_ns = controller.samples, clock.read(now_ns) - now_ns
-        t_ns = samples.believed_ns - late_ns if samples.believed_ns else 0
-        rows.append(Row(t_ns, samples.q[1], samples.v[1], controller.failsafe.mode))
+    for name, module, clock in zip(MODULES, modules, clocks, strict=True):
+        row, late_ns = row_of(module.controller), clock.read(now_ns) - now_ns
+        t_ns = row.t_ns - late_ns if row.t_ns else int(name in dead)
+        rows.append(row._replace(t_ns=t_ns))
     return near(MODULES[index], rows, now_ns)
