@@ -19,7 +19,7 @@ from tests.lockstep.runs import still
 from tools import cli
 from tools.runs import verdict, verdict_table
 from tools.runs.run_log import read_run
-from tools.runs.soundness import shaking_of
+from tools.runs.soundness import _longest_s, shaking_of
 from tools.runs.standing import why_not_standing
 
 
@@ -94,3 +94,11 @@ def test_hard_pushes_are_told(tmp_path: Path, robot: RobotConfig) -> None:
     cli.main(["sim", "--duration", "2", "--push", words, "--out", str(tmp_path)])
     summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 2.0)
     assert summary["torque_at_limit_ms"] > 50.0
+
+
+def test_nothing_is_said_of_a_gap_in_the_log() -> None:
+    """A service that was dead for 2 s between two torques at the limit."""
+    t_ns = (1e9 * np.array([0.0, 0.004, 0.008, 2.0, 2.004])).astype(np.int64)
+    assert _longest_s(t_ns, np.ones(5, bool)) == pytest.approx(0.008)
+    tau = np.array([[10.0, 0.0]] * 3 + [[90.0, 0.0]] * 2)
+    assert shaking_of(t_ns, tau).max() == 0.0

@@ -53,6 +53,8 @@ def run(args: argparse.Namespace) -> int:
     run_dir: Path = args.run_dir
     here = _ask_here(run_dir)  # first: it needs no bus, no supervisor, nobody
     if args.local:
+        if not here:
+            raise FleetError(f"{run_dir}: no joint service of a fleet is on this host")
         going = _wait_here(run_dir, here)
     else:
         try:

@@ -24,7 +24,7 @@ is: half is on its theta.
 
 
 class LeftAlone:
-    """Of one module."""
+    """What one module's drive is left with."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
         """Take HOLD's gains."""

@@ -29,7 +29,7 @@ class ControllerMemory(msgspec.Struct, frozen=True):
     last_cycle_ns: int
     found_tau: Pair | None
     damp_stop: float | None
-    """Of logs from before `sinking`, which has it; None: there is none."""
+    """The knee's stop in DAMP, rad, also in logs from before `sinking`; None: there is none."""
     cause: int
     tau: Pair
     cycle: int

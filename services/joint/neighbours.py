@@ -25,7 +25,7 @@ from shared.joints import MODULES, N_MODULES, kind_of
 from shared.messages import Mode, Pair
 
 STALE_NS: Final = 20 * NS_PER_MS
-"""Of an angle: what is older says nothing of where the joint is now."""
+"""An older angle says nothing of where the joint is now."""
 GONE_NS: Final = 100 * NS_PER_MS
 """What is older was written by a service that is no more, or about a drive that is lost."""
 _ROW: Final = struct.Struct("<QQddQQ")
@@ -55,9 +55,9 @@ class Near(NamedTuple):
     """What a module knows of its neighbours."""
 
     below: Pair | None = None
-    """Of a hip: theta and rate of ankle and knee together, rad, rad/s; None: not known now."""
+    """For a hip: theta and rate of ankle and knee together, rad, rad/s; None: not known now."""
     sinks: bool = True
-    """Of a knee or a hip: False if the robot would tip were it not to hold where it is."""
+    """For a knee or a hip: False if the robot would tip were it not to hold where it is."""
 
 
 NOTHING: Final = Near()
@@ -133,9 +133,10 @@ class Neighbours:
             with path_of(run_dir).open("rb") as file:
                 file.seek(MODULES.index(module) * _ROW.size)
                 number, *row = _ROW.unpack(file.read(_ROW.size))
-        except (FileNotFoundError, struct.error):
+        except (OSError, struct.error):
             return None
-        return Mode(Row(*row).mode) if number else None
+        mode = Row(*row).mode
+        return Mode(mode) if number and mode in tuple(Mode) else None
 
     def near(self, now_ns: int) -> Near:
         """Return what this module knows of the others."""

@@ -29,7 +29,7 @@ from shared.messages import Pair
 SHAKE_ABOVE_HZ: Final = 8.0
 SHAKE_S: Final = 0.1
 AT_LIMIT: Final = 0.995
-"""Of the diamond: a motor there gives all it has."""
+"""Share of the torque diamond: a motor there gives all it has."""
 
 
 class TripLimits(msgspec.Struct, frozen=True):
@@ -76,7 +76,7 @@ class Trips(msgspec.Struct):
     """Since when the joint turns too fast; 0: it does not."""
 
     def rest(self, tau: Pair) -> None:
-        """Begin anew with what the drive carries, N m: nothing is judged before TRACK."""
+        """Begin again from the torque that the drive gives, N m: nothing is judged before TRACK."""
         self.slow, self.mean = tau, (0.0, 0.0)
         self.at_limit_ns = self.fast_ns = 0
 

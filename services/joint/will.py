@@ -9,7 +9,8 @@ So each writes down what it last was, and a person who asks for the module (`xrl
 `xrl up`) wipes it out.
 
 The second is the emergency stop of whoever is on the robot's own host (`xrl estop`): it is heard
-with the planner dead and every link of the bus cut, and stands until the module is asked for anew.
+with the planner dead and every link of the bus cut, and stays in force until a person starts the
+module again.
 
 A mapped file: reading and writing it are loads and stores, which the control path may do.
 """

@@ -11,8 +11,8 @@ What no joint service can see by itself (`shared.trip_table`; limits: [trips] of
     harness    the person is carried far otherwise than was asked for
 
 Judged while it leads, `unloaded` once both legs have borne the torso: on the hoist neither does. It
-ends when all of it has been within its limits for `CALM_NS`, and counts
-as a drop-out (`services.planner.engagement`): what trips again and again is led ever more rarely.
+ends when all of it has been within its limits for `CALM_NS`, and counts as a drop-out
+(`services.planner.engagement`): what trips again and again is led ever more rarely.
 """
 
 from __future__ import annotations

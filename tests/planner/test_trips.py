@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from services.planner.hocca import LawOutput
 from services.planner.kinematics import Kinematics, leg_loads
-from services.planner.trips import CALM_NS, Trips
+from services.planner.trips import CALM_NS, Trips, values_of
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.messages import Trip
@@ -150,3 +151,46 @@ def test_a_straight_leg_tells_nothing() -> None:
     right, left = leg_loads(C, np.arange(12.0))
     assert math.isnan(right)
     assert left == 8.0
+
+
+def output_of(assist: float) -> LawOutput:
+    """Return what a law at rest says, with an assist force, N."""
+    zeros = dict.fromkeys(LawOutput._fields, np.zeros(12))
+    return LawOutput(**(zeros | {"assist": assist, "ik_residual": 0.0}))  # type: ignore[arg-type]
+
+
+HARNESS = TRIPS.index(Trip.HARNESS)
+UNLOADED = TRIPS.index(Trip.UNLOADED)
+
+
+@pytest.mark.parametrize(
+    ("lifted", "assist", "leads", "found"),
+    [
+        (-200.0, 200.0, True, 0.0),
+        (0.0, 200.0, True, 200.0),
+        (0.0, 200.0, False, 0.0),
+        (-300.0, 100.0, True, 200.0),
+        (-300.0, 100.0, False, 200.0),
+        (160.0, 0.0, False, 160.0),
+    ],
+)
+def test_in_hold_only_a_load_beyond_what_was_asked_or_a_pull_upwards_counts(
+    lifted: float, assist: float, leads: bool, found: float
+) -> None:
+    """A wish of 200 N with nobody there tripped for ever."""
+    values = values_of(output_of(assist), np.zeros(12), (200.0, 200.0), lifted, leads=leads)
+    assert values[HARNESS] == pytest.approx(found)
+
+
+def test_what_lasted_before_it_led_does_not_count(robot: RobotConfig) -> None:
+    trips, values = Trips(robot), beyond(robot, Trip.HARNESS)
+    for tick in range(500):
+        trips.advance(T0 + tick * TICK_NS, values, leads=False)
+    trips.advance(T0 + 500 * TICK_NS, values, leads=True)
+    assert trips.tripped is Trip.NONE
+
+
+@pytest.mark.parametrize("loads", [(math.nan, 5.0), (5.0, math.nan)])
+def test_with_one_leg_unknown_none_is_unloaded(loads: tuple[float, float]) -> None:
+    values = values_of(output_of(0.0), np.zeros(12), loads, None, leads=True)
+    assert math.isnan(values[UNLOADED])

@@ -48,6 +48,7 @@ KINDS: Final = {
     RunEventKind.STARTED: "note",
     RunEventKind.FINISHED: "note",
 }
+_USUAL: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
 
 
 def happenings(source: Source) -> list[Happening]:
@@ -221,7 +222,7 @@ def _planner(source: Source) -> Iterator[Happening]:
         before, after = rows[index - 1], rows[index]
         fresh = " in a new session" if before.session != after.session else ""
         text = f"planner: {_word(PlannerMode, before.mode)} to {_word(PlannerMode, after.mode)}"
-        bad = after.mode >= PlannerMode.OVERLOADED
+        bad = after.mode not in _USUAL
         yield Happening(float(t[index]), "bad" if bad else "note", text + fresh)
     for index in _changes([row.wait_s > 0.0 for row in rows]):
         if rows[index].wait_s >= WAIT_S:
