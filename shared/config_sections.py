@@ -262,6 +262,7 @@ class TripsConfig(Section, frozen=True):
     sinking: TripLimit = TripLimit(limit=0.8, after_ms=100.0)
     turning: TripLimit = TripLimit(limit=2.5, after_ms=100.0)
     harness: TripLimit = TripLimit(limit=150.0, after_ms=200.0)
+    sagging: TripLimit = TripLimit(limit=10.0, after_ms=10.0)
 
 
 class PlannerConfig(Section, frozen=True):

@@ -64,6 +64,7 @@ class Trip(IntEnum):
     SINKING = 5
     TURNING = 6
     HARNESS = 7
+    SAGGING = 8
 
 
 class Outside(IntEnum):

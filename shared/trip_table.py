@@ -70,6 +70,10 @@ PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
         "harness", "the person is carried otherwise than asked", "N",
         "take weight off the harness, or ask for more assist",
     ),
+    Trip.SAGGING: TripRow(
+        "sagging", "the person sinks with weight on the harness", "W",
+        "let the person stand up; ask for more assist, or lead down more slowly",
+    ),
 }  # fmt: skip
 """By the planner, while it leads. It leads again once all is within its limits for a second."""
 

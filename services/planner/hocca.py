@@ -231,6 +231,14 @@ class Hocca:
         """
         return leg_loads(self._measured.C, tau)
 
+    def harness_rate(self, v: Array) -> float:
+        """Return the vertical rate of the harness point at the last tick's pose, m/s, world.
+
+        Args:
+            v: joint rates (12,), rad/s.
+        """
+        return float(self._measured.J_harness[2] @ v)
+
     def remember(self) -> LawMemory:
         """Return the memory as it is now."""
         return LawMemory(

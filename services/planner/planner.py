@@ -173,7 +173,8 @@ class Planner:
         self._source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
-        values = values_of(self._output, self._q, loads, lifted, leads=leads)
+        rate = self._law.harness_rate(self._v)
+        values = values_of(self._output, self._q, loads, lifted, rate, leads=leads)
         self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
         common = Common(now_ns, self._seq, self.session, self._hold(), self._output.local.margins)

@@ -9,6 +9,8 @@ What no joint service can see by itself (`shared.trip_table`; limits: [trips] of
     sinking    COM and torso move faster than a person leads
     turning
     harness    the person is carried far otherwise than was asked for
+    sagging    the person presses the robot down faster than a lead does: the power of the load
+               beyond assist and lead, as it sinks
 
 Judged while it leads, `unloaded` once both legs have borne the torso: on the hoist neither does. It
 ends when all of it has been within its limits for `CALM_NS`, and counts as a drop-out
@@ -33,6 +35,10 @@ from shared.trip_table import PLANNER_TRIPS, limits_of
 Array = NDArray[np.float64]
 
 CALM_NS: Final = NS_PER_S
+LEADING_LOAD: Final = 40.0
+"""N: so hard a hand presses that leads down, by 0.4 m in 2 s."""
+LET_DOWN_RATE: Final = 0.25
+"""m/s: so fast a person who sags may be let down."""
 LOADED: Final = 3.0
 """Times the least load: a robot both of whose legs bear so much stands."""
 
@@ -110,6 +116,7 @@ def values_of(
     q: Array,
     leg_loads: tuple[float, float],
     lifted: float | None,
+    harness_rate: float,
     *,
     leads: bool,
 ) -> tuple[float, ...]:
@@ -120,6 +127,7 @@ def values_of(
         q: measured joint angles (12,), rad.
         leg_loads: N, of right and left leg (`Hocca.leg_loads`).
         lifted: upward force of the person on the robot, N, world; None: not known.
+        harness_rate: at which the harness point rises, m/s, world.
         leads: the planner leads.
     """
     x, y, z = output.closure[:3].tolist()
@@ -132,6 +140,7 @@ def values_of(
         abs(float(output.pdot[2])),
         abs(float(output.pdot[4])),
         _otherwise(lifted, output.assist, leads=leads),
+        _pressing(lifted, output.assist, harness_rate, leads=leads),
     )
 
 
@@ -143,3 +152,13 @@ def _otherwise(lifted: float | None, assist: float, *, leads: bool) -> float:
     if lifted is None:
         return math.nan
     return abs(lifted + assist) if leads else max(-lifted - assist, lifted)
+
+
+def _pressing(lifted: float | None, assist: float, rate: float, *, leads: bool) -> float:
+    """Return the power with which the person presses the robot down, W; NaN: not known.
+
+    In HOLD nothing sinks: what the load would have at `LET_DOWN_RATE` were it led.
+    """
+    if lifted is None:
+        return math.nan
+    return max(0.0, -lifted - assist - LEADING_LOAD) * (max(0.0, -rate) if leads else LET_DOWN_RATE)

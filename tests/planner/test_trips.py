@@ -18,7 +18,7 @@ from tests.planner.conftest import Closed
 
 T0 = 5_000_000_000
 TICK_NS = 4 * NS_PER_MS
-CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0)
+CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0, 0.0)
 TRIPS = list(PLANNER_TRIPS)
 
 
@@ -61,7 +61,7 @@ def test_each_trips_once_it_has_lasted(robot: RobotConfig, trip: Trip) -> None:
 def test_what_comes_back_in_between_does_not(robot: RobotConfig, trip: Trip) -> None:
     trips, values = led(robot), beyond(robot, trip)
     for tick in range(1000):
-        now = CALM if tick % 10 == 9 else values
+        now = CALM if tick % 3 == 2 else values
         trips.advance(T0 + tick * TICK_NS, now, leads=True)
     assert trips.tripped is Trip.NONE
 
@@ -161,6 +161,7 @@ def output_of(assist: float) -> LawOutput:
 
 HARNESS = TRIPS.index(Trip.HARNESS)
 UNLOADED = TRIPS.index(Trip.UNLOADED)
+SAGGING = TRIPS.index(Trip.SAGGING)
 
 
 @pytest.mark.parametrize(
@@ -178,8 +179,27 @@ def test_in_hold_only_a_load_beyond_what_was_asked_or_a_pull_upwards_counts(
     lifted: float, assist: float, leads: bool, found: float
 ) -> None:
     """A wish of 200 N with nobody there tripped for ever."""
-    values = values_of(output_of(assist), np.zeros(12), (200.0, 200.0), lifted, leads=leads)
+    values = values_of(output_of(assist), np.zeros(12), (200.0, 200.0), lifted, 0.0, leads=leads)
     assert values[HARNESS] == pytest.approx(found)
+
+
+@pytest.mark.parametrize(
+    ("lifted", "rate", "leads", "watts"),
+    [
+        (-240.0, -0.1, True, 10.0),
+        (-240.0, 0.1, True, 0.0),
+        (-130.0, -0.3, True, 0.0),
+        (60.0, -0.3, True, 0.0),
+        (-240.0, 0.0, False, 25.0),
+        (-130.0, 0.0, False, 0.0),
+    ],
+)
+def test_sagging_is_the_power_of_a_load_beyond_assist_and_lead_as_it_sinks(
+    lifted: float, rate: float, leads: bool, watts: float
+) -> None:
+    """The assist is 100 N, a lead 40 N. In HOLD nothing sinks, and the load itself is judged."""
+    values = values_of(output_of(100.0), np.zeros(12), (200.0, 200.0), lifted, rate, leads=leads)
+    assert values[SAGGING] == pytest.approx(watts)
 
 
 def test_what_lasted_before_it_led_does_not_count(robot: RobotConfig) -> None:
@@ -192,5 +212,5 @@ def test_what_lasted_before_it_led_does_not_count(robot: RobotConfig) -> None:
 
 @pytest.mark.parametrize("loads", [(math.nan, 5.0), (5.0, math.nan)])
 def test_with_one_leg_unknown_none_is_unloaded(loads: tuple[float, float]) -> None:
-    values = values_of(output_of(0.0), np.zeros(12), loads, None, leads=True)
+    values = values_of(output_of(0.0), np.zeros(12), loads, None, 0.0, leads=True)
     assert math.isnan(values[UNLOADED])
