@@ -45,6 +45,11 @@ def chunk_record(first_ns: int, last_ns: int, content: bytes) -> bytes:
     return record(mcap.CHUNK, times + _text("zstd") + struct.pack("<Q", len(packed)) + packed)
 
 
+def without_schema(channel: bytes) -> bytes:
+    """Return a channel's record content with no schema named."""
+    return channel[:2] + b"\0\0" + channel[4:]
+
+
 def message_index_record(channel_id: int, rows: Iterable[tuple[int, int]]) -> bytes:
     """Return where in its chunk a channel's messages are, as (log time, offset)."""
     body = b"".join(struct.pack("<QQ", *row) for row in rows)

@@ -33,6 +33,8 @@ class Copy:
         self._channel_bodies: dict[int, bytes] = {}
         self._announced: set[tuple[int, int]] = set()
         """(opcode, id) of the schemas and channels that are in the copy already."""
+        self._schemaless: set[int] = set()
+        """Channels whose schema is lost."""
         self._loose: list[bytes] = []
         self._loose_size = 0
         self._per_channel: dict[int, int] = {}
@@ -118,10 +120,16 @@ class Copy:
                 self._schemas[number] = body
         elif opcode == mcap.CHANNEL:
             channel = mcap.channel(body)
-            known_schema = channel.schema_id == 0 or channel.schema_id in self._schemas
-            if known_schema and (anew or channel.id not in self.channels):
-                self.channels[channel.id] = channel
-                self._channel_bodies[channel.id] = body
+            if not anew and channel.id in self.channels:
+                return
+            if channel.schema_id and channel.schema_id not in self._schemas:
+                # its messages are kept: a reader would refuse a file that lacks a schema
+                body = encoding.without_schema(body)
+                self._schemaless.add(channel.id)
+            else:
+                self._schemaless.discard(channel.id)
+            self.channels[channel.id] = channel
+            self._channel_bodies[channel.id] = body
 
     def _announce(self) -> None:
         """Write schemas and channels that are not in the copy yet, before their messages."""
@@ -142,7 +150,8 @@ class Copy:
             return
         times = [row.log_ns for row in rows]
         right = (piece.chunk.first_ns, piece.chunk.last_ns) == (min(times), max(times))
-        if piece.whole and right and len(rows) == len(piece.rows):
+        described = len(rows) == len(piece.rows) and not self._schemaless
+        if piece.whole and right and described:
             self._write_chunk(piece.chunk, self._raw(piece.start, piece.end), rows)
         else:
             begin = MESSAGE_RECORD.size

@@ -134,6 +134,16 @@ def test_whatever_bytes_are_flipped_nothing_breaks_and_nothing_false_is_read(
         read(path)
 
 
+def test_messages_whose_schema_is_lost_are_kept(tmp_path: Path, finished: bytes) -> None:
+    """The schemas stand before the first chunk and in it; with both damaged all was lost."""
+    content = bytearray(finished)
+    content[content.index(b"xrl.JointState") - 6] ^= 0x40  # its number
+    content[content.index(b"zstd") + 60] ^= 0x01
+    path = tmp_path / "flipped.mcap"
+    path.write_bytes(content[: content.rindex(b"zstd")])
+    assert (counted(path), recovered(path)) == (110, 110)
+
+
 def test_a_flip_in_one_chunk_costs_no_other(tmp_path: Path, killed: Killed) -> None:
     data = killed.path.read_bytes()
     dice = random.Random(11)
