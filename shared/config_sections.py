@@ -174,6 +174,8 @@ class AssistConfig(Section, frozen=True):
     rate_max: Annotated[float, Range(1.0, 5000.0, "N/s")]
     integral_max: Annotated[float, Range(0.0, 100.0, "N")]
     integral_s: Annotated[float, Range(0.5, 60.0, "s")]
+    stale_ms: Annotated[float, Range(50.0, 10000.0, "ms")] = 500.0
+    fade_s: Annotated[float, Range(0.5, 60.0, "s")] = 5.0
 
 
 LocalStiffness = Annotated[float, Range(0.0, 1e4, "N m/rad")]

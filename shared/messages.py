@@ -344,6 +344,8 @@ class PlannerStatus(Message, frozen=True):
     """Why it does not lead, in words, where the mode does not say it all."""
     trip: int = 0
     """`Trip`: what it does not lead for."""
+    asked_by: str = ""
+    """`OperatorIntent.source` of the intent that is given now; "": none, or it has gone stale."""
 
 
 class OperatorIntent(Message, frozen=True):
@@ -354,6 +356,8 @@ class OperatorIntent(Message, frozen=True):
     shift: Vector4 = STRAIGHT
     """Where the closed directions are wanted, off a straight stand: COM x and y, m, the torso's
     roll and yaw, rad."""
+    source: str = ""
+    """Who asks, in words."""
 
 
 class Estop(Message, frozen=True):

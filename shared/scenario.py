@@ -150,6 +150,10 @@ class Scenario(Section, frozen=True):
     inject: tuple[Inject, ...] = ()
 
 
+SCENARIO: Final = "the scenario"
+"""Source of the intents that a scenario asks for."""
+
+
 class Lead(NamedTuple):
     """What the operator wants at a moment."""
 

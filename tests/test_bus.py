@@ -471,7 +471,7 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.ATTITUDE: (("imu",), ("planner", "recorder", TOOL)),
     topics.HARNESS_TARE: ((TOOL,), ("harness", "recorder")),
     topics.PLANNER_STATUS: (("planner",), ("recorder", TOOL)),
-    topics.OPERATOR_INTENT: (("simulator", TOOL), ("planner", "recorder", TOOL)),
+    topics.OPERATOR_INTENT: (("simulator", TOOL), ("planner", "simulator", "recorder", TOOL)),
     topics.ESTOP: (("planner", "harness", TOOL), (*MODULES, "planner", "recorder")),
     topics.SIM_TRUTH: (("simulator",), ("recorder", TOOL)),
     topics.SIM_CONTROL: ((TOOL,), ("simulator", "recorder")),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import msgspec
 
+from services.planner.intents import Intents
 from services.planner.planner import Planner
 from services.planner.remembrance import Remembrance
 from shared.bus import Latest, Publisher
@@ -48,6 +49,7 @@ class PlannerLoop:
         self._planner = planner
         self._ports = ports
         self._rest_ns = round(REST_SHARE * NS_PER_S / config.planner.rate_hz)
+        self._intents = Intents(config.assist)
         self._remembrance = Remembrance(config.planner.rate_hz)
 
     def run(self, stop: StopFlag) -> None:
@@ -80,8 +82,8 @@ class PlannerLoop:
             planner.hear_attitude(attitude, now)
         intent = ports.intent.take()
         if intent is not None:
-            planner.hear_assist(intent.assist_n)
-            planner.hear_shift(intent.shift)
+            self._intents.hear(intent, now)
+        planner.hear_wish(self._intents.wish(now))
         for publisher, command in zip(ports.commands, planner.tick(now), strict=False):
             publisher.put(command)
         ports.status.put(planner.status(now, (now_ns() - now) / NS_PER_US))

@@ -6,6 +6,7 @@ import msgspec
 
 from services.planner.bracing import Bracing
 from services.planner.engagement import Engagement
+from services.planner.intents import Wish
 from shared.joints import N_JOINTS
 from shared.messages import (
     AS_CONFIGURED,
@@ -91,7 +92,6 @@ class TickMemory(msgspec.Struct, frozen=True):
 
     states: tuple[JointState | None, ...]
     arrived_ns: tuple[int, ...]
-    assist_wanted: float
     wrench: Wrench | None
     wrench_ns: int
     wrench_seq: int
@@ -105,5 +105,5 @@ class TickMemory(msgspec.Struct, frozen=True):
     attitude: Attitude | None = None
     attitude_ns: int = 0
     attitude_seq: int = -1
-    shift_wanted: Vector4 = STRAIGHT
     trips: TripsMemory = TripsMemory()
+    wish: Wish = Wish()

@@ -6,8 +6,6 @@ re-execution from a log.
 
 from __future__ import annotations
 
-import math
-
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +15,7 @@ from services.planner.bracing import Brace, Bracing
 from services.planner.commands import Common, commands_of
 from services.planner.engagement import Engagement
 from services.planner.hocca import Hocca, LawOutput
+from services.planner.intents import Wish
 from services.planner.memory import TickMemory
 from services.planner.plausible import Plausible
 from services.planner.trips import Trips, values_of
@@ -24,7 +23,6 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import N_JOINTS, N_MODULES
 from shared.messages import (
-    STRAIGHT,
     Attitude,
     JointCommand,
     JointState,
@@ -32,7 +30,6 @@ from shared.messages import (
     PlannerStatus,
     SplitSource,
     Vector3,
-    Vector4,
     Vector6,
     Wrench,
 )
@@ -70,8 +67,7 @@ class Planner:
         self._q: Array = np.zeros(N_JOINTS)
         self._v: Array = np.zeros(N_JOINTS)
         self._tau: Array = np.zeros(N_JOINTS)
-        self._assist_wanted = 0.0
-        self._shift_wanted = STRAIGHT
+        self._wish = Wish()
         self._wrench: Wrench | None = None
         self._wrench_ns = 0
         self._wrench_stale_ns = round(config.harness.stale_ms * NS_PER_MS)
@@ -113,14 +109,9 @@ class Planner:
         self._attitude_seq = attitude.seq
         self._attitude, self._attitude_ns = attitude, now_ns
 
-    def hear_assist(self, assist: float) -> None:
-        """Take the assist force that the operator asks for, N."""
-        self._assist_wanted = assist
-
-    def hear_shift(self, shift: Vector4) -> None:
-        """Take where the operator asks x, y (m), roll and yaw (rad) to be."""
-        if all(math.isfinite(each) for each in shift):
-            self._shift_wanted = shift
+    def hear_wish(self, wish: Wish) -> None:
+        """Take what the person asks for now (`services.planner.intents`)."""
+        self._wish = wish
 
     def is_due(self, now_ns: int) -> bool:
         """Return True if it is time to tick: as soon as all six have a new state.
@@ -163,9 +154,9 @@ class Planner:
         self._output = self._law.tick(
             self._q,
             self._v,
-            self._assist_wanted,
+            self._wish.assist_n,
             dt,
-            shift_wanted=self._shift_wanted,
+            shift_wanted=self._wish.shift,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -185,7 +176,6 @@ class Planner:
         return TickMemory(
             tuple(self._states),
             tuple(self._arrived_ns),
-            self._assist_wanted,
             self._wrench,
             self._wrench_ns,
             self._wrench_seq,
@@ -199,8 +189,8 @@ class Planner:
             self._attitude,
             self._attitude_ns,
             self._attitude_seq,
-            self._shift_wanted,
             self._trips.remember(),
+            self._wish,
         )
 
     def recall(self, memory: TickMemory) -> None:
@@ -209,7 +199,7 @@ class Planner:
         for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
             if state is not None:
                 self.hear_state(module, state, arrived_ns)
-        self._assist_wanted, self._shift_wanted = m.assist_wanted, m.shift_wanted
+        self._wish = m.wish
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
         self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
         self._attitude_seq = m.attitude_seq
@@ -293,12 +283,13 @@ class Planner:
             tick_us=tick_us,
             state_seq=(seqs[0], seqs[1], seqs[2], seqs[3], seqs[4], seqs[5]),
             wrench_seq=self._wrench_seq,
-            assist_wanted_n=self._assist_wanted,
+            assist_wanted_n=self._wish.assist_n,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
             wait_s=0.0 if leads else self._engagement.wait_ns(now_ns) / NS_PER_S,
             attitude_seq=self._attitude_seq,
             slope=output.slope if output is not None else (0.0, 0.0),
-            shift_wanted=self._shift_wanted,
+            shift_wanted=self._wish.shift,
+            asked_by=self._wish.source,
             stance=stance,
             why=self._law.stance_refusal() or self._trips.why,
             trip=int(self._trips.tripped),

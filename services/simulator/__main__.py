@@ -84,6 +84,7 @@ def main() -> int:
             intent=session.publisher(topics.OPERATOR_INTENT, OperatorIntent),
             control=session.latest(topics.SIM_CONTROL, SimControl),
             state=session.publisher(topics.SIM_STATE, SimState),
+            asked=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
         )
         hubs = open_hubs(robot, arguments.run_dir, stack)
         bank = AxisBank(

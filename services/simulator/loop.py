@@ -20,10 +20,13 @@ from shared.clock import NS_PER_MS, NS_PER_S, now_ns, sleep_until
 from shared.config import RobotConfig
 from shared.messages import OperatorIntent, SimControl, SimTruth
 from shared.process import StopFlag
+from shared.scenario import SCENARIO
 from shared.topics import SIM_STATE
 from shared.traces import SimState
 
 INTENT_RATE_HZ = 50.0
+SILENT_INTENTS = 250
+"""Intents of the scenario left out after somebody else's last: until his has faded out."""
 STATE_RATE_HZ = SIM_STATE.rate_hz
 
 
@@ -34,6 +37,7 @@ class Ports(msgspec.Struct, frozen=True):
     intent: Publisher[OperatorIntent]
     control: Latest[SimControl]
     state: Publisher[SimState]
+    asked: Latest[OperatorIntent]
 
 
 class SimulatorLoop:
@@ -74,6 +78,7 @@ class SimulatorLoop:
         self._torque = bank.torque
         self._steps = 0
         self._intents = 0
+        self._unasked = 0
         self._lost_ns = 0
         self._start_ns = 0
         self._start_step = 0
@@ -121,12 +126,29 @@ class SimulatorLoop:
             self._states += 1
             ports.state.put(taken(world, self._bank, now_ns(), self._states))
         if steps % self._intent_every == 0:
-            self._intents += 1
-            wanted = world.lead()
-            intent = OperatorIntent(
-                t_ns=now_ns(), seq=self._intents, assist_n=wanted.assist, shift=wanted.shift
-            )
-            ports.intent.put(intent)
+            self._ask()
+
+    def _ask(self) -> None:
+        """Ask for what the scenario says, unless somebody else asks: then the person rests that."""
+        world, other = self._world, self._ports.asked.take()
+        if other is not None and other.source != SCENARIO:
+            self._unasked = 0
+            world.asked = other.assist_n, other.shift
+            return
+        self._unasked += 1
+        if world.asked is not None and self._unasked < SILENT_INTENTS:
+            return
+        world.asked = None
+        self._intents += 1
+        wanted = world.lead()
+        intent = OperatorIntent(
+            t_ns=now_ns(),
+            seq=self._intents,
+            assist_n=wanted.assist,
+            shift=wanted.shift,
+            source=SCENARIO,
+        )
+        self._ports.intent.put(intent)
 
     def _publish_truth(self) -> None:
         """Publish the truth, and look at what needs no more than its rate."""

@@ -19,7 +19,7 @@ from services.simulator.body import Body
 from services.simulator.hoist import Hoist
 from services.simulator.operator import HandForce, Operator, Wearer
 from shared.joints import JOINTS, N_LEG, SIDES
-from shared.messages import SimTruth, Vector3
+from shared.messages import SimTruth, Vector3, Vector4
 from shared.scenario import Lead, Scenario, lead, push_at
 
 Array = NDArray[np.float64]
@@ -71,6 +71,8 @@ class World:
         self._hand_on = scenario.hand
         self.hand = HandForce(0.0, 0.0)
         self.load_n = 0.0
+        self.asked: tuple[float, Vector4] | None = None
+        """Assist, N, and shift that somebody asks for in place of the scenario."""
         self.push: Vector3 = (0.0, 0.0, 0.0)
         self.harness_force: Vector3 = (0.0, 0.0, 0.0)
         """What the operator does to the torso at the harness point, N, torso axes."""
@@ -240,7 +242,8 @@ class World:
 
     def lead(self) -> Lead:
         """Return what the operator wants now."""
-        return lead(self._scenario, self.scenario_s)
+        wanted = lead(self._scenario, self.scenario_s)
+        return wanted if self.asked is None else Lead(*wanted[:4], *self.asked)
 
     def _apply_outside_forces(self) -> None:
         """Set the wrench on the torso: hand, load, push and hoist.
@@ -249,7 +252,7 @@ class World:
         would cost more than the physics.
         """
         t = self.scenario_s
-        wanted = lead(self._scenario, t)
+        wanted = self.lead()
         r = self._torso_rotation.tolist()  # row by row
         x, y, z = self._harness_point
         arm_x = r[0] * x + r[1] * y + r[2] * z

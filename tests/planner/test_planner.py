@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from services.planner.certificate import Margins
+from services.planner.intents import Wish
 from services.planner.planner import EARLY_SHARE, LATE_SHARE, TICK_GAP_MAX_S, Planner
 from shared import gain_schedule
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -203,7 +204,7 @@ def test_a_tick_uses_states_up(planner: Planner, q: Array) -> None:
 def test_a_long_gap_is_not_integrated(robot: RobotConfig, planner: Planner, q: Array) -> None:
     """A planner stopped for 5 s raises the assist by one bounded step only."""
     last = lead(planner, q)
-    planner.hear_assist(200.0)
+    planner.hear_wish(Wish(200.0))
     now = last + 5 * NS_PER_S
     hear_all(planner, q, now, seq=50)
     planner.tick(now)
@@ -215,7 +216,7 @@ def test_assist_rises_by_the_time_between_ticks(
     robot: RobotConfig, planner: Planner, q: Array
 ) -> None:
     last = lead(planner, q)
-    planner.hear_assist(200.0)
+    planner.hear_wish(Wish(200.0))
     for tick in range(1, 11):
         now = last + tick * 4 * NS_PER_MS
         hear_all(planner, q, now, seq=50 + tick)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import msgspec
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from services.planner.intents import Wish
 from services.planner.memory import ShiftMemory
 from services.planner.planner import Planner
 from services.planner.shift import ROWS, SHIFT_S, ShiftReference
@@ -91,11 +89,9 @@ def test_a_follower_that_goes_on_from_its_memory_goes_on_bit_for_bit() -> None:
             np.testing.assert_array_equal(mine, other)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_planner_does_not_take_what_is_no_number(robot: RobotConfig, bad: float) -> None:
+def test_a_planner_goes_on_with_the_wish_it_had(robot: RobotConfig) -> None:
     planner = Planner(robot, 1)
-    planner.hear_shift((0.01, 0.0, 0.0, 0.02))
-    planner.hear_shift((0.01, bad, 0.0, 0.0))
+    planner.hear_wish(Wish(0.0, (0.01, 0.0, 0.0, 0.02)))
     assert planner.status(0, 0.0).shift_wanted == (0.01, 0.0, 0.0, 0.02)
     twin = Planner(robot, 1)
     twin.recall(planner.remember())

@@ -47,7 +47,10 @@ def make_loop(robot: RobotConfig, *faults: Fault) -> tuple[SimulatorLoop, World,
     )
     front = CanSimpleFront(bank, [], [])
     ports = cast(
-        "Ports", msgspec.defstruct("Fake", ["truth", "intent", "control", "state"])(*[Silent()] * 4)
+        "Ports",
+        msgspec.defstruct("Fake", ["truth", "intent", "control", "state", "asked"])(
+            *[Silent()] * 5
+        ),
     )
     harness = cast("HarnessFront", cast("Any", Silent()))
     return SimulatorLoop(robot, world, bank, front, [], (harness, None), ports), world, bank

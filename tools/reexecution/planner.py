@@ -7,6 +7,7 @@ from typing import Final
 
 import msgspec
 
+from services.planner.intents import Wish
 from services.planner.memory import TickMemory
 from services.planner.planner import Planner
 from shared import topics
@@ -102,8 +103,8 @@ class PlannerExecution:
                 return False
             planner.hear_attitude(attitude, status.t_ns)
             self._attitude_seq = status.attitude_seq
-        planner.hear_assist(status.assist_wanted_n)
-        planner.hear_shift(status.shift_wanted)
+        wish = Wish(status.assist_wanted_n, status.shift_wanted, status.asked_by)
+        planner.hear_wish(wish)
         return True
 
     def _tick(self, planner: Planner, status: PlannerStatus) -> Iterator[tuple[str, Message]]:

@@ -14,6 +14,7 @@ from services.joint.controller import JointController
 from services.joint.memory import ModuleMemory
 from services.joint.module import Module
 from services.joint.tracer import Tracer
+from services.planner.intents import Wish
 from services.planner.memory import TickMemory
 from services.planner.planner import Planner
 from services.planner.remembrance import Remembrance
@@ -38,7 +39,7 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
-from shared.scenario import Kill, Push, Restart, Scenario
+from shared.scenario import SCENARIO, Kill, Push, Restart, Scenario
 from shared.topics import Topic
 from shared.traces import SimState
 from tools.runs.host_clock import HostClock
@@ -324,8 +325,7 @@ class Lockstep:
         if attitude is not None:
             planner.hear_attitude(attitude, host_ns)
         wanted = self.world.lead()
-        planner.hear_assist(wanted.assist)
-        planner.hear_shift(wanted.shift)
+        planner.hear_wish(Wish(wanted.assist, wanted.shift, SCENARIO))
         for index, command in enumerate(planner.tick(host_ns)):
             self._commands[index].put(now, command)
             self._record(topics.JOINT_COMMAND, MODULES[index], command)
