@@ -117,6 +117,9 @@ class LawConfig(Section, frozen=True):
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
     shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
     stance_max: Stance6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    load_correction: tuple[
+        Annotated[float, Range(0.0, 50.0, "kg")], Annotated[float, Range(0.0, 100.0, "N m")]
+    ] = (0.0, 0.0)
 
 
 RequiredStiffness6 = tuple[
@@ -265,6 +268,7 @@ class TripsConfig(Section, frozen=True):
     turning: TripLimit = TripLimit(limit=2.5, after_ms=100.0)
     harness: TripLimit = TripLimit(limit=150.0, after_ms=200.0)
     sagging: TripLimit = TripLimit(limit=10.0, after_ms=10.0)
+    unattended: TripLimit = TripLimit(limit=0.03, after_ms=20.0)
 
 
 class PlannerConfig(Section, frozen=True):

@@ -168,6 +168,13 @@ LOSSES: Final[dict[str, Loss]] = {
         "planner/status: MISPLACED; `xrl status` says which way",
         "by itself, once the feet stand within `law.stance_max` of the robot file's place",
     ),
+    "a load far from the robot file's": Loss(
+        "HOLD",
+        "HOLD",
+        "planner/status: MISLOADED; `xrl status` says by how much",
+        "by itself, once the load is within `law.load_correction`; or set mass.payload, then "
+        "`xrl gains`",
+    ),
     "trouble noticed": Loss(
         "HOLD: it trips by itself, for what it alone sees (shaking, torque, speed)",
         "HOLD, by the planner's word; or all six, for what the planner sees",

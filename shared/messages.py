@@ -65,6 +65,7 @@ class Trip(IntEnum):
     TURNING = 6
     HARNESS = 7
     SAGGING = 8
+    UNATTENDED = 9
 
 
 class Outside(IntEnum):
@@ -120,6 +121,8 @@ class PlannerMode(IntEnum):
     been moved: `hold`."""
     TRIPPED = 6
     """Something was beyond its limit (`PlannerStatus.trip`): `hold` until all has been calm."""
+    MISLOADED = 7
+    """It carries more or less than `law.load_correction` beyond the robot file: `hold`."""
 
 
 class SplitSource(IntEnum):
@@ -344,6 +347,9 @@ class PlannerStatus(Message, frozen=True):
     """Why it does not lead, in words, where the mode does not say it all."""
     trip: int = 0
     """`Trip`: what it does not lead for."""
+    load: Vector3 = (0.0, 0.0, 0.0)
+    """What it carries beyond the robot file: kg, and its moments a and b about pitch, N m
+    (`services.planner.load`)."""
     asked_by: str = ""
     """`OperatorIntent.source` of the intent that is given now; "": none, or it has gone stale."""
 

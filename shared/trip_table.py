@@ -74,6 +74,10 @@ PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
         "sagging", "the person sinks with weight on the harness", "W",
         "let the person stand up; ask for more assist, or lead down more slowly",
     ),
+    Trip.UNATTENDED: TripRow(
+        "unattended", "it drifts with nobody's hand on it", "m",
+        "take hold of it: it leads again a second later",
+    ),
 }  # fmt: skip
 """By the planner, while it leads. It leads again once all is within its limits for a second."""
 
@@ -87,8 +91,12 @@ def limits_of(config: RobotConfig) -> TripsConfig:
 
 
 def untripped(config: RobotConfig) -> RobotConfig:
-    """Return the robot on which nothing trips: what a comparison is made with, and no robot."""
-    return msgspec.structs.replace(config, trips=_NEVER)
+    """Return the robot on which nothing trips: what a comparison is made with, and no robot.
+
+    Nor is a load looked for: what shakes is taken for one, and not led.
+    """
+    law = msgspec.structs.replace(config.law, load_correction=(0.0, 0.0))
+    return msgspec.structs.replace(config, trips=_NEVER, law=law)
 
 
 _NEVER: Final = TripsConfig(

@@ -12,11 +12,15 @@ from collections.abc import Callable
 from typing import Final
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from services.planner.memory import AssistMemory, EasingMemory, OverloadMemory
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config_sections import HarnessConfig
 from shared.messages import Vector3, Wrench
+
+Array = NDArray[np.float64]
 
 ERROR_MIN: Final = 5.0
 """N: what dry friction in the joints hides. Within it the force does not follow the assist
@@ -47,6 +51,19 @@ def force_up(force: Vector3, roll: float, pitch: float) -> float:
     """
     x, y, z = force
     return math.sin(roll) * y + math.cos(roll) * (z * math.cos(pitch) - x * math.sin(pitch))
+
+
+def in_world(wrench: Wrench, roll: float, pitch: float) -> tuple[Array, float]:
+    """Return the person's force in the torso's plane (3,), N, world but for yaw, and moment, N m.
+
+    Args:
+        wrench: of the person on the torso.
+        roll: of the torso, rad.
+        pitch: rad; the moment is about its axis.
+    """
+    x, _, z = wrench.force
+    ahead = math.cos(pitch) * x + math.sin(pitch) * z
+    return np.array((ahead, 0.0, force_up(wrench.force, roll, pitch))), wrench.moment[1]
 
 
 def is_still(rate_z: float, rate_pitch: float) -> bool:

@@ -61,7 +61,7 @@ class Engagement(msgspec.Struct):
             fresh: per module, a state has come within `planner.state_stale_ms`.
             ready: per module, `JointState.ready`.
             modes: per module, `JointState.mode`.
-            forbidden: OVERLOADED, UNCERTIFIED, MISPLACED or TRIPPED while the planner may not lead.
+            forbidden: why the planner may not lead, OVERLOADED and so on; None: it may.
         """
         after = self._next(now_ns, fresh, ready, modes, forbidden)
         self._remember_dropouts(now_ns, after)

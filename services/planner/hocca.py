@@ -19,17 +19,19 @@ Pure: no clock, bus or thread.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still
+from services.planner.assist import AssistLaw, LeadEasing, force_up, in_world, is_still
 from services.planner.coupling import CouplingFilter, Missing
 from services.planner.gains import GainLaw, JointGains
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics, leg_loads
 from services.planner.levelling import Levelling
+from services.planner.load import Load
 from services.planner.memory import LawMemory
 from services.planner.shift import ShiftReference
 from services.planner.split import GainSplit, LocalGains
@@ -92,6 +94,13 @@ class Hocca:
         self._stance = Stance(config.law.stance_max)
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
+        size = config.geometry.torso_size
+        inertia = config.torso_mass * (size[0] ** 2 + size[2] ** 2) / 12.0
+        # the paper's split is there to be compared with: nothing is added to it
+        certified = config.law.split == "certified"
+        largest = config.law.load_correction if certified else (0.0, 0.0)
+        self._load = Load(largest, self._weight, config.torso_mass, inertia)
+        self._T: Array = np.zeros((12, 6))
         assist = config.assist
         self._assist = AssistLaw(
             assist.force_max, assist.rate_max, assist.integral_max, assist.integral_s
@@ -113,6 +122,20 @@ class Hocca:
     def stance_refusal(self) -> str:
         """Return in words why it is refused; "" if it is not."""
         return self._stance.refusal() if self._stance.refused else ""
+
+    @property
+    def load(self) -> Vector3:
+        """What it carries beyond the robot file: kg, and moments a and b, N m."""
+        return self._load.kg, self._load.a, self._load.b
+
+    @property
+    def load_refused(self) -> bool:
+        """True while the load is farther from the robot file than the law leads."""
+        return self._load.refused
+
+    def load_refusal(self) -> str:
+        """Return in words why the load is not led; "" if it is."""
+        return self._load.refusal()
 
     def tick(
         self,
@@ -154,6 +177,7 @@ class Hocca:
         self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._aligned)
         up = self._levelling.up
         self._F_O[:3] = self._weight * up
+        self._F_O[4] = self._load.moment(float(measured.p[4]))
         if align or not self._aligned:
             self._align(q)
             self._shift.rest()
@@ -179,11 +203,11 @@ class Hocca:
 
         result = ik.solve(p_ref, measured.D_left)
         q_ref = ik.q.copy()
-        T = ik.solve_rates(self._per_p)
+        T = self._T = ik.solve_rates(self._per_p)
         v_ref = T @ pdot_ref
 
         at_ref = ik.kinematics
-        self._F_assist[:] = self._assist.assist * up
+        self._F_assist[:] = (self._assist.assist + self._load.force()) * up
         gains = self._gains
         tau_ff = self._F_O @ at_ref.J + self._F_assist @ at_ref.J_harness
         hessian_O = at_ref.hessian_times(self._F_O, self._F_assist).copy()
@@ -231,6 +255,28 @@ class Hocca:
         """
         return leg_loads(self._measured.C, tau)
 
+    def weigh(self, tau: Array, v: Array, wrench: Wrench | None, dt: float, *, led: bool) -> None:
+        """Look for a load that the robot file does not know, at the last tick's pose.
+
+        Args:
+            tau: measured joint torques (12,), N m.
+            v: joint rates (12,), rad/s.
+            wrench: of the operator on the torso, if it is fresh and valid, and all states are.
+            dt: since the last tick, s.
+            led: the planner leads.
+        """
+        if not self._load.looked_for:
+            return
+        known = not any(map(math.isnan, self.leg_loads(tau)))
+        if wrench is None or not known:
+            self._load.miss()
+            return
+        at_ref, p = self._ik.kinematics, self._measured.p
+        force, turn = in_world(wrench, float(p[3]), float(p[4]))
+        held = tau + force @ at_ref.J_harness + turn * at_ref.J[4]
+        T, rates = self._T, (self.harness_rate(v), float(self._measured.J[4] @ v))
+        self._load.advance(held @ T, at_ref.J_harness[2] @ T, float(p[4]), rates, dt, led=led)
+
     def harness_rate(self, v: Array) -> float:
         """Return the vertical rate of the harness point at the last tick's pose, m/s, world.
 
@@ -253,6 +299,7 @@ class Hocca:
             self._levelling.remember(),
             self._shift.remember(),
             self._stance.remember(),
+            self._load.remember(),
         )
 
     def recall(self, memory: LawMemory) -> None:
@@ -267,6 +314,7 @@ class Hocca:
         self._levelling.recall(memory.levelling)
         self._shift.recall(memory.shift)
         self._stance.recall(memory.stance)
+        self._load.recall(memory.load)
         self._stand_as_taken()
 
     def _stand_as_taken(self) -> None:

@@ -65,6 +65,27 @@ class TripsMemory(msgspec.Struct, frozen=True):
     why: str = ""
     stands: bool = False
     """Both legs have been seen to bear the torso since leading began."""
+    light: bool = False
+    """The person has been seen not to press on it since leading began."""
+
+
+class UnattendedMemory(msgspec.Struct, frozen=True):
+    """Of `Unattended`."""
+
+    felt_ns: int = 0
+    """When a hand was felt last."""
+    left: Pair | None = None
+    """Where it left the robot: height of the COM, m, and the torso's pitch, rad."""
+
+
+class LoadMemory(msgspec.Struct, frozen=True):
+    """Of `Load`."""
+
+    kg: float = 0.0
+    a: float = 0.0
+    b: float = 0.0
+    rates: Pair | None = None
+    refused: bool = False
 
 
 class LawMemory(msgspec.Struct, frozen=True):
@@ -85,6 +106,7 @@ class LawMemory(msgspec.Struct, frozen=True):
     shift: ShiftMemory = ShiftMemory()
     stance: tuple[Vector6, bool] = (AS_CONFIGURED, False)
     """Memory of `Stance`: what is taken, m and rad, and whether it is refused."""
+    load: LoadMemory = LoadMemory()
 
 
 class TickMemory(msgspec.Struct, frozen=True):
@@ -107,3 +129,4 @@ class TickMemory(msgspec.Struct, frozen=True):
     attitude_seq: int = -1
     trips: TripsMemory = TripsMemory()
     wish: Wish = Wish()
+    unattended: UnattendedMemory = UnattendedMemory()

@@ -6,6 +6,8 @@ re-execution from a log.
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ from services.planner.intents import Wish
 from services.planner.memory import TickMemory
 from services.planner.plausible import Plausible
 from services.planner.trips import Trips, values_of
+from services.planner.unattended import Unattended
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import N_JOINTS, N_MODULES
@@ -78,6 +81,7 @@ class Planner:
         self._overload = Overload.of(config.harness)
         self._bracing = Bracing()
         self._trips = Trips(config)
+        self._unattended = Unattended()
         self._brace = Brace.NONE
         self._wrench_seq = -1
         self._last_ns = 0
@@ -164,8 +168,12 @@ class Planner:
         self._source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
+        heard = engagement.mode is not PlannerMode.WAITING
+        hand = self._usable_wrench(now_ns) if heard else None
+        self._law.weigh(self._tau, self._v, hand, dt, led=leads)
         rate = self._law.harness_rate(self._v)
-        values = values_of(self._output, self._q, loads, lifted, rate, leads=leads)
+        drift = self._drift(now_ns, lifted)
+        values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)
         self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
         common = Common(now_ns, self._seq, self.session, self._hold(), self._output.local.margins)
@@ -191,6 +199,7 @@ class Planner:
             self._attitude_seq,
             self._trips.remember(),
             self._wish,
+            self._unattended.remember(),
         )
 
     def recall(self, memory: TickMemory) -> None:
@@ -200,6 +209,7 @@ class Planner:
             if state is not None:
                 self.hear_state(module, state, arrived_ns)
         self._wish = m.wish
+        self._unattended.recall(m.unattended)
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
         self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
         self._attitude_seq = m.attitude_seq
@@ -216,6 +226,16 @@ class Planner:
         if wrench is None or not wrench.valid or now_ns - self._wrench_ns > self._wrench_stale_ns:
             return None
         return wrench
+
+    def _drift(self, now_ns: int, lifted: float | None) -> float:
+        """Return how far the robot has drifted since a hand was felt last, m."""
+        wrench, output = self._usable_wrench(now_ns), self._output
+        if wrench is None or lifted is None or output is None:
+            force = moment = math.nan
+        else:
+            force, moment = lifted, wrench.moment[1]
+        p = output.p.tolist() if output is not None else [0.0] * 6
+        return self._unattended.drift(now_ns, (p[2], p[4]), force, moment)
 
     def _lifted(self, now_ns: int) -> float | None:
         """Return the person's upward force on the robot, N, world; None if it is not known now."""
@@ -237,6 +257,8 @@ class Planner:
             return PlannerMode.OVERLOADED
         if self._law.stance_refused:
             return PlannerMode.MISPLACED
+        if self._law.load_refused:
+            return PlannerMode.MISLOADED
         if self._source is SplitSource.UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
         if self._trips.tripped:
@@ -289,9 +311,10 @@ class Planner:
             attitude_seq=self._attitude_seq,
             slope=output.slope if output is not None else (0.0, 0.0),
             shift_wanted=self._wish.shift,
+            load=self._law.load,
             asked_by=self._wish.source,
             stance=stance,
-            why=self._law.stance_refusal() or self._trips.why,
+            why=self._law.stance_refusal() or self._law.load_refusal() or self._trips.why,
             trip=int(self._trips.tripped),
         )
 

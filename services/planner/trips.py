@@ -9,10 +9,12 @@ What no joint service can see by itself (`shared.trip_table`; limits: [trips] of
     sinking    COM and torso move faster than a person leads
     turning
     harness    the person is carried far otherwise than was asked for
-    sagging    the person presses the robot down faster than a lead does: the power of the load
+    sagging    the person presses the robot down harder than a lead does: the power of the load
                beyond assist and lead, as it sinks
+    unattended it drifts with nobody's hand on it (`services.planner.unattended`)
 
-Judged while it leads, `unloaded` once both legs have borne the torso: on the hoist neither does. It
+Judged while it leads; `unloaded` once both legs have borne the torso, for on the hoist neither
+does; `sagging` once the person has not pressed, for a hand that was held up in HOLD catches up. It
 ends when all of it has been within its limits for `CALM_NS`, and counts as a drop-out
 (`services.planner.engagement`): what trips again and again is led ever more rarely.
 """
@@ -37,13 +39,16 @@ Array = NDArray[np.float64]
 CALM_NS: Final = NS_PER_S
 LEADING_LOAD: Final = 40.0
 """N: so hard a hand presses that leads down, by 0.4 m in 2 s."""
-LET_DOWN_RATE: Final = 0.25
-"""m/s: so fast a person who sags may be let down."""
+LET_DOWN_RATE: Final = 1.0
+"""m/s: so fast a load beyond that would sink if it were led again."""
+STANDS_RATE: Final = 1e-3
+"""m/s, of one that does not sink."""
 LOADED: Final = 3.0
 """Times the least load: a robot both of whose legs bear so much stands."""
 
 _TRIPS: Final = tuple(PLANNER_TRIPS)
 _UNLOADED: Final = _TRIPS.index(Trip.UNLOADED)
+_SAGGING: Final = _TRIPS.index(Trip.SAGGING)
 
 
 class Trips:
@@ -92,6 +97,8 @@ class Trips:
             for value, limit, least in zip(values, self._limits, self._least, strict=True)
         ]
         beyond[_UNLOADED] &= stands
+        light = leads and (memory.light or values[_SAGGING] == 0.0)
+        beyond[_SAGGING] &= light or not leads
         since_ns = tuple(
             (since or now_ns) if is_beyond and leads else 0
             for since, is_beyond in zip(memory.since_ns, beyond, strict=True)
@@ -108,7 +115,7 @@ class Trips:
                     why = f"{row.measured}: {values[index]:.3g} {row.unit}"
                     why += f" (limit {self._limits[index]:g})"
                     break
-        self._memory = TripsMemory(since_ns, calm_ns, tripped, why, stands)
+        self._memory = TripsMemory(since_ns, calm_ns, tripped, why, stands, light)
 
 
 def values_of(
@@ -117,6 +124,7 @@ def values_of(
     leg_loads: tuple[float, float],
     lifted: float | None,
     harness_rate: float,
+    drift: float,
     *,
     leads: bool,
 ) -> tuple[float, ...]:
@@ -128,6 +136,7 @@ def values_of(
         leg_loads: N, of right and left leg (`Hocca.leg_loads`).
         lifted: upward force of the person on the robot, N, world; None: not known.
         harness_rate: at which the harness point rises, m/s, world.
+        drift: with nobody's hand on it, m.
         leads: the planner leads.
     """
     x, y, z = output.closure[:3].tolist()
@@ -141,6 +150,7 @@ def values_of(
         abs(float(output.pdot[4])),
         _otherwise(lifted, output.assist, leads=leads),
         _pressing(lifted, output.assist, harness_rate, leads=leads),
+        drift,
     )
 
 
@@ -157,8 +167,10 @@ def _otherwise(lifted: float | None, assist: float, *, leads: bool) -> float:
 def _pressing(lifted: float | None, assist: float, rate: float, *, leads: bool) -> float:
     """Return the power with which the person presses the robot down, W; NaN: not known.
 
-    In HOLD nothing sinks: what the load would have at `LET_DOWN_RATE` were it led.
+    Zero for no more than the load of a lead, and for that alone. In HOLD nothing sinks: what the
+    load would have at `LET_DOWN_RATE` were it led.
     """
     if lifted is None:
         return math.nan
-    return max(0.0, -lifted - assist - LEADING_LOAD) * (max(0.0, -rate) if leads else LET_DOWN_RATE)
+    down = max(STANDS_RATE, -rate) if leads else LET_DOWN_RATE
+    return max(0.0, -lifted - assist - LEADING_LOAD) * down

@@ -7,7 +7,7 @@ pitch (design section 8). Behind it is a person with a mass. Pure.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from services.simulator.plant import Person
 from shared.config_sections import OperatorConfig
@@ -24,10 +24,15 @@ class HandForce(NamedTuple):
     """N m about the torso's pitch axis."""
 
 
+REACH_S: Final = 0.4
+"""Time constant with which a person who takes hold goes over to the path."""
+
+
 class Wearer:
     """The person's own mass behind the hand: it gives way to what the hand meets.
 
-    d is how far the person is above the path:  m d'' = -m w^2 d - 2 zeta m w d' - f
+    It takes hold of the robot where that is, and goes over to the path. From then on d is how far
+    it is above the path:  m d'' = -m w^2 d - 2 zeta m w d' - f
     """
 
     def __init__(self, person: Person) -> None:
@@ -38,10 +43,27 @@ class Wearer:
         self._load_scale, self._load_lag_s = person.load_scale, person.load_lag_s
         self.above = 0.0
         """m"""
+        self.reach = 0.0
+        """m, the path is so far off still, since it took hold: gone before a scenario starts."""
+        self._holds = False
         self.rate = 0.0
         """m/s"""
         self.load_n = 0.0
         """What rests on the harness, N."""
+
+    def take_hold(self, above: float) -> None:
+        """Take hold of the robot where it is, `above` the path, m; one who has, goes on."""
+        if not self._holds:
+            self._holds, self.reach = True, above
+
+    def go_on(self, above: float, rate: float, load_n: float) -> None:
+        """Go on as somebody who has hold of it; m, m/s, N."""
+        self._holds = True
+        self.above, self.rate, self.load_n = above, rate, load_n
+
+    def motion(self) -> tuple[float, float]:
+        """Return how far the hand is above its path, m, and its rate, m/s."""
+        return self.above + self.reach, self.rate - self.reach / REACH_S
 
     def step(self, dt: float, force_on_robot: float, assist: float) -> None:
         """Move on.
@@ -55,6 +77,7 @@ class Wearer:
             acceleration = -self._per_mass * force_on_robot - self._k * self.above
             self.rate = (self.rate + dt * acceleration) / (1.0 + dt * self._b)
             self.above += dt * self.rate
+        self.reach -= self.reach * dt / REACH_S
         wanted = self._load_scale * assist
         lag = self._load_lag_s
         self.load_n += (wanted - self.load_n) * (min(1.0, dt / lag) if lag > 0.0 else 1.0)

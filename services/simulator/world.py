@@ -148,8 +148,7 @@ class World:
         kept = data.qacc_warmstart.copy()
         mujoco.mj_forward(self.model, data)
         data.qacc_warmstart[:] = kept
-        wearer = self._wearer
-        wearer.above, wearer.rate, wearer.load_n = hidden[:3]
+        self._wearer.go_on(*hidden[:3])
         self._actuation.restore(hidden[3:])
 
     def hidden(self) -> tuple[float, ...]:
@@ -264,8 +263,9 @@ class World:
             omega_x = r[0] * w_x + r[1] * w_y + r[2] * w_z
             omega_y = r[3] * w_x + r[4] * w_y + r[5] * w_z
             rate = v_z + omega_x * arm_y - omega_y * arm_x
-            wearer = self._wearer
-            height, rate = height - wearer.above, rate - wearer.rate
+            self._wearer.take_hold(height - wanted.height - z)
+            above, rising = self._wearer.motion()
+            height, rate = height - above, rate - rising
             self.hand = self._operator.force(wanted, height, rate, math.atan2(-r[6], r[8]), w_y)
         self._wearer.step(self._dt, self.hand.force_z, wanted.assist)
         self.load_n = self._wearer.load_n

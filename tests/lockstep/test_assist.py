@@ -33,6 +33,8 @@ def truths(robot: RobotConfig, scenario: Scenario, payload_error: float) -> list
 def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
     robot: RobotConfig,
 ) -> None:
+    unweighed = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))
+    robot = msgspec.structs.replace(robot, law=unweighed)
     off = msgspec.structs.replace(robot.assist, integral_max=0.0)
     open_loop = msgspec.structs.replace(robot, assist=off)
     given = [
@@ -41,6 +43,13 @@ def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
     ]
     assert given[0] == pytest.approx(200.0, abs=10.0)
     assert abs(given[1] - 200.0) > 12.0
+
+
+def test_with_the_load_found_it_comes_true_without_the_integral(robot: RobotConfig) -> None:
+    off = msgspec.structs.replace(robot.assist, integral_max=0.0)
+    heard = truths(msgspec.structs.replace(robot, assist=off), RESTING, -2.0)
+    given = np.mean([t.harness_force_z for t in heard if t.scenario_s > 17.0])
+    assert given == pytest.approx(200.0, abs=10.0)
 
 
 @pytest.mark.parametrize("delay_ms", [1.0, 20.0])

@@ -94,7 +94,8 @@ def stop(
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=3.0, height=height, pitch=pitch))
     told = still(14.0, kill=kills, restart=restarts, fault=faults, push=())
     told = msgspec.structs.replace(told, keyframe=frames)
-    fleet = Lockstep(robot, told, plant=plant)
+    law = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))  # led whatever it carries
+    fleet = Lockstep(msgspec.structs.replace(robot, law=law), told, plant=plant)
     pitches, heights = [], []
     for truth in fleet.run():
         if truth.scenario_s >= 3.8 and not fleet.estop:

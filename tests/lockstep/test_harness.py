@@ -101,7 +101,7 @@ def test_the_wrench_is_bit_identical_with_the_same_seed_and_another_with_another
 
 def unheeded(robot: RobotConfig) -> RobotConfig:
     """Return the robot with nothing made of the wrench."""
-    law = msgspec.structs.replace(robot.law, lead_easing=0.0)
+    law = msgspec.structs.replace(robot.law, lead_easing=0.0, load_correction=(0.0, 0.0))
     assist = msgspec.structs.replace(robot.assist, integral_max=0.0)
     return msgspec.structs.replace(robot, law=law, assist=assist)
 

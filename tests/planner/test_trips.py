@@ -18,7 +18,7 @@ from tests.planner.conftest import Closed
 
 T0 = 5_000_000_000
 TICK_NS = 4 * NS_PER_MS
-CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0, 0.0)
+CALM = (0.0, 0.0, 0.0, 200.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 TRIPS = list(PLANNER_TRIPS)
 
 
@@ -179,7 +179,9 @@ def test_in_hold_only_a_load_beyond_what_was_asked_or_a_pull_upwards_counts(
     lifted: float, assist: float, leads: bool, found: float
 ) -> None:
     """A wish of 200 N with nobody there tripped for ever."""
-    values = values_of(output_of(assist), np.zeros(12), (200.0, 200.0), lifted, 0.0, leads=leads)
+    values = values_of(
+        output_of(assist), np.zeros(12), (200.0, 200.0), lifted, 0.0, 0.0, leads=leads
+    )
     assert values[HARNESS] == pytest.approx(found)
 
 
@@ -187,10 +189,10 @@ def test_in_hold_only_a_load_beyond_what_was_asked_or_a_pull_upwards_counts(
     ("lifted", "rate", "leads", "watts"),
     [
         (-240.0, -0.1, True, 10.0),
-        (-240.0, 0.1, True, 0.0),
+        (-240.0, 0.1, True, 0.1),
         (-130.0, -0.3, True, 0.0),
         (60.0, -0.3, True, 0.0),
-        (-240.0, 0.0, False, 25.0),
+        (-240.0, 0.0, False, 100.0),
         (-130.0, 0.0, False, 0.0),
     ],
 )
@@ -198,8 +200,22 @@ def test_sagging_is_the_power_of_a_load_beyond_assist_and_lead_as_it_sinks(
     lifted: float, rate: float, leads: bool, watts: float
 ) -> None:
     """The assist is 100 N, a lead 40 N. In HOLD nothing sinks, and the load itself is judged."""
-    values = values_of(output_of(100.0), np.zeros(12), (200.0, 200.0), lifted, rate, leads=leads)
+    values = values_of(
+        output_of(100.0), np.zeros(12), (200.0, 200.0), lifted, rate, 0.0, leads=leads
+    )
     assert values[SAGGING] == pytest.approx(watts)
+
+
+def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
+    """It presses from the first tick on; once it has not, the same load is a person who sags."""
+    trips, values = Trips(robot), beyond(robot, Trip.SAGGING)
+    for tick in range(100):
+        trips.advance(T0 + tick * TICK_NS, values, leads=True)
+    assert trips.tripped is Trip.NONE
+    trips.advance(T0 + 100 * TICK_NS, CALM, leads=True)
+    for tick in range(101, 200):
+        trips.advance(T0 + tick * TICK_NS, values, leads=True)
+    assert trips.tripped is Trip.SAGGING
 
 
 def test_what_lasted_before_it_led_does_not_count(robot: RobotConfig) -> None:
@@ -212,5 +228,5 @@ def test_what_lasted_before_it_led_does_not_count(robot: RobotConfig) -> None:
 
 @pytest.mark.parametrize("loads", [(math.nan, 5.0), (5.0, math.nan)])
 def test_with_one_leg_unknown_none_is_unloaded(loads: tuple[float, float]) -> None:
-    values = values_of(output_of(0.0), np.zeros(12), loads, None, 0.0, leads=True)
+    values = values_of(output_of(0.0), np.zeros(12), loads, None, 0.0, 0.0, leads=True)
     assert math.isnan(values[UNLOADED])

@@ -1,0 +1,156 @@
+"""What the torso carries beyond what the robot file says: its weight, and where it lies. Pure.
+
+The open directions have no stiffness, so that a weight the law does not know moves the robot as
+soon as nobody holds on. The joints' torques tell it, by a momentum observer. F is what joints and
+person (w_h) hold up along p, n how far the harness point rises along each, M the torso's mass:
+
+    F         = T^T (tau + J_harness^T f_h + J_pitch^T m_h)       [J; C] T = [I; 0]
+    n         = T^T J_harness,z
+    dm g      = (F_z - m g) / n_z - M zddot_harness
+    a cos(pitch) + b sin(pitch) = F_pitch - n_pitch dm g - I pitchddot
+
+a and b are the surplus weight's moments about the harness point in torso axes, N m: a by how far
+ahead it lies, b by how high. Low-passed and shrunk by what dry friction in the joints hides, they
+are fed forward as the assist is, and so are part of every tick's own certificate. Beyond
+`law.load_correction` the planner does not lead: schedule and studies are of another robot. A
+harness that is off by f_h is taken for load.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner.memory import LoadMemory
+from shared.config import GRAVITY
+from shared.messages import Pair
+
+Array = NDArray[np.float64]
+
+LED_S: Final = 2.0
+HELD_S: Final = 0.25
+"""Time constants. While it is led it is looked for at rest only, and slowly: in motion what the
+drivetrain and a masses' error of 5 % do looks like 8 kg."""
+STILL: Final = (0.05, 0.1)
+"""m/s of the harness point and rad/s of the torso's pitch: at rest."""
+HIDDEN: Final = (8.0, 1.5)
+"""N and N m of the open directions that dry friction may be (0.3 N m a joint: 6 N)."""
+AGAIN_SHARE: Final = 0.8
+"""Of the limits: what was refused is led again within so much of them."""
+BORNE_SHARE: Final = 0.25
+"""Of the file's weight: with less on the feet it hangs on a hoist, or falls."""
+
+
+class Load:
+    """The surplus load, low-passed.
+
+    Attributes:
+        kg: surplus mass.
+        a: N m along pitch, by what lies ahead of (+) or behind the file's centre.
+        b: N m along pitch, by what lies above (+) or below it, with the torso at 90 degrees.
+    """
+
+    def __init__(self, largest: Pair, weight: float, mass: float, inertia: float) -> None:
+        """Begin with what the file says.
+
+        Args:
+            largest: `law.load_correction`: kg and N m; zero: nothing is looked for.
+            weight: of the whole robot by the file, N.
+            mass: of its torso, kg.
+            inertia: of its torso about pitch, kg m^2.
+        """
+        self._kg_max, self._moment_max = largest
+        self.looked_for = any(largest)
+        self._weight, self._mass, self._inertia = weight, mass, inertia
+        self._rates: Pair | None = None
+        self._refused = False
+        self.kg = self.a = self.b = 0.0
+
+    @property
+    def refused(self) -> bool:
+        """True while the load is farther from the file than the law leads."""
+        return self._refused
+
+    def refusal(self) -> str:
+        """Return in words why it is not led, and what would be right; "" if it is."""
+        if not self._refused:
+            return ""
+        words = []
+        if abs(self.kg) > AGAIN_SHARE * self._kg_max:
+            more = "more" if self.kg > 0.0 else "less"
+            words.append(
+                f"the robot carries {abs(self.kg):.1f} kg {more} than its file says: at most "
+                f"{self._kg_max:g} kg are led; set mass.payload, then `xrl gains`"
+            )
+        for moment, positive, negative in ((self.a, "ahead", "behind"), (self.b, "high", "low")):
+            if abs(moment) > AGAIN_SHARE * self._moment_max:
+                words.append(
+                    f"the load lies too far {positive if moment > 0.0 else negative}, by "
+                    f"{abs(moment):.0f} N m: at most {self._moment_max:g} N m are led"
+                )
+        return "; ".join(words)
+
+    def force(self) -> float:
+        """Return what is certain of its weight, N at the harness point, within the limit."""
+        return _shrunk(GRAVITY * self.kg, HIDDEN[0], GRAVITY * self._kg_max)
+
+    def moment(self, pitch: float) -> float:
+        """Return what is certain of its moment along pitch, N m, within the limit."""
+        return _shrunk(self._moment(pitch), HIDDEN[1], self._moment_max)
+
+    def advance(
+        self, F: Array, n: Array, pitch: float, rates: Pair, dt: float, *, led: bool
+    ) -> None:
+        """Take what joints and person hold up.
+
+        Args:
+            F: wrench along p (6,), N and N m, world.
+            n: how far the harness point rises along p (6,), m/m and m/rad.
+            pitch: of the torso, rad.
+            rates: of the harness point's height, m/s, and of the torso's pitch, rad/s.
+            dt: since the last call, s.
+            led: the planner leads.
+        """
+        before, self._rates = self._rates, rates
+        up = float(F[2]) - self._weight
+        if before is None or up < (BORNE_SHARE - 1.0) * self._weight:
+            return
+        if led and (abs(rates[0]) > STILL[0] or abs(rates[1]) > STILL[1]):
+            return
+        pole_s = LED_S if led else HELD_S
+        weight = up / float(n[2])
+        moment = float(F[4]) - float(n[4]) * GRAVITY * self.kg
+        self.kg += min(1.0, dt / pole_s) * (weight / GRAVITY - self.kg)
+        self.kg -= self._mass * (rates[0] - before[0]) / (GRAVITY * pole_s)
+        error = dt * (moment - self._moment(pitch)) - self._inertia * (rates[1] - before[1])
+        error /= pole_s
+        self.a += error * math.cos(pitch)
+        self.b += error * math.sin(pitch)
+        share = AGAIN_SHARE if self._refused else 1.0
+        moment = max(abs(self.a), abs(self.b))
+        self._refused = abs(self.kg) > share * self._kg_max or moment > share * self._moment_max
+
+    def miss(self) -> None:
+        """Take it that nothing can be known now; what was found stands."""
+        self._rates = None
+
+    def remember(self) -> LoadMemory:
+        """Return the memory as it is now."""
+        return LoadMemory(self.kg, self.a, self.b, self._rates, self._refused)
+
+    def recall(self, memory: LoadMemory) -> None:
+        """Go on from a memory."""
+        self.kg, self.a, self.b = memory.kg, memory.a, memory.b
+        self._rates, self._refused = memory.rates, memory.refused
+
+    def _moment(self, pitch: float) -> float:
+        return self.a * math.cos(pitch) + self.b * math.sin(pitch)
+
+
+def _shrunk(value: float, hidden: float, most: float) -> float:
+    """Return a value brought nearer to zero by what is hidden, and within a limit."""
+    certain = max(0.0, abs(value) - hidden)
+    return math.copysign(min(most, certain), value)

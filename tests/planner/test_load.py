@@ -1,0 +1,167 @@
+"""A load that the file does not know is found from the torques of one that stands, or moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.planner.hocca import Hocca
+from services.planner.kinematics import Kinematics
+from services.planner.load import AGAIN_SHARE, HIDDEN, Load
+from services.planner.memory import LoadMemory
+from shared.config import GRAVITY, RobotConfig
+from shared.messages import Pair, Tare, Wrench
+from tests.planner.conftest import Closed
+
+LARGEST = (8.0, 20.0)
+WEIGHT, MASS, INERTIA = 700.0, 40.0, 0.5
+STRAIGHT_UP = np.array((0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+DT = 0.004
+Push = Callable[[float], float]
+
+
+def found(
+    load: Load,
+    kg: float,
+    a: float = 0.0,
+    b: float = 0.0,
+    *,
+    seconds: float = 8.0,
+    pitch: Push = lambda _: 0.0,
+) -> Load:
+    """Feed it what a robot at rest holds up that carries so much more."""
+    for tick in range(round(seconds / DT)):
+        at = pitch(tick * DT)
+        moment = a * math.cos(at) + b * math.sin(at)
+        F = np.array((0.0, 0.0, WEIGHT + GRAVITY * kg, 0.0, moment, 0.0))
+        load.advance(F, STRAIGHT_UP, at, (0.0, 0.0), DT, led=False)
+    return load
+
+
+@pytest.fixture
+def load() -> Load:
+    return Load(LARGEST, WEIGHT, MASS, INERTIA)
+
+
+@pytest.mark.parametrize("kg", [-7.0, 0.0, 4.0])
+@pytest.mark.parametrize("moment", [-12.0, 0.0, 18.0])
+def test_what_rests_on_it_is_found(load: Load, kg: float, moment: float) -> None:
+    found(load, kg, moment)
+    assert (load.kg, load.a) == pytest.approx((kg, moment), abs=0.05)
+    assert not load.refused
+
+
+def test_how_high_it_lies_shows_as_the_torso_pitches(load: Load) -> None:
+    found(load, 0.0, 10.0, -8.0, seconds=300.0, pitch=lambda t: 0.7 + 0.7 * math.sin(t))
+    assert (load.a, load.b) == pytest.approx((10.0, -8.0), abs=0.3)
+
+
+def test_a_robot_that_falls_freely_upwards_tells_it_too(load: Load) -> None:
+    """Torques that hold the file's weight look right: the motion gives it away."""
+    kg, v = -5.0, 0.0
+    for _ in range(500):
+        load.advance(WEIGHT * STRAIGHT_UP, STRAIGHT_UP, 0.0, (v, 0.0), DT, led=False)
+        v += DT * -kg * GRAVITY / MASS
+    assert load.kg == pytest.approx(kg, abs=0.1)
+
+
+def test_a_person_who_presses_on_it_is_no_load(
+    robot: RobotConfig, kinematics: Kinematics, closed: Closed
+) -> None:
+    """The torques of a stand under the file's weight and 60 N and 10 N m of a hand."""
+    law, q = Hocca(robot), closed(height=0.95)
+    law.tick(q, np.zeros(12), 0.0, DT, align=True)
+    kinematics.update(q)
+    tau = robot.total_mass * GRAVITY * kinematics.J[2]
+    tau = tau + 60.0 * kinematics.J_harness[2] - 10.0 * kinematics.J[4]
+    hand = Wrench(
+        t_ns=1,
+        seq=1,
+        force=(0.0, 0.0, -60.0),
+        moment=(0.0, 10.0, 0.0),
+        valid=True,
+        saturated=False,
+        tare=Tare.DONE,
+        age_ns=0,
+    )
+    for _ in range(2000):
+        law.weigh(tau, np.zeros(12), hand, DT, led=False)
+    assert law.load == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
+    for _ in range(2000):  # and 3 kg at the harness point are, whatever the hand does
+        law.weigh(tau + 3.0 * GRAVITY * kinematics.J_harness[2], np.zeros(12), hand, DT, led=False)
+    assert law.load == pytest.approx((3.0, 0.0, 0.0), abs=0.05)
+
+
+def test_without_a_harness_what_was_found_stands(
+    robot: RobotConfig, kinematics: Kinematics, closed: Closed
+) -> None:
+    law, q = Hocca(robot), closed(height=0.95)
+    law.tick(q, np.zeros(12), 0.0, DT, align=True)
+    for _ in range(1000):
+        law.weigh(np.zeros(12), np.zeros(12), None, DT, led=False)
+    assert law.load == (0.0, 0.0, 0.0)
+
+
+def test_one_that_hangs_tells_nothing(load: Load) -> None:
+    for _ in range(1000):
+        load.advance(0.2 * WEIGHT * STRAIGHT_UP, STRAIGHT_UP, 0.0, (0.0, 0.0), DT, led=False)
+    assert (load.kg, load.a, load.b) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("rates", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.11), (0.0, -0.11)])
+def test_in_motion_it_is_looked_for_only_while_nobody_is_led(load: Load, rates: Pair) -> None:
+    F = (WEIGHT + 50.0) * STRAIGHT_UP
+    for _ in range(1000):
+        load.advance(F, STRAIGHT_UP, 0.0, rates, DT, led=True)
+    assert load.kg == 0.0
+    for _ in range(1000):
+        load.advance(F, STRAIGHT_UP, 0.0, rates, DT, led=False)
+    assert load.kg == pytest.approx(50.0 / GRAVITY, abs=0.05)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_what_friction_may_be_is_left_to_the_hand_and_no_more_is_given_than_may(
+    load: Load, sign: float
+) -> None:
+    for newtons, given in ((0.9 * HIDDEN[0], 0.0), (HIDDEN[0] + 10.0, 10.0), (500.0, 8 * GRAVITY)):
+        found(load, sign * newtons / GRAVITY)
+        assert load.force() == pytest.approx(sign * given, abs=0.05)
+    found(load, 0.0, sign * 9.0)
+    assert load.moment(0.0) == pytest.approx(sign * (9.0 - HIDDEN[1]), abs=0.05)
+    assert load.moment(math.pi / 2) == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("kg", "a", "said"),
+    [
+        (-10.0, 0.0, "10.0 kg less than its file says: at most 8 kg"),
+        (9.0, 0.0, "9.0 kg more"),
+        (0.0, 30.0, "too far ahead, by 30 N m"),
+        (0.0, -30.0, "too far behind, by 30 N m"),
+    ],
+)
+def test_far_from_the_file_it_is_refused_until_it_is_well_within(
+    load: Load, kg: float, a: float, said: str
+) -> None:
+    found(load, kg, a)
+    assert load.refused
+    assert said in load.refusal()
+    within = 1.05 * AGAIN_SHARE
+    found(load, math.copysign(8.0 * within, kg) if kg else 0.0, 20.0 * within if a else 0.0)
+    assert load.refused or a < 0.0, "it does not flap at the limit"
+    found(load, 0.0)
+    assert (load.refused, load.refusal()) == (False, "")
+
+
+def test_it_goes_on_from_a_memory(load: Load) -> None:
+    twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
+    found(load, 9.0, 5.0, seconds=0.5)
+    text = msgspec.json.encode(load.remember())
+    twin.recall(msgspec.json.decode(text, type=LoadMemory))
+    for each in (load, twin):
+        found(each, -3.0, 2.0, seconds=0.5)
+    assert twin.remember() == load.remember()
