@@ -9,6 +9,7 @@ chunk has its index.
 from __future__ import annotations
 
 import io
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator
@@ -66,7 +67,7 @@ class _Doctor:
             for place, length, record in self._records():
                 last = type(record).__name__
                 self._look(place, length, record)
-        except (McapError, CRCValidationError, ValueError) as error:
+        except (McapError, CRCValidationError, ValueError, struct.error) as error:
             self._error(f"cannot be read after a {last}: {error!r}")
         for name, there in (("DataEnd", self._ended), ("Footer", self._footed)):
             if not there:
