@@ -19,7 +19,6 @@ Pure: no clock, bus or thread.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -261,14 +260,14 @@ class Hocca:
         Args:
             tau: measured joint torques (12,), N m.
             v: joint rates (12,), rad/s.
-            wrench: of the operator on the torso, if it is fresh and valid, and all states are.
+            wrench: of the operator on the torso, None: it is not known, a state is
+                stale, or a leg is straight or folded, so that torques tell nothing.
             dt: since the last tick, s.
             led: the planner leads.
         """
         if not self._load.looked_for:
             return
-        known = not any(map(math.isnan, self.leg_loads(tau)))
-        if wrench is None or not known:
+        if wrench is None:
             self._load.miss()
             return
         at_ref, p = self._ik.kinematics, self._measured.p

@@ -168,8 +168,8 @@ class Planner:
         self._source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
-        heard = engagement.mode is not PlannerMode.WAITING
-        hand = self._usable_wrench(now_ns) if heard else None
+        known = engagement.mode is not PlannerMode.WAITING and not any(map(math.isnan, loads))
+        hand = self._usable_wrench(now_ns) if known else None
         self._law.weigh(self._tau, self._v, hand, dt, led=leads)
         rate = self._law.harness_rate(self._v)
         drift = self._drift(now_ns, lifted)
