@@ -15,6 +15,7 @@ STUDIES: Final = {
     "kill": ("tools.sweeps.kill", "kill the planner in random postures, under random pushes"),
     "latency": ("tools.sweeps.latency", "three controls over bad networks: who falls, who leads"),
     "push": ("tools.sweeps.push", "the hardest push by direction, duration, pose and mode"),
+    "trips": ("tools.sweeps.trips", "does each trip come where it is to, and none where not?"),
     "robust": (
         "tools.sweeps.robust",
         "every error of the plant at once: who falls, and why",

@@ -10,63 +10,32 @@ import math
 from itertools import pairwise
 from typing import Any
 
-import msgspec
 import pytest
 
 from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
-from shared.gain_schedule import believing
 from shared.impairment import Impairment
 from shared.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
 from shared.scenario import Keyframe, Push, Scenario
 from shared.trip_table import JOINT_TRIPS, untripped
 from tests.lockstep.runs import still, story
 from tools.runs.lockstep import Lockstep, Record, forget
+from tools.sweeps.trips_trial import PLANTS, unfiltered
 
-SMALL_ERRORS = {
-    "encoder.zero_errors": [math.radians(0.5) * (-1) ** i for i in range(12)],
-    "body.payload_scale": 0.85,
-    "body.com_offset": [0.015, 0.0, 0.0],
-    "drive.lag_s": 0.002,
-    "drivetrain.play": math.radians(0.25),
-    "floor.slope": [math.radians(1.0), 0.0],
-    "drive.torque_scale": 0.95,
-}
-PLANTS: dict[str, dict[str, Any]] = {
-    "k 2000": {"drivetrain.stiffness": 2000.0},
-    "k 3000": {"drivetrain.stiffness": 3000.0},
-    "k 5000": {"drivetrain.stiffness": 5000.0},
-    "k 8000": {},
-    "play 0.75 degrees": {"drivetrain.play": math.radians(0.75)},
-    "small errors together": SMALL_ERRORS,
-}
-
-
-def unfiltered(robot: RobotConfig) -> RobotConfig:
-    """Return the robot without what the dynamic certificate brought."""
-    made = robot.gain_schedule
-    assert made is not None
-    weak = msgspec.structs.replace(
-        made,
-        coupling_bandwidth_hz=200.0,
-        coupling_damping=1.0,
-        D_B=tuple(0.3 * each for each in made.D_B),
-    )
-    law = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))  # what shakes looks heavy
-    return believing(msgspec.structs.replace(robot, gain_schedule=weak, law=law))
+RESTS_TWICE = changed(PlantConfig(), {"person.load_scale": 2.0})
+SHAKEN = [name for name in PLANTS if name != "rigid"]
 
 
 def run(
     robot: RobotConfig,
     told: Scenario,
-    errors: dict[str, Any],
+    plant: PlantConfig,
     *,
     record: Record = forget,
     let_go_s: float = math.inf,
     delay_ms: float = 1.0,
 ) -> tuple[Lockstep, list[float], bool]:
     """Run to the end or a fall; return the fleet, heights from 1 s on, and whether it fell."""
-    plant = changed(PlantConfig(), errors)
     fleet = Lockstep(robot, told, Impairment(delay_ms=delay_ms), plant=plant, record=record)
     heights = []
     for row in fleet.run():
@@ -83,7 +52,7 @@ def causes(fleet: Lockstep) -> set[Cause]:
     return {Cause(event.cause) for _, event in fleet.events}
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", SHAKEN)
 def test_a_robot_that_shook_itself_down_stands_in_hold(robot: RobotConfig, name: str) -> None:
     shaky = unfiltered(robot)
     told = still(4.0, push=(Push(at=3.0, duration=0.3, force=(40.0, 0.0, 0.0)),))
@@ -133,7 +102,7 @@ def test_a_person_who_sags_is_caught(robot: RobotConfig, height: float, delay_ms
     fleet, heights, fell = run(
         robot,
         _sags(height),
-        {"person.load_scale": 2.0},
+        RESTS_TWICE,
         record=record,
         let_go_s=2.4,
         delay_ms=delay_ms,
@@ -151,7 +120,7 @@ def test_a_person_who_sags_is_caught(robot: RobotConfig, height: float, delay_ms
 
 
 def test_a_person_who_sags_and_holds_on_is_let_down_slowly(robot: RobotConfig) -> None:
-    fleet, heights, fell = run(robot, _sags(1.1), {"person.load_scale": 2.0})
+    fleet, heights, fell = run(robot, _sags(1.1), RESTS_TWICE)
     assert not fell
     assert max(before - after for before, after in pairwise(heights)) * 100.0 < 0.32, "m/s"
     assert min(heights) > 0.95
@@ -176,7 +145,9 @@ def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
         Keyframe(at=1.0, height=1.1),
         Keyframe(at=1.6, height=1.1, pitch=1.2),
     )
-    fleet, _, fell = run(robot, story("stand", duration=4.0, keyframe=frames, kill=(), push=()), {})
+    fleet, _, fell = run(
+        robot, story("stand", duration=4.0, keyframe=frames, kill=(), push=()), PlantConfig()
+    )
     assert not fell
     assert Cause.HOLD_ALL in causes(fleet)
     assert not causes(fleet) & set(JOINT_TRIPS)
@@ -196,6 +167,6 @@ def test_a_fast_lead_and_one_beyond_what_legs_reach_are_followed(
         Keyframe(at=1.0 + ways_s, height=height, pitch=pitch),
     )
     told = story("stand", duration=4.0, keyframe=frames, kill=(), push=())
-    fleet, _, fell = run(robot, told, {})
+    fleet, _, fell = run(robot, told, PlantConfig())
     assert not fell
     assert causes(fleet) == {Cause.DRIVE_ARMED, Cause.COMMANDS_FRESH}
