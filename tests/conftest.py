@@ -3,7 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 from shared import config_file
 from shared.config import RobotConfig
@@ -11,6 +11,14 @@ from shared.config import RobotConfig
 # A busy machine is no failed claim: no time limit for one example.
 settings.register_profile("no_deadline", deadline=None)
 settings.load_profile("no_deadline")
+# A mutant is to fail, no matter by which example.
+settings.register_profile(
+    "mutants",
+    deadline=None,
+    database=None,
+    derandomize=True,
+    phases=(Phase.explicit, Phase.generate),
+)
 
 SLOWEST = (
     "test_sweep.py", "test_assist.py", "test_gains_verb.py", "test_flapping.py", "test_estop.py",

@@ -11,6 +11,7 @@ ready to track (`Failsafe.ready`), so no planner leads by such numbers.
 
 from __future__ import annotations
 
+from services.joint import law
 from shared.config import RobotConfig
 from shared.gain_table import Bounds, ModuleBounds
 from shared.joints import kind_of
@@ -89,10 +90,9 @@ class Envelope:
         if last is None or last.hold or last.session != c.session:
             return Outside.NOTHING
         most = self._step + self._rate * min(self._gap_s, max(0.0, 1e-9 * (c.t_ns - last.t_ns)))
-        for axis in (0, 1):
-            step = _torque(c, axis, q[axis], v[axis]) - _torque(last, axis, q[axis], v[axis])
-            if not abs(step) <= most:
-                return Outside.TORQUE_STEP
+        (phi, theta), (last_phi, last_theta) = law.torque(c, q, v), law.torque(last, q, v)
+        if not (abs(phi - last_phi) <= most and abs(theta - last_theta) <= most):
+            return Outside.TORQUE_STEP
         return Outside.NOTHING
 
     @staticmethod
@@ -115,14 +115,3 @@ def _within(gains: Pair, bounds: Bounds) -> bool:
 def _at_least(gains: Pair, bounds: Bounds) -> bool:
     (phi, theta), (phi_low, theta_low) = gains, bounds[0]
     return phi >= (1.0 - ROUNDING) * phi_low and theta >= (1.0 - ROUNDING) * theta_low
-
-
-def _torque(command: JointCommand, axis: int, q: float, v: float) -> float:
-    """Return what a command asks of an axis at its stamp, N m."""
-    c = command
-    return (
-        c.k_p[axis] * (c.q_ref[axis] - q)
-        + c.k_d[axis] * (c.v_ref[axis] - v)
-        + c.tau_ff[axis]
-        + c.tau_coupled[axis]
-    )

@@ -197,8 +197,7 @@ class Failsafe(msgspec.Struct):
 
     def engage_after_ns(self, timing: Timing) -> int:
         """Return how long commands must be fresh before TRACK: doubled by each drop-out."""
-        wait = timing.engage_after_ns << min(self.dropouts, 16)
-        return min(wait, timing.engage_after_max_ns)
+        return min(timing.engage_after_ns << self.dropouts, timing.engage_after_max_ns)
 
     def ready(self, now_ns: int, timing: Timing) -> bool:
         """Return True if this module can track, and fresh commands are believed for long enough."""

@@ -31,8 +31,11 @@ class Setpoint(msgspec.Struct, gc=False, frozen=True):
     """N m s/rad"""
 
 
-def torque(setpoint: Setpoint, q: Pair, v: Pair) -> Pair:
-    """Return tau = k_p (q_ref - q) + k_d (v_ref - v) + tau_ff + tau_coupled, N m."""
+def torque(setpoint: Setpoint | JointCommand, q: Pair, v: Pair) -> Pair:
+    """Return tau = k_p (q_ref - q) + k_d (v_ref - v) + tau_ff + tau_coupled, N m.
+
+    Of a command: as it was when the planner sent it.
+    """
     s = setpoint
     return (
         s.k_p[0] * (s.q_ref[0] - q[0])

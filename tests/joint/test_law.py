@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -24,6 +25,10 @@ torques = pairs(st.floats(-200.0, 200.0))
 setpoints = st.builds(Setpoint, angles, rates, torques, torques, pairs(gains), pairs(gains))
 
 SOFT = Setpoint((0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 0.0), (10.0, 0.0))
+
+FULL = Setpoint(
+    (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
+)  # fmt: skip
 
 
 @given(s=setpoints, q=angles, v=rates)
@@ -131,3 +136,40 @@ def test_damping_begins_with_the_torque_that_was_in_force(
 def test_stand_asks_for_no_torque_where_it_stands(q: Pair) -> None:
     s = law.stand(q, (900.0, 1500.0), (40.0, 60.0))
     assert law.torque(s, q, (0.0, 0.0)) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("away_phi", [-0.126, -0.125, 0.0, 0.125, 0.126])
+@pytest.mark.parametrize("away_theta", [-0.063, -0.0625, 0.0, 0.0625, 0.063])
+def test_where_a_stiffer_spring_would_pull_too_hard_the_axis_holds_where_it_is(
+    away_phi: float, away_theta: float
+) -> None:
+    """50 N m more are allowed: phi rises by 400 N m/rad, theta by 800."""
+    s = msgspec.structs.replace(FULL, q_ref=(0.0, 0.0))
+    q = (-away_phi, -away_theta)
+    near = law.near(s, q, (500.0, 1600.0), 50.0)
+    far = abs(away_phi) > 0.1255, abs(away_theta) > 0.06275
+    carried = (3.0 + 100.0 * away_phi, -20.0 + 800.0 * away_theta)
+    expected = msgspec.structs.replace(
+        s,
+        q_ref=(q[0] if far[0] else 0.0, q[1] if far[1] else 0.0),
+        tau_ff=(carried[0] if far[0] else 3.0, carried[1] if far[1] else -20.0),
+    )
+    assert near == expected
+    np.testing.assert_allclose(law.torque(near, q, (0, 0)), law.torque(s, q, (0, 0)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("sinks", [(False, False), (True, False), (False, True), (True, True)])
+def test_each_axis_that_is_to_sink_carries_its_own_load_on(sinks: tuple[bool, bool]) -> None:
+    q = (0.3, -1.5)
+    tau_ff = (3.0 - 20.0 if sinks[0] else 3.0, -20.0 + 400.0 if sinks[1] else -20.0)
+    carried = law.carrying(FULL, sinks, q)
+    assert carried == msgspec.structs.replace(FULL, tau_ff=pytest.approx(tau_ff))
+
+
+def test_a_theta_that_is_levelled_or_caught_leaves_phi_as_it_was() -> None:
+    assert law.levelled(FULL, -0.7, 0.3, 900.0) == Setpoint(
+        (0.1, -0.7), (0.2, 0.3), FULL.tau_ff, FULL.tau_coupled, (100.0, 900.0), FULL.k_d
+    )
+    assert law.caught(FULL, -2.5, 900.0, 60.0) == Setpoint(
+        (0.1, -2.5), FULL.v_ref, FULL.tau_ff, FULL.tau_coupled, (100.0, 900.0), (10.0, 60.0)
+    )

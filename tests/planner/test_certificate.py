@@ -137,6 +137,13 @@ def test_all_of_k_q_gives_k_p_in_the_closed_directions(stand: Stand) -> None:
     np.testing.assert_allclose(T.T @ K_q @ T + K_geo, K_p + law.K_0 * T.T @ N @ T, atol=1e-5)
 
 
+def test_where_the_chain_has_no_rates_nothing_is_certified(robot: RobotConfig) -> None:
+    certificate = Certificate(robot)
+    certificate.at(np.full((12, 6), np.nan), np.zeros((12, 12)))
+    margins = certificate.margins(np.full(12, 1e4))
+    assert (margins.service, margins.onboard) == (0.0, 0.0)
+
+
 def test_a_robot_without_stiffness_falls(stand: Stand) -> None:
     """Held torques do not hold: forward and sideways the weight wins."""
     K = stand.certificate.failsafe_stiffness(np.zeros(12))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -53,6 +54,12 @@ def test_with_it_the_closed_rows_are_as_stiff_as_asked(seed: int, scale: float) 
     K_c, _ = missing().at(K_fail, np.zeros((6, 6)))
     left = (K_fail + K_c)[CLOSED] - np.diag(K_P[[0, 1, 3, 5]])
     assert np.linalg.eigvalsh(left).min() > -1e-6 * max(scale, 1e4)
+
+
+def test_a_pole_follows_as_its_bandwidth_says() -> None:
+    """1 - exp(-2 pi f dt): after the time constant 63 % of a step."""
+    assert follow(2.0, 1.0 / (2.0 * np.pi * 2.0)) == pytest.approx(1.0 - np.exp(-1.0))
+    assert follow(0.0, 1.0) == 0.0
 
 
 def test_a_step_comes_through_two_poles_and_all_of_it() -> None:

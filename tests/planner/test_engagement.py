@@ -5,8 +5,8 @@ from typing import TypeVar
 import pytest
 
 from services.joint.drivers.base import DriveStatus
-from services.planner.engagement import GRACE_NS, WAITS_NS, Engagement
-from shared.clock import NS_PER_MS
+from services.planner.engagement import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import JointCommand, Mode, PlannerMode
@@ -188,3 +188,35 @@ def test_it_tells_how_long_it_waits_and_leads_when_that_is_over(dropouts: int) -
         left_ns = engagement.wait_ns(now_ns)
         engagement.advance(now_ns, YES, YES, HOLD)
         assert engagement.hold is (left_ns > 0)
+
+
+def drop_out(engagement: Engagement, now_ns: int) -> None:
+    """Lose a module, and lead again."""
+    engagement.advance(now_ns, but(YES, 2, False), YES, TRACK)
+    engagement.mode, engagement.since_ns = PlannerMode.LEADING, now_ns - GRACE_NS - 1
+
+
+def test_drop_outs_are_counted_up_to_the_longest_wait() -> None:
+    engagement = leading()
+    for count in range(1, len(WAITS_NS) + 3):
+        now_ns = T0 + count * NS_PER_S
+        drop_out(engagement, now_ns)
+        assert engagement.dropouts == min(count, len(WAITS_NS) - 1)
+        assert engagement.dropped_ns == now_ns
+
+
+def test_each_good_while_makes_one_drop_out_forgotten() -> None:
+    engagement = leading()
+    for _ in range(3):
+        drop_out(engagement, T0)
+    engagement.steady_since_ns = T0
+    for now_ns, left in (
+        (T0 + FORGET_NS - 1, 3),
+        (T0 + FORGET_NS, 2),
+        (T0 + 2 * FORGET_NS - 1, 2),
+        (T0 + 2 * FORGET_NS, 1),
+        (T0 + 3 * FORGET_NS, 0),
+        (T0 + 4 * FORGET_NS, 0),
+    ):
+        engagement.advance(now_ns, YES, YES, TRACK)
+        assert engagement.dropouts == left, now_ns - T0

@@ -106,6 +106,31 @@ def test_without_a_harness_what_was_found_stands(
     assert law.load == (0.0, 0.0, 0.0)
 
 
+def test_a_torso_that_turns_freely_tells_it_too(load: Load) -> None:
+    """Torques that hold the file's moment look right: the motion gives it away."""
+    a, rate = 6.0, 0.0
+    for _ in range(500):
+        load.advance(WEIGHT * STRAIGHT_UP, STRAIGHT_UP, 0.0, (0.0, rate), DT, led=False)
+        rate += DT * -a / INERTIA
+    assert load.a == pytest.approx(a, abs=0.1)
+
+
+def test_while_it_is_led_it_is_found_eight_times_as_slowly(load: Load) -> None:
+    twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
+    for each, seconds in ((load, 2.0), (twin, 0.25)):
+        for _ in range(1 + round(seconds / DT)):
+            each.advance(
+                (WEIGHT + 50.0) * STRAIGHT_UP, STRAIGHT_UP, 0.0, (0.0, 0.0), DT, led=each is load
+            )
+        assert each.kg == pytest.approx((1.0 - math.exp(-1.0)) * 50.0 / GRAVITY, rel=0.02)
+
+
+def test_after_a_long_gap_it_is_found_at_once_and_no_more(load: Load) -> None:
+    for dt in (DT, 10.0):
+        load.advance((WEIGHT + 50.0) * STRAIGHT_UP, STRAIGHT_UP, 0.0, (0.0, 0.0), dt, led=False)
+    assert load.kg == pytest.approx(50.0 / GRAVITY)
+
+
 def test_one_that_hangs_tells_nothing(load: Load) -> None:
     for _ in range(1000):
         load.advance(0.2 * WEIGHT * STRAIGHT_UP, STRAIGHT_UP, 0.0, (0.0, 0.0), DT, led=False)
@@ -165,3 +190,32 @@ def test_it_goes_on_from_a_memory(load: Load) -> None:
     for each in (load, twin):
         found(each, -3.0, 2.0, seconds=0.5)
     assert twin.remember() == load.remember()
+
+
+@pytest.mark.parametrize(
+    ("kg", "a", "b", "words"),
+    [
+        (9.0, 0.0, 0.0, ["9.0 kg more"]),
+        (-0.5, 25.0, 0.0, ["too far ahead, by 25 N m"]),
+        (0.0, 0.5, 25.0, ["too far high, by 25 N m"]),
+        (0.0, -0.5, -25.0, ["too far low, by 25 N m"]),
+        (-9.0, -25.0, 0.0, ["9.0 kg less", "too far behind, by 25 N m"]),
+        (6.0, 17.0, 0.5, ["too far ahead, by 17 N m"]),
+    ],
+)
+def test_each_reason_is_told_and_none_that_is_none(
+    load: Load, kg: float, a: float, b: float, words: list[str]
+) -> None:
+    load.recall(LoadMemory(kg, a, b, None, refused=True))
+    told = load.refusal()
+    assert told.count("carries") + told.count("lies") == len(words)
+    assert [told.index(said) for said in words] == sorted(told.index(said) for said in words)
+    assert "; the load" in told or len(words) == 1
+
+
+def test_what_was_refused_stays_refused_in_a_memory(load: Load) -> None:
+    found(load, 9.0)
+    twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
+    twin.recall(load.remember())
+    assert twin.refused
+    assert twin.refusal() == load.refusal()

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from services.planner.planner import Planner
-from services.planner.plausible import BEYOND_RAD, Plausible
+from services.planner.plausible import BEYOND_RAD, SPEED_MAX, Plausible
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.joints import N_JOINTS, N_MODULES
@@ -37,6 +37,16 @@ def test_an_angle_is_taken_up_to_half_a_radian_beyond_its_soft_stop(
     for beyond, taken in ((0.99, True), (1.01, False)):
         q[index] = (high if side > 0.0 else low) + side * beyond * BEYOND_RAD
         assert plausible.is_state(module, state(module, q)) is taken
+
+
+def test_at_its_very_bounds_a_state_is_still_one(robot: RobotConfig) -> None:
+    plausible = Plausible(robot)
+    for index, (low, high) in enumerate(robot.joint_limits()):
+        for angle in (low - BEYOND_RAD, high + BEYOND_RAD):
+            q = np.zeros(N_JOINTS)
+            q[index] = angle
+            told = state(index // 2, q, v=(SPEED_MAX, -SPEED_MAX))
+            assert plausible.is_state(index // 2, told)
 
 
 @pytest.mark.parametrize("speed", [math.nan, math.inf, -math.inf, 1e300, -101.0])

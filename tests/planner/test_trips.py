@@ -230,3 +230,72 @@ def test_what_lasted_before_it_led_does_not_count(robot: RobotConfig) -> None:
 def test_with_one_leg_unknown_none_is_unloaded(loads: tuple[float, float]) -> None:
     values = values_of(output_of(0.0), np.zeros(12), loads, None, 0.0, 0.0, leads=True)
     assert math.isnan(values[UNLOADED])
+
+
+@pytest.mark.parametrize("trip", TRIPS)
+def test_at_its_limit_nothing_trips_yet(robot: RobotConfig, trip: Trip) -> None:
+    trips, values = led(robot), beyond(robot, trip, by=1.0)
+    for tick in range(1000):
+        trips.advance(T0 + tick * TICK_NS, values, leads=True)
+    assert trips.tripped is Trip.NONE
+
+
+def test_one_that_was_put_back_on_the_hoist_misses_no_leg(robot: RobotConfig) -> None:
+    trips, hanging = led(robot), beyond(robot, Trip.UNLOADED)
+    trips.advance(T0, hanging, leads=False)
+    for tick in range(1, 1000):
+        trips.advance(T0 + tick * TICK_NS, hanging, leads=True)
+    assert trips.tripped is Trip.NONE
+
+
+@pytest.mark.parametrize("trip", TRIPS)
+def test_one_that_stood_as_it_tripped_is_not_led_on_one_leg(robot: RobotConfig, trip: Trip) -> None:
+    trips = led(robot)
+    for tick in range(500):
+        trips.advance(T0 + tick * TICK_NS, beyond(robot, trip), leads=True)
+    for tick in range(500, 1500):
+        trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.UNLOADED), leads=False)
+    assert trips.tripped is trip
+
+
+def test_both_legs_have_borne_it_once_each_bears_three_times_the_least(robot: RobotConfig) -> None:
+    least = robot.trips.unloaded.limit
+    for borne, tripped in ((3.0 * least, Trip.NONE), (3.0 * least + 0.1, Trip.UNLOADED)):
+        trips, values = Trips(robot), list(CALM)
+        values[UNLOADED] = borne
+        trips.advance(T0, tuple(values), leads=True)
+        for tick in range(1, 500):
+            trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.UNLOADED), leads=True)
+        assert trips.tripped is tripped
+
+
+def test_what_tripped_first_is_told(robot: RobotConfig) -> None:
+    trips = led(robot)
+    for tick in range(100):
+        trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.LEGS), leads=True)
+    for tick in range(100, 200):
+        trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.REACH), leads=True)
+    assert trips.tripped is Trip.LEGS
+    assert PLANNER_TRIPS[Trip.LEGS].measured in trips.why
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("joint", range(12))
+def test_each_value_is_what_the_table_says(joint: int, sign: float) -> None:
+    q = np.zeros(12)
+    q[joint] = 0.2 * sign
+    pdot = np.array((0.1, 0.2, 0.3 * sign, 0.4, 0.5 * sign, 0.6))
+    said = output_of(0.0)._replace(
+        closure=np.array((0.01, -0.02, 0.02, 9.0, 9.0, 9.0)), ik_residual=0.004, pdot=pdot
+    )
+    values = values_of(said, q, (90.0, 80.0), None, 0.0, 0.07, leads=True)
+    by_name = dict(zip(TRIPS, values, strict=True))
+    assert by_name[Trip.LEGS] == pytest.approx(0.03)
+    assert by_name[Trip.REACH] == 0.004
+    assert by_name[Trip.TRACKING] == pytest.approx(0.2)
+    assert by_name[Trip.UNLOADED] == 80.0
+    assert by_name[Trip.SINKING] == pytest.approx(0.3)
+    assert by_name[Trip.TURNING] == pytest.approx(0.5)
+    assert math.isnan(by_name[Trip.HARNESS])
+    assert math.isnan(by_name[Trip.SAGGING])
+    assert by_name[Trip.UNATTENDED] == 0.07

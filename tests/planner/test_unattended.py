@@ -29,6 +29,11 @@ def test_it_is_told_from_where_the_hand_left_it(pose: Pair, drift: float) -> Non
     assert left().drift(T0 + LET_GO_NS + 1, pose, 0.0, 0.0) == pytest.approx(drift)
 
 
+def test_a_force_below_what_is_felt_is_no_hand() -> None:
+    drift = left().drift(T0 + LET_GO_NS + 1, (0.84, 0.1), 0.99 * FELT[0], 0.99 * FELT[1])
+    assert drift == pytest.approx(0.04)
+
+
 @pytest.mark.parametrize(
     ("force", "moment"),
     [(FELT[0], 0.0), (-FELT[0], 0.0), (0.0, FELT[1]), (0.0, -FELT[1]), (math.nan, math.nan)],

@@ -166,3 +166,9 @@ def test_a_wrench_that_was_heard_long_ago_eases_nothing(robot: RobotConfig) -> N
     assert max(eased[:5]) > 0.1, "it was heard at first"
     assert eased[-1] < 1e-6
     assert now_ns - START_NS > NS_PER_S
+
+
+def test_a_clock_that_starts_at_nought_is_a_clock(timing: Timing) -> None:
+    failsafe = Failsafe(mode=Mode.HOLD, fresh_since_ns=0)
+    assert failsafe.ready(timing.engage_after_ns, timing)
+    assert not failsafe.ready(timing.engage_after_ns - 1, timing)
