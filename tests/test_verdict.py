@@ -19,8 +19,9 @@ from tests.lockstep.runs import still
 from tools import cli
 from tools.runs import verdict, verdict_table
 from tools.runs.run_log import read_run
-from tools.runs.soundness import _longest_s, shaking_of
+from tools.runs.soundness import _longest_s, shaking_of, why_not_sound
 from tools.runs.standing import why_not_standing
+from tools.runs.verdict_limits import LIMITS, SOUND
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +87,31 @@ def test_a_sound_run_has_figures_within_their_limits(tmp_path: Path) -> None:
     assert all(word in text for word in ("torque above 8 Hz", "at its limit", "fastest way down"))
 
 
-def test_hard_pushes_are_told(tmp_path: Path, robot: RobotConfig) -> None:
+def test_motors_at_their_limit_are_no_sound_standing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A knee limp, the other carries all: it stands, and not as it is to."""
+    flags = ("--fault", "knee_left:disarmed@1.5", "--duration", "4")
+    assert cli.main(["sim", *flags, "--out", str(tmp_path)]) == 1
+    summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
+    assert (summary["stood"], summary["fallen_at_s"], summary["why_not"]) == (False, None, "")
+    assert "torque at its limit" in summary["unsound"]
+    said = capsys.readouterr().out
+    assert "STOOD, BUT NOT SOUNDLY" in said
+    assert "(limit 50)" in said
+
+
+@pytest.mark.parametrize("key", SOUND)
+def test_each_figure_of_soundness_is_judged_by_its_limit(key: str) -> None:
+    (limit,) = (row for row in LIMITS if row.key == key)
+    calm = dict.fromkeys(SOUND, 0.0)
+    assert why_not_sound(calm | {key: limit.limit}) == ""
+    assert limit.what in why_not_sound(calm | {key: 1.01 * limit.limit})
+    assert why_not_sound(dict.fromkeys(SOUND)) == "", "of which nothing is known"
+
+
+def test_hard_pushes_are_told(tmp_path: Path) -> None:
     """130 N from the side keep a knee's motors at their limit."""
-    del robot
     push = Push(at=0.5, duration=0.5, force=(0.0, 130.0, 0.0))
     words = f"{push.at:g}:{push.duration:g}:0,130,0"
     cli.main(["sim", "--duration", "2", "--push", words, "--out", str(tmp_path)])

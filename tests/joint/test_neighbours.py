@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from itertools import product
 from pathlib import Path
+from struct import Struct
+from typing import Any
 
 import pytest
 
+from services.joint import neighbours
 from services.joint.neighbours import (
     GONE_NS,
     NOTHING,
@@ -69,6 +72,12 @@ def test_who_holds_beside_whom() -> None:
         assert found.sinks is not holds, (asks, other, mode, age_ns, caught)
 
 
+def test_a_drive_that_was_never_heard_of_is_not_limp() -> None:
+    for asks, other in (("hip_right", "knee_left"), ("knee_right", "ankle_left")):
+        assert near(asks, rows(**{other: Row(0, 0.0, 0.0, Mode.FAULT)}), T0).sinks
+        assert not near(asks, rows(**{other: Row(1, 0.0, 0.0, Mode.FAULT)}), T0).sinks
+
+
 def test_a_clock_far_ahead_is_of_another_host() -> None:
     ahead = rows(knee_left=Row(T0 + STALE_NS + 1, 0.0, 0.0, Mode.HOLD))
     assert near("knee_right", ahead, T0).sinks
@@ -106,3 +115,32 @@ def test_a_row_that_its_writer_died_over_is_not_read(
     successor = Neighbours(tmp_path, "knee_left")
     successor.write(Row(T0, 0.3, 0.0, Mode.DAMP))
     assert six["hip_left"].near(T0) == Near(pytest.approx((0.4, 0.0)))
+
+
+def test_each_service_finds_its_own_row(tmp_path: Path, six: dict[str, Neighbours]) -> None:
+    for name, mode in zip(MODULES, (*Mode, Mode.HOLD), strict=True):
+        six[name].write(Row(T0, 0.0, 0.0, mode))
+    for name, mode in zip(MODULES, (*Mode, Mode.HOLD), strict=True):
+        assert Neighbours.mode_of(tmp_path, name) is mode
+
+
+def test_a_row_is_odd_while_it_is_written_and_never_has_the_same_number_twice(
+    tmp_path: Path, six: dict[str, Neighbours], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a reader that looks in between relies on; a service that starts anew counts on."""
+    last = MODULES[-1]
+    while_written, after = [], []
+
+    class Number(Struct):
+        def pack_into(self, buffer: Any, offset: int, *values: Any) -> None:
+            while_written.append(self.unpack_from(buffer, offset)[0])
+            super().pack_into(buffer, offset, *values)
+            after.append(self.unpack_from(buffer, offset)[0])
+
+    monkeypatch.setattr(neighbours, "_NUMBER", Number("<Q"))
+    six["ankle_right"].write(Row(T0, 0.0, 0.0, Mode.DAMP))
+    for _ in range(3):
+        six[last].write(Row(T0, 0.0, 0.0, Mode.DAMP))
+    Neighbours(tmp_path, last).write(Row(T0, 0.0, 0.0, Mode.DAMP))
+    assert [number % 2 for number in while_written] == [1] * 5
+    assert after == [2, 2, 4, 6, 8]

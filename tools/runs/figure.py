@@ -87,6 +87,8 @@ def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
     axes[-1].set_xlim(0.0, end_s)
     fell = summary["fallen_at_s"] is not None or summary["why_not"]
     verdict = "stood" if summary["stood"] else "FELL" if fell else "not finished"
+    if summary["unsound"]:
+        verdict = "stood, but not soundly"
     figure.suptitle(f"{name}: {verdict}", fontsize=12, x=0.01, ha="left")
     figure.savefig(path)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +16,7 @@ from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import JointState, Mode, SimTruth
 from tools.runs.run_log import RunLog
+from tools.runs.verdict_limits import LIMITS, SOUND
 
 Array = NDArray[np.float64]
 
@@ -53,6 +54,15 @@ def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dic
         "shaking_nm": max(shaking) if shaking else None,
         "sinking_m_s": _sinking(truth),
     }
+
+
+def why_not_sound(figures: Mapping[str, Any]) -> str:
+    """Return in words what is over its limit; "": the robot stood soundly, as far as is known."""
+    rows = (row for row in LIMITS if row.key in SOUND)
+    over = [row for row in rows if (figures.get(row.key) or 0.0) > row.limit]
+    return "; ".join(
+        f"{row.what}: {figures[row.key]:.3g} {row.unit} (limit {row.limit:g})" for row in over
+    )
 
 
 def shaking_of(t_ns: NDArray[np.int64], tau: Array) -> Array:

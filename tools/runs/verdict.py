@@ -30,7 +30,7 @@ from shared.messages import (
 from tools.runs.impaired import Impaired, impairments, touches
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog
-from tools.runs.soundness import soundness
+from tools.runs.soundness import soundness, why_not_sound
 from tools.runs.standing import why_not_standing
 
 Array = NDArray[np.float64]
@@ -94,10 +94,14 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     fallen = any(row.fallen for row in truth)
     reached = began and bool(t[-1] >= duration_s - 0.1)
     robot = _robot_of(log)
+    sound = soundness(log, truth, robot) if robot is not None else {}
     why_not = why_not_standing(last, robot) if robot is not None and reached else ""
+    stands = reached and not fallen and not why_not
+    unsound = why_not_sound(sound) if stands else ""
     summary: Summary = {
-        "stood": reached and not fallen and not why_not,
+        "stood": stands and not unsound,
         "why_not": why_not,
+        "unsound": unsound,
         "began": began,
         "fallen_at_s": next(
             (float(s) for s, row in zip(t, truth, strict=True) if row.fallen), None
@@ -118,7 +122,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     summary["torso_height_max_m"] = max(heights)
     tilt = np.array([max(row.foot_right_tilt, row.foot_left_tilt) for row in truth])
     summary["sole_tilt_max_rad"] = _max(tilt)
-    summary |= soundness(log, truth, robot) if robot is not None else {}
+    summary |= sound
     summary["alive_sole_tilt_max_rad"] = _max(tilt[alive])
     force = np.array([abs(row.operator_force[2]) for row in truth])
     summary["operator_peak_n"] = _max(force[alive])

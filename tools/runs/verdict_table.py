@@ -102,4 +102,6 @@ def _sentence(summary: Summary) -> str:
         return f"[bold red]FELL[/] at {summary['fallen_at_s']:.1f} s"
     if summary["why_not"]:
         return f"[bold red]DOES NOT STAND[/] at the end: {summary['why_not']}"
+    if summary["unsound"]:
+        return f"[bold red]STOOD, BUT NOT SOUNDLY[/]: {summary['unsound']}"
     return f"[bold red]NOT FINISHED[/]: the log ends at {summary['duration_s']:.1f} s"
