@@ -11,7 +11,7 @@ import pytest
 
 from services.joint import law
 from services.joint.controller import JointController
-from services.joint.envelope import Envelope
+from services.joint.envelope import ROUNDING, Envelope
 from services.joint.failsafe import Event, Failsafe, Refusal, timing_of
 from shared import config_file
 from shared.config import RobotConfig
@@ -132,6 +132,32 @@ def test_each_number_is_believed_up_to_its_bound_and_not_beyond(
         if name == "k_p" and value > 1e-3:  # stiffer: the reference is at the joint
             assert changed.q_ref == Q
         assert judge(robot, changed, module=module) is wanted, value
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("end", [0, 1])
+def test_at_its_very_bound_each_number_is_believed(robot: RobotConfig, axis: int, end: int) -> None:
+    bounds, own, least = bounds_of(robot), robot.envelope, robot.certificate
+    side, share = (-1.0, 1.0)[end], 1.0 + (-ROUNDING, ROUNDING)[end]
+    tau_ff = tau_ff_at(bounds, Q[1])[end][axis] + side * own.tau_ff_room
+    at_bound = {
+        "k_p": share * bounds.k_p[end][axis],
+        "k_d": share * bounds.k_d[end][axis],
+        "tau_ff": tau_ff,
+        "dtau_ff": side * own.dtau_ff,
+        "tau_coupled": side * own.tau_coupled,
+        "v_ref": side * min(own.v_ref, bounds.v_ref[axis]),
+    }
+    for name, value in at_bound.items():
+        told = middle(robot)
+        changed = with_axis(getattr(told, name), axis, value)
+        told = msgspec.structs.replace(told, q_ref=Q, **{name: changed})
+        assert judge(robot, told) is Outside.NOTHING, name
+    for name, bound in (
+        ("margin", least.margin_min), ("margin_onboard", least.onboard_margin_min),
+    ):  # fmt: skip
+        told = middle(robot, **{name: (1.0 - ROUNDING) * bound})
+        assert judge(robot, told) is Outside.NOTHING, name
 
 
 @pytest.mark.parametrize("name", ["margin", "margin_onboard"])

@@ -49,6 +49,13 @@ def test_blend_of_two_laws_gives_the_blended_torque_everywhere(
     np.testing.assert_allclose(blended, [1.0 - share, share] @ apart, rtol=1e-9, atol=1e-6)
 
 
+def test_with_no_gain_at_all_a_blend_goes_to_the_later_reference() -> None:
+    limp = msgspec.structs.replace(FULL, k_p=(0.0, 0.0), k_d=(0.0, 0.0))
+    later = msgspec.structs.replace(limp, q_ref=(0.3, 0.5), v_ref=(0.7, 0.9))
+    blended = law.blend(limp, later, 0.5)
+    assert (blended.q_ref, blended.v_ref) == ((0.3, 0.5), (0.7, 0.9))
+
+
 @given(a=setpoints, b=setpoints, share=shares)
 def test_blend_of_two_laws_has_no_negative_gain(a: Setpoint, b: Setpoint, share: float) -> None:
     blended = law.blend(a, b, share)

@@ -48,9 +48,12 @@ def test_a_motor_moves_no_further_than_its_speed_and_a_margin_explain(
     assert samples.q == joint_from_motor(samples.pos, N)
 
 
-def test_a_fast_motor_may_go_on_fast(samples: Samples) -> None:
-    samples.take(reading(T0 + PERIOD, vel=(60.0, 0.0)), armed=True)
-    moved = (1.0 + 60.0 * 2e-3, -2.0)
+@pytest.mark.parametrize(
+    ("vel", "moved"),
+    [((60.0, 0.0), (1.12, -2.0)), ((0.0, 60.0), (1.0, -1.88)), ((0.0, -60.0), (1.0, -2.12))],
+)
+def test_a_fast_motor_may_go_on_fast(samples: Samples, vel: Pair, moved: Pair) -> None:
+    samples.take(reading(T0 + PERIOD, vel=vel), armed=True)
     assert samples.take(reading(T0 + 2 * PERIOD, moved), armed=True) is Event.DRIVE_ARMED
     assert samples.pos == moved
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -45,6 +46,28 @@ def test_a_shaking_torque_trips_within_150_ms(robot: RobotConfig, hz: float, axi
     assert event is Event.SHAKING
     assert ms is not None
     assert ms < 150.0
+
+
+def test_shaking_is_the_mean_square_above_its_band_of_either_axis(robot: RobotConfig) -> None:
+    """One torque far from where the slow part is: (1 - share)^2 of its square counts."""
+    limits = limits_of(robot)
+    for axis in (0, 1):
+        for sign in (-1.0, 1.0):
+            trips = Trips()
+            trips.rest(STILL)
+            jump = (sign * 9.0, 0.0) if axis == 0 else (0.0, sign * 9.0)
+            trips.judge(T0, jump, STILL, limits)
+            left = 9.0 * (1.0 - limits.slow_share)
+            assert trips.mean[axis] == pytest.approx(limits.mean_share * left**2)
+            assert trips.mean[1 - axis] == 0.0
+
+
+def test_at_its_limit_shaking_and_speed_are_none_and_torque_is(robot: RobotConfig) -> None:
+    limits = msgspec.structs.replace(limits_of(robot), mean_share=0.0, shaking=4.0)
+    trips = Trips(mean=(4.0, 4.0))
+    at_limit = (0.25 * limits.torque, -0.75 * limits.torque)
+    assert trips.judge(T0, at_limit, (limits.speed, -limits.speed), limits) is Event.NONE
+    assert (trips.at_limit_ns, trips.fast_ns) == (T0, 0)
 
 
 @given(

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from services.joint.controller import JointController
-from services.joint.failsafe import Event, Failsafe, Refusal, Timing, timing_of
+from services.joint.failsafe import (
+    RETIRED_SESSIONS_KEPT,
+    Event,
+    Failsafe,
+    Refusal,
+    Timing,
+    timing_of,
+)
 from services.planner.engagement import GRACE_NS, Engagement
 from services.planner.planner import Planner
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -172,3 +179,12 @@ def test_a_clock_that_starts_at_nought_is_a_clock(timing: Timing) -> None:
     failsafe = Failsafe(mode=Mode.HOLD, fresh_since_ns=0)
     assert failsafe.ready(timing.engage_after_ns, timing)
     assert not failsafe.ready(timing.engage_after_ns - 1, timing)
+
+
+def test_the_last_256_sessions_never_become_current_again(timing: Timing) -> None:
+    failsafe, now_ns = Failsafe(), T0
+    for session in range(1, RETIRED_SESSIONS_KEPT + 4):
+        now_ns += timing.max_command_age_ns + 1
+        told = command(session=session, echo_t_ns=now_ns)
+        assert failsafe.offer(told, now_ns, timing) is Refusal.NONE
+    assert failsafe.retired == tuple(range(3, RETIRED_SESSIONS_KEPT + 3))
