@@ -50,30 +50,28 @@ class Group(Section, frozen=True):
     tests: tuple[str, ...]
 
 
-class Survivor(Section, frozen=True):
-    """A mutant that may live."""
+class Change(Section, frozen=True, order=True):
+    """What a mutant is."""
 
     function: str
     """As mutmut names it, such as `services.joint.gate.x_gate`."""
     was: str
     """The lines of code, stripped and joined by a space."""
     becomes: str
-    why: Annotated[str, msgspec.Meta(min_length=10)]
+
+
+class Reason(Section, frozen=True):
+    """Why some mutants may live."""
+
+    why: Annotated[str, msgspec.Meta(min_length=20)]
+    lives: tuple[Change, ...]
 
 
 class MutantsFile(Section, frozen=True):
     """The whole file."""
 
     group: tuple[Group, ...]
-    survivor: tuple[Survivor, ...] = ()
-
-
-class Change(NamedTuple):
-    """What a mutant is."""
-
-    function: str
-    was: str
-    becomes: str
+    reason: tuple[Reason, ...] = ()
 
 
 class Found(NamedTuple):
@@ -236,14 +234,14 @@ def _judge(
     total, dead = counts.total(), sum(counts[word] for word in DEAD)
     if not total:
         raise RunError("no mutant has such a name")
-    reasons = {Change(row.function, row.was, row.becomes): row.why for row in told.survivor}
+    listed = {change for reason in told.reason for change in reason.lives}
     alive = [row for found in groups for row in found.alive]
-    unlisted = [(name, change) for name, change in alive if change not in reasons]
+    unlisted = [(name, change) for name, change in alive if change not in listed]
     for name, change in unlisted:
         console.print(f"lives: {name}", style="red")
         console.print(f"  - {change.was}\n  + {change.becomes}", markup=False, soft_wrap=True)
     whole = not (args.only or args.sample or args.survivors or args.group)
-    stale = set(reasons) - {change for _, change in alive} if whole else set()
+    stale = listed - {change for _, change in alive} if whole else set()
     for change in sorted(stale):
         text = f"listed, and does not live: {change.function}: {change.becomes}"
         console.print(text, markup=False, soft_wrap=True)
