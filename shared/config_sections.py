@@ -224,6 +224,8 @@ class JointServiceConfig(Section, frozen=True):
     k_p_max: LocalStiffness
     k_d_max: LocalDamping
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
+    pendant_ms: Annotated[float, Range(20.0, 10_000.0, "ms")] = 500.0
+    """A pendant that was heard and is silent for so long: emergency stop."""
 
 
 class EnvelopeConfig(Section, frozen=True):

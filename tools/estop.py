@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     if args.local:
         if not here:
             raise FleetError(f"{run_dir}: no joint service of a fleet is on this host")
-        going = _wait_here(run_dir, here)
+        going = wait_here(run_dir, here)
     else:
         try:
             fleet = Fleet.attach(run_dir)
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
             if not here:
                 raise
             print(f"xrl: not over the bus: {error}", file=sys.stderr)
-            going = _wait_here(run_dir, here)
+            going = wait_here(run_dir, here)
     if going:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
     Console().print("all six modules are stopped: DAMP, a slow sink; `xrl down` ends it")
@@ -87,8 +87,13 @@ def _is_stopped(run_dir: Path, module: str) -> bool:
     return Neighbours.mode_of(run_dir, module) in STOPPED
 
 
-def _wait_here(run_dir: Path, here: list[str]) -> list[str]:
-    """Wait for the services on this host; return in words what has not stopped."""
+def wait_here(run_dir: Path, here: list[str]) -> list[str]:
+    """Wait for the services on this host; return in words what has not stopped.
+
+    Args:
+        run_dir: of the fleet.
+        here: the modules that have a service on this host.
+    """
     deadline = time.monotonic() + GIVE_UP_S
     while time.monotonic() < deadline and not all(_is_stopped(run_dir, m) for m in here):
         time.sleep(REPEAT_S)

@@ -34,6 +34,7 @@ VERBS: Final = (
     Verb("inject", "tools.inject", "make a live fleet's network late, lossy or cut, for a while"),
     Verb("start", "tools.start", "start a service that is down, or continue one that is stopped"),
     Verb("estop", "tools.estop", "stop every module: a slow sink, never a drop"),
+    Verb("pendant", "tools.pendant", "a dead man's handle: once it ends, every module stops"),
     Verb("assist", "tools.assist", "ask the robot to carry some of the person, while it runs"),
     Verb("gains", "tools.gains", "compute the certified gain schedule of a robot"),
     Verb("tare", "tools.tare", "take what the harness reads now, unloaded, for its zero"),

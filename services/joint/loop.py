@@ -11,6 +11,7 @@ from services.joint.controller import row_of
 from services.joint.drivers.base import Drive
 from services.joint.module import ARM_TRIES, Module, Obstacle, Order, Step
 from services.joint.neighbours import NOTHING, Neighbours
+from services.joint.pendant import PendantWatch
 from services.joint.tracer import Tracer
 from services.joint.will import Will, WillFile
 from shared import log
@@ -74,6 +75,7 @@ class JointLoop:
         """
         service = config.joint_service
         self._will, self._neighbours = will, neighbours
+        self._pendant, self._pendant_lost = PendantWatch(service.pendant_ms), False
         self._module = module
         self._drive = drive
         self._ports = ports
@@ -105,9 +107,7 @@ class JointLoop:
         module, ports, tracer = self._module, self._ports, self._tracer
         reading = self._drive.read(READ_TIMEOUT_S)
         now = now_ns()
-        estop = ports.estops.take() is not None or (
-            self._will is not None and self._will.stop_asked
-        )
+        estop = ports.estops.take() is not None or self._is_stopped_here(now)
         command = ports.commands.take()
         near = NOTHING
         if self._neighbours is not None and module.asks_near:
@@ -128,6 +128,17 @@ class JointLoop:
             ports.traces.put(trace)
         if step.event is not None or step.obstacle is not Obstacle.NONE:
             self._tell(now, step)
+
+    def _is_stopped_here(self, now: int) -> bool:
+        """Return True if this host says so: someone on it, or a pendant that is silent."""
+        will = self._will
+        if will is None:
+            return False
+        lost = self._pendant.is_lost(now, will.beats)
+        if lost and not self._pendant_lost:
+            log.get("xrl").error("emergency stop: the pendant is silent")
+        self._pendant_lost = lost
+        return lost or will.stop_asked
 
     def _write(self, step: Step) -> None:
         """Carry out the order of this cycle."""

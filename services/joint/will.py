@@ -1,4 +1,4 @@
-"""What a joint service is told, and tells, without a bus: two bytes of shared memory.
+"""What a joint service is told, and tells, without a bus: a few bytes of shared memory.
 
 The first is what a service that dies leaves to its successor.
 
@@ -10,7 +10,8 @@ So each writes down what it last was, and a person who asks for the module (`xrl
 
 The second is the emergency stop of whoever is on the robot's own host (`xrl estop`): it is heard
 with the planner dead and every link of the bus cut, and stays in force until a person starts the
-module again.
+module again. The third is how often a pendant has said that a person still holds it
+(`services.joint.pendant`).
 
 A mapped file: reading and writing it are loads and stores, which the control path may do.
 """
@@ -18,13 +19,18 @@ A mapped file: reading and writing it are loads and stores, which the control pa
 from __future__ import annotations
 
 import mmap
+import struct
+from collections.abc import Sequence
 from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
 _WILL, _STOP = range(2)
-_NEW: Final = bytes(2)
+_BEATS: Final = struct.Struct("<Q")
+_BEATS_AT: Final = 8
+"""Aligned, so that a store of it is whole."""
+_NEW: Final = bytes(_BEATS_AT + _BEATS.size)
 
 
 class Will(IntEnum):
@@ -73,6 +79,11 @@ class WillFile:
         """True if someone on this host has asked for the emergency stop."""
         return self._memory[_STOP] != 0
 
+    @property
+    def beats(self) -> int:
+        """How often a pendant has beaten; 0: there is none."""
+        return int(_BEATS.unpack_from(self._memory, _BEATS_AT)[0])
+
 
 def forget(run_dir: Path, module: str) -> None:
     """Wipe out what a module's services have left: a person asks for it anew.
@@ -96,3 +107,38 @@ def ask_stop(run_dir: Path, module: str) -> bool:
         file.seek(_STOP)
         file.write(b"\x01")
     return True
+
+
+class Pendant:
+    """The pendant's end, for the modules whose services are on this host."""
+
+    def __init__(self, run_dir: Path, modules: Sequence[str]) -> None:
+        """Open the modules' files; those without one have no service here.
+
+        Raises:
+            OSError: a file is there and cannot be written.
+        """
+        self._memories = {}
+        self._beats = 0
+        for module in modules:
+            with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
+                file.truncate(len(_NEW))  # one of before pendants is shorter
+                self._memories[module] = mmap.mmap(file.fileno(), len(_NEW))
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Those that hear it."""
+        return tuple(self._memories)
+
+    def beat(self) -> None:
+        """Say that it is held: from the first time on, its silence stops them."""
+        self._beats += 1
+        self._tell(self._beats)
+
+    def lay_down(self) -> None:
+        """Take it that nobody has to hold it any more."""
+        self._tell(0)
+
+    def _tell(self, beats: int) -> None:
+        for memory in self._memories.values():
+            _BEATS.pack_into(memory, _BEATS_AT, beats)

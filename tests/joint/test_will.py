@@ -13,9 +13,10 @@ from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.loop import JointLoop
 from services.joint.module import ARM_EVERY_NS, Module, Obstacle, Order, Step
-from services.joint.will import Will, WillFile
+from services.joint.will import Pendant, Will, WillFile
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
+from shared.joints import MODULES
 from shared.messages import JointCommand, Mode, Pair
 from tests.joint.helpers import T0, command
 from tests.joint.test_loop import Rig, Stop
@@ -226,6 +227,10 @@ class Process:
         self.loop = JointLoop(robot, self.module, self.rig.drive, ports, self.file)
         monkeypatch.setattr(joint_loop, "now_ns", lambda: self.rig.now_ns)
 
+    @property
+    def mode(self) -> Mode:
+        return self.module.controller.failsafe.mode
+
     def run(self, cycles: int) -> None:
         for _ in range(cycles):
             self.rig.now_ns += self.rig.period_ns
@@ -264,3 +269,44 @@ def test_a_service_that_crashed_and_is_started_again_arms_only_if_a_person_asked
     after.run(1000)
     assert after.rig.drive.armed == int(asked)
     assert WillFile(tmp_path, MODULE).read() is Will.HELD, "it holds, or has held"
+
+
+def test_a_pendant_that_falls_silent_stops_the_module_and_one_that_was_never_there_does_not(
+    robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = Process(robot, tmp_path, monkeypatch)
+    silent_cycles = round(robot.joint_service.pendant_ms / 2.0)
+    process.run(2 * silent_cycles)
+    assert process.mode is Mode.HOLD
+    pendant = Pendant(tmp_path, MODULES)
+    for _ in range(10):
+        pendant.beat()
+        process.run(silent_cycles)
+    assert process.mode is Mode.HOLD
+    process.run(2)
+    assert process.mode is Mode.DAMP
+    pendant.beat()
+    process.run(10)
+    assert process.mode is Mode.DAMP, "it does not rise again by itself"
+
+
+def test_a_pendant_that_is_laid_down_is_not_missed(
+    robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = Process(robot, tmp_path, monkeypatch)
+    pendant = Pendant(tmp_path, MODULES)
+    pendant.beat()
+    process.run(10)
+    pendant.lay_down()
+    process.run(round(robot.joint_service.pendant_ms))
+    assert process.mode is Mode.HOLD
+
+
+def test_a_service_that_starts_anew_misses_the_pendant_of_before(
+    robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    WillFile(tmp_path, MODULE)
+    Pendant(tmp_path, MODULES).beat()
+    process = Process(robot, tmp_path, monkeypatch)
+    process.run(round(robot.joint_service.pendant_ms))
+    assert process.mode is Mode.DAMP

@@ -9,7 +9,8 @@ from typing import cast
 import pytest
 
 from services.joint import neighbours
-from services.joint.will import Will, WillFile, ask_stop, forget, path_of
+from services.joint.will import Pendant, Will, WillFile, ask_stop, forget, path_of
+from shared.joints import MODULES
 from tools import kill
 from tools.supervision import fleet as fleets
 from tools.supervision import procfs, supervise
@@ -113,6 +114,32 @@ def test_a_stop_is_seen_by_a_process_that_has_it_mapped_until_it_is_forgotten(
 def test_where_no_service_is_nothing_is_stopped(tmp_path: Path) -> None:
     assert not ask_stop(tmp_path, MODULE)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pendant_is_heard_by_those_that_are_there(tmp_path: Path, file: WillFile) -> None:
+    other = WillFile(tmp_path, "hip_left")
+    pendant = Pendant(tmp_path, MODULES)
+    assert set(pendant.modules) == {MODULE, "hip_left"}
+    assert file.beats == 0, "it is not missed before it was heard"
+    for beats in range(1, 300):
+        pendant.beat()
+        assert (file.beats, other.beats) == (beats, beats)
+    assert (file.read(), file.stop_asked) == (Will.NOTHING, False)
+    pendant.lay_down()
+    assert (file.beats, other.beats) == (0, 0)
+
+
+def test_a_pendant_from_before_is_forgotten_with_the_rest(tmp_path: Path, file: WillFile) -> None:
+    Pendant(tmp_path, MODULES).beat()
+    forget(tmp_path, MODULE)
+    assert file.beats == 0
+
+
+def test_a_pendant_is_heard_through_a_file_of_before_pendants(tmp_path: Path) -> None:
+    path_of(tmp_path, MODULE).write_bytes(bytes([Will.HELD, 0]))
+    Pendant(tmp_path, MODULES).beat()
+    found = WillFile(tmp_path, MODULE)
+    assert (found.read(), found.stop_asked, found.beats) == (Will.HELD, False, 1)
 
 
 def test_a_file_of_one_byte_is_read_as_before(tmp_path: Path) -> None:

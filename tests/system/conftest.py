@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -44,6 +45,13 @@ def carried_pace() -> str:
         summary = json.loads((out / "summary.json").read_text())
         full = summary["fleet_cpu_pct"] > FULL * 100.0 * (os.cpu_count() or 1)
         return f"{summary['pace'] * (SLOWER if full else 1.0):g}"
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    """Return where a fleet may run; the path is short, for sockets are in it."""
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
+        yield Path(path) / "r"
 
 
 @pytest.hookimpl(tryfirst=True)

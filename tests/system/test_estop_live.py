@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,29 +16,12 @@ from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import JointState, Mode, SimTruth
 from shared.process import DEFAULT_CONFIG
+from tests.system.verbs import xrl
 from tools.supervision.supervise import Fleet
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
 ROOT = DEFAULT_CONFIG.parents[1]
-
-
-@pytest.fixture
-def run_dir() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
-        yield Path(path) / "r"
-
-
-def xrl(*arguments: str, run_dir: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.cli", *arguments, "--run-dir", str(run_dir)],
-        cwd=ROOT,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
 
 
 def wait_for_modes(robot: RobotConfig, run_dir: Path, wanted: dict[str, Mode]) -> None:

@@ -7,9 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -25,6 +23,7 @@ from shared.config import RobotConfig, expand
 from shared.joints import MODULES
 from shared.messages import JointState, Mode, SimTruth
 from shared.process import DEFAULT_CONFIG
+from tests.system.verbs import xrl
 from tools.bringup import bench, zeroing
 from tools.bringup.zeroing import Look, look
 from tools.supervision import procfs
@@ -36,24 +35,6 @@ ROOT = DEFAULT_CONFIG.parents[1]
 MODULE = "knee_left"
 LEG = (MODULE, "--torque-limit", "40", "--yes")
 """On the hoist its sole rests on the floor."""
-
-
-@pytest.fixture
-def run_dir() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
-        yield Path(path) / "r"
-
-
-def xrl(*arguments: str, run_dir: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tools.cli", *arguments, "--run-dir", str(run_dir)],
-        cwd=ROOT,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=100,
-        check=False,
-    )
 
 
 def lose_power(robot: RobotConfig, run_dir: Path, module: str) -> None:

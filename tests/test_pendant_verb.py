@@ -1,0 +1,125 @@
+"""The dead man's handle: it is held, laid down, or gone; nothing else is between."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from services.joint.neighbours import Neighbours, Row
+from services.joint.pendant import PendantWatch
+from services.joint.will import WillFile
+from shared.clock import NS_PER_MS
+from shared.joints import MODULES
+from shared.messages import Mode
+from tools import cli
+
+ROOT = Path(__file__).parents[1]
+PATIENCE_S = 30.0
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[WillFile]:
+    """Return what six joint services of a fleet have open."""
+    return [WillFile(tmp_path, module) for module in MODULES]
+
+
+def started(run_dir: Path, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "tools.cli", "pendant", "--run-dir", str(run_dir)]
+    return subprocess.Popen(
+        command, cwd=ROOT, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for(happens: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not happens():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_it_is_lost_once_it_has_been_silent_for_longer_than_it_may() -> None:
+    watch, limit_ns = PendantWatch(100.0), 100 * NS_PER_MS
+    assert not watch.is_lost(5, 0)
+    assert not watch.is_lost(10 * limit_ns, 0), "one that was never heard is not missed"
+    begin_ns = 20 * limit_ns
+    assert not watch.is_lost(begin_ns, 1)
+    assert not watch.is_lost(begin_ns + limit_ns, 1)
+    assert watch.is_lost(begin_ns + limit_ns + 1, 1)
+    assert not watch.is_lost(begin_ns + limit_ns + 2, 2)
+    assert watch.is_lost(begin_ns + 3 * limit_ns, 2)
+    assert not watch.is_lost(begin_ns + 9 * limit_ns, 0), "laid down"
+
+
+def test_killed_it_says_no_more(tmp_path: Path, files: list[WillFile]) -> None:
+    process = started(tmp_path)
+    try:
+        wait_for(lambda: all(file.beats > 3 for file in files))
+        process.send_signal(signal.SIGKILL)
+    finally:
+        process.kill()
+        process.communicate()
+    beats = [file.beats for file in files]
+    assert min(beats) > 3
+    time.sleep(0.1)
+    assert [file.beats for file in files] == beats, "and the services' rule does the rest"
+
+
+def test_enter_lays_it_down(tmp_path: Path, files: list[WillFile]) -> None:
+    person, terminal = pty.openpty()
+    process = started(tmp_path, terminal)
+    try:
+        wait_for(lambda: files[0].beats > 3)
+        os.write(person, b"\n")
+        said, _ = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+        os.close(person)
+        os.close(terminal)
+    assert process.returncode == 0
+    assert "laid down" in said
+    assert [file.beats for file in files] == [0] * 6
+
+
+def test_ctrl_c_is_the_stop_and_says_who_has_not_stopped(
+    tmp_path: Path, files: list[WillFile]
+) -> None:
+    """Five services stop in this test, the sixth does not hear it."""
+    rows = {module: Neighbours(tmp_path, module) for module in MODULES}
+    for module, row in rows.items():
+        row.write(Row(1, 0.0, 0.0, Mode.DAMP if module != "hip_left" else Mode.HOLD))
+    process = started(tmp_path)
+    try:
+        wait_for(lambda: files[0].beats > 3)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == 2
+    assert "hip_left" in error
+    assert "knee_left" not in error
+    assert files[0].beats > 3
+
+
+def test_a_time_lays_it_down_by_itself(
+    tmp_path: Path, files: list[WillFile], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["pendant", "--for", "0.1", "--run-dir", str(tmp_path)]) == 0
+    assert "laid down" in capsys.readouterr().out
+    assert files[3].beats == 0
+
+
+def test_where_nobody_hears_it_it_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
+    assert "no joint service" in capsys.readouterr().err
+    assert cli.main(["pendant", "--for", "0", "--run-dir", str(tmp_path)]) == 2
+    assert "--for 0" in capsys.readouterr().err

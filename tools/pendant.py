@@ -1,0 +1,79 @@
+"""`xrl pendant`: a dead man's handle; once it ends, in whatever way, this host's modules stop."""
+
+from __future__ import annotations
+
+import argparse
+import select
+import sys
+import time
+from typing import Final
+
+from rich.console import Console
+
+from services.joint.will import Pendant
+from shared.exceptions import FleetError
+from shared.joints import MODULES
+from shared.process import StopFlag
+from tools.estop import GIVE_UP_S, wait_here
+from tools.verbs import Subparsers, add_run_dir, add_verb
+
+EVERY_S: Final = 0.02
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "pendant",
+        """
+        xrl pendant               # held until Enter lays it down; Ctrl-C is the stop
+        xrl pendant --for 600     # laid down by itself after ten minutes
+        """,
+    )
+    add_run_dir(parser)
+    parser.add_argument(
+        "--for", dest="for_s", type=float, metavar="S", help="lay it down after so long, seconds"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Beat until it is laid down; 0 then, and after a stop that all modules of this host heard.
+
+    Raises:
+        FleetError: no joint service is on this host, or one does not stop.
+    """
+    if args.for_s is not None and not args.for_s > 0.0:
+        raise FleetError(f"--for {args.for_s:g}: a time is right, such as 600")
+    try:
+        pendant = Pendant(args.run_dir, MODULES)
+    except OSError as error:
+        raise FleetError(f"{args.run_dir}: the pendant cannot be heard: {error.strerror}") from None
+    if not pendant.modules:
+        raise FleetError(f"{args.run_dir}: no joint service of a fleet is on this host")
+    console, stop = Console(), StopFlag()
+    elsewhere = [module for module in MODULES if module not in pendant.modules]
+    if elsewhere:
+        console.print(f"not heard by {', '.join(elsewhere)}: they have no service on this host")
+    console.print("held: Enter lays it down; Ctrl-C, or this program's end, stops all modules")
+    ends = None if args.for_s is None else time.monotonic() + args.for_s
+    while not stop:
+        pendant.beat()
+        if _asked_to_lay_down(EVERY_S) or (ends is not None and time.monotonic() >= ends):
+            pendant.lay_down()
+            console.print("laid down: the robot goes on without it")
+            return 0
+    going = wait_here(args.run_dir, list(pendant.modules))
+    if going := [words for words in going if words in pendant.modules]:
+        raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
+    console.print("stopped: DAMP, a slow sink; `xrl down` ends it")
+    return 0
+
+
+def _asked_to_lay_down(wait_s: float) -> bool:
+    """Wait so long for a person's Enter; nobody is at what is no terminal."""
+    if not sys.stdin.isatty():
+        time.sleep(wait_s)
+        return False
+    if not select.select([sys.stdin], [], [], wait_s)[0]:
+        return False
+    return sys.stdin.readline() != ""
