@@ -13,6 +13,7 @@ from services.joint.failsafe import TRIPS, Event
 from services.joint.trips import Trips, limits_of
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
+from shared.config_sections import TripLimit
 from shared.messages import Cause, Mode, Pair
 from shared.trip_table import JOINT_TRIPS
 from tests.joint.helpers import T0, Bench
@@ -60,6 +61,16 @@ def test_shaking_is_the_mean_square_above_its_band_of_either_axis(robot: RobotCo
             left = 9.0 * (1.0 - limits.slow_share)
             assert trips.mean[axis] == pytest.approx(limits.mean_share * left**2)
             assert trips.mean[1 - axis] == 0.0
+
+
+def test_limits_are_the_robot_files(robot: RobotConfig) -> None:
+    weaker = msgspec.structs.replace(robot.trips, torque_limit=TripLimit(limit=0.8, after_ms=700.0))
+    found = limits_of(msgspec.structs.replace(robot, trips=weaker))
+    assert found.slow_share == pytest.approx(1.0 - math.exp(-2.0 * math.pi * 8.0 * 0.002))
+    assert found.mean_share == pytest.approx(1.0 - math.exp(-0.002 / 0.1))
+    assert found.torque == pytest.approx(0.995 * 0.8 * robot.joint.tau_module_max)
+    assert (found.torque_ns, found.speed_ns) == (700_000_000, 20_000_000)
+    assert (found.shaking, found.speed) == (15.0**2, robot.trips.speed.limit)
 
 
 def test_at_its_limit_shaking_and_speed_are_none_and_torque_is(robot: RobotConfig) -> None:

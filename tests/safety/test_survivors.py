@@ -21,9 +21,9 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.gain_schedule import believing
 from shared.joints import MODULES, kind_of
-from shared.messages import Mode, PlannerMode, Wrench
+from shared.messages import Cause, Mode, PlannerMode, Wrench
 from shared.robot_model import stand_pose
-from tests.joint.helpers import T0, Bench, command
+from tests.joint.helpers import SESSION, T0, Bench, command
 from tests.planner.test_planner import START_NS, hear_all, lead
 
 GENTLE = (3.0, -5.0)
@@ -188,3 +188,44 @@ def test_the_last_256_sessions_never_become_current_again(timing: Timing) -> Non
         told = command(session=session, echo_t_ns=now_ns)
         assert failsafe.offer(told, now_ns, timing) is Refusal.NONE
     assert failsafe.retired == tuple(range(3, RETIRED_SESSIONS_KEPT + 3))
+
+
+def test_the_failsafes_times_and_limits_are_the_robot_files(robot: RobotConfig) -> None:
+    service = robot.joint_service
+    assert timing_of(robot) == Timing(
+        max_command_age_ns=round(1e6 * service.max_command_age_ms),
+        engage_after_ns=round(1e6 * service.engage_after_ms),
+        engage_after_max_ns=round(1e6 * service.engage_after_max_ms),
+        dropout_forget_ns=round(1e9 * service.dropout_forget_s),
+        dropouts_max=5,  # 100 ms, doubled five times, are the 3.2 s at most
+        k_p_max=service.k_p_max,
+        k_d_max=service.k_d_max,
+        v_max=service.v_max,
+        tau_max=4.0 * robot.joint.tau_module_max,
+    )
+
+
+def test_each_good_while_makes_a_module_forget_one_drop_out(timing: Timing) -> None:
+    failsafe = Failsafe(mode=Mode.TRACK, dropouts=2, steady_since_ns=T0)
+    for after_ns, left in (
+        (timing.dropout_forget_ns - 1, 2),
+        (timing.dropout_forget_ns, 1),
+        (2 * timing.dropout_forget_ns - 1, 1),
+        (2 * timing.dropout_forget_ns, 0),
+        (4 * timing.dropout_forget_ns, 0),
+    ):
+        failsafe._remember_dropouts(T0 + after_ns, timing, Event.NONE)
+        assert failsafe.dropouts == left, after_ns
+
+
+def test_at_the_first_instant_of_a_clock_commands_are_fresh_as_at_any_other(
+    timing: Timing,
+) -> None:
+    failsafe = Failsafe(mode=Mode.HOLD)
+    for seq in range(3):
+        failsafe.offer(command(seq=seq, echo_t_ns=seq), seq, timing)
+        failsafe.advance(seq, timing, Event.NONE, estop=False)
+        assert failsafe.fresh_since_ns == 0
+    tracking = Failsafe(mode=Mode.TRACK, session=SESSION, fresh_since_ns=0)
+    tracking.offer(command(echo_t_ns=1), 1, timing)
+    assert tracking.advance(1, timing, Event.NONE, estop=False) is not Cause.COMMAND_STALE
