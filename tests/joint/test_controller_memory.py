@@ -12,7 +12,7 @@ from services.joint.sinking import SinkingMemory
 from services.joint.trips import Trips
 from shared.config import RobotConfig
 from shared.gain_schedule import believing
-from shared.messages import Mode
+from shared.messages import Cause, Mode
 from tests.joint.helpers import Bench
 
 COUPLED = (4.0, -6.0)
@@ -74,3 +74,30 @@ def test_neighbours_are_told_where_the_joint_is_and_how_it_does(bench: Bench) ->
         bench.now_ns += bench.cycle_ns
         bench.controller.step(bench.now_ns, bench.reading(), None, True, near=unheard)
     assert row_of(bench.controller)[3:] == (Mode.DAMP, 1)
+
+
+def test_cycles_are_counted_one_by_one_and_before_any_change_there_is_no_cause(
+    bench: Bench,
+) -> None:
+    assert bench.controller.state(bench.now_ns).cause == 0
+    for count in (1, 2, 3):
+        bench.cycle()
+        assert bench.controller.cycle == count
+
+
+def test_one_that_holds_with_all_it_has_says_so_from_the_first_instant(bench: Bench) -> None:
+    memory = bench.controller.remember()
+    for braced_ns, braced in ((0, False), (1, True)):
+        bench.controller.recall(msgspec.structs.replace(memory, braced_ns=braced_ns))
+        assert bench.controller.state(bench.now_ns).braced is braced
+
+
+def test_motors_at_their_limit_take_the_module_out_of_track(
+    robot: RobotConfig, bench: Bench
+) -> None:
+    beyond = (0.0, -2.0 * robot.joint.tau_module_max)
+    bench.to_track(tau_ff=beyond)  # it blends in: at once it would be shaking
+    causes = [
+        event.cause for _, event in bench.run(500, fresh=True, tau_ff=beyond) if event is not None
+    ]
+    assert causes[0] == Cause.TORQUE_LIMIT
