@@ -10,7 +10,7 @@ import pytest
 from shared import scenario
 from shared.config import RobotConfig
 from shared.joints import MODULES
-from shared.messages import JointEvent, Mode, RunEvent, RunEventKind, SimTruth
+from shared.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
 from tools.crash.cases import BACK_S, CASES, CRASH_S, DURATION_S, HAND, Case, Verdict, story_of
 from tools.crash.outcome import Heard, as_expected, measure
 
@@ -172,6 +172,15 @@ def test_what_balance_does_not_need_must_disturb_no_module(robot: RobotConfig) -
 def test_another_module_in_fault_is_remarked(robot: RobotConfig) -> None:
     events = [*holds(), change(2.6, "hip_left", Mode.HOLD, Mode.FAULT)]
     assert measure(KNEE, heard(KNEE, events), robot).remarks == ("hip_left went to FAULT",)
+
+
+@pytest.mark.parametrize("cause", [Cause.SHAKING, Cause.TORQUE_LIMIT, Cause.TOO_FAST])
+def test_a_module_that_trips_is_remarked(robot: RobotConfig, cause: Cause) -> None:
+    name, event = change(CRASH_S + 0.04, "hip_left", Mode.TRACK, Mode.HOLD)
+    tripped = (name, msgspec.structs.replace(event, cause=int(cause)))
+    events = [*holds(but=("hip_left",)), tripped]
+    remarks = measure(KNEE, heard(KNEE, events), robot).remarks
+    assert remarks == (f"hip_left tripped: {cause.name}",)
 
 
 def test_a_service_that_ends_by_itself_is_remarked(robot: RobotConfig) -> None:

@@ -79,7 +79,8 @@ def test_neighbours_are_told_where_the_joint_is_and_how_it_does(bench: Bench) ->
 def test_cycles_are_counted_one_by_one_and_before_any_change_there_is_no_cause(
     bench: Bench,
 ) -> None:
-    assert bench.controller.state(bench.now_ns).cause == 0
+    before = bench.controller.state(bench.now_ns)
+    assert (before.cause, before.braced) == (0, False)
     for count in (1, 2, 3):
         bench.cycle()
         assert bench.controller.cycle == count

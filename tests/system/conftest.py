@@ -13,6 +13,7 @@ from typing import Final
 
 import pytest
 
+from tests.system.stalls import FILE_VARIABLE, start_watch
 from tools.supervision.pace import PACE_VARIABLE, SLOWER
 
 FULL: Final = 0.75
@@ -69,3 +70,5 @@ def pytest_collection_finish(session: pytest.Session) -> None:
         pace = carried_pace()
         if pace:
             os.environ[PACE_VARIABLE] = pace
+    if led and not session.config.option.collectonly and FILE_VARIABLE not in os.environ:
+        start_watch()

@@ -1,25 +1,58 @@
 """A machine that stalls for longer than a command may be old makes drop-outs that are no fault.
 
 The robot stands, but after each the planner waits for longer: a scenario that begins once all six
-have tracked for a second may then never begin.
+have tracked for a second may then never begin. A test is let off only where the stall was measured,
+by a real-time thread that does nothing else (`tests.system.stall_watch`).
 """
 
 from __future__ import annotations
 
+import atexit
+import os
+import subprocess
+import sys
+import tempfile
+import time
 from pathlib import Path
 from typing import Final
 
 from shared import topics
+from shared.clock import NS_PER_S
 from shared.joints import MODULES
 from shared.messages import Mode
+from tests.system.stall_watch import gaps_in
 from tools.runs.run_log import read_run
 
 NEVER_READY: Final = "not all six modules track after"
 """Said by whoever leads the fleet, with exit code 2."""
+LONGEST_RUN_NS: Final = 200 * NS_PER_S
+FILE_VARIABLE: Final = "XRL_TEST_STALLS"
+"""Where the watch of this session writes."""
+
+
+def start_watch() -> None:
+    """Watch for stalls until this process ends."""
+    handle, path = tempfile.mkstemp(prefix="xrl-stalls-")
+    os.close(handle)
+    atexit.register(Path(path).unlink)
+    os.environ[FILE_VARIABLE] = path
+    program = Path(__file__).with_name("stall_watch.py")
+    subprocess.Popen([sys.executable, str(program), path])
+
+
+def has_stalled(since_ns: int) -> bool:
+    """Return True if the machine stalled, measured, since a time of the monotonic clock.
+
+    Where no watch runs nothing was measured.
+    """
+    path = os.environ.get(FILE_VARIABLE)
+    return path is not None and bool(gaps_in(Path(path), since_ns))
 
 
 def stalled_before_it_began(code: int, said: str, out: Path) -> bool:
-    """Return True if the machine did not let a live run begin; a fleet that never tracked is amiss.
+    """Return True if the machine stalled and did not let a live run begin.
+
+    A fleet that never tracked, or did not begin on a machine that did not stall, is amiss.
 
     Args:
         code: exit code.
@@ -27,7 +60,10 @@ def stalled_before_it_began(code: int, said: str, out: Path) -> bool:
         out: where the records are, at any depth.
     """
     words = " ".join(said.split())
-    return code == 2 and NEVER_READY in words and any(map(_has_tracked, out.rglob("*.mcap")))
+    if code != 2 or NEVER_READY not in words:
+        return False
+    tracked = any(map(_has_tracked, out.rglob("*.mcap")))
+    return tracked and has_stalled(time.monotonic_ns() - LONGEST_RUN_NS)
 
 
 def _has_tracked(record: Path) -> bool:

@@ -78,6 +78,7 @@ def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
     assert said.count("ruff called") == 2
     assert said.count("mypy called") == 1
     assert said.count("pytest called") == 3
+    assert said.count("python called") == 1, "a sample of the mutants"
 
 
 @pytest.mark.parametrize("status", [1, 2], ids=["a failure", "a file that cannot be imported"])

@@ -12,8 +12,9 @@ import msgspec
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
-from shared.messages import JointEvent, Mode, RunEvent, RunEventKind, SimTruth
+from shared.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
 from shared.scenario import lead
+from shared.trip_table import JOINT_TRIPS
 from tools.crash.cases import CRASH_S, REQUEST_S, Case, Verdict, story_of
 from tools.runs.standing import is_tipping
 from tools.runs.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
@@ -195,6 +196,11 @@ def _remarks(
         f"{name} went to {Mode(event.mode_after).name}"
         for name, event in reaction
         if name in case.others and event.mode_after in UNSAFE
+    ]
+    words += [
+        f"{name} tripped: {Cause(event.cause).name}"
+        for name, event in reaction
+        if event.cause in JOINT_TRIPS
     ]
     return words
 
