@@ -32,6 +32,7 @@ LEAST_SHARE: Final = 0.95
 SAMPLE: Final = "*__mutmut_7"
 """Of each function with so many mutants, one: what CI runs."""
 DEAD: Final = frozenset(("killed", "timeout", "segfault"))
+UNTRIED: Final = "not checked"
 LINKED: Final = ("services", "shared", "tests", "tools", "deploy", "docs", "README.md")
 EXAMPLES: Final = """examples:
   ./deploy/mutants                      all groups; an hour on two cores
@@ -128,7 +129,7 @@ def _run(group: Group, args: argparse.Namespace, console: Console) -> Found:
     folder = args.out.resolve() / group.name
     patterns = [args.only] if args.only else [SAMPLE] if args.sample else []
     if args.survivors:
-        patterns = [name for name, status in _statuses(folder) if status not in DEAD]
+        patterns = [name for name, status in _statuses(folder) if status not in {*DEAD, UNTRIED}]
         if not patterns:
             raise RunError(f"group {group.name}: none lived the last time, or it never ran")
     elif not args.resume and folder.exists():
@@ -136,7 +137,7 @@ def _run(group: Group, args: argparse.Namespace, console: Console) -> Found:
     _prepare(group, folder)
     console.print(f"[bold]{group.name}[/]: {len(group.modules)} modules; log: {folder}/run.log")
     _mutmut_run(folder, ["--max-children", str(args.children), *patterns], console)
-    ran = [row for row in _statuses(folder) if row[1] != "not checked"]
+    ran = [row for row in _statuses(folder) if row[1] != UNTRIED]
     alive = [
         (name, change_of(name, _mutmut(folder, "show", name)))
         for name, status in ran
