@@ -48,6 +48,11 @@ def carried_pace() -> str:
         return f"{summary['pace'] * (SLOWER if full else 1.0):g}"
 
 
+def _is_led(item: pytest.Item) -> bool:
+    """Return True for a test of this folder that leads a fleet; others may have files so named."""
+    return item.path.parent == Path(__file__).parent and item.path.stem in LED
+
+
 @pytest.fixture
 def run_dir() -> Iterator[Path]:
     """Return where a fleet may run; the path is short, for sockets are in it."""
@@ -59,13 +64,13 @@ def run_dir() -> Iterator[Path]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that need the cores to themselves."""
     for item in items:
-        if item.path.stem in LED:
+        if _is_led(item):
             item.add_marker(pytest.mark.live)
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Look before the first test, so that no test's own time is spent on it."""
-    led = any(item.path.stem in LED for item in session.items)
+    led = any(map(_is_led, session.items))
     if led and not session.config.option.collectonly and PACE_VARIABLE not in os.environ:
         pace = carried_pace()
         if pace:
