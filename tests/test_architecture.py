@@ -82,6 +82,7 @@ LAWS = [
     "services/joint/onboard.py",
     "services/joint/samples.py",
     "services/joint/module.py",
+    "services/joint/pendant.py",
     "services/joint/drivers/axes_status.py",
     "services/joint/drivers/odrive_dialects.py",
     "services/joint/drivers/readonly.py",

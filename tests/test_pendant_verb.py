@@ -14,9 +14,7 @@ from pathlib import Path
 import pytest
 
 from services.joint.neighbours import Neighbours, Row
-from services.joint.pendant import PendantWatch
 from services.joint.will import WillFile
-from shared.clock import NS_PER_MS
 from shared.joints import MODULES
 from shared.messages import Mode
 from tools import cli
@@ -43,19 +41,6 @@ def wait_for(happens: Callable[[], bool]) -> None:
     while not happens():
         assert time.monotonic() < deadline
         time.sleep(0.01)
-
-
-def test_it_is_lost_once_it_has_been_silent_for_longer_than_it_may() -> None:
-    watch, limit_ns = PendantWatch(100.0), 100 * NS_PER_MS
-    assert not watch.is_lost(5, 0)
-    assert not watch.is_lost(10 * limit_ns, 0), "one that was never heard is not missed"
-    begin_ns = 20 * limit_ns
-    assert not watch.is_lost(begin_ns, 1)
-    assert not watch.is_lost(begin_ns + limit_ns, 1)
-    assert watch.is_lost(begin_ns + limit_ns + 1, 1)
-    assert not watch.is_lost(begin_ns + limit_ns + 2, 2)
-    assert watch.is_lost(begin_ns + 3 * limit_ns, 2)
-    assert not watch.is_lost(begin_ns + 9 * limit_ns, 0), "laid down"
 
 
 def test_killed_it_says_no_more(tmp_path: Path, files: list[WillFile]) -> None:
@@ -105,7 +90,35 @@ def test_ctrl_c_is_the_stop_and_says_who_has_not_stopped(
     assert process.returncode == 2
     assert "hip_left" in error
     assert "knee_left" not in error
-    assert files[0].beats > 3
+    assert all(file.stop_asked for file in files), "at once, and not by silence"
+
+
+def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[WillFile]) -> None:
+    """Its hang-up ends the program; one that was started to outlive it stops all the same."""
+    person, terminal = pty.openpty()
+    process = started(tmp_path, terminal)
+    try:
+        wait_for(lambda: files[0].beats > 3)
+        os.close(terminal)
+        os.close(person)
+        wait_for(lambda: all(file.stop_asked for file in files))
+        process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == 2, "no service is there to stop"
+
+
+def test_a_second_pendant_is_refused_for_the_first_would_not_be_missed(
+    tmp_path: Path, files: list[WillFile], capsys: pytest.CaptureFixture[str]
+) -> None:
+    process = started(tmp_path)
+    try:
+        wait_for(lambda: files[0].beats > 3)
+        assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
+    finally:
+        process.kill()
+        process.communicate()
+    assert "another pendant is held" in capsys.readouterr().err
 
 
 def test_a_time_lays_it_down_by_itself(

@@ -21,7 +21,7 @@ HARD_PLANT = "small errors"
 
 def row(trouble: str, **changes: str) -> dict[str, str]:
     begin = {"number": "0", "trouble": trouble, "on": "k 2000"}
-    return begin | dict.fromkeys(Outcome.__struct_fields__, "") | changes
+    return begin | dict.fromkeys(Outcome.__struct_fields__, "") | {"led": "True"} | changes
 
 
 @pytest.mark.parametrize("trouble", [name for name in TROUBLES if not TROUBLES[name].unfiltered])
@@ -53,6 +53,9 @@ def test_on_a_plant_of_many_errors_what_is_to_trip_trips_and_stands(
         (row("sags", tripped="SAGGING", fell_at_s="3"), "fell at 3 s"),
         (row("shakes", tripped="SHAKING", untripped_fell_at_s="1"), ""),
         (row("shakes"), ""),
+        (row("shakes", led="False", tripped="SHAKING", untripped_fell_at_s="1"), ""),
+        (row("squats", led="False"), "the robot was never led so far that anything could happen"),
+        (row("sags", led="False"), "the robot was never led so far that anything could happen"),
         (row("shakes", untripped_fell_at_s="1"), "SHAKING never tripped"),
     ],
 )
@@ -70,7 +73,7 @@ def test_what_is_to_trip_is_in_the_table_of_trips() -> None:
 def test_the_study_prints_its_matrix_and_goes_on_with_what_is_there(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = ["sweep", "trips", "--trouble", "drops", "--plant", "rigid", "--out", str(tmp_path)]
+    asked = ["sweep", "trips", "--trouble", "drops", "--on", "rigid", "--out", str(tmp_path)]
     assert cli.main([*asked, "--workers", "1"]) == 0
     first = capsys.readouterr().out
     assert "sagging" in first

@@ -51,7 +51,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Say it until every module is stopped; a module leaves DAMP by a restart only."""
     run_dir: Path = args.run_dir
-    here = _ask_here(run_dir)  # first: it needs no bus, no supervisor, nobody
+    here = ask_here(run_dir)  # first: it needs no bus, no supervisor, nobody
     if args.local:
         if not here:
             raise FleetError(f"{run_dir}: no joint service of a fleet is on this host")
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _ask_here(run_dir: Path) -> list[str]:
+def ask_here(run_dir: Path) -> list[str]:
     """Ask the services on this host by shared memory; return those that are there."""
     here = []
     for module in MODULES:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
@@ -28,9 +29,9 @@ from shared.toml_file import Section, read_toml
 ROOT: Final = Path(__file__).resolve().parents[1]
 FILE: Final = ROOT / "tests" / "mutants.toml"
 LEAST_SHARE: Final = 0.95
-"""Of all mutants, that must fail a test."""
+"""Mutation score that is asked for: the share of mutants that fail a test."""
 SAMPLE: Final = "*__mutmut_7"
-"""Of each function with so many mutants, one: what CI runs."""
+"""The seventh mutant of every function that has seven: what CI runs."""
 DEAD: Final = frozenset(("killed", "timeout", "segfault"))
 UNTRIED: Final = "not checked"
 LINKED: Final = ("services", "shared", "tests", "tools", "deploy", "docs", "README.md")
@@ -87,6 +88,7 @@ class Found(NamedTuple):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the groups; 1 if too many live, or one that is not in the file."""
     args = _parser().parse_args(argv)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
     console = Console(highlight=False)
     try:
         told = read_toml(FILE, MutantsFile)
@@ -182,15 +184,24 @@ def _mutmut_run(folder: Path, words: Sequence[str], console: Console) -> None:
     with (
         (folder / "run.log").open("w", encoding="utf-8") as log,
         subprocess.Popen(
-            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            command,
+            cwd=folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,  # with the processes of its own that it leaves behind
         ) as process,
         console.status("mutating, and running the tests as they are") as status,
     ):
         assert process.stdout is not None  # noqa: S101 - it is a pipe
-        for line in process.stdout:
-            log.write(line)
-            if "/" in line and "🎉" in line:
-                status.update(line.strip())
+        try:
+            for line in process.stdout:
+                log.write(line)
+                if "/" in line and "🎉" in line:
+                    status.update(line.strip())
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
     if process.returncode != 0:
         last = (folder / "run.log").read_text(encoding="utf-8").strip().splitlines()[-3:]
         raise RunError(f"mutmut ended with {process.returncode}: {' / '.join(last)}")

@@ -14,10 +14,12 @@ from services.joint.will import Pendant
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.process import StopFlag
-from tools.estop import GIVE_UP_S, wait_here
+from tools.estop import GIVE_UP_S, ask_here, wait_here
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 EVERY_S: Final = 0.02
+OTHER_S: Final = 0.2
+"""Time in which another pendant would be heard."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -40,7 +42,8 @@ def run(args: argparse.Namespace) -> int:
     """Beat until it is laid down; 0 then, and after a stop that all modules of this host heard.
 
     Raises:
-        FleetError: no joint service is on this host, or one does not stop.
+        FleetError: no joint service is on this host, somebody holds a pendant already, or a module
+            does not stop.
     """
     if args.for_s is not None and not args.for_s > 0.0:
         raise FleetError(f"--for {args.for_s:g}: a time is right, such as 600")
@@ -50,18 +53,25 @@ def run(args: argparse.Namespace) -> int:
         raise FleetError(f"{args.run_dir}: the pendant cannot be heard: {error.strerror}") from None
     if not pendant.modules:
         raise FleetError(f"{args.run_dir}: no joint service of a fleet is on this host")
+    before = pendant.beats
+    time.sleep(OTHER_S)
+    if pendant.beats != before:
+        raise FleetError("another pendant is held: lay that one down first")
     console, stop = Console(), StopFlag()
     elsewhere = [module for module in MODULES if module not in pendant.modules]
     if elsewhere:
         console.print(f"not heard by {', '.join(elsewhere)}: they have no service on this host")
     console.print("held: Enter lays it down; Ctrl-C, or this program's end, stops all modules")
     ends = None if args.for_s is None else time.monotonic() + args.for_s
-    while not stop:
+    said = None
+    while not stop and said != "":
         pendant.beat()
-        if _asked_to_lay_down(EVERY_S) or (ends is not None and time.monotonic() >= ends):
+        said = _line(EVERY_S)
+        if said or (ends is not None and time.monotonic() >= ends):
             pendant.lay_down()
             console.print("laid down: the robot goes on without it")
             return 0
+    ask_here(args.run_dir)  # and not by silence, which takes longer
     going = wait_here(args.run_dir, list(pendant.modules))
     if going := [words for words in going if words in pendant.modules]:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
@@ -69,11 +79,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _asked_to_lay_down(wait_s: float) -> bool:
-    """Wait so long for a person's Enter; nobody is at what is no terminal."""
+def _line(wait_s: float) -> str | None:
+    """Return the line that a person enters within a time, s; None: none, "": the terminal is gone.
+
+    Without a terminal there is nobody to enter one.
+    """
     if not sys.stdin.isatty():
         time.sleep(wait_s)
-        return False
-    if not select.select([sys.stdin], [], [], wait_s)[0]:
-        return False
-    return sys.stdin.readline() != ""
+        return None
+    return sys.stdin.readline() if select.select([sys.stdin], [], [], wait_s)[0] else None

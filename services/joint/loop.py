@@ -75,7 +75,7 @@ class JointLoop:
         """
         service = config.joint_service
         self._will, self._neighbours = will, neighbours
-        self._pendant, self._pendant_lost = PendantWatch(service.pendant_ms), False
+        self._pendant = PendantWatch(service.pendant_ms)
         self._module = module
         self._drive = drive
         self._ports = ports
@@ -134,11 +134,7 @@ class JointLoop:
         will = self._will
         if will is None:
             return False
-        lost = self._pendant.is_lost(now, will.beats)
-        if lost and not self._pendant_lost:
-            log.get("xrl").error("emergency stop: the pendant is silent")
-        self._pendant_lost = lost
-        return lost or will.stop_asked
+        return self._pendant.is_lost(now, will.beats) or will.stop_asked
 
     def _write(self, step: Step) -> None:
         """Carry out the order of this cycle."""
@@ -158,6 +154,8 @@ class JointLoop:
     def _tell(self, now: int, step: Step) -> None:
         """Log what a person has to know; nothing is controlled then, and a line does no harm."""
         samples = self._module.controller.samples
+        if step.event is not None and step.event.cause == Cause.ESTOP and self._pendant.lost:
+            log.get("xrl").error("emergency stop: the pendant is silent")
         if step.event is not None and step.event.mode_after == Mode.FAULT:
             log.get("xrl").error(
                 "FAULT: %s, drive error 0x%x; restart this service to leave it",

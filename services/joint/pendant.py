@@ -2,30 +2,46 @@
 
 Whatever fails of the person's hand, a cable, a radio and a host between, it is silent. It beats in
 each module's shared memory (`services.joint.will`), which needs no bus. One that was never heard,
-or was laid down in order, is not missed.
+or was laid down in order, is not missed. Silence is counted in cycles that the module itself ran:
+where the whole machine stood still, nobody was silent.
 """
 
 from __future__ import annotations
 
+from typing import Final
+
 from shared.clock import NS_PER_MS
+
+CYCLE_MAX_NS: Final = 20 * NS_PER_MS
+"""So much of the time since the last cycle counts at most."""
 
 
 class PendantWatch:
-    """Listens to it, for one module."""
+    """Listens to it, for one module.
+
+    Attributes:
+        lost: True while there is one that has been silent for too long.
+    """
 
     def __init__(self, silent_ms: float) -> None:
         """Take how long it may be silent."""
         self._silent_ns = round(silent_ms * NS_PER_MS)
         self._beats = 0
-        self._heard_ns = 0
+        self._last_ns = 0
+        self._silence_ns = 0
+        self.lost = False
 
     def is_lost(self, now_ns: int, beats: int) -> bool:
-        """Return True if there was one, and it has been silent for too long.
+        """Take one cycle; return `lost`.
 
         Args:
             now_ns: this module's clock.
             beats: `WillFile.beats`, in each cycle.
         """
-        if beats != self._beats:
-            self._beats, self._heard_ns = beats, now_ns
-        return beats > 0 and now_ns - self._heard_ns > self._silent_ns
+        if beats == self._beats:
+            self._silence_ns += min(CYCLE_MAX_NS, now_ns - self._last_ns)
+        else:
+            self._beats, self._silence_ns = beats, 0
+        self._last_ns = now_ns
+        self.lost = beats > 0 and self._silence_ns > self._silent_ns
+        return self.lost

@@ -122,13 +122,18 @@ class Pendant:
         self._beats = 0
         for module in modules:
             with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
-                file.truncate(len(_NEW))  # one of before pendants is shorter
+                file.truncate(len(_NEW))  # from before there were pendants: it is shorter
                 self._memories[module] = mmap.mmap(file.fileno(), len(_NEW))
 
     @property
     def modules(self) -> tuple[str, ...]:
         """Those that hear it."""
         return tuple(self._memories)
+
+    @property
+    def beats(self) -> tuple[int, ...]:
+        """What the modules hear, of this pendant or of another."""
+        return tuple(_BEATS.unpack_from(row, _BEATS_AT)[0] for row in self._memories.values())
 
     def beat(self) -> None:
         """Say that it is held: from the first time on, its silence stops them."""

@@ -127,7 +127,7 @@ def test_each_service_finds_its_own_row(tmp_path: Path, six: dict[str, Neighbour
 def test_a_row_is_odd_while_it_is_written_and_never_has_the_same_number_twice(
     tmp_path: Path, six: dict[str, Neighbours], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a reader that looks in between relies on; a service that starts anew counts on."""
+    """So a reader knows that a row changed while it read. A restarted service goes on counting."""
     last = MODULES[-1]
     while_written, after = [], []
 

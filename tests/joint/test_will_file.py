@@ -142,6 +142,20 @@ def test_a_pendant_is_heard_through_a_file_of_before_pendants(tmp_path: Path) ->
     assert (found.read(), found.stop_asked, found.beats) == (Will.HELD, False, 1)
 
 
+def test_the_file_does_not_grow_and_a_stop_is_one_byte_of_it(tmp_path: Path) -> None:
+    for _ in range(3):
+        WillFile(tmp_path, MODULE)
+        ask_stop(tmp_path, MODULE)
+    assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14)
+
+
+def test_what_was_found_is_not_said_again(tmp_path: Path, left: WillFile) -> None:
+    successor = WillFile(tmp_path, MODULE)
+    forget(tmp_path, MODULE)
+    successor.write(Will.HELD)
+    assert left.read() is Will.NOTHING
+
+
 def test_a_file_of_one_byte_is_read_as_before(tmp_path: Path) -> None:
     path_of(tmp_path, MODULE).write_bytes(bytes([Will.HELD]))
     old = WillFile(tmp_path, MODULE)

@@ -52,7 +52,7 @@ def has_stalled(since_ns: int) -> bool:
 def stalled_before_it_began(code: int, said: str, out: Path) -> bool:
     """Return True if the machine stalled and did not let a live run begin.
 
-    A fleet that never tracked, or did not begin on a machine that did not stall, is amiss.
+    A fleet that never tracked, or that did not begin although nothing stalled, is at fault.
 
     Args:
         code: exit code.

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
 from services.joint.neighbours import Neighbours
+from services.joint.will import Pendant
 from shared import topics
 from shared.bus import open_session
 from shared.config import RobotConfig
@@ -37,6 +40,14 @@ def wait_for_modes(robot: RobotConfig, run_dir: Path, wanted: dict[str, Mode]) -
                 if state is not None:
                     modes[module] = state.mode
             time.sleep(0.01)
+
+
+def wait_for_beats(run_dir: Path) -> None:
+    """Wait until each module has heard a pendant for a while."""
+    pendant, deadline = Pendant(run_dir, MODULES), time.monotonic() + 40.0
+    while min(pendant.beats) < 20:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def truth(robot: RobotConfig, run_dir: Path, wait_s: float = 0.0) -> SimTruth:
@@ -71,6 +82,26 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
         others = {module: Mode.DAMP for module in MODULES if module != "hip_left"}
         waiting = Mode.DISARMED  # its drive holds, and is taken over once a planner is heard
         wait_for_modes(robot, run_dir, others | {"hip_left": waiting})
+    finally:
+        fleet.stop()
+
+
+def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(
+    run_dir: Path, robot: RobotConfig
+) -> None:
+    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
+    command = [sys.executable, "-m", "tools.cli", "pendant", "--run-dir", str(run_dir)]
+    try:
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.HOLD))
+        with subprocess.Popen(
+            command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
+        ) as held:
+            try:
+                wait_for_beats(run_dir)
+                assert {Neighbours.mode_of(run_dir, module) for module in MODULES} == {Mode.HOLD}
+            finally:
+                held.kill()
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.DAMP))
     finally:
         fleet.stop()
 

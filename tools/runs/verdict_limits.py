@@ -38,5 +38,5 @@ LIMITS: Final = (
 (`tools.runs.standing`), and soundly all the way (`SOUND`)."""
 
 SOUND: Final = ("torque_at_limit_ms", "shaking_nm", "sinking_m_s")
-"""Of these, none may be over its limit in a run that stood. A person who catches up with a robot
-that held leads it down by up to 0.73 m/s (`bad_network`)."""
+"""A run in which one of these is over its limit did not stand. The limit of sinking: a person who
+catches up with a robot that held leads it down at up to 0.73 m/s (`bad_network`)."""

@@ -29,14 +29,14 @@ Task: TypeAlias = "tuple[int, str, str, RobotConfig, int]"
 EXAMPLES: Final = """
     xrl sweep trips
     xrl sweep trips --trouble sags --trouble drops
-    xrl sweep trips --plant "k 2000" --out out/trips
+    xrl sweep trips --on "k 2000" --out out/trips
 """
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the study's flags."""
     add_config(parser)
-    for flag, names in (("trouble", TROUBLES), ("plant", PLANTS)):
+    for flag, names in (("trouble", TROUBLES), ("on", PLANTS)):
         parser.add_argument(
             f"--{flag}", action="append", choices=tuple(names), help="only this; may be repeated"
         )
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             f'law.split = "{robot.law.split}": only robots of the certified split have trips'
         )
     console = Console()
-    grid = list(product(args.trouble or TROUBLES, args.plant or PLANTS))
+    grid = list(product(args.trouble or TROUBLES, args.on or PLANTS))
     begins = [
         {"number": number, "trouble": trouble, "on": plant}
         for number, (trouble, plant) in enumerate(grid)
@@ -79,16 +79,21 @@ def run(args: argparse.Namespace) -> int:
             f"{row['trouble']} on {row['on']}: {wrong_with(row)}", style="red", highlight=False
         )
     if not wrong:
-        console.print("every trip came where it was to, and none where not", style="green")
+        console.print("what was to trip did, and stood; nothing tripped for nothing", style="green")
     console.print(f"{out / TABLE}", style="dim", soft_wrap=True)
     return 1 if wrong else 0
 
 
 def wrong_with(row: Mapping[str, str]) -> str:
-    """Return what is wrong with a row of the table in words; empty: nothing."""
+    """Return what is wrong with a row of the table in words; empty: nothing.
+
+    Any trip will do: a robot that tips over may be caught by the one or by the other.
+    """
     wanted = TROUBLES[row["trouble"]].trip
     if row["fell_at_s"]:
         return f"fell at {row['fell_at_s']} s"
+    if row["led"] != "True" and not TROUBLES[row["trouble"]].unfiltered:
+        return "the robot was never led so far that anything could happen"
     if wanted is None:
         return f"tripped for nothing: {row['tripped']}" if row["tripped"] else ""
     if row["tripped"]:
@@ -142,7 +147,7 @@ def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
 
 
 class _TripNames(frozenset[str]):
-    """Every row of names of trips and causes."""
+    """What the column of trips may hold: names of trips and causes, in any number."""
 
     def __contains__(self, text: object) -> bool:
         known = {trip.name for trip in Trip} | {cause.name for cause in Cause}
@@ -152,6 +157,7 @@ class _TripNames(frozenset[str]):
 WORDS: Final = {
     "trouble": frozenset(TROUBLES),
     "on": frozenset(PLANTS),
+    "led": frozenset(("True", "False")),
     "tripped": _TripNames(),
 }
 JOB: Final = study.Job(_run_task, _name, _rows, lambda row: bool(row["fell_at_s"]))
@@ -174,6 +180,6 @@ def _command(args: argparse.Namespace) -> str:
     words = [f"xrl sweep trips --seed {args.seed}"]
     if args.config != DEFAULT_CONFIG:
         words.append(f"--config {args.config}")
-    for flag in ("trouble", "plant"):
+    for flag in ("trouble", "on"):
         words += [f"--{flag} {value!r}" for value in getattr(args, flag) or ()]
     return " ".join(words)

@@ -58,7 +58,7 @@ class Trouble(NamedTuple):
     """What it is to trip; None: nothing."""
     told: Scenario
     errors: Mapping[str, Any] = {}
-    """Of the plant, beyond those of the column."""
+    """Errors of the plant that come with it."""
     let_go_s: float = math.inf
     """When the hand lets go, scenario time."""
     unfiltered: bool = False
@@ -68,6 +68,8 @@ class Trouble(NamedTuple):
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """How it came out."""
 
+    led: bool
+    """The scenario came to `BEGINS_S`; a robot that shakes at once never does."""
     tripped: str
     """The trips and causes that came, in their order; empty: none."""
     tripped_after_s: float | None
@@ -75,9 +77,9 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     fell_at_s: float | None
     """Scenario time."""
     speed_max: float
-    """Of the torso, upwards or down, m/s."""
+    """The torso's largest speed upwards or down, m/s."""
     pitch_max: float
-    """Of the torso, rad."""
+    """The torso's largest pitch, forwards or back, rad."""
     untripped_fell_at_s: float | None
     """The same on the robot on which nothing trips."""
     untripped_speed_max: float
@@ -217,6 +219,7 @@ def run_trial(trouble: str, plant: str, robot: RobotConfig, seed: int) -> Outcom
     seen = _Seen(robot, told, PLANTS[plant], seed)
     without = _Seen(untripped(robot), told, PLANTS[plant], seed)
     return Outcome(
+        led=seen.fleet.world.scenario_s > BEGINS_S,
         tripped=" ".join(sorted(seen.trips, key=lambda name: seen.trips[name])),
         tripped_after_s=seen.tripped_after_s(),
         fell_at_s=seen.fell_at_s,
