@@ -121,6 +121,18 @@ class RobotConfig(Section, frozen=True):
         theta = float(kind_of(module) in self.joint_service.hold_stiffens_theta)
         return (stand.k_p[0], theta * stand.k_p[1]), (stand.k_d[0], theta * stand.k_d[1])
 
+    def support_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return (k_p, k_d) of a module that stiffens because another one is limp.
+
+        The stand gains; a hip's theta holds the torso on a leg that is a strut, with
+        `joint_service.limp_leg_hip_theta`; (phi, theta), N m/rad and N m s/rad.
+        """
+        stand = self.stand_gains(module)
+        if kind_of(module) != "hip":
+            return stand.k_p, stand.k_d
+        theta = self.joint_service.limp_leg_hip_theta
+        return (stand.k_p[0], theta.k_p), (stand.k_d[0], theta.k_d)
+
     @property
     def torso_mass(self) -> float:
         """m_torso of the paper in kg: two hip modules, two batteries, the payload."""

@@ -200,6 +200,13 @@ class StandConfig(Section, frozen=True):
     hip: StandGains
 
 
+class AxisGains(Section, frozen=True):
+    """Local gains of one axis."""
+
+    k_p: LocalStiffness
+    k_d: LocalDamping
+
+
 class JointServiceConfig(Section, frozen=True):
     """Timing and limits of the joint service (design section 4)."""
 
@@ -226,6 +233,8 @@ class JointServiceConfig(Section, frozen=True):
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
     pendant_ms: Annotated[float, Range(20.0, 10_000.0, "ms")] = 500.0
     """A pendant that was heard and is silent for so long: emergency stop."""
+    limp_leg_hip_theta: AxisGains = AxisGains(k_p=2700.0, k_d=42.0)
+    """Gains of each hip's theta while a knee is limp: its leg stands as a strut on them."""
 
 
 class EnvelopeConfig(Section, frozen=True):

@@ -23,7 +23,7 @@ class DriveFault(NamedTuple):
     In every one the module's own mode is FAULT, and the planner has the other five go to HOLD:
     no leg works against the other. If it is a knee they brace: it may be limp, and then its leg
     stands as a strut between an ankle and a hip that are stiff; if it is an ankle the knees do
-    (`services.planner.bracing`).
+    (`shared.limp_leg_support`).
     """
 
     drive: str

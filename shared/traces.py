@@ -42,7 +42,9 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     knows_below: bool = False
     """if this says so."""
     sinks: bool = True
-    """Of a knee or a hip: nothing that it knew of the others kept it from sinking."""
+    """Of a knee: nothing that it knew of the others kept it from sinking."""
+    stiffen: bool = False
+    """It knew of a limp module for which it is to stiffen."""
 
 
 class JointTrace(Message, frozen=True):

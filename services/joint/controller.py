@@ -51,6 +51,7 @@ class JointController:
         self._limits = limits_of(config, module)
         self._trips, self._trip_limits = Trips(), trip_limits_of(config)
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
+        self._support_k_p, self._support_k_d = config.support_gains(module)
         self._sinking = Sinking(config, module)
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
         self._gear_ratio = config.joint.gear_ratio
@@ -70,7 +71,7 @@ class JointController:
         """What the drive carried beyond the law as the service went on after a gap, N m."""
         self._resumed_ns = 0
         self._braced_ns = 0
-        """Since when HOLD rises to all stand gains, for another may be limp; 0: it does not."""
+        """Since when it stiffens because another module may be limp; 0: it does not."""
         self._near = NOTHING
         self._cause = 0
         self.tau: Pair = law.ZERO
@@ -126,7 +127,8 @@ class JointController:
         if cause is not None:
             self._cause = int(cause)
             self._enter(now_ns, before)
-        if not self._braced_ns and failsafe.asks_to_brace:
+        limp = near.stiffen and failsafe.mode in (Mode.HOLD, Mode.DAMP)
+        if not self._braced_ns and (limp or failsafe.asks_to_brace):
             self._braced_ns = now_ns
         self._setpoint = self._evaluate(now_ns)
         tau_before = self.tau
@@ -271,7 +273,8 @@ class JointController:
     def _enter(self, now_ns: int, before: Mode) -> None:
         """Take the anchor of the new mode: what was in force until now, frozen."""
         self._changed_ns = now_ns
-        self._braced_ns = 0
+        if self.failsafe.mode is not Mode.DAMP:
+            self._braced_ns = 0
         k_p, k_d = self._stand_k_p, self._stand_k_d
         if before is Mode.DISARMED and self._found_tau is not None:
             q, v = self._samples.q, self._samples.v
@@ -304,11 +307,12 @@ class JointController:
                 return fresh
             return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
         if mode is Mode.DAMP:
-            return self._sinking.law(self._anchor, since_ns, self._samples.q, self._near)
+            near = self._near._replace(stiffen=self._braced_ns > 0)
+            return self._sinking.law(self._anchor, since_ns, self._samples.q, near)
         held = self._held(since_ns)
         if self._braced_ns:
             risen = min(1.0, (now_ns - self._braced_ns) / self._blend_ns)
-            return law.stiffened(held, self._stand_k_p, self._stand_k_d, risen)
+            return law.stiffened(held, self._support_k_p, self._support_k_d, risen)
         return held
 
     def _held(self, since_ns: int) -> Setpoint:

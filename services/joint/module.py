@@ -112,8 +112,8 @@ class Module:
 
     @property
     def asks_near(self) -> bool:
-        """True while it matters what the neighbours do: in DAMP."""
-        return self.controller.failsafe.mode is Mode.DAMP
+        """True while it matters what the neighbours do: in HOLD and DAMP."""
+        return self.controller.failsafe.mode in (Mode.HOLD, Mode.DAMP)
 
     @property
     def leaves_holding(self) -> bool:

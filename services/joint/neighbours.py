@@ -3,13 +3,14 @@
 After an emergency stop the knees sink. A torso on hips that only damp is dragged along by the
 thighs: it turned back by 1.5 rad, and with its COM 5 cm back and 10 cm up it threw the robot over.
 A hip that knows how its ankle and its knee have turned holds the torso as it stood. And a knee that
-sinks beside one whose service is dead, or that is limp, tips the robot sideways: it was down in
-4 s. It has to know that the other one does not sink. Beside a limp knee the hips hold, as in HOLD
-(`services.planner.bracing`).
+sinks beside one whose service is dead tips the robot sideways: it was down in 4 s. It has to know
+that the other one does not sink. A limp module makes the others stiffen, in HOLD and in DAMP
+(`shared.limp_leg_support`): without that the robot fell within 1.3 s of a knee that went limp with
+the planner dead, and within 2 s of a stop beside a limp knee.
 
 All this with planner and bus dead: so each service writes down where it is in a file that all six
 have mapped, by a store to memory in each cycle, which the control path may do. What runs on another
-host is not known: hips then damp, and knees sink.
+host is not known: hips then damp, knees sink, and only a planner has the others stiffen.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import Final, NamedTuple
 
 from shared.clock import NS_PER_MS
 from shared.joints import MODULES, N_MODULES, kind_of
+from shared.limp_leg_support import SUPPORT_FOR, Support
 from shared.messages import Mode, Pair
 
 STALE_NS: Final = 20 * NS_PER_MS
@@ -57,7 +59,9 @@ class Near(NamedTuple):
     below: Pair | None = None
     """For a hip: theta and rate of ankle and knee together, rad, rad/s; None: not known now."""
     sinks: bool = True
-    """For a knee or a hip: False if the robot would tip were it not to hold where it is."""
+    """For a knee: False if the robot would tip unless it holds where it is."""
+    stiffen: bool = False
+    """Another module is limp, and this one is to stiffen for it."""
 
 
 NOTHING: Final = Near()
@@ -77,18 +81,19 @@ def near(module: str, rows: Sequence[Row | None], now_ns: int) -> Near:
         now_ns: the host's monotonic clock.
     """
     kind, own = kind_of(module), MODULES.index(module)
+    limp = [wanted for row, wanted in zip(rows, SUPPORT_FOR, strict=True) if _is_limp(row)]
+    stiffen = max(limp, default=Support.NONE).includes(module)
     if kind == "hip":
-        below, knees = (rows[own - 2], rows[own - 1]), (rows[1], rows[1 + _LEG])
-        sinks = not any(map(_is_limp, knees))
+        below = rows[own - 2], rows[own - 1]
         known = [row for row in below if row is not None and _is_fresh(row, now_ns)]
         if len(known) < len(below):
-            return Near(sinks=sinks)
-        return Near((sum(row.theta for row in known), sum(row.rate for row in known)), sinks)
+            return Near(stiffen=stiffen)
+        theta, rate = sum(row.theta for row in known), sum(row.rate for row in known)
+        return Near((theta, rate), stiffen=stiffen)
     if kind == "knee":
-        other, ankles = rows[(own + _LEG) % N_MODULES], (rows[0], rows[_LEG])
-        stays = other is not None and _stays(other, now_ns)
-        return Near(sinks=not stays and not any(map(_is_limp, ankles)))
-    return NOTHING
+        other = rows[(own + _LEG) % N_MODULES]
+        return Near(sinks=other is None or not _stays(other, now_ns), stiffen=stiffen)
+    return Near(stiffen=stiffen)
 
 
 def _is_fresh(row: Row, now_ns: int) -> bool:
@@ -140,8 +145,6 @@ class Neighbours:
 
     def near(self, now_ns: int) -> Near:
         """Return what this module knows of the others."""
-        if kind_of(self._module) == "ankle":
-            return NOTHING
         return near(self._module, [self._read(at) for at in range(0, _SIZE, _ROW.size)], now_ns)
 
     def _read(self, at: int) -> Row | None:

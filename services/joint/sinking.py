@@ -5,6 +5,9 @@ on as feedforward that fades: a slow sink, never a drop. A knee is caught at its
 is once the other does not sink with it. A hip that knows how ankle and knee have turned holds the
 torso as it stood; one that does not damps, and the torso goes with the thighs
 (`services.joint.neighbours`).
+
+A module that is to stiffen for a limp one stops sinking: it holds where it is, on all its stand
+gains, with the load that it carries. A leg with a limp knee stands as a strut only on a stiff hip.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ class SinkingMemory(msgspec.Struct, frozen=True):
     below: float | None = None
     caught: bool = False
     doubt_ns: int = -1
+    held_ns: int = -1
 
 
 class Sinking:
@@ -47,7 +51,8 @@ class Sinking:
     Attributes:
         stop: where a knee is caught, rad; -inf: nowhere.
         upright: how the torso stood as it began, the leg's thetas together, rad; None: not known.
-        held: where a hip holds beside a limp knee, rad; None: it does not.
+        held: theta at which it stiffened for a limp module, rad; None: it has not.
+        held_ns: when it did, from the beginning on; -1: it has not.
         below: how ankle and knee had turned when that was known last, rad; None: never.
         caught: True if a knee does not sink any more for the others' sake.
         doubt_ns: since when there is reason to, from the beginning on; -1: there is none.
@@ -58,6 +63,7 @@ class Sinking:
         service, kind = config.joint_service, kind_of(module)
         stand = config.stand_gains(module)
         self._k_p, self._k_d = stand.k_p, stand.k_d
+        self._support = config.support_gains(module)
         self._damp_k_d = service.damp_k_d
         self._sinks = (False, kind in service.damp_sinks)
         self._levels = kind == "hip" and self._sinks[1]
@@ -70,13 +76,13 @@ class Sinking:
         self.held: float | None = None
         self.below: float | None = None
         self.caught = False
-        self.doubt_ns = -1
+        self.doubt_ns = self.held_ns = -1
 
     def begin(self, setpoint: Setpoint, q: Pair) -> Setpoint:
         """Return what it starts from, of the setpoint in force until now and where the joint is."""
         self.stop = min(self.stop, q[1])
         self.upright = self.held = self.below = None
-        self.caught, self.doubt_ns = False, -1
+        self.caught, self.doubt_ns, self.held_ns = False, -1, -1
         return law.carrying(setpoint, self._sinks, q)
 
     def law(self, anchor: Setpoint, since_ns: int, q: Pair, near: Near) -> Setpoint:
@@ -88,32 +94,49 @@ class Sinking:
             q: where the joint is, rad.
             near: what is known of the other modules.
         """
+        if near.stiffen and self.held is None:
+            self.held, self.held_ns = q[1], since_ns
+        if self.held is not None:
+            return self._stiffened(anchor, since_ns, self.held)
         holds = self._is_to_hold(since_ns, near)
-        share = max(0.0, 1.0 - since_ns / self._fade_ns)
-        risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
-        held = law.held(anchor, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
-        held = law.stiffened(held, self._k_p, self._k_d, 1.0 - share)
-        sunk = law.damped(held, self._sinks, self._damp_k_d, share, risen)
+        sunk = self._sunk(anchor, since_ns, since_ns)
         if self._levels:
-            if holds and self.held is None:
-                self.held = q[1]
-            return self._levelled(sunk, q[1], near, risen)
+            return self._levelled(sunk, q[1], near, min(1.0, since_ns / self._blend_ns))
         if holds and self._stops and not self.caught:
             self.caught, self.stop = True, max(self.stop, q[1])
         if q[1] < self.stop:
             return law.caught(sunk, self.stop, self._k_p[1], self._k_d[1])
         return sunk
 
+    def _sunk(self, anchor: Setpoint, since_ns: int, faded_ns: int) -> Setpoint:
+        """Return the law of sinking, with the load that is left after `faded_ns`."""
+        share = max(0.0, 1.0 - faded_ns / self._fade_ns)
+        risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
+        held = law.held(anchor, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
+        held = law.stiffened(held, self._k_p, self._k_d, 1.0 - share)
+        return law.damped(held, self._sinks, self._damp_k_d, share, risen)
+
+    def _stiffened(self, anchor: Setpoint, since_ns: int, theta: float) -> Setpoint:
+        """Return the law of a module that holds at theta (rad), with the load it had then."""
+        sunk = self._sunk(anchor, since_ns, self.held_ns)
+        q_ref = (sunk.q_ref[0], theta if self._sinks[1] else sunk.q_ref[1])
+        stands = msgspec.structs.replace(law.stand(q_ref, *self._support), tau_ff=sunk.tau_ff)
+        risen = min(1.0, (since_ns - self.held_ns) / self._blend_ns)
+        return law.blend(sunk, stands, risen)
+
     def remember(self) -> SinkingMemory:
         """Return the memory as it is now."""
         stop = self.stop if math.isfinite(self.stop) else None
-        return SinkingMemory(stop, self.upright, self.held, self.below, self.caught, self.doubt_ns)
+        return SinkingMemory(
+            stop, self.upright, self.held, self.below, self.caught, self.doubt_ns, self.held_ns
+        )
 
     def recall(self, memory: SinkingMemory) -> None:
         """Go on from a memory."""
         self.stop = -math.inf if memory.stop is None else memory.stop
         self.upright, self.held, self.below = memory.upright, memory.held, memory.below
         self.caught, self.doubt_ns = memory.caught, memory.doubt_ns
+        self.held_ns = memory.held_ns
 
     def _is_to_hold(self, since_ns: int, near: Near) -> bool:
         if near.sinks:
@@ -128,13 +151,10 @@ class Sinking:
         rate = 0.0
         if near.below is not None:
             self.below, rate = near.below
-        if self.held is not None:
-            wanted, rate = self.held, 0.0
-        elif self.below is not None:
-            if self.upright is None:
-                self.upright = self.below + theta
-            wanted = self.upright - self.below
-        else:
+        if self.below is None:
             return sunk
+        if self.upright is None:
+            self.upright = self.below + theta
+        wanted = self.upright - self.below
         wanted = min(theta + LEVEL_MAX, max(theta - LEVEL_MAX, wanted))
         return law.levelled(sunk, wanted, -rate, risen * self._k_p[1])

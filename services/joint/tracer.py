@@ -66,6 +66,7 @@ class Tracer:
                 near.below or _NOTHING,
                 near.below is not None,
                 near.sinks,
+                near.stiffen,
             )
         )
         return self.take() if len(self._cycles) == CYCLES else None

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from services.planner.bracing import Brace
 from services.planner.certificate import Margins
 from services.planner.hocca import LawOutput
 from shared.joints import MODULES, N_MODULES
+from shared.limp_leg_support import Support
 from shared.messages import JointCommand, JointState, Pair
 
 
@@ -25,7 +25,7 @@ class Common(NamedTuple):
 
 
 def commands_of(
-    common: Common, states: Sequence[JointState], output: LawOutput, brace: Brace
+    common: Common, states: Sequence[JointState], output: LawOutput, support: Support
 ) -> list[JointCommand]:
     """Return the commands, in the order of `MODULES`.
 
@@ -33,7 +33,7 @@ def commands_of(
         common: what all tell.
         states: the newest of each module; its stamp is echoed.
         output: what the law found.
-        brace: which modules are to stand stiffly, beside a limp one.
+        support: which modules are to stiffen, beside a limp one.
     """
     rows = np.array(
         (
@@ -48,7 +48,7 @@ def commands_of(
     ).reshape(7, N_MODULES, 2)
     by_module = rows.transpose(1, 0, 2).tolist()
     return [
-        _command(common, state.t_ns, rows, brace=brace.of(module))
+        _command(common, state.t_ns, rows, brace=support.includes(module))
         for module, state, rows in zip(MODULES, states, by_module, strict=True)
     ]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import Overload, force_up
-from services.planner.bracing import Brace, Bracing
+from services.planner.bracing import Bracing
 from services.planner.commands import Common, commands_of
 from services.planner.engagement import Engagement
 from services.planner.hocca import Hocca, LawOutput
@@ -25,6 +25,7 @@ from services.planner.unattended import Unattended
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import N_JOINTS, N_MODULES
+from shared.limp_leg_support import Support
 from shared.messages import (
     Attitude,
     JointCommand,
@@ -82,7 +83,7 @@ class Planner:
         self._bracing = Bracing()
         self._trips = Trips(config)
         self._unattended = Unattended()
-        self._brace = Brace.NONE
+        self._support = Support.NONE
         self._wrench_seq = -1
         self._last_ns = 0
         self._new = 0  # bit i: module i has a state that no tick has used
@@ -153,7 +154,7 @@ class Planner:
             [state.mode for state in states],
             self._forbidden(),
         )
-        self._brace = self._bracing.advance(now_ns, states)
+        self._support = self._bracing.advance(now_ns, states)
         # until all engage the law starts anew from the measured pose: there is no step
         self._output = self._law.tick(
             self._q,
@@ -177,7 +178,7 @@ class Planner:
         self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
         common = Common(now_ns, self._seq, self.session, self._hold(), self._output.local.margins)
-        return commands_of(common, states, self._output, self._brace)
+        return commands_of(common, states, self._output, self._support)
 
     def remember(self) -> TickMemory:
         """Return the memory as it is between two ticks; `recall` goes on from there."""

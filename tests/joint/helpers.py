@@ -10,6 +10,7 @@ import msgspec
 from services.joint.controller import CycleResult, JointController
 from services.joint.differential import motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.neighbours import NOTHING, Near
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.gain_schedule import believing
@@ -82,11 +83,12 @@ class Bench:
         estop: bool = False,
         stalled: bool = False,
         after_ns: int = 0,
+        near: Near = NOTHING,
     ) -> CycleResult:
         """Run the next cycle: a period, or `after_ns`, after the one before."""
         self.now_ns += after_ns or self.cycle_ns
         reading = None if stalled else self.reading()
-        return self.controller.step(self.now_ns, reading, sent, estop)
+        return self.controller.step(self.now_ns, reading, sent, estop, near=near)
 
     def run(self, cycles: int, *, fresh: bool = False, **changes: Any) -> list[CycleResult]:
         """Run cycles, with a fresh command in each or with none."""

@@ -1,4 +1,4 @@
-"""HOLD while a knee may be limp: the module rises to all of its stand gains, and stays there."""
+"""HOLD and DAMP while a knee may be limp: the module rises to all support gains, and stays."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.joint import law
 from services.joint.controller import JointController
 from services.joint.memory import ControllerMemory
+from services.joint.neighbours import Near
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.joints import MODULES, kind_of
@@ -44,15 +44,15 @@ def is_braced(bench: Bench) -> bool:
 
 
 def at_least(robot: RobotConfig, module: str, k_p: Pair, k_d: Pair) -> tuple[Pair, Pair]:
-    stand = robot.stand_gains(module)
+    support_p, support_d = robot.support_gains(module)
     return (
-        (max(k_p[0], stand.k_p[0]), max(k_p[1], stand.k_p[1])),
-        (max(k_d[0], stand.k_d[0]), max(k_d[1], stand.k_d[1])),
+        (max(k_p[0], support_p[0]), max(k_p[1], support_p[1])),
+        (max(k_d[0], support_d[0]), max(k_d[1], support_d[1])),
     )
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_told_to_it_rises_to_its_stand_gains_within_the_blend_time(
+def test_told_to_it_rises_to_its_support_gains_within_the_blend_time(
     robot: RobotConfig, module: str
 ) -> None:
     bench = holding(robot, module)
@@ -80,8 +80,8 @@ def test_no_gain_is_ever_lowered_and_none_jumps(
     robot: RobotConfig, module: str, k_p: Pair, k_d: Pair
 ) -> None:
     bench = holding(robot, module, k_p, k_d)
-    stand, cycles = robot.stand_gains(module), blended(bench, robot)
-    steps = [max(p, d) / cycles for p, d in zip(stand.k_p, stand.k_d, strict=True)]
+    gains, cycles = robot.support_gains(module), blended(bench, robot)
+    steps = [max(p, d) / cycles for p, d in zip(*gains, strict=True)]
     last = bench.controller.setpoint
     for _ in range(cycles + 5):
         bench.run(1, fresh=True, hold=True, brace=True)
@@ -102,7 +102,7 @@ def test_it_stays_braced_until_it_tracks_again(robot: RobotConfig, after: str) -
     bench.run(1, fresh=True, hold=True, brace=True)
     bench.run(500, fresh=after == "told so no more", hold=True)
     assert is_braced(bench)
-    assert bench.controller.setpoint.k_p == robot.stand_gains("hip_right").k_p
+    assert bench.controller.setpoint.k_p == robot.support_gains("hip_right")[0]
     while bench.mode is Mode.HOLD:
         bench.run(1, fresh=True, k_p=SOFT_P, k_d=SOFT_D)
     assert bench.mode is Mode.TRACK
@@ -150,7 +150,7 @@ def test_bracing_and_going_on_to_track_is_without_a_step(robot: RobotConfig) -> 
             largest = max(largest, *(abs(b - a) for a, b in zip(last, tau, strict=True)))
             last = tau
     assert bench.mode is Mode.TRACK
-    whole = robot.stand_gains("hip_right").k_p[1] * 0.05
+    whole = robot.support_gains("hip_right")[0][1] * 0.05
     assert largest < 3.0 * whole / blended(bench, robot), "a share of it in each cycle"
 
 
@@ -167,11 +167,43 @@ def test_a_controller_that_goes_on_from_its_memory_goes_on_bracing(robot: RobotC
     assert twin.state(bench.now_ns).braced
 
 
-def test_an_emergency_stop_of_a_braced_module_sinks(robot: RobotConfig) -> None:
-    bench = holding(robot, "knee_right")
+@pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
+def test_an_emergency_stop_of_a_braced_module_goes_on_holding(
+    robot: RobotConfig, module: str
+) -> None:
+    """Its planner has told it of a limp knee, which may be on another host."""
+    bench = holding(robot, module)
     bench.run(300, fresh=True, hold=True, brace=True)
     bench.cycle(bench.fresh(hold=True, brace=True), estop=True)
-    bench.run(5, fresh=True, hold=True, brace=True)
     assert bench.mode is Mode.DAMP
-    assert bench.controller.setpoint.k_p[1] == law.ZERO[1]
+    bench.run(2 * blended(bench, robot))
+    assert is_braced(bench)
+    assert bench.controller.setpoint.k_p == pytest.approx(robot.support_gains(module)[0])
+
+
+@pytest.mark.parametrize("mode", [Mode.HOLD, Mode.DAMP])
+@pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
+def test_a_limp_neighbour_braces_it_without_a_planner(
+    robot: RobotConfig, module: str, mode: Mode
+) -> None:
+    bench = holding(robot, module)
+    if mode is Mode.DAMP:
+        bench.cycle(estop=True)
+    bench.run(10)
+    assert not is_braced(bench)
+    bench.cycle(near=Near(stiffen=True))
+    assert is_braced(bench)
+    bench.run(2 * blended(bench, robot))
+    assert bench.mode is mode
+    assert is_braced(bench), "once is enough: its row may be lost with its service"
+    k_p, k_d = at_least(robot, module, (0.0, 0.0), (0.0, 0.0))
+    assert bench.controller.setpoint.k_p == pytest.approx(k_p)
+    assert bench.controller.setpoint.k_d == pytest.approx(k_d)
+
+
+def test_in_track_a_limp_neighbour_is_the_planners_business(robot: RobotConfig) -> None:
+    bench = Bench(robot, "hip_right")
+    bench.to_track()
+    bench.cycle(bench.fresh(), near=Near(stiffen=True))
+    assert bench.mode is Mode.TRACK
     assert not is_braced(bench)

@@ -63,19 +63,17 @@ def test_who_holds_beside_whom() -> None:
             continue
         found = near(asks, rows(**{other: Row(T0 - age_ns, 0.0, 0.0, mode, caught)}), T0)
         pair = kind_of(asks), kind_of(other)
-        limp = mode is Mode.FAULT
-        holds = (
-            (pair == ("knee", "knee") and (age_ns > GONE_NS or mode != Mode.DAMP or caught == 1))
-            or (pair == ("knee", "ankle") and limp)
-            or (pair == ("hip", "knee") and limp)
-        )
-        assert found.sinks is not holds, (asks, other, mode, age_ns, caught)
+        stays = age_ns > GONE_NS or mode != Mode.DAMP or caught == 1
+        assert found.sinks is not (pair == ("knee", "knee") and stays), (asks, other, mode, age_ns)
+        for_knee, for_ankle = pair[1] == "knee", pair == ("knee", "ankle")
+        stiffens = mode is Mode.FAULT and (for_knee or for_ankle)
+        assert found.stiffen is stiffens, (asks, other, mode, age_ns)
 
 
 def test_a_drive_that_was_never_heard_of_is_not_limp() -> None:
     for asks, other in (("hip_right", "knee_left"), ("knee_right", "ankle_left")):
-        assert near(asks, rows(**{other: Row(0, 0.0, 0.0, Mode.FAULT)}), T0).sinks
-        assert not near(asks, rows(**{other: Row(1, 0.0, 0.0, Mode.FAULT)}), T0).sinks
+        assert not near(asks, rows(**{other: Row(0, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
+        assert near(asks, rows(**{other: Row(1, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
 
 
 def test_a_clock_far_ahead_is_of_another_host() -> None:

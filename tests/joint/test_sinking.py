@@ -77,20 +77,41 @@ def test_a_leg_that_is_not_heard_of_any_more_is_taken_to_stay(robot: RobotConfig
     assert found.v_ref[1] == 0.0
 
 
-def test_a_hip_holds_where_it_is_once_it_has_had_reason_to_for_long(robot: RobotConfig) -> None:
-    sinking, anchor = begun(robot, "hip_right")
-    bad = Near((0.3, 0.2), sinks=False)
-    sinking.law(anchor, 5, Q, bad)
-    assert sinking.doubt_ns == 5
-    sinking.law(anchor, 5 + DOUBT_NS - 1, Q, bad)
-    assert sinking.held is None
-    sinking.law(anchor, 5 + DOUBT_NS, (0.02, -0.5), bad)
-    assert sinking.held == -0.5
-    found = sinking.law(anchor, LONG_NS, (0.02, -0.47), Near((0.8, 0.2)))
-    assert found.q_ref[1] == -0.5, "and goes on to, whatever it is told then"
-    assert found.v_ref[1] == 0.0
-    sinking.law(anchor, LONG_NS + DOUBT_NS, (0.02, -0.4), bad)
-    assert sinking.held == -0.5
+@pytest.mark.parametrize("module", ["ankle_right", "knee_right", "hip_right"])
+def test_for_a_limp_module_it_holds_where_it_is_with_the_load_it_has(
+    robot: RobotConfig, module: str
+) -> None:
+    """From then on, whatever it is told: a robot under load never softens by itself."""
+    sinking, anchor = begun(robot, module)
+    half_ns = round(0.5 * robot.joint_service.damp_fade_s * NS_PER_S)
+    blend_ns = round(robot.joint_service.blend_ms * 1e6)
+    before = sinking.law(anchor, half_ns, Q, NOTHING)
+    limp = Near((0.3, 0.2), stiffen=True)
+    at_first = sinking.law(anchor, half_ns, (0.02, -0.5), limp)
+    assert law.torque(at_first, Q, law.ZERO) == pytest.approx(law.torque(before, Q, law.ZERO))
+    k_p, k_d = robot.support_gains(module)
+    for later_ns in (blend_ns, LONG_NS):
+        found = sinking.law(anchor, half_ns + later_ns, (0.02, -0.47), Near((0.8, 0.2)))
+        sinks = not module.startswith("ankle")
+        assert found.q_ref == (0.1, -0.5 if sinks else -1.0)
+        assert found.v_ref == found.tau_coupled == law.ZERO
+        assert found.tau_ff == before.tau_ff
+        assert (found.k_p, found.k_d) == (k_p, k_d)
+    assert sinking.law(anchor, half_ns + LONG_NS, (0.02, -0.4), limp).q_ref == found.q_ref
+    half_way = sinking.law(anchor, half_ns + blend_ns // 2, Q, limp)
+    assert half_way.k_p[1] == pytest.approx(0.5 * (before.k_p[1] + k_p[1]))
+
+
+def test_of_a_hip_only_the_theta_is_stiffer_for_a_limp_knee_than_in_a_stand(
+    robot: RobotConfig,
+) -> None:
+    stand, (k_p, k_d) = robot.stand_gains("hip_left"), robot.support_gains("hip_left")
+    assert (k_p[0], k_d[0]) == (stand.k_p[0], stand.k_d[0])
+    assert k_p[1] >= 2.0 * stand.k_p[1]
+    assert k_d[1] > stand.k_d[1]
+    for module in ("ankle_right", "knee_left"):
+        stand = robot.stand_gains(module)
+        assert robot.support_gains(module) == (stand.k_p, stand.k_d)
 
 
 def test_a_reason_that_passes_is_none(robot: RobotConfig) -> None:
@@ -134,8 +155,8 @@ def test_only_knees_are_caught(robot: RobotConfig, module: str) -> None:
 
 def test_a_second_stop_begins_anew(robot: RobotConfig) -> None:
     sinking, anchor = begun(robot, "hip_right")
-    sinking.law(anchor, 0, Q, Near((0.3, 0.2), sinks=False))
-    sinking.law(anchor, DOUBT_NS, Q, Near((0.3, 0.2), sinks=False))
+    sinking.law(anchor, DOUBT_NS, Q, Near((0.3, 0.2), stiffen=True))
+    assert sinking.remember().held_ns == DOUBT_NS
     sinking.begin(FULL, Q)
     assert sinking.remember() == SinkingMemory(doubt_ns=-1)
     knee, anchor = begun(robot, "knee_right", (0.0, -1.0))
@@ -147,7 +168,7 @@ def test_a_second_stop_begins_anew(robot: RobotConfig) -> None:
 
 @pytest.mark.parametrize("stop", [None, -2.2])
 def test_it_goes_on_from_its_memory(robot: RobotConfig, stop: float | None) -> None:
-    memory = SinkingMemory(stop, 0.1, -0.3, 0.4, caught=True, doubt_ns=7)
+    memory = SinkingMemory(stop, 0.1, -0.3, 0.4, caught=True, doubt_ns=7, held_ns=9)
     sinking = Sinking(robot, "hip_right")
     sinking.recall(memory)
     assert sinking.stop == (-math.inf if stop is None else stop)

@@ -151,6 +151,21 @@ def test_it_does_not_fall_with_an_ankle_or_a_hip_limp(robot: RobotConfig, limp: 
     assert found.turned < 0.1
 
 
+@pytest.mark.parametrize("height", [0.9, 1.1])
+@pytest.mark.parametrize("planner", ["alive", "dead"])
+@pytest.mark.parametrize("at", [3.7, 5.0], ids=["before the stop", "after it"])
+def test_beside_a_limp_knee_it_stops_sinking_and_stands(
+    robot: RobotConfig, height: float, planner: str, at: float
+) -> None:
+    """Sinking on beside the limp knee all of 24 such stops fell, within 2 s."""
+    kills = (Kill(service="planner", at=3.55),) if planner == "dead" else ()
+    limp = (Fault(module="knee_left", kind="disarmed", at=at),)
+    found = stop(robot, height, 0.0, PlantConfig(), kills=kills, faults=limp)
+    assert not found.fell
+    assert found.turned < 0.65, "0.55 measured at 1.1 m, with nobody holding on"
+    assert found.sank < 0.15
+
+
 @pytest.mark.parametrize("freezes_s", [0.05, 0.3])
 def test_a_knee_that_pauses_on_the_way_down_tips_nothing(
     robot: RobotConfig, freezes_s: float

@@ -7,8 +7,8 @@ import pytest
 from shared.config import RobotConfig
 from shared.joints import MODULE_INDEX, MODULES
 from shared.messages import Mode
-from shared.scenario import Fault, FaultKind
-from tests.lockstep.runs import Run, push, run, story
+from shared.scenario import Fault, FaultKind, Kill
+from tests.lockstep.runs import Run, kill, push, run, story
 
 PUSHED_AFTER = 1.0
 LASTING = 2.6
@@ -16,13 +16,19 @@ LASTING = 2.6
 
 
 def limp(
-    robot: RobotConfig, name: str, module: str, kind: FaultKind, at: float, *force: float
+    robot: RobotConfig,
+    name: str,
+    module: str,
+    kind: FaultKind,
+    at: float,
+    *force: float,
+    kill: tuple[Kill, ...] = (),
 ) -> Run:
     """Run a scenario to a fault and on, with a push a while after it."""
     scenario = story(
         name,
         duration=at + LASTING,
-        kill=(),
+        kill=kill,
         restart=(),
         fault=(Fault(module=module, kind=kind, at=at),),
         push=(push(at + PUSHED_AFTER, *force),),
@@ -67,6 +73,22 @@ def test_a_limp_knee_stands_on_five_that_brace_and_takes_a_push(
         if other != module and event.mode_after == Mode.HOLD
     ]
     assert max(steps) < 3.0, "nor does any of the five jerk"
+
+
+@pytest.mark.parametrize(
+    ("at", "force"),
+    [(0.3, (0.0, 30.0, 0.0)), (1.5, (30.0, 0.0, 0.0)), (2.4, (0.0, -30.0, 0.0))],
+)
+def test_with_the_planner_dead_a_limp_knee_stands_as_well(
+    robot: RobotConfig, at: float, force: tuple[float, float, float]
+) -> None:
+    """The services see it in each other's rows. Only a planner told them: 9 of 9 such runs fell."""
+    planner_dead = kill(at - 0.2)
+    outcome = limp(robot, "squat", "knee_left", "disarmed", at, *force, kill=planner_dead)
+    assert outcome.stood
+    assert braced(outcome) == [other for other in MODULES if other != "knee_left"]
+    after = outcome.t > at
+    assert abs(outcome.com_mm[after, :2]).max() < 75.0, "40 to 54 measured"
 
 
 def test_for_a_limp_ankle_the_knees_alone_brace(robot: RobotConfig) -> None:

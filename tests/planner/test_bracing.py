@@ -7,19 +7,20 @@ import itertools
 import msgspec
 import pytest
 
-from services.planner.bracing import DISARMED_NS, Brace, Bracing
+from services.planner.bracing import DISARMED_NS, Bracing
 from services.planner.memory import TickMemory
 from services.planner.planner import Planner
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
+from shared.limp_leg_support import Support
 from shared.messages import DriveStatus, JointState, Mode
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 from tests.planner.test_planner import SESSION, START_NS, hear_all, lead, state
 
 TICK_NS = 4 * NS_PER_MS
-FOR = {"ankle": Brace.KNEES, "knee": Brace.ALL, "hip": Brace.NONE}
+FOR = {"ankle": Support.KNEES, "knee": Support.ALL, "hip": Support.NONE}
 """Who braces for a limp one of a kind."""
 BRACED_FOR = [name for name in MODULES if FOR[kind_of(name)]]
 HIPS = [name for name in MODULES if kind_of(name) == "hip"]
@@ -55,7 +56,7 @@ def test_one_that_stays_disarmed_is_braced_for_after_the_time_a_takeover_may_tak
 ) -> None:
     bracing, rows = Bracing(), states(q, module, Mode.DISARMED, drive)
     told = [bracing.advance(START_NS + off, rows) for off in range(0, DISARMED_NS + 1, TICK_NS)]
-    assert told == [Brace.NONE] * (DISARMED_NS // TICK_NS) + [FOR[kind_of(module)]]
+    assert told == [Support.NONE] * (DISARMED_NS // TICK_NS) + [FOR[kind_of(module)]]
     well = states(q, module, Mode.HOLD, DriveStatus.ARMED)
     assert not bracing.advance(START_NS + 2 * DISARMED_NS, well)
     assert not bracing.advance(START_NS + 3 * DISARMED_NS, rows), "counted anew"
@@ -98,17 +99,17 @@ def test_a_knee_counts_before_an_ankle(q: Array, ankle: str) -> None:
     rows = states(q, ankle, Mode.FAULT, DriveStatus.ERROR)
     index = MODULE_INDEX["knee_left"]
     rows[index] = state(index, q, mode=int(Mode.FAULT))
-    assert Bracing().advance(START_NS, rows) is Brace.ALL
+    assert Bracing().advance(START_NS, rows) is Support.ALL
 
 
 def test_a_knee_that_restarts_beside_an_ankle_long_out_is_given_its_own_time(q: Array) -> None:
     """Else the hips brace, and stay so: with one ankle 12 of 12 fell."""
     bracing, out = Bracing(), states(q, "ankle_left", Mode.DISARMED, DriveStatus.LOST)
     bracing.advance(START_NS, out)
-    assert bracing.advance(START_NS + 2 * DISARMED_NS, out) is Brace.KNEES
+    assert bracing.advance(START_NS + 2 * DISARMED_NS, out) is Support.KNEES
     index = MODULE_INDEX["knee_left"]
     out[index] = state(index, q, mode=int(Mode.DISARMED), drive=int(DriveStatus.LOST))
-    for off_ns, asked in ((0, Brace.KNEES), (DISARMED_NS, Brace.ALL)):
+    for off_ns, asked in ((0, Support.KNEES), (DISARMED_NS, Support.ALL)):
         assert bracing.advance(START_NS + 2 * DISARMED_NS + TICK_NS + off_ns, out) is asked
 
 
@@ -133,13 +134,13 @@ def test_the_commands_of_those_that_are_to_brace_carry_it_with_the_hold(
     planner.hear_state(index, gone, now_ns)
     told = [(command.hold, command.brace) for command in planner.tick(now_ns)]
     asked = FOR[kind_of(module)]
-    assert told == [(True, asked.of(name)) for name in MODULES]
+    assert told == [(True, asked.includes(name)) for name in MODULES]
 
 
 def test_knees_are_knees() -> None:
-    assert [name for name in MODULES if Brace.KNEES.of(name)] == KNEES
-    assert [name for name in MODULES if Brace.ALL.of(name)] == list(MODULES)
-    assert not any(Brace.NONE.of(name) for name in MODULES)
+    assert [name for name in MODULES if Support.KNEES.includes(name)] == KNEES
+    assert [name for name in MODULES if Support.ALL.includes(name)] == list(MODULES)
+    assert not any(Support.NONE.includes(name) for name in MODULES)
 
 
 def test_a_planner_that_goes_on_from_its_memory_goes_on_counting(

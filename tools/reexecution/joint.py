@@ -80,7 +80,7 @@ class JointExecution:
                 outcome.skipped += 1
                 self._module = None
                 return
-        near = Near(c.below if c.knows_below else None, c.sinks)
+        near = Near(c.below if c.knows_below else None, c.sinks, c.stiffen)
         step = module.step(c.now_ns, _reading(c), command, c.estop, near)
         controller = module.controller
         outcome.ticks += 1

@@ -237,7 +237,7 @@ def module_status(state: Message | None) -> ModuleStatus:
         way_out = f"{told}: by itself after a push or a stall; if it lasts, xrl kill planner"
     knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
     q = state.q if knows else None
-    braced = state.braced and mode is Mode.HOLD
+    braced = state.braced and mode in (Mode.HOLD, Mode.DAMP)
     tier = TIERS.get(mode)
     return ModuleStatus(mode.name, tier, cause.name, drive.name, q, way_out, braced, outside)
 
