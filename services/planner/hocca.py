@@ -260,21 +260,24 @@ class Hocca:
         Args:
             tau: measured joint torques (12,), N m.
             v: joint rates (12,), rad/s.
-            wrench: of the operator on the torso, None: it is not known, a state is
-                stale, or a leg is straight or folded, so that torques tell nothing.
+            wrench: of the operator on the torso; None: it is not known.
             dt: since the last tick, s.
             led: the planner leads.
         """
         if not self._load.looked_for:
             return
         if wrench is None:
-            self._load.miss()
+            self._load.advance_without_harness(float(tau @ self._T[:, 2]), dt, led=led)
             return
         at_ref, p = self._ik.kinematics, self._measured.p
         force, turn = in_world(wrench, float(p[3]), float(p[4]))
         held = tau + force @ at_ref.J_harness + turn * at_ref.J[4]
         T, rates = self._T, (self.harness_rate(v), float(self._measured.J[4] @ v))
         self._load.advance(held @ T, at_ref.J_harness[2] @ T, float(p[4]), rates, dt, led=led)
+
+    def miss_load(self) -> None:
+        """Take it that torques tell nothing now: a state is stale, a leg straight or folded."""
+        self._load.miss()
 
     def harness_rate(self, v: Array) -> float:
         """Return the vertical rate of the harness point at the last tick's pose, m/s, world.

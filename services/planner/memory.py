@@ -86,6 +86,8 @@ class LoadMemory(msgspec.Struct, frozen=True):
     b: float = 0.0
     rates: Pair | None = None
     refused: bool = False
+    weighing_s: float = 0.0
+    looked: bool = True
 
 
 class LawMemory(msgspec.Struct, frozen=True):

@@ -30,6 +30,7 @@ from shared.messages import (
     Attitude,
     JointCommand,
     JointState,
+    Mode,
     PlannerMode,
     PlannerStatus,
     SplitSource,
@@ -169,9 +170,13 @@ class Planner:
         self._source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
-        known = engagement.mode is not PlannerMode.WAITING and not any(map(math.isnan, loads))
-        hand = self._usable_wrench(now_ns) if known else None
-        self._law.weigh(self._tau, self._v, hand, dt, led=leads)
+        all_carry = all(state.mode in (Mode.HOLD, Mode.TRACK) for state in states)
+        is_fresh = engagement.mode is not PlannerMode.WAITING
+        known = is_fresh and all_carry and not any(map(math.isnan, loads))
+        if known:
+            self._law.weigh(self._tau, self._v, self._usable_wrench(now_ns), dt, led=leads)
+        else:
+            self._law.miss_load()
         rate = self._law.harness_rate(self._v)
         drift = self._drift(now_ns, lifted)
         values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)

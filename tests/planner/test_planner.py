@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import msgspec
 import numpy as np
 import pytest
 
 from services.planner.certificate import Margins
 from services.planner.intents import Wish
+from services.planner.kinematics import Kinematics
 from services.planner.planner import EARLY_SHARE, LATE_SHARE, TICK_GAP_MAX_S, Planner
-from shared import gain_schedule
+from shared import config_file, gain_schedule
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
+from shared.config import GRAVITY, RobotConfig
 from shared.joints import N_MODULES
 from shared.messages import (
     DriveStatus,
@@ -23,6 +26,7 @@ from shared.messages import (
     Tare,
     Wrench,
 )
+from tests.conftest import ROBOT_FILE
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 
@@ -40,13 +44,24 @@ def q(closed: Closed) -> Array:
     return closed(1.188, x=0.01, pitch=0.1)
 
 
+@cache
+def standing_torque(q: tuple[float, ...]) -> Array:
+    """Return the torques (12,) of the shipped robot's stand at q (12,), rad; N m."""
+    robot = config_file.load(ROBOT_FILE)
+    kinematics = Kinematics(robot)
+    kinematics.update(np.array(q))
+    return np.asarray(robot.total_mass * GRAVITY * kinematics.J[2])
+
+
 def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
+    """Return the state of a module of a robot that stands on its feet."""
+    tau = standing_torque(tuple(q.tolist())) if np.isfinite(q).all() else np.zeros(12)
     fields: dict[str, object] = {
         "t_ns": 1000 * (module + 1) + seq,
         "seq": seq,
         "q": (float(q[2 * module]), float(q[2 * module + 1])),
         "v": (0.0, 0.0),
-        "tau": (0.0, 0.0),
+        "tau": (float(tau[2 * module]), float(tau[2 * module + 1])),
         "mode": int(Mode.TRACK),
         "cause": 0,
         "ready": True,
