@@ -22,6 +22,7 @@ from shared.robot_model import stand_pose
 from shared.scenario import Inject, Scenario
 from tests.joint.helpers import command
 from tests.lockstep.runs import push, story
+from tests.planner.test_planner import standing_torque
 from tests.test_architecture import IMPORTS, Import, imports_in
 from tools import cli
 from tools.centralised.control import CentralPlanner, PassThrough
@@ -182,8 +183,9 @@ def test_an_estop_and_a_lost_drive_are_as_shipped(robot: RobotConfig, bench: Ben
 
 
 def states(robot: RobotConfig, now_ns: int, seq: int) -> list[JointState]:
-    """Return six states of a stand, each joint moving."""
+    """Return six states of a robot that stands on its feet, each joint moving."""
     q = stand_pose(robot, 1.1)
+    tau = standing_torque(tuple(q))
     fleet = Lockstep(robot, story("stand"))
     blank = [module.state(now_ns) for module in fleet.controllers]
     return [
@@ -193,6 +195,7 @@ def states(robot: RobotConfig, now_ns: int, seq: int) -> list[JointState]:
             seq=seq,
             q=(q[2 * i], q[2 * i + 1]),
             v=(0.01 * i, -0.03 * i),
+            tau=(float(tau[2 * i]), float(tau[2 * i + 1])),
             mode=int(Mode.TRACK),
             ready=True,
         )
