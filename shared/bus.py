@@ -23,7 +23,7 @@ from typing import Final, Generic, Self, TypeAlias, TypeVar
 
 import zenoh
 
-from shared import linger
+from shared import socket_linger
 from shared.clock import keep_pace, now_ns
 from shared.codec import Decoder, encode
 from shared.config import SERVICES, RobotConfig, expand
@@ -385,10 +385,10 @@ def _meet_link(event: zenoh.LinkEvent) -> None:
     """
     link = event.link
     if event.kind == zenoh.SampleKind.PUT and link.src.startswith(_TCP):
-        linger.turn_off(_address(link.src), _address(link.dst))
+        socket_linger.turn_off(_address(link.src), _address(link.dst))
 
 
-def _address(locator: str) -> linger.Address:
+def _address(locator: str) -> socket_linger.Address:
     """Return host and port of tcp/HOST:PORT, as Zenoh tells them of a link: numeric."""
     address = re.split("[?#]", locator.partition("/")[2])[0]
     host, _, port = address.rpartition(":")

@@ -27,7 +27,7 @@ up, and joints are led on samples of before."""
 GAINS_HZ: Final = 10.0
 """How often the onboard loop's gains go out even if they stand still."""
 BLEND_HZ: Final = 125.0
-"""And while they blend: `FOLLOW_MS` of `services.joint.onboard`."""
+"""And while they blend: `FOLLOW_MS` of `services.joint.drive_setpoint`."""
 LOADCELL_FRAMES: Final = 3
 """To a sample of the harness sensor."""
 

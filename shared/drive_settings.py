@@ -73,7 +73,7 @@ class Setting(NamedTuple):
     compare: Compare = Compare.EQUAL
 
 
-class Wanted(NamedTuple):
+class WantedSetting(NamedTuple):
     """A setting of one drive, by its whole name, with its value worked out."""
 
     name: str
@@ -88,9 +88,9 @@ class Wanted(NamedTuple):
             return beyond or same(found, self.value)
         return same(found, self.value)
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return what is wanted: "60", ">= 1.2"."""
-        return f"{self.compare.value}{value_in_words(self.value)}"
+        return f"{self.compare.value}{describe_value(self.value)}"
 
 
 AXIS_TABLE: Final[tuple[Setting, ...]] = (
@@ -236,7 +236,7 @@ DRIVE_TABLE: Final[tuple[Setting, ...]] = (
 """Of the whole ODrive."""
 
 
-def of_module(robot: RobotConfig, module: str) -> tuple[Wanted, ...]:
+def of_module(robot: RobotConfig, module: str) -> tuple[WantedSetting, ...]:
     """Return all that is wanted of a module's ODrive."""
     counts = robot.joint.encoder_counts_per_turn
     common = Need(robot.drive, counts)
@@ -261,15 +261,15 @@ def same(one: Value, other: Value) -> bool:
     return one == other
 
 
-def value_in_words(value: object) -> str:
+def describe_value(value: object) -> str:
     """Return a setting's value as a person would write it."""
     if isinstance(value, float):
         return f"{value:.6g}"
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _worked_out(setting: Setting, need: Need, prefix: str) -> Wanted | None:
+def _worked_out(setting: Setting, need: Need, prefix: str) -> WantedSetting | None:
     value = setting.wanted(need)
     if value is None:
         return None
-    return Wanted(f"{prefix}{setting.name}", value, setting.why, setting.compare)
+    return WantedSetting(f"{prefix}{setting.name}", value, setting.why, setting.compare)

@@ -6,7 +6,7 @@ recovery included. `xrl faults` prints it.
 
 The rule behind the last column: what has let go of the robot never takes hold of it again by
 itself. It is asked for, by a person, by starting the module's service again; a service that crashes
-and is started by the supervisor knows the difference (`services.joint.will`).
+and is started by the supervisor knows the difference (`services.joint.rearm_guard`).
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
 """By the names that scenarios and `--fault` use."""
 
 
-class Loss(NamedTuple):
+class LossRow(NamedTuple):
     """What comes of a process or a link that is lost, and of the emergency stop."""
 
     module: str
@@ -115,8 +115,8 @@ class Loss(NamedTuple):
     recovery: str
 
 
-LOSSES: Final[dict[str, Loss]] = {
-    "joint service killed or hung": Loss(
+LOSSES: Final[dict[str, LossRow]] = {
+    "joint service killed or hung": LossRow(
         "its drive holds by its own loop, the torques of the coupling frozen",
         "HOLD: the planner asks for it once the module's state is stale",
         "`xrl status`: not heard, restarts; planner/status: hold",
@@ -124,64 +124,64 @@ LOSSES: Final[dict[str, Loss]] = {
         "all track again; a hung one by `xrl kill`. If the drive has let go in the meantime: hang "
         "the robot, then `xrl kill`",
     ),
-    "planner killed or hung": Loss(
+    "planner killed or hung": LossRow(
         "HOLD within max_command_age: local gains, references frozen",
         "the same",
         "`xrl status`: HOLD because COMMAND_STALE",
         "by itself: a new planner starts from the measured pose and leads after a blend",
     ),
-    "bus slow, lossy or cut": Loss(
+    "bus slow, lossy or cut": LossRow(
         "HOLD once its commands are too old",
         "HOLD: the planner asks for it",
         "`xrl status`: HOLD, ages, drop-outs",
         "by itself, after a wait that each drop-out doubles",
     ),
-    "harness lost": Loss(
+    "harness lost": LossRow(
         "nothing",
         "the planner leads on, without the closed assist force and without easing the lead",
         "harness/wrench: not valid",
         "by itself",
     ),
-    "IMU lost, where one is fitted": Loss(
+    "IMU lost, where one is fitted": LossRow(
         "nothing",
         "the planner leads on, and takes the floor to slope as it last did; a new planner takes "
         "it as level",
         "imu/attitude: not valid",
         "by itself",
     ),
-    "recorder lost": Loss(
+    "recorder lost": LossRow(
         "nothing",
         "nothing",
         "`xrl status`: restarts",
         "by itself: a new file; the old one is read as far as it was flushed",
     ),
-    "emergency stop": Loss(
+    "emergency stop": LossRow(
         "DAMP: knees sink slowly, hips keep the torso as it stood, ankles and frontal axes hold; "
         "beside a dead knee or a limp ankle it holds where it is; beside a limp knee it falls",
         "the same",
         "`xrl status`: DAMP because ESTOP",
         "by starting the joint services again",
     ),
-    "feet astray before the planner leads": Loss(
+    "feet astray before the planner leads": LossRow(
         "HOLD",
         "HOLD",
         "planner/status: MISPLACED; `xrl status` says which way",
         "by itself, once the feet stand within `law.stance_max` of the robot file's place",
     ),
-    "a load far from the robot file's": Loss(
+    "a load far from the robot file's": LossRow(
         "HOLD",
         "HOLD",
         "planner/status: MISLOADED; `xrl status` says by how much",
         "by itself, once the load is within `law.load_correction`; or set mass.payload, then "
         "`xrl gains`",
     ),
-    "trouble noticed": Loss(
+    "trouble noticed": LossRow(
         "HOLD: it trips by itself, for what it alone sees (shaking, torque, speed)",
         "HOLD, by the planner's word; or all six, for what the planner sees",
         "`xrl status`: because SHAKING, TORQUE_LIMIT, TOO_FAST; planner/status: TRIPPED, and why",
         "by itself, after a wait that each one lengthens",
     ),
-    "overload at the harness": Loss(
+    "overload at the harness": LossRow(
         "HOLD",
         "HOLD",
         "planner/status: OVERLOADED",

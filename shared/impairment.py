@@ -53,7 +53,7 @@ class Impairment(Section, frozen=True, kw_only=True):
     partition: bool = False
     """Nothing passes."""
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return what is done, as `--inject` takes it: `delay=30ms loss=20%`; `nothing`."""
         words = [
             f"{name}={_digits(value, places)}{unit}"
@@ -79,9 +79,9 @@ class Impairment(Section, frozen=True, kw_only=True):
         What is amiss, `; ` and what would be right.
         """
         late = self.delay_ms or self.jitter_ms
-        alone = Impairment(partition=self.partition, ordered=self.ordered).in_words()
-        if self.partition and self.in_words() != alone:
-            return f"{self.in_words()}; in a partition nothing passes: leave out all but ordered"
+        alone = Impairment(partition=self.partition, ordered=self.ordered).describe()
+        if self.partition and self.describe() != alone:
+            return f"{self.describe()}; in a partition nothing passes: leave out all but ordered"
         if self.ordered and self.reorder:
             return "ordered, and reorder; on a stream nothing overtakes: leave one out"
         if self.burst > 1.0 and not 0.0 < self.loss < 1.0:
@@ -207,7 +207,7 @@ class Direction:
             seed: of all that will be decided here.
         """
         self.name = name
-        self.in_force: Impairer | None = None
+        self.active: Impairer | None = None
         """What decides now; None: everything passes at once."""
         self._seed = f"{seed} {name}"
         self._asked: dict[int, Impairer] = {}
@@ -229,9 +229,9 @@ class Direction:
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
         """Take a message in; return when it comes out, ns. As `Impairer.passes`."""
-        return (now_ns,) if self.in_force is None else self.in_force.passes(now_ns, size)
+        return (now_ns,) if self.active is None else self.active.passes(now_ns, size)
 
     def _choose(self) -> None:
         asked = self._asked.values()
         cut = [impairer for impairer in asked if impairer.what.partition]
-        self.in_force = next(reversed(cut or [*asked]), None)
+        self.active = next(reversed(cut or [*asked]), None)

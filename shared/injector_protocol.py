@@ -35,7 +35,7 @@ class List(msgspec.Struct, frozen=True, tag="list"):
 Request: TypeAlias = Begin | Clear | List
 
 
-class Asked(msgspec.Struct, frozen=True):
+class RequestedImpairment(msgspec.Struct, frozen=True):
     """One impairment that was asked for and is not over."""
 
     number: int
@@ -62,7 +62,7 @@ class Asked(msgspec.Struct, frozen=True):
         count = len(directions_of(self.link))
         return "hidden" if len(self.hidden) == count else f"hidden on {len(self.hidden)} of {count}"
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return where it is, what, and what keeps it from being done now."""
         standing = self.standing()
         return f"{self.link} {self.detail}{f' ({standing})' if standing else ''}"
@@ -72,5 +72,5 @@ class Reply(msgspec.Struct, frozen=True):
     """The answer to every request."""
 
     error: str = ""
-    asked: tuple[Asked, ...] = ()
+    asked: tuple[RequestedImpairment, ...] = ()
     """What is asked for after the request was carried out, the newest last."""

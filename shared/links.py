@@ -17,17 +17,17 @@ class Pair(NamedTuple):
     """Two processes with a link."""
 
     dials: str
-    listens: str
+    flushing: str
 
     @property
     def there(self) -> str:
         """Name of the direction from the one that dials."""
-        return f"{self.dials}->{self.listens}"
+        return f"{self.dials}->{self.flushing}"
 
     @property
     def back(self) -> str:
         """Name of the direction from the one that listens."""
-        return f"{self.listens}->{self.dials}"
+        return f"{self.flushing}->{self.dials}"
 
 
 PAIRS: Final = (
@@ -57,7 +57,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 
 def endpoint_through(pair: Pair) -> str:
     """Return where the injector listens for a pair: what `bus.endpoints` is without it."""
-    return f"unixsock-stream/{{run}}/through-{pair.dials}-{pair.listens}.zenoh"
+    return f"unixsock-stream/{{run}}/through-{pair.dials}-{pair.flushing}.zenoh"
 
 
 def directions_of(link: str, file: str = "--link", key: str = "link") -> tuple[str, ...]:

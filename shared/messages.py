@@ -205,7 +205,7 @@ class JointState(Message, frozen=True):
     """`DriveStatus`."""
     drive_error: int
     """The drives' error bits, both axes or-ed; 0 if none."""
-    braced: bool = False
+    stiffened: bool = False
     """True while this module holds with all of its stand gains, for another may be limp."""
     outside: int = 0
     """`Outside`: why the newest command was not believed; 0 if it was."""
@@ -240,7 +240,7 @@ class JointCommand(Message, frozen=True):
     stiffness required, 0 is a fall."""
     margin_onboard: float
     """The same with the joint services gone and the drives' own loops left."""
-    brace: bool = False
+    stiffen: bool = False
     """True while another may be limp: this module in HOLD is to rise to all its stand gains."""
 
 

@@ -73,9 +73,9 @@ JOINT_TRACE: Final = Topic(
     recorded=True,
     why="every cycle's inputs: a joint service is executed again from them, bit for bit",
 )
-PLANNER_MEMORY: Final = Topic(
-    name="planner/memory",
-    type=traces.PlannerMemory,
+PLANNER_CHECKPOINT: Final = Topic(
+    name="planner/checkpoint",
+    type=traces.PlannerCheckpoint,
     rate_hz=1.0,
     priority=Priority.BACKGROUND,
     recorded=True,
@@ -179,7 +179,7 @@ TOPICS: Final = (
     ATTITUDE,
     HARNESS_TARE,
     PLANNER_STATUS,
-    PLANNER_MEMORY,
+    PLANNER_CHECKPOINT,
     OPERATOR_INTENT,
     ESTOP,
     SIM_TRUTH,

@@ -56,7 +56,7 @@ class JointTrace(Message, frozen=True):
     cycles: tuple[CycleTrace, ...]
 
 
-class PlannerMemory(Message, frozen=True):
+class PlannerCheckpoint(Message, frozen=True):
     """What the planner knew before a tick: from here it is executed again."""
 
     session: int
@@ -104,7 +104,7 @@ class LinkEvent(Message, frozen=True):
     """As it was asked for: that direction, or a group of them."""
     number: int
     """The same for all directions of one impairment, and for its beginning and its end."""
-    in_force: bool
+    active: bool
     """True: from now on, unless a partition or what begins later hides it; False: it is over."""
     delay_ms: float
     jitter_ms: float

@@ -93,7 +93,7 @@ def test_why_it_is_not_given_is_shown(robot: RobotConfig) -> None:
     holds = msgspec.structs.replace(
         status(robot, "me"), mode=int(PlannerMode.TRIPPED), why="the torso turns fast"
     )
-    assert "TRIPPED: the torso turns fast" in assist.in_words(WISH, holds)
+    assert "TRIPPED: the torso turns fast" in assist.describe(WISH, holds)
 
 
 @pytest.mark.parametrize(

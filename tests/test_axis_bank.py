@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.axis_bank import AXIS_NAMES, FAULTS, AxisBank, Fault
+from services.simulator.axis_bank import AXIS_NAMES, FAULTS, AxisBank, AxisErrors
 from shared.cansimple import AxisError, AxisState, ControllerError, ControlMode, InputMode
 from shared.exceptions import DriveError
 from tests.simulator.banks import CPR, DRIVE, DT, ZERO, make_bank
@@ -131,7 +131,7 @@ def test_an_idle_axis_spun_too_fast_has_the_error_once_it_has_been_armed() -> No
     speed = np.full(12, 80.0)
     for k in range(1, 30):
         bank.step(k * DT, speed * k * DT, speed)
-    assert [axis for axis in range(12) if bank.faults[axis] != Fault()] == [3]
+    assert [axis for axis in range(12) if bank.faults[axis] != AxisErrors()] == [3]
     assert bank.faults[3].controller == ControllerError.OVERSPEED
 
 

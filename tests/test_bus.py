@@ -465,7 +465,7 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.JOINT_COMMAND: (("planner",), (*MODULES, "recorder", TOOL)),
     topics.JOINT_EVENT: (MODULES, ("recorder", TOOL)),
     topics.JOINT_TRACE: (MODULES, ("recorder",)),
-    topics.PLANNER_MEMORY: (("planner",), ("recorder",)),
+    topics.PLANNER_CHECKPOINT: (("planner",), ("recorder",)),
     topics.SIM_STATE: (("simulator",), ("recorder",)),
     topics.WRENCH: (("harness",), ("planner", "recorder", TOOL)),
     topics.ATTITUDE: (("imu",), ("planner", "recorder", TOOL)),

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.drivers.odrive_due import Due, Row
-from services.joint.law import ZERO, Setpoint
-from services.joint.onboard import FOLLOW_MS, OnboardLaw
+from services.joint.drive_setpoint import FOLLOW_MS, DriveSetpointLaw
+from services.joint.drivers.resend_policy import GainRow, ResendPolicy
+from services.joint.pd_law import ZERO, Setpoint
 from shared.can_load import BLEND_HZ, BLEND_MAX, LOAD_MAX, BusLoad, bus_load, frame_bits
 from shared.cansimple import Command, arbitration_id, pack_input_pos, pack_two_floats
 from shared.config import RobotConfig
@@ -113,14 +113,14 @@ def test_with_torques_alone_no_gains_blend() -> None:
 def test_a_whole_blend_sends_gains_no_more_often_than_is_planned_with() -> None:
     """As the law of the drives' own loops changes them, and as they are told over CAN."""
     rate_hz, blend_s = 500.0, 0.3
-    law, due = OnboardLaw(17.5, 60.0), Due()
+    law, due = DriveSetpointLaw(17.5, 60.0), ResendPolicy()
     due.armed(0)
     sent, cycles = 0, round(blend_s * rate_hz)
     for cycle in range(1, cycles + 1):
         now_ns, done = round(cycle * 1e9 / rate_hz), cycle / cycles
         k_p, k_d = (900.0 * done, 600.0 * (1.0 - done)), (60.0 * done, 20.0)
         target = law.target(now_ns, Setpoint(ZERO, ZERO, ZERO, ZERO, k_p, k_d), ZERO, ZERO, ZERO)
-        sent += due.with_target((target.pos_gain, target.vel_gain), now_ns) is not Row.INPUTS
+        sent += due.with_target((target.pos_gain, target.vel_gain), now_ns) is not GainRow.INPUTS
     assert 0.9 * blend_s * BLEND_HZ <= sent <= blend_s * BLEND_HZ + 2, "the first two at once"
 
 

@@ -26,7 +26,7 @@ from shared.joints import MODULES
 from tests.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools import cli, configure
 from tools.bringup import backup, changes, reach
-from tools.bringup.boards import Found, Value
+from tools.bringup.boards import FoundBoards, Value
 from tools.bringup.jog_drive import Interrupts
 from tools.supervision import procfs
 from tools.supervision.run_dir import RunDir
@@ -139,20 +139,20 @@ def test_a_backup_of_another_firmware_is_refused(robot: RobotConfig) -> None:
 
 
 def test_a_board_that_is_not_there_or_not_known_is_refused(robot: RobotConfig) -> None:
-    absent = Found({}, {SERIAL: "not plugged in"}, ("0000000000AA",))
+    absent = FoundBoards({}, {SERIAL: "not plugged in"}, ("0000000000AA",))
     with pytest.raises(DriveError, match=r"not plugged in; .*0000000000AA"):
         configure.boards_of(robot, [MODULE], absent)
     newer = BoardInMemory({})
     newer.firmware = (0, 6, 10)
     with pytest.raises(DriveError, match=r"firmware 0\.6\.10"):
-        configure.boards_of(robot, [MODULE], Found({SERIAL: newer}, {}, ()))
+        configure.boards_of(robot, [MODULE], FoundBoards({SERIAL: newer}, {}, ()))
 
 
 def test_a_board_that_is_older_than_its_settings_names_is_refused(robot: RobotConfig) -> None:
     older = BoardInMemory({})
     older.firmware = (0, 5, 1)
     with pytest.raises(DriveError, match=r"firmware 0\.5\.1"):
-        configure.boards_of(robot, [MODULE], Found({SERIAL: older}, {}, ()))
+        configure.boards_of(robot, [MODULE], FoundBoards({SERIAL: older}, {}, ()))
 
 
 class Interrupted(BoardInMemory):

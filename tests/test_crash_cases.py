@@ -11,12 +11,12 @@ from shared.config import OPTIONAL, SERVICES
 from shared.joints import MODULES
 from shared.scenario import FAULT_KINDS, Fault, FaultKind, Kill
 from tools import crashtest
-from tools.crash.cases import BACK_S, CASES, CRASH_S, REQUEST_S, Case, Verdict, story_of
+from tools.crash.cases import BACK_S, CASES, CRASH_S, REQUEST_S, CrashCase, CrashVerdict, story_of
 
 BY_NAME = {case.name: case for case in CASES}
 
 
-def alone(case: Case) -> bool:
+def alone(case: CrashCase) -> bool:
     return len(case.crash) == 1 and case.chase is None
 
 
@@ -69,17 +69,17 @@ def test_names_are_their_own_and_can_be_folders() -> None:
 def test_any_one_process_that_dies_has_to_leave_the_robot_standing() -> None:
     deaths = [case for case in CASES if all(isinstance(row, Kill) for row in case.crash)]
     assert len(deaths) > 2 * (len(SERVICES) - 1)
-    assert {case.expected for case in deaths} == {Verdict.STOOD}
+    assert {case.expected for case in deaths} == {CrashVerdict.STOOD}
 
 
 def test_a_robot_may_fall_only_where_a_module_is_limp() -> None:
     for case in CASES:
         limp = [r for r in case.crash if isinstance(r, Fault) and r.kind != "link_lost"]
-        assert limp or case.expected is Verdict.STOOD, case.name
+        assert limp or case.expected is CrashVerdict.STOOD, case.name
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_case_is_a_scenario_that_asks_back_whatever_was_lost(case: Case) -> None:
+def test_a_case_is_a_scenario_that_asks_back_whatever_was_lost(case: CrashCase) -> None:
     story = story_of(case)
     scenario.check(case.name, story)
     assert {row.service for row in story.restart if row.at == BACK_S} == case.hit

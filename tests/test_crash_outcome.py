@@ -11,7 +11,16 @@ from shared import scenario
 from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
-from tools.crash.cases import BACK_S, CASES, CRASH_S, DURATION_S, HAND, Case, Verdict, story_of
+from tools.crash.cases import (
+    BACK_S,
+    CASES,
+    CRASH_S,
+    DURATION_S,
+    HAND,
+    CrashCase,
+    CrashVerdict,
+    story_of,
+)
 from tools.crash.outcome import Heard, as_expected, measure
 
 BY_NAME = {case.name: case for case in CASES}
@@ -71,7 +80,7 @@ def holds(at: float = CRASH_S + 0.05, *, but: Sequence[str] = ()) -> list[tuple[
 
 
 def heard(
-    case: Case,
+    case: CrashCase,
     events: Sequence[tuple[str, JointEvent]] = (),
     *,
     world: Callable[[float], SimTruth] = truth,
@@ -88,7 +97,7 @@ def heard(
 
 def test_a_robot_that_goes_on_has_stood(robot: RobotConfig) -> None:
     outcome = measure(PLANNER, heard(PLANNER, holds()), robot)
-    assert outcome.verdict is Verdict.STOOD
+    assert outcome.verdict is CrashVerdict.STOOD
     assert outcome.remarks == ()
     assert outcome.in_real_time
     assert outcome.sank_mm == pytest.approx(0.0, abs=1e-9)
@@ -97,14 +106,16 @@ def test_a_robot_that_goes_on_has_stood(robot: RobotConfig) -> None:
 def test_a_fall_is_timed_from_the_crash(robot: RobotConfig) -> None:
     run = heard(PLANNER, holds(), world=lambda t: truth(t, fallen=t >= 4.0), end=5.0)
     outcome = measure(PLANNER, run, robot)
-    assert outcome.verdict is Verdict.FELL
+    assert outcome.verdict is CrashVerdict.FELL
     assert outcome.fell_after_s == pytest.approx(4.0 - CRASH_S)
     assert not as_expected(PLANNER, outcome)
 
 
-@pytest.mark.parametrize(("depth", "verdict"), [(0.04, Verdict.STOOD), (0.06, Verdict.SANK)])
+@pytest.mark.parametrize(
+    ("depth", "verdict"), [(0.04, CrashVerdict.STOOD), (0.06, CrashVerdict.SANK)]
+)
 def test_a_robot_below_where_the_hand_ever_led_has_sunk(
-    robot: RobotConfig, depth: float, verdict: Verdict
+    robot: RobotConfig, depth: float, verdict: CrashVerdict
 ) -> None:
     lowest = min(frame.height for frame in HAND)
 
@@ -124,15 +135,15 @@ def test_a_robot_that_is_tipping_at_the_end_has_fallen(
     robot: RobotConfig, changes: dict[str, object]
 ) -> None:
     run = heard(PLANNER, holds(), world=lambda t: truth(t, **(changes if t > 7.9 else {})))
-    assert measure(PLANNER, run, robot).verdict is Verdict.FELL
+    assert measure(PLANNER, run, robot).verdict is CrashVerdict.FELL
 
 
 def test_a_run_that_broke_off_is_not_judged(robot: RobotConfig) -> None:
     outcome = measure(PLANNER, heard(PLANNER, holds(), end=6.0), robot)
-    assert outcome.verdict is Verdict.UNJUDGED
+    assert outcome.verdict is CrashVerdict.UNJUDGED
     assert "6.0 s" in outcome.remarks[0]
     never = Heard([truth(-1.0)], [], [], ("D",) * 6)
-    assert measure(PLANNER, never, robot).verdict is Verdict.UNJUDGED
+    assert measure(PLANNER, never, robot).verdict is CrashVerdict.UNJUDGED
 
 
 @pytest.mark.parametrize("changes", [{"real_time_factor": 0.9}, {"late_s": 0.2}])
@@ -215,7 +226,7 @@ def test_a_chase_is_timed_by_its_own_kill(robot: RobotConfig) -> None:
     case = BY_NAME["reengaging-blend"]
     run = heard(case, [*holds(at=0.9), *holds(at=2.35)])
     missed = measure(case, run, robot)
-    assert missed.verdict is Verdict.UNJUDGED
+    assert missed.verdict is CrashVerdict.UNJUDGED
     run.said.append(said(2.3, RunEventKind.KILLED))  # type: ignore[attr-defined]
     tracked = [change(2.1, name, Mode.HOLD, Mode.TRACK) for name in MODULES]
     run = run._replace(events=[*holds(at=0.9), *tracked, *holds(at=2.35)])

@@ -19,28 +19,28 @@ from shared.scenario import Kill
 from tests.test_cli import assert_one_line_error, xrl
 from tools import crashtest
 from tools.crash import report, runner
-from tools.crash.cases import CASES, Case, Verdict, story_of
-from tools.crash.outcome import Outcome
+from tools.crash.cases import CASES, CrashCase, CrashVerdict, story_of
+from tools.crash.outcome import CrashResult
 from tools.crash.report import Result
-from tools.runs.conductor import Chase, Conductor
+from tools.runs.scenario_runner import Chase, ScenarioRunner
 from tools.supervision.supervisor_client import ServiceInfo
 
 BY_NAME = {case.name: case for case in CASES}
 PLANNER = BY_NAME["kill-planner"]
 KNEE = BY_NAME["kill-knee_left"]
-STOOD = Outcome(verdict=Verdict.STOOD, wall_s=13.0)
-FELL = Outcome(verdict=Verdict.FELL, fell_after_s=0.7, wall_s=9.0)
-LOST = Outcome(verdict=Verdict.UNJUDGED, remarks=("no fleet",))
+STOOD = CrashResult(verdict=CrashVerdict.STOOD, wall_s=13.0)
+FELL = CrashResult(verdict=CrashVerdict.FELL, fell_after_s=0.7, wall_s=9.0)
+LOST = CrashResult(verdict=CrashVerdict.UNJUDGED, remarks=("no fleet",))
 
 
 def run_with(
-    outcomes: list[Outcome],
+    outcomes: list[CrashResult],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     robot: RobotConfig,
-    case: Case = PLANNER,
-) -> tuple[Outcome, list[Path]]:
-    def once(case: Case, robot: RobotConfig, out: Path, *rest: object) -> Outcome:
+    case: CrashCase = PLANNER,
+) -> tuple[CrashResult, list[Path]]:
+    def once(case: CrashCase, robot: RobotConfig, out: Path, *rest: object) -> CrashResult:
         (out / "run.mcap").write_bytes(b"log")
         return outcomes.pop(0)
 
@@ -55,7 +55,11 @@ def test_a_disturbed_run_is_made_once_more(
     late = msgspec.structs.replace(STOOD, in_real_time=False)
     for first in (late, LOST):
         outcome, _ = run_with([first, STOOD], tmp_path, monkeypatch, robot)
-        assert (outcome.verdict, outcome.in_real_time, outcome.tries) == (Verdict.STOOD, True, 2)
+        assert (outcome.verdict, outcome.in_real_time, outcome.tries) == (
+            CrashVerdict.STOOD,
+            True,
+            2,
+        )
     outcome, _ = run_with([late, late, STOOD], tmp_path, monkeypatch, robot)
     assert (outcome.in_real_time, outcome.tries) == (False, 2)
 
@@ -65,7 +69,7 @@ def test_a_fall_is_not_tried_again_and_keeps_its_log(
 ) -> None:
     for fell in (FELL, msgspec.structs.replace(FELL, in_real_time=False)):
         outcome, logs = run_with([fell, STOOD], tmp_path, monkeypatch, robot)
-        assert (outcome.verdict, outcome.tries) == (Verdict.FELL, 1)
+        assert (outcome.verdict, outcome.tries) == (CrashVerdict.FELL, 1)
         assert len(logs) == 1
     limp_ankle = BY_NAME["disarmed-ankle_left"]
     _, logs = run_with([FELL], tmp_path, monkeypatch, robot, limp_ankle)
@@ -102,7 +106,7 @@ def test_what_is_chased_is_killed_once_as_the_modules_track_again(
     session = SimpleNamespace(latest=lambda *_: None, publisher=lambda *_: None)
     story = story_of(BY_NAME["reengaging-first"])
     chase = Chase("planner", modules=2, after_s=0.0)
-    conductor = Conductor(None, session, story, print, chase)  # type: ignore[arg-type]
+    conductor = ScenarioRunner(None, session, story, print, chase)  # type: ignore[arg-type]
     killed: list[object] = []
     monkeypatch.setattr(conductor, "_act", killed.append)
     for tracking, expected in ((6, 0), (3, 0), (0, 0), (1, 0), (2, 1), (6, 1)):
@@ -139,7 +143,7 @@ def test_json_says_what_was_done_and_what_came_of_it(tmp_path: Path) -> None:
     assert rows["kill-knee_left"]["fell_after_s"] == 0.7
     assert rows["kill-knee_left"]["safe_ms"] is None
     assert "knee_left KILL at 2.4 s" in rows["kill-knee_left"]["what"]
-    assert set(rows["kill-knee_left"]) >= set(Outcome.__struct_fields__)
+    assert set(rows["kill-knee_left"]) >= set(CrashResult.__struct_fields__)
 
 
 def test_junit_tells_a_failure_from_an_error_and_allows_what_is_expected(tmp_path: Path) -> None:
@@ -158,8 +162,8 @@ def test_junit_tells_a_failure_from_an_error_and_allows_what_is_expected(tmp_pat
 
 def test_the_table_fits_a_terminal_and_has_every_case() -> None:
     console = Console(width=80, record=True, file=None, quiet=False)
-    full = Outcome(
-        verdict=Verdict.STOOD,
+    full = CrashResult(
+        verdict=CrashVerdict.STOOD,
         safe_ms=123.4,
         torque_step_nm=12.34,
         torque_step_back_nm=12.34,
@@ -208,7 +212,7 @@ def test_what_was_done_before_an_interrupt_is_kept(
 ) -> None:
     outcomes = [STOOD, FELL]
 
-    def run_case(*_: object, **__: object) -> Outcome:
+    def run_case(*_: object, **__: object) -> CrashResult:
         if not outcomes:
             raise KeyboardInterrupt
         return outcomes.pop(0)

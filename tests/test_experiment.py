@@ -40,7 +40,7 @@ def test_a_fault_is_read_from_its_flag(text: str, fault: Fault) -> None:
 def test_every_kind_of_fault_can_be_asked_for(kind: str) -> None:
     story = experiment.make_scenario(parse("--fault", f"ankle_left:{kind}@1"))
     assert [row.kind for row in story.fault] == [kind]
-    assert f"ankle_left {kind} at 1 s" in experiment.in_words(story)
+    assert f"ankle_left {kind} at 1 s" in experiment.describe(story)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from services.planner.account import account
 from services.planner.kinematics import Kinematics
+from services.planner.torque_breakdown import torque_breakdown
 from shared import topics
 from shared.config import RobotConfig
 from shared.joints import JOINTS, MODULES, N_JOINTS
@@ -41,7 +41,9 @@ def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(
     }
     status = tick.status
     q_ref, v_ref = commands["q_ref"], commands["v_ref"]
-    found = account(robot, q, v, q_ref, v_ref, status.assist_n, status.slope, status.stance)
+    found = torque_breakdown(
+        robot, q, v, q_ref, v_ref, status.assist_n, status.slope, status.stance
+    )
     np.testing.assert_allclose(found.p, tick.status.p, atol=1e-12)
     np.testing.assert_allclose(found.gravity + found.assist, commands["tau_ff"], atol=0.05)
     np.testing.assert_allclose(found.local.D, commands["k_p"], rtol=0.01)

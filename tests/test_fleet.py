@@ -26,7 +26,7 @@ def run_dir() -> Iterator[Path]:
         yield Path(path)
 
 
-def plan(run_dir: Path, **changes: object) -> fleet.Plan:
+def plan(run_dir: Path, **changes: object) -> fleet.FleetPlan:
     arguments = {
         "overrides": {},
         "services": None,
@@ -159,13 +159,13 @@ def test_a_bound_port_is_refused_with_service_and_endpoint() -> None:
         other.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
         with pytest.raises(FleetError, match=f"planner: {endpoint}: port in use"):
-            fleet.check_free([fleet.Listener("planner", "bus.endpoints.planner", endpoint)])
-    fleet.check_free([fleet.Listener("planner", "bus.endpoints.planner", endpoint)])
+            fleet.check_free([fleet.ListenPoint("planner", "bus.endpoints.planner", endpoint)])
+    fleet.check_free([fleet.ListenPoint("planner", "bus.endpoints.planner", endpoint)])
 
 
 def test_a_unix_socket_is_in_use_only_while_somebody_listens(run_dir: Path) -> None:
     path = run_dir / "planner.zenoh"
-    listener = fleet.Listener("planner", "bus.endpoints.planner", f"{fleet.UNIX}{path}")
+    listener = fleet.ListenPoint("planner", "bus.endpoints.planner", f"{fleet.UNIX}{path}")
     with socket.socket(socket.AF_UNIX) as other:
         other.bind(str(path))
         other.listen()

@@ -10,16 +10,16 @@ from rich.console import Console
 
 from shared.clock import NS_PER_S
 from shared.impairment import Direction, Impairment
-from shared.injections import Injections
+from shared.impairment_schedule import ImpairmentSchedule
 from shared.links import DIRECTIONS, directions_of
 from shared.messages import PlannerMode, PlannerStatus, SimTruth
 from shared.scenario import Inject
 from shared.traces import LinkEvent
 from tests.recorder.runs import sample
 from tools.runs import verdict_table
-from tools.runs.conductor import Snapshot
-from tools.runs.impaired import impairments, touches
-from tools.runs.live_view import LiveView, in_force, waiting
+from tools.runs.impairment_intervals import impairments, touches
+from tools.runs.live_view import LiveView, active, waiting
+from tools.runs.scenario_runner import LiveSnapshot
 from tools.runs.verdict import Summary
 from tools.runs.verdict_limits import LIMITS
 
@@ -31,7 +31,7 @@ def told(*asked: tuple[str, Impairment, float, float], until_s: int = 10) -> lis
     """Return the events of (link, what, begin, end), with a message a second on every link."""
     directions = {name: Direction(name, 0) for name in DIRECTIONS}
     events: list[LinkEvent] = []
-    injections = Injections(directions, events.append)
+    injections = ImpairmentSchedule(directions, events.append)
     for link, what, begins, ends in asked:
         injections.plan(link, what, begins, ends)
     for s in range(until_s):
@@ -144,7 +144,7 @@ INJECTS = (
     ],
 )
 def test_only_what_is_done_now_is_named(scenario_s: float, words: str) -> None:
-    assert in_force(INJECTS, scenario_s) == words
+    assert active(INJECTS, scenario_s) == words
 
 
 def waits(wait_s: float) -> PlannerStatus:
@@ -175,6 +175,6 @@ def test_the_line_tells_what_is_done_and_how_long_the_planner_waits() -> None:
     view = LiveView(Console(file=text, width=200), INJECTS, Planner())
     truth = sample(SimTruth, seq=1, t_ns=1, scenario_s=3.5)
     with view:
-        view.show(Snapshot(truth, ("T",) * 6, "push"))
+        view.show(LiveSnapshot(truth, ("T",) * 6, "push"))
     line = text.getvalue().strip()
     assert line.endswith("TTTTTT  push; planner->joints delay=30ms; leads again in 3 s")

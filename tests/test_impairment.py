@@ -31,7 +31,7 @@ def delays_ms(what: Impairment, count: int = 4000, seed: str = "a") -> list[floa
 
 def test_nothing_is_done_unless_asked() -> None:
     assert delays_ms(Impairment()) == [0.0] * 4000
-    assert Impairment().in_words() == "nothing"
+    assert Impairment().describe() == "nothing"
 
 
 def test_uniform_jitter_stays_in_its_bounds_and_fills_them() -> None:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from shared.injector_protocol import Asked
+from shared.injector_protocol import RequestedImpairment
 from shared.links import COMMANDS
 from shared.scenario import Inject
 from tools import cli, inject
 
-BEGUN = Asked(1, "planner->joints", "delay=30ms", None, 10, 0, hidden=COMMANDS[:3])
-COMING = Asked(2, "all", "loss=100%", 7.0, 0, 0, in_s=2.0)
+BEGUN = RequestedImpairment(1, "planner->joints", "delay=30ms", None, 10, 0, hidden=COMMANDS[:3])
+COMING = RequestedImpairment(2, "all", "loss=100%", 7.0, 0, 0, in_s=2.0)
 
 
 class Injector:
@@ -24,15 +24,15 @@ class Injector:
     def __init__(self, run_dir: Path) -> None:
         pass
 
-    def begin(self, what: Inject, in_s: float) -> tuple[Asked, ...]:
+    def begin(self, what: Inject, in_s: float) -> tuple[RequestedImpairment, ...]:
         Injector.began = (what, in_s)
         return (BEGUN, COMING)
 
-    def clear(self, link: str) -> tuple[Asked, ...]:
+    def clear(self, link: str) -> tuple[RequestedImpairment, ...]:
         Injector.cleared = link
         return (COMING,)
 
-    def list(self) -> tuple[Asked, ...]:
+    def list(self) -> tuple[RequestedImpairment, ...]:
         return (BEGUN, COMING)
 
 

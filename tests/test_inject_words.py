@@ -20,7 +20,7 @@ from shared.messages import Mode
 from shared.scenario import Inject
 from tests.lockstep.runs import still
 from tools import sim
-from tools.runs import experiment, inject_words, verdict
+from tools.runs import describe_inject, experiment, verdict
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
 from tools.runs.run_log import RunLog, read_run
@@ -54,7 +54,7 @@ def parse(*words: str) -> argparse.Namespace:
     ],
 )  # fmt: skip
 def test_an_impairment_is_read_from_its_words(text: str, inject: Inject) -> None:
-    assert inject_words.parse_inject(text) == inject
+    assert describe_inject.parse_inject(text) == inject
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_an_impairment_is_read_from_its_words(text: str, inject: Inject) -> None
 )
 def test_what_makes_no_sense_is_refused_with_what_would_be_right(text: str, right: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError) as caught:
-        inject_words.parse_inject(text)
+        describe_inject.parse_inject(text)
     assert right in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -112,8 +112,8 @@ def test_a_number_is_the_same_in_each_of_its_units(
     word: str, texts: tuple[str, ...], value: float
 ) -> None:
     for text in texts:
-        inject = inject_words.make("all", {"burst": "1", "delay": "1", word: text})
-        assert getattr(inject, inject_words.NUMBERS[word].field) == value
+        inject = describe_inject.make("all", {"burst": "1", "delay": "1", word: text})
+        assert getattr(inject, describe_inject.NUMBERS[word].field) == value
 
 
 SHARES = st.floats(0.0, 1.0)
@@ -127,15 +127,15 @@ SHARES = st.floats(0.0, 1.0)
     )
 )  # fmt: skip
 def test_words_come_back_exactly_from_what_they_made(what: Impairment) -> None:
-    inject = inject_words.parse_inject(f"all {what.in_words()}")
+    inject = describe_inject.parse_inject(f"all {what.describe()}")
     assert {name: getattr(inject, name) for name in what.__struct_fields__} == (
         msgspec.structs.asdict(what)
     )
 
 
 def test_what_is_done_is_told_with_units_and_shares_in_percent() -> None:
-    what = inject_words.parse_inject("all delay=0.03s jitter=10 loss=1 burst=1 duplicate=.125")
-    assert what.in_words() == "delay=30ms jitter=10ms loss=100% duplicate=12.5%"
+    what = describe_inject.parse_inject("all delay=0.03s jitter=10 loss=1 burst=1 duplicate=.125")
+    assert what.describe() == "delay=30ms jitter=10ms loss=100% duplicate=12.5%"
 
 
 def test_a_flag_replaces_the_impairments_of_the_scenario_and_is_told() -> None:
@@ -145,7 +145,7 @@ def test_a_flag_replaces_the_impairments_of_the_scenario_and_is_told() -> None:
         parse("--scenario", "bad_network", "--inject", "all loss=0.1 at=2 for=1")
     )
     assert [row.link for row in story.inject] == ["all"]
-    assert "all loss=10% at 2 s for 1 s" in experiment.in_words(story)
+    assert "all loss=10% at 2 s for 1 s" in experiment.describe(story)
 
 
 def test_a_scenario_with_impairments_comes_back_from_its_own_toml(tmp_path: Path) -> None:
@@ -192,15 +192,16 @@ def test_every_beginning_and_end_is_in_the_log_with_what_was_lost(cut: RunLog) -
     assert [event.seq for event in events] == list(range(1, len(events) + 1))
     left = [event for event in events if event.asked == "planner->left"]
     assert {event.link for event in left} < set(DIRECTIONS)
-    assert [event.in_force for event in left] == [True] * 3 + [False] * 3
+    assert [event.active for event in left] == [True] * 3 + [False] * 3
     assert len({event.number for event in left}) == 1
-    assert all(event.lost == 150 for event in left if not event.in_force), "0.6 s at 250 Hz"
-    (late,) = [e for e in events if e.link == "harness->planner" and not e.in_force]
+    lost = [event.lost for event in left if not event.active]
+    assert all(149 <= number <= 151 for number in lost), "0.6 s at 250 Hz"
+    (late,) = [e for e in events if e.link == "harness->planner" and not e.active]
     assert (late.passed, late.lost, late.detail) == (50, 0, "delay=5ms")
 
 
 def test_what_lasts_to_the_end_of_a_run_is_in_its_log_with_its_counts(cut: RunLog) -> None:
-    (ended,) = [e for e in cut.messages(topics.LINK_EVENT) if e.number == 3 and not e.in_force]
+    (ended,) = [e for e in cut.messages(topics.LINK_EVENT) if e.number == 3 and not e.active]
     assert ended.passed == pytest.approx(250, abs=3), "1 s at 250 Hz"
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from shared.exceptions import ConfigError
 from shared.impairment import Direction, Impairment
-from shared.injections import Injections
-from shared.injector_protocol import Asked
+from shared.impairment_schedule import ImpairmentSchedule
+from shared.injector_protocol import RequestedImpairment
 from shared.links import COMMANDS, DIRECTIONS, WRENCHES
 from shared.traces import LinkEvent
 
@@ -21,10 +21,10 @@ class Rig:
     def __init__(self) -> None:
         self.directions = {name: Direction(name, 0) for name in DIRECTIONS}
         self.told: list[LinkEvent] = []
-        self.injections = Injections(self.directions, self.told.append)
+        self.injections = ImpairmentSchedule(self.directions, self.told.append)
 
     def begun(self) -> list[tuple[int, bool]]:
-        return [(event.number, event.in_force) for event in self.told]
+        return [(event.number, event.active) for event in self.told]
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_what_is_planned_begins_when_it_is_due_and_ends_at_its_time(rig: Rig) ->
     assert not rig.injections.advance(1.9, 19)
     assert rig.told == []
     assert rig.injections.advance(2.0, 20)
-    assert rig.directions[WRENCHES].in_force is not None
+    assert rig.directions[WRENCHES].active is not None
     assert rig.injections.next_due == 3.0
     assert rig.injections.advance(3.1, 31)
     assert rig.begun() == [(number, True), (number, False)]
@@ -100,5 +100,5 @@ def test_what_is_hidden_is_told_with_the_directions_on_which_it_is(rig: Rig) -> 
 def test_one_that_is_not_in_force_says_why(
     link: str, in_s: float, hidden: tuple[str, ...], words: str
 ) -> None:
-    asked = Asked(1, link, LATE.in_words(), None, 0, 0, in_s, hidden)
-    assert asked.in_words() == words
+    asked = RequestedImpairment(1, link, LATE.describe(), None, 0, 0, in_s, hidden)
+    assert asked.describe() == words

@@ -22,7 +22,7 @@ from tests.bench_drive import START, BenchDrive
 from tools.bringup import jog_drive
 from tools.bringup.jogging import (
     APART_MAX,
-    Plan,
+    JogPlan,
     Sample,
     duration_s,
     gentle,
@@ -33,7 +33,7 @@ from tools.bringup.jogging import (
 )
 
 MODULE = "knee_left"
-PLAN = Plan(axis=1, by=0.05, period_s=2.0, cycles=2, torque_limit=10.0)
+PLAN = JogPlan(axis=1, by=0.05, period_s=2.0, cycles=2, torque_limit=10.0)
 
 
 @pytest.fixture
@@ -49,12 +49,12 @@ def drive(limited: RobotConfig) -> BenchDrive:
 def jog(
     drive: BenchDrive,
     robot: RobotConfig,
-    plan: Plan = PLAN,
+    plan: JogPlan = PLAN,
     *,
     q_seen: Pair = START,
     interrupts: jog_drive.Interrupts | None = None,
     told: list[Sample] | None = None,
-) -> jog_drive.Outcome:
+) -> jog_drive.JogResult:
     def progress(sample: Sample) -> None:
         if told is not None:
             told.append(sample)
@@ -73,7 +73,7 @@ def jog(
 
 @pytest.mark.parametrize("plan", [PLAN, PLAN._replace(axis=0, by=-0.08, cycles=1)])
 def test_a_free_joint_follows_and_comes_back_and_is_idle(
-    drive: BenchDrive, limited: RobotConfig, plan: Plan
+    drive: BenchDrive, limited: RobotConfig, plan: JogPlan
 ) -> None:
     told: list[Sample] = []
     outcome = jog(drive, limited, plan, told=told)
@@ -234,7 +234,7 @@ def test_the_reference_is_smooth_and_ends_where_it_began() -> None:
     ],
 )
 def test_a_joint_that_would_leave_its_limits_is_refused(
-    robot: RobotConfig, q: Pair, plan: Plan, words: str
+    robot: RobotConfig, q: Pair, plan: JogPlan, words: str
 ) -> None:
     assert re.search(words, outside(robot, MODULE, plan, q))
     assert outside(robot, MODULE, PLAN, START) == ""

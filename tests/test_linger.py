@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from shared import config_file, linger
+from shared import config_file, socket_linger
 from shared.bus import open_session
 from shared.process import DEFAULT_CONFIG
 
@@ -57,10 +57,10 @@ def test_only_the_connection_between_the_two_addresses_is_changed() -> None:
         ):
             for connection in (one, other):
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, ON_FOR_10_S)
-            assert linger.turn_off(one.getsockname(), one.getpeername())
+            assert socket_linger.turn_off(one.getsockname(), one.getpeername())
             assert not lingers(one)
             assert lingers(other)
-        assert not linger.turn_off(("127.0.0.1", 1), ("127.0.0.1", 2))
+        assert not socket_linger.turn_off(("127.0.0.1", 1), ("127.0.0.1", 2))
 
 
 def test_no_tcp_link_of_the_bus_lingers_when_it_is_given_up(tmp_path: Path) -> None:

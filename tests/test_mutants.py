@@ -13,17 +13,19 @@ from rich.console import Console
 
 from shared.toml_file import read_toml
 from tools import mutants
-from tools.mutants import FILE, ROOT, Change, Found, Group, MutantsFile, Reason, change_of
+from tools.mutants import FILE, ROOT, Group, GroupResult, MutantsFile, Mutation, Reason, change_of
 
-DIFF = """--- services/joint/gate.py
-+++ services/joint/gate.py
+DIFF = """--- services/joint/torque_limiter.py
++++ services/joint/torque_limiter.py
 @@ -1,5 +1,5 @@
  def _soft_stop(q: float, stops: Pair) -> float:
 -    if q < stops[0]:
 +    if q <= stops[0]:
          return STIFFNESS * (stops[0] - q)
 """
-LIVES = Change("services.joint.gate.x__soft_stop", "if q < stops[0]:", "if q <= stops[0]:")
+LIVES = Mutation(
+    "services.joint.torque_limiter.x__soft_stop", "if q < stops[0]:", "if q <= stops[0]:"
+)
 WHY = "at the stop itself the spring pulls by nothing"
 
 
@@ -54,12 +56,12 @@ def test_each_mutant_that_may_live_is_of_a_function_that_is_there(told: MutantsF
 
 
 def test_a_mutant_is_known_by_its_function_and_its_lines() -> None:
-    assert change_of("services.joint.gate.x__soft_stop__mutmut_1", DIFF) == LIVES
+    assert change_of("services.joint.torque_limiter.x__soft_stop__mutmut_1", DIFF) == LIVES
 
 
-def judged(alive: int, listed: tuple[Change, ...], **asked: object) -> tuple[int, str]:
+def judged(alive: int, listed: tuple[Mutation, ...], **asked: object) -> tuple[int, str]:
     """Return exit code and words for 100 mutants of which some live, each by the same change."""
-    found = Found(Counter(killed=100 - alive, survived=alive), [("one", LIVES)] * alive)
+    found = GroupResult(Counter(killed=100 - alive, survived=alive), [("one", LIVES)] * alive)
     told = MutantsFile(
         group=(Group(name="a", modules=(), tests=()),),
         reason=(Reason(why=WHY, lives=listed),) if listed else (),

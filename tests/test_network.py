@@ -11,7 +11,7 @@ from shared.impairment import Impairment
 from shared.messages import SimControl
 from shared.scenario import Inject
 from shared.traces import LinkEvent
-from tools.runs.network import BASE, Link
+from tools.runs.network import BASE, VirtualLink
 from tools.runs.virtual_network import VirtualNetwork
 
 
@@ -19,11 +19,11 @@ def message(number: int) -> SimControl:
     return SimControl(t_ns=0, seq=number, start=True)
 
 
-def link(seed: int = 0, **what: float) -> Link[SimControl]:
-    return Link(Impairment(**what), "planner->knee_left", seed)  # type: ignore[arg-type]
+def link(seed: int = 0, **what: float) -> VirtualLink[SimControl]:
+    return VirtualLink(Impairment(**what), "planner->knee_left", seed)  # type: ignore[arg-type]
 
 
-def arrivals(one: Link[SimControl], until_ms: int) -> list[tuple[int, int]]:
+def arrivals(one: VirtualLink[SimControl], until_ms: int) -> list[tuple[int, int]]:
     """Return (ms, number) as they are taken, looking once a millisecond."""
     seen = []
     for ms in range(until_ms):
@@ -228,7 +228,7 @@ def test_what_lasts_to_the_end_of_a_run_tells_its_counts_then() -> None:
         made.wrenches().put(number, message(number))  # type: ignore[arg-type]
     made.end(7 * NS_PER_MS)
     begun, ended = told
-    assert (begun.in_force, ended.in_force) == (True, False)
+    assert (begun.active, ended.active) == (True, False)
     assert (ended.t_ns, ended.passed, ended.lost) == (7 * NS_PER_MS, 0, 5)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from services.joint.drivers.base import DriveStatus
-from services.joint.drivers.odrive_dialects import (
+from services.joint.drivers.firmware import (
     OTHER_ERROR,
     UNANSWERED,
     AxesReport,
@@ -70,7 +70,7 @@ def test_a_heartbeat_shows_its_dialect_only_where_the_other_could_not_have_sent_
 def test_a_version_is_an_answer_of_0_6_and_tells_the_firmware() -> None:
     report = heard((0, new(IDLE)))
     assert (report.dialect, report.firmware) == ("", None)
-    report.hear_version(VERSION)
+    report.receive_version(VERSION)
     assert (report.dialect, report.firmware) == ("0.6", (0, 6, 10))
 
 
@@ -90,7 +90,7 @@ def test_0_6_taken_for_0_5_looks_like_an_error_until_its_answer_comes() -> None:
         for axis in (0, 1):
             report.hear(axis, busy)
     assert (report.dialect, report.status) == ("0.5", DriveStatus.ERROR)
-    report.hear_version(VERSION)  # and what was heard is judged again
+    report.receive_version(VERSION)  # and what was heard is judged again
     assert (report.dialect, report.status) == ("0.6", DriveStatus.ARMED)
 
 

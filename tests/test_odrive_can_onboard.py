@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from services.joint.differential import joint_torque, motor_from_joint
+from services.joint.drive_setpoint import DriveSetpointLaw
 from services.joint.drivers.base import DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
-from services.joint.drivers.odrive_due import DRIFT_MS, GAINS_MS
-from services.joint.law import Setpoint
-from services.joint.onboard import OnboardLaw
+from services.joint.drivers.resend_policy import DRIFT_MS, GAINS_MS
+from services.joint.pd_law import Setpoint
 from shared.cansimple import ControlMode
 from tests.test_odrive_can import AXES, DRIVE, MS, Rig, connected, driver, make_driver, path, rig
 
@@ -64,7 +64,7 @@ def test_the_joint_gets_the_same_torque_by_either_loop_to_rounding(rig: Rig, pat
     """Over the wire, in the emulated firmware: thousandths of a newton metre at the motor."""
     driver = connected(rig, path)
     arm(rig, driver)
-    law = OnboardLaw(N, DRIVE.vel_limit)
+    law = DriveSetpointLaw(N, DRIVE.vel_limit)
     dice = np.random.default_rng(3)
     for _ in range(30):
         q = dice.uniform(-0.3, 0.3, 2)

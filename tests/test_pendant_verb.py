@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.neighbours import Neighbours, Row
-from services.joint.will import WillFile
+from services.joint.neighbours import NeighbourRow, Neighbours
+from services.joint.rearm_guard import RearmGuard
 from shared.joints import MODULES
 from shared.messages import Mode
 from tools import cli
@@ -24,9 +24,9 @@ PATIENCE_S = 30.0
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> list[WillFile]:
+def files(tmp_path: Path) -> list[RearmGuard]:
     """Return what six joint services of a fleet have open."""
-    return [WillFile(tmp_path, module) for module in MODULES]
+    return [RearmGuard(tmp_path, module) for module in MODULES]
 
 
 def started(run_dir: Path, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
@@ -43,7 +43,7 @@ def wait_for(happens: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def test_killed_it_says_no_more(tmp_path: Path, files: list[WillFile]) -> None:
+def test_killed_it_says_no_more(tmp_path: Path, files: list[RearmGuard]) -> None:
     process = started(tmp_path)
     try:
         wait_for(lambda: all(file.beats > 3 for file in files))
@@ -57,7 +57,7 @@ def test_killed_it_says_no_more(tmp_path: Path, files: list[WillFile]) -> None:
     assert [file.beats for file in files] == beats, "and the services' rule does the rest"
 
 
-def test_enter_lays_it_down(tmp_path: Path, files: list[WillFile]) -> None:
+def test_enter_lays_it_down(tmp_path: Path, files: list[RearmGuard]) -> None:
     person, terminal = pty.openpty()
     process = started(tmp_path, terminal)
     try:
@@ -74,12 +74,12 @@ def test_enter_lays_it_down(tmp_path: Path, files: list[WillFile]) -> None:
 
 
 def test_ctrl_c_is_the_stop_and_says_who_has_not_stopped(
-    tmp_path: Path, files: list[WillFile]
+    tmp_path: Path, files: list[RearmGuard]
 ) -> None:
     """Five services stop in this test, the sixth does not hear it."""
     rows = {module: Neighbours(tmp_path, module) for module in MODULES}
     for module, row in rows.items():
-        row.write(Row(1, 0.0, 0.0, Mode.DAMP if module != "hip_left" else Mode.HOLD))
+        row.write(NeighbourRow(1, 0.0, 0.0, Mode.DAMP if module != "hip_left" else Mode.HOLD))
     process = started(tmp_path)
     try:
         wait_for(lambda: files[0].beats > 3)
@@ -93,7 +93,7 @@ def test_ctrl_c_is_the_stop_and_says_who_has_not_stopped(
     assert all(file.stop_asked for file in files), "at once, and not by silence"
 
 
-def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[WillFile]) -> None:
+def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[RearmGuard]) -> None:
     """Its hang-up ends the program; one that was started to outlive it stops all the same."""
     person, terminal = pty.openpty()
     process = started(tmp_path, terminal)
@@ -109,7 +109,7 @@ def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[WillFile
 
 
 def test_a_second_pendant_is_refused_for_the_first_would_not_be_missed(
-    tmp_path: Path, files: list[WillFile], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, files: list[RearmGuard], capsys: pytest.CaptureFixture[str]
 ) -> None:
     process = started(tmp_path)
     try:
@@ -122,7 +122,7 @@ def test_a_second_pendant_is_refused_for_the_first_would_not_be_missed(
 
 
 def test_a_time_lays_it_down_by_itself(
-    tmp_path: Path, files: list[WillFile], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, files: list[RearmGuard], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["pendant", "--for", "0.1", "--run-dir", str(tmp_path)]) == 0
     assert "laid down" in capsys.readouterr().out

@@ -10,7 +10,7 @@ import pytest
 from shared.config import RobotConfig
 from tools import cli
 from tools.sweeps.push_range import PushRange
-from tools.sweeps.push_trial import Trial, limits_of
+from tools.sweeps.push_trial import PushTrial, limits_of
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def pushes(robot: RobotConfig) -> PushRange:
 def test_the_limit_is_that_of_the_push_study_in_the_stand(
     robot: RobotConfig, pushes: PushRange, angle_deg: int
 ) -> None:
-    point = Trial(number=0, pose="stand", angle_deg=angle_deg, duration_s=3.0, mode="led")
+    point = PushTrial(number=0, pose="stand", angle_deg=angle_deg, duration_s=3.0, mode="led")
     borne = limits_of(point, robot).body.force_n
     assert pushes.limit_n(math.radians(angle_deg)) == pytest.approx(borne, rel=0.02)
 

@@ -1,4 +1,4 @@
-"""`xrl recover`; what it can bring back is in tests/recorder/test_recovery.py."""
+"""`xrl recover`; what it can bring back is in tests/recorder/test_recover.py."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import pytest
 from shared.messages import Cause, DriveStatus, JointState, Mode, Outside
 from shared.trip_table import JOINT_TRIPS
 from tools.runs.fleet_status import LeadStatus, lead_status, module_status
-from tools.status import lead_in_words
+from tools.status import describe_lead
 
 
 def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:
@@ -63,13 +63,13 @@ def test_a_module_that_is_not_heard_is_not_guessed_at() -> None:
 
 def test_a_planner_that_is_not_heard_is_said_so() -> None:
     assert lead_status(None) is None
-    assert "each module holds" in lead_in_words(None)
+    assert "each module holds" in describe_lead(None)
 
 
 def test_why_the_planner_does_not_lead_yet_is_told() -> None:
     good = LeadStatus("LEADING", wait_s=0.0, margin=1.2)
-    assert lead_in_words(good) == "planner LEADING, margin 1.20"
-    waits = lead_in_words(LeadStatus("ALIGNING", wait_s=12.3, margin=1.2))
+    assert describe_lead(good) == "planner LEADING, margin 1.20"
+    waits = describe_lead(LeadStatus("ALIGNING", wait_s=12.3, margin=1.2))
     assert "leads again in 12 s" in waits
-    told = lead_in_words(LeadStatus("MISPLACED", wait_s=0.0, margin=1.2, why="a foot is ahead"))
+    told = describe_lead(LeadStatus("MISPLACED", wait_s=0.0, margin=1.2, why="a foot is ahead"))
     assert told == "planner MISPLACED, margin 1.20; a foot is ahead"

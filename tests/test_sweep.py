@@ -166,7 +166,7 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A plain average of the legs cannot carry the whole payload: it falls at the start."""
-    some = cases.Cases(robot)
+    some = cases.KillCases(robot)
     seed = next(s for s in range(100) if some.draw(s, 0).payload_kg == 20.4)
     average = ("--n", "1", "--seed", str(seed), "--jacobian", "average")
     assert sweep(*average, "--out", str(tmp_path)) == 1

@@ -24,15 +24,15 @@ from tools.runs import lockstep
 from tools.runs.lockstep import Lockstep
 from tools.runs.standing import is_tipping
 from tools.sweeps import cases
-from tools.sweeps.cases import Case, Cases
+from tools.sweeps.cases import KillCase, KillCases
 from tools.sweeps.figures import Ending
 from tools.sweeps.outcome import FootLoads, run_case
 from tools.sweeps.push_range import PushRange
 
 
 @pytest.fixture(scope="module")
-def drawn(robot: RobotConfig) -> list[Case]:
-    some = Cases(robot)
+def drawn(robot: RobotConfig) -> list[KillCase]:
+    some = KillCases(robot)
     return [some.draw(1, number) for number in range(500)]
 
 
@@ -43,22 +43,22 @@ def diagonal(robot: RobotConfig) -> RobotConfig:
     return msgspec.structs.replace(robot, law=law)
 
 
-def frames(story: Scenario, case: Case) -> Iterator[tuple[cases.Pose, Keyframe]]:
+def frames(story: Scenario, case: KillCase) -> Iterator[tuple[cases.LeadPose, Keyframe]]:
     return zip(case.poses, story.keyframe[1:], strict=True)
 
 
-def test_a_case_is_the_same_without_the_others(robot: RobotConfig, drawn: list[Case]) -> None:
-    assert Cases(robot).draw(1, 137) == drawn[137]
+def test_a_case_is_the_same_without_the_others(robot: RobotConfig, drawn: list[KillCase]) -> None:
+    assert KillCases(robot).draw(1, 137) == drawn[137]
 
 
-def test_no_two_cases_are_alike(robot: RobotConfig, drawn: list[Case]) -> None:
+def test_no_two_cases_are_alike(robot: RobotConfig, drawn: list[KillCase]) -> None:
     assert len({case.kill_s for case in drawn}) > 450
-    some = Cases(robot)
+    some = KillCases(robot)
     other = [some.draw(2, number) for number in range(20)]
     assert all(a.pushes != b.pushes for a, b in zip(other, drawn, strict=False))
 
 
-def test_no_draw_is_beyond_the_study(robot: RobotConfig, drawn: list[Case]) -> None:
+def test_no_draw_is_beyond_the_study(robot: RobotConfig, drawn: list[KillCase]) -> None:
     borne = {kg: PushRange(cases.with_payload(robot, kg)) for kg in cases.payloads(robot)}
     for case in drawn:
         assert case.payload_kg in (0.0, 5.1, 10.2, 15.3, 20.4)
@@ -77,7 +77,7 @@ def test_no_draw_is_beyond_the_study(robot: RobotConfig, drawn: list[Case]) -> N
         assert all(0.0 <= pose.assist_n <= robot.assist.force_max for pose in case.poses)
 
 
-def test_every_kind_of_case_is_drawn(drawn: list[Case]) -> None:
+def test_every_kind_of_case_is_drawn(drawn: list[KillCase]) -> None:
     share = {
         "moving": sum(case.moving for case in drawn),
         "hand off": sum(case.let_go_s is not None for case in drawn),
@@ -99,14 +99,14 @@ def test_every_kind_of_case_is_drawn(drawn: list[Case]) -> None:
     assert len(quadrants) == 4
 
 
-def test_the_planner_dies_on_the_way_or_after_it(robot: RobotConfig, drawn: list[Case]) -> None:
+def test_the_planner_dies_on_the_way_or_after_it(robot: RobotConfig, drawn: list[KillCase]) -> None:
     for case in drawn:
         there = cases.story_of(robot, case).keyframe[-1].at
         assert there == case.way_end_s
         assert (case.kill_s < there) if case.moving else (case.kill_s >= there + 0.3)
 
 
-def test_a_case_is_a_scenario(robot: RobotConfig, drawn: list[Case]) -> None:
+def test_a_case_is_a_scenario(robot: RobotConfig, drawn: list[KillCase]) -> None:
     for case in drawn:
         story = cases.story_of(robot, case)
         scenario.check("case", story)
@@ -117,7 +117,7 @@ def test_a_case_is_a_scenario(robot: RobotConfig, drawn: list[Case]) -> None:
             assert (led.height, led.pitch, led.assist) == msgspec.structs.astuple(pose)
 
 
-def test_nobody_leads_faster_than_the_pace(robot: RobotConfig, drawn: list[Case]) -> None:
+def test_nobody_leads_faster_than_the_pace(robot: RobotConfig, drawn: list[KillCase]) -> None:
     for case in drawn:
         for a, b in pairwise(cases.story_of(robot, case).keyframe):
             for way, speed in zip(
@@ -159,7 +159,9 @@ def test_the_feet_carry_the_robot(diagonal: RobotConfig) -> None:
     assert feet.read()[0] == pytest.approx(feet.read()[1], rel=0.02)
 
 
-def test_the_hand_is_off_from_when_the_case_says(diagonal: RobotConfig, drawn: list[Case]) -> None:
+def test_the_hand_is_off_from_when_the_case_says(
+    diagonal: RobotConfig, drawn: list[KillCase]
+) -> None:
     case = msgspec.structs.replace(drawn[0], kill_s=0.9, let_go_s=0.8, delay_ms=1.0, pushes=())
     rows: list[SimTruth] = []
     run_case(case, cases.with_payload(diagonal, case.payload_kg), watch=rows.append)
@@ -171,7 +173,7 @@ def test_the_hand_is_off_from_when_the_case_says(diagonal: RobotConfig, drawn: l
 
 
 def test_a_robot_that_falls_before_it_can_begin_has_fallen(
-    diagonal: RobotConfig, drawn: list[Case]
+    diagonal: RobotConfig, drawn: list[KillCase]
 ) -> None:
     law = msgspec.structs.replace(diagonal.law, jacobian="average")
     average = msgspec.structs.replace(diagonal, law=law)
@@ -192,7 +194,7 @@ def test_a_robot_that_falls_before_it_can_begin_has_fallen(
     ],
 )
 def test_a_robot_on_its_way_down_at_the_end_does_not_stand(
-    robot: RobotConfig, drawn: list[Case], com: tuple[float, float], tilt: float, tipping: bool
+    robot: RobotConfig, drawn: list[KillCase], com: tuple[float, float], tilt: float, tipping: bool
 ) -> None:
     """The soles end 0.127 m before and behind the ankles, and 0.41 m to the sides."""
     row = World(body_of(robot, IDEAL), cases.story_of(robot, drawn[0])).truth(0, 1.0, 0.0)
@@ -200,7 +202,9 @@ def test_a_robot_on_its_way_down_at_the_end_does_not_stand(
     assert is_tipping(row, robot) is tipping
 
 
-def test_a_case_that_ends_in_mid_fall_is_a_fall(diagonal: RobotConfig, drawn: list[Case]) -> None:
+def test_a_case_that_ends_in_mid_fall_is_a_fall(
+    diagonal: RobotConfig, drawn: list[KillCase]
+) -> None:
     """A push that nothing withstands, half a second before the end."""
     push = Push(at=3.7, duration=0.25, force=(300.0, 0.0, 0.0))
     case = msgspec.structs.replace(
@@ -215,7 +219,7 @@ def test_a_case_that_ends_in_mid_fall_is_a_fall(diagonal: RobotConfig, drawn: li
         assert outcome.fell_at_s is None
 
 
-class _Until4s(Case, frozen=True, kw_only=True):
+class _Until4s(KillCase, frozen=True, kw_only=True):
     """A case that does not wait for what comes of its pushes."""
 
     @property
@@ -224,7 +228,7 @@ class _Until4s(Case, frozen=True, kw_only=True):
 
 
 def test_a_robot_that_never_tracks_is_no_stand(
-    diagonal: RobotConfig, drawn: list[Case], monkeypatch: pytest.MonkeyPatch
+    diagonal: RobotConfig, drawn: list[KillCase], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At 30 ms each way every command is older than 50 ms: it holds, and nothing can begin."""
     monkeypatch.setattr(lockstep, "READY_NS", 6 * NS_PER_S)

@@ -17,7 +17,7 @@ from shared.exceptions import RunError
 from tools import cli
 from tools.sweeps import cluster, latency
 from tools.sweeps.latency import JOB
-from tools.sweeps.latency_trial import Network, Trial
+from tools.sweeps.latency_trial import LatencyTrial, Network
 from tools.sweeps.table import code_digest
 
 CODE = ("tools/sweeps/pool.py",)
@@ -139,7 +139,7 @@ def test_a_trial_on_a_real_cluster_is_the_trial_of_this_machine(robot: RobotConf
     """In a process of its own, as a worker is; it falls early, and so takes no time."""
     distributed = pytest.importorskip("distributed")
     network = Network(200.0, 0.0, 0.0)
-    trial = Trial(number=0, repeat=0, seed=1, control="centralised", network=network)
+    trial = LatencyTrial(number=0, repeat=0, seed=1, control="centralised", network=network)
     task = trial, robot
     with distributed.LocalCluster(
         n_workers=1,

@@ -11,10 +11,10 @@ import pytest
 from shared.config import RobotConfig
 from tools import cli
 from tools.sweeps import dynamics, dynamics_trial
-from tools.sweeps.dynamics_trial import UNREADY, Outcome, delay_s, draw, drawn, run_trial
+from tools.sweeps.dynamics_trial import UNREADY, DynamicsResult, delay_s, draw, drawn, run_trial
 
 
-def outcome(**changes: object) -> Outcome:
+def outcome(**changes: object) -> DynamicsResult:
     given: dict[str, object] = {"rate": -1.0, "ended": "tracked", "early_rad_s": 0.04}
     return msgspec.structs.replace(UNREADY, **(given | changes))
 

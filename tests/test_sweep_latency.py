@@ -22,8 +22,8 @@ from tools.sweeps.latency_trial import (
     CONTROLS,
     DURATION_S,
     PUSH_S,
+    LatencyTrial,
     Network,
-    Trial,
     fleet_of,
     hold_share,
     robot_of,
@@ -40,13 +40,13 @@ def sweep(*flags: str) -> int:
     return cli.main(["sweep", "latency", *flags])
 
 
-def grid(*flags: str) -> list[Trial]:
+def grid(*flags: str) -> list[LatencyTrial]:
     parser = argparse.ArgumentParser()
     latency.add_flags(parser)
     return latency.trials_of(parser.parse_args(flags))
 
 
-def trial(**changes: Any) -> Trial:
+def trial(**changes: Any) -> LatencyTrial:
     fields: dict[str, Any] = {
         "number": 0,
         "repeat": 0,
@@ -54,7 +54,7 @@ def trial(**changes: Any) -> Trial:
         "control": "distributed",
         "network": GOOD,
     }
-    return Trial(**(fields | changes))
+    return LatencyTrial(**(fields | changes))
 
 
 @pytest.mark.parametrize(

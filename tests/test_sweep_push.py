@@ -14,7 +14,7 @@ from shared.config import RobotConfig
 from shared.exceptions import RunError
 from tools import cli
 from tools.sweeps import push, push_trial
-from tools.sweeps.push_trial import Outcome, Trial, limits_of, run_trial, story_of
+from tools.sweeps.push_trial import PushResult, PushTrial, limits_of, run_trial, story_of
 
 
 def asked(**changes: object) -> argparse.Namespace:
@@ -22,11 +22,11 @@ def asked(**changes: object) -> argparse.Namespace:
     return argparse.Namespace(**(given | changes))
 
 
-def point(**changes: object) -> Trial:
+def point(**changes: object) -> PushTrial:
     given: dict[str, object] = {
         "number": 0, "pose": "squat", "angle_deg": 90, "duration_s": 3.0, "mode": "dead",
     }  # fmt: skip
-    return Trial(**(given | changes))  # type: ignore[arg-type]  # as the fields are
+    return PushTrial(**(given | changes))  # type: ignore[arg-type]  # as the fields are
 
 
 def test_the_grid_has_every_pose_duration_angle_and_mode_once() -> None:
@@ -89,7 +89,7 @@ def test_the_push_is_in_the_direction_that_was_asked_for() -> None:
 
 def test_a_table_is_drawn_with_both_modes_and_the_limits(tmp_path: Path) -> None:
     trials = push.trials_of(asked(pose=["stand", "crawl"]))
-    outcome = Outcome(
+    outcome = PushResult(
         stood_n=50.0, fell_n=55.0, held_limit_n=40.0, held_part="left sole's toe", body_limit_n=90.0
     )
     rows = [

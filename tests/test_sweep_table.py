@@ -13,7 +13,7 @@ from rich.console import Console
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from tools.sweeps import study
-from tools.sweeps.table import Table, code_of
+from tools.sweeps.table import CaseTable, code_of
 
 INPUTS = {"study": "test", "seed": "1"}
 COLUMNS = ("number", "value")
@@ -25,36 +25,36 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 def test_a_table_is_sorted_whatever_came_first(tmp_path: Path) -> None:
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
         for number in (3, 1, 2):
             table.add({"number": number, "value": number / 2})
     assert [row["number"] for row in rows_of(tmp_path / "t.csv")] == ["1", "2", "3"]
 
 
 def test_a_row_is_on_the_disk_when_it_is_done(tmp_path: Path) -> None:
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
         table.add({"number": 7, "value": None})
         assert rows_of(tmp_path / "t.csv") == [{"number": "7", "value": ""}]
 
 
 @pytest.mark.parametrize("torn", ["2,0.", "2", "2\n", ""])
 def test_a_row_cut_off_in_the_middle_is_done_again(tmp_path: Path, torn: str) -> None:
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
         table.add({"number": 1, "value": 0.5})
     with (tmp_path / "t.csv").open("a") as file:
         file.write(torn)
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
         assert table.numbers == {1}
         table.add({"number": 2, "value": 1.5})
     assert [row["value"] for row in rows_of(tmp_path / "t.csv")] == ["0.5", "1.5"]
 
 
 def test_a_folder_of_other_inputs_is_refused(tmp_path: Path) -> None:
-    Table(tmp_path, "t.csv", COLUMNS, INPUTS)
+    CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS)
     with pytest.raises(RunError, match=r"another seed \(1, now 2\); choose another --out"):
-        Table(tmp_path, "t.csv", COLUMNS, INPUTS | {"seed": "2"})
+        CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS | {"seed": "2"})
     with pytest.raises(RunError, match="other columns"):
-        Table(tmp_path, "t.csv", (*COLUMNS, "more"), INPUTS)
+        CaseTable(tmp_path, "t.csv", (*COLUMNS, "more"), INPUTS)
 
 
 WORDS = {"ending": {"stood", "fell"}}
@@ -79,13 +79,13 @@ def test_a_damaged_row_is_done_again_and_the_others_are_kept(
     tmp_path: Path, damaged: bytes
 ) -> None:
     columns = (*COLUMNS, "ending")
-    with Table(tmp_path, "t.csv", columns, INPUTS, WORDS) as table:
+    with CaseTable(tmp_path, "t.csv", columns, INPUTS, WORDS) as table:
         for number in (1, 3):
             table.add({"number": number, "value": None, "ending": "fell"})
     path = tmp_path / "t.csv"
     head, first, third = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(head + first + damaged + third)
-    with Table(tmp_path, "t.csv", columns, INPUTS, WORDS) as table:
+    with CaseTable(tmp_path, "t.csv", columns, INPUTS, WORDS) as table:
         assert table.numbers == {1, 3}
     assert path.read_bytes() == head + first + third
 
@@ -93,12 +93,12 @@ def test_a_damaged_row_is_done_again_and_the_others_are_kept(
 @pytest.mark.parametrize("value", ["0.7", ""])
 def test_a_row_that_is_of_another_case_is_done_again(tmp_path: Path, value: str) -> None:
     drawn = [{"number": number, "value": number / 2} for number in (1, 2)]
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS, drawn=drawn) as table:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS, drawn=drawn) as table:
         for case in (*drawn, {"number": 3, "value": 9.0}):
             table.add(case)
     path = tmp_path / "t.csv"
     path.write_text(path.read_text().replace("1,0.5", f"1,{value}"))
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS, drawn=drawn) as table:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS, drawn=drawn) as table:
         assert table.numbers == {2, 3}
 
 
@@ -106,7 +106,7 @@ def test_a_row_that_is_of_another_case_is_done_again(tmp_path: Path, value: str)
 def test_a_table_of_inputs_that_nobody_knows_is_refused_and_left_alone(
     tmp_path: Path, inputs: bytes | None
 ) -> None:
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
         table.add({"number": 1, "value": 0.5})
     before = (tmp_path / "t.csv").read_bytes()
     if inputs is None:
@@ -115,23 +115,23 @@ def test_a_table_of_inputs_that_nobody_knows_is_refused_and_left_alone(
         (tmp_path / "inputs.json").write_bytes(inputs)
     for _ in range(2):
         with pytest.raises(RunError, match=r"does not say what t\.csv was made from"):
-            Table(tmp_path, "t.csv", COLUMNS, INPUTS)
+            CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS)
     assert (tmp_path / "t.csv").read_bytes() == before
 
 
 def test_a_study_cut_off_before_it_wrote_anything_is_begun_anew(tmp_path: Path) -> None:
     (tmp_path / "inputs.json").write_bytes(b"")
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS):
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS):
         pass
     assert json.loads((tmp_path / "inputs.json").read_text()) == INPUTS
 
 
 def test_two_studies_do_not_write_into_one_table(tmp_path: Path) -> None:
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as first:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as first:
         with pytest.raises(RunError, match="another study is writing there"):
-            Table(tmp_path, "t.csv", COLUMNS, INPUTS)
+            CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS)
         first.add({"number": 1, "value": 0.5})
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as second:
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as second:
         assert second.numbers == {1}
 
 
@@ -139,8 +139,8 @@ def test_two_studies_do_not_write_into_one_table(tmp_path: Path) -> None:
 def test_a_study_that_loses_its_workers_says_how_to_go_on(
     tmp_path: Path, error: BaseException, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    crew = study.Crew(2, "tcp://host:8786", ())
-    with Table(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
+    crew = study.Executor(2, "tcp://host:8786", ())
+    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
         table.add({"number": 1, "value": 0.5})
         again = study.resumable(table, tmp_path / "a b", "xrl sweep kill", crew, Console())
         with pytest.raises(type(error)), again:
@@ -174,5 +174,5 @@ def test_the_code_of_a_study_is_all_that_it_imports_in_either_way(
 def test_a_folder_of_something_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(b"a run")
     with pytest.raises(RunError, match="holds other files than a study's; choose another --out"):
-        Table(tmp_path, "t.csv", COLUMNS, INPUTS)
+        CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS)
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]

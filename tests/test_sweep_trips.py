@@ -14,14 +14,14 @@ from shared.process import DEFAULT_CONFIG
 from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools import cli
 from tools.sweeps.trips import wrong_with
-from tools.sweeps.trips_trial import PLANTS, TROUBLES, Outcome, run_trial
+from tools.sweeps.trips_trial import PLANTS, TROUBLES, TripResult, run_trial
 
 HARD_PLANT = "small errors"
 
 
 def row(trouble: str, **changes: str) -> dict[str, str]:
     begin = {"number": "0", "trouble": trouble, "on": "k 2000"}
-    return begin | dict.fromkeys(Outcome.__struct_fields__, "") | {"led": "True"} | changes
+    return begin | dict.fromkeys(TripResult.__struct_fields__, "") | {"led": "True"} | changes
 
 
 @pytest.mark.parametrize("trouble", [name for name in TROUBLES if not TROUBLES[name].unfiltered])

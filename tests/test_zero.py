@@ -23,13 +23,13 @@ from shared.messages import Pair
 from tools import zero as verb
 from tools.bringup import bench, zeroing
 from tools.bringup.standing import standing
-from tools.bringup.zeroing import Back, Look, is_right, look, outside, refusal, zero
-from tools.supervision.supervise import Fleet
+from tools.bringup.zeroing import Back, DriveLook, is_right, look, outside, refusal, zero
+from tools.supervision.supervise import SupervisedFleet
 
 MODULE = "knee_left"
 MARK = 64.0
 N = 17.5
-STILL = Look(DriveStatus.IDLE, zeroed=True, q=(0.0, -1.0), speed=0.0, moved=0.0, error=0)
+STILL = DriveLook(DriveStatus.IDLE, zeroed=True, q=(0.0, -1.0), speed=0.0, moved=0.0, error=0)
 
 
 class PlayedDrive:
@@ -272,7 +272,7 @@ def test_over_usb_the_services_must_be_down(robot: RobotConfig, tmp_path: Path) 
         robot, joint_service=msgspec.structs.replace(robot.joint_service, driver="odrive_usb")
     )
     with pytest.raises(FleetError, match=r"has the drive's USB.*xrl down"):
-        verb.refuse_services(usb, {MODULE: Fleet(tmp_path)})
+        verb.refuse_services(usb, {MODULE: SupervisedFleet(tmp_path)})
     verb.refuse_services(usb, {MODULE: None})
 
 

@@ -23,7 +23,7 @@ from shared.exceptions import FleetError
 from shared.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
 from shared.process import StopFlag
 from shared.scenario import SCENARIO
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 REPEAT_S: Final = 0.02
@@ -35,7 +35,7 @@ SHIFT_UNITS: Final = (("x", "m"), ("y", "m"), ("roll", "rad"), ("yaw", "rad"))
 Stop = Callable[[], bool]
 
 
-class Intents(Protocol):
+class IntentClient(Protocol):
     """The way to the planner."""
 
     def put(self, message: OperatorIntent) -> bool:
@@ -83,7 +83,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Ask until told to stop."""
-    fleet = Fleet.attach(args.run_dir)
+    fleet = SupervisedFleet.attach(args.run_dir)
     robot = load(Path(fleet.manifest.config))
     refuse_beyond_limits(robot, args.assist, args.shift)
     if args.for_s is not None and not args.for_s > 0.0:
@@ -121,7 +121,7 @@ def refuse_beyond_limits(robot: RobotConfig, assist: float, shift: Vector4) -> N
 
 
 def ask(
-    intents: Intents,
+    intents: IntentClient,
     statuses: Statuses,
     wish: OperatorIntent,
     stop: Stop,
@@ -162,7 +162,7 @@ def ask(
         newest = statuses.take()
         if newest is not None:
             status = newest
-            shown.update(Text(in_words(wish, status)))
+            shown.update(Text(describe(wish, status)))
             if status.asked_by == wish.source:
                 heard = now
         if now - heard > HEARD_S:
@@ -172,7 +172,7 @@ def ask(
     return status.assist_n
 
 
-def in_words(wish: OperatorIntent, status: PlannerStatus) -> str:
+def describe(wish: OperatorIntent, status: PlannerStatus) -> str:
     """Return what is asked for and what is given, in a line."""
     words = f"asked for {wish.assist_n:.0f} N, given {status.assist_n:.0f} N"
     if any(wish.shift):

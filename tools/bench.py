@@ -150,9 +150,9 @@ def tick_times(robot: RobotConfig, inputs: Sequence[tuple[int, list[JointState]]
     times = []
     for now_ns, states in inputs:
         begin = time.perf_counter()
-        planner.hear_wrench(wrench, now_ns)
+        planner.receive_wrench(wrench, now_ns)
         for module, state in enumerate(states):
-            planner.hear_state(module, state, now_ns)
+            planner.receive_state(module, state, now_ns)
         planner.tick(now_ns)
         planner.status(now_ns, 0.0)
         times.append(time.perf_counter() - begin)

@@ -18,8 +18,8 @@ from shared.config import RobotConfig
 from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
 from tools.bringup import backup, bench, changes
-from tools.bringup.boards import FIRMWARE, Board, Found, firmware_in_words, is_known
-from tools.bringup.changes import Change, Outcome
+from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
+from tools.bringup.changes import ChangeResult, SettingChange
 from tools.bringup.check_robot import joint_services, services_up
 from tools.bringup.difference import shown
 from tools.bringup.jog_drive import Interrupts
@@ -171,7 +171,7 @@ def refuse_services(robot: RobotConfig, run_dir: Path, modules: Sequence[str]) -
             )
 
 
-def boards_of(robot: RobotConfig, modules: Sequence[str], found: Found) -> dict[str, Board]:
+def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) -> dict[str, Board]:
     """Return the boards by module, every one of them.
 
     Raises:
@@ -190,8 +190,8 @@ def boards_of(robot: RobotConfig, modules: Sequence[str], found: Found) -> dict[
             )
         if not is_known(board.firmware):
             raise DriveError(
-                f"{module}: firmware {firmware_in_words(board.firmware)}; these settings are those "
-                f"of {firmware_in_words(FIRMWARE)}"
+                f"{module}: firmware {describe_firmware(board.firmware)}; these settings are those "
+                f"of {describe_firmware(FIRMWARE)}"
             )
         boards[module] = board
     return boards
@@ -199,20 +199,20 @@ def boards_of(robot: RobotConfig, modules: Sequence[str], found: Found) -> dict[
 
 def differences(
     robot: RobotConfig, boards: Mapping[str, Board], saved: backup.Backup | None
-) -> list[Change]:
+) -> list[SettingChange]:
     """Return everything that is to be changed, module by module.
 
     Raises:
         DriveError: a board does not answer, or has another firmware than its backup.
     """
-    rows: list[Change] = []
+    rows: list[SettingChange] = []
     kept = {board.module: board for board in saved.boards} if saved else {}
     for module, board in boards.items():
         if saved is None:
             wanted = drive_settings.of_module(robot, module)
             rows += changes.against_wanted(module, wanted, board)
             continue
-        firmware = firmware_in_words(board.firmware)
+        firmware = describe_firmware(board.firmware)
         if firmware != kept[module].firmware:
             raise DriveError(
                 f"{module}: the backup is of firmware {kept[module].firmware}, the board has "
@@ -233,7 +233,7 @@ def keep(folder: Path, boards: Mapping[str, Board], robot_file: Path) -> Path:
         backup.of_board(
             module,
             board.serial_number,
-            firmware_in_words(board.firmware),
+            describe_firmware(board.firmware),
             board.read(board.settings),
         )
         for module, board in boards.items()
@@ -245,15 +245,15 @@ def keep(folder: Path, boards: Mapping[str, Board], robot_file: Path) -> Path:
 def apply(
     console: Console,
     boards: Mapping[str, Board],
-    difference: Sequence[Change],
+    difference: Sequence[SettingChange],
     interrupts: Interrupts,
-) -> list[Outcome]:
+) -> list[ChangeResult]:
     """Write, save and read back, board after board; one that fails does not stop the others.
 
     A board that was begun is finished before an interrupt is heeded: half of its settings would be
     in force and none saved.
     """
-    outcomes: list[Outcome] = []
+    outcomes: list[ChangeResult] = []
     for module, board in boards.items():
         mine = [change for change in difference if change.module == module]
         if interrupts.number or not mine:
@@ -263,17 +263,17 @@ def apply(
                 outcomes += changes.apply(board, mine)
         except DriveError as error:
             console.print(f"[bold red]{module}[/]: {escape(str(error))}")
-            outcomes += [Outcome(change, None, good=False) for change in mine]
+            outcomes += [ChangeResult(change, None, good=False) for change in mine]
     return outcomes
 
 
 def conclude(
-    console: Console, robot: RobotConfig, outcomes: Sequence[Outcome], *, emulated: bool
+    console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResult], *, emulated: bool
 ) -> int:
     """Say what came of it and return the exit code."""
     bad = [outcome for outcome in outcomes if not outcome.good]
     for change, now, _ in bad:
-        what = change.obstacle or f"it is {changes.in_words(now)} after the restart"
+        what = change.obstacle or f"it is {changes.describe(now)} after the restart"
         console.print(f"[bold red]not as wanted[/]: {change.module} {change.name}: {escape(what)}")
     done = len(outcomes) - len(bad)
     console.print(f"{done} settings written, saved, and read back after the restart")

@@ -17,11 +17,11 @@ from services.recorder import provenance
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from tools.crash import report
-from tools.crash.cases import CASES, Case, Verdict
+from tools.crash.cases import CASES, CrashCase, CrashVerdict
 from tools.crash.report import JUNIT, RESULTS, Result
 from tools.crash.runner import run_case
 from tools.runs import experiment
-from tools.runs.conductor import Snapshot
+from tools.runs.scenario_runner import LiveSnapshot
 from tools.supervision import procfs
 from tools.verbs import Subparsers, add_config, add_verb
 
@@ -97,7 +97,9 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(results)
 
 
-def select(cases: Sequence[Case], *, quick: bool, only: Sequence[str] | None) -> list[Case]:
+def select(
+    cases: Sequence[CrashCase], *, quick: bool, only: Sequence[str] | None
+) -> list[CrashCase]:
     """Return the cases that are asked for, in their order.
 
     Args:
@@ -124,13 +126,13 @@ def select(cases: Sequence[Case], *, quick: bool, only: Sequence[str] | None) ->
 def exit_code(results: Sequence[Result]) -> int:
     """Return 0, 1 if a case came out worse than it has to, 2 if one could not be judged."""
     bad = {result.outcome.verdict for result in results if not result.good}
-    if bad - {Verdict.UNJUDGED}:
+    if bad - {CrashVerdict.UNJUDGED}:
         return EXIT_FELL
     return EXIT_UNJUDGED if bad else 0
 
 
 def _run_all(
-    cases: Sequence[Case],
+    cases: Sequence[CrashCase],
     robot: RobotConfig,
     seed: int,
     out: Path,
@@ -163,7 +165,7 @@ def _run_all(
 
 
 def _is_unjudged(result: Result) -> bool:
-    return result.outcome.verdict is Verdict.UNJUDGED
+    return result.outcome.verdict is CrashVerdict.UNJUDGED
 
 
 class _View:
@@ -172,7 +174,7 @@ class _View:
     def __init__(self, bar: Progress, task: TaskID) -> None:
         self._bar, self._task = bar, task
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, snapshot: LiveSnapshot) -> None:
         """Show the run as it is now."""
         if snapshot.truth is not None:
             now_s, modes = max(0.0, snapshot.truth.scenario_s), "".join(snapshot.modes)

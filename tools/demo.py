@@ -15,13 +15,13 @@ from shared.config import RobotConfig
 from shared.messages import PlannerStatus
 from shared.scenario import Scenario
 from tools.runs import experiment, figure, verdict, verdict_table
-from tools.runs.conductor import Conductor
 from tools.runs.live import run_live
 from tools.runs.live_view import LiveView
 from tools.runs.run_log import read_run
+from tools.runs.scenario_runner import ScenarioRunner
 from tools.supervision import procfs
 from tools.supervision.pace import add_pace
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_verb
 
 EXIT_FELL = 1
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     robot, story = experiment.make_robot(args), experiment.make_scenario(args)
     plant_from(args.plant)  # refused before anything is started
     out = experiment.make_out(args.out, "demo")
-    console.print(f"[bold]{story.name}[/]: {story.about}{experiment.in_words(story)}")
+    console.print(f"[bold]{story.name}[/]: {story.about}{experiment.describe(story)}")
     for other in procfs.fleets():
         console.print(
             f"[yellow]another fleet runs in {other}: two do not fit on two cores; "
@@ -90,10 +90,10 @@ def lead_run(
         style="dim",
     )
 
-    def lead(fleet: Fleet, session: Session) -> float | None:
+    def lead(fleet: SupervisedFleet, session: Session) -> float | None:
         planner = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         with LiveView(console, story.inject, planner) as view:
-            return Conductor(fleet, session, story, view.show).run()
+            return ScenarioRunner(fleet, session, story, view.show).run()
 
     return run_live(
         out,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 
@@ -23,7 +23,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Stop every service, also of a fleet whose supervisor is dead; keep the logs."""
-    fleet = Fleet(args.run_dir)
+    fleet = SupervisedFleet(args.run_dir)
     was_up = fleet.run.read_manifest() is not None
     fleet.stop(keep_logs=True)
     if was_up:

@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from services.joint.neighbours import Neighbours
-from services.joint.will import ask_stop
+from services.joint.rearm_guard import ask_stop
 from shared import topics
 from shared.bus import open_session
 from shared.clock import now_ns
@@ -20,7 +20,7 @@ from shared.config_file import load
 from shared.exceptions import FleetError, XrlError
 from shared.joints import MODULES
 from shared.messages import Estop, JointState, Mode
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 REPEAT_S = 0.05
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
         going = wait_here(run_dir, here)
     else:
         try:
-            fleet = Fleet.attach(run_dir)
+            fleet = SupervisedFleet.attach(run_dir)
             going = _say(load(Path(fleet.manifest.config)), run_dir)
         except XrlError as error:
             if not here:

@@ -13,12 +13,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from services.planner.account import Account, account
 from services.planner.certificate import Weakest
 from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.inverse_kinematics import in_words as in_words_of_reach
+from services.planner.inverse_kinematics import describe as in_words_of_reach
 from services.planner.kinematics import Kinematics
 from services.planner.push_limit import PushLimits
+from services.planner.torque_breakdown import TorqueBreakdown, torque_breakdown
 from shared import config_file, gain_schedule, topics
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
@@ -26,7 +26,7 @@ from shared.exceptions import RunError
 from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.messages import JointCommand, JointState, PlannerMode, PlannerStatus, SplitSource
 from shared.robot_model import stand_pose
-from tools.runs import moment, verdict
+from tools.runs import snapshot_text, verdict
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.verbs import RUN_HELP, Subparsers, add_config, add_verb
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         gain_schedule.require(robot, args.config)
         q = at_pose(robot, args.p) if args.q is None else parse("--q", args.q, N_JOINTS)
         still = np.zeros(N_JOINTS)
-        show(robot, account(robot, q, still, q, still, args.assist), console)
+        show(robot, torque_breakdown(robot, q, still, q, still, args.assist), console)
         return 0
     log = read_run(args.log)
     robot = robot_of(log)
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     _introduce(log, tick, args.at, console)
     q, v = (_joined(tick.states, name) for name in ("q", "v"))
     q_ref, v_ref = (_joined(tick.commands, name) for name in ("q_ref", "v_ref"))
-    found = account(
+    found = torque_breakdown(
         robot, q, v, q_ref, v_ref, tick.status.assist_n, tick.status.slope, tick.status.stance
     )
     found = found._replace(eased=_joined(tick.commands, "tau_coupled") - found.coupled)
@@ -205,22 +205,22 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, console: Console) ->
         f"{ages:.1f} ms old, assist {status.assist_n:.1f} N, IK {status.ik_iterations} steps, "
         f"residual {status.ik_residual:.1e}"
     )
-    words = moment.modules_in_words(tick.states)
+    words = snapshot_text.describe_modules(tick.states)
     console.print(f"modules, and how old their commands were: {words}", style="dim")
     at_ns = status.t_ns if at_s is None else course.zero_ns + round(at_s * 1e9)
     late_s = (at_ns - status.t_ns) / 1e9
     if late_s > AWAY_S:
-        words = moment.modules_in_words(moment.states_at(log, at_ns))
+        words = snapshot_text.describe_modules(snapshot_text.states_at(log, at_ns))
         console.print(
             f"[yellow]at {at_s:g} s the planner did not tick: its last, {late_s:.2f} s before, "
             f"is shown. The modules at {at_s:g} s: {words}[/]"
         )
-    network = moment.network_in_words(log, at_ns, course.zero_ns)
+    network = snapshot_text.describe_network(log, at_ns, course.zero_ns)
     if network:
         console.print(f"network: {network}", style="yellow", markup=False, highlight=False)
 
 
-def show(robot: RobotConfig, found: Account, console: Console) -> None:
+def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
     """Print an account."""
     poses = _table("Body", DIRECTIONS)
     for row, values, digits in (
@@ -245,14 +245,14 @@ def show(robot: RobotConfig, found: Account, console: Console) -> None:
     for who, weakest in (
         ("joint services alone", found.weakest), ("drives alone", found.weakest_onboard),
     ):  # fmt: skip
-        console.print(f"margin, {who}: {in_words(weakest)}")
+        console.print(f"margin, {who}: {describe(weakest)}")
     for name, limits in found.pushes.items():
         console.print(f"push {name}: {describe_limits(limits)}", highlight=False, soft_wrap=True)
     console.print()
     console.print(_torques(found))
 
 
-def in_words(weakest: Weakest) -> str:
+def describe(weakest: Weakest) -> str:
     """Return for example "0.24; weakest: lean forward, 71 N/m of 300"."""
     parts = ", ".join(
         f"{name} {value:.2f}"
@@ -276,7 +276,7 @@ def describe_limits(limits: PushLimits) -> str:
     )
 
 
-def _gains(found: Account) -> Table:
+def _gains(found: TorqueBreakdown) -> Table:
     table = _table(
         "Gains, N m/rad and N m s/rad",
         ("K_q", "D: service", "B_q", "D_B: service"),
@@ -289,7 +289,7 @@ def _gains(found: Account) -> Table:
     return table
 
 
-def _torques(found: Account) -> Table:
+def _torques(found: TorqueBreakdown) -> Table:
     table = _table(
         "Torques by origin, N m",
         ("gravity", "assist", "local PD", "coupled", "low-pass", "total"),

@@ -78,12 +78,12 @@ def run(args: argparse.Namespace) -> int:
     )
     for name, (trip, limit) in trips.items():
         console.print(f"[bold]{name}[/]: {trip.measured}")
-        _say(console, "trips", _limit_in_words(trip, limit))
+        _say(console, "trips", _describe_limit(trip, limit))
         _say(console, "you do", trip.recovery)
     return 0
 
 
-def _limit_in_words(row: TripRow, limit: TripLimit) -> str:
+def _describe_limit(row: TripRow, limit: TripLimit) -> str:
     beyond = "below" if row.least else "above"
     lasting = f" for {limit.after_ms:g} ms" if limit.after_ms else ""
     return f"{beyond} {limit.limit:g} {row.unit}{lasting} (trips.{row.key})"

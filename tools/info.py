@@ -14,15 +14,15 @@ from rich.table import Table
 from rich.text import Text
 
 from services.recorder.mcap_log import SCHEMA_VERSION
-from services.recorder.recovery import clock_time, lost_in_words
-from services.recorder.salvage import Loss
+from services.recorder.reader import LostBytes
+from services.recorder.recover import clock_time, describe_lost
 from shared import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from tools.logs.files import files_of_run
 from tools.logs.survey import FileFacts, Survey, TopicFacts
 from tools.runs import verdict
-from tools.runs.impaired import impairments
+from tools.runs.impairment_intervals import impairments
 from tools.runs.run_log import RunLog, read_run
 from tools.verbs import Subparsers, add_verb
 
@@ -131,7 +131,7 @@ def _show_file(file: FileFacts, console: Console) -> None:
     size = f"{file.size / MIB:.2f} MiB" if file.size >= MIB else f"{file.size} bytes"
     console.print(f"[bold]{plain(str(file.path))}[/]: {size}, {state}", soft_wrap=True)
     if not file.finished or file.damage:
-        for line in lost_in_words(file.cut, file.damage, finished=file.finished):
+        for line in describe_lost(file.cut, file.damage, finished=file.finished):
             console.print(f"  {line}", style="yellow", soft_wrap=True)
     if file.orphans:
         console.print(f"  {file.orphans} messages of channels that are nowhere described")
@@ -258,7 +258,7 @@ def _file_as_json(file: FileFacts) -> dict[str, Any]:
     }
 
 
-def _loss_as_json(loss: Loss | None) -> dict[str, int] | None:
+def _loss_as_json(loss: LostBytes | None) -> dict[str, int] | None:
     return None if loss is None else loss._asdict()
 
 

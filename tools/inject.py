@@ -11,10 +11,17 @@ from rich.console import Console
 from rich.table import Table
 
 from shared.exceptions import ConfigError, RunError
-from shared.injector_protocol import Asked
+from shared.injector_protocol import RequestedImpairment
 from shared.links import GROUPS
 from shared.scenario import Inject
-from tools.runs.inject_words import DISTRIBUTION, NUMBERS, SWITCHES, check_link, make, parse_inject
+from tools.runs.describe_inject import (
+    DISTRIBUTION,
+    NUMBERS,
+    SWITCHES,
+    check_link,
+    make,
+    parse_inject,
+)
 from tools.runs.injector_client import InjectorClient
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
@@ -165,7 +172,7 @@ def _refuse(args: argparse.Namespace, flag: str, *others: str) -> None:
         raise RunError(f"{flag} with {words}: without effect; leave one of them out")
 
 
-def show(asked: Sequence[Asked], console: Console) -> None:
+def show(asked: Sequence[RequestedImpairment], console: Console) -> None:
     """Print what is done and what will be, the newest last."""
     if not asked:
         console.print("nothing is done to any link")

@@ -18,8 +18,8 @@ from shared.config import RobotConfig
 from shared.exceptions import DriveError, FleetError, XrlError
 from shared.joints import AXES, MODULES
 from tools.bringup import bench, limits
-from tools.bringup.jog_drive import NOT_IDLE, Interrupts, Outcome, first_words, jog_drive
-from tools.bringup.jogging import Plan, Sample, gentle, judge, outside, what_to_see
+from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_words, jog_drive
+from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
 
 BY: Final = 0.05
@@ -105,9 +105,9 @@ def look_ask_move(
     args: argparse.Namespace,
     console: Console,
     robot: RobotConfig,
-    plan: Plan,
+    plan: JogPlan,
     interrupts: Interrupts,
-) -> Outcome | None:
+) -> JogResult | None:
     """Open the drive, look at the joint, ask, and move it; None if the answer was no.
 
     Args:
@@ -149,7 +149,7 @@ def look_ask_move(
         drive.close()
 
 
-def plan_of(args: argparse.Namespace) -> Plan:
+def plan_of(args: argparse.Namespace) -> JogPlan:
     """Return what is asked for.
 
     Raises:
@@ -161,7 +161,7 @@ def plan_of(args: argparse.Namespace) -> Plan:
         raise DriveError(f"--period {args.period:g}: {PERIOD_MIN_S:g} .. 60 s is right")
     if not 1 <= args.cycles <= CYCLES_MAX:
         raise DriveError(f"--cycles {args.cycles}: 1 .. {CYCLES_MAX} is right")
-    return Plan(AXES.index(args.axis), args.by, args.period, args.cycles, args.torque_limit)
+    return JogPlan(AXES.index(args.axis), args.by, args.period, args.cycles, args.torque_limit)
 
 
 def refuse_service(robot: RobotConfig, args: argparse.Namespace) -> None:
@@ -178,7 +178,7 @@ def refuse_service(robot: RobotConfig, args: argparse.Namespace) -> None:
         )
 
 
-def progress(sample: Sample, plan: Plan) -> str:
+def progress(sample: Sample, plan: JogPlan) -> str:
     """Return a line on a sample."""
     axis = plan.axis
     return (
@@ -187,7 +187,7 @@ def progress(sample: Sample, plan: Plan) -> str:
     )
 
 
-def report(outcome: Outcome, module: str, plan: Plan, console: Console) -> int:
+def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> int:
     """Print how it went; return 0 if the joint followed, else 1."""
     code = 1
     if outcome.trouble:
@@ -226,7 +226,7 @@ def _give_limits_back(robot: RobotConfig, args: argparse.Namespace, console: Con
         )
 
 
-def _introduce(robot: RobotConfig, module: str, plan: Plan, console: Console) -> None:
+def _introduce(robot: RobotConfig, module: str, plan: JogPlan, console: Console) -> None:
     """Say what is going to happen."""
     console.print(
         f"{module} {AXES[plan.axis]}: {plan.by:+g} rad and back, {plan.cycles} times in "

@@ -7,7 +7,7 @@ import signal
 from typing import Final
 
 from shared.joints import MODULES
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 SIGNALS: Final = {
@@ -39,7 +39,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Send the signal."""
-    fleet = Fleet.attach(args.run_dir)
+    fleet = SupervisedFleet.attach(args.run_dir)
     if args.signal in ("KILL", "TERM") and args.service in MODULES:
         fleet.forget(args.service)  # its next process is asked for: it may arm the drive
     pid = fleet.kill(args.service, SIGNALS[args.signal])

@@ -52,11 +52,11 @@ class Group(Section, frozen=True):
     tests: tuple[str, ...]
 
 
-class Change(Section, frozen=True, order=True):
+class Mutation(Section, frozen=True, order=True):
     """What a mutant is."""
 
     function: str
-    """As mutmut names it, such as `services.joint.gate.x_gate`."""
+    """As mutmut names it, such as `services.joint.torque_limiter.x_gate`."""
     was: str
     """The lines of code, stripped and joined by a space."""
     becomes: str
@@ -66,7 +66,7 @@ class Reason(Section, frozen=True):
     """Why some mutants may live."""
 
     why: Annotated[str, msgspec.Meta(min_length=20)]
-    lives: tuple[Change, ...]
+    lives: tuple[Mutation, ...]
 
 
 class MutantsFile(Section, frozen=True):
@@ -76,12 +76,12 @@ class MutantsFile(Section, frozen=True):
     reason: tuple[Reason, ...] = ()
 
 
-class Found(NamedTuple):
+class GroupResult(NamedTuple):
     """What became of a group."""
 
     counts: Counter[str]
     """Mutants by mutmut's word for what became of them."""
-    alive: list[tuple[str, Change]]
+    alive: list[tuple[str, Mutation]]
     """Names and changes of those that live."""
 
 
@@ -126,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(group: Group, args: argparse.Namespace, console: Console) -> Found:
+def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResult:
     """Run one group."""
     folder = args.out.resolve() / group.name
     patterns = [args.only] if args.only else [SAMPLE] if args.sample else []
@@ -145,7 +145,7 @@ def _run(group: Group, args: argparse.Namespace, console: Console) -> Found:
         for name, status in ran
         if status not in DEAD
     ]
-    return Found(Counter(status for _, status in ran), alive)
+    return GroupResult(Counter(status for _, status in ran), alive)
 
 
 def _prepare(group: Group, folder: Path) -> None:
@@ -224,22 +224,22 @@ def _statuses(folder: Path) -> list[tuple[str, str]]:
     return [(name, status) for name, _, status in pairs]
 
 
-def change_of(name: str, shown: str) -> Change:
+def change_of(name: str, shown: str) -> Mutation:
     """Return what a mutant changes.
 
     Args:
-        name: mutmut's, such as `services.joint.gate.x_gate__mutmut_3`.
+        name: mutmut's, such as `services.joint.torque_limiter.x_gate__mutmut_3`.
         shown: its unified diff.
     """
     lines = [line for line in shown.splitlines() if not line.startswith(("---", "+++"))]
     was, becomes = (
         " ".join(line[1:].strip() for line in lines if line.startswith(sign)) for sign in "-+"
     )
-    return Change(name.rpartition("__mutmut_")[0], was, becomes)
+    return Mutation(name.rpartition("__mutmut_")[0], was, becomes)
 
 
 def _judge(
-    groups: Sequence[Found], told: MutantsFile, args: argparse.Namespace, console: Console
+    groups: Sequence[GroupResult], told: MutantsFile, args: argparse.Namespace, console: Console
 ) -> int:
     """Print the score and who lives; return the exit code."""
     counts = sum((found.counts for found in groups), Counter[str]())

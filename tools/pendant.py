@@ -10,7 +10,7 @@ from typing import Final
 
 from rich.console import Console
 
-from services.joint.will import Pendant
+from services.joint.rearm_guard import Pendant
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.process import StopFlag

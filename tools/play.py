@@ -27,7 +27,7 @@ from tools.playback.keyboard import Keyboard, Press
 from tools.playback.player import Player
 from tools.playback.reading import Recording
 from tools.playback.schedule import Playhead, Schedule, Window, window
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_verb
 
 _POLL_S: Final = 0.01
@@ -64,7 +64,9 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         stack.callback(_leave_no_directory, args.run_dir, made=not args.run_dir.exists())
         acting = [] if prefix else guard.those_of(guard.ACTED_ON, targets.values())
-        watch = stack.enter_context(guard.Watch(bus.robot, args.run_dir)) if acting else None
+        watch = (
+            stack.enter_context(guard.LiveRobotWatch(bus.robot, args.run_dir)) if acting else None
+        )
         if watch is not None:
             targets = _permitted(targets, watch, console, force=args.force)
         schedule = schedule_of(recording, targets, part, loop=args.loop)
@@ -106,7 +108,7 @@ def bus_of(recording: Recording, args: argparse.Namespace) -> Bus:
     if args.config is not None:
         return Bus(config_file.load_without_schedule(args.config), "")
     with contextlib.suppress(FleetError):
-        fleet = Fleet.attach(args.run_dir)
+        fleet = SupervisedFleet.attach(args.run_dir)
         return Bus(config_file.load_without_schedule(Path(fleet.manifest.config)), "")
     why = "the log holds no robot file"
     if recording.robot_file is not None:
@@ -139,19 +141,19 @@ def schedule_of(
 
 
 def _permitted(
-    targets: dict[str, str], watch: guard.Watch, console: Console, *, force: bool
+    targets: dict[str, str], watch: guard.LiveRobotWatch, console: Console, *, force: bool
 ) -> dict[str, str]:
     live = watch.look()
     left = guard.allowed(targets, live, force=force)
     out = [target for key, target in targets.items() if key not in left]
     if out:
-        words = f"{live}: left out even with --force: {guard.in_words(out)}"
+        words = f"{live}: left out even with --force: {guard.describe(out)}"
         console.print(escape(words), style="yellow", soft_wrap=True)
     return left
 
 
 def _alarm(
-    watch: guard.Watch | None, targets: dict[str, str], args: argparse.Namespace
+    watch: guard.LiveRobotWatch | None, targets: dict[str, str], args: argparse.Namespace
 ) -> Callable[[], None]:
     """Return what ends a play onto live keys when a joint service comes up meanwhile."""
     rows = guard.IN_THE_LOOP if args.force else guard.ACTED_ON
@@ -159,7 +161,7 @@ def _alarm(
 
     def look() -> None:
         if watch is not None and refused and (heard := watch.heard()):
-            raise FleetError(f"stopped: {heard}, and it acts on {guard.in_words(refused)}")
+            raise FleetError(f"stopped: {heard}, and it acts on {guard.describe(refused)}")
 
     return look
 

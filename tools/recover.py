@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from services.recorder import recovery
+from services.recorder import recover
 from services.recorder.files import in_use, recovered_name
-from services.recorder.salvage import opened
+from services.recorder.reader import opened
 from shared.exceptions import RunError
 from tools.info import plain
 from tools.logs.files import Metadata, head_of
@@ -51,9 +51,9 @@ def run(args: argparse.Namespace) -> int:
         raise RunError(f"{out}: exists already; remove it, give another with -o, or --force")
     if _in_use(path):
         console.print("a recorder is writing this file: what follows is not in the copy")
-    outcome = recovery.recover(path, out)
+    outcome = recover.recover(path, out)
     console.print(f"[bold]{plain(str(out))}[/]: a finished file", soft_wrap=True)
-    for line in recovery.in_words(outcome):
+    for line in recover.describe(outcome):
         console.print(f"  {line}", soft_wrap=True)
     flush_ms = _head(path).get("recorder", {}).get("flush_ms", "")
     if not outcome.finished and flush_ms:

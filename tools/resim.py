@@ -21,7 +21,7 @@ from shared.messages import JointEvent, JointState, Message, PlannerStatus
 from tools.reexecution import rewritten
 from tools.reexecution.compare import size
 from tools.reexecution.joint import JointExecution
-from tools.reexecution.outcome import Outcome
+from tools.reexecution.outcome import ReexecutionResult
 from tools.reexecution.params import with_params
 from tools.reexecution.planner import PlannerExecution
 from tools.runs.recorded_robot import robot_of
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         task = progress.add_task("executing again", total=len(names))
         for name in names:
             progress.update(task, description=f"executing {name}")
-            outcome = Outcome(name, args.tolerance, exact=not args.param)
+            outcome = ReexecutionResult(name, args.tolerance, exact=not args.param)
             for key, message in execute(log, robot, name, outcome):
                 if args.param:
                     recomputed.setdefault(key, []).append(message)
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def execute(
-    log: RunLog, robot: RobotConfig, name: str, outcome: Outcome
+    log: RunLog, robot: RobotConfig, name: str, outcome: ReexecutionResult
 ) -> Iterator[tuple[str, Message]]:
     """Execute a service; yield what comes out, with its full key."""
     if name == "planner":
@@ -141,7 +141,7 @@ def execute(
             yield topics.JOINT_EVENT.key(log.robot, name), message
 
 
-def summary(outcomes: list[Outcome]) -> Table:
+def summary(outcomes: list[ReexecutionResult]) -> Table:
     """Return the counts as a table."""
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("service", "ticks", "not executed", "messages compared", "result"):
@@ -164,7 +164,7 @@ def summary(outcomes: list[Outcome]) -> Table:
     return table
 
 
-def tell(outcome: Outcome, log: RunLog, console: Console, *, changed: bool) -> None:
+def tell(outcome: ReexecutionResult, log: RunLog, console: Console, *, changed: bool) -> None:
     """Print the first difference of a service, and with a changed parameter the largest."""
     first = outcome.comparison.first
     if outcome.lost_inputs:
@@ -175,7 +175,7 @@ def tell(outcome: Outcome, log: RunLog, console: Console, *, changed: bool) -> N
     if first is None:
         return
     at_s = (first.t_ns - log.began_ns()) / 1e9
-    console.print(f"[bold]{outcome.service}[/], first at {at_s:.3f} s: {first.in_words()}")
+    console.print(f"[bold]{outcome.service}[/], first at {at_s:.3f} s: {first.describe()}")
     if not changed:
         return
     table = Table(title="largest changes", title_justify="left", box=box.SIMPLE_HEAD)

@@ -109,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
     true_plant = plant_from(args.plant)
     network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
     out = experiment.make_out(args.out, "sim")
-    console.print(f"[bold]{story.name}[/]: {story.about}{experiment.in_words(story)}")
+    console.print(f"[bold]{story.name}[/]: {story.about}{experiment.describe(story)}")
     begin = time.monotonic()
     simulated_s = simulate(robot, story, network, args.seed, out, console, args.control, true_plant)
     factor = simulated_s / (time.monotonic() - begin)

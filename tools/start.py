@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 
@@ -24,6 +24,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start it."""
-    Fleet.attach(args.run_dir).start_service(args.service)
+    SupervisedFleet.attach(args.run_dir).start_service(args.service)
     print(f"{args.service}: started; `xrl status` shows how it does")
     return 0

@@ -18,14 +18,14 @@ from shared.config_file import load
 from shared.messages import DriveStatus
 from tools.runs.fleet_status import (
     SILENT_INJECTOR,
-    Ear,
     FleetStatus,
     LeadStatus,
+    RateMonitor,
     ears_of,
     listen_for_all,
     look,
 )
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 _WORDS: Final = ("state", "last exit")
@@ -51,7 +51,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Look at the fleet once, or until interrupted."""
-    fleet = Fleet.attach(args.run_dir)
+    fleet = SupervisedFleet.attach(args.run_dir)
     with open_session(load(Path(fleet.manifest.config)), "status", fleet.run.path) as session:
         ears = ears_of(session, fleet.manifest.topics)
         listen_for_all(ears)
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def lead_in_words(lead: LeadStatus | None) -> str:
+def describe_lead(lead: LeadStatus | None) -> str:
     """Return one line on the planner."""
     if lead is None:
         return "planner not heard: each module holds by itself"
@@ -113,7 +113,7 @@ def tables(status: FleetStatus) -> Group:
         modules.add_column(heading, no_wrap=heading != "way out")
     for name, module in status.modules.items():
         mode = module.mode or "not heard"
-        if module.braced:
+        if module.stiffened:
             mode = f"{mode}, braced"
         drive = module.drive or "-"
         angles = ("-", "-") if module.q is None else (f"{a:+.3f}" for a in module.q)
@@ -129,13 +129,13 @@ def tables(status: FleetStatus) -> Group:
     way_out = "kill injector" if SILENT_INJECTOR in status.network else "inject --clear"
     said = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
     slow = f" in slow motion: the fleet's clock goes at {status.pace:g} of real time"
-    lines = [f" {lead_in_words(status.lead)}"]
+    lines = [f" {describe_lead(status.lead)}"]
     lines += [slow] if status.pace != 1.0 else []
     lines += [said] if status.network else []
     return Group(services, modules, *lines)
 
 
-def _watch(fleet: Fleet, ears: Mapping[str, Ear]) -> None:
+def _watch(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> None:
     with Live(tables(look(fleet, ears)), console=Console(), auto_refresh=False) as live:
         while True:
             live.update(tables(look(fleet, ears)), refresh=True)

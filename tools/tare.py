@@ -17,7 +17,7 @@ from shared.clock import now_ns
 from shared.config_file import load
 from shared.exceptions import FleetError
 from shared.messages import Tare, TareRequest, Wrench
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 LOADED_N: Final = 30.0
@@ -29,7 +29,7 @@ HEARD_S: Final = 3.0
 GIVE_UP_S: Final = 10.0
 
 
-class Requests(Protocol):
+class TareClient(Protocol):
     """The way to the harness service."""
 
     def put(self, message: TareRequest) -> bool:
@@ -63,18 +63,18 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Ask for it, and wait until the wrench is valid again."""
-    fleet = Fleet.attach(args.run_dir)
+    fleet = SupervisedFleet.attach(args.run_dir)
     robot = load(Path(fleet.manifest.config))
     with open_session(robot, "tare", args.run_dir) as session:
         requests = session.publisher(topics.HARNESS_TARE, TareRequest)
         wrenches = session.latest(topics.WRENCH, Wrench)
         before = tare(requests, wrenches, anyway=args.anyway)
-    read = in_words(before) if before.valid else "nothing valid"
+    read = describe(before) if before.valid else "nothing valid"
     Console().print(f"the harness is tared: what it reads now is zero; before it read {read}")
     return 0
 
 
-def tare(requests: Requests, wrenches: Wrenches, *, anyway: bool) -> Wrench:
+def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
     """Ask until the tare has begun, and wait until it is done.
 
     Args:
@@ -91,7 +91,7 @@ def tare(requests: Requests, wrenches: Wrenches, *, anyway: bool) -> Wrench:
     before = newest = _first(wrenches)
     if before.valid and math.hypot(*before.force) > LOADED_N and not anyway:
         raise FleetError(
-            f"the harness reads {in_words(before)}: let go of it, and again; "
+            f"the harness reads {describe(before)}: let go of it, and again; "
             "or --anyway, if nobody holds it and the sensor has drifted"
         )
     source = f"xrl tare by {getpass.getuser()}"
@@ -110,7 +110,7 @@ def tare(requests: Requests, wrenches: Wrenches, *, anyway: bool) -> Wrench:
     raise FleetError(f"no zero after {GIVE_UP_S:g} s: {_why_not(newest, begun=begun)}")
 
 
-def in_words(wrench: Wrench) -> str:
+def describe(wrench: Wrench) -> str:
     """Return a wrench's size."""
     return f"{math.hypot(*wrench.force):.1f} N, {math.hypot(*wrench.moment):.1f} N m"
 

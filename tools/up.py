@@ -13,7 +13,7 @@ from shared.joints import MODULES
 from tools.runs.experiment import add_plant, make_out, scenario_file
 from tools.supervision.fleet import check_known, load_table
 from tools.supervision.pace import add_pace
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
 
 SETTLE_S = 3.0
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if services is None or "recorder" in services:
         make_out(out, "up")
     asleep = args.no_planner and (services is None or "planner" in services)
-    fleet = Fleet.start(
+    fleet = SupervisedFleet.start(
         args.config,
         args.run_dir,
         overrides=overrides,

@@ -19,7 +19,7 @@ from shared.scenario import Scenario
 from shared.toml_file import parse_toml
 from tools.counterfactual import picture
 from tools.counterfactual.moments import moments_of
-from tools.counterfactual.run import Fate, Task, fate_of
+from tools.counterfactual.run import Counterfactual, Task, counterfactual_of
 from tools.runs.experiment import PLANT_FILE
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     kill = tuple(dict.fromkeys(args.kill))
     true_plant = plant_of(log)
     tasks = [Task(robot, story, true_plant, moment, kill, args.for_s) for moment in moments]
-    fates: list[Fate] = []
+    counterfactuals: list[Counterfactual] = []
     bar = Progress(
         TextColumn("{task.fields[fell]}"), BarColumn(), MofNCompleteColumn(),
         TimeRemainingColumn(), console=console, transient=True,
@@ -86,24 +86,26 @@ def run(args: argparse.Namespace) -> int:
     with bar as progress:
         shown = progress.add_task("", total=len(tasks), fell="0 fell")
         for _, fate in results(
-            fate_of, tasks, args.workers, lambda task: f"{task.moment.at_s:g} s"
+            counterfactual_of, tasks, args.workers, lambda task: f"{task.moment.at_s:g} s"
         ):
-            fates.append(fate)
-            fell = sum(not one.stood for one in fates)
+            counterfactuals.append(fate)
+            fell = sum(not one.stood for one in counterfactuals)
             progress.update(shown, advance=1, fell=f"{fell} fell")
-    fates.sort(key=lambda one: one.at_s)
+    counterfactuals.sort(key=lambda one: one.at_s)
     out = args.out or log.files[0].parent
     out.mkdir(parents=True, exist_ok=True)
     names = " and ".join(kill)
     (out / "whatif.json").write_bytes(
         msgspec.json.format(
-            msgspec.json.encode({"kill": kill, "for_s": args.for_s, "fates": fates})
+            msgspec.json.encode({"kill": kill, "for_s": args.for_s, "fates": counterfactuals})
         )
     )
-    picture.draw(log, fates, f"{names} killed at each moment", args.every, out / "whatif.png")
-    show(fates, names, args.for_s, console)
+    picture.draw(
+        log, counterfactuals, f"{names} killed at each moment", args.every, out / "whatif.png"
+    )
+    show(counterfactuals, names, args.for_s, console)
     console.print(f"{out}/whatif.json, whatif.png", style="dim")
-    return 0 if all(one.stood for one in fates) else 1
+    return 0 if all(one.stood for one in counterfactuals) else 1
 
 
 def _name(task: Task) -> str:
@@ -136,19 +138,21 @@ def plant_of(log: RunLog) -> PlantConfig:
     return parse_toml(text.decode(), f"{log.path}: {PLANT_FILE}", PlantConfig)
 
 
-def show(fates: list[Fate], names: str, for_s: float, console: Console) -> None:
+def show(counterfactuals: list[Counterfactual], names: str, for_s: float, console: Console) -> None:
     """Print the strip and the worst moments."""
-    for begin in range(0, len(fates), WIDTH):
-        row = fates[begin : begin + WIDTH]
+    for begin in range(0, len(counterfactuals), WIDTH):
+        row = counterfactuals[begin : begin + WIDTH]
         strip = Text(f"{row[0].at_s:6.1f} s ")
         for one in row:
             strip.append("█", style="green" if one.stood else "red")
         console.print(strip)
-    fell = [one for one in fates if not one.stood]
-    worst = max(fates, key=lambda one: (not one.stood, max(one.com_x_max_mm, one.com_y_max_mm)))
+    fell = [one for one in counterfactuals if not one.stood]
+    worst = max(
+        counterfactuals, key=lambda one: (not one.stood, max(one.com_x_max_mm, one.com_y_max_mm))
+    )
     console.print(
-        f"{names} killed at {len(fates)} moments, each gone on with for {for_s:g} s: "
-        f"{len(fates) - len(fell)} stood, {len(fell)} fell"
+        f"{names} killed at {len(counterfactuals)} moments, each gone on with for {for_s:g} s: "
+        f"{len(counterfactuals) - len(fell)} stood, {len(fell)} fell"
     )
     if fell:
         times = ", ".join(f"{one.at_s:.1f}" for one in fell[:20])

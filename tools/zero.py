@@ -26,8 +26,8 @@ from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
 from shared.messages import JointState, Mode, Pair
 from tools.bringup import bench
-from tools.bringup.zeroing import Look, is_right, look, outside, refusal, zero
-from tools.supervision.supervise import Fleet
+from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, zero
+from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_config, add_run_dir, add_verb
 
 DEGREES_FROM: Final = 7.0
@@ -134,7 +134,7 @@ def _if_degrees(q: Pair) -> str:
     return f"; if these are degrees: --at {phi:.4g},{theta:.4g}"
 
 
-def refuse_services(robot: RobotConfig, holders: Mapping[str, Fleet | None]) -> None:
+def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | None]) -> None:
     """Refuse where a joint service has the drive's USB, or is not DISARMED.
 
     Raises:
@@ -161,7 +161,7 @@ def refuse_services(robot: RobotConfig, holders: Mapping[str, Fleet | None]) -> 
                 raise FleetError(f"{module}: {_way_out(module, Mode(state.mode))}")
 
 
-def plan_table(wanted: Mapping[str, Pair], before: Mapping[str, Look]) -> Table:
+def plan_table(wanted: Mapping[str, Pair], before: Mapping[str, DriveLook]) -> Table:
     """Return what is to be changed, for the terminal."""
     table = _table("before, rad", "after, rad", "change, rad")
     for module, q in wanted.items():
@@ -196,7 +196,7 @@ def _set_all(
     return code
 
 
-def _look_all(robot: RobotConfig, drives: Mapping[str, Drive]) -> dict[str, Look]:
+def _look_all(robot: RobotConfig, drives: Mapping[str, Drive]) -> dict[str, DriveLook]:
     """Look at every drive.
 
     Raises:
@@ -219,7 +219,7 @@ def _open(robot: RobotConfig, module: str, run_dir: Path, stack: contextlib.Exit
 
 
 def _warn(
-    wanted: Mapping[str, Pair], holders: Mapping[str, Fleet | None], console: Console
+    wanted: Mapping[str, Pair], holders: Mapping[str, SupervisedFleet | None], console: Console
 ) -> None:
     """Say what comes by itself once a drive is zeroed."""
     armed = [module for module in wanted if holders[module] is not None]
@@ -230,7 +230,9 @@ def _warn(
         )
 
 
-def _states(robot: RobotConfig, fleet: Fleet, modules: list[str]) -> dict[str, JointState]:
+def _states(
+    robot: RobotConfig, fleet: SupervisedFleet, modules: list[str]
+) -> dict[str, JointState]:
     """Return a state of each of a fleet's modules that is heard."""
     heard: dict[str, JointState] = {}
     with open_session(robot, "zero", fleet.run.path) as session:

@@ -68,7 +68,7 @@ class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     """Samples that were not finite."""
 
 
-class Reading(msgspec.Struct, frozen=True, gc=False, kw_only=True):
+class FilteredWrench(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     """What the filter says at one moment."""
 
     wrench: Array
@@ -126,14 +126,14 @@ class WrenchFilter:
 
     def step(
         self, state: FilterState, now_ns: int, sample: LegSample | None
-    ) -> tuple[FilterState, Reading]:
+    ) -> tuple[FilterState, FilteredWrench]:
         """Take the newest sample, or None if there is none, and say what holds now."""
         if sample is not None:
             state = self._take(state, sample)
         seen = state.sample_t_ns != NEVER_NS
         age_ns = now_ns - state.sample_t_ns if seen else -1
         fresh = 0 <= age_ns <= self._stale_ns
-        reading = Reading(
+        reading = FilteredWrench(
             wrench=state.wrench,
             valid=fresh and not state.saturated and state.tare is Tare.DONE,
             saturated=state.saturated,

@@ -10,14 +10,14 @@ from services.harness.sensor import HarnessSensor
 from shared.messages import TareRequest, Wrench
 
 
-class Publisher(Protocol):
+class WrenchPublisher(Protocol):
     """Where the wrench goes."""
 
     def put(self, message: Wrench) -> bool:
         """Send without waiting; False if it could not be sent."""
 
 
-class Requests(Protocol):
+class TareRequests(Protocol):
     """Where requests for a tare come from."""
 
     def take(self) -> TareRequest | None:
@@ -31,8 +31,8 @@ class HarnessLoop:
         self,
         sensor: HarnessSensor,
         law: WrenchFilter,
-        publisher: Publisher,
-        requests: Requests,
+        publisher: WrenchPublisher,
+        requests: TareRequests,
     ) -> None:
         """Begin with a tare."""
         self.state: FilterState = wrench_filter.initial_state()

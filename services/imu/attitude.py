@@ -25,7 +25,7 @@ Rotation = tuple[Vector3, Vector3, Vector3]
 """Rows."""
 
 
-class Reading(NamedTuple):
+class AttitudeReading(NamedTuple):
     """What is known at one moment."""
 
     up: Vector3
@@ -53,7 +53,7 @@ class AttitudeLaw:
         self._knows = False
         self._sample_ns: int | None = None
 
-    def step(self, now_ns: int, sample: ImuSample | None) -> Reading:
+    def step(self, now_ns: int, sample: ImuSample | None) -> AttitudeReading:
         """Take the newest sample, or None if there is none, and say what holds now."""
         if sample is not None and not _is_unit(sample.quaternion):
             self.refused += 1
@@ -65,10 +65,10 @@ class AttitudeLaw:
                 self._up = _turned(self._mounting, up_in_sensor(sample.quaternion))
                 self._rate = _turned(self._mounting, sample.rate)
         if self._sample_ns is None:
-            return Reading(self._up, self._rate, valid=False, age_ns=-1)
+            return AttitudeReading(self._up, self._rate, valid=False, age_ns=-1)
         age_ns = now_ns - self._sample_ns
         fresh = age_ns <= self._stale_ns
-        return Reading(self._up, self._rate, fresh and self._knows, age_ns)
+        return AttitudeReading(self._up, self._rate, fresh and self._knows, age_ns)
 
 
 def up_in_sensor(quaternion: Vector4) -> Vector3:

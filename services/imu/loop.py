@@ -19,7 +19,7 @@ class ImuSensor(Protocol):
         """
 
 
-class Publisher(Protocol):
+class AttitudePublisher(Protocol):
     """Where attitudes go."""
 
     def put(self, message: Attitude) -> bool:
@@ -29,7 +29,7 @@ class Publisher(Protocol):
 class ImuLoop:
     """One cycle of the service, on whatever clock it is called with."""
 
-    def __init__(self, sensor: ImuSensor, law: AttitudeLaw, publisher: Publisher) -> None:
+    def __init__(self, sensor: ImuSensor, law: AttitudeLaw, publisher: AttitudePublisher) -> None:
         self.cycles = 0
         self.skipped = 0
         """Deadlines that were missed and not made up for."""

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.injector.control import Control
-from services.injector.listener import Listener
+from services.injector.commands import Orders
+from services.injector.control import ControlSocket
+from services.injector.event_loop import SocketWatch
+from services.injector.listener import SocketListener
 from services.injector.loop import run
-from services.injector.orders import Orders
-from services.injector.place import Place, address_of
+from services.injector.proxy_endpoint import Place, address_of
 from services.injector.relay import Relay
-from services.injector.watch import Watch
 from shared import bus, log, process, topics
 from shared.clock import NS_PER_MS, now_ns
 from shared.config import RobotConfig, expand
 from shared.config_file import load
 from shared.impairment import Direction
-from shared.injections import Injections
+from shared.impairment_schedule import ImpairmentSchedule
 from shared.injector_protocol import SOCKET
 from shared.links import DIRECTIONS, PAIRS, Pair, endpoint_through
 from shared.priority import raise_priority
@@ -41,12 +41,14 @@ def main() -> int:
     granted = raise_priority(FIFO_PRIORITY)
     directions = {name: Direction(name, arguments.seed) for name in DIRECTIONS}
     places = [_place(pair, config, arguments.run_dir) for pair in PAIRS]
-    watch = Watch()
+    watch = SocketWatch()
     relay = Relay(places, directions, watch, round(config.bus.lease_ms * NS_PER_MS))
     with bus.open_session(config, "injector", arguments.run_dir) as session:
-        injections = Injections(directions, session.publisher(topics.LINK_EVENT, LinkEvent).put)
+        injections = ImpairmentSchedule(
+            directions, session.publisher(topics.LINK_EVENT, LinkEvent).put
+        )
         orders = Orders(injections)
-        control = Control(arguments.run_dir / SOCKET, orders.obey, watch)
+        control = ControlSocket(arguments.run_dir / SOCKET, orders.obey, watch)
         logger.info("between %d pairs, priority %s", len(places), granted)
         process.freeze_garbage()
         try:
@@ -71,8 +73,8 @@ def _place(pair: Pair, config: RobotConfig, run_dir: Path) -> Place:
         BusError: it is not possible there.
     """
     path = Path(expand(endpoint_through(pair), run_dir).removeprefix(_UNIX))
-    beyond = address_of(expand(config.bus.endpoints[pair.listens], run_dir))
-    return Place(pair, Listener(path), beyond)
+    beyond = address_of(expand(config.bus.endpoints[pair.flushing], run_dir))
+    return Place(pair, SocketListener(path), beyond)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@ import socket
 from collections.abc import Callable
 from functools import partial
 
-from services.injector.flow import Flow, Waiting
-from services.injector.watch import READ, WRITE, Ready, Watch
+from services.injector.direction import Flow, Waiting
+from services.injector.event_loop import READ, WRITE, Ready, SocketWatch
 from shared.impairment import Direction
 
 
@@ -18,7 +18,7 @@ class Connection:
         self,
         ends: tuple[socket.socket, socket.socket],
         directions: tuple[Direction, Direction],
-        watch: Watch,
+        watch: SocketWatch,
         taken: Callable[[Connection, Flow, list[Waiting], int], None],
     ) -> None:
         """Begin to watch both ends.

@@ -10,8 +10,8 @@ from typing import Final
 
 import msgspec
 
-from services.injector.listener import Listener
-from services.injector.watch import READ, WRITE, Watch
+from services.injector.event_loop import READ, WRITE, SocketWatch
+from services.injector.listener import SocketListener
 from shared.injector_protocol import LINE_MAX, Reply, Request
 
 ASKERS_MAX: Final = 16
@@ -60,10 +60,10 @@ class _Asker:
         del self.answer[:sent]
 
 
-class Control:
+class ControlSocket:
     """A UNIX socket that takes one request a line."""
 
-    def __init__(self, path: Path, obey: Callable[[Request], Reply], watch: Watch) -> None:
+    def __init__(self, path: Path, obey: Callable[[Request], Reply], watch: SocketWatch) -> None:
         """Listen.
 
         Args:
@@ -76,7 +76,7 @@ class Control:
         """
         self._obey, self._watch = obey, watch
         self._askers: list[_Asker] = []
-        self._listener = Listener(path)
+        self._listener = SocketListener(path)
         watch.want(self._listener.socket, READ, self._dialled)
 
     def close(self) -> None:

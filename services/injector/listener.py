@@ -11,7 +11,7 @@ from pathlib import Path
 from shared.exceptions import BusError
 
 
-class Listener:
+class SocketListener:
     """Accepts without ever waiting."""
 
     def __init__(self, path: Path) -> None:

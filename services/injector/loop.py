@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from services.injector.orders import Orders
+from services.injector.commands import Orders
+from services.injector.event_loop import SocketWatch
 from services.injector.relay import Relay
-from services.injector.watch import Watch
 from shared.clock import NS_PER_S, machine_s, now_ns
-from shared.injections import Injections
+from shared.impairment_schedule import ImpairmentSchedule
 from shared.process import StopFlag
 
 LOOK_S: Final = 0.02
@@ -16,7 +16,9 @@ LOOK_S: Final = 0.02
 recorder, which listens for 0.1 s after its own stop."""
 
 
-def run(watch: Watch, relay: Relay, orders: Orders, injections: Injections, stop: StopFlag) -> None:
+def run(
+    watch: SocketWatch, relay: Relay, orders: Orders, injections: ImpairmentSchedule, stop: StopFlag
+) -> None:
     """Run until `stop`."""
     while not stop:
         ready = watch.wait(_patience_s(relay, injections))
@@ -30,7 +32,7 @@ def run(watch: Watch, relay: Relay, orders: Orders, injections: Injections, stop
             relay.release(at_ns)
 
 
-def _patience_s(relay: Relay, injections: Injections) -> float:
+def _patience_s(relay: Relay, injections: ImpairmentSchedule) -> float:
     """Return how long there is nothing to do."""
     at_ns = now_ns()
     due_ns = relay.next_ns()

@@ -9,9 +9,9 @@ from itertools import count
 from typing import Final, NamedTuple
 
 from services.injector.connection import Connection
-from services.injector.flow import Flow, Waiting
-from services.injector.place import Place
-from services.injector.watch import READ, Watch
+from services.injector.direction import Flow, Waiting
+from services.injector.event_loop import READ, SocketWatch
+from services.injector.proxy_endpoint import Place
 from shared.impairment import Direction
 
 LINKS_MAX: Final = 16
@@ -36,7 +36,7 @@ class Relay:
         self,
         places: Sequence[Place],
         directions: Mapping[str, Direction],
-        watch: Watch,
+        watch: SocketWatch,
         lease_ns: int,
     ) -> None:
         """Begin to listen.

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from services.joint.drive_manager import DriveManager
 from services.joint.drivers.base import Drive
 from services.joint.drivers.odrive_can import OdriveCan
 from services.joint.drivers.readonly import ReadOnly
 from services.joint.drivers.signed import Signed
 from services.joint.drivers.zeroed import Zeroed
-from services.joint.loop import JointLoop, Ports
-from services.joint.module import Module
+from services.joint.loop import JointLoop, JointPorts
 from services.joint.neighbours import Neighbours
-from services.joint.will import Will, WillFile
+from services.joint.rearm_guard import LastState, RearmGuard
 from shared import config_file, log, topics
 from shared.bus import open_session
 from shared.config import RobotConfig, expand
@@ -50,7 +50,7 @@ def main() -> int:
     stop = StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
     with open_session(robot, module, arguments.run_dir) as session:
-        ports = Ports(
+        ports = JointPorts(
             commands=session.latest(topics.JOINT_COMMAND, JointCommand, module),
             estops=session.latest(topics.ESTOP, Estop),
             states=session.publisher(topics.JOINT_STATE, JointState, module),
@@ -60,10 +60,12 @@ def main() -> int:
         drive = open_drive(robot, module, arguments.run_dir)
         if arguments.readonly:
             drive = ReadOnly(drive)
-        will = None if arguments.readonly else WillFile(arguments.run_dir, module)
-        left = Will.NOTHING if will is None else will.read()
+        last_state = None if arguments.readonly else RearmGuard(arguments.run_dir, module)
+        left = LastState.NOTHING if last_state is None else last_state.read()
         neighbours = None if arguments.readonly else Neighbours(arguments.run_dir, module)
-        loop = JointLoop(robot, Module(robot, module, left), drive, ports, will, neighbours)
+        loop = JointLoop(
+            robot, DriveManager(robot, module, left), drive, ports, last_state, neighbours
+        )
         logger.info("up, %s%s", granted, ", read-only" if arguments.readonly else "")
         freeze_garbage()
         loop.run(stop)

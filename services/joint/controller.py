@@ -10,18 +10,18 @@ from typing import NamedTuple
 
 import msgspec
 
-from services.joint import law
+from services.joint import pd_law
 from services.joint.differential import joint_torque
 from services.joint.drivers.base import DriveReading
 from services.joint.envelope import Envelope
 from services.joint.failsafe import Event, Failsafe, timing_of
-from services.joint.gate import diamond, gate, limits_of
-from services.joint.law import Setpoint
-from services.joint.memory import ControllerMemory
-from services.joint.neighbours import NOTHING, Near, Row
-from services.joint.samples import Samples
+from services.joint.joint_estimate import JointEstimate
+from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
+from services.joint.pd_law import Setpoint
 from services.joint.sinking import Sinking
-from services.joint.trips import Trips
+from services.joint.snapshots import ControllerState
+from services.joint.torque_limiter import limit_differential, limit_torque, limits_of
+from services.joint.trips import JointTrips
 from services.joint.trips import limits_of as trip_limits_of
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
@@ -49,7 +49,7 @@ class JointController:
         self._envelope = Envelope(config, module)
         self._hold_torque = config.envelope.hold_torque
         self._limits = limits_of(config, module)
-        self._trips, self._trip_limits = Trips(), trip_limits_of(config)
+        self._trips, self._trip_limits = JointTrips(), trip_limits_of(config)
         self._stand_k_p, self._stand_k_d = stand.k_p, stand.k_d
         self._support_k_p, self._support_k_d = config.support_gains(module)
         self._sinking = Sinking(config, module)
@@ -59,22 +59,24 @@ class JointController:
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
         self._blend_ns = service.blend_ms * NS_PER_MS
         self._period_late_ns = round(2 * NS_PER_S / service.rate_hz)
-        self._anchor: Setpoint = law.stand(law.ZERO, self._stand_k_p, self._stand_k_d)
+        self._frozen_setpoint: Setpoint = pd_law.stand(
+            pd_law.ZERO, self._stand_k_p, self._stand_k_d
+        )
         """The setpoint at the last change of state: what HOLD holds and TRACK blends from."""
-        self._setpoint: Setpoint = self._anchor
+        self._setpoint: Setpoint = self._frozen_setpoint
         self._changed_ns = 0
         self._last_cycle_ns = 0
-        self._samples = Samples(config.joint.gear_ratio)
-        self._found_tau: Pair | None = None
+        self._samples = JointEstimate(config.joint.gear_ratio)
+        self._initial_torque: Pair | None = None
         """What a drive that was found armed carries, N m: it is taken over without a step."""
-        self._residual: Pair = law.ZERO
+        self._takeover_offset: Pair = pd_law.ZERO
         """What the drive carried beyond the law as the service went on after a gap, N m."""
         self._resumed_ns = 0
-        self._braced_ns = 0
+        self._stiffened_ns = 0
         """Since when it stiffens because another module may be limp; 0: it does not."""
-        self._near = NOTHING
+        self._near = UNKNOWN
         self._cause = 0
-        self.tau: Pair = law.ZERO
+        self.tau: Pair = pd_law.ZERO
         self.cycle = 0
         self.late = 0
         self._events = 0
@@ -87,8 +89,8 @@ class JointController:
         command: JointCommand | None,
         estop: bool,
         *,
-        listens: bool = False,
-        near: Near = NOTHING,
+        flushing: bool = False,
+        near: NeighbourView = UNKNOWN,
     ) -> CycleResult:
         """Run one cycle.
 
@@ -97,7 +99,7 @@ class JointController:
             reading: the drive's newest sample; None if none came in time.
             command: the newest command, if one came since the last cycle.
             estop: the emergency stop is engaged.
-            listens: the service was frozen, and what the link's buffer kept comes first: samples
+            flushing: the service was frozen, and what the link's buffer kept comes first: samples
                 may jump from where the joint was to where it is.
             near: what is known of the other modules on this host.
         """
@@ -106,10 +108,10 @@ class JointController:
         failsafe, samples = self.failsafe, self._samples
         drive = Event.NONE
         if reading is not None:
-            controlled = failsafe.mode is not Mode.DISARMED and not listens
+            controlled = failsafe.mode is not Mode.DISARMED and not flushing
             drive = samples.take(reading, armed=controlled)
             if reading.torque is not None:
-                self._found_tau = joint_torque(reading.torque, self._gear_ratio)
+                self._initial_torque = joint_torque(reading.torque, self._gear_ratio)
         if command is not None:
             tracked = failsafe.command if failsafe.mode is Mode.TRACK else None
             age_s = min(self._aging_max_s, (now_ns - command.echo_t_ns) / NS_PER_S)
@@ -128,15 +130,15 @@ class JointController:
             self._cause = int(cause)
             self._enter(now_ns, before)
         limp = near.stiffen and failsafe.mode in (Mode.HOLD, Mode.DAMP)
-        if not self._braced_ns and (limp or failsafe.asks_to_brace):
-            self._braced_ns = now_ns
+        if not self._stiffened_ns and (limp or failsafe.asks_to_stiffen):
+            self._stiffened_ns = now_ns
         self._setpoint = self._evaluate(now_ns)
         tau_before = self.tau
         if failsafe.mode in (Mode.DISARMED, Mode.FAULT):
-            self.tau = law.ZERO
+            self.tau = pd_law.ZERO
         else:
             wanted = self._wanted(now_ns)
-            self.tau = gate(wanted, samples.q, tau_before, self._limits)
+            self.tau = limit_torque(wanted, samples.q, tau_before, self._limits)
         event = None
         if cause is not None:
             event = self._event(now_ns, before, cause, tau_before)
@@ -153,14 +155,14 @@ class JointController:
             carried: joint torques (phi, theta) that the drive gives now, N m.
         """
         s = self._samples
-        wanted = law.torque(self._setpoint, s.q, s.v)
-        self._residual = (carried[0] - wanted[0], carried[1] - wanted[1])
+        wanted = pd_law.torque(self._setpoint, s.q, s.v)
+        self._takeover_offset = (carried[0] - wanted[0], carried[1] - wanted[1])
         self._resumed_ns = now_ns
-        self.tau = diamond(carried, self._limits.tau_module_max)
+        self.tau = limit_differential(carried, self._limits.tau_module_max)
         return self.tau
 
     @property
-    def samples(self) -> Samples:
+    def samples(self) -> JointEstimate:
         """What the drive's samples say of the joint."""
         return self._samples
 
@@ -205,46 +207,45 @@ class JointController:
             refused=failsafe.refused,
             drive=int(samples.status),
             drive_error=samples.error,
-            braced=self._braced_ns > 0,
+            stiffened=self._stiffened_ns > 0,
             outside=int(failsafe.disbelieves(now_ns, self.timing)),
         )
 
-    def remember(self) -> ControllerMemory:
-        """Return the memory as it is now; `recall` goes on from there."""
-        return ControllerMemory(
-            self.failsafe,
-            self._samples,
-            self._anchor,
-            self._setpoint,
-            self._changed_ns,
-            self._last_cycle_ns,
-            self._found_tau,
-            self._sinking.remember().stop,
-            self._cause,
-            self.tau,
-            self.cycle,
-            self.late,
-            self._events,
-            self._states,
-            self._residual,
-            self._resumed_ns,
-            self._braced_ns,
-            msgspec.structs.replace(self._trips),
-            self._sinking.remember(),
+    def snapshot(self) -> ControllerState:
+        """Return the memory as it is now; `restore` goes on from there."""
+        return ControllerState(
+            failsafe=self.failsafe,
+            samples=self._samples,
+            frozen_setpoint=self._frozen_setpoint,
+            setpoint=self._setpoint,
+            changed_ns=self._changed_ns,
+            last_cycle_ns=self._last_cycle_ns,
+            initial_torque=self._initial_torque,
+            cause=self._cause,
+            tau=self.tau,
+            cycle=self.cycle,
+            late=self.late,
+            events=self._events,
+            states=self._states,
+            takeover_offset=self._takeover_offset,
+            resumed_ns=self._resumed_ns,
+            stiffened_ns=self._stiffened_ns,
+            trips=msgspec.structs.replace(self._trips),
+            sinking=self._sinking.snapshot(),
         )
 
-    def recall(self, memory: ControllerMemory) -> None:
+    def restore(self, memory: ControllerState) -> None:
         """Go on from a memory."""
         m = memory
         self.failsafe = msgspec.structs.replace(m.failsafe)  # copies: these go on changing
         self._samples = msgspec.structs.replace(m.samples)
-        self._anchor, self._setpoint = m.anchor, m.setpoint
+        self._frozen_setpoint, self._setpoint = m.frozen_setpoint, m.setpoint
         self._changed_ns, self._last_cycle_ns = m.changed_ns, m.last_cycle_ns
-        self._found_tau, self._cause, self.tau = m.found_tau, m.cause, m.tau
-        self._sinking.recall(msgspec.structs.replace(m.sinking, stop=m.damp_stop))
+        self._initial_torque, self._cause, self.tau = m.initial_torque, m.cause, m.tau
+        self._sinking.restore(m.sinking)
         self.cycle, self.late, self._events, self._states = m.cycle, m.late, m.events, m.states
-        self._residual, self._resumed_ns = m.residual, m.resumed_ns
-        self._braced_ns = m.braced_ns
+        self._takeover_offset, self._resumed_ns = m.takeover_offset, m.resumed_ns
+        self._stiffened_ns = m.stiffened_ns
         self._trips = msgspec.structs.replace(m.trips)
 
     def inside_limits(self) -> bool:
@@ -254,14 +255,14 @@ class JointController:
 
     def _wanted(self, now_ns: int) -> Pair:
         """Return the law's torque, N m, and what is left of a gap's difference."""
-        wanted = law.torque(self._setpoint, self._samples.q, self._samples.v)
-        if self._residual == law.ZERO:
+        wanted = pd_law.torque(self._setpoint, self._samples.q, self._samples.v)
+        if self._takeover_offset == pd_law.ZERO:
             return wanted
         share = 1.0 - (now_ns - self._resumed_ns) / self._blend_ns
         if share <= 0.0:
-            self._residual = law.ZERO
+            self._takeover_offset = pd_law.ZERO
             return wanted
-        phi, theta = self._residual
+        phi, theta = self._takeover_offset
         return (wanted[0] + share * phi, wanted[1] + share * theta)
 
     def _count(self, now_ns: int) -> None:
@@ -274,25 +275,25 @@ class JointController:
         """Take the anchor of the new mode: what was in force until now, frozen."""
         self._changed_ns = now_ns
         if self.failsafe.mode is not Mode.DAMP:
-            self._braced_ns = 0
+            self._stiffened_ns = 0
         k_p, k_d = self._stand_k_p, self._stand_k_d
-        if before is Mode.DISARMED and self._found_tau is not None:
+        if before is Mode.DISARMED and self._initial_torque is not None:
             q, v = self._samples.q, self._samples.v
             command = self.failsafe.command
-            believed = self.failsafe.outside is Outside.NOTHING
-            if command is not None and believed and self.failsafe.usable(now_ns, self.timing):
+            accepted = self.failsafe.outside is Outside.NOTHING
+            if command is not None and accepted and self.failsafe.usable(now_ns, self.timing):
                 k_p, k_d = command.k_p, command.k_d  # as soft as the other five
-            self._anchor = law.taken_over(q, v, self._found_tau, k_p, k_d)
-            self.tau = self._found_tau  # what the gate takes for the last torque
+            self._frozen_setpoint = pd_law.take_over(q, v, self._initial_torque, k_p, k_d)
+            self.tau = self._initial_torque  # what the gate takes for the last torque
         elif before is Mode.DISARMED:
-            self._anchor = law.stand(self._samples.q, k_p, k_d)
+            self._frozen_setpoint = pd_law.stand(self._samples.q, k_p, k_d)
         elif self.failsafe.mode is Mode.DAMP:
-            self._anchor = self._sinking.begin(self._setpoint, self._samples.q)
+            self._frozen_setpoint = self._sinking.begin(self._setpoint, self._samples.q)
         elif self.failsafe.mode is Mode.HOLD:
             q, most = self._samples.q, self._hold_torque
-            self._anchor = law.near(self._setpoint, q, self._hold_k_p, most)
+            self._frozen_setpoint = pd_law.limit_stiffening(self._setpoint, q, self._hold_k_p, most)
         else:
-            self._anchor = self._setpoint
+            self._frozen_setpoint = self._setpoint
 
     def _evaluate(self, now_ns: int) -> Setpoint:
         """Return the setpoint of this instant."""
@@ -302,25 +303,25 @@ class JointController:
             command = self.failsafe.command
             assert command is not None  # noqa: S101 - TRACK is entered on fresh commands only
             age_s = (now_ns - command.echo_t_ns) / NS_PER_S
-            fresh = law.aged(command, min(age_s, self._aging_max_s))
+            fresh = pd_law.extrapolate(command, min(age_s, self._aging_max_s))
             if since_ns >= self._blend_ns:
                 return fresh
-            return law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
+            return pd_law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
         if mode is Mode.DAMP:
-            near = self._near._replace(stiffen=self._braced_ns > 0)
-            return self._sinking.law(self._anchor, since_ns, self._samples.q, near)
+            near = self._near._replace(stiffen=self._stiffened_ns > 0)
+            return self._sinking.law(self._frozen_setpoint, since_ns, self._samples.q, near)
         held = self._held(since_ns)
-        if self._braced_ns:
-            risen = min(1.0, (now_ns - self._braced_ns) / self._blend_ns)
-            return law.stiffened(held, self._support_k_p, self._support_k_d, risen)
+        if self._stiffened_ns:
+            risen = min(1.0, (now_ns - self._stiffened_ns) / self._blend_ns)
+            return pd_law.raise_gains(held, self._support_k_p, self._support_k_d, risen)
         return held
 
     def _held(self, since_ns: int) -> Setpoint:
         """Return HOLD's law: the anchor frozen; some gains rise to the stand gains."""
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._blend_ns)
-        frozen = law.held(self._anchor, moving)
-        return law.stiffened(frozen, self._hold_k_p, self._hold_k_d, risen)
+        frozen = pd_law.freeze(self._frozen_setpoint, moving)
+        return pd_law.raise_gains(frozen, self._hold_k_p, self._hold_k_d, risen)
 
     def _event(self, now_ns: int, before: Mode, cause: Cause, tau_before: Pair) -> JointEvent:
         self._events += 1
@@ -336,7 +337,9 @@ class JointController:
         )
 
 
-def row_of(controller: JointController) -> Row:
+def row_of(controller: JointController) -> NeighbourRow:
     """Return what the module's neighbours are told."""
     samples, mode = controller.samples, controller.failsafe.mode
-    return Row(samples.believed_ns, samples.q[1], samples.v[1], mode, int(controller.caught))
+    return NeighbourRow(
+        samples.accepted_ns, samples.q[1], samples.v[1], mode, int(controller.caught)
+    )

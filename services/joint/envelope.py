@@ -11,7 +11,7 @@ ready to track (`Failsafe.ready`), so no planner leads by such numbers.
 
 from __future__ import annotations
 
-from services.joint import law
+from services.joint import pd_law
 from shared.config import RobotConfig
 from shared.gain_table import Bounds, ModuleBounds
 from shared.joints import kind_of
@@ -90,7 +90,7 @@ class Envelope:
         if last is None or last.hold or last.session != c.session:
             return Outside.NOTHING
         most = self._step + self._rate * min(self._gap_s, max(0.0, 1e-9 * (c.t_ns - last.t_ns)))
-        (phi, theta), (last_phi, last_theta) = law.torque(c, q, v), law.torque(last, q, v)
+        (phi, theta), (last_phi, last_theta) = pd_law.torque(c, q, v), pd_law.torque(last, q, v)
         if not (abs(phi - last_phi) <= most and abs(theta - last_theta) <= most):
             return Outside.TORQUE_STEP
         return Outside.NOTHING

@@ -175,9 +175,9 @@ class Failsafe(msgspec.Struct):
         return refusal
 
     @property
-    def asks_to_brace(self) -> bool:
+    def asks_to_stiffen(self) -> bool:
         """True in HOLD if the newest command taken says that another module may be limp."""
-        return self.mode is Mode.HOLD and self.command is not None and self.command.brace
+        return self.mode is Mode.HOLD and self.command is not None and self.command.stiffen
 
     def age_ns(self, now_ns: int) -> int:
         """Return the age of the newest command taken, by this module's clock; -1 if none."""
@@ -238,7 +238,7 @@ class Failsafe(msgspec.Struct):
             event = trip
             self.fresh_since_ns = now_ns  # what tripped waits, as after a drop-out
         row = TRANSITIONS[self.mode].get(event)
-        self._remember_dropouts(now_ns, timing, event)
+        self._count_dropouts(now_ns, timing, event)
         if row is None:
             return None
         self.mode = row[0]
@@ -259,7 +259,7 @@ class Failsafe(msgspec.Struct):
             return Event.HOLD_ASKED
         return Event.READY if self.ready(now_ns, timing) else Event.NONE
 
-    def _remember_dropouts(self, now_ns: int, timing: Timing, event: Event) -> None:
+    def _count_dropouts(self, now_ns: int, timing: Timing, event: Event) -> None:
         if self.mode is Mode.TRACK and (event is Event.COMMAND_STALE or event in TRIPS):
             self.dropouts = min(self.dropouts + 1, timing.dropouts_max)
             self.steady_since_ns = now_ns

@@ -8,12 +8,18 @@ from typing import Final
 import msgspec
 
 from services.joint.controller import row_of
+from services.joint.drive_manager import (
+    ARM_TRIES,
+    ArmingInhibit,
+    DriveAction,
+    DriveCommand,
+    DriveManager,
+)
 from services.joint.drivers.base import Drive
-from services.joint.module import ARM_TRIES, Module, Obstacle, Order, Step
-from services.joint.neighbours import NOTHING, Neighbours
+from services.joint.neighbours import UNKNOWN, Neighbours
 from services.joint.pendant import PendantWatch
+from services.joint.rearm_guard import LastState, RearmGuard
 from services.joint.tracer import Tracer
-from services.joint.will import Will, WillFile
 from shared import log
 from shared.bus import Latest, Publisher
 from shared.clock import NS_PER_S, now_ns
@@ -30,18 +36,19 @@ TELL_EVERY_NS: Final = 10 * NS_PER_S
 """What keeps a drive from being armed is said so often."""
 
 _WHY_NOT: Final = {
-    Obstacle.UNZEROED: "the drive has had no power since it was zeroed, or never was, or its "
+    ArmingInhibit.UNZEROED: "the drive has had no power since it was zeroed, or never was, or its "
     "encoder is lost; hang the robot and tell it where it is with `xrl zero`",
-    Obstacle.OUTSIDE_LIMITS: "the joint is at phi {q[0]:.3f}, theta {q[1]:.3f} rad, outside its "
-    "limits; bring it inside, or correct the joint's zero",
-    Obstacle.LET_GO: "the drive held the robot and has let go while no service looked after it: "
-    "drive error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
-    Obstacle.WAITING: "the drive holds by its own loop, and is taken over once a planner is heard",
-    Obstacle.WILL_NOT: f"asked for {ARM_TRIES} times: drive error 0x{{error:x}}",
+    ArmingInhibit.OUTSIDE_LIMITS: "the joint is at phi {q[0]:.3f}, theta {q[1]:.3f} rad, outside "
+    "its limits; bring it inside, or correct the joint's zero",
+    ArmingInhibit.LET_GO: "the drive held the robot and lost torque while no service ran: drive "
+    "error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
+    ArmingInhibit.WAITING: "the drive holds by its own loop; it is taken over once a planner is "
+    "heard",
+    ArmingInhibit.WILL_NOT: f"asked for {ARM_TRIES} times: drive error 0x{{error:x}}",
 }
 
 
-class Ports(msgspec.Struct, frozen=True):
+class JointPorts(msgspec.Struct, frozen=True):
     """The bus ends of one joint service."""
 
     commands: Latest[JointCommand]
@@ -57,10 +64,10 @@ class JointLoop:
     def __init__(
         self,
         config: RobotConfig,
-        module: Module,
+        module: DriveManager,
         drive: Drive,
-        ports: Ports,
-        will: WillFile | None = None,
+        ports: JointPorts,
+        last_state: RearmGuard | None = None,
         neighbours: Neighbours | None = None,
     ) -> None:
         """Take the module's parts.
@@ -70,17 +77,17 @@ class JointLoop:
             module: what it does in a cycle.
             drive: its drive.
             ports: its ends of the bus.
-            will: where it leaves what its successor has to know, and hears of a stop.
+            last_state: where it leaves what its successor has to know, and hears of a stop.
             neighbours: what it shares with the other five on this host.
         """
         service = config.joint_service
-        self._will, self._neighbours = will, neighbours
+        self._last_state, self._neighbours = last_state, neighbours
         self._pendant = PendantWatch(service.pendant_ms)
         self._module = module
         self._drive = drive
         self._ports = ports
         self._tracer = Tracer(module)
-        self._told = Obstacle.NONE
+        self._told = ArmingInhibit.NONE
         self._tell_at_ns = 0
         self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._nowhere = (-config.drive.zero_mark_turns,) * 2
@@ -99,8 +106,8 @@ class JointLoop:
             self._ports.traces.put(rest)
         if stop.interrupted or not self._module.leaves_holding:
             self._drive.idle()
-        if stop.interrupted and self._will is not None:
-            self._will.write(Will.NOTHING)
+        if stop.interrupted and self._last_state is not None:
+            self._last_state.write(LastState.NOTHING)
 
     def cycle(self) -> None:
         """Run one cycle."""
@@ -109,9 +116,9 @@ class JointLoop:
         now = now_ns()
         estop = ports.estops.take() is not None or self._is_stopped_here(now)
         command = ports.commands.take()
-        near = NOTHING
-        if self._neighbours is not None and module.asks_near:
-            near = self._neighbours.near(now)
+        near = UNKNOWN
+        if self._neighbours is not None and module.needs_neighbours:
+            near = self._neighbours.view(now)
         step = module.step(now, reading, command, estop, near)
         self._write(step)
         controller = module.controller
@@ -121,37 +128,37 @@ class JointLoop:
             ports.states.put(controller.state(now))
         if step.event is not None:
             ports.events.put(step.event)
-        if self._will is not None:
-            self._will.write(module.will)
+        if self._last_state is not None:
+            self._last_state.write(module.last_state)
         trace = tracer.after(now, reading, command, estop, step, near)
         if trace is not None:
             ports.traces.put(trace)
-        if step.event is not None or step.obstacle is not Obstacle.NONE:
+        if step.event is not None or step.obstacle is not ArmingInhibit.NONE:
             self._tell(now, step)
 
     def _is_stopped_here(self, now: int) -> bool:
         """Return True if this host says so: someone on it, or a pendant that is silent."""
-        will = self._will
-        if will is None:
+        last_state = self._last_state
+        if last_state is None:
             return False
-        return self._pendant.is_lost(now, will.beats) or will.stop_asked
+        return self._pendant.is_lost(now, last_state.beats) or last_state.stop_asked
 
-    def _write(self, step: Step) -> None:
+    def _write(self, step: DriveAction) -> None:
         """Carry out the order of this cycle."""
         drive, order = self._drive, step.order
         if step.target is not None:
             drive.write(step.target)
-        elif order is Order.TORQUE:
+        elif order is DriveCommand.TORQUE:
             drive.write_torque(step.torque)
-        elif order is Order.ARM:
+        elif order is DriveCommand.ARM:
             drive.arm(onboard=self._module.onboard)
-        elif order is Order.IDLE:
+        elif order is DriveCommand.IDLE:
             drive.idle()
-        elif order is Order.FORGET_ZERO:
+        elif order is DriveCommand.FORGET_ZERO:
             with suppress(DriveError):  # it is gone: no zero is left to be forgotten
                 drive.set_position(self._nowhere)
 
-    def _tell(self, now: int, step: Step) -> None:
+    def _tell(self, now: int, step: DriveAction) -> None:
         """Log what a person has to know; nothing is controlled then, and a line does no harm."""
         samples = self._module.controller.samples
         if step.event is not None and step.event.cause == Cause.ESTOP and self._pendant.lost:
@@ -163,7 +170,7 @@ class JointLoop:
                 samples.error,
             )
         told = step.obstacle is self._told and now < self._tell_at_ns
-        if step.obstacle is not Obstacle.NONE and not told:
+        if step.obstacle is not ArmingInhibit.NONE and not told:
             self._told, self._tell_at_ns = step.obstacle, now + TELL_EVERY_NS
             why = _WHY_NOT[step.obstacle].format(q=samples.q, error=samples.error)
             log.get("xrl").error("not armed: %s", why)

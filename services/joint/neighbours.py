@@ -31,14 +31,14 @@ STALE_NS: Final = 20 * NS_PER_MS
 GONE_NS: Final = 100 * NS_PER_MS
 """What is older was written by a service that is no more, or about a drive that is lost."""
 _ROW: Final = struct.Struct("<QQddQQ")
-"""A number that is odd while it is written, then a `Row`."""
+"""A number that is odd while it is written, then a `NeighbourRow`."""
 _NUMBER: Final = struct.Struct("<Q")
 _LEG: Final = N_MODULES // 2
 """From a module to its like of the other leg."""
 _SIZE: Final = N_MODULES * _ROW.size
 
 
-class Row(NamedTuple):
+class NeighbourRow(NamedTuple):
     """One module, as its service wrote it."""
 
     t_ns: int
@@ -53,7 +53,7 @@ class Row(NamedTuple):
     """1: a knee that does not sink any more."""
 
 
-class Near(NamedTuple):
+class NeighbourView(NamedTuple):
     """What a module knows of its neighbours."""
 
     below: Pair | None = None
@@ -64,7 +64,7 @@ class Near(NamedTuple):
     """Another module is limp, and this one is to stiffen for it."""
 
 
-NOTHING: Final = Near()
+UNKNOWN: Final = NeighbourView()
 
 
 def path_of(run_dir: Path) -> Path:
@@ -72,7 +72,7 @@ def path_of(run_dir: Path) -> Path:
     return run_dir / "joints.near"
 
 
-def near(module: str, rows: Sequence[Row | None], now_ns: int) -> Near:
+def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> NeighbourView:
     """Return what a module makes of the rows.
 
     Args:
@@ -87,28 +87,28 @@ def near(module: str, rows: Sequence[Row | None], now_ns: int) -> Near:
         below = rows[own - 2], rows[own - 1]
         known = [row for row in below if row is not None and _is_fresh(row, now_ns)]
         if len(known) < len(below):
-            return Near(stiffen=stiffen)
+            return NeighbourView(stiffen=stiffen)
         theta, rate = sum(row.theta for row in known), sum(row.rate for row in known)
-        return Near((theta, rate), stiffen=stiffen)
+        return NeighbourView((theta, rate), stiffen=stiffen)
     if kind == "knee":
         other = rows[(own + _LEG) % N_MODULES]
-        return Near(sinks=other is None or not _stays(other, now_ns), stiffen=stiffen)
-    return Near(stiffen=stiffen)
+        return NeighbourView(sinks=other is None or not _stays(other, now_ns), stiffen=stiffen)
+    return NeighbourView(stiffen=stiffen)
 
 
-def _is_fresh(row: Row, now_ns: int) -> bool:
+def _is_fresh(row: NeighbourRow, now_ns: int) -> bool:
     """Return True if a row tells of now; it may be newer than the clock was read."""
     return abs(now_ns - row.t_ns) <= STALE_NS
 
 
-def _stays(row: Row, now_ns: int) -> bool:
+def _stays(row: NeighbourRow, now_ns: int) -> bool:
     """Return True if a knee that was heard of once does not sink."""
     if row.t_ns == 0 or row.t_ns > now_ns + STALE_NS:
         return False  # of another host, or its clock
     return now_ns - row.t_ns > GONE_NS or row.mode != Mode.DAMP or row.caught > 0
 
 
-def _is_limp(row: Row | None) -> bool:
+def _is_limp(row: NeighbourRow | None) -> bool:
     return row is not None and row.t_ns > 0 and row.mode == Mode.FAULT
 
 
@@ -124,7 +124,7 @@ class Neighbours:
         self._at = MODULES.index(module) * _ROW.size
         self._written: int = _ROW.unpack_from(self._memory, self._at)[0] & ~1
 
-    def write(self, row: Row) -> None:
+    def write(self, row: NeighbourRow) -> None:
         """Write down where this module is."""
         self._written += 2
         memory, at = self._memory, self._at
@@ -140,15 +140,15 @@ class Neighbours:
                 number, *row = _ROW.unpack(file.read(_ROW.size))
         except (OSError, struct.error):
             return None
-        mode = Row(*row).mode
+        mode = NeighbourRow(*row).mode
         return Mode(mode) if number and mode in tuple(Mode) else None
 
-    def near(self, now_ns: int) -> Near:
+    def view(self, now_ns: int) -> NeighbourView:
         """Return what this module knows of the others."""
-        return near(self._module, [self._read(at) for at in range(0, _SIZE, _ROW.size)], now_ns)
+        return view_of(self._module, [self._read(at) for at in range(0, _SIZE, _ROW.size)], now_ns)
 
-    def _read(self, at: int) -> Row | None:
+    def _read(self, at: int) -> NeighbourRow | None:
         number, *row = _ROW.unpack_from(self._memory, at)
         if number & 1 or _ROW.unpack_from(self._memory, at)[0] != number:
             return None  # written meanwhile; the next cycle is 2 ms away
-        return Row(*row)
+        return NeighbourRow(*row)

@@ -1,9 +1,9 @@
 """The pendant, a dead man's handle: all six stop once it falls silent. Pure.
 
 Whatever fails of the person's hand, a cable, a radio and a host between, it is silent. It beats in
-each module's shared memory (`services.joint.will`), which needs no bus. One that was never heard,
-or was laid down in order, is not missed. Silence is counted in cycles that the module itself ran:
-where the whole machine stood still, nobody was silent.
+each module's shared memory (`services.joint.rearm_guard`), which needs no bus. A pendant that was
+never heard, or was laid down in order, is not missed. Silence is counted in cycles that the module
+ran: while the whole machine stood still, nobody was silent.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PendantWatch:
 
         Args:
             now_ns: this module's clock.
-            beats: `WillFile.beats`, in each cycle.
+            beats: `RearmGuard.beats`, in each cycle.
         """
         if beats == self._beats:
             self._silence_ns += min(CYCLE_MAX_NS, now_ns - self._last_ns)

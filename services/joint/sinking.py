@@ -17,9 +17,9 @@ from typing import Final
 
 import msgspec
 
-from services.joint import law
-from services.joint.law import Setpoint
-from services.joint.neighbours import Near
+from services.joint import pd_law
+from services.joint.neighbours import NeighbourView
+from services.joint.pd_law import Setpoint
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import kind_of
@@ -32,7 +32,7 @@ LEVEL_MAX: Final = 0.1
 """rad; a torso that is farther off is brought back no harder than that."""
 
 
-class SinkingMemory(msgspec.Struct, frozen=True):
+class SinkingState(msgspec.Struct, frozen=True):
     """State of `Sinking`."""
 
     stop: float | None = None
@@ -83,13 +83,15 @@ class Sinking:
         self.stop = min(self.stop, q[1])
         self.upright = self.held = self.below = None
         self.caught, self.doubt_ns, self.held_ns = False, -1, -1
-        return law.carrying(setpoint, self._sinks, q)
+        return pd_law.load_to_feedforward(setpoint, self._sinks, q)
 
-    def law(self, anchor: Setpoint, since_ns: int, q: Pair, near: Near) -> Setpoint:
+    def law(
+        self, frozen_setpoint: Setpoint, since_ns: int, q: Pair, near: NeighbourView
+    ) -> Setpoint:
         """Return the local law.
 
         Args:
-            anchor: what `begin` returned.
+            frozen_setpoint: what `begin` returned.
             since_ns: since then.
             q: where the joint is, rad.
             near: what is known of the other modules.
@@ -97,48 +99,48 @@ class Sinking:
         if near.stiffen and self.held is None:
             self.held, self.held_ns = q[1], since_ns
         if self.held is not None:
-            return self._stiffened(anchor, since_ns, self.held)
+            return self._stiffened(frozen_setpoint, since_ns, self.held)
         holds = self._is_to_hold(since_ns, near)
-        sunk = self._sunk(anchor, since_ns, since_ns)
+        sunk = self._sunk(frozen_setpoint, since_ns, since_ns)
         if self._levels:
             return self._levelled(sunk, q[1], near, min(1.0, since_ns / self._blend_ns))
         if holds and self._stops and not self.caught:
             self.caught, self.stop = True, max(self.stop, q[1])
         if q[1] < self.stop:
-            return law.caught(sunk, self.stop, self._k_p[1], self._k_d[1])
+            return pd_law.add_stop(sunk, self.stop, self._k_p[1], self._k_d[1])
         return sunk
 
-    def _sunk(self, anchor: Setpoint, since_ns: int, faded_ns: int) -> Setpoint:
+    def _sunk(self, frozen_setpoint: Setpoint, since_ns: int, faded_ns: int) -> Setpoint:
         """Return the law of sinking, with the load that is left after `faded_ns`."""
         share = max(0.0, 1.0 - faded_ns / self._fade_ns)
         risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
-        held = law.held(anchor, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
-        held = law.stiffened(held, self._k_p, self._k_d, 1.0 - share)
-        return law.damped(held, self._sinks, self._damp_k_d, share, risen)
+        held = pd_law.freeze(frozen_setpoint, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
+        held = pd_law.raise_gains(held, self._k_p, self._k_d, 1.0 - share)
+        return pd_law.damp(held, self._sinks, self._damp_k_d, share, risen)
 
-    def _stiffened(self, anchor: Setpoint, since_ns: int, theta: float) -> Setpoint:
+    def _stiffened(self, frozen_setpoint: Setpoint, since_ns: int, theta: float) -> Setpoint:
         """Return the law of a module that holds at theta (rad), with the load it had then."""
-        sunk = self._sunk(anchor, since_ns, self.held_ns)
+        sunk = self._sunk(frozen_setpoint, since_ns, self.held_ns)
         q_ref = (sunk.q_ref[0], theta if self._sinks[1] else sunk.q_ref[1])
-        stands = msgspec.structs.replace(law.stand(q_ref, *self._support), tau_ff=sunk.tau_ff)
+        stands = msgspec.structs.replace(pd_law.stand(q_ref, *self._support), tau_ff=sunk.tau_ff)
         risen = min(1.0, (since_ns - self.held_ns) / self._blend_ns)
-        return law.blend(sunk, stands, risen)
+        return pd_law.blend(sunk, stands, risen)
 
-    def remember(self) -> SinkingMemory:
+    def snapshot(self) -> SinkingState:
         """Return the memory as it is now."""
         stop = self.stop if math.isfinite(self.stop) else None
-        return SinkingMemory(
+        return SinkingState(
             stop, self.upright, self.held, self.below, self.caught, self.doubt_ns, self.held_ns
         )
 
-    def recall(self, memory: SinkingMemory) -> None:
+    def restore(self, memory: SinkingState) -> None:
         """Go on from a memory."""
         self.stop = -math.inf if memory.stop is None else memory.stop
         self.upright, self.held, self.below = memory.upright, memory.held, memory.below
         self.caught, self.doubt_ns = memory.caught, memory.doubt_ns
         self.held_ns = memory.held_ns
 
-    def _is_to_hold(self, since_ns: int, near: Near) -> bool:
+    def _is_to_hold(self, since_ns: int, near: NeighbourView) -> bool:
         if near.sinks:
             self.doubt_ns = -1
             return False
@@ -146,7 +148,9 @@ class Sinking:
             self.doubt_ns = since_ns
         return since_ns - self.doubt_ns >= DOUBT_NS
 
-    def _levelled(self, sunk: Setpoint, theta: float, near: Near, risen: float) -> Setpoint:
+    def _levelled(
+        self, sunk: Setpoint, theta: float, near: NeighbourView, risen: float
+    ) -> Setpoint:
         """Return the law of a hip; a leg of which nothing is heard any more stays as it is."""
         rate = 0.0
         if near.below is not None:
@@ -157,4 +161,4 @@ class Sinking:
             self.upright = self.below + theta
         wanted = self.upright - self.below
         wanted = min(theta + LEVEL_MAX, max(theta - LEVEL_MAX, wanted))
-        return law.levelled(sunk, wanted, -rate, risen * self._k_p[1])
+        return pd_law.hold_theta(sunk, wanted, -rate, risen * self._k_p[1])

@@ -10,9 +10,9 @@ from typing import Final
 
 import msgspec
 
+from services.joint.drive_manager import DriveAction, DriveManager
 from services.joint.drivers.base import DriveReading
-from services.joint.module import Module, Step
-from services.joint.neighbours import NOTHING, Near
+from services.joint.neighbours import UNKNOWN, NeighbourView
 from shared.messages import JointCommand
 from shared.traces import CycleTrace, JointTrace
 
@@ -27,7 +27,7 @@ _NOTHING: Final = (0.0, 0.0)
 class Tracer:
     """Gathers the cycles of one module's service."""
 
-    def __init__(self, module: Module) -> None:
+    def __init__(self, module: DriveManager) -> None:
         """Begin before the first cycle."""
         self._module = module
         self._encode = msgspec.json.Encoder().encode
@@ -42,8 +42,8 @@ class Tracer:
         reading: DriveReading | None,
         command: JointCommand | None,
         estop: bool,
-        step: Step,
-        near: Near = NOTHING,
+        step: DriveAction,
+        near: NeighbourView = UNKNOWN,
     ) -> JointTrace | None:
         """Take down a cycle; return a message when it is full."""
         r = reading
@@ -89,4 +89,4 @@ class Tracer:
     def _remember(self) -> None:
         """Take down the memory if the next message is to have it."""
         due = self._seq % MEMORY_EVERY == 0
-        self._memory = self._encode(self._module.remember()).decode() if due else ""
+        self._memory = self._encode(self._module.snapshot()).decode() if due else ""

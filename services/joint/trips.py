@@ -63,7 +63,7 @@ def limits_of(config: RobotConfig) -> TripLimits:
     )
 
 
-class Trips(msgspec.Struct):
+class JointTrips(msgspec.Struct):
     """What has been seen since the module began to track."""
 
     slow: Pair = (0.0, 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 
-from services.planner.loop import PlannerLoop, Ports
+from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner
 from shared import config_file, gain_schedule, log, topics
 from shared.bus import open_session
@@ -25,7 +25,7 @@ from shared.process import (
     run_service,
     service_parser,
 )
-from shared.traces import PlannerMemory
+from shared.traces import PlannerCheckpoint
 
 FIFO_PRIORITY = 15
 """Below the joint services: the failsafe outranks the law."""
@@ -44,14 +44,14 @@ def main() -> int:
     stop = StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
     with open_session(robot, "planner", arguments.run_dir, injected=arguments.injected) as session:
-        ports = Ports(
+        ports = PlannerPorts(
             states=[session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES],
             wrench=session.latest(topics.WRENCH, Wrench),
             attitude=session.latest(topics.ATTITUDE, Attitude),
             intent=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
             commands=[session.publisher(topics.JOINT_COMMAND, JointCommand, m) for m in MODULES],
             status=session.publisher(topics.PLANNER_STATUS, PlannerStatus),
-            memory=session.publisher(topics.PLANNER_MEMORY, PlannerMemory),
+            memory=session.publisher(topics.PLANNER_CHECKPOINT, PlannerCheckpoint),
         )
         session_id = secrets.randbelow(1 << 53) + 1  # JSON readers keep 53 bits
         loop = PlannerLoop(robot, Planner(robot, session_id), ports)

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.memory import AssistMemory, EasingMemory, OverloadMemory
+from services.planner.snapshots import AssistState, EasingState, OverloadState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config_sections import HarnessConfig
 from shared.messages import Vector3, Wrench
@@ -110,11 +110,11 @@ class AssistLaw:
         self.integral = 0.0
         """N"""
 
-    def remember(self) -> AssistMemory:
+    def snapshot(self) -> AssistState:
         """Return the memory as it is now."""
-        return AssistMemory(self._ramp, self._wanted, self._still_s, self.integral)
+        return AssistState(self._ramp, self._wanted, self._still_s, self.integral)
 
-    def recall(self, memory: AssistMemory) -> None:
+    def restore(self, memory: AssistState) -> None:
         """Go on from a memory."""
         m = memory
         self._ramp, self._wanted, self._still_s, self.integral = (
@@ -174,11 +174,11 @@ class LeadEasing:
         self._lead = (0.0, 0.0)
         self._left = 0.0
 
-    def remember(self) -> EasingMemory:
+    def snapshot(self) -> EasingState:
         """Return the memory as it is now."""
-        return EasingMemory(self._lead, self._left)
+        return EasingState(self._lead, self._left)
 
-    def recall(self, memory: EasingMemory) -> None:
+    def restore(self, memory: EasingState) -> None:
         """Go on from a memory."""
         self._lead, self._left = memory.lead, memory.left
 
@@ -232,11 +232,11 @@ class Overload:
         release_ns = round(harness.overload_release_s * NS_PER_S)
         return cls(harness.overload_force, harness.overload_moment, after_ns, release_ns)
 
-    def remember(self) -> OverloadMemory:
+    def snapshot(self) -> OverloadState:
         """Return the memory as it is now."""
-        return OverloadMemory(self._beyond_since_ns, self._below_since_ns, self.hold)
+        return OverloadState(self._beyond_since_ns, self._below_since_ns, self.hold)
 
-    def recall(self, memory: OverloadMemory) -> None:
+    def restore(self, memory: OverloadState) -> None:
         """Go on from a memory."""
         m = memory
         self._beyond_since_ns, self._below_since_ns = m.beyond_since_ns, m.below_since_ns

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
-from services.planner.poses import Node
+from services.planner.poses import PoseNode
 from shared.config import GRAVITY, RobotConfig
 from shared.gain_table import Bounds, ModuleBounds
 from shared.joints import MODULES, N_LEG, kind_of
@@ -39,7 +39,7 @@ class BoundsOverPoses:
         self._tau_ff: list[Array] = []
         self._v_ref: list[Array] = []
 
-    def add(self, q: Array, kinematics: Kinematics, node: Node, D: Array) -> None:
+    def add(self, q: Array, kinematics: Kinematics, node: PoseNode, D: Array) -> None:
         """Take a pose.
 
         Args:

@@ -48,13 +48,13 @@ def commands_of(
     ).reshape(7, N_MODULES, 2)
     by_module = rows.transpose(1, 0, 2).tolist()
     return [
-        _command(common, state.t_ns, rows, brace=support.includes(module))
+        _command(common, state.t_ns, rows, stiffen=support.includes(module))
         for module, state, rows in zip(MODULES, states, by_module, strict=True)
     ]
 
 
 def _command(
-    common: Common, echo_t_ns: int, rows: list[list[float]], *, brace: bool
+    common: Common, echo_t_ns: int, rows: list[list[float]], *, stiffen: bool
 ) -> JointCommand:
     pairs: list[Pair] = [(row[0], row[1]) for row in rows]
     return JointCommand(
@@ -72,5 +72,5 @@ def _command(
         k_d=pairs[6],
         margin=common.margins.service,
         margin_onboard=common.margins.onboard,
-        brace=brace,
+        stiffen=stiffen,
     )

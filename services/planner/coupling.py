@@ -30,7 +30,7 @@ LEAST = 1e-9
 """Of a body's gain: a smaller one is none."""
 
 
-class Missing:
+class UncoupledGains:
     """K_c and B_c: what local gains lack of the body's stiffness and damping."""
 
     def __init__(self, K_p: Array, B_p: Array, S: Array, damping: float) -> None:
@@ -102,10 +102,10 @@ class CouplingFilter:
         self._first[:] = 0.0
         self._second[:] = 0.0
 
-    def remember(self) -> tuple[float, ...]:
+    def snapshot(self) -> tuple[float, ...]:
         """Return both poles' states (24,), N m."""
         return (*self._first.tolist(), *self._second.tolist())
 
-    def recall(self, state: tuple[float, ...]) -> None:
-        """Go on from a state that `remember` returned."""
+    def restore(self, state: tuple[float, ...]) -> None:
+        """Go on from a state that `snapshot` returned."""
         self._first[:], self._second[:] = state[:N_JOINTS], state[N_JOINTS:]

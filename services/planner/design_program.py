@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from services.planner.dynamic_certificate import Design, DynamicCertificate, Node
+from services.planner.dynamic_certificate import Design, DynamicCertificate, StiffnessNode
 from services.planner.split import CouplingGains
 from shared.config import RobotConfig
 from shared.exceptions import RunError
@@ -40,7 +40,7 @@ SWAY_WEIGHT: Final = 40.0
 
 
 def choose(
-    config: RobotConfig, nodes: list[Node], progress: Progress = lambda _text: None
+    config: RobotConfig, nodes: list[StiffnessNode], progress: Progress = lambda _text: None
 ) -> Design:
     """Return the design of a robot.
 
@@ -74,7 +74,10 @@ def choose(
 
 
 def check(
-    config: RobotConfig, nodes: list[Node], design: Design, progress: Progress = lambda _text: None
+    config: RobotConfig,
+    nodes: list[StiffnessNode],
+    design: Design,
+    progress: Progress = lambda _text: None,
 ) -> None:
     """Hold a design to the certificate.
 
@@ -132,7 +135,7 @@ def _rough(config: RobotConfig) -> RobotConfig:
     )
 
 
-def _few(nodes: list[Node]) -> list[Node]:
+def _few(nodes: list[StiffnessNode]) -> list[StiffnessNode]:
     """Return the lowest, a middle and the highest upright pose, and a pitched one."""
     upright = [node for node in nodes if node.pitch == 0.0]
     pitched = [node for node in nodes if node.pitch > 0.5]

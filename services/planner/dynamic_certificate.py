@@ -18,20 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.certificate import motor_mean
-from services.planner.coupling import Missing
+from services.planner.coupling import UncoupledGains
 from services.planner.model import BodyInertia
 from services.planner.poses import Poses
 from services.planner.sampled_loop import (
     NO_HAND,
     NOMINAL,
-    Drivetrain,
+    DrivetrainModel,
     Feedback,
     Gains,
     Growth,
-    Hand,
+    HandModel,
+    LoopTiming,
     SampledLoop,
     Stand,
-    Timing,
     halves,
 )
 from services.planner.split import CouplingGains
@@ -57,7 +57,7 @@ class Design(NamedTuple):
     coupling: CouplingGains
 
 
-class Node(NamedTuple):
+class StiffnessNode(NamedTuple):
     """A pose of the schedule with its local stiffness."""
 
     z: float
@@ -72,11 +72,11 @@ class Condition(NamedTuple):
 
     mode: str
     """TRACK, HOLD, or drives alone."""
-    node: Node
+    node: StiffnessNode
     half: int
     stiffness: float
     delay_s: float
-    hand: Hand
+    hand: HandModel
     gains: Gains
 
     def words(self) -> str:
@@ -95,7 +95,7 @@ class Condition(NamedTuple):
         return f"{HALF_NAMES[self.half]}: " + ", ".join(parts)
 
 
-class Verdict(NamedTuple):
+class DynamicVerdict(NamedTuple):
     """The worst case that was found."""
 
     growth: Growth
@@ -117,7 +117,7 @@ class Verdict(NamedTuple):
 
 def nodes_of(
     config: RobotConfig, D_at: Callable[[float, float], Array], heights: Array, pitches: Array
-) -> list[Node]:
+) -> list[StiffnessNode]:
     """Return the poses that can be reached, linearised, without and with the full assist.
 
     Args:
@@ -147,14 +147,16 @@ def nodes_of(
                     hessian,
                     S,
                 )
-                found.append(Node(float(z), float(pitch), stand, D_at(float(z), float(pitch))))
+                found.append(
+                    StiffnessNode(float(z), float(pitch), stand, D_at(float(z), float(pitch)))
+                )
     return found
 
 
 class DynamicCertificate:
     """The conditions of a robot, and the loop in each of them."""
 
-    def __init__(self, config: RobotConfig, nodes: list[Node]) -> None:
+    def __init__(self, config: RobotConfig, nodes: list[StiffnessNode]) -> None:
         """Take the robot and its poses."""
         self._config = config
         self._nodes = nodes
@@ -163,15 +165,15 @@ class DynamicCertificate:
         S = np.array(law.S, float)
         self._K_p, self._B_p = (np.array(gain) * (1.0 - S) for gain in (law.K_p, law.B_p))
         self._S = S
-        self._hands = [Hand(*hand) for hand in wanted.hands]
+        self._hands = [HandModel(*hand) for hand in wanted.hands]
         self._halves = halves()
         self._hold = _hold_gains(config)
 
-    def feedback(self, node: Node, design: Design) -> Feedback:
+    def feedback(self, node: StiffnessNode, design: Design) -> Feedback:
         """Return what services and planner do in TRACK at a pose."""
         T, J = node.stand.T, node.stand.J
         D_B = np.tile(design.D_B, 2)
-        missing = Missing(self._K_p, self._B_p, self._S, design.coupling.damping)
+        missing = UncoupledGains(self._K_p, self._B_p, self._S, design.coupling.damping)
         K_fail = T.T @ (node.D[:, np.newaxis] * T) + node.stand.K_geo
         K_c, B_c = missing.at(K_fail, (T.T * D_B) @ T)
         # tau_coupled = C_q e_q + C_v e_v, with J e_q = p_ref - p in the closed rows
@@ -185,7 +187,7 @@ class DynamicCertificate:
             self._config.harness.low_pass_hz,
         )
 
-    def held(self, node: Node, design: Design, *, onboard: bool) -> Feedback:
+    def held(self, node: StiffnessNode, design: Design, *, onboard: bool) -> Feedback:
         """Return what holds in HOLD, by the services or by the drives alone."""
         k_p, k_d = self._hold
         D, D_B = np.maximum(node.D, k_p), np.maximum(np.tile(design.D_B, 2), k_d)
@@ -211,17 +213,17 @@ class DynamicCertificate:
         yield from self._cases(self._in_track, margins=margins)
         yield from self._cases(self._in_hold, margins=margins)
 
-    def worst(self, design: Design, *, margins: bool = True) -> Verdict:
+    def worst(self, design: Design, *, margins: bool = True) -> DynamicVerdict:
         """Return the condition that fades most slowly."""
         return self._worst(self.conditions(margins=margins), design, np.inf)
 
     def worst_in_track(
         self, design: Design, *, margins: bool = True, enough: float = np.inf
-    ) -> Verdict:
+    ) -> DynamicVerdict:
         """Return the worst while the planner leads; stop at the first above `enough`, 1/s."""
         return self._worst(self._cases(self._in_track, margins=margins), design, enough)
 
-    def worst_in_hold(self, design: Design, *, margins: bool = True) -> Verdict:
+    def worst_in_hold(self, design: Design, *, margins: bool = True) -> DynamicVerdict:
         """Return the worst without a planner, with the services and with the drives alone."""
         return self._worst(self._cases(self._in_hold, margins=margins), design, np.inf)
 
@@ -242,15 +244,17 @@ class DynamicCertificate:
         """Drivetrains that are asked about, N m/rad."""
         return self._wanted.stiffness
 
-    def judge(self, condition: Condition, design: Design) -> Verdict:
+    def judge(self, condition: Condition, design: Design) -> DynamicVerdict:
         """Return what the loop does in a condition."""
         growth = self.loop(condition, design).growth(condition.gains)
         drifts = condition.half == 0 and growth.frequency_hz < DRIFT_HZ
         allowed = self._wanted.drift_max if drifts and condition.mode == "TRACK" else 0.0
-        return Verdict(growth, condition, growth.rate - allowed)
+        return DynamicVerdict(growth, condition, growth.rate - allowed)
 
-    def _worst(self, conditions: Iterable[Condition], design: Design, enough: float) -> Verdict:
-        worst: Verdict | None = None
+    def _worst(
+        self, conditions: Iterable[Condition], design: Design, enough: float
+    ) -> DynamicVerdict:
+        worst: DynamicVerdict | None = None
         for condition in conditions:
             verdict = self.judge(condition, design)
             if worst is None or verdict.excess > worst.excess:
@@ -269,7 +273,7 @@ class DynamicCertificate:
                     yield from cases_of(node, stiffness, half, margins=margins)
 
     def _in_track(
-        self, node: Node, stiffness: float, half: int, *, margins: bool
+        self, node: StiffnessNode, stiffness: float, half: int, *, margins: bool
     ) -> Iterator[Condition]:
         wanted = self._wanted
         delay = wanted.delay_ms / 1e3
@@ -285,7 +289,7 @@ class DynamicCertificate:
                 yield case._replace(delay_s=delay, gains=Gains(torque=wanted.gain_margin))
 
     def _in_hold(
-        self, node: Node, stiffness: float, half: int, *, margins: bool
+        self, node: StiffnessNode, stiffness: float, half: int, *, margins: bool
     ) -> Iterator[Condition]:
         for mode in ("HOLD", "drives alone"):
             case = Condition(mode, node, half, stiffness, LEAST_DELAY_S, NO_HAND, NOMINAL)
@@ -293,9 +297,9 @@ class DynamicCertificate:
             if margins:
                 yield case._replace(gains=Gains(torque=self._wanted.gain_margin))
 
-    def _drivetrain(self, stiffness: float) -> Drivetrain:
+    def _drivetrain(self, stiffness: float) -> DrivetrainModel:
         joint, wanted = self._config.joint, self._wanted
-        return Drivetrain(
+        return DrivetrainModel(
             stiffness,
             wanted.damping_s * stiffness,
             joint.armature,
@@ -303,9 +307,9 @@ class DynamicCertificate:
             encoder_bandwidth=self._config.drive.encoder_bandwidth,
         )
 
-    def _timing(self, delay_s: float) -> Timing:
+    def _timing(self, delay_s: float) -> LoopTiming:
         service = self._config.joint_service
-        return Timing(
+        return LoopTiming(
             1.0 / service.rate_hz, 1.0 / self._config.planner.rate_hz, delay_s, DRIVE_STEP_S
         )
 

@@ -25,14 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import AssistLaw, LeadEasing, force_up, in_world, is_still
-from services.planner.coupling import CouplingFilter, Missing
+from services.planner.coupling import CouplingFilter, UncoupledGains
 from services.planner.gains import GainLaw, JointGains
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics, leg_loads
 from services.planner.levelling import Levelling
 from services.planner.load import Load
-from services.planner.memory import LawMemory
 from services.planner.shift import ShiftReference
+from services.planner.snapshots import LawState
 from services.planner.split import GainSplit, LocalGains
 from services.planner.stance import FOLLOWED_S, Stance
 from shared.config import GRAVITY, RobotConfig
@@ -85,7 +85,7 @@ class Hocca:
         self._split = GainSplit(config)
         self._S = self._gains.S
         coupling = self._split.coupling
-        self._missing = Missing(self._gains.K_p, self._gains.B_p, self._S, coupling.damping)
+        self._missing = UncoupledGains(self._gains.K_p, self._gains.B_p, self._S, coupling.damping)
         self._coupling = CouplingFilter(coupling.bandwidth_hz)
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
@@ -287,36 +287,36 @@ class Hocca:
         """
         return float(self._measured.J_harness[2] @ v)
 
-    def remember(self) -> LawMemory:
+    def snapshot(self) -> LawState:
         """Return the memory as it is now."""
-        return LawMemory(
+        return LawState(
             tuple(self._p_C0.tolist()),
             self._since_align_s,
             self._aligned,
             tuple(self._ik.q.tolist()),
-            self._assist.remember(),
-            self._easing.remember(),
+            self._assist.snapshot(),
+            self._easing.snapshot(),
             self._has_led,
-            self._coupling.remember(),
-            self._levelling.remember(),
-            self._shift.remember(),
-            self._stance.remember(),
-            self._load.remember(),
+            self._coupling.snapshot(),
+            self._levelling.snapshot(),
+            self._shift.snapshot(),
+            self._stance.snapshot(),
+            self._load.snapshot(),
         )
 
-    def recall(self, memory: LawMemory) -> None:
+    def restore(self, memory: LawState) -> None:
         """Go on from a memory."""
         self._p_C0 = np.array(memory.p_C0)
         self._since_align_s, self._aligned = memory.since_align_s, memory.aligned
         self._has_led = memory.has_led
         self._ik.q[:] = memory.q
-        self._assist.recall(memory.assist)
-        self._easing.recall(memory.easing)
-        self._coupling.recall(memory.coupling)
-        self._levelling.recall(memory.levelling)
-        self._shift.recall(memory.shift)
-        self._stance.recall(memory.stance)
-        self._load.recall(memory.load)
+        self._assist.restore(memory.assist)
+        self._easing.restore(memory.easing)
+        self._coupling.restore(memory.coupling)
+        self._levelling.restore(memory.levelling)
+        self._shift.restore(memory.shift)
+        self._stance.restore(memory.stance)
+        self._load.restore(memory.load)
         self._stand_as_taken()
 
     def _stand_as_taken(self) -> None:

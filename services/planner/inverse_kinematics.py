@@ -68,7 +68,7 @@ class IkResult(NamedTuple):
         return self.residual <= TOLERANCE
 
 
-class Outcome(IntEnum):
+class IkEnding(IntEnum):
     """How a solve from anywhere ended."""
 
     CONVERGED = 0
@@ -83,7 +83,7 @@ class Outcome(IntEnum):
 class Reach(NamedTuple):
     """How near p_ref a configuration is, and what keeps it from coming nearer."""
 
-    outcome: Outcome
+    outcome: IkEnding
     error: Array
     """p_ref - p (6,), m and rad: which rows are missed, and to which side."""
     closure: float
@@ -96,7 +96,7 @@ class Reach(NamedTuple):
     @property
     def converged(self) -> bool:
         """True if p_ref was reached and the legs agree."""
-        return self.outcome is Outcome.CONVERGED
+        return self.outcome is IkEnding.CONVERGED
 
 
 class InverseKinematics:
@@ -206,7 +206,7 @@ class InverseKinematics:
         error = self._error[:6].copy()
         closure = float(np.abs(self._error[6:]).max())
         if residual <= TOLERANCE:
-            outcome, stopped = Outcome.CONVERGED, np.zeros(N_JOINTS)
+            outcome, stopped = IkEnding.CONVERGED, np.zeros(N_JOINTS)
         else:
             at_limit = 1.0 * (self.q >= self._high - 1e-9) - (self.q <= self._low + 1e-9)
             pull, C = error @ self._system[:6], self._system[6:]
@@ -216,9 +216,9 @@ class InverseKinematics:
             moves = np.abs(left) > STATIONARY * float(np.abs(error).max())
             stopped = at_limit * (moves & (left * at_limit > 0.0))
             if closure > STEP_SURE or bool((moves & (stopped == 0.0)).any()):
-                outcome = Outcome.UNFINISHED
+                outcome = IkEnding.UNFINISHED
             else:
-                outcome = Outcome.JOINT_LIMIT if stopped.any() else Outcome.OUT_OF_REACH
+                outcome = IkEnding.JOINT_LIMIT if stopped.any() else IkEnding.OUT_OF_REACH
         return Reach(outcome, error, closure, tuple(map(int, stopped)), self._evaluations)
 
     def _starts(self, pitch: float) -> Iterator[Array]:
@@ -315,7 +315,7 @@ def _shortened(step: Array, largest: float) -> Array:
     return step * (largest / max(largest, float(np.abs(step).max())))
 
 
-def in_words(reach: Reach, p_ref: Array, limits: Array) -> str:
+def describe(reach: Reach, p_ref: Array, limits: Array) -> str:
     """Return one line for people: what was asked, how far it goes and what stops it.
 
     Args:
@@ -338,7 +338,7 @@ def in_words(reach: Reach, p_ref: Array, limits: Array) -> str:
         for index, (joint, side) in enumerate(zip(JOINTS, reach.stopped, strict=True))
         if side
     )
-    if reach.outcome is Outcome.UNFINISHED:
+    if reach.outcome is IkEnding.UNFINISHED:
         verdict = "was not reached"
         why = f"given up after {reach.evaluations} evaluations, there may be something nearer"
     else:

@@ -78,12 +78,12 @@ class Levelling:
         before = self.slope
         self._stand_on((before[0] + share * (x - before[0]), before[1] + share * (y - before[1])))
 
-    def remember(self) -> tuple[bool, float, float]:
+    def snapshot(self) -> tuple[bool, float, float]:
         """Return whether a slope is known, and the slope, rad."""
         return (self._known, *self.slope)
 
-    def recall(self, memory: tuple[bool, float, float]) -> None:
-        """Go on from what `remember` returned."""
+    def restore(self, memory: tuple[bool, float, float]) -> None:
+        """Go on from what `snapshot` returned."""
         self._known = memory[0]
         self._stand_on(memory[1:])
 

@@ -28,7 +28,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.memory import LoadMemory
+from services.planner.snapshots import LoadState
 from shared.config import GRAVITY
 from shared.messages import Pair
 
@@ -186,13 +186,13 @@ class Load:
             self.kg, self._refused, self._weighing_s = up / GRAVITY, True, WEIGHING_S
         return hangs
 
-    def remember(self) -> LoadMemory:
+    def snapshot(self) -> LoadState:
         """Return the memory as it is now."""
-        return LoadMemory(
+        return LoadState(
             self.kg, self.a, self.b, self._rates, self._refused, self._weighing_s, self._looked
         )
 
-    def recall(self, memory: LoadMemory) -> None:
+    def restore(self, memory: LoadState) -> None:
         """Go on from a memory."""
         self.kg, self.a, self.b = memory.kg, memory.a, memory.b
         self._rates, self._refused = memory.rates, memory.refused

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import msgspec
 
+from services.planner.checkpoint import Checkpoints
 from services.planner.intents import Intents
 from services.planner.planner import Planner
-from services.planner.remembrance import Remembrance
 from shared.bus import Latest, Publisher
 from shared.clock import NS_PER_S, NS_PER_US, now_ns, sleep_until
 from shared.config import RobotConfig
@@ -21,10 +21,10 @@ from shared.messages import (
     Wrench,
 )
 from shared.process import StopFlag
-from shared.traces import PlannerMemory
+from shared.traces import PlannerCheckpoint
 
 
-class Ports(msgspec.Struct, frozen=True):
+class PlannerPorts(msgspec.Struct, frozen=True):
     """The planner's bus ends; per module in `MODULES` order."""
 
     states: Sequence[Latest[JointState]]
@@ -33,7 +33,7 @@ class Ports(msgspec.Struct, frozen=True):
     intent: Latest[OperatorIntent]
     commands: Sequence[Publisher[JointCommand]]
     status: Publisher[PlannerStatus]
-    memory: Publisher[PlannerMemory]
+    memory: Publisher[PlannerCheckpoint]
 
 
 POLL_NS = 400 * NS_PER_US
@@ -45,12 +45,12 @@ REST_SHARE = 0.8
 class PlannerLoop:
     """Ticks the planner as its six states come, at its rate."""
 
-    def __init__(self, config: RobotConfig, planner: Planner, ports: Ports) -> None:
+    def __init__(self, config: RobotConfig, planner: Planner, ports: PlannerPorts) -> None:
         self._planner = planner
         self._ports = ports
         self._rest_ns = round(REST_SHARE * NS_PER_S / config.planner.rate_hz)
         self._intents = Intents(config.assist)
-        self._remembrance = Remembrance(config.planner.rate_hz)
+        self._remembrance = Checkpoints(config.planner.rate_hz)
 
     def run(self, stop: StopFlag) -> None:
         """Run until told to stop."""
@@ -68,7 +68,7 @@ class PlannerLoop:
         for module, latest in enumerate(self._ports.states):
             state = latest.take()
             if state is not None:
-                planner.hear_state(module, state, now)
+                planner.receive_state(module, state, now)
         return planner.is_due(now)
 
     def tick(self, now: int) -> None:
@@ -76,14 +76,14 @@ class PlannerLoop:
         planner, ports = self._planner, self._ports
         wrench = ports.wrench.take()
         if wrench is not None:
-            planner.hear_wrench(wrench, now)
+            planner.receive_wrench(wrench, now)
         attitude = ports.attitude.take()
         if attitude is not None:
-            planner.hear_attitude(attitude, now)
+            planner.receive_attitude(attitude, now)
         intent = ports.intent.take()
         if intent is not None:
             self._intents.hear(intent, now)
-        planner.hear_wish(self._intents.wish(now))
+        planner.receive_wish(self._intents.wish(now))
         for publisher, command in zip(ports.commands, planner.tick(now), strict=False):
             publisher.put(command)
         ports.status.put(planner.status(now, (now_ns() - now) / NS_PER_US))

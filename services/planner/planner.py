@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import Overload, force_up
-from services.planner.bracing import Bracing
 from services.planner.commands import Common, commands_of
-from services.planner.engagement import Engagement
+from services.planner.engagement_fsm import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.intents import Wish
-from services.planner.memory import TickMemory
+from services.planner.limp_leg_watch import LimpLegWatch
 from services.planner.plausible import Plausible
-from services.planner.trips import Trips, values_of
+from services.planner.snapshots import TickState
+from services.planner.trips import PlannerTrips, values_of
 from services.planner.unattended import Unattended
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
@@ -81,8 +81,8 @@ class Planner:
         self._attitude_seq = -1
         self._attitude_stale_ns = round(config.imu.stale_ms * NS_PER_MS)
         self._overload = Overload.of(config.harness)
-        self._bracing = Bracing()
-        self._trips = Trips(config)
+        self._limp_legs = LimpLegWatch()
+        self._trips = PlannerTrips(config)
         self._unattended = Unattended()
         self._support = Support.NONE
         self._wrench_seq = -1
@@ -93,7 +93,7 @@ class Planner:
         self._source: SplitSource | None = None
         """Where the gains of the last tick came from."""
 
-    def hear_state(self, module: int, state: JointState, now_ns: int) -> None:
+    def receive_state(self, module: int, state: JointState, now_ns: int) -> None:
         """Take a module's newest state, if it can be one."""
         if not self._plausible.is_state(module, state):
             return
@@ -104,18 +104,18 @@ class Planner:
         self._v[2 * module : 2 * module + 2] = state.v
         self._tau[2 * module : 2 * module + 2] = state.tau
 
-    def hear_wrench(self, wrench: Wrench, now_ns: int) -> None:
+    def receive_wrench(self, wrench: Wrench, now_ns: int) -> None:
         """Take the harness's newest wrench."""
         self._wrench_seq = wrench.seq
         self._wrench, self._wrench_ns = wrench, now_ns
         self._overload.hear(wrench, now_ns)
 
-    def hear_attitude(self, attitude: Attitude, now_ns: int) -> None:
+    def receive_attitude(self, attitude: Attitude, now_ns: int) -> None:
         """Take the IMU's newest attitude."""
         self._attitude_seq = attitude.seq
         self._attitude, self._attitude_ns = attitude, now_ns
 
-    def hear_wish(self, wish: Wish) -> None:
+    def receive_wish(self, wish: Wish) -> None:
         """Take what the person asks for now (`services.planner.intents`)."""
         self._wish = wish
 
@@ -153,9 +153,9 @@ class Planner:
             fresh,
             [state.ready for state in states],
             [state.mode for state in states],
-            self._forbidden(),
+            self._inhibit(),
         )
-        self._support = self._bracing.advance(now_ns, states)
+        self._support = self._limp_legs.advance(now_ns, states)
         # until all engage the law starts anew from the measured pose: there is no step
         self._output = self._law.tick(
             self._q,
@@ -185,9 +185,9 @@ class Planner:
         common = Common(now_ns, self._seq, self.session, self._hold(), self._output.local.margins)
         return commands_of(common, states, self._output, self._support)
 
-    def remember(self) -> TickMemory:
-        """Return the memory as it is between two ticks; `recall` goes on from there."""
-        return TickMemory(
+    def snapshot(self) -> TickState:
+        """Return the memory as it is between two ticks; `restore` goes on from there."""
+        return TickState(
             tuple(self._states),
             tuple(self._arrived_ns),
             self._wrench,
@@ -197,34 +197,34 @@ class Planner:
             self._seq,
             self._source,
             msgspec.structs.replace(self._engagement),
-            self._overload.remember(),
-            self._law.remember(),
-            msgspec.structs.replace(self._bracing),
+            self._overload.snapshot(),
+            self._law.snapshot(),
+            msgspec.structs.replace(self._limp_legs),
             self._attitude,
             self._attitude_ns,
             self._attitude_seq,
-            self._trips.remember(),
+            self._trips.snapshot(),
             self._wish,
-            self._unattended.remember(),
+            self._unattended.snapshot(),
         )
 
-    def recall(self, memory: TickMemory) -> None:
+    def restore(self, memory: TickState) -> None:
         """Go on from a memory, bit for bit."""
         m = memory
         for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
             if state is not None:
-                self.hear_state(module, state, arrived_ns)
+                self.receive_state(module, state, arrived_ns)
         self._wish = m.wish
-        self._unattended.recall(m.unattended)
+        self._unattended.restore(m.unattended)
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
         self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
         self._attitude_seq = m.attitude_seq
         self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
         self._engagement = msgspec.structs.replace(m.engagement)
-        self._bracing = msgspec.structs.replace(m.bracing)
-        self._overload.recall(m.overload)
-        self._law.recall(m.law)
-        self._trips.recall(m.trips)
+        self._limp_legs = msgspec.structs.replace(m.limp_legs)
+        self._overload.restore(m.overload)
+        self._law.restore(m.law)
+        self._trips.restore(m.trips)
 
     def _usable_wrench(self, now_ns: int) -> Wrench | None:
         """Return the newest wrench, or None if it is not valid or has come too long ago."""
@@ -257,7 +257,7 @@ class Planner:
             return None
         return attitude.up if now_ns - self._attitude_ns <= self._attitude_stale_ns else None
 
-    def _forbidden(self) -> PlannerMode | None:
+    def _inhibit(self) -> PlannerMode | None:
         """Return why the planner may not lead, by what the last tick found; None if it may."""
         if self._overload.hold:
             return PlannerMode.OVERLOADED
@@ -276,7 +276,7 @@ class Planner:
 
         By what this very tick found: no gains are lent to TRACK without a certificate.
         """
-        return self._engagement.hold or self._forbidden() is not None
+        return self._engagement.hold or self._inhibit() is not None
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
         """Return what the last tick saw and decided."""

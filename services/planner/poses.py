@@ -23,7 +23,7 @@ MID_HEIGHT: Final = 0.8
 """Of the straight leg: a stand from where every other pose is walked to."""
 
 
-class Node(NamedTuple):
+class PoseNode(NamedTuple):
     """The certificate's ingredients at a pose."""
 
     T: Array
@@ -87,7 +87,7 @@ class Poses:
             for j in direction:
                 yield j, pitches[j]
 
-    def node(self, z: float, pitch: float) -> Node | None:
+    def node(self, z: float, pitch: float) -> PoseNode | None:
         """Return the node, or None if the pose cannot be reached."""
         if not self._stands(z, pitch):
             return None
@@ -103,4 +103,4 @@ class Poses:
         K_q: Array = np.max(diagonals, axis=0)
         share = self._config.certificate.k_q_share_max
         D_max = np.clip(share * K_q[:N_LEG], 0.0, self._config.joint_service.k_p_max)
-        return Node(T, (hessians[0], hessians[1]), np.asarray(D_max, float))
+        return PoseNode(T, (hessians[0], hessians[1]), np.asarray(D_max, float))

@@ -26,7 +26,7 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from services.planner.certificate import motor_mean
-from services.planner.coupling import Missing
+from services.planner.coupling import UncoupledGains
 from services.planner.kinematics import Kinematics
 from shared.config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
@@ -246,7 +246,7 @@ def limits_along(
     """
     law, schedule = config.law, config.gain_schedule
     damping = 0.0 if schedule is None else schedule.coupling_damping
-    missing = Missing(np.array(law.K_p), np.array(law.B_p), np.array(law.S), damping)
+    missing = UncoupledGains(np.array(law.K_p), np.array(law.B_p), np.array(law.S), damping)
     K_c, _ = missing.at(stand.stiffness(D), stand.along_p(D_B))
     in_hold = np.maximum(D, np.ravel([config.hold_gains(module)[0] for module in MODULES]))
     return PushLimits(

@@ -11,7 +11,7 @@ deviations from it, with the feet where they are:
 and on it, each at its own rate:
 
     drive          u = W - D_m q^ - D_Bm v^                     D_m: the module's mean
-    joint service  W = tau + D_m q^ + D_Bm v^, tau the law of `services.joint.law` on q^, v^
+    joint service  W = tau + D_m q^ + D_Bm v^, tau the law of `services.joint.pd_law` on q^, v^
     planner        r = S J q^, q_ref = T r, tau_coupled filtered, sent d later than sampled
 
 One planner period is a linear map; the loop is stable if its spectral radius is below 1.
@@ -35,7 +35,7 @@ from shared.joints import N_JOINTS, N_LEG
 Array = NDArray[np.float64]
 
 
-class Drivetrain(NamedTuple):
+class DrivetrainModel(NamedTuple):
     """Between motor and joint, as the certificate takes it."""
 
     stiffness: float
@@ -53,7 +53,7 @@ class Drivetrain(NamedTuple):
     """w, rad/s."""
 
 
-class Hand(NamedTuple):
+class HandModel(NamedTuple):
     """The hand at the harness."""
 
     k_z: float
@@ -62,10 +62,10 @@ class Hand(NamedTuple):
     b_pitch: float
 
 
-NO_HAND: Final = Hand(0.0, 0.0, 0.0, 0.0)
+NO_HAND: Final = HandModel(0.0, 0.0, 0.0, 0.0)
 
 
-class Timing(NamedTuple):
+class LoopTiming(NamedTuple):
     """When what happens, s."""
 
     joint_period: float
@@ -164,9 +164,9 @@ class SampledLoop:
         stand: Stand,
         half: Half,
         feedback: Feedback,
-        drivetrain: Drivetrain,
-        timing: Timing,
-        hand: Hand = NO_HAND,
+        drivetrain: DrivetrainModel,
+        timing: LoopTiming,
+        hand: HandModel = NO_HAND,
         served: Array | None = None,
     ) -> None:
         """Discretise the plant over one step of the drives.
@@ -210,7 +210,7 @@ class SampledLoop:
         self._plant(P.T @ stand.M @ P, P.T @ stand.K_geo @ P, drivetrain)
         self._n_x = 2 * self._n_p + 5 * n
 
-    def _plant(self, M: Array, K_geo: Array, drivetrain: Drivetrain) -> None:
+    def _plant(self, M: Array, K_geo: Array, drivetrain: DrivetrainModel) -> None:
         """Build the step of plant and estimator: x+ = E x + G u + G_f f, f a force on p."""
         n_p, n, T, d = self._n_p, self._n_q, self._T, drivetrain
         n_x = 2 * n_p + 5 * n

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.memory import ShiftMemory
+from services.planner.snapshots import ShiftState
 from shared.messages import Vector4
 
 Array = NDArray[np.float64]
@@ -65,11 +65,11 @@ class ShiftReference:
             p[row] += at
             pdot[row] += rate
 
-    def remember(self) -> ShiftMemory:
+    def snapshot(self) -> ShiftState:
         """Return the memory as it is now."""
-        return ShiftMemory(_four(self._at), _four(self._rate))
+        return ShiftState(_four(self._at), _four(self._rate))
 
-    def recall(self, memory: ShiftMemory) -> None:
+    def restore(self, memory: ShiftState) -> None:
         """Go on from a memory."""
         self._at, self._rate = list(memory.at), list(memory.rate)
 

@@ -27,8 +27,8 @@ from services.planner import design_program
 from services.planner.certificate import Certificate, Margins
 from services.planner.command_bounds import BoundsOverPoses
 from services.planner.dynamic_certificate import Design, nodes_of
-from services.planner.dynamic_certificate import Node as DynamicNode
-from services.planner.poses import Node, Poses
+from services.planner.dynamic_certificate import StiffnessNode as DynamicNode
+from services.planner.poses import PoseNode, Poses
 from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import CouplingGains, ScheduledGains
 from shared.config import RobotConfig
@@ -171,7 +171,7 @@ def _with_middles(nodes: Array) -> Array:
     return np.sort(np.concatenate((nodes, 0.5 * (nodes[1:] + nodes[:-1]))))
 
 
-def _program(config: RobotConfig, node: Node, z: float, pitch: float) -> Array:
+def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Array:
     """Return D of one leg (6,), N m/rad, at a node.
 
     Raises:

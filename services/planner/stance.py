@@ -99,11 +99,11 @@ class Stance:
             or "the feet have moved: wait until their new places are taken"
         )
 
-    def remember(self) -> tuple[Vector6, bool]:
+    def snapshot(self) -> tuple[Vector6, bool]:
         """Return the memory as it is now."""
         a, b, c, d, e, f = self.taken.tolist()
         return (a, b, c, d, e, f), self.refused
 
-    def recall(self, memory: tuple[Vector6, bool]) -> None:
+    def restore(self, memory: tuple[Vector6, bool]) -> None:
         """Go on from a memory."""
         self.taken[:], self.refused = memory

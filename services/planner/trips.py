@@ -16,7 +16,7 @@ What no joint service can see by itself (`shared.trip_table`; limits: [trips] of
 Judged while it leads; `unloaded` once both legs have borne the torso, for on the hoist neither
 does; `sagging` once the person has not pressed, for a hand that was held up in HOLD catches up. It
 ends when all of it has been within its limits for `CALM_NS`, and counts as a drop-out
-(`services.planner.engagement`): what trips again and again is led ever more rarely.
+(`services.planner.engagement_fsm`): what trips again and again is led ever more rarely.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.hocca import LawOutput
-from services.planner.memory import TripsMemory
+from services.planner.snapshots import TripsState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.messages import Trip
@@ -51,7 +51,7 @@ _UNLOADED: Final = _TRIPS.index(Trip.UNLOADED)
 _SAGGING: Final = _TRIPS.index(Trip.SAGGING)
 
 
-class Trips:
+class PlannerTrips:
     """Judges each tick."""
 
     def __init__(self, config: RobotConfig) -> None:
@@ -61,7 +61,7 @@ class Trips:
         self._limits = [row.limit for row in rows]
         self._after_ns = [round(row.after_ms * NS_PER_MS) for row in rows]
         self._least = [PLANNER_TRIPS[trip].least for trip in _TRIPS]
-        self._memory = TripsMemory()
+        self._memory = TripsState()
 
     @property
     def tripped(self) -> Trip:
@@ -73,11 +73,11 @@ class Trips:
         """The same in words: figure and limit as it tripped."""
         return self._memory.why
 
-    def remember(self) -> TripsMemory:
+    def snapshot(self) -> TripsState:
         """Return the memory as it is now."""
         return self._memory
 
-    def recall(self, memory: TripsMemory) -> None:
+    def restore(self, memory: TripsState) -> None:
         """Go on from a memory."""
         self._memory = memory
 
@@ -115,7 +115,7 @@ class Trips:
                     why = f"{row.measured}: {values[index]:.3g} {row.unit}"
                     why += f" (limit {self._limits[index]:g})"
                     break
-        self._memory = TripsMemory(since_ns, calm_ns, tripped, why, stands, light)
+        self._memory = TripsState(since_ns, calm_ns, tripped, why, stands, light)
 
 
 def values_of(

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from services.planner.memory import UnattendedMemory
+from services.planner.snapshots import UnattendedState
 from shared.clock import NS_PER_S
 from shared.messages import Pair
 
@@ -29,7 +29,7 @@ class Unattended:
 
     def __init__(self) -> None:
         """Begin with nobody felt."""
-        self._memory = UnattendedMemory()
+        self._memory = UnattendedState()
 
     def drift(self, now_ns: int, pose: Pair, force: float, moment: float) -> float:
         """Return the drift, m.
@@ -44,13 +44,13 @@ class Unattended:
         felt = not (abs(force) < FELT[0] and abs(moment) < FELT[1])
         felt_ns = now_ns if felt else memory.felt_ns
         left = memory.left if memory.left is not None and now_ns - felt_ns > LET_GO_NS else pose
-        self._memory = UnattendedMemory(felt_ns, left)
+        self._memory = UnattendedState(felt_ns, left)
         return max(abs(pose[0] - left[0]), ARM * abs(pose[1] - left[1]))
 
-    def remember(self) -> UnattendedMemory:
+    def snapshot(self) -> UnattendedState:
         """Return the memory as it is now."""
         return self._memory
 
-    def recall(self, memory: UnattendedMemory) -> None:
+    def restore(self, memory: UnattendedState) -> None:
         """Go on from a memory."""
         self._memory = memory

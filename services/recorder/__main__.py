@@ -19,12 +19,12 @@ from types import FrameType
 from typing import Final
 
 from services.recorder import provenance
+from services.recorder.auto_recover import Rescue
+from services.recorder.disk_guard import MIB
 from services.recorder.files import FIRST
-from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter, Source
-from services.recorder.recording import CAPACITY, Recording, free_bytes_at, summary
-from services.recorder.rescue import Rescue
-from services.recorder.snapshot import Snapshot
-from services.recorder.space import MIB
+from services.recorder.mcap_log import SCHEMA_VERSION, MessageSource, RunWriter
+from services.recorder.recording import CAPACITY, Recorder, free_bytes_at, summary
+from services.recorder.snapshot import SnapshotRing
 from shared import gain_schedule, log, topics
 from shared.bus import open_session
 from shared.clock import keep_pace, now_ns, pace
@@ -47,7 +47,7 @@ LAST_WORDS_S: Final = 0.1
 SNAPSHOT_MAX_S: Final = 3600.0
 
 
-class Asked:
+class SnapshotRequest:
     """True once after each SIGUSR1: write the snapshot."""
 
     def __init__(self) -> None:
@@ -65,7 +65,7 @@ class Asked:
 
 def main() -> int:
     """Run the recorder; return the exit code."""
-    stop, asked = StopFlag(), Asked()
+    stop, asked = StopFlag(), SnapshotRequest()
     logger = log.setup("recorder")
     arguments = _arguments()
     config = load(arguments.config)
@@ -105,7 +105,7 @@ def main() -> int:
     return 0
 
 
-def _record(recording: Recording, stop: StopFlag, asked: Asked) -> None:
+def _record(recording: Recorder, stop: StopFlag, asked: SnapshotRequest) -> None:
     """Record until `stop`, then what is left.
 
     Raises:
@@ -122,14 +122,14 @@ def _record(recording: Recording, stop: StopFlag, asked: Asked) -> None:
 
 
 def _recording(
-    source: Source,
+    source: MessageSource,
     writer: RunWriter,
     config: RecorderConfig,
     logger: logging.Logger,
     out: Path,
-    snapshot: Snapshot | None,
-) -> Recording:
-    return Recording(
+    snapshot: SnapshotRing | None,
+) -> Recorder:
+    return Recorder(
         source,
         writer,
         config,
@@ -140,7 +140,7 @@ def _recording(
     )
 
 
-def _about(writer: RunWriter, snapshot: Snapshot | None, keys: int) -> str:
+def _about(writer: RunWriter, snapshot: SnapshotRing | None, keys: int) -> str:
     if snapshot is not None:
         return f"keeping {keys} keys in memory until there is a fault"
     if not writer.recording:
@@ -151,13 +151,13 @@ def _about(writer: RunWriter, snapshot: Snapshot | None, keys: int) -> str:
 
 def _snapshot(
     seconds: float | None, config: RecorderConfig, recorded: dict[str, topics.Topic]
-) -> Snapshot | None:
+) -> SnapshotRing | None:
     if seconds is None:
         return None
     if not 0.0 < seconds <= SNAPSHOT_MAX_S:
         right = f"more than 0 and at most {SNAPSHOT_MAX_S:g} s"
         raise ConfigError("--snapshot", "SECONDS", f"{seconds:g}", right)
-    return Snapshot(seconds, config.snapshot_mib * MIB, recorded)
+    return SnapshotRing(seconds, config.snapshot_mib * MIB, recorded)
 
 
 def _arguments() -> argparse.Namespace:

@@ -12,7 +12,7 @@ clocks; one offset, taken at the start and written as `offset_ns` into metadata 
 maps them to ns since 1970 so that viewers show dates: wall = monotonic + offset_ns.
 `publish_time` therefore means something only for senders on the recorder's host.
 
-A file whose writer was killed has no summary: `services/recorder/recovery.py` gives it
+A file whose writer was killed has no summary: `services/recorder/recover.py` gives it
 one, and `tools/runs/run_log.py` reads it as it is. While it is written it is locked.
 """
 
@@ -33,12 +33,12 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
 from services.recorder import files, schema
-from services.recorder.gaps import KeyCount
-from services.recorder.syncer import Syncer
+from services.recorder.fsync_thread import Syncer
+from services.recorder.sequence_stats import KeyCount
 from shared.exceptions import RunError
 from shared.topics import Topic
 
-SCHEMA_VERSION: Final = "3"
+SCHEMA_VERSION: Final = "4"
 """Of the layout above and of the messages in `shared/messages.py`."""
 
 FILE_NAME: Final = files.FIRST
@@ -55,7 +55,7 @@ _SEQUENCE_MASK: Final = 0xFFFFFFFF  # MCAP keeps 32 bits; the payload has all of
 _UNSIGNED = msgspec.Meta(ge=0, le=2**62)  # so that MCAP's unsigned 64-bit times can hold it
 
 
-class Source(Protocol):
+class MessageSource(Protocol):
     """Where messages come from: a stream of the bus."""
 
     def take(self) -> tuple[str, bytes, int] | None:
@@ -194,7 +194,7 @@ class RunWriter:
         self.begun += 1
         self._before = copy.deepcopy(self.counts)
 
-    def take_from(self, source: Source, at_most: int) -> int:
+    def take_from(self, source: MessageSource, at_most: int) -> int:
         """Write what has come, until the source is empty; return the number taken.
 
         While no file is open, messages are only counted as left out.
@@ -307,7 +307,7 @@ class RunWriter:
         records: Callable[[], bytes] = early.end
         file.write(records())
 
-    def _leave_out(self, source: Source, at_most: int) -> int:
+    def _leave_out(self, source: MessageSource, at_most: int) -> int:
         taken = 0
         while taken < at_most and source.take() is not None:
             taken += 1

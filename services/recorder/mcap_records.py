@@ -268,7 +268,7 @@ def _unlz4(found: Chunk) -> bytes:
     return data
 
 
-class Row(NamedTuple):
+class ChunkMessage(NamedTuple):
     """One message of a chunk: its head, and where its payload is in the content."""
 
     channel_id: int
@@ -279,14 +279,14 @@ class Row(NamedTuple):
     end: int
 
 
-def contents(data: bytes) -> tuple[list[Row], list[tuple[int, bytes]]]:
+def contents(data: bytes) -> tuple[list[ChunkMessage], list[tuple[int, bytes]]]:
     """Return the messages, and the other records as (opcode, body), of a chunk's content.
 
     What is not whole at the end is left out, so this reads the start of a cut chunk too.
     """
-    rows: list[Row] = []
+    rows: list[ChunkMessage] = []
     others: list[tuple[int, bytes]] = []
-    at, size, new = 0, len(data), Row._make
+    at, size, new = 0, len(data), ChunkMessage._make
     head, prefix = MESSAGE_RECORD, PREFIX
     while at + prefix.size <= size:
         if data[at] == MESSAGE and at + head.size <= size:

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from services.recorder.mcap_log import RunWriter, Source
-from services.recorder.snapshot import Snapshot
-from services.recorder.space import MIB, Change, SpaceGuard
+from services.recorder.disk_guard import MIB, DiskChange, SpaceGuard
+from services.recorder.mcap_log import MessageSource, RunWriter
+from services.recorder.snapshot import SnapshotRing
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config_sections import RecorderConfig
 
@@ -40,19 +40,19 @@ class Deadline:
         return True
 
 
-class Recording:
+class Recorder:
     """Moves messages from the bus into files, in cycles of a few milliseconds."""
 
     def __init__(
         self,
-        source: Source,
+        source: MessageSource,
         writer: RunWriter,
         config: RecorderConfig,
         logger: logging.Logger,
         *,
         free_bytes: FreeBytes,
         now_ns: int,
-        snapshot: Snapshot | None = None,
+        snapshot: SnapshotRing | None = None,
     ) -> None:
         """Begin with a look at the disk, and the first file unless there is a snapshot.
 
@@ -106,7 +106,7 @@ class Recording:
         if self._snapshot is not None:
             self._snapshot.trigger(reason, now_ns)
 
-    def _follow(self, snapshot: Snapshot, now_ns: int) -> None:
+    def _follow(self, snapshot: SnapshotRing, now_ns: int) -> None:
         """Keep the ring, and write it while a fault asks for it."""
         snapshot.take_from(self._source, CAPACITY)
         snapshot.pass_time(now_ns)
@@ -145,26 +145,26 @@ class Recording:
             return
         where, least = self._writer.path.parent, self._config.free_min_mib
         match self._guard.feed(free):
-            case Change.LOW:
+            case DiskChange.LOW:
                 self._logger.warning(
                     "%s: %d MiB free; recording stops below %d MiB (recorder.free_min_mib)",
                     where, free // MIB, least,
                 )  # fmt: skip
-            case Change.FULL:
+            case DiskChange.FULL:
                 self._writer.finish()
                 self._logger.error(
                     "%s: %d MiB free, less than recorder.free_min_mib = %d: recording has stopped, "
                     "what there is is finished; it goes on when there is space again",
                     where, free // MIB, least,
                 )  # fmt: skip
-            case Change.BACK:
+            case DiskChange.BACK:
                 if self._snapshot is None:
                     self._begin(now_ns, {"why": "space again"})
                 self._logger.warning(
                     "%s: %d MiB free: recording goes on; %d messages were left out",
                     where, free // MIB, self._writer.left_out,
                 )  # fmt: skip
-            case Change.NONE:
+            case DiskChange.NONE:
                 pass
 
     def close(self) -> None:
@@ -193,7 +193,7 @@ def free_bytes_at(directory: Path) -> int:
     return found.f_bavail * found.f_frsize
 
 
-def summary(writer: RunWriter, snapshot: Snapshot | None = None) -> str:
+def summary(writer: RunWriter, snapshot: SnapshotRing | None = None) -> str:
     """Return the counts in one line."""
     counts = writer.counts.values()
     line = (

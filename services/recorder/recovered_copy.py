@@ -9,8 +9,8 @@ from typing import BinaryIO, Final
 from services.recorder import mcap_encoding as encoding
 from services.recorder import mcap_records as mcap
 from services.recorder.mcap_encoding import Totals
-from services.recorder.mcap_records import MESSAGE_RECORD, Chunk, Malformed, Row
-from services.recorder.salvage import Piece
+from services.recorder.mcap_records import MESSAGE_RECORD, Chunk, ChunkMessage, Malformed
+from services.recorder.reader import Piece
 
 LIBRARY: Final = "xrl recover"
 
@@ -179,7 +179,7 @@ class Copy:
         raw = encoding.chunk_record(min(times), max(times), content)
         self._write_chunk(mcap.chunk(raw[mcap.PREFIX.size :]), raw, rows)
 
-    def _write_chunk(self, chunk: Chunk, raw: bytes, rows: list[Row]) -> None:
+    def _write_chunk(self, chunk: Chunk, raw: bytes, rows: list[ChunkMessage]) -> None:
         self._announce()
         place = self._write(raw)
         by_channel: dict[int, list[tuple[int, int]]] = {}

@@ -15,9 +15,9 @@ from typing import BinaryIO, Final, NamedTuple
 
 from services.recorder import mcap_encoding as encoding
 from services.recorder import mcap_records as mcap
-from services.recorder.mcap_records import Malformed, Row
+from services.recorder.mcap_records import ChunkMessage, Malformed
+from services.recorder.reader import Piece, Salvage, opened
 from services.recorder.recovered_copy import Copy
-from services.recorder.salvage import Piece, Salvage, opened
 from shared.exceptions import RunError
 
 LIBRARY: Final = "xrl export"
@@ -111,7 +111,7 @@ class _Extended(Copy):
         self._sent[message.channel] += 1
         head = _HEAD.pack(number, seq, message.log_ns, message.log_ns)
         body = head + message.payload
-        row = Row(number, seq, message.log_ns, message.log_ns, _HEAD.size, len(body))
+        row = ChunkMessage(number, seq, message.log_ns, message.log_ns, _HEAD.size, len(body))
         self.take(_piece(mcap.MESSAGE, body, (row,)))
 
     def finish(self, source: str, lost_bytes: int) -> None:
@@ -170,7 +170,7 @@ def _topics_in(piece: Piece) -> Iterator[str]:
                 yield mcap.channel(body).topic
 
 
-def _piece(opcode: int, body: bytes, rows: tuple[Row, ...] = ()) -> Piece:
+def _piece(opcode: int, body: bytes, rows: tuple[ChunkMessage, ...] = ()) -> Piece:
     return Piece(opcode, 0, 0, body, rows=rows)
 
 

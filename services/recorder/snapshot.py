@@ -14,7 +14,7 @@ from typing import Final
 
 import msgspec
 
-from services.recorder.mcap_log import Source
+from services.recorder.mcap_log import MessageSource
 from shared import topics
 from shared.clock import NS_PER_S
 from shared.messages import Mode
@@ -37,8 +37,8 @@ class _Event(msgspec.Struct, gc=False):
     mode_after: int
 
 
-class Snapshot:
-    """A ring of messages, and whether it is to be written; a `Source` of what is."""
+class SnapshotRing:
+    """A ring of messages, and whether it is to be written; a `MessageSource` of what is."""
 
     def __init__(self, seconds: float, most_bytes: int, keys: Mapping[str, Topic]) -> None:
         """Keep the messages of some keys.
@@ -80,7 +80,7 @@ class Snapshot:
         """True from a fault on until all that belongs to it was taken."""
         return self._until_ns is not None
 
-    def take_from(self, source: Source, at_most: int) -> int:
+    def take_from(self, source: MessageSource, at_most: int) -> int:
         """Keep what has come; return the number of messages."""
         taken = 0
         ring, special = self._ring, self._special

@@ -9,12 +9,12 @@ from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_settings import plant
 from services.simulator.body import body_of
 from services.simulator.cansimple_front import CanSimpleFront
-from services.simulator.fibre_endpoints import Board
+from services.simulator.fibre_endpoints import EmulatedBoard
 from services.simulator.fibre_front import FibreFront
 from services.simulator.fibre_port import FibreHub, FibrePort
 from services.simulator.harness_front import HarnessFront
 from services.simulator.imu_front import ImuFront
-from services.simulator.loop import Ports, SimulatorLoop
+from services.simulator.loop import SimulatorLoop, SimulatorPorts
 from services.simulator.plant import plant_from
 from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
@@ -79,7 +79,7 @@ def main() -> int:
     granted = raise_priority(FIFO_PRIORITY)
     with ExitStack() as stack:
         session = stack.enter_context(open_session(robot, "simulator", arguments.run_dir))
-        ports = Ports(
+        ports = SimulatorPorts(
             truth=session.publisher(topics.SIM_TRUTH, SimTruth),
             intent=session.publisher(topics.OPERATOR_INTENT, OperatorIntent),
             control=session.latest(topics.SIM_CONTROL, SimControl),
@@ -149,7 +149,7 @@ def open_usb(robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack
     for module in robot.module:
         if module.serial_number:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            board = Board(bank, MODULE_INDEX[module.name], int(module.serial_number, 16))
+            board = EmulatedBoard(bank, MODULE_INDEX[module.name], int(module.serial_number, 16))
             ports.append(FibrePort(FibreFront(board), folder / module.serial_number.upper()))
             stack.callback(ports[-1].unplug)
     if not ports:

@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from services.simulator.axis_calibration import SEQUENCES, Calibration
 from services.simulator.axis_conditions import Conditions
 from services.simulator.axis_control import AxisControl
-from services.simulator.axis_faults import AXIS_NAMES, BUS_FAULTS, FAULTS, Fault, controller_fault
+from services.simulator.axis_faults import (
+    AXIS_NAMES,
+    BUS_FAULTS,
+    FAULTS,
+    AxisErrors,
+    controller_fault,
+)
 from services.simulator.axis_settings import Settings, configured
 from services.simulator.dc_bus import DEAD_VOLTAGE, DcBus
 from shared.cansimple import (
@@ -35,7 +41,7 @@ from shared.config_sections import DriveConfig
 from shared.exceptions import DriveError
 from shared.joints import N_JOINTS
 
-__all__ = ["AXIS_NAMES", "FAULTS", "AxisBank", "Fault"]
+__all__ = ["AXIS_NAMES", "FAULTS", "AxisBank", "AxisErrors"]
 
 Vector = NDArray[np.float64]
 
@@ -80,7 +86,7 @@ class AxisBank:
         self.counts_from[:] = mark * np.array(motor_signs)
         self.bus = DcBus(self.settings)
         self.state = [AxisState.IDLE] * n
-        self.faults = [Fault()] * n
+        self.faults = [AxisErrors()] * n
         self.control_mode = control.control_mode
         self.input_mode = self.settings.axis("controller.config.input_mode")
         self.input_pos, self.input_vel = control.input_pos, control.input_vel
@@ -156,8 +162,8 @@ class AxisBank:
             self._disarm(axis)
         elif state == AxisState.CLOSED_LOOP_CONTROL:
             if not self.calibration.ready(axis):
-                self._fail(axis, Fault(AxisError.INVALID_STATE))
-            elif fault == Fault():
+                self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
+            elif fault == AxisErrors():
                 self._arm(axis)
         elif state in SEQUENCES:
             self._disarm(axis)
@@ -165,7 +171,7 @@ class AxisBank:
             states = SEQUENCES[AxisState(state)]
             self._become(axis, self.calibration.begin(axis, states, self.now_s, turns))
         elif state != AxisState.UNDEFINED:
-            self._fail(axis, Fault(AxisError.INVALID_STATE))
+            self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
 
     def set_modes(self, axis: int, control_mode: int, input_mode: int) -> None:
         """Set the controller's modes; only PASSTHROUGH is emulated, others are an error.
@@ -190,7 +196,7 @@ class AxisBank:
         What is still so (heat, a lost encoder, the bus) is an error again at the next step.
         """
         for each in _both(axis):
-            self.faults[each] = Fault()
+            self.faults[each] = AxisErrors()
 
     def estop(self, axis: int) -> None:
         """Disarm one axis with ESTOP_REQUESTED; its sibling goes on."""
@@ -206,7 +212,7 @@ class AxisBank:
         for each in _both(axis):
             self._disarm(each)
             self.state[each] = AxisState.UNDEFINED
-            self.faults[each] = Fault()
+            self.faults[each] = AxisErrors()
             self.input_pos[each] = self.input_vel[each] = self.input_torque[each] = 0.0
             self._control.connected[each] = 0.0
         self.settings.restore(drive)
@@ -284,9 +290,9 @@ class AxisBank:
                 if fed_s < self.now_s - timeout_s:
                     self._fail(axis, FAULTS["WATCHDOG"])
 
-    def _become(self, axis: int, outcome: AxisState | Fault) -> None:
+    def _become(self, axis: int, outcome: AxisState | AxisErrors) -> None:
         """Take the state that a calibration is at, or the fault that it ended with."""
-        if isinstance(outcome, Fault):
+        if isinstance(outcome, AxisErrors):
             self._fail(axis, outcome)
         else:
             self.state[axis] = outcome
@@ -303,7 +309,7 @@ class AxisBank:
         self._control.armed[axis] = 0.0
         self.torque[axis] = 0.0
 
-    def _fail(self, axis: int, fault: Fault) -> None:
+    def _fail(self, axis: int, fault: AxisErrors) -> None:
         """Latch a fault and disarm this axis alone; a drive that is down has no registers."""
         if axis >> 1 in self.conditions.down:
             return

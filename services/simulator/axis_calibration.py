@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from services.simulator.axis_faults import Fault
+from services.simulator.axis_faults import AxisErrors
 from services.simulator.axis_settings import Settings
 from shared.cansimple import AxisError, AxisState, EncoderError
 from shared.joints import N_JOINTS
@@ -69,7 +69,7 @@ class Calibration:
 
     def begin(
         self, axis: int, states: tuple[AxisState, ...], now_s: float, turns: float
-    ) -> AxisState | Fault:
+    ) -> AxisState | AxisErrors:
         """Begin the first of the states; return it, IDLE if there is none, or why not."""
         self.stop(axis)
         if not states:
@@ -77,18 +77,18 @@ class Calibration:
         state, *rest = states
         of_encoder = state == AxisState.ENCODER_OFFSET_CALIBRATION
         if of_encoder and not self.motor[axis]:
-            return Fault(AxisError.INVALID_STATE)
+            return AxisErrors(AxisError.INVALID_STATE)
         duration_s = ENCODER_S if of_encoder else MOTOR_S
         self.running[axis] = _Task(state, now_s + duration_s, turns, tuple(rest))
         return state
 
-    def advance(self, axis: int, now_s: float, turns: float) -> AxisState | Fault:
+    def advance(self, axis: int, now_s: float, turns: float) -> AxisState | AxisErrors:
         """Go on with what an axis is at; return its state, or why it failed."""
         task = self.running[axis]
         of_encoder = task.state == AxisState.ENCODER_OFFSET_CALIBRATION
         if of_encoder and abs(turns - task.start_turns) > SLIP:
             failed = AxisError.ENCODER_FAILED
-            return Fault(failed, encoder=EncoderError.CPR_POLEPAIRS_MISMATCH)
+            return AxisErrors(failed, encoder=EncoderError.CPR_POLEPAIRS_MISMATCH)
         if now_s < task.until_s:
             return task.state
         (self.encoder if of_encoder else self.motor)[axis] = True

@@ -10,7 +10,7 @@ import math
 from typing import Final
 
 from services.simulator.axis_control import AxisControl
-from services.simulator.axis_faults import FAULTS, Fault
+from services.simulator.axis_faults import FAULTS, AxisErrors
 from services.simulator.axis_settings import N_DRIVES, Settings
 from shared.joints import N_JOINTS
 
@@ -99,7 +99,7 @@ class Conditions:
         over = enabled and celsius >= high + OVER_TEMP_MARGIN
         (self._hot.add if over else self._hot.discard)(axis)
 
-    def failing(self) -> list[tuple[int, Fault]]:
+    def failing(self) -> list[tuple[int, AxisErrors]]:
         """Return the axes that a condition disarms, and with what; blind ones stand still."""
         for axis in self.blind:
             self._control.blind(axis)

@@ -23,7 +23,7 @@ AXIS_NAMES: Final = tuple(f"{module}.axis{index}" for module in MODULES for inde
 """The 12 axes by name, in order."""
 
 
-class Fault(NamedTuple):
+class AxisErrors(NamedTuple):
     """The error registers of an axis, and that of its ODrive."""
 
     axis: int = 0
@@ -33,34 +33,34 @@ class Fault(NamedTuple):
     odrive: int = 0
     """`odrv.error`; the same on both axes, for its errors disarm both."""
 
-    def with_(self, other: Fault) -> Fault:
+    def with_(self, other: AxisErrors) -> AxisErrors:
         """Return both together."""
-        return Fault(*(a | b for a, b in zip(self, other, strict=True)))
+        return AxisErrors(*(a | b for a, b in zip(self, other, strict=True)))
 
 
-def _motor(error: MotorError) -> Fault:
-    return Fault(AxisError.MOTOR_FAILED, motor=error)
+def _motor(error: MotorError) -> AxisErrors:
+    return AxisErrors(AxisError.MOTOR_FAILED, motor=error)
 
 
-def controller_fault(error: ControllerError) -> Fault:
+def controller_fault(error: ControllerError) -> AxisErrors:
     """Return what is left of a controller that fails: it gives no torque."""
     no_command = MotorError.UNKNOWN_TORQUE | MotorError.UNKNOWN_VOLTAGE_COMMAND
     axis = AxisError.CONTROLLER_FAILED | AxisError.MOTOR_FAILED
-    return Fault(axis, motor=no_command, controller=error)
+    return AxisErrors(axis, motor=no_command, controller=error)
 
 
-FAULTS: Final[Mapping[str, Fault]] = {
-    "DISARM": Fault(),
+FAULTS: Final[Mapping[str, AxisErrors]] = {
+    "DISARM": AxisErrors(),
     "OVERSPEED": controller_fault(ControllerError.OVERSPEED),
     "SPINOUT": controller_fault(ControllerError.SPINOUT_DETECTED),
     "DRV_FAULT": _motor(MotorError.DRV_FAULT),
     "REGENERATION": _motor(MotorError.I_BUS_OUT_OF_RANGE),
     "ENCODER": controller_fault(ControllerError.INVALID_ESTIMATE).with_(
-        Fault(AxisError.ENCODER_FAILED, encoder=EncoderError.ABS_SPI_COM_FAIL)
+        AxisErrors(AxisError.ENCODER_FAILED, encoder=EncoderError.ABS_SPI_COM_FAIL)
     ),
     "OVER_TEMP": _motor(MotorError.FET_THERMISTOR_OVER_TEMP),
-    "WATCHDOG": Fault(AxisError.WATCHDOG_TIMER_EXPIRED),
-    "ESTOP": Fault(AxisError.ESTOP_REQUESTED),
+    "WATCHDOG": AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED),
+    "ESTOP": AxisErrors(AxisError.ESTOP_REQUESTED),
 }
 """Faults of one axis by name, for `AxisBank.inject`; its sibling keeps its torque.
 
@@ -68,11 +68,11 @@ DISARM is the silent one: IDLE and no error at all.
 """
 
 
-def _system(error: OdriveError) -> Fault:
+def _system(error: OdriveError) -> AxisErrors:
     return _motor(MotorError.SYSTEM_LEVEL)._replace(odrive=error)
 
 
-BUS_FAULTS: Final[Mapping[str, Fault]] = {
+BUS_FAULTS: Final[Mapping[str, AxisErrors]] = {
     "UNDER_VOLTAGE": _system(OdriveError.DC_BUS_UNDER_VOLTAGE),
     "OVER_VOLTAGE": _system(OdriveError.DC_BUS_OVER_VOLTAGE),
     "OVER_REGEN_CURRENT": _system(OdriveError.DC_BUS_OVER_REGEN_CURRENT),

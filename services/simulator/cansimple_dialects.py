@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.axis_bank import AxisBank
-from services.simulator.axis_faults import Fault
+from services.simulator.axis_faults import AxisErrors
 from services.simulator.axis_settings import AXIS_SETTINGS, DRIVE_SETTINGS, Value
 from shared import cansimple, cansimple_06
 from shared.cansimple import (
@@ -87,7 +87,7 @@ class Dialect(NamedTuple):
     """By command, in place of the front's own."""
 
 
-def errors_06(fault: Fault) -> DriveError06:
+def errors_06(fault: AxisErrors) -> DriveError06:
     """Return 0.5's registers as 0.6 has them."""
     errors = DriveError06.NONE
     for register, bit, error in _ERRORS_06:
@@ -110,7 +110,7 @@ def _heartbeat_06(bank: AxisBank, axis: int) -> bytes:
         result = ProcedureResult.INVALID_STATE if ready else ProcedureResult.NOT_CALIBRATED
     elif fault.encoder & EncoderError.CPR_POLEPAIRS_MISMATCH:
         result = ProcedureResult.POLE_PAIR_CPR_MISMATCH
-    elif fault != Fault():
+    elif fault != AxisErrors():
         result = ProcedureResult.DISARMED
     return cansimple_06.pack_heartbeat(
         Heartbeat06(errors_06(fault), bank.state[axis], result, trajectory_done=True)

@@ -45,7 +45,7 @@ _INPUT_MODE = "controller.config.input_mode"
 _MODES = ("controller.config.control_mode", _INPUT_MODE)
 
 
-class Board(NamedTuple):
+class EmulatedBoard(NamedTuple):
     """One emulated ODrive: two axes of a bank."""
 
     bank: AxisBank
@@ -74,8 +74,8 @@ class Property(NamedTuple):
 
     name: str
     type: str
-    read: Callable[[Board], Value]
-    write: Callable[[Board, Value], None] | None = None
+    read: Callable[[EmulatedBoard], Value]
+    write: Callable[[EmulatedBoard, Value], None] | None = None
 
 
 class Argument(NamedTuple):
@@ -109,7 +109,7 @@ def endpoints() -> list[Endpoint]:
         Property("error", "uint8", lambda b: b.bank.faults[b.axis(0)].odrive),
         *(_setting(name, default) for name, default in DRIVE_SETTINGS.items()),
         Function("clear_errors", lambda b: b.bank.clear_errors(b.axis(0))),
-        Function("save_configuration", Board.save),
+        Function("save_configuration", EmulatedBoard.save),
         Function("reboot", lambda b: b.bank.reboot(b.axis(0))),
     ]
     for i in AXES:
@@ -171,13 +171,13 @@ def _fault(name: str, kind: str, i: int, register: str) -> Property:
     return Property(name, kind, lambda b: int(getattr(b.bank.faults[b.axis(i)], register)))
 
 
-def _current(board: Board, i: int) -> float:
+def _current(board: EmulatedBoard, i: int) -> float:
     axis = board.axis(i)
     return board.bank.settings.current(axis, board.bank.torque[axis])
 
 
 def _input(name: str, i: int) -> Property:
-    def write(board: Board, value: Value) -> None:
+    def write(board: EmulatedBoard, value: Value) -> None:
         getattr(board.bank, name)[board.axis(i)] = value
 
     return Property(
@@ -200,7 +200,7 @@ def _setting(name: str, default: Value) -> Property:
     )
 
 
-def _set(board: Board, name: str, value: Value) -> None:
+def _set(board: EmulatedBoard, name: str, value: Value) -> None:
     """Set a setting; a mode goes to the controller, which knows which there are."""
     axis, _, below = name.partition(".")
     if below not in _MODES or (below == _INPUT_MODE and value == InputMode.PASSTHROUGH):

@@ -18,7 +18,7 @@ from typing import Any, Final
 from services.simulator.fibre_endpoints import (
     CODECS,
     Argument,
-    Board,
+    EmulatedBoard,
     Endpoint,
     Function,
     Property,
@@ -58,7 +58,7 @@ class FibreFront:
             values that no setting can have.
     """
 
-    def __init__(self, board: Board) -> None:
+    def __init__(self, board: EmulatedBoard) -> None:
         self.board = board
         self.ignored = 0
         self._rows = endpoints()

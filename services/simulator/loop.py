@@ -30,7 +30,7 @@ SILENT_INTENTS = 250
 STATE_RATE_HZ = SIM_STATE.rate_hz
 
 
-class Ports(msgspec.Struct, frozen=True):
+class SimulatorPorts(msgspec.Struct, frozen=True):
     """The simulator's bus ends."""
 
     truth: Publisher[SimTruth]
@@ -55,7 +55,7 @@ class SimulatorLoop:
         front: CanSimpleFront,
         usb: Sequence[FibreHub],
         sensors: tuple[HarnessFront, ImuFront | None],
-        ports: Ports,
+        ports: SimulatorPorts,
     ) -> None:
         self._world, self._bank, self._front = world, bank, front
         (self._harness, self._imu), self._ports = sensors, ports

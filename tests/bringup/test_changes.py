@@ -9,7 +9,7 @@ import pytest
 
 from shared.cansimple import AxisState
 from shared.config import RobotConfig
-from shared.drive_settings import Wanted, of_module
+from shared.drive_settings import WantedSetting, of_module
 from shared.exceptions import DriveError
 from tests.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools.bringup import backup, changes
@@ -22,18 +22,20 @@ PRE_CALIBRATED = "axis1.encoder.config.pre_calibrated"
 
 
 @pytest.fixture
-def wanted(robot: RobotConfig) -> tuple[Wanted, ...]:
+def wanted(robot: RobotConfig) -> tuple[WantedSetting, ...]:
     return of_module(robot, MODULE)
 
 
-def test_a_board_as_wanted_is_left_alone(wanted: tuple[Wanted, ...]) -> None:
+def test_a_board_as_wanted_is_left_alone(wanted: tuple[WantedSetting, ...]) -> None:
     board = BoardInMemory(as_wanted())
     assert changes.against_wanted(MODULE, wanted, board) == []
     assert changes.apply(board, []) == []
     assert (board.writes, board.saves) == ([], 0)
 
 
-def test_only_what_differs_is_written_saved_once_and_read_back(wanted: tuple[Wanted, ...]) -> None:
+def test_only_what_differs_is_written_saved_once_and_read_back(
+    wanted: tuple[WantedSetting, ...],
+) -> None:
     board = BoardInMemory(as_wanted() | {VEL_LIMIT: 2.0, PERIOD: 10, "config.other": 7})
     difference = changes.against_wanted(MODULE, wanted, board)
     assert [(c.name, c.before, c.after) for c in difference] == [
@@ -48,7 +50,7 @@ def test_only_what_differs_is_written_saved_once_and_read_back(wanted: tuple[Wan
 
 
 def test_a_value_that_the_board_does_not_take_is_not_called_good(
-    wanted: tuple[Wanted, ...],
+    wanted: tuple[WantedSetting, ...],
 ) -> None:
     board = BoardInMemory(as_wanted() | {VEL_LIMIT: 2.0, PERIOD: 10})
     board.deaf = {PERIOD}
@@ -60,7 +62,7 @@ def test_a_value_that_the_board_does_not_take_is_not_called_good(
 
 
 def test_pre_calibrated_is_written_to_an_axis_only_once_it_is_calibrated(
-    wanted: tuple[Wanted, ...],
+    wanted: tuple[WantedSetting, ...],
 ) -> None:
     raw = BoardInMemory(as_wanted() | {PRE_CALIBRATED: False}, **{"axis1.encoder.is_ready": False})
     (change,) = changes.against_wanted(MODULE, wanted, raw)
@@ -73,7 +75,7 @@ def test_pre_calibrated_is_written_to_an_axis_only_once_it_is_calibrated(
 
 
 def test_a_setting_that_is_not_in_this_firmware_is_a_row_and_no_crash(
-    wanted: tuple[Wanted, ...],
+    wanted: tuple[WantedSetting, ...],
 ) -> None:
     settings = as_wanted()
     del settings[PERIOD]
@@ -109,7 +111,7 @@ def test_how_the_phases_were_wired_is_not_written_from_a_backup() -> None:
 
 
 def test_a_current_that_counts_the_other_way_is_nothing_to_write(
-    wanted: tuple[Wanted, ...],
+    wanted: tuple[WantedSetting, ...],
 ) -> None:
     board = BoardInMemory(as_wanted() | {"axis0.encoder.config.direction": -1})
     assert changes.against_wanted(MODULE, wanted, board) == []

@@ -8,7 +8,7 @@ from shared.joints import MODULES
 from tests.bringup.board_in_memory import as_wanted, healthy
 from tools.bringup.boards import Value
 from tools.bringup.check_alike import alike_rows
-from tools.bringup.rows import Row, Verdict
+from tools.bringup.rows import Finding, FindingKind
 
 POLES = "axis0.motor.config.pole_pairs"
 RESISTANCE = "axis1.motor.config.phase_resistance"
@@ -21,13 +21,13 @@ def boards() -> dict[str, dict[str, Value]]:
     }
 
 
-def bad(rows: list[Row]) -> list[tuple[str, str, Verdict]]:
-    return [(row.subject, row.what, row.verdict) for row in rows if row.verdict != Verdict.OK]
+def bad(rows: list[Finding]) -> list[tuple[str, str, FindingKind]]:
+    return [(row.subject, row.what, row.verdict) for row in rows if row.verdict != FindingKind.OK]
 
 
 def test_boards_that_are_alike_are_one_row() -> None:
     (row,) = alike_rows(boards())
-    assert (row.verdict, row.subject) == (Verdict.OK, "all 6")
+    assert (row.verdict, row.subject) == (FindingKind.OK, "all 6")
 
 
 def test_the_one_that_differs_is_named_with_what_the_others_have() -> None:
@@ -35,13 +35,15 @@ def test_the_one_that_differs_is_named_with_what_the_others_have() -> None:
     six["knee_left"][POLES] = 20
     (row,) = alike_rows(six)
     assert (row.subject, row.what) == ("knee_left.axis0", "motor.config.pole_pairs")
-    assert (row.verdict, row.found, row.wanted) == (Verdict.WARNING, "20", "7, as 5 others")
+    assert (row.verdict, row.found, row.wanted) == (FindingKind.WARNING, "20", "7, as 5 others")
 
 
 def test_a_setting_that_one_board_lacks_shows() -> None:
     six = boards()
     del six["hip_right"][POLES]
-    assert bad(alike_rows(six)) == [("hip_right.axis0", "motor.config.pole_pairs", Verdict.WARNING)]
+    assert bad(alike_rows(six)) == [
+        ("hip_right.axis0", "motor.config.pole_pairs", FindingKind.WARNING)
+    ]
 
 
 def test_half_against_half_accuses_nobody() -> None:
@@ -69,14 +71,19 @@ def test_what_belongs_to_one_board_may_differ() -> None:
 
 @pytest.mark.parametrize(
     ("ohm", "expected"),
-    [(0.125, []), (0.2, [Verdict.WARNING]), (0.05, [Verdict.WARNING]), (0.0, [Verdict.WRONG])],
+    [
+        (0.125, []),
+        (0.2, [FindingKind.WARNING]),
+        (0.05, [FindingKind.WARNING]),
+        (0.0, [FindingKind.WRONG]),
+    ],
 )
 def test_a_phase_resistance_unlike_the_others_is_a_loose_phase_or_another_motor(
-    ohm: float, expected: list[Verdict]
+    ohm: float, expected: list[FindingKind]
 ) -> None:
     six = boards()
     six["ankle_left"][RESISTANCE] = ohm
-    assert [row.verdict for row in alike_rows(six) if row.verdict != Verdict.OK] == expected
+    assert [row.verdict for row in alike_rows(six) if row.verdict != FindingKind.OK] == expected
 
 
 def test_a_motor_that_is_not_calibrated_has_no_resistance_yet() -> None:
@@ -88,4 +95,4 @@ def test_a_motor_that_is_not_calibrated_has_no_resistance_yet() -> None:
 def test_a_supply_lower_than_the_others_is_a_bad_plug() -> None:
     six = boards()
     six["hip_left"]["vbus_voltage"] = 46.5
-    assert bad(alike_rows(six)) == [("hip_left", "supply", Verdict.WARNING)]
+    assert bad(alike_rows(six)) == [("hip_left", "supply", FindingKind.WARNING)]

@@ -15,8 +15,8 @@ from shared.config_sections import CanConfig
 from shared.imu_can import ImuSample
 from tests.imu.robots import with_imu
 from tools.bringup import check_can
-from tools.bringup.can_ear import BusHeard, NodeHeard, long_enough, period_ms
-from tools.bringup.rows import Row, Verdict
+from tools.bringup.can_monitor import BusHeard, NodeHeard, long_enough, period_ms
+from tools.bringup.rows import Finding, FindingKind
 
 MODULE = "knee_left"
 NODES = (8, 9)
@@ -37,12 +37,12 @@ def healthy() -> BusHeard:
     return BusHeard(seconds=0.5, frames=600, nodes={node: axis() for node in NODES})
 
 
-def rows_of(robot: RobotConfig, heard: BusHeard) -> list[Row]:
+def rows_of(robot: RobotConfig, heard: BusHeard) -> list[Finding]:
     return check_can.drive_rows(robot, MODULE, heard, services_up=False)
 
 
-def bad(rows: list[Row]) -> list[tuple[str, str, Verdict]]:
-    return [(row.subject, row.what, row.verdict) for row in rows if row.verdict != Verdict.OK]
+def bad(rows: list[Finding]) -> list[tuple[str, str, FindingKind]]:
+    return [(row.subject, row.what, row.verdict) for row in rows if row.verdict != FindingKind.OK]
 
 
 def test_a_bus_that_carries_both_axes_at_their_periods_is_ok(robot: RobotConfig) -> None:
@@ -55,8 +55,8 @@ def test_an_encoder_at_its_factory_period_is_a_warning_with_the_setting(robot: R
     heard = healthy()
     heard.nodes[8] = axis(encoder_s=0.01)
     rows = rows_of(robot, heard)
-    assert bad(rows) == [(f"{MODULE}.axis0", "encoder frames", Verdict.WARNING)]
-    row = next(row for row in rows if row.verdict != Verdict.OK)
+    assert bad(rows) == [(f"{MODULE}.axis0", "encoder frames", FindingKind.WARNING)]
+    row = next(row for row in rows if row.verdict != FindingKind.OK)
     assert (row.found, row.wanted) == ("10.0 ms", "2 ms")
     assert "encoder_rate_ms" in row.fix
 
@@ -64,19 +64,19 @@ def test_an_encoder_at_its_factory_period_is_a_warning_with_the_setting(robot: R
 def test_an_axis_without_encoder_frames_is_wrong(robot: RobotConfig) -> None:
     heard = healthy()
     heard.nodes[9].estimates_s = []
-    assert bad(rows_of(robot, heard)) == [(f"{MODULE}.axis1", "encoder frames", Verdict.WRONG)]
+    assert bad(rows_of(robot, heard)) == [(f"{MODULE}.axis1", "encoder frames", FindingKind.WRONG)]
 
 
 def test_an_axis_that_sends_no_heartbeat_is_wrong(robot: RobotConfig) -> None:
     heard = healthy()
     heard.nodes[9] = NodeHeard()
-    assert bad(rows_of(robot, heard)) == [(f"{MODULE}.axis1", "heartbeat", Verdict.WRONG)]
+    assert bad(rows_of(robot, heard)) == [(f"{MODULE}.axis1", "heartbeat", FindingKind.WRONG)]
 
 
 def test_other_nodes_on_a_silent_bus_are_named(robot: RobotConfig) -> None:
     heard = BusHeard(nodes={8: NodeHeard(), 9: NodeHeard(), 0: axis(), 1: axis()})
     (row,) = rows_of(robot, heard)
-    assert row.verdict is Verdict.WRONG
+    assert row.verdict is FindingKind.WRONG
     assert "nodes 0, 1 are heard" in row.fix
 
 
@@ -84,8 +84,8 @@ def test_a_failed_motor_shows_though_the_axis_error_is_0(robot: RobotConfig) -> 
     heard = healthy()
     heard.nodes[8] = axis(IDLE._replace(motor_failed=True))
     rows = rows_of(robot, heard)
-    assert bad(rows) == [(f"{MODULE}.axis0", "errors", Verdict.WRONG)]
-    assert "MOTOR_FAILED" in next(row.found for row in rows if row.verdict != Verdict.OK)
+    assert bad(rows) == [(f"{MODULE}.axis0", "errors", FindingKind.WRONG)]
+    assert "MOTOR_FAILED" in next(row.found for row in rows if row.verdict != FindingKind.OK)
 
 
 def test_firmware_0_6_is_named_and_its_heartbeats_are_not_taken_for_errors(
@@ -95,7 +95,7 @@ def test_firmware_0_6_is_named_and_its_heartbeats_are_not_taken_for_errors(
     heard.nodes[8] = axis(IDLE._replace(motor_failed=True))
     heard.nodes[8].version = Version(2, (4, 4, 58), (0, 6, 10), 0)
     rows = rows_of(robot, heard)
-    assert bad(rows) == [(f"{MODULE}.axis0", "firmware", Verdict.WARNING)]
+    assert bad(rows) == [(f"{MODULE}.axis0", "firmware", FindingKind.WARNING)]
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_a_bus_that_cannot_be_opened_says_how_to_open_it(
     can = {name: CanConfig(interface=interface, channel="can7") for name in robot.can}
     other = msgspec.structs.replace(robot, can=can)
     (row,) = rows_of(other, BusHeard(trouble="no such device"))
-    assert row.verdict is Verdict.WRONG
+    assert row.verdict is FindingKind.WRONG
     assert words in row.fix
 
 
@@ -128,8 +128,8 @@ def test_two_axes_under_one_node_id_show_however_their_heartbeats_fall(
     # the first and the last gap are long ones: so is then the median of 1 and 19 ms
     heard.nodes[8] = NodeHeard(IDLE, both[1:-1], times(0.002), pos_turns=64.0)
     rows = rows_of(robot, heard)
-    assert bad(rows) == [(f"{MODULE}.axis0", "heartbeat", Verdict.WARNING)]
-    assert "the same node id" in next(row.why for row in rows if row.verdict != Verdict.OK)
+    assert bad(rows) == [(f"{MODULE}.axis0", "heartbeat", FindingKind.WARNING)]
+    assert "the same node id" in next(row.why for row in rows if row.verdict != FindingKind.OK)
 
 
 def cells(rate_hz: float = 250.0, force: float = 20.0) -> BusHeard:
@@ -142,18 +142,18 @@ def cells(rate_hz: float = 250.0, force: float = 20.0) -> BusHeard:
     ("heard", "expected"),
     [
         (cells(), []),
-        (cells(rate_hz=100.0), [("load cells", Verdict.WARNING)]),
-        (cells(force=1500.0), [("largest force", Verdict.WRONG)]),
-        (cells(force=float("nan")), [("largest force", Verdict.WRONG)]),
-        (BusHeard(seconds=0.5, frames=3), [("load cells", Verdict.WRONG)]),
-        (BusHeard(trouble="gone"), [("CAN bus", Verdict.WRONG)]),
+        (cells(rate_hz=100.0), [("load cells", FindingKind.WARNING)]),
+        (cells(force=1500.0), [("largest force", FindingKind.WRONG)]),
+        (cells(force=float("nan")), [("largest force", FindingKind.WRONG)]),
+        (BusHeard(seconds=0.5, frames=3), [("load cells", FindingKind.WRONG)]),
+        (BusHeard(trouble="gone"), [("CAN bus", FindingKind.WRONG)]),
     ],
 )
 def test_the_load_cells_are_judged_by_rate_and_range(
-    robot: RobotConfig, heard: BusHeard, expected: list[tuple[str, Verdict]]
+    robot: RobotConfig, heard: BusHeard, expected: list[tuple[str, FindingKind]]
 ) -> None:
     rows = check_can.harness_rows(robot, heard)
-    assert [(row.what, row.verdict) for row in rows if row.verdict != Verdict.OK] == expected
+    assert [(row.what, row.verdict) for row in rows if row.verdict != FindingKind.OK] == expected
 
 
 def test_frames_of_load_cells_out_of_order_are_counted(robot: RobotConfig) -> None:
@@ -195,14 +195,14 @@ def imu_heard(*, valid: bool = True, period_s: float = 0.01) -> BusHeard:
     ("heard", "wrong"),
     [
         (imu_heard(), []),
-        (imu_heard(period_s=0.02), [("IMU", "samples", Verdict.WARNING)]),
-        (imu_heard(valid=False), [("IMU", "orientation valid", Verdict.WRONG)]),
-        (BusHeard(frames=7), [("IMU", "samples", Verdict.WRONG)]),
-        (BusHeard(trouble="no such device"), [("IMU", "CAN bus", Verdict.WRONG)]),
+        (imu_heard(period_s=0.02), [("IMU", "samples", FindingKind.WARNING)]),
+        (imu_heard(valid=False), [("IMU", "orientation valid", FindingKind.WRONG)]),
+        (BusHeard(frames=7), [("IMU", "samples", FindingKind.WRONG)]),
+        (BusHeard(trouble="no such device"), [("IMU", "CAN bus", FindingKind.WRONG)]),
     ],
 )
 def test_an_imu_is_judged_by_its_rate_and_by_what_it_says_of_itself(
-    robot: RobotConfig, heard: BusHeard, wrong: list[tuple[str, str, Verdict]]
+    robot: RobotConfig, heard: BusHeard, wrong: list[tuple[str, str, FindingKind]]
 ) -> None:
     assert bad(check_can.imu_rows(robot, heard)) == wrong
 

@@ -13,7 +13,7 @@ from shared import priority
 from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.bringup import check_machine
-from tools.bringup.rows import Row, Verdict
+from tools.bringup.rows import Finding, FindingKind
 
 ROOT = DEFAULT_CONFIG.parents[1]
 
@@ -24,7 +24,7 @@ def write(root: Path, path: str, text: str) -> None:
     file.write_text(text + "\n", encoding="utf-8")
 
 
-def row_of(rows: list[Row], what: str) -> Row:
+def row_of(rows: list[Finding], what: str) -> Finding:
     return next(row for row in rows if row.what == what)
 
 
@@ -44,7 +44,7 @@ def test_what_slows_a_loop_is_a_warning_on_a_real_robot_and_said_on_an_emulated_
     robot: RobotConfig, real: RobotConfig, tmp_path: Path, path: str, text: str, what: str
 ) -> None:
     write(tmp_path, path, text)
-    for config, verdict in ((real, Verdict.WARNING), (robot, Verdict.OK)):
+    for config, verdict in ((real, FindingKind.WARNING), (robot, FindingKind.OK)):
         row = row_of(check_machine.machine_rows(config, tmp_path), what)
         assert row.verdict is verdict
         assert row.found != row.wanted
@@ -54,21 +54,21 @@ def test_one_processor_that_sleeps_is_seen(real: RobotConfig, tmp_path: Path) ->
     for cpu, governor in enumerate(("performance", "powersave", "performance")):
         write(tmp_path, f"sys/devices/system/cpu/cpu{cpu}/cpufreq/scaling_governor", governor)
     row = row_of(check_machine.machine_rows(real, tmp_path), "frequency governor")
-    assert (row.verdict, row.found) == (Verdict.WARNING, "performance and powersave")
+    assert (row.verdict, row.found) == (FindingKind.WARNING, "performance and powersave")
 
 
 def test_a_kernel_that_tells_nothing_is_ok(robot: RobotConfig, tmp_path: Path) -> None:
     rows = check_machine.machine_rows(robot, tmp_path)
     assert row_of(rows, "frequency governor").found == "not told here"
-    assert {row.verdict for row in rows} == {Verdict.OK}
+    assert {row.verdict for row in rows} == {FindingKind.OK}
 
 
 @pytest.mark.parametrize(
     ("granted", "emulated", "verdict"),
     [
-        ("slice 100000 ns", True, Verdict.OK),
-        ("slice 100000 ns", False, Verdict.WARNING),
-        ("normal priority", True, Verdict.WARNING),
+        ("slice 100000 ns", True, FindingKind.OK),
+        ("slice 100000 ns", False, FindingKind.WARNING),
+        ("normal priority", True, FindingKind.WARNING),
     ],
 )
 def test_without_real_time_permission_the_services_fallback_is_named(
@@ -78,7 +78,7 @@ def test_without_real_time_permission_the_services_fallback_is_named(
     monkeypatch: pytest.MonkeyPatch,
     granted: str,
     emulated: bool,
-    verdict: Verdict,
+    verdict: FindingKind,
 ) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError
@@ -89,7 +89,7 @@ def test_without_real_time_permission_the_services_fallback_is_named(
     row = row_of(rows, "real-time priority")
     assert row.verdict is verdict
     assert "refused" in row.found
-    if verdict is Verdict.OK:
+    if verdict is FindingKind.OK:
         assert granted in row.found
 
 
@@ -118,13 +118,13 @@ def test_an_odrive_that_may_not_be_opened_wants_its_udev_rule(
 ) -> None:
     node = plug_in(tmp_path)
     (row,) = check_machine.usb_node_rows(tmp_path)
-    assert row.verdict is Verdict.OK
+    assert row.verdict is FindingKind.OK
     real_access: Callable[..., bool] = os.access
     monkeypatch.setattr(
         os, "access", lambda path, mode: Path(path) != node and real_access(path, mode)
     )
     (row,) = check_machine.usb_node_rows(tmp_path)
-    assert row.verdict is Verdict.WRONG
+    assert row.verdict is FindingKind.WRONG
     (rules,) = (ROOT / word for word in row.fix.split() if word.endswith(".rules"))
     ids = re.search(r'idVendor}=="1209", ATTR\{idProduct\}=="(0d3\[\d-\d\])"', rules.read_text())
     assert ids is not None
@@ -135,5 +135,5 @@ def test_an_odrive_that_may_not_be_opened_wants_its_udev_rule(
 def test_other_usb_devices_are_not_taken_for_odrives(tmp_path: Path) -> None:
     plug_in(tmp_path, product="beef")
     (row,) = check_machine.usb_node_rows(tmp_path)
-    assert row.verdict is Verdict.WARNING
+    assert row.verdict is FindingKind.WARNING
     assert "none plugged in" in row.found

@@ -11,7 +11,7 @@ import pytest
 from shared.config import RobotConfig
 from tools.bringup import check_socketcan
 from tools.bringup.check_socketcan import socketcan_rows
-from tools.bringup.rows import Row, Verdict
+from tools.bringup.rows import Finding, FindingKind
 
 UP, DOWN = "0x40081", "0x40080"
 
@@ -34,7 +34,7 @@ def link(length: int = 64, bitrate: int = 1_000_000, **data: Any) -> dict[str, A
     return {"ifname": "can0", "txqlen": length, "linkinfo": info}
 
 
-def rows_of(real: RobotConfig, root: Path, said: dict[str, Any]) -> list[Row]:
+def rows_of(real: RobotConfig, root: Path, said: dict[str, Any]) -> list[Finding]:
     flag(root, "can0", UP)
     return [row for row in socketcan_rows(real, root, {"can0": said}) if row.subject == "can0"]
 
@@ -49,31 +49,31 @@ def test_interfaces_are_there_and_up(real: RobotConfig, tmp_path: Path) -> None:
 
 def test_an_interface_that_is_set_as_it_should_be_is_ok(real: RobotConfig, tmp_path: Path) -> None:
     rows = rows_of(real, tmp_path, link())
-    assert {row.verdict for row in rows} == {Verdict.OK}
+    assert {row.verdict for row in rows} == {FindingKind.OK}
     assert {"interface", "bit rate", "controller", "send queue"} <= {row.what for row in rows}
 
 
 @pytest.mark.parametrize(
     ("said", "what", "verdict"),
     [
-        (link(bitrate=500_000), "bit rate", Verdict.WRONG),
-        (link(state="BUS-OFF"), "controller", Verdict.WRONG),
-        (link(state="STOPPED"), "controller", Verdict.WRONG),
-        (link(state="ERROR-PASSIVE"), "controller", Verdict.WARNING),
-        (link(state="ERROR-WARNING"), "controller", Verdict.WARNING),
-        (link(ctrlmode=["LISTEN-ONLY"]), "mode", Verdict.WRONG),
-        (link(restart_ms=0), "restart-ms", Verdict.WARNING),
-        (link(length=10), "send queue", Verdict.WARNING),
-        (link(length=1000), "send queue", Verdict.WARNING),
+        (link(bitrate=500_000), "bit rate", FindingKind.WRONG),
+        (link(state="BUS-OFF"), "controller", FindingKind.WRONG),
+        (link(state="STOPPED"), "controller", FindingKind.WRONG),
+        (link(state="ERROR-PASSIVE"), "controller", FindingKind.WARNING),
+        (link(state="ERROR-WARNING"), "controller", FindingKind.WARNING),
+        (link(ctrlmode=["LISTEN-ONLY"]), "mode", FindingKind.WRONG),
+        (link(restart_ms=0), "restart-ms", FindingKind.WARNING),
+        (link(length=10), "send queue", FindingKind.WARNING),
+        (link(length=1000), "send queue", FindingKind.WARNING),
     ],
 )
 def test_what_stops_or_delays_frames_is_named(
-    real: RobotConfig, tmp_path: Path, said: dict[str, Any], what: str, verdict: Verdict
+    real: RobotConfig, tmp_path: Path, said: dict[str, Any], what: str, verdict: FindingKind
 ) -> None:
     rows = rows_of(real, tmp_path, said)
-    bad = [(row.what, row.verdict) for row in rows if row.verdict != Verdict.OK]
+    bad = [(row.what, row.verdict) for row in rows if row.verdict != FindingKind.OK]
     assert bad == [(what, verdict)]
-    assert all(row.fix for row in rows if row.verdict != Verdict.OK)
+    assert all(row.fix for row in rows if row.verdict != FindingKind.OK)
 
 
 def test_counted_errors_are_told(real: RobotConfig, tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_counted_errors_are_told(real: RobotConfig, tmp_path: Path) -> None:
 
 def test_what_ip_does_not_tell_is_not_judged(real: RobotConfig, tmp_path: Path) -> None:
     (row,) = rows_of(real, tmp_path, {"ifname": "can0", "linkinfo": {"info_kind": "vcan"}})
-    assert (row.what, row.verdict) == ("interface", Verdict.OK)
+    assert (row.what, row.verdict) == ("interface", FindingKind.OK)
 
 
 @pytest.mark.parametrize("said", [b"", b"[]", b"[{}]", b"no JSON"])

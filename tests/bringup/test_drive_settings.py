@@ -16,7 +16,7 @@ from services.simulator.axis_settings import (
     plant,
 )
 from shared.config import RobotConfig
-from shared.drive_settings import AXIS_TABLE, DRIVE_TABLE, Compare, Wanted, of_module, same
+from shared.drive_settings import AXIS_TABLE, DRIVE_TABLE, Compare, WantedSetting, of_module, same
 from shared.exceptions import DriveError
 from shared.joints import MODULES
 
@@ -131,7 +131,7 @@ def test_the_watchdog_runs_only_if_the_robot_file_gives_it_a_time(
 def test_a_value_fits_to_within_single_precision(
     compare: Compare, found: float, fits: bool
 ) -> None:
-    assert Wanted("x", 1.2, "", compare).fits(found) is fits
+    assert WantedSetting("x", 1.2, "", compare).fits(found) is fits
 
 
 def test_true_is_one_to_a_drive_and_infinity_is_itself() -> None:

@@ -16,7 +16,7 @@ from shared.config import RobotConfig
 from shared.exceptions import DriveError
 from tests.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools.bringup import limits
-from tools.bringup.boards import Found
+from tools.bringup.boards import FoundBoards
 
 MODULE = "knee_left"
 SERIAL = "3A0000000005"
@@ -74,8 +74,8 @@ def test_a_bus_that_is_gone_is_said(robot: RobotConfig, link: Link) -> None:
 
 
 @pytest.fixture
-def on_usb(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[RobotConfig, Found]:
-    found = Found({SERIAL: BoardInMemory(as_wanted() | SMALL)}, {}, ())
+def on_usb(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[RobotConfig, FoundBoards]:
+    found = FoundBoards({SERIAL: BoardInMemory(as_wanted() | SMALL)}, {}, ())
 
     @contextmanager
     def boards(*_: object):  # type: ignore[no-untyped-def]
@@ -86,7 +86,7 @@ def on_usb(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[RobotCo
     return msgspec.structs.replace(robot, joint_service=service), found
 
 
-def test_over_usb_they_are_written_and_read_back(on_usb: tuple[RobotConfig, Found]) -> None:
+def test_over_usb_they_are_written_and_read_back(on_usb: tuple[RobotConfig, FoundBoards]) -> None:
     robot, found = on_usb
     board = found.boards[SERIAL]
     assert isinstance(board, BoardInMemory)
@@ -99,7 +99,7 @@ def test_over_usb_they_are_written_and_read_back(on_usb: tuple[RobotConfig, Foun
         limits.give_back(robot, MODULE, Path("/nowhere"))
 
 
-def test_a_board_that_has_gone_is_said(on_usb: tuple[RobotConfig, Found]) -> None:
+def test_a_board_that_has_gone_is_said(on_usb: tuple[RobotConfig, FoundBoards]) -> None:
     robot, found = on_usb
     found.boards.clear()
     with pytest.raises(DriveError, match=f"{SERIAL}: not there"):

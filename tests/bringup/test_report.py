@@ -11,7 +11,7 @@ from rich.console import Console
 from shared.drive_settings import AXES
 from shared.joints import MODULES
 from tools.bringup.report import Report, report_of, show, verdict_line
-from tools.bringup.rows import Row, Verdict, merged, ok, warning, wrong
+from tools.bringup.rows import Finding, FindingKind, merged, ok, warning, wrong
 
 FINE = [ok(f"m{i}", "supply", f"{volts:.1f} V", "8 to 60 V") for i, volts in enumerate((9.5, 48.0))]
 TRAP = wrong(
@@ -25,7 +25,7 @@ TRAP = wrong(
 NOTED = warning("robot file", "assumed", "14 [assumed]", "none", "measure them")
 
 
-def printed(groups: dict[str, list[Row]], width: int, *, verbose: bool = False) -> str:
+def printed(groups: dict[str, list[Finding]], width: int, *, verbose: bool = False) -> str:
     text = io.StringIO()
     show(Console(file=text, width=width), groups, verbose=verbose)
     return text.getvalue()
@@ -40,7 +40,7 @@ def test_rows_that_are_not_ok_stay_themselves() -> None:
     assert merged([*FINE, TRAP, NOTED])[1:] == [TRAP, NOTED]
 
 
-def trap(subject: str, what: str = "controller.config.vel_limit") -> Row:
+def trap(subject: str, what: str = "controller.config.vel_limit") -> Finding:
     module = subject.partition(".")[0]
     fix = f"`xrl configure --apply --module {module}`"
     return wrong(subject, what, "2", "60", fix, "it disarms")
@@ -49,7 +49,7 @@ def trap(subject: str, what: str = "controller.config.vel_limit") -> Row:
 def test_a_trap_of_all_twelve_axes_is_one_row_and_one_command_for_all() -> None:
     rows = [trap(f"{module}.{axis}") for module in MODULES for axis in AXES]
     (row,) = merged(rows)
-    assert (row.subject, row.found, row.verdict) == ("all 12", "2", Verdict.WRONG)
+    assert (row.subject, row.found, row.verdict) == ("all 12", "2", FindingKind.WRONG)
     assert row.fix == "`xrl configure --apply`"
     assert verdict_line({"drives": rows}) == "12 wrong: all 12 vel_limit"
     assert report_of({"drives": rows}).wrong == 12
@@ -97,7 +97,7 @@ def test_the_same_said_of_several_is_said_once() -> None:
         ([TRAP] * 8, "8 wrong: " + ", ".join(["knee_left.axis0 vel_limit"] * 6) + " and 2 more"),
     ],
 )
-def test_the_last_line_is_the_answer(rows: list[Row], line: str) -> None:
+def test_the_last_line_is_the_answer(rows: list[Finding], line: str) -> None:
     assert verdict_line({"drives": rows}) == line
     assert " ".join(printed({"drives": rows}, 80).split()).endswith(line)
 
@@ -122,4 +122,4 @@ def test_the_report_counts_and_reads_back_from_its_json() -> None:
     assert (report.ok, report.wrong, report.warnings) == (False, 1, 1)
     assert msgspec.json.decode(msgspec.json.encode(report), type=Report) == report
     assert report_of({"drives": [*FINE, NOTED]}).ok
-    assert TRAP.verdict is Verdict.WRONG
+    assert TRAP.verdict is FindingKind.WRONG

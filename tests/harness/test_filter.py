@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.harness.filter import (
+    FilteredWrench,
     FilterState,
-    Reading,
     WrenchFilter,
     initial_state,
     start_tare,
@@ -31,7 +31,7 @@ biases = st.tuples(*[st.floats(-200.0, 200.0)] * 6)
 
 def feed(
     law: WrenchFilter, state: FilterState, t_ns: int, forces: tuple[float, ...]
-) -> tuple[FilterState, Reading]:
+) -> tuple[FilterState, FilteredWrench]:
     return law.step(state, t_ns, sample(t_ns, forces))
 
 
@@ -48,7 +48,7 @@ def tared(law: WrenchFilter = LAW, bias: tuple[float, ...] = ZERO) -> tuple[Filt
 
 def settled(
     law: WrenchFilter, state: FilterState, t_ns: int, forces: tuple[float, ...]
-) -> tuple[FilterState, Reading, int]:
+) -> tuple[FilterState, FilteredWrench, int]:
     """Feed constant forces for 0.5 s: 20 time constants of the low-pass and more."""
     reading = law.step(state, t_ns, None)[1]
     for _ in range(125):

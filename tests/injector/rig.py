@@ -7,10 +7,10 @@ import socket
 import struct
 from pathlib import Path
 
-from services.injector.listener import Listener
-from services.injector.place import Address, Place
+from services.injector.event_loop import SocketWatch
+from services.injector.listener import SocketListener
+from services.injector.proxy_endpoint import Address, Place
 from services.injector.relay import Relay
-from services.injector.watch import Watch
 from shared.clock import NS_PER_MS
 from shared.impairment import Direction
 from shared.links import Pair
@@ -53,9 +53,9 @@ class Rig:
         self.there, self.back = Direction(PAIR.there, 0), Direction(PAIR.back, 0)
         self.beyond = beyond or listening(socket.AF_UNIX, str(folder / "b"))
         self.through = folder / "t"
-        self.watch = Watch()
+        self.watch = SocketWatch()
         where = Address(self.beyond.family, self.beyond.getsockname())
-        self.place = Place(PAIR, Listener(self.through), where)
+        self.place = Place(PAIR, SocketListener(self.through), where)
         names = {PAIR.there: self.there, PAIR.back: self.back}
         self.relay = Relay([self.place], names, self.watch, LEASE_NS)
         self.ends: list[socket.socket] = [self.beyond]

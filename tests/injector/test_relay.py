@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.injector.flow import PENDING_MAX, WAITING_MAX
+from services.injector.direction import PENDING_MAX, WAITING_MAX
 from shared.impairment import Impairment
 from tests.injector.rig import DECLARE, MESSAGE, Rig, batch, heard, numbers
 

@@ -10,7 +10,7 @@ import msgspec
 from services.joint.controller import CycleResult, JointController
 from services.joint.differential import motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus
-from services.joint.neighbours import NOTHING, Near
+from services.joint.neighbours import UNKNOWN, NeighbourView
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.gain_schedule import believing
@@ -83,7 +83,7 @@ class Bench:
         estop: bool = False,
         stalled: bool = False,
         after_ns: int = 0,
-        near: Near = NOTHING,
+        near: NeighbourView = UNKNOWN,
     ) -> CycleResult:
         """Run the next cycle: a period, or `after_ns`, after the one before."""
         self.now_ns += after_ns or self.cycle_ns

@@ -7,17 +7,24 @@ from itertools import pairwise
 import msgspec
 import pytest
 
+from services.joint.drive_manager import (
+    ARM_EVERY_NS,
+    ARM_TRIES,
+    GAP_NS,
+    ArmingInhibit,
+    DriveCommand,
+    DriveManager,
+)
+from services.joint.drive_setpoint import INPUT_TORQUE_SHARE
 from services.joint.drivers.base import DriveStatus
-from services.joint.module import ARM_EVERY_NS, ARM_TRIES, GAP_NS, Module, Obstacle, Order
-from services.joint.neighbours import Near
-from services.joint.onboard import INPUT_TORQUE_SHARE
+from services.joint.neighbours import NeighbourView
+from services.joint.rearm_guard import LastState
 from services.joint.sinking import DOUBT_NS
-from services.joint.will import Will
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.messages import Mode
-from tests.joint.test_module import MOVED, Bench
-from tests.joint.test_will import CARRIED, Successor
+from tests.joint.test_drive_manager import MOVED, Bench
+from tests.joint.test_rearm_guard import CARRIED, Successor
 
 
 def test_a_drive_that_never_arms_is_asked_so_often_and_told_of_once(robot: RobotConfig) -> None:
@@ -26,11 +33,11 @@ def test_a_drive_that_never_arms_is_asked_so_often_and_told_of_once(robot: Robot
         step = bench.cycle()
         bench.status = DriveStatus.IDLE  # it does not do it
         assert step.torque == (0.0, 0.0)
-        if step.order is Order.ARM or step.obstacle is not Obstacle.NONE:
+        if step.order is DriveCommand.ARM or step.obstacle is not ArmingInhibit.NONE:
             told.append((bench.now_ns, step.order, step.obstacle))
     assert [row[1:] for row in told] == [
-        *[(Order.ARM, Obstacle.NONE)] * ARM_TRIES,
-        (Order.NOTHING, Obstacle.WILL_NOT),
+        *[(DriveCommand.ARM, ArmingInhibit.NONE)] * ARM_TRIES,
+        (DriveCommand.NOTHING, ArmingInhibit.WILL_NOT),
     ]
     times = [row[0] for row in told]
     assert {later - sooner for sooner, later in pairwise(times)} == {ARM_EVERY_NS}
@@ -44,8 +51,8 @@ def test_after_a_freeze_the_change_of_mode_is_told_with_the_torques_that_were_ca
     bench.freeze(2 * NS_PER_S, MOVED)
     carried = bench.carried()
     step = bench.cycle()
-    assert step.order is Order.NOTHING, "it listens first"
-    assert (step.torque, step.target, step.obstacle) == ((0.0, 0.0), None, Obstacle.NONE)
+    assert step.order is DriveCommand.NOTHING, "it listens first"
+    assert (step.torque, step.target, step.obstacle) == ((0.0, 0.0), None, ArmingInhibit.NONE)
     event = step.event
     assert event is not None
     assert (event.mode_before, event.mode_after) == (Mode.TRACK, Mode.HOLD)
@@ -67,25 +74,25 @@ def test_a_module_that_controls_nothing_listens_to_nothing(
     bench.freeze(2 * GAP_NS, MOVED)
     for _ in range(3):
         bench.cycle(silent=status is DriveStatus.IDLE)
-        assert bench.module.remember().listen_until_ns == 0
+        assert bench.module.snapshot().listen_until_ns == 0
     assert bench.mode in (Mode.FAULT, Mode.DISARMED)
 
 
 def test_what_the_neighbours_do_comes_through(robot: RobotConfig) -> None:
     bench = Bench(robot, "onboard")
     bench.to(Mode.DAMP)
-    assert bench.module.asks_near
+    assert bench.module.needs_neighbours
     for _ in range(2 * DOUBT_NS // bench.cycle_ns):
         bench.now_ns += bench.cycle_ns
-        bench.module.step(bench.now_ns, None, None, True, Near(sinks=False))
+        bench.module.step(bench.now_ns, None, None, True, NeighbourView(sinks=False))
     assert bench.module.controller.caught
 
 
 def test_a_module_that_found_nothing_or_what_let_go_leaves_nothing_holding(
     robot: RobotConfig,
 ) -> None:
-    assert not Module(robot, "knee_left").leaves_holding
-    service = Successor(robot, Will.HELD, DriveStatus.ARMED)
+    assert not DriveManager(robot, "knee_left").leaves_holding
+    service = Successor(robot, LastState.HELD, DriveStatus.ARMED)
     service.carries = CARRIED
     service.run(ARM_EVERY_NS)
     assert service.module.leaves_holding
@@ -96,8 +103,8 @@ def test_a_module_that_found_nothing_or_what_let_go_leaves_nothing_holding(
 
 
 def test_a_drive_of_unknown_torques_is_no_reason_to_wait_for_a_planner(robot: RobotConfig) -> None:
-    service = Successor(robot, Will.NOTHING, DriveStatus.ARMED)
-    assert {step.obstacle for step in service.run(3 * ARM_EVERY_NS)} == {Obstacle.NONE}
+    service = Successor(robot, LastState.NOTHING, DriveStatus.ARMED)
+    assert {step.obstacle for step in service.run(3 * ARM_EVERY_NS)} == {ArmingInhibit.NONE}
 
 
 @pytest.mark.parametrize(("mark_turns", "forgets"), [(0.0, False), (0.5, True), (40.0, True)])
@@ -110,17 +117,17 @@ def test_only_a_drive_with_a_mark_for_no_zero_is_made_to_forget_its_zero(
     bench.status = DriveStatus.UNZEROED
     orders = [bench.cycle().order for _ in range(1000)]
     assert bench.mode is Mode.FAULT
-    assert orders.count(Order.FORGET_ZERO) == int(forgets)
+    assert orders.count(DriveCommand.FORGET_ZERO) == int(forgets)
 
 
 def test_a_module_goes_on_from_all_that_it_remembers(robot: RobotConfig) -> None:
     bench = Bench(robot, "onboard")
     bench.to(Mode.TRACK)
-    memory = bench.module.remember()
+    memory = bench.module.snapshot()
     assert memory.gains_changed_ns > 0
-    other = Module(bench.robot, "knee_right")
-    other.recall(memory)
-    assert other.remember() == memory
+    other = DriveManager(bench.robot, "knee_right")
+    other.restore(memory)
+    assert other.snapshot() == memory
 
 
 def test_a_motors_torque_is_within_what_its_current_gives(robot: RobotConfig) -> None:
@@ -133,9 +140,9 @@ def test_a_motors_torque_is_within_what_its_current_gives(robot: RobotConfig) ->
 
 
 def test_a_drive_that_was_taken_over_counts_as_asked_once(robot: RobotConfig) -> None:
-    service = Successor(robot, Will.HELD, DriveStatus.ARMED)
+    service = Successor(robot, LastState.HELD, DriveStatus.ARMED)
     service.carries = CARRIED
     for _ in range(3):
         service.lead(hold=True)
     assert service.mode is Mode.HOLD
-    assert service.module.remember().tries == 1
+    assert service.module.snapshot().tries == 1

@@ -274,7 +274,7 @@ def test_state_tells_what_the_cycle_saw_and_did(bench: Bench) -> None:
     assert state.v == pytest.approx(bench.v)
     assert state.tau == bench.controller.tau
     assert (state.mode, state.ready) == (Mode.TRACK, True)
-    assert (state.cause, state.braced) == (Cause.COMMANDS_FRESH, False)
+    assert (state.cause, state.stiffened) == (Cause.COMMANDS_FRESH, False)
     assert (state.session, state.command_seq) == (SESSION, 5_000)
     assert state.age_ns == bench.now_ns - sent.echo_t_ns == 2 * bench.cycle_ns
     assert (state.refused, state.dropouts, state.late) == (1, 0, 0)

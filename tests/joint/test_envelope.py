@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.joint import law
+from services.joint import pd_law
 from services.joint.controller import JointController
 from services.joint.envelope import ROUNDING, Envelope
 from services.joint.failsafe import Event, Failsafe, Refusal, timing_of
@@ -123,11 +123,11 @@ def test_each_number_is_believed_up_to_its_bound_and_not_beyond(
     told = middle(robot, module)
     low, high = edges(robot, module, axis)[name]
     small = 1e-6 * max(1.0, abs(low), abs(high))
-    for value, believed in (
+    for value, accepted in (
         (low + small, True), (high - small, True), (low - small, False), (high + small, False),
     ):  # fmt: skip
         pair = with_axis(getattr(told, name), axis, value)
-        wanted = Outside.NOTHING if believed else BY_NAME[name]
+        wanted = Outside.NOTHING if accepted else BY_NAME[name]
         changed = msgspec.structs.replace(told, **{name: pair})
         if name == "k_p" and value > 1e-3:  # stiffer: the reference is at the joint
             assert changed.q_ref == Q
@@ -266,12 +266,12 @@ def test_while_track_blends_in_the_reference_may_be_as_far_as_it_was_held_off(
 
 def test_hold_stiffens_about_the_joint_where_the_reference_is_too_far(robot: RobotConfig) -> None:
     """A knee 0.1 rad off was pulled by 300 N m once HOLD had stiffened, and the robot fell."""
-    setpoint = law.aged(middle(robot, q_ref=(0.13, -1.1), tau_coupled=(4.0, -6.0)), 0.0)
-    moved = law.near(setpoint, Q, (3000.0, 0.0), 300.0)
+    setpoint = pd_law.extrapolate(middle(robot, q_ref=(0.13, -1.1), tau_coupled=(4.0, -6.0)), 0.0)
+    moved = pd_law.limit_stiffening(setpoint, Q, (3000.0, 0.0), 300.0)
     assert moved.q_ref == (Q[0], setpoint.q_ref[1])
-    assert law.torque(moved, Q, V) == pytest.approx(law.torque(setpoint, Q, V))
+    assert pd_law.torque(moved, Q, V) == pytest.approx(pd_law.torque(setpoint, Q, V))
     assert moved.tau_coupled == setpoint.tau_coupled, "it fades, as the rates do"
-    assert law.near(setpoint, Q, (2700.0, 3000.0), 400.0) is setpoint
+    assert pd_law.limit_stiffening(setpoint, Q, (2700.0, 3000.0), 400.0) is setpoint
 
 
 def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:

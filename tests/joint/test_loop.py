@@ -9,10 +9,10 @@ import pytest
 
 from services.joint import loop as joint_loop
 from services.joint.differential import joint_torque, motor_from_joint
+from services.joint.drive_manager import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS, DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.loop import JointLoop, Ports
-from services.joint.module import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS, Module
-from services.joint.will import Will, WillFile
+from services.joint.loop import JointLoop, JointPorts
+from services.joint.rearm_guard import LastState, RearmGuard
 from shared.config import RobotConfig
 from shared.messages import Estop, JointEvent, JointState, Mode, Pair
 from shared.traces import JointTrace
@@ -89,7 +89,7 @@ class Rig:
         self,
         robot: RobotConfig,
         monkeypatch: pytest.MonkeyPatch,
-        will: WillFile | None = None,
+        last_state: RearmGuard | None = None,
     ) -> None:
         self.now_ns = T0
         self.onboard = robot.joint_service.loop == "onboard"
@@ -98,19 +98,21 @@ class Rig:
         self.period_ns = round(1e9 / robot.joint_service.rate_hz)
         monkeypatch.setattr(joint_loop, "now_ns", lambda: self.now_ns)
         self.drive = FakeDrive(self)
-        module = Module(robot, "knee_right", will.read() if will else Will.NOTHING)
+        module = DriveManager(
+            robot, "knee_right", last_state.read() if last_state else LastState.NOTHING
+        )
         self.controller = module.controller
         self.commands, self.estops = Inbox[Any](), Inbox[Estop]()
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
         self.traces = Outbox[JointTrace]()
-        ports = Ports(
+        ports = JointPorts(
             commands=cast("Any", self.commands),
             estops=cast("Any", self.estops),
             states=cast("Any", self.states),
             events=cast("Any", self.events),
             traces=cast("Any", self.traces),
         )
-        self.loop = JointLoop(robot, module, self.drive, ports, will)
+        self.loop = JointLoop(robot, module, self.drive, ports, last_state)
 
     def run(self, cycles: int) -> None:
         for _ in range(cycles):

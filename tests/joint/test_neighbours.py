@@ -12,47 +12,49 @@ import pytest
 from services.joint import neighbours
 from services.joint.neighbours import (
     GONE_NS,
-    NOTHING,
     STALE_NS,
-    Near,
+    UNKNOWN,
+    NeighbourRow,
     Neighbours,
-    Row,
-    near,
+    NeighbourView,
     path_of,
+    view_of,
 )
 from shared.joints import MODULES, kind_of
 from shared.messages import Mode
 from tests.joint.helpers import T0
 
 
-def rows(**changes: Row | None) -> list[Row | None]:
+def rows(**changes: NeighbourRow | None) -> list[NeighbourRow | None]:
     """Return six modules that sink, with some replaced."""
-    known = {name: Row(T0, 0.1 * i, 0.01 * i, Mode.DAMP) for i, name in enumerate(MODULES)}
+    known = {name: NeighbourRow(T0, 0.1 * i, 0.01 * i, Mode.DAMP) for i, name in enumerate(MODULES)}
     return [changes.get(name, row) for name, row in known.items()]
 
 
 def test_a_hip_knows_how_its_own_leg_has_turned() -> None:
-    assert near("hip_right", rows(), T0) == Near(pytest.approx((0.0 + 0.1, 0.0 + 0.01)))
-    assert near("hip_left", rows(), T0) == Near(pytest.approx((0.3 + 0.4, 0.03 + 0.04)))
+    assert view_of("hip_right", rows(), T0) == NeighbourView(pytest.approx((0.0 + 0.1, 0.0 + 0.01)))
+    assert view_of("hip_left", rows(), T0) == NeighbourView(pytest.approx((0.3 + 0.4, 0.03 + 0.04)))
 
 
 @pytest.mark.parametrize("age_ns", [-STALE_NS - 1, STALE_NS + 1])
 @pytest.mark.parametrize("kind", ["ankle", "knee"])
 def test_what_is_old_or_of_another_clock_is_not_known(kind: str, age_ns: int) -> None:
     name = f"{kind}_left"
-    old = rows(**{name: Row(T0 - age_ns, 0.5, 0.0, Mode.DAMP)})
-    assert near("hip_left", old, T0).below is None
-    assert near("hip_right", old, T0).below is not None, "it is no business of the other leg"
-    just = rows(**{name: Row(T0 - STALE_NS, 0.5, 0.0, Mode.DAMP)})
-    assert near("hip_left", just, T0).below is not None
+    old = rows(**{name: NeighbourRow(T0 - age_ns, 0.5, 0.0, Mode.DAMP)})
+    assert view_of("hip_left", old, T0).below is None
+    assert view_of("hip_right", old, T0).below is not None, "it is no business of the other leg"
+    just = rows(**{name: NeighbourRow(T0 - STALE_NS, 0.5, 0.0, Mode.DAMP)})
+    assert view_of("hip_left", just, T0).below is not None
 
 
 @pytest.mark.parametrize("kind", ["ankle", "knee"])
 def test_what_is_being_written_or_never_was_is_not_known(kind: str) -> None:
-    for row in (None, Row(0, 0.0, 0.0, 0)):
-        found = near("hip_left", rows(**{f"{kind}_left": row}), T0)
-        assert found == NOTHING
-    assert near("knee_right", rows(knee_left=Row(0, 0.0, 0.0, 0)), T0).sinks, "on another host"
+    for row in (None, NeighbourRow(0, 0.0, 0.0, 0)):
+        found = view_of("hip_left", rows(**{f"{kind}_left": row}), T0)
+        assert found == UNKNOWN
+    assert view_of("knee_right", rows(knee_left=NeighbourRow(0, 0.0, 0.0, 0)), T0).sinks, (
+        "on another host"
+    )
 
 
 def test_who_holds_beside_whom() -> None:
@@ -61,7 +63,9 @@ def test_who_holds_beside_whom() -> None:
     for asks, other, mode, age_ns, caught in product(MODULES, MODULES, Mode, ages, (0, 1)):
         if asks == other:
             continue
-        found = near(asks, rows(**{other: Row(T0 - age_ns, 0.0, 0.0, mode, caught)}), T0)
+        found = view_of(
+            asks, rows(**{other: NeighbourRow(T0 - age_ns, 0.0, 0.0, mode, caught)}), T0
+        )
         pair = kind_of(asks), kind_of(other)
         stays = age_ns > GONE_NS or mode != Mode.DAMP or caught == 1
         assert found.sinks is not (pair == ("knee", "knee") and stays), (asks, other, mode, age_ns)
@@ -72,13 +76,13 @@ def test_who_holds_beside_whom() -> None:
 
 def test_a_drive_that_was_never_heard_of_is_not_limp() -> None:
     for asks, other in (("hip_right", "knee_left"), ("knee_right", "ankle_left")):
-        assert not near(asks, rows(**{other: Row(0, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
-        assert near(asks, rows(**{other: Row(1, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
+        assert not view_of(asks, rows(**{other: NeighbourRow(0, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
+        assert view_of(asks, rows(**{other: NeighbourRow(1, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
 
 
 def test_a_clock_far_ahead_is_of_another_host() -> None:
-    ahead = rows(knee_left=Row(T0 + STALE_NS + 1, 0.0, 0.0, Mode.HOLD))
-    assert near("knee_right", ahead, T0).sinks
+    ahead = rows(knee_left=NeighbourRow(T0 + STALE_NS + 1, 0.0, 0.0, Mode.HOLD))
+    assert view_of("knee_right", ahead, T0).sinks
 
 
 @pytest.fixture
@@ -90,11 +94,13 @@ def test_what_one_writes_the_others_read(tmp_path: Path, six: dict[str, Neighbou
     assert Neighbours.mode_of(tmp_path, "hip_left") is None
     for cycle in range(300):  # the number's low byte goes round
         for i, name in enumerate(MODULES):
-            six[name].write(Row(T0 + cycle, 0.1 * i + cycle, 0.01 * i, Mode.DAMP))
-        assert six["hip_left"].near(T0 + cycle) == Near(pytest.approx((0.7 + 2 * cycle, 0.07)))
-    assert six["ankle_left"].near(T0) == NOTHING
-    assert six["knee_left"].near(T0 + 299).sinks
-    assert not six["knee_left"].near(T0 + 300 + GONE_NS).sinks, "the others are dead"
+            six[name].write(NeighbourRow(T0 + cycle, 0.1 * i + cycle, 0.01 * i, Mode.DAMP))
+        assert six["hip_left"].view(T0 + cycle) == NeighbourView(
+            pytest.approx((0.7 + 2 * cycle, 0.07))
+        )
+    assert six["ankle_left"].view(T0) == UNKNOWN
+    assert six["knee_left"].view(T0 + 299).sinks
+    assert not six["knee_left"].view(T0 + 300 + GONE_NS).sinks, "the others are dead"
     assert Neighbours.mode_of(tmp_path, "hip_left") is Mode.DAMP
 
 
@@ -102,22 +108,22 @@ def test_a_row_that_its_writer_died_over_is_not_read(
     tmp_path: Path, six: dict[str, Neighbours]
 ) -> None:
     for name in MODULES:
-        six[name].write(Row(T0, 0.1, 0.0, Mode.DAMP))
-    assert six["hip_left"].near(T0).below is not None
+        six[name].write(NeighbourRow(T0, 0.1, 0.0, Mode.DAMP))
+    assert six["hip_left"].view(T0).below is not None
     whole = path_of(tmp_path).read_bytes()
     row_of_the_knee = len(whole) // 6 * MODULES.index("knee_left")
     with path_of(tmp_path).open("r+b") as file:
         file.seek(row_of_the_knee)
         file.write(bytes([whole[row_of_the_knee] | 1]))
-    assert six["hip_left"].near(T0).below is None
+    assert six["hip_left"].view(T0).below is None
     successor = Neighbours(tmp_path, "knee_left")
-    successor.write(Row(T0, 0.3, 0.0, Mode.DAMP))
-    assert six["hip_left"].near(T0) == Near(pytest.approx((0.4, 0.0)))
+    successor.write(NeighbourRow(T0, 0.3, 0.0, Mode.DAMP))
+    assert six["hip_left"].view(T0) == NeighbourView(pytest.approx((0.4, 0.0)))
 
 
 def test_each_service_finds_its_own_row(tmp_path: Path, six: dict[str, Neighbours]) -> None:
     for name, mode in zip(MODULES, (*Mode, Mode.HOLD), strict=True):
-        six[name].write(Row(T0, 0.0, 0.0, mode))
+        six[name].write(NeighbourRow(T0, 0.0, 0.0, mode))
     for name, mode in zip(MODULES, (*Mode, Mode.HOLD), strict=True):
         assert Neighbours.mode_of(tmp_path, name) is mode
 
@@ -136,9 +142,9 @@ def test_a_row_is_odd_while_it_is_written_and_never_has_the_same_number_twice(
             after.append(self.unpack_from(buffer, offset)[0])
 
     monkeypatch.setattr(neighbours, "_NUMBER", Number("<Q"))
-    six["ankle_right"].write(Row(T0, 0.0, 0.0, Mode.DAMP))
+    six["ankle_right"].write(NeighbourRow(T0, 0.0, 0.0, Mode.DAMP))
     for _ in range(3):
-        six[last].write(Row(T0, 0.0, 0.0, Mode.DAMP))
-    Neighbours(tmp_path, last).write(Row(T0, 0.0, 0.0, Mode.DAMP))
+        six[last].write(NeighbourRow(T0, 0.0, 0.0, Mode.DAMP))
+    Neighbours(tmp_path, last).write(NeighbourRow(T0, 0.0, 0.0, Mode.DAMP))
     assert [number % 2 for number in while_written] == [1] * 5
     assert after == [2, 2, 4, 6, 8]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.will import WillFile, ask_stop, forget
+from services.joint.rearm_guard import RearmGuard, ask_stop, clear
 from shared.config import RobotConfig
 from shared.messages import Mode
 from tests.joint.test_loop import Rig
@@ -15,17 +15,17 @@ from tests.joint.test_loop import Rig
 def test_a_stop_by_shared_memory_is_heard_in_the_next_cycle_by_a_service_without_a_bus(
     robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    rig = Rig(robot, monkeypatch, WillFile(tmp_path, "knee_right"))
+    rig = Rig(robot, monkeypatch, RearmGuard(tmp_path, "knee_right"))
     rig.run(20)
     assert rig.controller.failsafe.mode is Mode.HOLD
     ask_stop(tmp_path, "knee_right")
     rig.run(1)
     assert rig.controller.failsafe.mode is Mode.DAMP
-    crashed = Rig(robot, monkeypatch, WillFile(tmp_path, "knee_right"))
+    crashed = Rig(robot, monkeypatch, RearmGuard(tmp_path, "knee_right"))
     crashed.run(20)
     assert crashed.controller.failsafe.mode in (Mode.DAMP, Mode.FAULT)
     assert crashed.drive.armed == 0, "nobody has asked for it"
-    forget(tmp_path, "knee_right")
-    asked_for = Rig(robot, monkeypatch, WillFile(tmp_path, "knee_right"))
+    clear(tmp_path, "knee_right")
+    asked_for = Rig(robot, monkeypatch, RearmGuard(tmp_path, "knee_right"))
     asked_for.run(20)
     assert asked_for.controller.failsafe.mode is Mode.HOLD

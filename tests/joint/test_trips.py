@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.failsafe import TRIPS, Event
-from services.joint.trips import Trips, limits_of
+from services.joint.trips import JointTrips, limits_of
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.config_sections import TripLimit
@@ -24,7 +24,7 @@ STILL: Pair = (0.0, 0.0)
 
 def tripped_ms(robot: RobotConfig, taus: list[Pair], v: Pair = STILL) -> tuple[Event, float | None]:
     """Return the first trip and how long it took, ms, of these torques cycle by cycle."""
-    trips, limits = Trips(), limits_of(robot)
+    trips, limits = JointTrips(), limits_of(robot)
     trips.rest(taus[0])
     for cycle, tau in enumerate(taus):
         event = trips.judge(T0 + cycle * CYCLE_NS, tau, v, limits)
@@ -54,7 +54,7 @@ def test_shaking_is_the_mean_square_above_its_band_of_either_axis(robot: RobotCo
     limits = limits_of(robot)
     for axis in (0, 1):
         for sign in (-1.0, 1.0):
-            trips = Trips()
+            trips = JointTrips()
             trips.rest(STILL)
             jump = (sign * 9.0, 0.0) if axis == 0 else (0.0, sign * 9.0)
             trips.judge(T0, jump, STILL, limits)
@@ -75,7 +75,7 @@ def test_limits_are_the_robot_files(robot: RobotConfig) -> None:
 
 def test_at_its_limit_shaking_and_speed_are_none_and_torque_is(robot: RobotConfig) -> None:
     limits = msgspec.structs.replace(limits_of(robot), mean_share=0.0, shaking=4.0)
-    trips = Trips(mean=(4.0, 4.0))
+    trips = JointTrips(mean=(4.0, 4.0))
     at_limit = (0.25 * limits.torque, -0.75 * limits.torque)
     assert trips.judge(T0, at_limit, (limits.speed, -limits.speed), limits) is Event.NONE
     assert (trips.at_limit_ns, trips.fast_ns) == (T0, 0)
@@ -157,8 +157,8 @@ def test_in_hold_nothing_trips(robot: RobotConfig) -> None:
 def test_what_was_seen_is_remembered(tracking: Bench, robot: RobotConfig) -> None:
     tracking.v = (0.6, -0.3)
     tracking.run(3, fresh=True)
-    memory = tracking.controller.remember()
+    memory = tracking.controller.snapshot()
     other = Bench(robot).controller
-    other.recall(memory)
-    assert other.remember() == memory
+    other.restore(memory)
+    assert other.snapshot() == memory
     assert memory.trips.mean != (0.0, 0.0)

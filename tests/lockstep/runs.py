@@ -21,7 +21,7 @@ from shared.messages import SimTruth
 from shared.scenario import Keyframe, Kill, Push, Restart, Scenario
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
-from tools.runs.partial import Start
+from tools.runs.partial import PartialStart
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 
@@ -78,7 +78,7 @@ def still(duration: float, height: float = 1.188, **changes: object) -> Scenario
     return story("stand", duration=duration, keyframe=frames, **changes)
 
 
-def standing(robot: RobotConfig, plant: PlantConfig) -> Start:
+def standing(robot: RobotConfig, plant: PlantConfig) -> PartialStart:
     """Return the moment at which a scenario begins; a robot is stood up once in this process."""
     schedule = robot.gain_schedule
     key = (to_toml(robot), plant_to_toml(plant), schedule.digest if schedule else "")
@@ -86,15 +86,15 @@ def standing(robot: RobotConfig, plant: PlantConfig) -> Start:
         fleet = Lockstep(robot, still(1.0), BASE, plant=plant)
         assert any(row.scenario_s >= 0.0 for row in fleet.run()), "it stands and tracks"
         assert fleet.planner is not None
-        _standing[key] = Start(
+        _standing[key] = PartialStart(
             taken(fleet.world, fleet.bank, fleet.now_ns, 0),
             {module: fleet.memory_of(module) for module in MODULES},
-            (fleet.planner.session, fleet.planner.remember()),
+            (fleet.planner.session, fleet.planner.snapshot()),
         )
     return _standing[key]
 
 
-_standing: dict[tuple[str, str, str], Start] = {}
+_standing: dict[tuple[str, str, str], PartialStart] = {}
 
 
 def run(

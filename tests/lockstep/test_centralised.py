@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.joint import law
+from services.joint import pd_law
 from services.joint.differential import joint_torque, motor_from_joint
+from services.joint.drive_manager import DriveAction, DriveCommand
 from services.joint.drivers.base import DriveReading, DriveStatus
-from services.joint.module import Order, Step
 from services.planner.planner import Planner
 from services.simulator.plant import IDEAL, PlantConfig
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -22,7 +22,7 @@ from shared.robot_model import stand_pose
 from shared.scenario import Inject, Scenario
 from tests.joint.helpers import command
 from tests.lockstep.runs import push, story
-from tests.planner.test_planner import standing_torque
+from tests.planner.conftest import standing_torque
 from tests.test_architecture import IMPORTS, Import, imports_in
 from tools import cli
 from tools.centralised.control import CentralPlanner, PassThrough
@@ -104,7 +104,9 @@ class Bench:
         self.seq = 0
         self.status = DriveStatus.ARMED
 
-    def cycle(self, tau: Pair | None = None, age_ns: int = 0, *, estop: bool = False) -> Step:
+    def cycle(
+        self, tau: Pair | None = None, age_ns: int = 0, *, estop: bool = False
+    ) -> DriveAction:
         """Run a cycle, with a command of this torque or with none."""
         self.now_ns += CYCLE_NS
         pos = motor_from_joint((0.02, -1.0), self.gear_ratio)
@@ -113,7 +115,11 @@ class Bench:
         if tau is not None:
             self.seq += 1
             sent = command(
-                seq=self.seq, echo_t_ns=self.now_ns - age_ns, tau_ff=tau, k_p=law.ZERO, k_d=law.ZERO
+                seq=self.seq,
+                echo_t_ns=self.now_ns - age_ns,
+                tau_ff=tau,
+                k_p=pd_law.ZERO,
+                k_d=pd_law.ZERO,
             )
         return self.module.step(self.now_ns, reading, sent, estop)
 
@@ -130,8 +136,8 @@ class Bench:
     def mode(self) -> Mode:
         return self.module.controller.failsafe.mode
 
-    def torque_of(self, step: Step) -> Pair:
-        assert step.order is Order.TORQUE
+    def torque_of(self, step: DriveAction) -> Pair:
+        assert step.order is DriveCommand.TORQUE
         return joint_torque(step.torque, self.gear_ratio)
 
 
@@ -179,7 +185,7 @@ def test_an_estop_and_a_lost_drive_are_as_shipped(robot: RobotConfig, bench: Ben
     other.status = DriveStatus.LOST
     other.cycle(TAU)
     assert other.mode is Mode.FAULT
-    assert other.cycle(TAU).order is not Order.TORQUE
+    assert other.cycle(TAU).order is not DriveCommand.TORQUE
 
 
 def states(robot: RobotConfig, now_ns: int, seq: int) -> list[JointState]:
@@ -212,12 +218,12 @@ def test_a_command_is_all_that_the_shipped_planner_asks_for_as_one_torque(
         now += 4 * NS_PER_MS
         heard = states(robot, now, seq)
         for index, state in enumerate(heard):
-            shipped.hear_state(index, state, now)
-            central.hear_state(index, state, now)
+            shipped.receive_state(index, state, now)
+            central.receive_state(index, state, now)
         for state, whole, parts in zip(heard, central.tick(now), shipped.tick(now), strict=True):
-            wanted = law.torque(law.aged(parts, 0.0), state.q, state.v)
+            wanted = pd_law.torque(pd_law.extrapolate(parts, 0.0), state.q, state.v)
             assert whole.tau_ff == pytest.approx(wanted, abs=1e-12)
-            assert whole.k_p == whole.k_d == whole.tau_coupled == whole.dtau_ff == law.ZERO
+            assert whole.k_p == whole.k_d == whole.tau_coupled == whole.dtau_ff == pd_law.ZERO
             assert whole.margin == whole.margin_onboard == 0.0
             assert max(map(abs, parts.tau_coupled)) > 0.0
             assert whole.echo_t_ns == parts.echo_t_ns
@@ -229,7 +235,7 @@ def test_once_it_leads_the_planner_leads_whatever_it_hears(robot: RobotConfig) -
     modes = []
     for planner in planners:
         for index, state in enumerate(heard):
-            planner.hear_state(index, state, NS_PER_S)
+            planner.receive_state(index, state, NS_PER_S)
         for tick in range(3):
             planner.tick(NS_PER_S + tick * 4 * NS_PER_MS)
         assert planner.status(NS_PER_S, 0.0).mode == PlannerMode.LEADING

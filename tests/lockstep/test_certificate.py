@@ -9,7 +9,7 @@ from shared.config import RobotConfig
 from shared.messages import SimTruth
 from tests.planner import oracle
 from tools.sweeps import certificate_study as study
-from tools.sweeps.certificate_study import Case, Cases, Outcome
+from tools.sweeps.certificate_study import CertificateCase, CertificateCases, CertificateResult
 
 SEED = 1
 DRAWN = 300
@@ -20,28 +20,30 @@ TRIED = 8
 
 
 @pytest.fixture(scope="module")
-def drawn(robot: RobotConfig) -> list[Case]:
-    cases = Cases(robot)
+def drawn(robot: RobotConfig) -> list[CertificateCase]:
+    cases = CertificateCases(robot)
     return sorted((cases.draw(SEED, number) for number in range(DRAWN)), key=margin_of)
 
 
-def margin_of(case: Case) -> float:
+def margin_of(case: CertificateCase) -> float:
     return case.weakest.margin
 
 
-def outcome(case: Case, *, stood: bool, margin: float | None = None) -> Outcome:
+def outcome(
+    case: CertificateCase, *, stood: bool, margin: float | None = None
+) -> CertificateResult:
     told = case.weakest.margin if margin is None else margin
     case = case._replace(weakest=case.weakest._replace(margin=told))
-    return Outcome(case, stood, not stood, 1.0, 0.01, 0.01, 0.5)
+    return CertificateResult(case, stood, not stood, 1.0, 0.01, 0.01, 0.5)
 
 
-def test_the_cases_are_about_half_of_either_kind(drawn: list[Case]) -> None:
+def test_the_cases_are_about_half_of_either_kind(drawn: list[CertificateCase]) -> None:
     positive = sum(margin_of(case) > 0.0 for case in drawn)
     assert 0.4 * DRAWN < positive < 0.6 * DRAWN
 
 
 def test_a_case_starts_at_rest_in_its_posture_on_flat_soles(
-    robot: RobotConfig, drawn: list[Case]
+    robot: RobotConfig, drawn: list[CertificateCase]
 ) -> None:
     """p by the oracle's own kinematics, and by where the simulated robot is."""
     for case in (drawn[0], drawn[DRAWN // 2], drawn[-1]):
@@ -56,14 +58,18 @@ def test_a_case_starts_at_rest_in_its_posture_on_flat_soles(
         assert truth.hoist == 0.0
 
 
-def test_what_the_certificate_lets_stand_stands(robot: RobotConfig, drawn: list[Case]) -> None:
+def test_what_the_certificate_lets_stand_stands(
+    robot: RobotConfig, drawn: list[CertificateCase]
+) -> None:
     nearest = [case for case in drawn if margin_of(case) > CLEAR][:TRIED]
     assert len(nearest) == TRIED
     fell = [case.number for case in nearest if not study.run(robot, case).stood]
     assert fell == []
 
 
-def test_what_the_certificate_refuses_falls(robot: RobotConfig, drawn: list[Case]) -> None:
+def test_what_the_certificate_refuses_falls(
+    robot: RobotConfig, drawn: list[CertificateCase]
+) -> None:
     nearest = [case for case in drawn if margin_of(case) < -CLEAR][-TRIED:]
     assert len(nearest) == TRIED
     stood = [case.number for case in nearest if study.run(robot, case).stood]
@@ -71,7 +77,7 @@ def test_what_the_certificate_refuses_falls(robot: RobotConfig, drawn: list[Case
 
 
 def test_on_a_rigid_floor_the_sign_is_right_much_nearer_to_zero(
-    robot: RobotConfig, drawn: list[Case]
+    robot: RobotConfig, drawn: list[CertificateCase]
 ) -> None:
     near = [case for case in drawn if 0.005 < abs(margin_of(case)) < 0.03]
     assert {margin_of(case) > 0.0 for case in near} == {True, False}
@@ -80,7 +86,7 @@ def test_on_a_rigid_floor_the_sign_is_right_much_nearer_to_zero(
     assert wrong == []
 
 
-def test_a_slow_drift_away_is_no_stand(robot: RobotConfig, drawn: list[Case]) -> None:
+def test_a_slow_drift_away_is_no_stand(robot: RobotConfig, drawn: list[CertificateCase]) -> None:
     case = drawn[-1]
     world = study.world_of(robot, case, 1.0, rigid=False)
     still = world.truth(0, 1.0, 0.0)
@@ -99,10 +105,10 @@ def test_a_slow_drift_away_is_no_stand(robot: RobotConfig, drawn: list[Case]) ->
 
 
 def test_the_same_number_is_the_same_case_whatever_was_drawn_before(
-    robot: RobotConfig, drawn: list[Case]
+    robot: RobotConfig, drawn: list[CertificateCase]
 ) -> None:
     case = drawn[7]
-    again = Cases(robot).draw(SEED, case.number)
+    again = CertificateCases(robot).draw(SEED, case.number)
     np.testing.assert_array_equal(again.D, case.D)
     np.testing.assert_array_equal(again.posture.q, case.posture.q)
     assert again.nudge == case.nudge

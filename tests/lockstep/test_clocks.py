@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 import pytest
 
-from services.planner.engagement import WAITS_NS
+from services.planner.engagement_fsm import WAITS_NS
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import MODULES
@@ -23,11 +23,11 @@ from shared.topics import Topic
 from tools.runs import partial
 from tools.runs.host_clock import HostClock
 from tools.runs.lockstep import Lockstep
-from tools.runs.partial import Case, Start
+from tools.runs.partial import PartialCase, PartialStart
 
 HOUR_NS = 3600 * NS_PER_S
 HOSTS = ("planner", "harness", *MODULES)
-SQUAT = partial.story_of(Case("links", ()))
+SQUAT = partial.story_of(PartialCase("links", ()))
 
 
 class Fleet(Lockstep):
@@ -81,7 +81,7 @@ def plain(robot: RobotConfig) -> Run:
 
 
 @pytest.fixture(scope="module")
-def start(robot: RobotConfig) -> Start:
+def start(robot: RobotConfig) -> PartialStart:
     return partial.start_of(robot)
 
 
@@ -161,7 +161,7 @@ def put_again(fleet: Fleet, module: int, sent: JointCommand) -> None:
     fleet.network.commands()[module].put(fleet.now_ns, sent)
 
 
-def gone_on(robot: RobotConfig, start: Start, *, led: bool, again: Run | None) -> Fleet:
+def gone_on(robot: RobotConfig, start: PartialStart, *, led: bool, again: Run | None) -> Fleet:
     """Go on for 0.6 s, with or without a planner, with a record's commands played on top."""
     fleet = Fleet(robot, SQUAT)
     fleet.go_on(start.state, start.modules, start.planner if led else None)
@@ -180,7 +180,7 @@ def gone_on(robot: RobotConfig, start: Start, *, led: bool, again: Run | None) -
 
 @pytest.mark.parametrize("led", [True, False], ids=["led", "held"])
 def test_yesterdays_commands_put_onto_the_bus_move_nothing(
-    led: bool, robot: RobotConfig, plain: Run, start: Start
+    led: bool, robot: RobotConfig, plain: Run, start: PartialStart
 ) -> None:
     """A record of the same robot, same session, in the same pose: older by a day."""
     day_ns = 24 * HOUR_NS

@@ -36,10 +36,10 @@ def limp(
     return run(robot, scenario)
 
 
-def braced(outcome: Run) -> list[str]:
+def stiffened(outcome: Run) -> list[str]:
     """Return the modules that hold with all they have."""
     states = [each.state(outcome.lockstep.now_ns) for each in outcome.lockstep.controllers]
-    return [name for name, state in zip(MODULES, states, strict=True) if state.braced]
+    return [name for name, state in zip(MODULES, states, strict=True) if state.stiffened]
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_a_limp_knee_stands_on_five_that_brace_and_takes_a_push(
     # in the crawl 15 N is near its limit: at 0.9 s a push of 20 N to the side ends in a fall
     assert abs(outcome.com_mm[after, :2]).max() < 60.0
     assert outcome.lockstep.controllers[MODULE_INDEX[module]].failsafe.mode is Mode.FAULT
-    assert braced(outcome) == [other for other in MODULES if other != module]
+    assert stiffened(outcome) == [other for other in MODULES if other != module]
     steps = [
         max(abs(b - a) for a, b in zip(event.tau_before, event.tau_after, strict=True))
         for other, event in outcome.lockstep.events
@@ -86,7 +86,7 @@ def test_with_the_planner_dead_a_limp_knee_stands_as_well(
     planner_dead = kill(at - 0.2)
     outcome = limp(robot, "squat", "knee_left", "disarmed", at, *force, kill=planner_dead)
     assert outcome.stood
-    assert braced(outcome) == [other for other in MODULES if other != "knee_left"]
+    assert stiffened(outcome) == [other for other in MODULES if other != "knee_left"]
     after = outcome.t > at
     assert abs(outcome.com_mm[after, :2]).max() < 75.0, "40 to 54 measured"
 
@@ -95,5 +95,5 @@ def test_for_a_limp_ankle_the_knees_alone_brace(robot: RobotConfig) -> None:
     """Stiff hips handed the hand's moment to the one ankle that is left: 4 of 4 fell."""
     outcome = limp(robot, "crawl", "ankle_left", "disarmed", 0.886, 0.001, 0.0, 0.0)
     assert outcome.stood
-    assert braced(outcome) == ["knee_right", "knee_left"]
+    assert stiffened(outcome) == ["knee_right", "knee_left"]
     assert abs(outcome.com_mm[:, 0]).max() < 120.0, "within the sole that is left"

@@ -16,7 +16,7 @@ import random
 
 import pytest
 
-from services.planner.engagement import GRACE_NS, WAITS_NS
+from services.planner.engagement_fsm import GRACE_NS, WAITS_NS
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import MODULES, SIDES
@@ -24,7 +24,7 @@ from shared.links import ATTITUDES, DIRECTIONS, WRENCHES, directions_of
 from shared.messages import SimTruth
 from tests.recorder.runs import sample as sample_of
 from tools.runs import partial
-from tools.runs.partial import KINDS, SUBSETS, Case, Start, run_case
+from tools.runs.partial import KINDS, SUBSETS, PartialCase, PartialStart, run_case
 
 LEGS = [tuple(module for module in MODULES if module.endswith(side)) for side in SIDES]
 ALWAYS = {"links": [*((module,) for module in MODULES), *LEGS]}
@@ -32,27 +32,27 @@ ALWAYS["frozen"] = ALWAYS["links"]
 DRAWN = {"links": 4, "frozen": 4, "commands": 2, "states": 2}
 
 
-def sample(kind: partial.FailureKind) -> list[Case]:
+def sample(kind: partial.FailureKind) -> list[PartialCase]:
     if os.environ.get("XRL_ALL_SUBSETS"):
-        return [Case(kind, modules) for modules in SUBSETS[1:]]
+        return [PartialCase(kind, modules) for modules in SUBSETS[1:]]
     always = [*ALWAYS.get(kind, []), SUBSETS[-1]]
     others = [modules for modules in SUBSETS[1:] if modules not in always]
     drawn = random.Random(f"partial {kind}").sample(others, DRAWN[kind])
-    return [Case(kind, modules) for modules in (*always, *drawn)]
+    return [PartialCase(kind, modules) for modules in (*always, *drawn)]
 
 
-def words(case: Case) -> str:
+def words(case: PartialCase) -> str:
     return f"{case.kind}-{'+'.join(case.modules)}"
 
 
 @pytest.fixture(scope="module")
-def start(robot: RobotConfig) -> Start:
+def start(robot: RobotConfig) -> PartialStart:
     return partial.start_of(robot)
 
 
 @pytest.mark.parametrize("case", [case for kind in KINDS for case in sample(kind)], ids=words)
 def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_again(
-    case: Case, robot: RobotConfig, start: Start
+    case: PartialCase, robot: RobotConfig, start: PartialStart
 ) -> None:
     outcome = run_case(case, robot, start)
     age_ms = robot.joint_service.max_command_age_ms
@@ -70,8 +70,8 @@ def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_
     assert outcome.operator_end_n < 75.0, "44 to 50 measured: it leads, and is not at its limit"
 
 
-def test_with_nothing_failed_nobody_holds(robot: RobotConfig, start: Start) -> None:
-    outcome = run_case(Case("links", ()), robot, start)
+def test_with_nothing_failed_nobody_holds(robot: RobotConfig, start: PartialStart) -> None:
+    outcome = run_case(PartialCase("links", ()), robot, start)
     assert outcome.stood
     assert outcome.hold_shown_ms is None
     assert outcome.track_left_ms is None
@@ -95,8 +95,8 @@ def test_who_tips_at_the_end_or_does_not_come_so_far_has_not_stood(
     good = {"scenario_s": partial.END_S, "com": (0.0, 0.0, 1.0), "fallen": False}
     flat = {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0, "lean": (0.0, 0.0)}
     row = sample_of(SimTruth, **(good | flat | changes))
-    case = Case("links", ())
-    fleet = partial.Fleet(robot, partial.story_of(case))
+    case = PartialCase("links", ())
+    fleet = partial.PartialFleet(robot, partial.story_of(case))
     outcome = partial._measure(case, fleet, [row], [], 0, None)
     assert outcome.stood is stands
 
@@ -116,7 +116,7 @@ def test_there_are_64_subsets_and_each_kind_fails_what_it_says() -> None:
     cut = {
         kind: {
             direction
-            for row in partial.story_of(Case(kind, MODULES)).inject
+            for row in partial.story_of(PartialCase(kind, MODULES)).inject
             for direction in directions_of(row.link)
         }
         for kind in KINDS
@@ -124,11 +124,11 @@ def test_there_are_64_subsets_and_each_kind_fails_what_it_says() -> None:
     assert cut["links"] == cut["commands"] | cut["states"]
     assert cut["links"] == set(DIRECTIONS) - {WRENCHES, ATTITUDES}
     assert not cut["commands"] & cut["states"]
-    frozen = partial.story_of(Case("frozen", MODULES))
+    frozen = partial.story_of(PartialCase("frozen", MODULES))
     assert {row.service for row in frozen.kill if row.signal == "STOP"} == set(MODULES)
     assert not cut["frozen"]
 
 
-def test_a_case_gone_on_with_is_the_same_each_time(robot: RobotConfig, start: Start) -> None:
-    case = Case("states", ("knee_left",))
+def test_a_case_gone_on_with_is_the_same_each_time(robot: RobotConfig, start: PartialStart) -> None:
+    case = PartialCase("states", ("knee_left",))
     assert run_case(case, robot, start) == run_case(case, robot, start)

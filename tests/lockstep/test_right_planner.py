@@ -11,7 +11,7 @@ import pytest
 
 from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
-from services.planner.trips import Trips
+from services.planner.trips import PlannerTrips
 from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.impairment import Impairment
@@ -32,7 +32,7 @@ class Judged:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.leading, self.outside = 0, Counter[str]()
         self.tripped: list[str] = []
-        advance, seen = Trips.advance, Failsafe.advance
+        advance, seen = PlannerTrips.advance, Failsafe.advance
         judge = Envelope.judge
 
         def listening(own: Envelope, command, last, *rest, **more):  # type: ignore[no-untyped-def]
@@ -42,7 +42,7 @@ class Judged:
                 self.outside[found.name] += 1
             return found
 
-        def watching(own: Trips, *rest: Any, **more: Any) -> None:
+        def watching(own: PlannerTrips, *rest: Any, **more: Any) -> None:
             advance(own, *rest, **more)
             if own.tripped:
                 self.tripped.append(own.why)
@@ -54,7 +54,7 @@ class Judged:
             return cause
 
         monkeypatch.setattr(Envelope, "judge", listening)
-        monkeypatch.setattr(Trips, "advance", watching)
+        monkeypatch.setattr(PlannerTrips, "advance", watching)
         monkeypatch.setattr(Failsafe, "advance", hearing)
 
 

@@ -16,8 +16,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import pytest
 
-from services.joint.memory import ModuleMemory
-from services.planner.memory import TickMemory
+from services.joint.snapshots import DriveManagerState
+from services.planner.snapshots import TickState
 from services.simulator.state import taken
 from shared.config import RobotConfig
 from shared.gain_schedule import believing
@@ -43,8 +43,8 @@ class Begin(NamedTuple):
     name: str
     at: float
     state: SimState
-    modules: Mapping[str, ModuleMemory]
-    planner: tuple[int, TickMemory]
+    modules: Mapping[str, DriveManagerState]
+    planner: tuple[int, TickState]
 
 
 class End(NamedTuple):
@@ -68,7 +68,7 @@ def begin(robot: RobotConfig, name: str, at: float) -> Begin:
         if row.scenario_s >= at:
             break
     assert fleet.planner is not None
-    planner = fleet.planner.session, fleet.planner.remember()
+    planner = fleet.planner.session, fleet.planner.snapshot()
     modules = {module: fleet.memory_of(module) for module in MODULES}
     return Begin(name, at, taken(fleet.world, fleet.bank, fleet.now_ns, 0), modules, planner)
 

@@ -11,8 +11,10 @@ import pytest
 
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
-from shared.config import RobotConfig
+from shared import config_file
+from shared.config import GRAVITY, RobotConfig
 from shared.robot_model import stand_pose
+from tests.conftest import ROBOT_FILE
 from tests.planner import oracle
 from tests.planner.oracle import Array
 
@@ -44,6 +46,15 @@ def limits(robot: RobotConfig) -> Array:
 @pytest.fixture(scope="session")
 def ik(robot: RobotConfig, limits: Array) -> InverseKinematics:
     return InverseKinematics(Kinematics(robot), limits)
+
+
+@cache
+def standing_torque(q: tuple[float, ...]) -> Array:
+    """Return the torques (12,) of the shipped robot's stand at q (12,), rad; N m."""
+    robot = config_file.load(ROBOT_FILE)
+    kinematics = Kinematics(robot)
+    kinematics.update(np.array(q))
+    return np.asarray(robot.total_mass * GRAVITY * kinematics.J[2])
 
 
 def com_height(robot: RobotConfig, height: float) -> float:

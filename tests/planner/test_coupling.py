@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.coupling import CouplingFilter, Missing, follow
+from services.planner.coupling import CouplingFilter, UncoupledGains, follow
 
 K_P = np.array([2810.0, 2810.0, 0.0, 800.0, 0.0, 400.0])
 B_P = np.array([300.0, 300.0, 0.0, 60.0, 0.0, 40.0])
@@ -20,8 +20,8 @@ def symmetric(seed: int, scale: float) -> np.ndarray:
     return scale * 0.5 * (A + A.T)
 
 
-def missing(damping: float = 1.0) -> Missing:
-    return Missing(K_P, B_P, S, damping)
+def missing(damping: float = 1.0) -> UncoupledGains:
+    return UncoupledGains(K_P, B_P, S, damping)
 
 
 def test_what_is_missing_fills_up_to_the_body_s_gains() -> None:
@@ -84,7 +84,7 @@ def test_it_goes_on_from_what_it_remembers_and_forgets_on_reset() -> None:
     one, other = CouplingFilter(3.0), CouplingFilter(3.0)
     for step in range(20):
         one.advance(np.full(12, float(step)), 0.004)
-    other.recall(one.remember())
+    other.restore(one.snapshot())
     np.testing.assert_array_equal(
         one.advance(np.ones(12), 0.004), other.advance(np.ones(12), 0.004)
     )

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from services.planner.inverse_kinematics import TOLERANCE, InverseKinematics, Outcome, in_words
+from services.planner.inverse_kinematics import TOLERANCE, IkEnding, InverseKinematics, describe
 from services.planner.kinematics import Kinematics
 from shared.config import RobotConfig
 from shared.robot_model import stand_pose
@@ -209,7 +209,7 @@ def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
         for _ in range(8):
             ik.q[:] = rng.uniform(limits[:, 0], limits[:, 1])
             reach = ik.solve_from_anywhere(p_ref)
-            assert reach.converged, in_words(reach, p_ref, limits)
+            assert reach.converged, describe(reach, p_ref, limits)
             assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE
             assert_within(ik.q, limits)
 
@@ -248,7 +248,7 @@ def test_out_of_reach_it_ends_inside_the_limits_with_legs_that_agree(
     for start in (rng.uniform(*limits.T), closed(1.188), closed(0.85, pitch=1.0)):
         ik.q[:] = start
         reach = ik.solve_from_anywhere(p_unreachable)
-        assert reach.outcome in (Outcome.JOINT_LIMIT, Outcome.OUT_OF_REACH)
+        assert reach.outcome in (IkEnding.JOINT_LIMIT, IkEnding.OUT_OF_REACH)
         assert np.isfinite(ik.q).all()
         assert_within(ik.q, limits)
         assert np.abs(oracle.closure(robot, ik.q)).max() < 1e-5
@@ -297,9 +297,9 @@ def test_too_high_says_how_far_it_goes_and_which_joints_stop_it(
     p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
     ik.q[:] = closed(1.188)
     reach = ik.solve_from_anywhere(p_ref)
-    assert reach.outcome is Outcome.JOINT_LIMIT
+    assert reach.outcome is IkEnding.JOINT_LIMIT
     assert reach.stopped == (0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0)
-    assert in_words(reach, p_ref, limits) == (
+    assert describe(reach, p_ref, limits) == (
         "p_ref cannot be reached: COM z 1.31 m asked, 0.93 m is as far as it goes: "
         "knee_right_theta at its limit -0.2 rad, knee_left_theta at its limit -0.2 rad"
     )
@@ -312,9 +312,9 @@ def test_beyond_straight_legs_no_joint_limit_is_blamed(robot: RobotConfig, limit
     ik.q[:] = stand_pose(robot, 1.188)
     p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
     reach = ik.solve_from_anywhere(p_ref)
-    assert reach.outcome is Outcome.OUT_OF_REACH
+    assert reach.outcome is IkEnding.OUT_OF_REACH
     assert set(reach.stopped) == {0}
-    assert in_words(reach, p_ref, wide).endswith("reach no further, no joint is at its limit")
+    assert describe(reach, p_ref, wide).endswith("reach no further, no joint is at its limit")
 
 
 def test_a_configuration_on_the_way_is_not_called_the_nearest(
@@ -323,11 +323,11 @@ def test_a_configuration_on_the_way_is_not_called_the_nearest(
     p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
     ik.q[:] = closed(1.0)
     reach = ik.examine(p_ref)
-    assert reach.outcome is Outcome.UNFINISHED
-    assert in_words(reach, p_ref, limits).startswith("p_ref was not reached: COM z 1.31 m asked")
+    assert reach.outcome is IkEnding.UNFINISHED
+    assert describe(reach, p_ref, limits).startswith("p_ref was not reached: COM z 1.31 m asked")
     ik.solve_from_anywhere(p_ref)  # its knees now stand at their limit, and can come off it
     reach = ik.examine(np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]))
-    assert reach.outcome is Outcome.UNFINISHED
+    assert reach.outcome is IkEnding.UNFINISHED
     assert set(reach.stopped) == {0}
 
 
@@ -336,7 +336,7 @@ def test_a_reached_pose_is_said_to_be_reached(
 ) -> None:
     ik.q[:] = closed(1.188)
     p_ref = p_at(robot, 1.0, pitch=0.3)
-    assert in_words(ik.solve_from_anywhere(p_ref), p_ref, limits) == "p_ref is reached"
+    assert describe(ik.solve_from_anywhere(p_ref), p_ref, limits) == "p_ref is reached"
 
 
 def test_the_same_start_and_pose_give_the_same_bits(

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from services.planner.account import account
 from services.planner.hocca import Hocca
 from services.planner.levelling import SLOPE_MAX, Levelling, slope_of, up_of
+from services.planner.torque_breakdown import torque_breakdown
 from shared.config import GRAVITY, RobotConfig
 from shared.messages import Pair, Vector3
 from tests.imu.robots import with_imu
@@ -80,7 +80,7 @@ def test_without_the_imu_the_last_slope_stands_and_with_none_ever_the_floor_is_l
 def test_a_memory_goes_on_bit_for_bit() -> None:
     first, second = Levelling(1.0), Levelling(1.0)
     first.advance(told((0.05, 0.01)), LEVEL, DT, jump=True)
-    second.recall(first.remember())
+    second.restore(first.snapshot())
     for each in (first, second):
         each.advance(told((0.02, 0.0), (0.1, 0.2, 0.0)), np.array((0.1, 0.2, 0.0)), DT)
     assert first.slope == second.slope
@@ -115,7 +115,7 @@ def test_a_tick_is_laid_open_with_the_slope_that_it_took(
 ) -> None:
     law, q, still = Hocca(with_imu(robot)), closed(1.0), np.zeros(12)
     output = law.tick(q, still, 0.0, DT, align=True, up_torso=told((0.0873, -0.03)))
-    found = account(robot, q, still, output.q_ref, output.v_ref, 0.0, output.slope)
+    found = torque_breakdown(robot, q, still, output.q_ref, output.v_ref, 0.0, output.slope)
     np.testing.assert_allclose(found.gravity, output.tau_ff, atol=1e-6)
 
 

@@ -12,7 +12,7 @@ import pytest
 from services.planner.hocca import Hocca
 from services.planner.kinematics import Kinematics
 from services.planner.load import AGAIN_SHARE, HIDDEN, WEIGHING_S, Load
-from services.planner.memory import LoadMemory
+from services.planner.snapshots import LoadState
 from shared.config import GRAVITY, RobotConfig
 from shared.messages import Pair, Tare, Wrench
 from tests.planner.conftest import Closed
@@ -198,12 +198,12 @@ def test_without_a_harness_one_that_hangs_is_not_led_until_it_is_down(
 def test_a_memory_of_one_that_hangs_is_gone_on_with(load: Load) -> None:
     twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
     bears(load, 0.3, 0.1)
-    text = msgspec.json.encode(load.remember())
-    twin.recall(msgspec.json.decode(text, type=LoadMemory))
+    text = msgspec.json.encode(load.snapshot())
+    twin.restore(msgspec.json.decode(text, type=LoadState))
     for each in (load, twin):
         bears(each, 1.0, 0.9)
         assert each.refused
-    assert twin.remember() == load.remember()
+    assert twin.snapshot() == load.snapshot()
 
 
 @pytest.mark.parametrize("rates", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.11), (0.0, -0.11)])
@@ -254,11 +254,11 @@ def test_far_from_the_file_it_is_refused_until_it_is_well_within(
 def test_it_goes_on_from_a_memory(load: Load) -> None:
     twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
     found(load, 9.0, 5.0, seconds=0.5)
-    text = msgspec.json.encode(load.remember())
-    twin.recall(msgspec.json.decode(text, type=LoadMemory))
+    text = msgspec.json.encode(load.snapshot())
+    twin.restore(msgspec.json.decode(text, type=LoadState))
     for each in (load, twin):
         found(each, -3.0, 2.0, seconds=0.5)
-    assert twin.remember() == load.remember()
+    assert twin.snapshot() == load.snapshot()
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_it_goes_on_from_a_memory(load: Load) -> None:
 def test_each_reason_is_told_and_none_that_is_none(
     load: Load, kg: float, a: float, b: float, words: list[str]
 ) -> None:
-    load.recall(LoadMemory(kg, a, b, None, refused=True))
+    load.restore(LoadState(kg, a, b, None, refused=True))
     told = load.refusal()
     assert told.count("carries") + told.count("lies") == len(words)
     assert [told.index(said) for said in words] == sorted(told.index(said) for said in words)
@@ -285,6 +285,6 @@ def test_each_reason_is_told_and_none_that_is_none(
 def test_what_was_refused_stays_refused_in_a_memory(load: Load) -> None:
     found(load, 9.0)
     twin = Load(LARGEST, WEIGHT, MASS, INERTIA)
-    twin.recall(load.remember())
+    twin.restore(load.snapshot())
     assert twin.refused
     assert twin.refusal() == load.refusal()

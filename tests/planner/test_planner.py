@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import msgspec
 import numpy as np
 import pytest
 
 from services.planner.certificate import Margins
 from services.planner.intents import Wish
-from services.planner.kinematics import Kinematics
 from services.planner.planner import EARLY_SHARE, LATE_SHARE, TICK_GAP_MAX_S, Planner
-from shared import config_file, gain_schedule
+from shared import gain_schedule
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import GRAVITY, RobotConfig
+from shared.config import RobotConfig
 from shared.joints import N_MODULES
 from shared.messages import (
     DriveStatus,
@@ -26,8 +23,7 @@ from shared.messages import (
     Tare,
     Wrench,
 )
-from tests.conftest import ROBOT_FILE
-from tests.planner.conftest import Closed
+from tests.planner.conftest import Closed, standing_torque
 from tests.planner.oracle import Array
 
 SESSION = 4711
@@ -42,15 +38,6 @@ def planner(robot: RobotConfig) -> Planner:
 @pytest.fixture
 def q(closed: Closed) -> Array:
     return closed(1.188, x=0.01, pitch=0.1)
-
-
-@cache
-def standing_torque(q: tuple[float, ...]) -> Array:
-    """Return the torques (12,) of the shipped robot's stand at q (12,), rad; N m."""
-    robot = config_file.load(ROBOT_FILE)
-    kinematics = Kinematics(robot)
-    kinematics.update(np.array(q))
-    return np.asarray(robot.total_mass * GRAVITY * kinematics.J[2])
 
 
 def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
@@ -80,7 +67,7 @@ def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
 
 def hear_all(planner: Planner, q: Array, now_ns: int, seq: int = 1, **changes: object) -> None:
     for module in range(N_MODULES):
-        planner.hear_state(module, state(module, q, seq, **changes), now_ns)
+        planner.receive_state(module, state(module, q, seq, **changes), now_ns)
 
 
 def lead(planner: Planner, q: Array, now_ns: int = START_NS) -> int:
@@ -99,14 +86,14 @@ def joined(commands: list[JointCommand], name: str) -> Array:
 
 def test_no_commands_before_all_six_were_heard(planner: Planner, q: Array) -> None:
     for module in range(N_MODULES - 1):
-        planner.hear_state(module, state(module, q), START_NS)
+        planner.receive_state(module, state(module, q), START_NS)
         assert planner.tick(START_NS + module) == []
     status = planner.status(START_NS + 10, 1.0)
     assert status.mode == PlannerMode.WAITING
     assert status.hold
     assert status.state_seq == (1, 1, 1, 1, 1, -1)
     assert status.state_age_ns == (10, 10, 10, 10, 10, -1)
-    planner.hear_state(5, state(5, q), START_NS + 20)
+    planner.receive_state(5, state(5, q), START_NS + 20)
     assert len(planner.tick(START_NS + 20)) == N_MODULES
 
 
@@ -114,7 +101,7 @@ def test_each_command_echoes_its_own_modules_stamp(planner: Planner, q: Array) -
     hear_all(planner, q, START_NS)
     stamps = [command.echo_t_ns for command in planner.tick(START_NS)]
     assert stamps == [1000 * (module + 1) + 1 for module in range(N_MODULES)]
-    planner.hear_state(3, state(3, q, seq=7), START_NS + 1)
+    planner.receive_state(3, state(3, q, seq=7), START_NS + 1)
     stamps = [command.echo_t_ns for command in planner.tick(START_NS + 4 * NS_PER_MS)]
     assert stamps == [1001, 2001, 3001, 4007, 5001, 6001]
 
@@ -137,7 +124,7 @@ def test_all_hold_until_all_are_ready(planner: Planner, q: Array) -> None:
     for tick in range(5):
         now = START_NS + tick * 4 * NS_PER_MS
         hear_all(planner, q, now, seq=tick)
-        planner.hear_state(2, state(2, q, seq=tick, ready=False), now)
+        planner.receive_state(2, state(2, q, seq=tick, ready=False), now)
         assert all(command.hold for command in planner.tick(now))
     hear_all(planner, q, now, seq=9)
     assert not any(command.hold for command in planner.tick(now + 4 * NS_PER_MS))
@@ -151,7 +138,7 @@ def test_all_hold_while_one_is_stale(
     stale_ns = round(robot.planner.state_stale_ms * NS_PER_MS)
     for now in (start + stale_ns, start + stale_ns + 1):
         for module in set(range(N_MODULES)) - {silent}:
-            planner.hear_state(module, state(module, q, seq=50), now)
+            planner.receive_state(module, state(module, q, seq=50), now)
         holds = {command.hold for command in planner.tick(now)}
         assert holds == {now > start + stale_ns}
     assert planner.status(now, 0.0).mode == PlannerMode.WAITING
@@ -203,8 +190,8 @@ def test_fewer_than_six_are_due_after_a_period_and_a_quarter(
     last = lead(planner, q)
     late = round(LATE_SHARE * NS_PER_S / robot.planner.rate_hz)
     for module in range(heard):
-        planner.hear_state(module, state(module, q, seq=50), last + 1)
-        planner.hear_state(module, state(module, q, seq=51), last + 2)
+        planner.receive_state(module, state(module, q, seq=50), last + 1)
+        planner.receive_state(module, state(module, q, seq=51), last + 2)
     assert not planner.is_due(last + late - 1)
     assert planner.is_due(last + late)
 
@@ -219,7 +206,7 @@ def test_a_tick_uses_states_up(planner: Planner, q: Array) -> None:
 def test_a_long_gap_is_not_integrated(robot: RobotConfig, planner: Planner, q: Array) -> None:
     """A planner stopped for 5 s raises the assist by one bounded step only."""
     last = lead(planner, q)
-    planner.hear_wish(Wish(200.0))
+    planner.receive_wish(Wish(200.0))
     now = last + 5 * NS_PER_S
     hear_all(planner, q, now, seq=50)
     planner.tick(now)
@@ -231,7 +218,7 @@ def test_assist_rises_by_the_time_between_ticks(
     robot: RobotConfig, planner: Planner, q: Array
 ) -> None:
     last = lead(planner, q)
-    planner.hear_wish(Wish(200.0))
+    planner.receive_wish(Wish(200.0))
     for tick in range(1, 11):
         now = last + tick * 4 * NS_PER_MS
         hear_all(planner, q, now, seq=50 + tick)
@@ -241,7 +228,7 @@ def test_assist_rises_by_the_time_between_ticks(
 
 def test_status_tells_what_the_tick_saw(planner: Planner, q: Array) -> None:
     hear_all(planner, q, START_NS, seq=7)
-    planner.hear_wrench(
+    planner.receive_wrench(
         Wrench(
             t_ns=1,
             seq=33,

@@ -30,11 +30,11 @@ def test_an_attitude_is_heeded_while_it_is_fresh_and_valid(
     q = closed(1.188)
     planner = Planner(with_imu(robot, stale_ms=100.0), SESSION)
     hear_all(planner, q, START_NS)
-    planner.hear_attitude(attitude(0.0, 1), START_NS)
+    planner.receive_attitude(attitude(0.0, 1), START_NS)
     planner.tick(START_NS)
     before = planner.status(START_NS, 0.0)
     assert before.attitude_seq == 1
-    planner.hear_attitude(attitude(0.05, 2, valid=valid), START_NS + 1)
+    planner.receive_attitude(attitude(0.05, 2, valid=valid), START_NS + 1)
     later = START_NS + 1 + round(late_ms * NS_PER_MS)
     hear_all(planner, q, later, seq=2)
     planner.tick(later)

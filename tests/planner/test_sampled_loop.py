@@ -12,19 +12,19 @@ import pytest
 from services.planner.dynamic_certificate import (
     Condition,
     DynamicCertificate,
-    Node,
+    StiffnessNode,
     nodes_of,
 )
 from services.planner.model import BodyInertia
 from services.planner.sampled_loop import (
     NO_HAND,
-    Drivetrain,
+    DrivetrainModel,
     Feedback,
     Gains,
-    Hand,
+    HandModel,
+    LoopTiming,
     SampledLoop,
     Stand,
-    Timing,
     whole,
 )
 from services.planner.split import ScheduledGains
@@ -40,7 +40,7 @@ from tools.runs.lockstep import Lockstep
 
 
 @pytest.fixture(scope="module")
-def nodes(robot: RobotConfig) -> list[Node]:
+def nodes(robot: RobotConfig) -> list[StiffnessNode]:
     schedule = robot.gain_schedule
     assert schedule is not None
     heights = np.array([schedule.z[2], schedule.z[12], schedule.z[22]])
@@ -48,12 +48,16 @@ def nodes(robot: RobotConfig) -> list[Node]:
 
 
 @pytest.fixture(scope="module")
-def certificate(robot: RobotConfig, nodes: list[Node]) -> DynamicCertificate:
+def certificate(robot: RobotConfig, nodes: list[StiffnessNode]) -> DynamicCertificate:
     return DynamicCertificate(robot, nodes)
 
 
 def oracle_of(
-    stand: Stand, feedback: Feedback, drivetrain: Drivetrain, timing: Timing, hand: Hand
+    stand: Stand,
+    feedback: Feedback,
+    drivetrain: DrivetrainModel,
+    timing: LoopTiming,
+    hand: HandModel,
 ) -> loop_oracle.Loop:
     return loop_oracle.Loop(
         M=stand.M, K_geo=stand.K_geo, T=stand.T, J=stand.J, J_harness=stand.J_harness,
@@ -71,7 +75,7 @@ def oracle_of(
 
 @pytest.mark.parametrize("seed", range(6))
 def test_its_eigenvalues_are_those_of_an_independent_implementation(
-    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate, seed: int
+    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate, seed: int
 ) -> None:
     """Another formulation (all joints, queues, events) and another integrator (RK4), to 1 %."""
     dice = np.random.default_rng(seed)
@@ -82,7 +86,7 @@ def test_its_eigenvalues_are_those_of_an_independent_implementation(
         coupling=design.coupling._replace(bandwidth_hz=float(dice.uniform(2.0, 8.0))),
     )
     node = nodes[int(dice.integers(len(nodes)))]
-    hand = Hand(1500.0, 150.0, 200.0, 20.0) if seed % 2 else NO_HAND
+    hand = HandModel(1500.0, 150.0, 200.0, 20.0) if seed % 2 else NO_HAND
     delay = float(dice.choice([0.002, 0.01, 0.016]))
     stiffness = float(dice.choice([2000.0, 5000.0, 15000.0]))
     condition = Condition("TRACK", node, 0, stiffness, delay, hand, Gains())
@@ -104,7 +108,7 @@ def test_its_eigenvalues_are_those_of_an_independent_implementation(
 
 
 def test_the_two_halves_together_are_the_whole(
-    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
 ) -> None:
     assert robot.gain_schedule is not None
     design = design_of(robot.gain_schedule)
@@ -141,10 +145,10 @@ def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
     simulated = modes(simulated_transition(world, fleet._torque.copy()), world.model.opt.timestep)
     stand = stand_at(robot, world._actuation.flexible.theta)
     nothing = np.zeros((12, 12))
-    drivetrain = Drivetrain(5000.0, 10.0, 0.15)
+    drivetrain = DrivetrainModel(5000.0, 10.0, 0.15)
     loop = SampledLoop(
         stand, whole(), Feedback(np.zeros(12), np.zeros(12), nothing, nothing, 1.0),
-        drivetrain, Timing(2e-3, 4e-3, 2e-3),
+        drivetrain, LoopTiming(2e-3, 4e-3, 2e-3),
     )  # fmt: skip
     mechanical = np.r_[0:36]  # p, p', rotors: neither torques nor estimates
     modelled = modes_of(np.linalg.eigvals(loop.A[np.ix_(mechanical, mechanical)]))
@@ -225,7 +229,7 @@ def test_inertia_along_p_is_that_of_the_simulated_body(robot: RobotConfig) -> No
 
 
 def test_a_hand_that_moves_it_feels_little_more_than_its_mass(
-    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
 ) -> None:
     assert robot.gain_schedule is not None
     design = design_of(robot.gain_schedule)
@@ -240,7 +244,7 @@ def test_a_hand_that_moves_it_feels_little_more_than_its_mass(
 
 
 def test_the_shipped_design_is_stable_at_its_poses(
-    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
 ) -> None:
     assert robot.gain_schedule is not None
     verdict = certificate.worst(design_of(robot.gain_schedule), margins=False)
@@ -248,7 +252,7 @@ def test_the_shipped_design_is_stable_at_its_poses(
 
 
 def test_yesterday_s_coupling_is_called_unstable(
-    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
 ) -> None:
     """Hardly filtered, with little damping at the joints: it fell below 20 000 N m/rad."""
     assert robot.gain_schedule is not None
@@ -267,7 +271,7 @@ def test_yesterday_s_coupling_is_called_unstable(
 
 
 def test_a_motion_that_hardly_grows_is_a_drift_only_where_the_person_leads(
-    robot: RobotConfig, nodes: list[Node], certificate: DynamicCertificate
+    robot: RobotConfig, nodes: list[StiffnessNode], certificate: DynamicCertificate
 ) -> None:
     assert robot.gain_schedule is not None
     design = design_of(robot.gain_schedule)
@@ -281,7 +285,7 @@ def test_a_motion_that_hardly_grows_is_a_drift_only_where_the_person_leads(
 
 
 def test_what_is_in_hand_is_at_least_what_was_asked_for(
-    robot: RobotConfig, nodes: list[Node]
+    robot: RobotConfig, nodes: list[StiffnessNode]
 ) -> None:
     assert robot.gain_schedule is not None
     wanted = robot.robustness

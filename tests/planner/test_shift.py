@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.planner.intents import Wish
-from services.planner.memory import ShiftMemory
 from services.planner.planner import Planner
 from services.planner.shift import ROWS, SHIFT_S, ShiftReference
+from services.planner.snapshots import ShiftState
 from shared.config import RobotConfig
 from shared.messages import STRAIGHT, Vector4
 
@@ -80,8 +80,8 @@ def test_a_follower_that_goes_on_from_its_memory_goes_on_bit_for_bit() -> None:
     follower, twin = ShiftReference(LARGEST), ShiftReference(LARGEST)
     for _ in range(40):
         follower.advance((0.03, -0.04, 0.0, 0.1), DT)
-    text = msgspec.json.encode(follower.remember())
-    twin.recall(msgspec.json.decode(text, type=ShiftMemory))
+    text = msgspec.json.encode(follower.snapshot())
+    twin.restore(msgspec.json.decode(text, type=ShiftState))
     for _ in range(40):
         for mine, other in zip(
             advanced(follower, STRAIGHT, DT), advanced(twin, STRAIGHT, DT), strict=True
@@ -91,8 +91,8 @@ def test_a_follower_that_goes_on_from_its_memory_goes_on_bit_for_bit() -> None:
 
 def test_a_planner_goes_on_with_the_wish_it_had(robot: RobotConfig) -> None:
     planner = Planner(robot, 1)
-    planner.hear_wish(Wish(0.0, (0.01, 0.0, 0.0, 0.02)))
+    planner.receive_wish(Wish(0.0, (0.01, 0.0, 0.0, 0.02)))
     assert planner.status(0, 0.0).shift_wanted == (0.01, 0.0, 0.0, 0.02)
     twin = Planner(robot, 1)
-    twin.recall(planner.remember())
+    twin.restore(planner.snapshot())
     assert twin.status(0, 0.0).shift_wanted == (0.01, 0.0, 0.0, 0.02)

@@ -258,9 +258,9 @@ def test_without_limits_the_feet_are_where_the_robot_file_has_them() -> None:
 
 def test_a_planner_that_is_recalled_goes_on_in_the_stance_it_had(robot: RobotConfig) -> None:
     planner, again = Planner(robot, 1), Planner(robot, 1)
-    memory = planner.remember()
+    memory = planner.snapshot()
     stance = (0.05, -0.02, 0.0, 0.0, 0.01, 0.1)
     law = msgspec.structs.replace(memory.law, stance=(stance, False), aligned=True, has_led=True)
-    again.recall(msgspec.structs.replace(memory, law=law))
-    assert again.remember().law.stance == (stance, False)
+    again.restore(msgspec.structs.replace(memory, law=law))
+    assert again.snapshot().law.stance == (stance, False)
     assert again.status(1, 0.0).mode == PlannerMode.WAITING

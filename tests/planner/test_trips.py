@@ -9,7 +9,7 @@ import pytest
 
 from services.planner.hocca import LawOutput
 from services.planner.kinematics import Kinematics, leg_loads
-from services.planner.trips import CALM_NS, Trips, values_of
+from services.planner.trips import CALM_NS, PlannerTrips, values_of
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.messages import Trip
@@ -31,9 +31,9 @@ def beyond(robot: RobotConfig, trip: Trip, by: float = 1.001) -> tuple[float, ..
     return tuple(values)
 
 
-def led(robot: RobotConfig) -> Trips:
+def led(robot: RobotConfig) -> PlannerTrips:
     """Return the trips of a planner that leads a robot which stands."""
-    trips = Trips(robot)
+    trips = PlannerTrips(robot)
     trips.advance(T0 - TICK_NS, CALM, leads=True)
     return trips
 
@@ -68,14 +68,14 @@ def test_what_comes_back_in_between_does_not(robot: RobotConfig, trip: Trip) -> 
 
 @pytest.mark.parametrize("trip", TRIPS)
 def test_a_planner_that_does_not_lead_trips_on_nothing(robot: RobotConfig, trip: Trip) -> None:
-    trips = Trips(robot)
+    trips = PlannerTrips(robot)
     for tick in range(1000):
         trips.advance(T0 + tick * TICK_NS, beyond(robot, trip), leads=False)
     assert trips.tripped is Trip.NONE
 
 
 def test_what_is_not_known_is_no_reason(robot: RobotConfig) -> None:
-    trips = Trips(robot)
+    trips = PlannerTrips(robot)
     for tick in range(1000):
         trips.advance(T0 + tick * TICK_NS, (math.nan,) * len(CALM), leads=True)
     assert trips.tripped is Trip.NONE
@@ -98,21 +98,21 @@ def test_it_ends_after_a_second_within_all_limits(robot: RobotConfig, trip: Trip
 
 
 def test_on_the_hoist_no_leg_is_missed(robot: RobotConfig) -> None:
-    trips, hanging = Trips(robot), beyond(robot, Trip.UNLOADED)
+    trips, hanging = PlannerTrips(robot), beyond(robot, Trip.UNLOADED)
     for tick in range(1000):
         trips.advance(T0 + tick * TICK_NS, hanging, leads=True)
     assert trips.tripped is Trip.NONE
 
 
 def test_it_goes_on_from_a_memory(robot: RobotConfig) -> None:
-    trips, other, values = Trips(robot), Trips(robot), beyond(robot, Trip.LEGS)
+    trips, other, values = PlannerTrips(robot), PlannerTrips(robot), beyond(robot, Trip.LEGS)
     for tick in range(11):
         trips.advance(T0 + tick * TICK_NS, values, leads=True)
-    other.recall(trips.remember())
+    other.restore(trips.snapshot())
     for each in (trips, other):
         for tick in range(11, 14):
             each.advance(T0 + tick * TICK_NS, values, leads=True)
-    assert other.remember() == trips.remember()
+    assert other.snapshot() == trips.snapshot()
     assert other.tripped is Trip.LEGS
 
 
@@ -208,7 +208,7 @@ def test_sagging_is_the_power_of_a_load_beyond_assist_and_lead_as_it_sinks(
 
 def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
     """It presses from the first tick on; once it has not, the same load is a person who sags."""
-    trips, values = Trips(robot), beyond(robot, Trip.SAGGING)
+    trips, values = PlannerTrips(robot), beyond(robot, Trip.SAGGING)
     for tick in range(100):
         trips.advance(T0 + tick * TICK_NS, values, leads=True)
     assert trips.tripped is Trip.NONE
@@ -219,7 +219,7 @@ def test_a_hand_that_was_held_up_may_catch_up(robot: RobotConfig) -> None:
 
 
 def test_what_lasted_before_it_led_does_not_count(robot: RobotConfig) -> None:
-    trips, values = Trips(robot), beyond(robot, Trip.HARNESS)
+    trips, values = PlannerTrips(robot), beyond(robot, Trip.HARNESS)
     for tick in range(500):
         trips.advance(T0 + tick * TICK_NS, values, leads=False)
     trips.advance(T0 + 500 * TICK_NS, values, leads=True)
@@ -261,7 +261,7 @@ def test_one_that_stood_as_it_tripped_is_not_led_on_one_leg(robot: RobotConfig, 
 def test_both_legs_have_borne_it_once_each_bears_three_times_the_least(robot: RobotConfig) -> None:
     least = robot.trips.unloaded.limit
     for borne, tripped in ((3.0 * least, Trip.NONE), (3.0 * least + 0.1, Trip.UNLOADED)):
-        trips, values = Trips(robot), list(CALM)
+        trips, values = PlannerTrips(robot), list(CALM)
         values[UNLOADED] = borne
         trips.advance(T0, tuple(values), leads=True)
         for tick in range(1, 500):

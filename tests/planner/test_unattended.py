@@ -54,7 +54,7 @@ def test_a_hand_that_is_not_felt_for_a_moment_has_not_let_go() -> None:
 
 def test_it_goes_on_from_a_memory() -> None:
     hand, twin = left(), Unattended()
-    twin.recall(hand.remember())
+    twin.restore(hand.snapshot())
     for each in (hand, twin):
         each.drift(T0 + LET_GO_NS + 1, (0.9, 0.2), 0.0, 0.0)
-    assert twin.remember() == hand.remember()
+    assert twin.snapshot() == hand.snapshot()

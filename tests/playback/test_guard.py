@@ -10,7 +10,7 @@ from shared import topics
 from shared.exceptions import FleetError
 from tests.test_bus import TALK, TOOL
 from tools.playback import guard, selection
-from tools.playback.guard import ACTED_ON, IN_THE_LOOP, allowed, in_words, those_of
+from tools.playback.guard import ACTED_ON, IN_THE_LOOP, allowed, describe, those_of
 
 KEYS = tuple(topics.all_keys("lab"))
 LIVE = "the joint service knee_left is heard"
@@ -51,7 +51,7 @@ def test_beside_a_live_drive_every_topic_that_it_acts_on_is_refused_by_name() ->
 
 def test_force_lets_all_go_but_what_moves_the_robot_by_itself() -> None:
     left = allowed(on_live_keys(), LIVE, force=True)
-    names = set(in_words(left.values()).split(", "))
+    names = set(describe(left.values()).split(", "))
     assert {"estop", "harness/tare", "sim/control", "operator/intent"} <= names
     assert not {"joint/*/command", "joint/*/state", "harness/wrench"} & names
     commands = {key: key for key in topics.keys(topics.JOINT_COMMAND, "lab")}

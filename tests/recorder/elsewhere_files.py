@@ -10,7 +10,7 @@ from typing import Any
 
 from mcap.writer import Writer
 
-from services.recorder import recovery
+from services.recorder import recover
 from services.recorder.mcap_log import RunWriter
 from shared import codec, topics
 from shared.clock import NS_PER_S
@@ -47,7 +47,7 @@ def make(log: RunLog, out: Path) -> dict[str, Path]:
         run.take_from(Queue(recent), len(recent))
     cut = out / "cut.mcap"
     cut.write_bytes(run.path.read_bytes()[: run.path.stat().st_size * 2 // 3])
-    recovery.recover(cut, out / "recovered.mcap")
+    recover.recover(cut, out / "recovered.mcap")
     with contextlib.redirect_stdout(io.StringIO()):
         words = ["export", str(run.path), "--scene", "-o", str(out / "exported.mcap")]
         assert cli.main(words) == 0

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from services.recorder import recovery
+from services.recorder import recover
 from shared import topics
 from shared.exceptions import RunError
 from tests.recorder import runs
@@ -65,10 +65,10 @@ def counted(path: Path) -> int | None:
 def recovered(path: Path) -> int | None:
     """Return the messages that recovery gives back to the mcap package, or None for a line."""
     try:
-        outcome = recovery.recover(path, path.with_name("recovered.mcap"))
+        outcome = recover.recover(path, path.with_name("recovered.mcap"))
     except RunError as error:
         return in_one_line(error)
-    assert all("\n" not in line for line in recovery.in_words(outcome))
+    assert all("\n" not in line for line in recover.describe(outcome))
     with outcome.out.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         found = [message for _, _, message in reader.iter_messages()]

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from services.recorder.disk_guard import MIB
 from services.recorder.mcap_log import RunWriter
-from services.recorder.recording import Recording, free_bytes_at
-from services.recorder.snapshot import Snapshot
-from services.recorder.space import MIB
+from services.recorder.recording import Recorder, free_bytes_at
+from services.recorder.snapshot import SnapshotRing
 from shared import codec, topics
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config_sections import RecorderConfig
@@ -28,13 +28,13 @@ EVENT_KEY = topics.JOINT_EVENT.key(ROBOT, "knee_right")
 class Rig:
     """A recording of ten messages a cycle; each is stamped when it comes."""
 
-    def __init__(self, out: Path, config: RecorderConfig, snapshot: Snapshot | None) -> None:
+    def __init__(self, out: Path, config: RecorderConfig, snapshot: SnapshotRing | None) -> None:
         self.now_ns = 0
         self.free = 10_000 * MIB
         self.sent = 0
         self.queue = Queue()
         self.writer: RunWriter = runs.writer(out, begin=False)
-        self.recording = Recording(
+        self.recording = Recorder(
             self.queue,
             self.writer,
             config,
@@ -59,7 +59,7 @@ class Rig:
         self.writer.__exit__(None, None, None)
 
 
-def rig(out: Path, *, snapshot: Snapshot | None = None, **changes: float) -> Rig:
+def rig(out: Path, *, snapshot: SnapshotRing | None = None, **changes: float) -> Rig:
     settings = {"chunk_kib": 64, "flush_ms": 250.0, "fsync_s": 1.0, "free_min_mib": 100}
     return Rig(out, RecorderConfig(**settings | changes), snapshot)  # type: ignore[arg-type]
 
@@ -141,7 +141,7 @@ def test_a_full_disk_at_the_start_is_waited_for(tmp_path: Path) -> None:
     settings = RecorderConfig(chunk_kib=64, flush_ms=250.0, fsync_s=1.0, free_min_mib=100)
     queue, free = Queue(), [10 * MIB]
     with runs.writer(tmp_path, begin=False) as writer:
-        recording = Recording(
+        recording = Recorder(
             queue, writer, settings, logging.getLogger("test"),
             free_bytes=lambda: free[0], now_ns=0,
         )  # fmt: skip
@@ -160,7 +160,7 @@ def fault(now_ns: int) -> tuple[str, bytes, int]:
 
 
 def test_a_snapshot_writes_nothing_until_a_fault_and_then_before_and_after(tmp_path: Path) -> None:
-    run = rig(tmp_path, snapshot=Snapshot(2.0, 1 << 28, runs.recorded_topics()))
+    run = rig(tmp_path, snapshot=SnapshotRing(2.0, 1 << 28, runs.recorded_topics()))
     run.run(10.0)
     assert list(tmp_path.iterdir()) == []
     run.queue.items.append(fault(run.now_ns))
@@ -182,7 +182,7 @@ def test_a_snapshot_writes_nothing_until_a_fault_and_then_before_and_after(tmp_p
 
 
 def test_a_snapshot_without_a_fault_leaves_no_file(tmp_path: Path) -> None:
-    run = rig(tmp_path / "out", snapshot=Snapshot(2.0, 1 << 28, runs.recorded_topics()))
+    run = rig(tmp_path / "out", snapshot=SnapshotRing(2.0, 1 << 28, runs.recorded_topics()))
     run.run(3.0)
     run.finish()
     assert not (tmp_path / "out").exists()
@@ -190,7 +190,7 @@ def test_a_snapshot_without_a_fault_leaves_no_file(tmp_path: Path) -> None:
 
 def test_a_long_snapshot_is_written_in_slices(tmp_path: Path) -> None:
     """So that the bus is emptied in between; its queue holds 13 s."""
-    run = rig(tmp_path, snapshot=Snapshot(600.0, 1 << 28, runs.recorded_topics()))
+    run = rig(tmp_path, snapshot=SnapshotRing(600.0, 1 << 28, runs.recorded_topics()))
     run.run(50.0)
     run.recording.trigger("asked", run.now_ns)
     run.run(0.02)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.recorder.snapshot import OVERHEAD, Snapshot
+from services.recorder.snapshot import OVERHEAD, SnapshotRing
 from shared import codec, topics
 from shared.clock import NS_PER_S
 from shared.messages import Estop, JointEvent, Mode
@@ -15,8 +15,8 @@ ESTOP_KEY = topics.ESTOP.key(ROBOT)
 TRUTH_KEY = topics.SIM_TRUTH.key(ROBOT)
 
 
-def ring(seconds: float = 10.0, most_bytes: int = 1 << 24) -> Snapshot:
-    return Snapshot(seconds, most_bytes, runs.recorded_topics())
+def ring(seconds: float = 10.0, most_bytes: int = 1 << 24) -> SnapshotRing:
+    return SnapshotRing(seconds, most_bytes, runs.recorded_topics())
 
 
 def at(second: float, key: str = TRUTH_KEY, payload: bytes = b"{}") -> Item:
@@ -27,13 +27,13 @@ def event(second: float, mode: int) -> Item:
     return at(second, EVENT_KEY, codec.encode(runs.sample(JointEvent, mode_after=mode)))
 
 
-def feed(snapshot: Snapshot, *items: Item) -> None:
+def feed(snapshot: SnapshotRing, *items: Item) -> None:
     for item in items:
         snapshot.take_from(Queue([item]), 1)
         snapshot.pass_time(item[2])
 
 
-def taken(snapshot: Snapshot) -> list[float]:
+def taken(snapshot: SnapshotRing) -> list[float]:
     found = []
     while (item := snapshot.take()) is not None:
         found.append(item[2] / NS_PER_S)

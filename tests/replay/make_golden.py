@@ -19,7 +19,7 @@ KEPT_FROM_S: Final = 2.3
 TRACED: Final = ("knee_left", "hip_left")
 TOPICS: Final = (
     topics.PLANNER_STATUS,
-    topics.PLANNER_MEMORY,
+    topics.PLANNER_CHECKPOINT,
     topics.JOINT_STATE,
     topics.JOINT_COMMAND,
     topics.JOINT_EVENT,

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.messages import JointEvent
-from shared.traces import PlannerMemory
+from shared.traces import PlannerCheckpoint
 from tools.reexecution.compare import Comparison, ulp
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -79,9 +79,9 @@ def test_first_and_largest_are_kept() -> None:
 
 
 def test_a_memory_is_compared_value_by_value() -> None:
-    def memory(x: float) -> PlannerMemory:
+    def memory(x: float) -> PlannerCheckpoint:
         text = msgspec.json.encode({"law": {"q": [1.0, x]}}).decode()
-        return PlannerMemory(t_ns=1, seq=1, session=3, memory=text)
+        return PlannerCheckpoint(t_ns=1, seq=1, session=3, memory=text)
 
     comparison = Comparison()
     comparison.take("planner/memory", 4, memory(2.0), memory(3.0))
@@ -91,7 +91,9 @@ def test_a_memory_is_compared_value_by_value() -> None:
 
 def test_a_long_value_is_cut_in_words() -> None:
     comparison = Comparison()
-    one, other = (PlannerMemory(t_ns=1, seq=1, session=3, memory=text) for text in ("", "x" * 999))
+    one, other = (
+        PlannerCheckpoint(t_ns=1, seq=1, session=3, memory=text) for text in ("", "x" * 999)
+    )
     comparison.take("k", 1, one, other)
     assert comparison.first is not None
-    assert len(comparison.first.in_words()) < 200
+    assert len(comparison.first.describe()) < 200

@@ -14,7 +14,7 @@ from shared import topics
 from shared.joints import MODULES
 from tests.replay.make_golden import TRACED
 from tools import resim
-from tools.reexecution.outcome import Outcome
+from tools.reexecution.outcome import ReexecutionResult
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import read_run
 
@@ -42,7 +42,7 @@ def test_a_golden_log_is_read_message_by_message(path: Path) -> None:
 @pytest.mark.parametrize("name", TRACED)
 def test_joint_services_of_the_newest_come_out_equal_on_any_machine(name: str) -> None:
     log = read_run(NEWEST)
-    outcome = Outcome(name, 0.0, exact=True)
+    outcome = ReexecutionResult(name, 0.0, exact=True)
     for _ in resim.execute(log, robot_of(log), name, outcome):
         pass
     assert outcome.ticks >= 200
@@ -51,7 +51,7 @@ def test_joint_services_of_the_newest_come_out_equal_on_any_machine(name: str) -
 
 def test_the_planner_of_the_newest_comes_out_equal_but_for_last_bits() -> None:
     log = read_run(NEWEST)
-    outcome = Outcome("planner", OTHER_MACHINES, exact=True)
+    outcome = ReexecutionResult("planner", OTHER_MACHINES, exact=True)
     for _ in resim.execute(log, robot_of(log), "planner", outcome):
         pass
     assert outcome.ticks >= 100

@@ -19,7 +19,7 @@ from shared.scenario import Fault, Kill, Restart
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tools import resim, sim
-from tools.reexecution.outcome import Outcome
+from tools.reexecution.outcome import ReexecutionResult
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 
@@ -52,8 +52,8 @@ def log(recorded: Path) -> RunLog:
     return read_run(recorded)
 
 
-def execute(log: RunLog, robot: RobotConfig, name: str, *, exact: bool = True) -> Outcome:
-    outcome = Outcome(name, 0.0, exact=exact)
+def execute(log: RunLog, robot: RobotConfig, name: str, *, exact: bool = True) -> ReexecutionResult:
+    outcome = ReexecutionResult(name, 0.0, exact=exact)
     for _ in resim.execute(log, robot, name, outcome):
         pass
     return outcome

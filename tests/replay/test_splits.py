@@ -16,7 +16,7 @@ from shared.scenario import Kill, Restart
 from tests.lockstep.runs import still
 from tests.recorder.runs import Queue
 from tools import cli, resim, sim
-from tools.reexecution.outcome import Outcome
+from tools.reexecution.outcome import ReexecutionResult
 from tools.runs.network import BASE
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
@@ -75,7 +75,7 @@ def test_the_directory_of_a_split_run_is_the_run(whole: RunLog, directory: Path)
 @pytest.mark.parametrize("name", ["planner", MODULES[0]])
 def test_a_split_run_is_executed_again_across_its_files(directory: Path, name: str) -> None:
     log = read_run(directory)
-    outcome = Outcome(name, 0.0, exact=True)
+    outcome = ReexecutionResult(name, 0.0, exact=True)
     for _ in resim.execute(log, robot_of(log), name, outcome):
         pass
     assert outcome.comparison.first is None
@@ -85,7 +85,7 @@ def test_a_split_run_is_executed_again_across_its_files(directory: Path, name: s
 
 def test_one_file_of_a_split_run_stands_for_itself(directory: Path) -> None:
     log = read_run(directory / "run_1.mcap")
-    outcome = Outcome("ankle_left", 0.0, exact=True)
+    outcome = ReexecutionResult("ankle_left", 0.0, exact=True)
     for _ in resim.execute(log, robot_of(log), "ankle_left", outcome):
         pass
     assert outcome.comparison.first is None

@@ -17,7 +17,7 @@ from shared.scenario import Scenario
 from tests.lockstep.runs import kill, push, run, still
 from tools import sim, whatif
 from tools.counterfactual.moments import Moment, moments_of
-from tools.counterfactual.run import Task, fate_of
+from tools.counterfactual.run import Task, counterfactual_of
 from tools.runs.network import BASE
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
@@ -58,7 +58,7 @@ def test_moments_are_as_far_apart_as_asked_and_have_everybody_in_them(
 def test_gone_on_with_unchanged_it_comes_out_as_it_was(
     robot: RobotConfig, log: RunLog, moments: list[Moment], story: Scenario
 ) -> None:
-    fate = fate_of(Task(robot_of(log), story, PlantConfig(), moments[2], (), 1.5))
+    fate = counterfactual_of(Task(robot_of(log), story, PlantConfig(), moments[2], (), 1.5))
     truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
     late = [row for row in truth if moments[2].at_s <= row.scenario_s < moments[2].at_s + 1.5]
     assert fate.stood
@@ -68,7 +68,9 @@ def test_gone_on_with_unchanged_it_comes_out_as_it_was(
 def test_a_kill_in_a_counterfactual_is_the_kill_in_a_run(
     robot: RobotConfig, log: RunLog, moments: list[Moment], story: Scenario
 ) -> None:
-    fate = fate_of(Task(robot_of(log), story, PlantConfig(), moments[2], ("planner",), 1.5))
+    fate = counterfactual_of(
+        Task(robot_of(log), story, PlantConfig(), moments[2], ("planner",), 1.5)
+    )
     killed = run(robot, still(2.5, height=1.1, push=story.push, kill=kill(moments[2].at_s + 1e-3)))
     after = killed.com_mm[killed.t >= moments[2].at_s]
     assert fate.stood
@@ -79,7 +81,7 @@ def test_a_kill_in_a_counterfactual_is_the_kill_in_a_run(
 def test_a_joint_service_can_die_in_it_too(
     log: RunLog, moments: list[Moment], story: Scenario
 ) -> None:
-    assert fate_of(
+    assert counterfactual_of(
         Task(robot_of(log), story, PlantConfig(), moments[1], ("planner", "knee_left"), 2.0)
     ).stood
 

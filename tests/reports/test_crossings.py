@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from shared import topics
 from shared.traces import LinkEvent
 from tests.reports import runs
-from tools.reports.crossings import crossings, first_beyond
-from tools.reports.sheet import Happening
-from tools.reports.source import Source
+from tools.reports.limit_violations import crossings, first_beyond
+from tools.reports.page_model import TimelineEvent
+from tools.reports.run_data import RunData
 from tools.runs.run_log import RunLog
 
 T_S = 2.5
@@ -26,9 +26,9 @@ T_S = 2.5
 
 def changed(
     log: RunLog, directory: Path, name: str, change: Callable[[float, dict[str, Any]], object]
-) -> list[Happening]:
+) -> list[TimelineEvent]:
     """Return the crossings of a log of which one key's messages are changed."""
-    zero_ns = Source(log).zero_ns
+    zero_ns = RunData(log).zero_ns
 
     def payload(key: str, body: bytes) -> bytes:
         if key != name:
@@ -37,11 +37,11 @@ def changed(
         change((message["t_ns"] - zero_ns) / 1e9, message)
         return msgspec.json.encode(message)
 
-    return list(crossings(Source(runs.rewritten(log, directory, payload=payload))))
+    return list(crossings(RunData(runs.rewritten(log, directory, payload=payload))))
 
 
 def test_a_run_within_its_limits_has_none(log: RunLog) -> None:
-    assert list(crossings(Source(log))) == []
+    assert list(crossings(RunData(log))) == []
 
 
 def test_a_sole_that_tips_is_told_with_its_first_time_and_how_long(
@@ -94,7 +94,7 @@ def test_a_torque_at_its_limit_is_told_unless_it_was_a_moment(
 def test_a_joint_beyond_its_stop_is_told_once_the_drives_are_armed(
     log: RunLog, tmp_path: Path
 ) -> None:
-    armed_s = Source(log).armed_s()
+    armed_s = RunData(log).armed_s()
 
     def bend(t: float, state: dict[str, Any]) -> None:
         if t < armed_s or T_S <= t < T_S + 0.05:
@@ -119,10 +119,10 @@ def test_hold_is_not_led_only_where_the_network_was_impaired_on_purpose(
     log: RunLog, tmp_path: Path, on_purpose: bool
 ) -> None:
     """The verdict's rule: a module that drops out otherwise is no excuse."""
-    zero_ns = Source(log).zero_ns
+    zero_ns = RunData(log).zero_ns
     link = "planner->ankle_right"
     event = LinkEvent(
-        t_ns=zero_ns, seq=1, link=link, asked=link, number=1, in_force=True, delay_ms=1.0,
+        t_ns=zero_ns, seq=1, link=link, asked=link, number=1, active=True, delay_ms=1.0,
         jitter_ms=0.0, loss=0.0, partition=False, detail="delay=1", passed=0, lost=0,
     )  # fmt: skip
     more = [(zero_ns, topics.LINK_EVENT.name, msgspec.json.encode(event))]
@@ -138,7 +138,7 @@ def test_hold_is_not_led_only_where_the_network_was_impaired_on_purpose(
         return msgspec.json.encode(message)
 
     again = runs.rewritten(log, tmp_path, payload=unplugged, more=more if on_purpose else ())
-    told = " ".join(row.text for row in crossings(Source(again)))
+    told = " ".join(row.text for row in crossings(RunData(again)))
     assert ("operator's force: over 40 N" in told) is not on_purpose
 
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from shared.clock import NS_PER_S
 from shared.impairment import Direction, Impairment
-from shared.injections import Injections
+from shared.impairment_schedule import ImpairmentSchedule
 from shared.links import DIRECTIONS, WRENCHES
 from shared.traces import LinkEvent
-from tools.reports.network import Link, histories
+from tools.reports.network import ImpairedLink, histories
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 6), st.integers(1, 9)), max_size=8))
@@ -19,15 +19,15 @@ def test_cut_is_shown_when_nothing_passes_and_only_then(
 ) -> None:
     directions = {name: Direction(name, 0) for name in DIRECTIONS}
     told: list[LinkEvent] = []
-    injections = Injections(directions, told.append)
+    injections = ImpairmentSchedule(directions, told.append)
     for cut, begins, lasts in asked:
         what = Impairment(delay_ms=0.0 if cut else 5.0, partition=cut)
         injections.plan(WRENCHES, what, float(begins), float(begins + lasts))
     for s in range(20):
         injections.advance(float(s), s * NS_PER_S)
         rows = histories(told, 0).get(WRENCHES, ())
-        shown = rows[-1][1] if rows else Link.CLEAR
+        shown = rows[-1][1] if rows else ImpairedLink.CLEAR
         now_ns = s * NS_PER_S
         passed = directions[WRENCHES].passes(now_ns, 0)
-        assert (shown is Link.CUT) is (passed == ())
-        assert (shown is Link.CLEAR) is (passed == (now_ns,))
+        assert (shown is ImpairedLink.CUT) is (passed == ())
+        assert (shown is ImpairedLink.CLEAR) is (passed == (now_ns,))

@@ -14,7 +14,7 @@ from tests.reports import pages, runs
 from tests.reports.runs import Made
 from tools.reports import page as page_module
 from tools.reports.page import render
-from tools.reports.source import Source
+from tools.reports.run_data import RunData
 from tools.reports.timeline import happenings
 from tools.reports.torques import origins
 from tools.runs.run_log import RunLog, read_run
@@ -67,7 +67,7 @@ def test_every_panel_is_there_with_its_data(page: str, log: RunLog) -> None:
 
 def test_the_plots_show_what_the_log_holds(page: str, log: RunLog) -> None:
     data = pages.data_of(page)
-    zero_ns = Source(log).zero_ns
+    zero_ns = RunData(log).zero_ns
     truth = log.messages(topics.SIM_TRUTH)
     t = (np.array([row.t_ns for row in truth]) - zero_ns) / 1e9
     x_mm = 1e3 * np.array([row.com[0] for row in truth])
@@ -109,7 +109,7 @@ def test_a_fall_is_said_as_the_verbs_say_it(log: RunLog, tmp_path: Path) -> None
 
 def test_a_minute_of_the_fleet_is_at_most_5_mb(log: RunLog, tmp_path: Path) -> None:
     minute = runs.rewritten(log, tmp_path, repeats=10, keep=lambda name: "trace" not in name)
-    begin, end = Source(minute).span
+    begin, end = RunData(minute).span
     assert end - begin > 60.0
     page = render(minute)
     assert len(page.encode()) <= 5e6
@@ -188,7 +188,7 @@ def test_text_from_a_log_is_text_in_the_page(log: RunLog, tmp_path: Path) -> Non
 
 def test_the_origins_of_a_torque_add_up_to_it(log: RunLog) -> None:
     """But for what the gate cuts off."""
-    source = Source(log)
+    source = RunData(log)
     assert source.robot is not None
     most = source.robot.joint.tau_module_max
     for module in MODULES:
@@ -207,7 +207,7 @@ def test_the_origins_of_a_torque_add_up_to_it(log: RunLog) -> None:
 
 
 def test_the_timeline_tells_kill_hold_and_what_came_after(log: RunLog) -> None:
-    rows = happenings(Source(log))
+    rows = happenings(RunData(log))
     assert [row.t for row in rows] == sorted(row.t for row in rows)
     texts = [row.text for row in rows]
     kill = next(row for row in rows if row.kind == "kill")

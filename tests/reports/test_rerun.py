@@ -21,7 +21,7 @@ from tests.reports.runs import Made
 from tools import cli
 from tools.reports import scene, urdf
 from tools.reports.foxglove import Entity, Solid
-from tools.reports.scene import Pose
+from tools.reports.scene import RobotPose
 from tools.runs.run_log import RunLog
 
 SIZES: dict[str, Callable[[pin.GeometryObject], list[float]]] = {
@@ -39,17 +39,17 @@ def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def first(log: RunLog, robot: RobotConfig) -> Pose:
+def first(log: RunLog, robot: RobotConfig) -> RobotPose:
     return next(scene.poses(log, robot))
 
 
 @pytest.fixture(scope="module")
-def model(robot: RobotConfig, first: Pose) -> str:
+def model(robot: RobotConfig, first: RobotPose) -> str:
     return scene.model("lab", robot, first)
 
 
 def test_the_model_comes_once_before_the_first_transforms_under_the_name_rerun_knows(
-    shown: Path, log: RunLog, robot: RobotConfig, first: Pose
+    shown: Path, log: RunLog, robot: RobotConfig, first: RobotPose
 ) -> None:
     with shown.open("rb") as file:
         rows = list(make_reader(file).iter_messages(log_time_order=False))
@@ -66,7 +66,7 @@ def test_the_model_comes_once_before_the_first_transforms_under_the_name_rerun_k
 
 
 def test_the_links_hang_together_as_the_frames_do(
-    model: str, robot: RobotConfig, first: Pose
+    model: str, robot: RobotConfig, first: RobotPose
 ) -> None:
     tree = pin.buildModelFromXML(model)
     assert tree.name == "lab"
@@ -81,7 +81,7 @@ def test_the_links_hang_together_as_the_frames_do(
 
 
 def test_the_bodies_of_the_model_are_those_of_the_scene(
-    model: str, robot: RobotConfig, first: Pose
+    model: str, robot: RobotConfig, first: RobotPose
 ) -> None:
     tree = pin.buildModelFromXML(model)
     found = pin.buildGeomFromUrdfString(tree, model, pin.GeometryType.VISUAL).geometryObjects
@@ -101,7 +101,7 @@ def test_the_bodies_of_the_model_are_those_of_the_scene(
     assert count.total() == 14
 
 
-def test_names_with_marks_of_xml_stay_what_they_are(robot: RobotConfig, first: Pose) -> None:
+def test_names_with_marks_of_xml_stay_what_they_are(robot: RobotConfig, first: RobotPose) -> None:
     name = 'a<b>&"c'
     solid = Solid("sphere", (0.1, 0.1, 0.1), (1.0, 0.0, 0.0, 1.0))
     text = urdf.urdf(name, scene.frames(robot, first), [Entity("torso", name, (solid,))])

@@ -31,7 +31,7 @@ from tests.reports.runs import Made
 from tools import cli
 from tools.reports import scene
 from tools.reports.foxglove import UPRIGHT, Arrow, Entity, Placed, Solid
-from tools.reports.scene import Pose
+from tools.reports.scene import RobotPose
 from tools.runs.run_log import RunLog, read_run
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ def shown(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def poses(log: RunLog, robot: RobotConfig) -> list[Pose]:
+def poses(log: RunLog, robot: RobotConfig) -> list[RobotPose]:
     return list(scene.poses(log, robot))
 
 
@@ -96,7 +96,7 @@ def apart(found: Any, right: Any) -> float:
 
 
 def test_the_frames_are_those_of_the_model_at_random_times(
-    poses: list[Pose], log: RunLog, robot: RobotConfig
+    poses: list[RobotPose], log: RunLog, robot: RobotConfig
 ) -> None:
     dice = random.Random(3)
     for pose in dice.sample(poses, 25):
@@ -122,7 +122,7 @@ def test_the_frames_are_those_of_the_model_in_any_pose(
 ) -> None:
     torso, angles, q = tuple(numbers[:3]), tuple(numbers[3:6]), tuple(numbers[6:])
     nothing = (0.0, 0.0, 0.0)
-    pose = Pose(0, torso, angles, nothing, q, (0,) * 6, nothing, nothing)
+    pose = RobotPose(0, torso, angles, nothing, q, (0,) * 6, nothing, nothing)
     assert apart(in_world(scene.frames(robot, pose)), bodies(robot, torso, angles, q)) < 1e-9
 
 
@@ -138,7 +138,7 @@ def test_the_bodies_are_those_of_the_model(robot: RobotConfig) -> None:
         assert solid.at == pytest.approx(geom.pos)
 
 
-def test_the_scene_comes_at_30_hz_and_shows_modes_and_forces(poses: list[Pose]) -> None:
+def test_the_scene_comes_at_30_hz_and_shows_modes_and_forces(poses: list[RobotPose]) -> None:
     seconds = (poses[-1].t_ns - poses[0].t_ns) / 1e9
     assert len(poses) / seconds == pytest.approx(30.0, rel=0.02)
     colours = set()
@@ -228,7 +228,7 @@ def arrows(entity: Any) -> tuple[Arrow, ...]:
 
 
 def test_another_reader_of_protobuf_finds_all_frames_and_bodies_of_the_scene(
-    shown: Path, poses: list[Pose], log: RunLog, robot: RobotConfig
+    shown: Path, poses: list[RobotPose], log: RunLog, robot: RobotConfig
 ) -> None:
     """It knows nothing but the schemas in the file."""
     found: dict[str, dict[int, Any]] = {}

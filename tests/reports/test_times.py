@@ -14,9 +14,9 @@ from shared.joints import MODULES
 from shared.messages import DriveStatus
 from shared.traces import LinkEvent
 from tests.reports import pages, runs
-from tools.reports.network import Link
+from tools.reports.network import ImpairedLink
 from tools.reports.page import render
-from tools.reports.source import Source
+from tools.reports.run_data import RunData
 from tools.reports.timeline import happenings
 from tools.runs.run_log import RunLog
 
@@ -30,7 +30,7 @@ def test_the_cycles_of_a_service_come_at_its_rate(page: str) -> None:
 def test_late_cycles_are_counted_from_the_arming_on_and_across_a_restart(
     log: RunLog, tmp_path: Path
 ) -> None:
-    source = Source(log)
+    source = RunData(log)
     begin_ns = source.zero_ns + round(source.armed_s() * 1e9)
 
     def late(name: str, body: bytes) -> bytes:
@@ -73,7 +73,7 @@ def test_a_machine_too_slow_is_said_beside_the_verdict(log: RunLog, tmp_path: Pa
 def test_drives_that_come_up_together_are_one_line_and_no_alarm(
     log: RunLog, tmp_path: Path
 ) -> None:
-    source = Source(log)
+    source = RunData(log)
 
     def coming_up(name: str, body: bytes) -> bytes:
         if not name.endswith("/state") or not name.startswith("joint/"):
@@ -86,7 +86,7 @@ def test_drives_that_come_up_together_are_one_line_and_no_alarm(
             state["drive"] = int(DriveStatus.IDLE)
         return msgspec.json.encode(state)
 
-    rows = happenings(Source(runs.rewritten(log, tmp_path, payload=coming_up)))
+    rows = happenings(RunData(runs.rewritten(log, tmp_path, payload=coming_up)))
     told = {row.text: row.kind for row in rows if "drive" in row.text}
     assert told["all six: drive LOST to IDLE"] == "note"
     assert told["all six: drive IDLE to ARMED"] == "note"
@@ -95,7 +95,7 @@ def test_drives_that_come_up_together_are_one_line_and_no_alarm(
 
 def impairment(number: int, link: str, t_ns: int, *, begins: bool, cut: bool) -> LinkEvent:
     return LinkEvent(
-        t_ns=t_ns, seq=number, link=link, asked="planner->left", number=number, in_force=begins,
+        t_ns=t_ns, seq=number, link=link, asked="planner->left", number=number, active=begins,
         delay_ms=0.0 if cut else 5.0, jitter_ms=0.0, loss=0.0, partition=cut,
         detail="partition" if cut else "delay=5", passed=0 if begins else 20,
         lost=0 if begins else 7,
@@ -105,7 +105,7 @@ def impairment(number: int, link: str, t_ns: int, *, begins: bool, cut: bool) ->
 def test_what_was_injected_into_the_network_is_a_panel_marks_and_lines(
     log: RunLog, tmp_path: Path
 ) -> None:
-    source = Source(log)
+    source = RunData(log)
     more: list[tuple[int, str, bytes]] = []
     for number, cut, begin, end in ((1, False, 0.5, 2.0), (2, True, 1.0, 1.5)):
         for t, begins in ((begin, True), (end, False)):
@@ -118,7 +118,12 @@ def test_what_was_injected_into_the_network_is_a_panel_marks_and_lines(
     assert row["label"] == "to left"
     starts, _, codes = zip(*row["spans"][1:], strict=True)
     assert starts == pytest.approx((0.5, 1.0, 1.5, 2.0), abs=1e-3)
-    assert codes == (Link.IMPAIRED, Link.CUT, Link.IMPAIRED, Link.CLEAR)
+    assert codes == (
+        ImpairedLink.IMPAIRED,
+        ImpairedLink.CUT,
+        ImpairedLink.IMPAIRED,
+        ImpairedLink.CLEAR,
+    )
     assert [mark[2] for mark in data["marks"] if mark[1] == "network"] == [
         "planner->left delay=5", "planner->left partition", "planner->left ends",
         "planner->left ends",
@@ -127,7 +132,7 @@ def test_what_was_injected_into_the_network_is_a_panel_marks_and_lines(
 
 
 def test_ages_stand_beside_what_was_done_to_the_network(log: RunLog, tmp_path: Path) -> None:
-    t_ns = Source(log).zero_ns + 10**9
+    t_ns = RunData(log).zero_ns + 10**9
     event = msgspec.json.encode(impairment(1, "planner->knee_left", t_ns, begins=True, cut=True))
     data = pages.data_of(
         render(runs.rewritten(log, tmp_path, more=[(t_ns, topics.LINK_EVENT.name, event)]))
@@ -156,7 +161,7 @@ def test_inputs_of_seconds_do_not_flatten_the_ages_of_milliseconds(
 def test_a_planner_that_waits_after_drop_outs_is_in_the_timeline(
     log: RunLog, tmp_path: Path
 ) -> None:
-    zero_ns = Source(log).zero_ns
+    zero_ns = RunData(log).zero_ns
 
     def waits(name: str, body: bytes) -> bytes:
         if name != "planner/status":
@@ -166,14 +171,14 @@ def test_a_planner_that_waits_after_drop_outs_is_in_the_timeline(
         status["wait_s"] = 3.5 - t_s if 2.5 <= t_s < 3.5 else 0.0
         return msgspec.json.encode(status)
 
-    found = happenings(Source(runs.rewritten(log, tmp_path, payload=waits)))
+    found = happenings(RunData(runs.rewritten(log, tmp_path, payload=waits)))
     (row,) = [row for row in found if "leads again" in row.text]
     assert row.t == pytest.approx(2.5, abs=0.01)
     assert row.text.startswith("planner: leads again in 1.0 s at the earliest")
 
 
 def panel_and_rows(log: RunLog) -> tuple[dict[str, Any], list[str]]:
-    return pages.data_of(render(log)), [row.text for row in happenings(Source(log))]
+    return pages.data_of(render(log)), [row.text for row in happenings(RunData(log))]
 
 
 def test_a_log_with_nothing_injected_says_so(page: str) -> None:

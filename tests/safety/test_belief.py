@@ -106,5 +106,5 @@ def test_a_step_that_says_nothing_of_it_does_not_listen(robot: RobotConfig) -> N
     bench.to_hold()
     bench.q = (bench.q[0], bench.q[1] + 0.5)
     bench.cycle()
-    assert bench.controller.samples.odd == 1
+    assert bench.controller.samples.rejected_count == 1
     assert bench.controller.samples.q[1] == pytest.approx(bench.q[1] - 0.5)

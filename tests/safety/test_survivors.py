@@ -15,7 +15,7 @@ from services.joint.failsafe import (
     Timing,
     timing_of,
 )
-from services.planner.engagement import GRACE_NS, Engagement
+from services.planner.engagement_fsm import GRACE_NS, Engagement
 from services.planner.planner import Planner
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
@@ -161,7 +161,7 @@ def test_a_wrench_that_was_heard_long_ago_eases_nothing(robot: RobotConfig) -> N
         tare=0,
         age_ns=0,
     )
-    heard.hear_wrench(pull, now_ns)
+    heard.receive_wrench(pull, now_ns)
     eased = []
     for seq in range(5, 400):
         now_ns += 4 * NS_PER_MS
@@ -207,7 +207,7 @@ def test_the_failsafes_times_and_limits_are_the_robot_files(robot: RobotConfig) 
 
 def test_each_good_while_makes_a_module_forget_one_drop_out(timing: Timing) -> None:
     failsafe = Failsafe(mode=Mode.HOLD, dropouts=2, steady_since_ns=T0 - 10**12)
-    failsafe._remember_dropouts(T0, timing, Event.NONE)
+    failsafe._count_dropouts(T0, timing, Event.NONE)
     failsafe.mode = Mode.TRACK  # only what is tracked without one counts
     for after_ns, left in (
         (timing.dropout_forget_ns - 1, 2),
@@ -216,7 +216,7 @@ def test_each_good_while_makes_a_module_forget_one_drop_out(timing: Timing) -> N
         (2 * timing.dropout_forget_ns, 0),
         (4 * timing.dropout_forget_ns, 0),
     ):
-        failsafe._remember_dropouts(T0 + after_ns, timing, Event.NONE)
+        failsafe._count_dropouts(T0 + after_ns, timing, Event.NONE)
         assert failsafe.dropouts == left, after_ns
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from services.simulator.axis_bank import AXIS_NAMES, AxisBank
 from services.simulator.axis_conditions import BOOT_S
-from services.simulator.axis_faults import Fault as Registers
+from services.simulator.axis_faults import AxisErrors as Registers
 from services.simulator.fault_injector import FaultInjector
 from shared.cansimple import (
     AxisError,

@@ -12,7 +12,7 @@ from services.simulator.axis_bank import AxisBank
 from services.simulator.body import body_of
 from services.simulator.cansimple_front import CanSimpleFront
 from services.simulator.harness_front import HarnessFront
-from services.simulator.loop import Ports, SimulatorLoop
+from services.simulator.loop import SimulatorLoop, SimulatorPorts
 from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared.cansimple import AxisState, ControlMode, InputMode
@@ -47,7 +47,7 @@ def make_loop(robot: RobotConfig, *faults: Fault) -> tuple[SimulatorLoop, World,
     )
     front = CanSimpleFront(bank, [], [])
     ports = cast(
-        "Ports",
+        "SimulatorPorts",
         msgspec.defstruct("Fake", ["truth", "intent", "control", "state", "asked"])(
             *[Silent()] * 5
         ),

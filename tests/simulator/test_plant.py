@@ -89,8 +89,8 @@ def test_no_controller_sees_the_plant(robot: RobotConfig) -> None:
     )
     assert right.planner is not None
     assert wrong.planner is not None
-    assert msgspec.json.encode(right.planner.remember()) == msgspec.json.encode(
-        wrong.planner.remember()
+    assert msgspec.json.encode(right.planner.snapshot()) == msgspec.json.encode(
+        wrong.planner.snapshot()
     )
     for name in ("ankle_left", "knee_right"):
         assert right.memory_of(name) == wrong.memory_of(name)

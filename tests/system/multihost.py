@@ -34,10 +34,10 @@ from shared.process import DEFAULT_CONFIG
 from shared.scenario import Push, Scenario
 from tests.system.namespaces import Network
 from tools.runs import experiment
-from tools.runs.conductor import Conductor, Snapshot
+from tools.runs.scenario_runner import LiveSnapshot, ScenarioRunner
 from tools.supervision import fleet
-from tools.supervision.leash import die_with_parent
-from tools.supervision.supervise import Fleet
+from tools.supervision.parent_death import die_with_parent
+from tools.supervision.supervise import SupervisedFleet
 
 BODY: Final = "body"
 LEGS: Final = {
@@ -97,7 +97,7 @@ class Cutter:
         self._tracking = False
         self._course = self._make_all()
 
-    def see(self, snapshot: Snapshot) -> None:
+    def see(self, snapshot: LiveSnapshot) -> None:
         """Do what is due; the conductor calls this with each news of the simulated world."""
         self._tracking = snapshot.modes == _ALL_TRACK
         if snapshot.truth is not None and snapshot.truth.scenario_s >= 0.0:
@@ -183,7 +183,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
     robot = spread(experiment.load_robot(DEFAULT_CONFIG), network)
     told = story()
     robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, told, PlantConfig())
-    started = Fleet.start(
+    started = SupervisedFleet.start(
         robot_path,
         run_dir,
         overrides={
@@ -196,7 +196,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
     try:
         with open_session(robot, "multihost", run_dir) as session:
             try:
-                Conductor(started, session, told, Cutter(network, report).see).run()
+                ScenarioRunner(started, session, told, Cutter(network, report).see).run()
             except _FinishedError:
                 return
     finally:

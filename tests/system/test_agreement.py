@@ -142,7 +142,7 @@ def ages_ms(out: Path) -> list[float]:
 
 def lost_share(out: Path) -> float:
     """Return the share of messages that the network took away, of all links together."""
-    ended = [e for e in read_run(out / "run.mcap").messages(topics.LINK_EVENT) if not e.in_force]
+    ended = [e for e in read_run(out / "run.mcap").messages(topics.LINK_EVENT) if not e.active]
     assert {event.link for event in ended} == set(DIRECTIONS)
     lost, passed = sum(e.lost for e in ended), sum(e.passed for e in ended)
     return float(lost / (lost + passed))

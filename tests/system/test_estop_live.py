@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from services.joint.neighbours import Neighbours
-from services.joint.will import Pendant
+from services.joint.rearm_guard import Pendant
 from shared import topics
 from shared.bus import open_session
 from shared.config import RobotConfig
@@ -20,7 +20,7 @@ from shared.joints import MODULES
 from shared.messages import JointState, Mode, SimTruth
 from shared.process import DEFAULT_CONFIG
 from tests.system.verbs import xrl
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -66,7 +66,7 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
     run_dir: Path, robot: RobotConfig
 ) -> None:
     """`--local` opens no session: of the bus nothing is used. Asked for anew, a module waits."""
-    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
     try:
         wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.HOLD))
         done = xrl("estop", "--local", run_dir=run_dir)
@@ -89,7 +89,7 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
 def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(
     run_dir: Path, robot: RobotConfig
 ) -> None:
-    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
     command = [sys.executable, "-m", "tools.cli", "pendant", "--run-dir", str(run_dir)]
     try:
         wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.HOLD))
@@ -108,7 +108,7 @@ def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(
 
 def test_it_needs_no_supervisor(run_dir: Path, robot: RobotConfig) -> None:
     """With the supervisor hung the bus way ends in an error; by then the six have been asked."""
-    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
     pid = int(fleet.run.supervisor_pid.read_text(encoding="utf-8"))
     try:
         wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.HOLD))
@@ -123,7 +123,7 @@ def test_it_needs_no_supervisor(run_dir: Path, robot: RobotConfig) -> None:
 
 
 def test_a_module_without_a_service_here_is_named(run_dir: Path, robot: RobotConfig) -> None:
-    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES[:5]])
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES[:5]])
     try:
         wait_for_modes(robot, run_dir, dict.fromkeys(MODULES[:5], Mode.HOLD))
         done = xrl("estop", "--local", run_dir=run_dir)

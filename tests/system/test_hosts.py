@@ -24,7 +24,7 @@ from shared.process import DEFAULT_CONFIG
 from tests.system.waiting import wait_for
 from tools import cli
 from tools.supervision import procfs
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -42,7 +42,7 @@ def run_dirs() -> Iterator[dict[str, Path]]:
         paths = {host: Path(parent) / host for host in HOSTS}
         yield paths
         for path in paths.values():
-            Fleet(path).stop()
+            SupervisedFleet(path).stop()
 
 
 def spread(robot: RobotConfig, drives: Path) -> RobotConfig:
@@ -75,7 +75,7 @@ def test_each_host_starts_its_own_services_and_all_six_modules_track(
             cli.main(["up", *where, "--out", str(tmp_path / host), "--only", ",".join(services)])
             == 0
         )
-        assert set(Fleet.attach(run_dirs[host]).pids()) == set(services)
+        assert set(SupervisedFleet.attach(run_dirs[host]).pids()) == set(services)
     assert (tmp_path / "body" / "run.mcap").exists()
     assert not (tmp_path / "right").exists(), "a host without recorder records nothing"
 

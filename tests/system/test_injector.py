@@ -100,8 +100,8 @@ class Rig:
 
     def ended(self) -> LinkEvent:
         """Return what the newest impairment has done to the states, once it is told."""
-        self.wait(lambda: any(not e.in_force and e.link == f"{KNEE}->planner" for e in self.told))
-        found = [e for e in self.told if not e.in_force and e.link == f"{KNEE}->planner"]
+        self.wait(lambda: any(not e.active and e.link == f"{KNEE}->planner" for e in self.told))
+        found = [e for e in self.told if not e.active and e.link == f"{KNEE}->planner"]
         self.told.clear()
         return found[-1]
 
@@ -269,6 +269,6 @@ def test_what_is_done_is_told_on_the_bus_and_shown_by_the_verb(
     assert cli.main(["inject", "--clear", *words]) == 0
     assert "nothing is done" in capsys.readouterr().out
     rig.wait(lambda: len(rig.told) == 12)
-    assert [event.in_force for event in rig.told] == [True] * 6 + [False] * 6
+    assert [event.active for event in rig.told] == [True] * 6 + [False] * 6
     assert cli.main(["inject", "--link", "elbow", "--loss", "0.5", *words]) == 2
     assert "planner->MODULE" in capsys.readouterr().err

@@ -12,9 +12,9 @@ import msgspec
 import pytest
 
 from services.joint.differential import motor_from_joint
+from services.joint.drive_manager import DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.loop import JointLoop, Ports
-from services.joint.module import Module
+from services.joint.loop import JointLoop, JointPorts
 from shared import topics
 from shared.bus import open_session
 from shared.clock import NS_PER_S
@@ -83,14 +83,14 @@ class Serving:
     def _serve(self) -> None:
         robot, module = self._robot, self._module
         with open_session(robot, module, self._run_dir) as session:
-            ports = Ports(
+            ports = JointPorts(
                 commands=session.latest(topics.JOINT_COMMAND, JointCommand, module),
                 estops=session.latest(topics.ESTOP, Estop),
                 states=session.publisher(topics.JOINT_STATE, JointState, module),
                 events=session.publisher(topics.JOINT_EVENT, JointEvent, module),
                 traces=session.publisher(topics.JOINT_TRACE, JointTrace, module),
             )
-            loop = JointLoop(robot, Module(robot, module), self.drive, ports)
+            loop = JointLoop(robot, DriveManager(robot, module), self.drive, ports)
             self._up.set()
             while not self._over.is_set():
                 loop.cycle()

@@ -20,7 +20,7 @@ from shared.process import DEFAULT_CONFIG
 from tests.system.waiting import wait_for
 from tools import cli
 from tools.supervision import procfs
-from tools.supervision.supervise import Fleet, ServiceInfo
+from tools.supervision.supervise import ServiceInfo, SupervisedFleet
 
 pytestmark = pytest.mark.system
 
@@ -75,28 +75,28 @@ def run_dir() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as parent:
         path = Path(parent) / "run"
         yield path
-        Fleet(path).stop()
+        SupervisedFleet(path).stop()
 
 
-Start = Callable[..., Fleet]
+Start = Callable[..., SupervisedFleet]
 
 
 @pytest.fixture
 def start(run_dir: Path, tmp_path: Path) -> Start:
-    def start(programs: dict[str, str] | None = None, **arguments: object) -> Fleet:
+    def start(programs: dict[str, str] | None = None, **arguments: object) -> SupervisedFleet:
         table = write_table(
             tmp_path / "processes.toml", programs or {"planner": SLEEPER, "harness": SLEEPER}
         )
-        return Fleet.start(DEFAULT_CONFIG, run_dir, table_path=table, **arguments)
+        return SupervisedFleet.start(DEFAULT_CONFIG, run_dir, table_path=table, **arguments)
 
     return start
 
 
-def service(fleet: Fleet, name: str) -> ServiceInfo:
+def service(fleet: SupervisedFleet, name: str) -> ServiceInfo:
     return next(row for row in fleet.info() if row.name == name)
 
 
-def supervisor_pid(fleet: Fleet) -> int:
+def supervisor_pid(fleet: SupervisedFleet) -> int:
     return int(fleet.run.supervisor_pid.read_text(encoding="utf-8"))
 
 
@@ -180,8 +180,8 @@ def test_no_service_outlives_a_killed_supervisor(start: Start, run_dir: Path) ->
     os.kill(supervisor_pid(fleet), signal.SIGKILL)
     assert wait_for(lambda: all(procfs.is_gone(pid) for pid in pids))
     with pytest.raises(FleetError, match="does not answer"):
-        Fleet.attach(run_dir)
-    Fleet(run_dir).stop()
+        SupervisedFleet.attach(run_dir)
+    SupervisedFleet(run_dir).stop()
     assert_nothing_left(run_dir, pids)
 
 
@@ -214,7 +214,7 @@ def test_a_service_that_ends_at_once_fails_the_start_with_its_log(
 def test_a_service_that_never_listens_fails_the_start(run_dir: Path, tmp_path: Path) -> None:
     table = write_table(tmp_path / "p.toml", {"planner": SLEEPER}, ready="endpoint")
     with pytest.raises(FleetError, match="not up after 2 s: planner"):
-        Fleet.start(DEFAULT_CONFIG, run_dir, table_path=table, timeout_s=2.0)
+        SupervisedFleet.start(DEFAULT_CONFIG, run_dir, table_path=table, timeout_s=2.0)
     assert_nothing_left(run_dir, [])
 
 
@@ -227,7 +227,7 @@ def test_a_port_in_use_is_refused_before_anything_starts(run_dir: Path, tmp_path
         config.write_text(text.replace("unixsock-stream/{run}/planner.zenoh", endpoint))
         table = write_table(tmp_path / "p.toml", {"planner": SLEEPER})
         with pytest.raises(FleetError, match=f"planner: {endpoint}: port in use"):
-            Fleet.start(config, run_dir, table_path=table)
+            SupervisedFleet.start(config, run_dir, table_path=table)
     assert_nothing_left(run_dir, [])
 
 

@@ -25,9 +25,9 @@ from shared.messages import JointState, Mode, SimTruth
 from shared.process import DEFAULT_CONFIG
 from tests.system.verbs import xrl
 from tools.bringup import bench, zeroing
-from tools.bringup.zeroing import Look, look
+from tools.bringup.zeroing import DriveLook, look
 from tools.supervision import procfs
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -50,7 +50,7 @@ def lose_power(robot: RobotConfig, run_dir: Path, module: str) -> None:
         )
 
 
-def eventually_look(robot: RobotConfig, run_dir: Path, module: str, *, zeroed: bool) -> Look:
+def eventually_look(robot: RobotConfig, run_dir: Path, module: str, *, zeroed: bool) -> DriveLook:
     """Return what a drive says once it has a zero, or has none."""
     unmarked = msgspec.structs.replace(robot.drive, zero_mark_turns=0.0)
     drive = open_drive(msgspec.structs.replace(robot, drive=unmarked), module, run_dir)
@@ -91,7 +91,7 @@ def wait_for_mode(robot: RobotConfig, run_dir: Path, module: str, mode: Mode) ->
 def test_emulated_drives_are_zeroed_by_a_protractor_and_by_the_stand(
     run_dir: Path, robot: RobotConfig
 ) -> None:
-    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator"])
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator"])
     try:
         height = torso_height(robot, run_dir)
         true = {m: eventually_look(robot, run_dir, m, zeroed=True).q for m in MODULES}
@@ -119,7 +119,7 @@ def test_emulated_drives_are_zeroed_by_a_protractor_and_by_the_stand(
 def test_beside_its_joint_service_a_module_is_zeroed_only_while_that_is_disarmed(
     run_dir: Path, robot: RobotConfig
 ) -> None:
-    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", MODULE])
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", MODULE])
     order = ("zero", MODULE, "--at", "0.03,-1.0", "--yes")
     try:
         wait_for_mode(robot, run_dir, MODULE, Mode.HOLD)
@@ -153,7 +153,7 @@ def test_a_leg_of_the_emulated_robot_follows_and_nothing_is_left_behind(run_dir:
 
 def test_after_a_jog_the_doctor_finds_the_drive_as_it_was(run_dir: Path) -> None:
     """Its limits too: `xrl configure --apply` would restart the board for them, zero and all."""
-    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator"])
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator"])
     try:
         jogged = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
         assert "both axes are idle" in jogged.stdout, jogged.stdout + jogged.stderr
@@ -168,7 +168,7 @@ def test_after_a_jog_the_doctor_finds_the_drive_as_it_was(run_dir: Path) -> None
 def test_on_the_emulated_robot_a_small_limit_an_interrupt_and_a_service_stop_it(
     run_dir: Path, robot: RobotConfig
 ) -> None:
-    fleet = Fleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", "ankle_left"])
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", "ankle_left"])
     try:
         weak = xrl("jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
         assert weak.returncode == 1, weak.stdout + weak.stderr

@@ -14,7 +14,7 @@ import numpy as np
 
 from services.joint.drivers.base import Drive, DriveStatus, MotorTarget
 from services.simulator.axis_bank import AxisBank
-from services.simulator.fibre_endpoints import Board
+from services.simulator.fibre_endpoints import EmulatedBoard
 from services.simulator.fibre_front import FibreFront
 from services.simulator.fibre_port import FibreHub, FibrePort
 from services.simulator.usb_standin import build, load
@@ -47,7 +47,7 @@ class UsbRobot:
         self.bank = AxisBank(robot.drive, encoder_counts_per_turn=counts, watchdog=watchdog)
         self.ports = [
             FibrePort(
-                FibreFront(Board(self.bank, module, FIRST_SERIAL + module)),
+                FibreFront(EmulatedBoard(self.bank, module, FIRST_SERIAL + module)),
                 folder / serial_number(module),
             )
             for module in range(len(MODULES))

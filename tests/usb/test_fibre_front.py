@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_settings import NAMES
-from services.simulator.fibre_endpoints import CODECS, Board
+from services.simulator.fibre_endpoints import CODECS, EmulatedBoard
 from services.simulator.fibre_front import FibreFront, crc16
 from shared.cansimple import AxisError, AxisState
 from shared.config import RobotConfig
@@ -85,7 +85,7 @@ def bank(robot: RobotConfig) -> AxisBank:
 
 @pytest.fixture
 def front(bank: AxisBank) -> FibreFront:
-    return FibreFront(Board(bank, MODULE, SERIAL))
+    return FibreFront(EmulatedBoard(bank, MODULE, SERIAL))
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def test_every_setting_of_the_bank_is_there_and_reads_as_the_bank_has_it(
 
 
 def test_two_fronts_of_one_firmware_have_the_same_descriptor(bank: AxisBank) -> None:
-    first, second = (FibreFront(Board(bank, module, SERIAL + module)) for module in (0, 5))
+    first, second = (FibreFront(EmulatedBoard(bank, module, SERIAL + module)) for module in (0, 5))
     assert first.descriptor == second.descriptor
 
 
@@ -175,7 +175,7 @@ def test_a_request_made_for_another_descriptor_is_ignored(client: Client, bank: 
 @given(packet=st.binary(max_size=80))
 def test_no_packet_makes_the_front_fail(robot: RobotConfig, packet: bytes) -> None:
     bank = AxisBank(robot.drive, encoder_counts_per_turn=8192)
-    front = FibreFront(Board(bank, MODULE, SERIAL))
+    front = FibreFront(EmulatedBoard(bank, MODULE, SERIAL))
     front.answer(packet)
     (trailer,) = struct.unpack("<H", struct.pack("<H", crc16(1, front.descriptor)))
     front.answer(packet + struct.pack("<H", trailer))

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from services.simulator.axis_bank import AxisBank
-from services.simulator.fibre_endpoints import Board
+from services.simulator.fibre_endpoints import EmulatedBoard
 from services.simulator.fibre_front import FibreFront
 from services.simulator.fibre_port import LOOK_EVERY, FibreHub, FibrePort
 from shared.config import RobotConfig
@@ -29,7 +29,7 @@ def bank(robot: RobotConfig) -> AxisBank:
 @pytest.fixture
 def hub(bank: AxisBank, tmp_path: Path) -> Iterator[FibreHub]:
     hub = FibreHub(
-        [FibrePort(FibreFront(Board(bank, i, 16 + i)), tmp_path / str(i)) for i in range(6)]
+        [FibrePort(FibreFront(EmulatedBoard(bank, i, 16 + i)), tmp_path / str(i)) for i in range(6)]
     )
     yield hub
     hub.close()
@@ -113,7 +113,7 @@ def test_a_plug_that_is_in_again_takes_clients_again(
 def test_a_dead_simulators_plug_is_taken_over_and_a_live_ones_is_not(
     bank: AxisBank, tmp_path: Path
 ) -> None:
-    front, path = FibreFront(Board(bank, 0, 16)), tmp_path / "0"
+    front, path = FibreFront(EmulatedBoard(bank, 0, 16)), tmp_path / "0"
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as dead:
         dead.bind(str(path))
     port = FibrePort(front, path)

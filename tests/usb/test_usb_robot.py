@@ -13,7 +13,7 @@ from tests.usb import robot_file
 from tools.supervision import fleet
 
 
-def plan(path: Path, *, simulation: bool) -> fleet.Plan:
+def plan(path: Path, *, simulation: bool) -> fleet.FleetPlan:
     return fleet.make_plan(
         path,
         Path("/tmp/xrl-t"),

@@ -23,7 +23,7 @@ from shared.process import DEFAULT_CONFIG
 from tools.bringup import reach
 from tools.supervision import fleet, procfs
 from tools.supervision.run_dir import RunDir
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 
 SETTLE_S: Final = 1.5
 """Until an emulated robot hangs still in its hoist."""
@@ -52,7 +52,7 @@ def robot_file(args: Namespace) -> Path:
     return Path(manifest.config)
 
 
-def service_on(robot: RobotConfig, module: str, run_dir: Path) -> Fleet | None:
+def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFleet | None:
     """Return the fleet of this user's that has a joint service on a module's drive, or None.
 
     In whatever run directory: two fleets may mean the same drive.
@@ -66,7 +66,7 @@ def service_on(robot: RobotConfig, module: str, run_dir: Path) -> Fleet | None:
             other = config_file.load_without_schedule(Path(manifest.config))
             services = [name for name in manifest.services if name in MODULES]
             if any(_drive_of(other, name, path) == drive for name in services):
-                return Fleet(path)
+                return SupervisedFleet(path)
     return None
 
 

@@ -68,7 +68,7 @@ class Board(Protocol):
         """Return `AxisState` of both axes."""
 
 
-class Found(NamedTuple):
+class FoundBoards(NamedTuple):
     """What is on a way to the boards."""
 
     boards: dict[str, Board]
@@ -95,7 +95,7 @@ def is_known(firmware: tuple[int, int, int]) -> bool:
     return firmware >= OLDEST and firmware[:2] == FIRMWARE[:2]
 
 
-def firmware_in_words(firmware: tuple[int, int, int]) -> str:
+def describe_firmware(firmware: tuple[int, int, int]) -> str:
     """Return "0.5.6"."""
     return ".".join(map(str, firmware))
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from shared.cansimple import AxisState
-from shared.drive_settings import AXES, Wanted, value_in_words
+from shared.drive_settings import AXES, WantedSetting, describe_value
 from shared.exceptions import DriveError
 from tools.bringup.boards import Board, Value, equal
 from tools.bringup.check_board import CALIBRATE
@@ -23,7 +23,7 @@ _FOUND = (
 these the motor has no torque, or runs away."""
 
 
-class Change(NamedTuple):
+class SettingChange(NamedTuple):
     """One setting that is not as it should be."""
 
     module: str
@@ -38,16 +38,18 @@ class Change(NamedTuple):
     """Whether a value that is read back is as it should be."""
 
 
-class Outcome(NamedTuple):
+class ChangeResult(NamedTuple):
     """What came of a change."""
 
-    change: Change
+    change: SettingChange
     now: Value
     """Read back after the restart."""
     good: bool
 
 
-def against_wanted(module: str, wanted: Iterable[Wanted], board: Board) -> list[Change]:
+def against_wanted(
+    module: str, wanted: Iterable[WantedSetting], board: Board
+) -> list[SettingChange]:
     """Return what of a board is not as the robot wants it.
 
     Raises:
@@ -64,11 +66,13 @@ def against_wanted(module: str, wanted: Iterable[Wanted], board: Board) -> list[
             continue
         else:
             obstacle = _uncalibrated(row.name, calibrated)
-        changes.append(Change(module, row.name, before, row.value, row.why, obstacle, _fitter(row)))
+        changes.append(
+            SettingChange(module, row.name, before, row.value, row.why, obstacle, _fitter(row))
+        )
     return changes
 
 
-def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> list[Change]:
+def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> list[SettingChange]:
     """Return what of a board is not as a backup has it.
 
     Raises:
@@ -88,7 +92,7 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
         else:
             obstacle = ""
         changes.append(
-            Change(module, name, settings.get(name), value, "", obstacle,
+            SettingChange(module, name, settings.get(name), value, "", obstacle,
                    _equal_to(value))
         )  # fmt: skip
     return changes
@@ -110,7 +114,7 @@ def refuse_armed(module: str, board: Board) -> None:
             )
 
 
-def apply(board: Board, changes: Sequence[Change]) -> list[Outcome]:
+def apply(board: Board, changes: Sequence[SettingChange]) -> list[ChangeResult]:
     """Write a board's changes, save them, and read them back after the restart.
 
     Raises:
@@ -122,21 +126,23 @@ def apply(board: Board, changes: Sequence[Change]) -> list[Outcome]:
         board.save()
     now = board.read([change.name for change in changes])
     return [
-        Outcome(change, now.get(change.name), change.name in now and change.fits(now[change.name]))
+        ChangeResult(
+            change, now.get(change.name), change.name in now and change.fits(now[change.name])
+        )
         for change in changes
     ]
 
 
-def in_words(value: Value) -> str:
+def describe(value: Value) -> str:
     """Return a setting's value as a person would write it."""
-    return "-" if value is None else value_in_words(value)
+    return "-" if value is None else describe_value(value)
 
 
-def _fits(row: Wanted, value: Value) -> bool:
+def _fits(row: WantedSetting, value: Value) -> bool:
     return isinstance(value, bool | int | float) and row.fits(value)
 
 
-def _fitter(row: Wanted) -> Callable[[Value], bool]:
+def _fitter(row: WantedSetting) -> Callable[[Value], bool]:
     return lambda value: _fits(row, value)
 
 

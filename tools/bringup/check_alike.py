@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from statistics import median
 from typing import Final
 
-from shared.drive_settings import AXES, AXIS_TABLE, DRIVE_TABLE, value_in_words
+from shared.drive_settings import AXES, AXIS_TABLE, DRIVE_TABLE, describe_value
 from tools.bringup.boards import Value
-from tools.bringup.rows import Row, ok, warning, wrong
+from tools.bringup.rows import Finding, ok, warning, wrong
 
 Boards = Mapping[str, Mapping[str, Value]]
 """By module: a board's settings and readings."""
@@ -43,7 +43,7 @@ _OWN: Final = frozenset(
 """Below the axis: compared with the robot file, found by calibration, or written by services."""
 
 
-def alike_rows(boards: Boards) -> list[Row]:
+def alike_rows(boards: Boards) -> list[Finding]:
     """Return what one board or few have otherwise than most, and what no motor can have."""
     if len(boards) < BOARDS_MIN:
         return []
@@ -60,9 +60,9 @@ def _is_shared(name: str) -> bool:
     return ".config." in f".{name}" and (below if axis in AXES else name) not in _OWN
 
 
-def _odd_ones(name: str, boards: Boards) -> list[Row]:
+def _odd_ones(name: str, boards: Boards) -> list[Finding]:
     """Return a row for each board that has a setting otherwise than more than half of them."""
-    words = {module: value_in_words(values.get(name)) for module, values in boards.items()}
+    words = {module: describe_value(values.get(name)) for module, values in boards.items()}
     usual, count = Counter(words.values()).most_common(1)[0]
     if count == len(boards) or 2 * count <= len(boards):
         return []
@@ -76,7 +76,7 @@ def _odd_ones(name: str, boards: Boards) -> list[Row]:
     ]
 
 
-def _measured_rows(name: str, boards: Boards) -> list[Row]:
+def _measured_rows(name: str, boards: Boards) -> list[Finding]:
     """Judge what calibration has found on each axis, against the others."""
     found = {
         (module, axis): float(value)
@@ -90,7 +90,7 @@ def _measured_rows(name: str, boards: Boards) -> list[Row]:
     rows = []
     fix = "look at its three phase wires; calibrate it again (deploy/bring-up.md, section 5)"
     for (module, axis), value in found.items():
-        subject, words = f"{module}.{axis}", value_in_words(value)
+        subject, words = f"{module}.{axis}", describe_value(value)
         if not value > 0.0:
             calibrated = boards[module].get(f"{axis}.motor.is_calibrated")
             if calibrated:
@@ -102,7 +102,7 @@ def _measured_rows(name: str, boards: Boards) -> list[Row]:
     return rows
 
 
-def _supply_rows(boards: Boards) -> list[Row]:
+def _supply_rows(boards: Boards) -> list[Finding]:
     volts = {
         module: float(value)
         for module, values in boards.items()

@@ -16,12 +16,12 @@ from shared.cansimple import (
     OdriveError,
 )
 from shared.config import RobotConfig
-from shared.drive_settings import AXES, Wanted, value_in_words
+from shared.drive_settings import AXES, WantedSetting, describe_value
 from shared.exceptions import DriveError
 from shared.joints import AXES as JOINT_AXES
 from shared.joints import MODULE_INDEX
-from tools.bringup.boards import FIRMWARE, Value, firmware_in_words, is_known, number
-from tools.bringup.rows import Row, Verdict, judged, ok, warning, wrong
+from tools.bringup.boards import FIRMWARE, Value, describe_firmware, is_known, number
+from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 
 Values = Mapping[str, Value]
 
@@ -47,10 +47,10 @@ CALIBRATE: Final = (
 )
 
 
-def firmware_row(module: str, firmware: tuple[int, int, int]) -> Row:
+def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
     """Judge a board's firmware."""
-    wanted = firmware_in_words(FIRMWARE)
-    found = firmware_in_words(firmware)
+    wanted = describe_firmware(FIRMWARE)
+    found = describe_firmware(firmware)
     fix = (
         f"flash {wanted}: `odrivetool legacy-dfu FILE.elf`; then "
         f"`xrl configure --apply --module {module}`"
@@ -58,29 +58,31 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Row:
     if is_known(firmware):
         why = "settings may have other names or defaults"
         good = firmware == FIRMWARE
-        return judged(good, module, "firmware", found, wanted, fix, why, otherwise=Verdict.WARNING)
+        return judged(
+            good, module, "firmware", found, wanted, fix, why, otherwise=FindingKind.WARNING
+        )
     why = "other settings, other errors, other CAN frames: nothing of it can be compared"
     return wrong(module, "firmware", found, wanted, fix, why)
 
 
-def settings_rows(module: str, wanted: tuple[Wanted, ...], values: Values) -> list[Row]:
+def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values) -> list[Finding]:
     """Compare a board's settings with what is wanted of them; all that fit are one row."""
     rows = []
     fix = f"`xrl configure --apply --module {module}`"
     for setting in wanted:
         subject, name = _subject(module, setting.name)
         value = values.get(setting.name)
-        words = setting.in_words()
+        words = setting.describe()
         if not isinstance(value, bool | int | float):
             rows.append(warning(subject, name, "not there", words, "firmware 0.5.6", setting.why))
         elif not setting.fits(value):
             by_hand = CALIBRATE if name.endswith("pre_calibrated") else fix
-            rows.append(wrong(subject, name, value_in_words(value), words, by_hand, setting.why))
+            rows.append(wrong(subject, name, describe_value(value), words, by_hand, setting.why))
     fitting = f"{len(wanted) - len(rows)} as wanted"
     return [ok(module, "other settings" if rows else "settings", fitting), *rows]
 
 
-def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Row]:
+def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Finding]:
     """Judge which way currents count, as each axis's encoder calibration has found it.
 
     The firmware turns the torque round where it is -1, so that the motion is the same; its
@@ -102,14 +104,14 @@ def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Row]
         value = values.get(f"{axis}.{_DIRECTION}")
         if isinstance(value, int | float) and values.get(f"{axis}.encoder.is_ready"):
             wanted = "1" if over_can else "1 or -1"
-            subject, found = f"{module}.{axis}", value_in_words(value)
+            subject, found = f"{module}.{axis}", describe_value(value)
             good = value == 1 or (not over_can and value == -1)
             by_hand = fix if value == -1 else CALIBRATE
             rows.append(judged(good, subject, _DIRECTION, found, wanted, by_hand, why))
     return rows
 
 
-def error_rows(module: str, values: Values) -> list[Row]:
+def error_rows(module: str, values: Values) -> list[Finding]:
     """Return what the board's error registers hold; one row if nothing.
 
     Arming clears them all, so a watchdog that ran out while nobody wrote is no fault.
@@ -118,21 +120,21 @@ def error_rows(module: str, values: Values) -> list[Row]:
     rows = []
     error = int(number(values, "error"))
     if error:
-        found = flags_in_words(OdriveError, error)
+        found = describe_flags(OdriveError, error)
         rows.append(wrong(module, "error", found, "none", fix, "both axes disarm"))
     for axis in AXES:
         for name, kind in REGISTERS:
             bits = int(number(values, f"{axis}.{name}"))
             benign = kind is AxisError and bits == AxisError.WATCHDOG_TIMER_EXPIRED
             if bits and not benign:
-                found = flags_in_words(kind, bits)
+                found = describe_flags(kind, bits)
                 rows.append(wrong(f"{module}.{axis}", name, found, "none", fix))
     return rows or [ok(module, "errors", "none", "none")]
 
 
 def condition_rows(
     module: str, values: Values, trip_levels: tuple[float, float], *, services_up: bool
-) -> list[Row]:
+) -> list[Finding]:
     """Judge calibration, supply and state.
 
     Args:
@@ -165,7 +167,7 @@ def condition_rows(
     return rows
 
 
-def state_row(subject: str, state: int, *, services_up: bool) -> Row:
+def state_row(subject: str, state: int, *, services_up: bool) -> Finding:
     """Judge an axis's state: idle, or in closed loop where a joint service has it."""
     known = state in AxisState.__members__.values()
     found = AxisState(state).name.lower().replace("_", " ") if known else str(state)
@@ -177,7 +179,7 @@ def state_row(subject: str, state: int, *, services_up: bool) -> Row:
     return warning(subject, "state", found, "idle", fix, "it moves or holds with nobody at it")
 
 
-def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -> list[Row]:
+def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -> list[Finding]:
     """Judge where a module's joint is, by its motors' positions as the drive counts them."""
     mark = robot.drive.zero_mark_turns
     a, b = turns[0] - mark, turns[1] - mark
@@ -210,14 +212,14 @@ def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -
     return rows
 
 
-def flags_in_words(kind: type[IntFlag], bits: int) -> str:
+def describe_flags(kind: type[IntFlag], bits: int) -> str:
     """Return an error register as its firmware names it, unknown bits in hex."""
     names = [flag.name or "" for flag in kind if flag and bits & flag == flag]
     rest = bits & ~sum(flag for flag in kind if flag)
     return " ".join([*names, *([hex(rest)] if rest else [])])
 
 
-def _temperature(subject: str, celsius: Value) -> list[Row]:
+def _temperature(subject: str, celsius: Value) -> list[Finding]:
     """Judge an output stage's temperature; nothing where the board does not tell it."""
     if not isinstance(celsius, int | float):
         return []
@@ -234,12 +236,12 @@ def _temperature(subject: str, celsius: Value) -> list[Row]:
             f"{low:g} to {high:g} C",
             fix,
             why,
-            otherwise=Verdict.WARNING,
+            otherwise=FindingKind.WARNING,
         )
     ]
 
 
-def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Row:
+def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Finding:
     low, high = trip_levels
     wanted = f"{low:g} to {high:g} V"
     found = f"{volts:.1f} V"

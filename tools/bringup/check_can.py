@@ -11,11 +11,11 @@ from shared.cansimple import AxisError
 from shared.config import RobotConfig
 from shared.config_sections import CanConfig
 from shared.drive_settings import AXES
-from tools.bringup.boards import firmware_in_words
-from tools.bringup.can_ear import BusHeard, NodeHeard, mean_ms, period_ms
-from tools.bringup.check_board import flags_in_words, state_row
+from tools.bringup.boards import describe_firmware
+from tools.bringup.can_monitor import BusHeard, NodeHeard, mean_ms, period_ms
+from tools.bringup.check_board import describe_flags, state_row
 from tools.bringup.check_socketcan import up_command
-from tools.bringup.rows import Row, Verdict, judged, ok, warning, wrong
+from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 from tools.supervision.fleet import SIMULATED_CAN
 
 PERIOD_SHARE: Final = 0.2
@@ -25,7 +25,9 @@ TWICE: Final = 0.65
 RATE_SHARE: Final = 0.2
 
 
-def drive_rows(robot: RobotConfig, module: str, heard: BusHeard, *, services_up: bool) -> list[Row]:
+def drive_rows(
+    robot: RobotConfig, module: str, heard: BusHeard, *, services_up: bool
+) -> list[Finding]:
     """Judge a module's two axes by what came on its bus."""
     bus = robot.can[robot.module_named(module).bus]
     if heard.trouble:
@@ -53,7 +55,7 @@ def drive_rows(robot: RobotConfig, module: str, heard: BusHeard, *, services_up:
     return rows
 
 
-def harness_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
+def harness_rows(robot: RobotConfig, heard: BusHeard) -> list[Finding]:
     """Judge the load cells by what came on their bus."""
     subject, harness = "harness", robot.harness
     wanted = f"{harness.rate_hz:g} Hz"
@@ -74,7 +76,7 @@ def harness_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
     return rows + _lost_frames(subject, heard)
 
 
-def imu_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
+def imu_rows(robot: RobotConfig, heard: BusHeard) -> list[Finding]:
     """Judge the IMU by what came on its bus."""
     subject, imu = "IMU", robot.imu
     wanted = f"{imu.rate_hz:g} Hz"
@@ -96,16 +98,16 @@ def imu_rows(robot: RobotConfig, heard: BusHeard) -> list[Row]:
     return rows + _lost_frames(subject, heard)
 
 
-def _rate_row(subject: str, what: str, times_s: list[float], wanted_hz: float, fix: str) -> Row:
+def _rate_row(subject: str, what: str, times_s: list[float], wanted_hz: float, fix: str) -> Finding:
     """Judge the rate at which a sensor's samples came."""
     period = period_ms(times_s, 1e3 / wanted_hz)
     rate_hz = 1e3 / period if period else 0.0
     near = abs(rate_hz / wanted_hz - 1.0) <= RATE_SHARE
     found, wanted = f"{rate_hz:.0f} Hz", f"{wanted_hz:g} Hz"
-    return judged(near, subject, what, found, wanted, fix, otherwise=Verdict.WARNING)
+    return judged(near, subject, what, found, wanted, fix, otherwise=FindingKind.WARNING)
 
 
-def _lost_frames(subject: str, heard: BusHeard) -> list[Row]:
+def _lost_frames(subject: str, heard: BusHeard) -> list[Finding]:
     """Tell of a sensor's frames that were out of order: others were lost."""
     if not heard.malformed:
         return []
@@ -152,18 +154,18 @@ def _how_to_open(bus: CanConfig, trouble: str) -> str:
 
 def _axis_rows(
     robot: RobotConfig, subject: str, node: int, heard: NodeHeard, *, services_up: bool
-) -> list[Row]:
+) -> list[Finding]:
     if heard.heartbeat is None:
         fix = f"node {node} in `node_ids`, or the drive's config.can.node_id and heartbeat_rate_ms"
         return [wrong(subject, "heartbeat", f"node {node} silent", "heard", fix)]
     if heard.version is not None:
-        found = firmware_in_words(heard.version.firmware)
+        found = describe_firmware(heard.version.firmware)
         fix = "the settings of firmware 0.6 are not read back yet: check them in its web GUI"
         return [warning(subject, "firmware", found, "0.5.6", fix, "other settings, other errors")]
     drive = robot.drive
     # Errors by the flags too: `axis_error` alone can stay 0.
     errors = heard.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED
-    words = flags_in_words(AxisError, errors) if errors else "none"
+    words = describe_flags(AxisError, errors) if errors else "none"
     fix = "find what caused it; `xrl up` clears it at arming, power off and on does too"
     return [
         _period(
@@ -177,7 +179,9 @@ def _axis_rows(
     ]
 
 
-def _period(subject: str, what: str, times_s: list[float], wanted_ms: float, setting: str) -> Row:
+def _period(
+    subject: str, what: str, times_s: list[float], wanted_ms: float, setting: str
+) -> Finding:
     module = subject.partition(".")[0]
     measured = period_ms(times_s, wanted_ms)
     if len(times_s) > 2 and mean_ms(times_s) < TWICE * wanted_ms:

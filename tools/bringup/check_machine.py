@@ -15,7 +15,7 @@ from typing import Final
 from shared import priority
 from shared.config import RobotConfig
 from tools.bringup.check_socketcan import ask_ip, socketcan_rows
-from tools.bringup.rows import Row, Verdict, judged, ok, warning, wrong
+from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 from tools.supervision.fleet import is_simulated
 
 SUBJECT: Final = "machine"
@@ -39,7 +39,7 @@ RTPRIO_FIX: Final = (
 )
 
 
-def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Row]:
+def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
     """Check the computer.
 
     Args:
@@ -61,7 +61,7 @@ def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Row]:
     return rows + socketcan_rows(robot, root, ask_ip())
 
 
-def usb_node_rows(root: Path) -> list[Row]:
+def usb_node_rows(root: Path) -> list[Finding]:
     """Check that the ODrives on USB may be opened by this user."""
     nodes = []
     for device in sorted((root / "sys/bus/usb/devices").glob("*")):
@@ -77,7 +77,7 @@ def usb_node_rows(root: Path) -> list[Row]:
     return [judged(not closed, "USB", "permission", found, "read and write", UDEV_FIX)]
 
 
-def _cpus() -> Row:
+def _cpus() -> Finding:
     count = len(os.sched_getaffinity(0))
     if count < CPUS_MIN:
         fix = "another computer, or more of this one's processors (taskset, container)"
@@ -86,7 +86,7 @@ def _cpus() -> Row:
     return ok(SUBJECT, "processors", str(count), wanted)
 
 
-def _governor(root: Path, *, emulated: bool) -> Row:
+def _governor(root: Path, *, emulated: bool) -> Finding:
     files = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     found = sorted({_text(file) for file in files} - {""})
     if not found:
@@ -99,11 +99,11 @@ def _governor(root: Path, *, emulated: bool) -> Row:
         "performance",
         "`sudo cpupower frequency-set -g performance`",
         "a processor that sleeps is late",
-        otherwise=Verdict.WARNING,
+        otherwise=FindingKind.WARNING,
     )
 
 
-def _clock(root: Path, *, emulated: bool) -> Row:
+def _clock(root: Path, *, emulated: bool) -> Finding:
     found = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
     return judged(
         found in CLOCKS or not found or emulated,
@@ -113,11 +113,11 @@ def _clock(root: Path, *, emulated: bool) -> Row:
         f"{CLOCKS[0]} or alike",
         "look in the kernel's log why it was given up",
         "every look at the clock costs a system call",
-        otherwise=Verdict.WARNING,
+        otherwise=FindingKind.WARNING,
     )
 
 
-def _real_time(*, emulated: bool) -> Row:
+def _real_time(*, emulated: bool) -> Finding:
     what, wanted = "real-time priority", "SCHED_FIFO"
     if _may_be_fifo():
         return ok(SUBJECT, what, "SCHED_FIFO allowed", wanted)
@@ -142,7 +142,7 @@ def _may_be_fifo() -> bool:
     return True
 
 
-def _swap(root: Path, *, emulated: bool) -> Row:
+def _swap(root: Path, *, emulated: bool) -> Finding:
     areas = len(_text(root / "proc/swaps").splitlines()) - 1
     return judged(
         areas <= 0 or emulated,
@@ -152,11 +152,11 @@ def _swap(root: Path, *, emulated: bool) -> Row:
         "none",
         "`sudo swapoff -a`",
         "the services lock no memory: a page that was swapped out stops a loop",
-        otherwise=Verdict.WARNING,
+        otherwise=FindingKind.WARNING,
     )
 
 
-def _libusb() -> Row:
+def _libusb() -> Finding:
     try:
         ctypes.CDLL("libusb-1.0.so.0")
     except OSError:

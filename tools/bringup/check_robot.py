@@ -9,14 +9,14 @@ from shared import gain_schedule
 from shared.config import RobotConfig, expand
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from tools.bringup.rows import Row, judged, ok, warning, wrong
+from tools.bringup.rows import Finding, judged, ok, warning, wrong
 from tools.supervision import fleet
-from tools.supervision.fleet import Listener
+from tools.supervision.fleet import ListenPoint
 
 SUBJECT: Final = "robot file"
 
 
-def robot_rows(robot: RobotConfig, path: Path) -> list[Row]:
+def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
     """Check the robot file; that it can be read at all is known by now."""
     count = len(robot.assumed)
     found = f"{count} values assumed" if count else "all values measured"
@@ -49,7 +49,7 @@ def joint_services(services: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(service for service in services if service in MODULES)
 
 
-def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> list[Row]:
+def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> list[Finding]:
     """Check that the endpoints of the bus are free, or the fleet's."""
     up = services_up(robot, run_dir)
     if fleet_is_up:
@@ -64,7 +64,7 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
             )
         ]  # fmt: skip
     listeners = [
-        Listener(service, f"bus.endpoints.{service}", expand(endpoint, run_dir))
+        ListenPoint(service, f"bus.endpoints.{service}", expand(endpoint, run_dir))
         for service, endpoint in robot.bus.endpoints.items()
     ]
     try:

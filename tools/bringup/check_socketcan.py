@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from shared.config import RobotConfig
 from shared.drive_settings import CAN_BAUD_RATE
-from tools.bringup.rows import Row, Verdict, judged, warning, wrong
+from tools.bringup.rows import Finding, FindingKind, judged, warning, wrong
 
 Links = Mapping[str, Mapping[str, Any]]
 """By interface: what `ip` says of it."""
@@ -37,7 +37,7 @@ def ask_ip() -> Links:
         return {}
 
 
-def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Row]:
+def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding]:
     """Check every interface that the robot uses.
 
     Args:
@@ -67,7 +67,7 @@ def up_command(name: str) -> str:
     return f"`sudo ip link set {name} up type can bitrate {CAN_BAUD_RATE} restart-ms 100`"
 
 
-def _details(name: str, link: Mapping[str, Any]) -> list[Row]:
+def _details(name: str, link: Mapping[str, Any]) -> list[Finding]:
     """Judge an interface that is up by what `ip` says; what it does not say is not judged."""
     data = link.get("linkinfo", {}).get("info_data", {})
     again = f"`sudo ip link set {name} down`, then {up_command(name)}"
@@ -98,13 +98,13 @@ def _details(name: str, link: Mapping[str, Any]) -> list[Row]:
                 f"{low} to {high}",
                 f"deploy/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`",
                 why,
-                otherwise=Verdict.WARNING,
+                otherwise=FindingKind.WARNING,
             )
         )
     return rows
 
 
-def _state(name: str, state: str, errors: Mapping[str, Any], again: str) -> Row:
+def _state(name: str, state: str, errors: Mapping[str, Any], again: str) -> Finding:
     counted = f" (errors sent {errors.get('tx', 0)}, received {errors.get('rx', 0)})"
     found = state.lower() + (counted if any(errors.values()) else "")
     if state in _OFF:
@@ -113,7 +113,9 @@ def _state(name: str, state: str, errors: Mapping[str, Any], again: str) -> Row:
     why = "frames are sent again and come late, or the bus goes off"
     good = state == _WELL
     wanted = _WELL.lower()
-    return judged(good, name, "controller", found, wanted, wires, why, otherwise=Verdict.WARNING)
+    return judged(
+        good, name, "controller", found, wanted, wires, why, otherwise=FindingKind.WARNING
+    )
 
 
 def _flags(root: Path, name: str) -> int | None:

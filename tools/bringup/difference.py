@@ -12,10 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from tools.bringup import changes
-from tools.bringup.changes import Change
+from tools.bringup.changes import SettingChange
 
 
-def shown(difference: Sequence[Change]) -> Group:
+def shown(difference: Sequence[SettingChange]) -> Group:
     """Return the difference for the terminal: a table, and below it why each is wanted."""
     rows = Table(title="difference", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("module", "setting", "now"):
@@ -27,8 +27,8 @@ def shown(difference: Sequence[Change]) -> Group:
         rows.add_row(
             change.module,
             f"{head}.\n{tail}" if head else tail,
-            escape(changes.in_words(change.before)),
-            escape(changes.in_words(change.after)),
+            escape(changes.describe(change.before)),
+            escape(changes.describe(change.after)),
         )
         if change.why:
             reasons.setdefault(f"{tail}: {change.why}")

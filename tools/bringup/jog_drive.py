@@ -14,7 +14,7 @@ from shared.clock import NS_PER_S, now_ns
 from shared.config import RobotConfig
 from shared.exceptions import DriveError
 from shared.messages import Pair
-from tools.bringup.jogging import STRAYED_MAX, Jog, Plan, Sample, duration_s, outside
+from tools.bringup.jogging import STRAYED_MAX, Jog, JogPlan, Sample, duration_s, outside
 
 ANSWER_S: Final = 3.0
 """Longest wait for a drive's first words."""
@@ -37,7 +37,7 @@ Clock = Callable[[], int]
 Progress = Callable[[Sample], None]
 
 
-class Outcome(NamedTuple):
+class JogResult(NamedTuple):
     """How a jog ended."""
 
     samples: list[Sample]
@@ -97,13 +97,13 @@ def jog_drive(
     drive: Drive,
     robot: RobotConfig,
     module: str,
-    plan: Plan,
+    plan: JogPlan,
     *,
     q_seen: Pair,
     interrupts: Interrupts,
     progress: Progress,
     clock: Clock = now_ns,
-) -> Outcome:
+) -> JogResult:
     """Arm a drive, move its joint as planned, and idle it, whatever happens.
 
     Args:
@@ -134,7 +134,7 @@ def jog_drive(
         if not _idle(drive, clock):
             error.add_note(NOT_IDLE)
         raise
-    return Outcome(samples, trouble, _idle(drive, clock))
+    return JogResult(samples, trouble, _idle(drive, clock))
 
 
 def _strayed(q: Pair, q_seen: Pair) -> str:

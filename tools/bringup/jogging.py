@@ -13,11 +13,11 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from services.joint import law
+from services.joint import pd_law
 from services.joint.differential import joint_from_motor
+from services.joint.drive_setpoint import DriveSetpointLaw
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.gate import GateLimits, gate, limits_of
-from services.joint.onboard import OnboardLaw
+from services.joint.torque_limiter import GateLimits, limit_torque, limits_of
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.exceptions import DriveError
@@ -47,7 +47,7 @@ SIBLING_MAX: Final = 0.02
 """rad that the other axis may move."""
 
 
-class Plan(NamedTuple):
+class JogPlan(NamedTuple):
     """What is to be done."""
 
     axis: int
@@ -72,7 +72,7 @@ class Sample(NamedTuple):
     """What the drive was asked for at this sample, N m at the joint."""
 
 
-class Row(NamedTuple):
+class JogCheck(NamedTuple):
     """One line of the verdict."""
 
     what: str
@@ -82,7 +82,7 @@ class Row(NamedTuple):
     good: bool
 
 
-def gentle(robot: RobotConfig, plan: Plan) -> RobotConfig:
+def gentle(robot: RobotConfig, plan: JogPlan) -> RobotConfig:
     """Return the robot with its drives limited to the plan's torque and speed.
 
     A motor's torque is at most T / 2N, so that |tau_phi| + |tau_theta| <= T in the drive.
@@ -106,7 +106,7 @@ def gentle(robot: RobotConfig, plan: Plan) -> RobotConfig:
     return msgspec.structs.replace(robot, drive=limited)
 
 
-def outside(robot: RobotConfig, module: str, plan: Plan, q: Pair) -> str:
+def outside(robot: RobotConfig, module: str, plan: JogPlan, q: Pair) -> str:
     """Return why the joint may not go where the plan leads it from q, rad; "" if it may."""
     limits = limits_of(robot, module)
     for axis, (low, high) in enumerate((limits.phi, limits.theta)):
@@ -151,7 +151,9 @@ class Jog:
         samples: what has been.
     """
 
-    def __init__(self, robot: RobotConfig, module: str, plan: Plan, q: Pair, now_ns: int) -> None:
+    def __init__(
+        self, robot: RobotConfig, module: str, plan: JogPlan, q: Pair, now_ns: int
+    ) -> None:
         """Begin at q, rad, with a drive that has just been armed.
 
         Args:
@@ -168,11 +170,11 @@ class Jog:
             limits, tau_module_max=min(plan.torque_limit, limits.tau_module_max)
         )
         self._gear_ratio = robot.joint.gear_ratio
-        self._onboard = OnboardLaw(robot.joint.gear_ratio, robot.drive.vel_limit)
+        self._onboard = DriveSetpointLaw(robot.joint.gear_ratio, robot.drive.vel_limit)
         self._plan, self._q_start = plan, q
         self._start_ns = self._heard_ns = now_ns
         self._at_limit_s: float | None = None
-        self._tau: Pair = law.ZERO
+        self._tau: Pair = pd_law.ZERO
         self.trouble = ""
         self.done = False
         self.samples: list[Sample] = []
@@ -196,8 +198,8 @@ class Jog:
         q = joint_from_motor(reading.pos_turns, self._gear_ratio)
         v = joint_from_motor(reading.vel_turns, self._gear_ratio)
         q_ref, v_ref = reference(self._plan, self._q_start, t_s)
-        setpoint = law.Setpoint(q_ref, v_ref, law.ZERO, law.ZERO, self._k_p, self._k_d)
-        self._tau = gate(law.torque(setpoint, q, v), q, self._tau, self._limits)
+        setpoint = pd_law.Setpoint(q_ref, v_ref, pd_law.ZERO, pd_law.ZERO, self._k_p, self._k_d)
+        self._tau = limit_torque(pd_law.torque(setpoint, q, v), q, self._tau, self._limits)
         self.samples.append(Sample(t_s, q_ref, q, self._tau))
         self.trouble = self._watch(t_s, q_ref, q)
         self.done = t_s > duration_s(self._plan)
@@ -227,16 +229,16 @@ class Jog:
         return ""
 
 
-def duration_s(plan: Plan) -> float:
+def duration_s(plan: JogPlan) -> float:
     """Return how long the whole takes."""
     return SETTLE_S + plan.cycles * plan.period_s + SETTLE_S
 
 
-def reference(plan: Plan, q_start: Pair, t_s: float) -> tuple[Pair, Pair]:
+def reference(plan: JogPlan, q_start: Pair, t_s: float) -> tuple[Pair, Pair]:
     """Return q_ref, rad, and v_ref, rad/s: q + by/2 (1 - cos) along the axis, between two rests."""
     moving_s = t_s - SETTLE_S
     if not 0.0 <= moving_s <= plan.cycles * plan.period_s:
-        return q_start, law.ZERO
+        return q_start, pd_law.ZERO
     omega = 2.0 * math.pi / plan.period_s
     way = 0.5 * plan.by * (1.0 - math.cos(omega * moving_s))
     rate = 0.5 * plan.by * omega * math.sin(omega * moving_s)
@@ -246,13 +248,15 @@ def reference(plan: Plan, q_start: Pair, t_s: float) -> tuple[Pair, Pair]:
     return (phi, theta + way), (0.0, rate)
 
 
-def judge(samples: list[Sample], plan: Plan) -> list[Row]:
+def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
     """Return the verdict on a jog that came to its end."""
     axis, other = plan.axis, 1 - plan.axis
     rest = [s for s in samples if s.t_s < SETTLE_S][-20:]
     moving = [s for s in samples if SETTLE_S <= s.t_s <= duration_s(plan) - SETTLE_S]
     if not rest or not moving:
-        return [Row("samples", f"{len(rest)} at rest, {len(moving)} moving", "some of both", False)]
+        return [
+            JogCheck("samples", f"{len(rest)} at rest, {len(moving)} moving", "some of both", False)
+        ]
     q_rest = _mean([s.q[axis] for s in rest])
     sag = q_rest - rest[-1].q_ref[axis]
     sign = math.copysign(1.0, plan.by)
@@ -262,26 +266,26 @@ def judge(samples: list[Sample], plan: Plan) -> list[Row]:
     strayed = max(abs(s.q[other] - still) for s in moving)
     peak = max(abs(s.tau[0]) + abs(s.tau[1]) for s in samples)
     return [
-        Row(
+        JogCheck(
             f"{AXES[axis]} went",
             f"{travel:+.4f} rad",
             f"{plan.by:+.4f} within {TRAVEL_SHARE:.0%}",
             abs(travel - plan.by) <= TRAVEL_SHARE * abs(plan.by),
         ),
-        Row("largest lag", f"{lag:.4f} rad", f"<= {LAG_MAX:g}", lag <= LAG_MAX),
-        Row(
+        JogCheck("largest lag", f"{lag:.4f} rad", f"<= {LAG_MAX:g}", lag <= LAG_MAX),
+        JogCheck(
             f"{AXES[other]} strayed",
             f"{strayed:.4f} rad",
             f"<= {SIBLING_MAX:g}",
             strayed <= SIBLING_MAX,
         ),
-        Row("torque at rest", f"{_mean([s.tau[axis] for s in rest]):+.2f} N m", "", True),
-        Row("largest torque, both axes", f"{peak:.2f} N m", f"< {plan.torque_limit:g}", True),
-        Row("friction, dry and viscous", f"{friction(moving, plan):.2f} N m", "", True),
+        JogCheck("torque at rest", f"{_mean([s.tau[axis] for s in rest]):+.2f} N m", "", True),
+        JogCheck("largest torque, both axes", f"{peak:.2f} N m", f"< {plan.torque_limit:g}", True),
+        JogCheck("friction, dry and viscous", f"{friction(moving, plan):.2f} N m", "", True),
     ]
 
 
-def friction(moving: list[Sample], plan: Plan) -> float:
+def friction(moving: list[Sample], plan: JogPlan) -> float:
     """Return half of what the way there takes more than the way back, N m.
 
     Where it is fast; gravity and springs, the same on both ways, cancel.

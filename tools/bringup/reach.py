@@ -21,12 +21,12 @@ from services.simulator.axis_settings import Settings, plant
 from shared.config import RobotConfig, expand
 from shared.config_sections import CanConfig
 from shared.exceptions import FleetError
-from tools.bringup.boards import Found
-from tools.bringup.can_ear import listen
+from tools.bringup.boards import FoundBoards
+from tools.bringup.can_monitor import listen
 from tools.supervision import procfs
 from tools.supervision.fleet import SIMULATED_CAN, is_simulated
 from tools.supervision.run_dir import RunDir
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 
 STARTED_S: Final = 15.0
 """Longest wait for the first frames of a simulator that was started."""
@@ -118,10 +118,10 @@ def drives_within_reach(
     if not is_simulated(robot):
         yield False
         return
-    simulator: Fleet | None = None
+    simulator: SupervisedFleet | None = None
     if not is_up(run_dir):
         words = [word for planted in plants for word in ("--drive-setting", planted)]
-        simulator = Fleet.start(
+        simulator = SupervisedFleet.start(
             config_path,
             run_dir,
             overrides={"simulator": words},
@@ -203,7 +203,9 @@ def emulated_usb(run_dir: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def boards_on_usb(robot: RobotConfig, run_dir: Path, modules: Iterable[str]) -> Iterator[Found]:
+def boards_on_usb(
+    robot: RobotConfig, run_dir: Path, modules: Iterable[str]
+) -> Iterator[FoundBoards]:
     """Connect to the boards of these modules over USB, the emulated ones if they are.
 
     Modules without a serial number have none.

@@ -14,12 +14,16 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from tools.bringup.rows import Row, Verdict, count, merged
+from tools.bringup.rows import Finding, FindingKind, count, merged
 from tools.bringup.survey import Groups
 
 WIDE: Final = 110
 """Columns from which what to do stands beside a finding; else it stands below its table."""
-COLOURS: Final = {Verdict.OK: "green", Verdict.WARNING: "yellow", Verdict.WRONG: "bold red"}
+COLOURS: Final = {
+    FindingKind.OK: "green",
+    FindingKind.WARNING: "yellow",
+    FindingKind.WRONG: "bold red",
+}
 NAME_MAX: Final = 22
 """Longest name on one line."""
 NAMED_MAX: Final = 6
@@ -33,14 +37,14 @@ class Report(msgspec.Struct, frozen=True):
     """Nothing is wrong; there may be warnings."""
     wrong: int
     warnings: int
-    groups: dict[str, list[Row]]
+    groups: dict[str, list[Finding]]
 
 
 def report_of(groups: Groups) -> Report:
     """Return the findings with their counts."""
     rows = list(chain(*groups.values()))
-    wrong = count(rows, Verdict.WRONG)
-    return Report(wrong == 0, wrong, count(rows, Verdict.WARNING), groups)
+    wrong = count(rows, FindingKind.WRONG)
+    return Report(wrong == 0, wrong, count(rows, FindingKind.WARNING), groups)
 
 
 def show(console: Console, groups: Groups, *, verbose: bool) -> None:
@@ -54,17 +58,17 @@ def verdict_line(groups: Groups) -> str:
     """Return "all ok", or how much is wrong and what: the command's answer in a line."""
     rows = list(chain(*groups.values()))
     put_together = [row for group in groups.values() for row in merged(group)]
-    wrong, warnings = count(rows, Verdict.WRONG), count(rows, Verdict.WARNING)
-    named = _names(row for row in put_together if row.verdict is Verdict.WARNING)
+    wrong, warnings = count(rows, FindingKind.WRONG), count(rows, FindingKind.WARNING)
+    named = _names(row for row in put_together if row.verdict is FindingKind.WARNING)
     noted = f"{warnings} warning{'s' * (warnings != 1)}: {named}"
     if wrong:
-        named = _names(row for row in put_together if row.verdict is Verdict.WRONG)
+        named = _names(row for row in put_together if row.verdict is FindingKind.WRONG)
         said = f"{wrong} wrong: {named}"
         return f"{said}; {noted}" if warnings else said
     return f"nothing wrong; {noted}" if warnings else "all ok"
 
 
-def _group(title: str, rows: list[Row], width: int) -> RenderableType:
+def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
     wide = width >= WIDE
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     names = {row.what: _broken(row.what) for row in rows}
@@ -84,7 +88,7 @@ def _group(title: str, rows: list[Row], width: int) -> RenderableType:
     return Group(table, *below, *([Text("")] if below else []))
 
 
-def _notes(rows: list[Row], *, wide: bool) -> list[str]:
+def _notes(rows: list[Finding], *, wide: bool) -> list[str]:
     """Return what is said below the table; the same about several is said once."""
     subjects: dict[tuple[str, str], list[str]] = {}
     for row in rows:
@@ -101,13 +105,13 @@ def _broken(name: str) -> str:
     return f"{head}.\n{tail}"
 
 
-def _note(row: Row, *, wide: bool) -> str:
+def _note(row: Finding, *, wide: bool) -> str:
     """Return what is said of a row below the table: why, and what to do if it has no column."""
     fix = "" if wide else row.fix
     return f"{fix} ({row.why})" if fix and row.why else fix or row.why
 
 
-def _names(rows: Iterable[Row]) -> str:
+def _names(rows: Iterable[Finding]) -> str:
     """Return the first of the rows, and how many more lines there are."""
     names = [f"{row.subject} {_short(row.what)}" for row in rows]
     more = len(names) - NAMED_MAX
@@ -119,9 +123,9 @@ def _short(name: str) -> str:
     return name.rpartition(".")[2] if "config." in name else name
 
 
-def _worst(rows: Iterable[Row]) -> Verdict:
+def _worst(rows: Iterable[Finding]) -> FindingKind:
     verdicts = {row.verdict for row in rows}
-    for verdict in (Verdict.WRONG, Verdict.WARNING):
+    for verdict in (FindingKind.WRONG, FindingKind.WARNING):
         if verdict in verdicts:
             return verdict
-    return Verdict.OK
+    return FindingKind.OK

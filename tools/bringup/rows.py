@@ -12,7 +12,7 @@ from shared.drive_settings import AXES
 from shared.joints import MODULES
 
 
-class Verdict(StrEnum):
+class FindingKind(StrEnum):
     """What a row means."""
 
     OK = "ok"
@@ -22,7 +22,7 @@ class Verdict(StrEnum):
     """The robot must not be let down from its hoist like this."""
 
 
-class Row(msgspec.Struct, frozen=True):
+class Finding(msgspec.Struct, frozen=True):
     """One finding."""
 
     subject: str
@@ -30,7 +30,7 @@ class Row(msgspec.Struct, frozen=True):
     what: str
     found: str
     wanted: str
-    verdict: Verdict
+    verdict: FindingKind
     fix: str = ""
     """What to do about it; commands in backquotes."""
     why: str = ""
@@ -44,19 +44,19 @@ _MODULES: Final = set(MODULES)
 _AXES: Final = {f"{module}.{axis}" for module in MODULES for axis in AXES}
 
 
-def ok(subject: str, what: str, found: str, wanted: str = "") -> Row:
+def ok(subject: str, what: str, found: str, wanted: str = "") -> Finding:
     """Return a row that needs nothing."""
-    return Row(subject, what, found, wanted, Verdict.OK)
+    return Finding(subject, what, found, wanted, FindingKind.OK)
 
 
-def warning(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Row:
+def warning(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
     """Return a row that somebody should know of."""
-    return Row(subject, what, found, wanted, Verdict.WARNING, fix, why)
+    return Finding(subject, what, found, wanted, FindingKind.WARNING, fix, why)
 
 
-def wrong(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Row:
+def wrong(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
     """Return a row that keeps the robot in its hoist."""
-    return Row(subject, what, found, wanted, Verdict.WRONG, fix, why)
+    return Finding(subject, what, found, wanted, FindingKind.WRONG, fix, why)
 
 
 def judged(
@@ -68,20 +68,20 @@ def judged(
     fix: str,
     why: str = "",
     *,
-    otherwise: Verdict = Verdict.WRONG,
-) -> Row:
+    otherwise: FindingKind = FindingKind.WRONG,
+) -> Finding:
     """Return a row that is ok if it is good, else `otherwise`, with what to do."""
     if good:
         return ok(subject, what, found, wanted)
-    return Row(subject, what, found, wanted, otherwise, fix, why)
+    return Finding(subject, what, found, wanted, otherwise, fix, why)
 
 
-def count(rows: Iterable[Row], verdict: Verdict) -> int:
+def count(rows: Iterable[Finding], verdict: FindingKind) -> int:
     """Return how many rows have a verdict."""
     return sum(row.verdict is verdict for row in rows)
 
 
-def merged(rows: Iterable[Row]) -> list[Row]:
+def merged(rows: Iterable[Finding]) -> list[Finding]:
     """Return the rows with those about the same matter put into one.
 
     What is ok becomes one row, from the smallest to the largest. What is not ok does where all
@@ -89,10 +89,10 @@ def merged(rows: Iterable[Row]) -> list[Row]:
     them, are not told setting by setting and axis by axis. Else it stays as it is. What is ok comes
     first, in the order of the first of each.
     """
-    alike: dict[str, list[Row]] = {}
-    others: dict[tuple[str, ...], list[Row]] = {}
+    alike: dict[str, list[Finding]] = {}
+    others: dict[tuple[str, ...], list[Finding]] = {}
     for row in rows:
-        if row.verdict is Verdict.OK:
+        if row.verdict is FindingKind.OK:
             alike.setdefault(row.what, []).append(row)
         else:
             matter = (row.what, row.wanted, row.verdict, row.why, _anywhere(row))
@@ -101,7 +101,7 @@ def merged(rows: Iterable[Row]) -> list[Row]:
     return [_one(group) for group in alike.values()] + bad
 
 
-def _of_all_or_both_axes(group: list[Row]) -> list[Row]:
+def _of_all_or_both_axes(group: list[Finding]) -> list[Finding]:
     """Return as few rows as can stand for rows of one matter, none of which is ok."""
     subjects = {row.subject for row in group}
     if len(subjects) == len(group) and subjects in (_MODULES, _AXES):
@@ -117,13 +117,13 @@ def _of_all_or_both_axes(group: list[Row]) -> list[Row]:
     return together
 
 
-def _anywhere(row: Row) -> str:
+def _anywhere(row: Finding) -> str:
     """Return what to do about a row, whichever module it is about."""
     module = row.subject.partition(".")[0]
     return row.fix.replace(f" --module {module}", "").replace(module, "MODULE")
 
 
-def _one(group: list[Row]) -> Row:
+def _one(group: list[Finding]) -> Finding:
     """Return the row that stands for rows of one matter."""
     first = group[0]
     if len(group) == 1:

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from services.planner.inverse_kinematics import InverseKinematics, in_words
+from services.planner.inverse_kinematics import InverseKinematics, describe
 from services.planner.kinematics import Kinematics
 from shared.config import RobotConfig
 from shared.exceptions import RunError
@@ -54,7 +54,7 @@ def standing(robot: RobotConfig, height: float) -> Standing:
     for _ in range(ROUNDS):
         reach = ik.solve_from_anywhere(p_ref)
         if not reach.converged:
-            raise RunError(f"--standing {height:g}: {in_words(reach, p_ref, limits)}")
+            raise RunError(f"--standing {height:g}: {describe(reach, p_ref, limits)}")
         z, z_com = float(kinematics.r_torso[2]), float(p_ref[2])
         if abs(height - z) <= HEIGHT_TOLERANCE:
             angles = ik.q.reshape(len(MODULES), 2).tolist()

@@ -12,13 +12,13 @@ from shared.config_sections import CanConfig
 from shared.exceptions import DriveError, FleetError
 from shared.joints import MODULES
 from tools.bringup import check_alike, check_board, check_can, check_machine, check_robot
-from tools.bringup.boards import STATUS, Board, Found, Value, is_known, number
-from tools.bringup.can_ear import BusHeard, listen, long_enough
+from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, number
+from tools.bringup.can_monitor import BusHeard, listen, long_enough
 from tools.bringup.reach import boards_on_usb, drives_within_reach, is_up
-from tools.bringup.rows import Row, Verdict, judged, ok
+from tools.bringup.rows import Finding, FindingKind, judged, ok
 from tools.supervision.fleet import is_simulated
 
-Groups = dict[str, list[Row]]
+Groups = dict[str, list[Finding]]
 """Rows by the heading that they stand under."""
 Say = Callable[[str], None]
 
@@ -103,9 +103,9 @@ def _listen(
 
 def _usb(
     robot: RobotConfig, run_dir: Path, heard: dict[str, BusHeard], *, services_up: bool
-) -> list[Row]:
+) -> list[Finding]:
     """Check every module's board; what of it cannot be reached over USB is a row too."""
-    rows: list[Row] = []
+    rows: list[Finding] = []
     read: dict[str, Mapping[str, Value]] = {}
     try:
         with boards_on_usb(robot, run_dir, MODULES) as found:
@@ -122,11 +122,11 @@ def _usb(
 def _module(
     robot: RobotConfig,
     module: str,
-    found: Found,
+    found: FoundBoards,
     read: dict[str, Mapping[str, Value]],
     *,
     services_up: bool,
-) -> list[Row]:
+) -> list[Finding]:
     """Check a module's board, and put what was read from it into `read`."""
     serial = robot.module_named(module).serial_number.upper()
     board = found.boards.get(serial)
@@ -145,7 +145,7 @@ def _board(
     read: dict[str, Mapping[str, Value]],
     *,
     services_up: bool,
-) -> list[Row]:
+) -> list[Finding]:
     """Check a board that is connected."""
     rows = [
         ok(module, "USB", board.serial_number, "there"),
@@ -168,8 +168,8 @@ def _board(
 
 
 def _position(
-    robot: RobotConfig, module: str, found: Found, heard: dict[str, BusHeard]
-) -> list[Row]:
+    robot: RobotConfig, module: str, found: FoundBoards, heard: dict[str, BusHeard]
+) -> list[Finding]:
     """Judge where a module is, by its bus if it is on one, else by its board."""
     bus = heard.get(robot.module_named(module).bus)
     turns = check_can.positions(robot, module, bus) if bus else None
@@ -185,7 +185,7 @@ def _position(
 
 
 def _why_not(
-    robot: RobotConfig, serial: str, found: Found, *, services_up: bool
+    robot: RobotConfig, serial: str, found: FoundBoards, *, services_up: bool
 ) -> tuple[str, str]:
     """Return why a module's board was not reached, and what to do."""
     strangers = ", ".join(found.strangers)
@@ -198,9 +198,9 @@ def _why_not(
     return trouble, "plug its USB cable in; supply on; libusb-1.0 and the udev rule are there"
 
 
-def _unreached(robot: RobotConfig, subject: str, found: str, fix: str) -> Row:
+def _unreached(robot: RobotConfig, subject: str, found: str, fix: str) -> Finding:
     """Return the row of a board that USB does not reach: its settings stay unknown."""
     on_usb = robot.joint_service.driver == "odrive_usb"
-    verdict = Verdict.WRONG if on_usb else Verdict.WARNING
+    verdict = FindingKind.WRONG if on_usb else FindingKind.WARNING
     why = "its settings are not read back" + ("" if on_usb else ": CAN of firmware 0.5 cannot")
     return judged(False, subject, "USB", found, "there", fix, why, otherwise=verdict)

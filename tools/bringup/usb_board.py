@@ -25,7 +25,7 @@ from odrive.runtime_device import RuntimeDevice
 
 from shared.drive_settings import AXES
 from shared.exceptions import DriveError
-from tools.bringup.boards import Board, Found, Value, firmware_in_words, number
+from tools.bringup.boards import Board, FoundBoards, Value, describe_firmware, number
 
 LIBUSB_FIX: Final = "apt install libusb-1.0-0"
 
@@ -64,7 +64,7 @@ class UsbBus:
         self._boards: list[UsbBoard] = []
         self._subscription: Subscription = self.run(self._watch(), TRANSFER_S)
 
-    def open(self, serial_numbers: Iterable[str], timeout_s: float = FIND_S) -> Found:
+    def open(self, serial_numbers: Iterable[str], timeout_s: float = FIND_S) -> FoundBoards:
         """Connect to boards by their serial numbers, to all at once.
 
         Args:
@@ -82,7 +82,7 @@ class UsbBus:
                 boards[serial] = board
             else:
                 troubles[serial] = result
-        return Found(boards, troubles, tuple(sorted(set(self._present) - set(wanted))))
+        return FoundBoards(boards, troubles, tuple(sorted(set(self._present) - set(wanted))))
 
     def close(self) -> None:
         """Release every board; a later call on one fails."""
@@ -103,7 +103,7 @@ class UsbBus:
         except DriveError:
             raise
         except Exception as error:
-            raise DriveError(f"USB: {in_words(error)}") from error
+            raise DriveError(f"USB: {describe(error)}") from error
         finally:
             task.cancel()
 
@@ -164,7 +164,7 @@ class UsbBus:
         except TimeoutError:
             return f"plugged in, but silent for {CONNECT_S:g} s"
         except Exception as error:  # noqa: BLE001 - the package raises bare Exceptions
-            return f"plugged in, but: {in_words(error)}"
+            return f"plugged in, but: {describe(error)}"
         return connected if isinstance(connected, RuntimeDevice) else "no ODrive that runs"
 
     async def _leave(self) -> None:
@@ -217,7 +217,7 @@ class UsbBoard:
         missing = [name for name in values if name not in self.device.properties]
         if missing:
             raise DriveError(
-                f"ODrive {self.serial_number}, firmware {firmware_in_words(self.firmware)}: "
+                f"ODrive {self.serial_number}, firmware {describe_firmware(self.firmware)}: "
                 f"it has no {missing[0]}"
             )
         self._run(self._write(values), "write")
@@ -263,7 +263,7 @@ class UsbBoard:
         return plain
 
 
-def in_words(error: BaseException) -> str:
+def describe(error: BaseException) -> str:
     """Return one line of what the package raised."""
     said = str(error).strip().splitlines()
     return f"{type(error).__name__}: {said[0]}" if said else type(error).__name__

@@ -48,7 +48,7 @@ class Back(NamedTuple):
     """Its joint service has armed it: it is not told again."""
 
 
-class Look(NamedTuple):
+class DriveLook(NamedTuple):
     """What a drive says of itself, over a moment."""
 
     status: DriveStatus
@@ -64,7 +64,7 @@ class Look(NamedTuple):
     """`AxisError` bits of both axes."""
 
 
-def look(drive: Drive, mark_turns: float, gear_ratio: float) -> Look:
+def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
     """Watch a drive for `LOOK_S`, once it answers.
 
     Args:
@@ -76,7 +76,9 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> Look:
     reading = drive.read(_READ_S)
     while reading is None or reading.status is DriveStatus.LOST:
         if time.monotonic() > answer_by:
-            return Look(DriveStatus.LOST, zeroed=False, q=(0.0, 0.0), speed=0.0, moved=0.0, error=0)
+            return DriveLook(
+                DriveStatus.LOST, zeroed=False, q=(0.0, 0.0), speed=0.0, moved=0.0, error=0
+            )
         reading = drive.read(_READ_S)
     first = newest = reading
     speed = moved = 0.0
@@ -92,7 +94,7 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> Look:
         speed = max(speed, *map(abs, rates))
         moved = max(moved, _apart(reading, first, gear_ratio))
     counted = from_zero(newest, mark_turns)
-    return Look(
+    return DriveLook(
         newest.status,
         counted.status is not DriveStatus.UNZEROED,
         joint_from_motor(counted.pos_turns, gear_ratio),
@@ -102,7 +104,7 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> Look:
     )
 
 
-def refusal(seen: Look) -> str:
+def refusal(seen: DriveLook) -> str:
     """Return why a drive cannot be zeroed now; "" if it can."""
     if seen.status is DriveStatus.LOST:
         return "its drive does not answer; look at its power and its bus (`xrl doctor`)"

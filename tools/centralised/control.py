@@ -16,13 +16,13 @@ from collections.abc import Sequence
 
 import msgspec
 
-from services.joint import law
+from services.joint import pd_law
 from services.joint.differential import motor_torque
+from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveCommand, DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus
-from services.joint.gate import diamond
-from services.joint.module import Module, Obstacle, Order, Step
-from services.joint.neighbours import NOTHING, Near
-from services.planner.engagement import Engagement
+from services.joint.neighbours import UNKNOWN, NeighbourView
+from services.joint.torque_limiter import limit_differential
+from services.planner.engagement_fsm import Engagement
 from services.planner.planner import Planner
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
@@ -38,12 +38,12 @@ class LeadsOn(Engagement):
         fresh: list[bool],
         ready: list[bool],
         modes: list[int],
-        forbidden: PlannerMode | None = None,
+        inhibit: PlannerMode | None = None,
     ) -> bool:
         """Take the modules' news, as `Engagement.advance`."""
         if self.mode is PlannerMode.LEADING:
             return False
-        return super().advance(now_ns, fresh, ready, modes, forbidden)
+        return super().advance(now_ns, fresh, ready, modes, inhibit)
 
 
 class CentralPlanner(Planner):
@@ -70,18 +70,18 @@ def _whole(command: JointCommand, state: JointState) -> JointCommand:
     """Return the command with all that it asks for, in a state, as one torque."""
     return msgspec.structs.replace(
         command,
-        v_ref=law.ZERO,
-        tau_ff=law.torque(law.aged(command, 0.0), state.q, state.v),
-        dtau_ff=law.ZERO,
-        tau_coupled=law.ZERO,
-        k_p=law.ZERO,
-        k_d=law.ZERO,
+        v_ref=pd_law.ZERO,
+        tau_ff=pd_law.torque(pd_law.extrapolate(command, 0.0), state.q, state.v),
+        dtau_ff=pd_law.ZERO,
+        tau_coupled=pd_law.ZERO,
+        k_p=pd_law.ZERO,
+        k_d=pd_law.ZERO,
         margin=0.0,
         margin_onboard=0.0,
     )
 
 
-class PassThrough(Module):
+class PassThrough(DriveManager):
     """A joint module that passes torques on.
 
     It comes up as the shipped one, from the hoist through HOLD into TRACK. From the end of that
@@ -103,8 +103,8 @@ class PassThrough(Module):
         reading: DriveReading | None,
         command: JointCommand | None,
         estop: bool,
-        near: Near = NOTHING,  # noqa: ARG002 - nothing here sinks
-    ) -> Step:
+        near: NeighbourView = UNKNOWN,  # noqa: ARG002 - nothing here sinks
+    ) -> DriveAction:
         """Run one cycle; arguments as for the shipped module."""
         amiss = estop or (reading is not None and reading.status is not DriveStatus.ARMED)
         if amiss or not self._passes(now_ns):
@@ -119,9 +119,9 @@ class PassThrough(Module):
             controller.samples.take(reading, armed=True)
         if command is not None and all(map(math.isfinite, command.tau_ff)):
             controller.failsafe.command = command  # its age goes into the states
-            controller.tau = diamond(command.tau_ff, self._tau_module_max)
+            controller.tau = limit_differential(command.tau_ff, self._tau_module_max)
         torque = motor_torque(controller.tau, self._gear_ratio)
-        return Step(None, Order.TORQUE, torque, None, Obstacle.NONE)
+        return DriveAction(None, DriveCommand.TORQUE, torque, None, ArmingInhibit.NONE)
 
     def _passes(self, now_ns: int) -> bool:
         since_ns = self._tracks_since_ns

@@ -8,8 +8,8 @@ from typing import Final, TypeVar
 
 import msgspec
 
-from services.joint.memory import ModuleMemory
-from services.planner.memory import TickMemory
+from services.joint.snapshots import DriveManagerState
+from services.planner.snapshots import TickState
 from shared import topics
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
@@ -18,7 +18,7 @@ from shared.joints import MODULES
 from shared.messages import PlannerStatus
 from shared.traces import SimState
 from tools.reexecution.joint import JointExecution
-from tools.reexecution.outcome import Outcome
+from tools.reexecution.outcome import ReexecutionResult
 from tools.reexecution.planner import PlannerExecution
 from tools.runs.run_log import RunLog
 
@@ -35,9 +35,9 @@ class Moment(msgspec.Struct):
     """All that a fleet is at one time of a run."""
 
     state: SimState
-    modules: dict[str, ModuleMemory] = msgspec.field(default_factory=dict)
+    modules: dict[str, DriveManagerState] = msgspec.field(default_factory=dict)
     """What each joint service that was alive knew."""
-    planner: tuple[int, TickMemory] | None = None
+    planner: tuple[int, TickState] | None = None
     """Session, and what the planner knew, if it was alive."""
     margin: float | None = None
     """Of the failsafe certificate, as last published."""
@@ -70,12 +70,12 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
             "whose scenario has begun has one every 0.1 s, a real robot's has none"
         )
     for name in MODULES:
-        joint = JointExecution(log, robot, name, Outcome(name, 0.0, exact=False))
+        joint = JointExecution(log, robot, name, ReexecutionResult(name, 0.0, exact=False))
         rows = ((message.t_ns, joint) for message in joint.run())
         for moment, memory in _at(found, rows, _copy):
             if memory is not None:
                 moment.modules[name] = memory
-    planner = PlannerExecution(log, robot, Outcome("planner", 0.0, exact=False))
+    planner = PlannerExecution(log, robot, ReexecutionResult("planner", 0.0, exact=False))
     ticks = ((m.t_ns, planner) for _, m in planner.run() if isinstance(m, PlannerStatus))
     for moment, known in _at(found, ticks, PlannerExecution.memory):
         moment.planner = known
@@ -86,12 +86,12 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
     return found
 
 
-def _copy(execution: JointExecution) -> ModuleMemory | None:
+def _copy(execution: JointExecution) -> DriveManagerState | None:
     """Return a copy of what a service knows now: its own goes on changing."""
     memory = execution.memory()
     if memory is None:
         return None
-    return msgspec.json.decode(msgspec.json.encode(memory), type=ModuleMemory)
+    return msgspec.json.decode(msgspec.json.encode(memory), type=DriveManagerState)
 
 
 def _at(

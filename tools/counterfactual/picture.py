@@ -10,13 +10,15 @@ from matplotlib.figure import Figure
 
 from shared import topics
 from shared.clock import NS_PER_S
-from tools.counterfactual.run import Fate
+from tools.counterfactual.run import Counterfactual
 from tools.runs.run_log import RunLog
 
 STOOD, FELL = "#2e7d32", "#c0392b"
 
 
-def draw(log: RunLog, fates: Sequence[Fate], title: str, every_s: float, path: Path) -> None:
+def draw(
+    log: RunLog, counterfactuals: Sequence[Counterfactual], title: str, every_s: float, path: Path
+) -> None:
     """Draw the fates over the recorded height into a PNG file."""
     truth = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
     figure = Figure(figsize=(11, 7.0), dpi=110, layout="constrained")
@@ -25,17 +27,17 @@ def draw(log: RunLog, fates: Sequence[Fate], title: str, every_s: float, path: P
     )
     height.plot([row.scenario_s for row in truth], [row.torso[2] for row in truth], lw=1.1)
     height.set_ylabel("torso height as recorded, m", fontsize=8)
-    for one in fates:
+    for one in counterfactuals:
         colour = STOOD if one.stood else FELL
         fate.axvspan(one.at_s, one.at_s + every_s, color=colour, lw=0)
     fate.set_yticks([])
     fate.set_ylabel("killed then", fontsize=8, rotation=0, ha="right", va="center")
-    at = np.array([one.at_s for one in fates])
-    com.plot(at, [one.com_x_max_mm for one in fates], ".-", ms=4, lw=0.8, label="x")
-    com.plot(at, [one.com_y_max_mm for one in fates], ".-", ms=4, lw=0.8, label="y")
+    at = np.array([one.at_s for one in counterfactuals])
+    com.plot(at, [one.com_x_max_mm for one in counterfactuals], ".-", ms=4, lw=0.8, label="x")
+    com.plot(at, [one.com_y_max_mm for one in counterfactuals], ".-", ms=4, lw=0.8, label="y")
     com.set_ylabel("then COM at most, mm", fontsize=8)
     com.legend(loc="upper right", fontsize=8, ncols=2)
-    known = [(one.at_s, one.margin) for one in fates if one.margin is not None]
+    known = [(one.at_s, one.margin) for one in counterfactuals if one.margin is not None]
     if known:
         margin.plot(*zip(*known, strict=True), ".-", ms=4, lw=0.8)
     margin.axhline(0.0, color=FELL, lw=0.8, ls="--")

@@ -29,7 +29,7 @@ class Task(msgspec.Struct, frozen=True):
     """So long it is gone on with."""
 
 
-class Fate(msgspec.Struct, frozen=True):
+class Counterfactual(msgspec.Struct, frozen=True):
     """What would have come of it."""
 
     at_s: float
@@ -56,7 +56,7 @@ def story_from(story: Scenario, at_s: float, kill: tuple[str, ...], for_s: float
     )
 
 
-def fate_of(task: Task) -> Fate:
+def counterfactual_of(task: Task) -> Counterfactual:
     """Go on from the moment, and judge."""
     moment = task.moment
     story = story_from(task.story, moment.at_s, task.kill, task.for_s)
@@ -69,7 +69,7 @@ def fate_of(task: Task) -> Fate:
             fell_at_s = truth.scenario_s
             break
         rows.append(truth)
-    return Fate(
+    return Counterfactual(
         at_s=moment.at_s,
         stood=fell_at_s is None,
         fell_after_s=None if fell_at_s is None else fell_at_s - moment.at_s,

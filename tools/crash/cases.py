@@ -16,7 +16,7 @@ from shared.config import OPTIONAL, SERVICES
 from shared.fault_table import DRIVE_FAULTS
 from shared.joints import MODULES, kind_of
 from shared.scenario import FAULT_KINDS, Fault, FaultKind, Keyframe, Kill, Push, Restart, Scenario
-from tools.runs.conductor import Chase
+from tools.runs.scenario_runner import Chase
 
 CRASH_S: Final = 2.4
 REQUEST_S: Final = 5.0
@@ -41,7 +41,7 @@ CRASHED: Final = tuple(name for name in SERVICES if name not in ("simulator", *O
 """Services that are killed. The simulator is the world and the drives: no robot has it."""
 
 
-class Verdict(StrEnum):
+class CrashVerdict(StrEnum):
     """How a case came out."""
 
     STOOD = "stood"
@@ -54,17 +54,17 @@ class Verdict(StrEnum):
     @property
     def badness(self) -> int:
         """0 is best."""
-        return list(Verdict).index(self)
+        return list(CrashVerdict).index(self)
 
 
-class Case(msgspec.Struct, frozen=True, kw_only=True):
+class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
     """One row of the matrix."""
 
     name: str
     kind: str
     """What sort of crash; `--quick` has at least one of each."""
     crash: tuple[Kill | Fault, ...]
-    expected: Verdict
+    expected: CrashVerdict
     """The worst that is allowed."""
     why: str
     """Why no better is expected, or why so much is."""
@@ -90,7 +90,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
         return tuple(module for module in MODULES if module not in self.hit)
 
 
-def story_of(case: Case) -> Scenario:
+def story_of(case: CrashCase) -> Scenario:
     """Return the case as a scenario, with the requests that bring back what was lost."""
     kills = [row for row in (*case.before, *case.crash) if isinstance(row, Kill)]
     down = [row.service for row in case.crash if isinstance(row, Kill)]
@@ -125,7 +125,7 @@ def fault(module: str, kind: FaultKind) -> Fault:
     return Fault(module=module, kind=kind, at=CRASH_S, duration=lasts)
 
 
-def _of_service(service: str, signal: str) -> Case:
+def _of_service(service: str, signal: str) -> CrashCase:
     """Return the case of one service that dies, or is frozen."""
     is_joint, is_planner = service in MODULES, service == "planner"
     if is_joint:
@@ -136,11 +136,11 @@ def _of_service(service: str, signal: str) -> Case:
         why = "balance needs nothing from it"
     how = "kill" if signal == "KILL" else "stop"
     vital = is_joint or is_planner
-    return Case(
+    return CrashCase(
         name=f"{how}-{service}",
         kind=f"{how} {'joint service' if is_joint else service}" if vital else f"{service} lost",
         crash=killed(service, signal=signal),
-        expected=Verdict.STOOD,
+        expected=CrashVerdict.STOOD,
         why=why,
         holds=vital,
         quick=service in ("knee_left", "planner") or (signal == "KILL" and not vital),
@@ -148,23 +148,29 @@ def _of_service(service: str, signal: str) -> Case:
 
 
 LIMP: Final = {
-    "ankle": (Verdict.FELL, "nothing turns its sole against the floor: a push to its side tips it"),
-    "knee": (Verdict.STOOD, "the other five brace, and its leg stands as a strut on a stiff hip"),
-    "hip": (Verdict.STOOD, "the other hip carries the torso's pitch alone"),
+    "ankle": (
+        CrashVerdict.FELL,
+        "nothing turns its sole against the floor: a push to its side tips it",
+    ),
+    "knee": (
+        CrashVerdict.STOOD,
+        "the other five brace, and its leg stands as a strut on a stiff hip",
+    ),
+    "hip": (CrashVerdict.STOOD, "the other hip carries the torso's pitch alone"),
 }
 """What a robot with one limp module may come to, by the kind of module, and why."""
 
 
-def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = "") -> Case:
+def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = "") -> CrashCase:
     """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
     if kind == "link_lost":
-        expected = Verdict.STOOD
+        expected = CrashVerdict.STOOD
         why = "the drive holds what it was told last; its service does not know it any more"
     else:
         expected, reason = LIMP[kind_of(module)]
         why = f"limp ({FAULT_KINDS[kind].about}): {reason}"
     name = "unplugged" if kind == "link_lost" else kind
-    return Case(
+    return CrashCase(
         name=f"{name}-{module}",
         kind=sort or name,
         crash=(fault(module, kind),),
@@ -197,7 +203,7 @@ LEFT_ONLY: Final[tuple[tuple[FaultKind, str], ...]] = (
 module is enough where only the error's name differs."""
 
 
-def _drives() -> list[Case]:
+def _drives() -> list[CrashCase]:
     cases = [
         _of_drive(module, kind, quick=module == quick)
         for kind, quick in EACH_DRIVE
@@ -210,17 +216,17 @@ def _drives() -> list[Case]:
     return cases
 
 
-def _reengaging() -> list[Case]:
+def _reengaging() -> list[CrashCase]:
     """Return the planner killed again as it comes back."""
     before = (Kill(service="planner", at=0.8), Restart(service="planner", at=0.9))
     return [
-        Case(
+        CrashCase(
             name=f"reengaging-{name}",
             kind="planner killed during re-engagement",
             crash=(),
             before=before,
             chase=Chase("planner", modules=modules, after_s=after_s),
-            expected=Verdict.STOOD,
+            expected=CrashVerdict.STOOD,
             why=why,
             quick=name == "blend",
         )
@@ -235,7 +241,7 @@ _FREE: Final = "each drive holds by its own loop, and needs neither its service 
 _UNNEEDED: Final = "balance needs neither"
 
 
-def _together() -> list[Case]:
+def _together() -> list[CrashCase]:
     """Return what happens to all joint services at once."""
     rows: tuple[tuple[str, tuple[Kill | Fault, ...]], ...] = (
         ("kill-all-joints", killed(*MODULES)),
@@ -244,11 +250,11 @@ def _together() -> list[Case]:
         ("unplugged-all", tuple(fault(module, "link_lost") for module in MODULES)),
     )
     return [
-        Case(
+        CrashCase(
             name=name,
             kind="all joint services",
             crash=crash,
-            expected=Verdict.STOOD,
+            expected=CrashVerdict.STOOD,
             why=_FREE,
             quick=name == "kill-all-joints",
         )
@@ -259,13 +265,13 @@ def _together() -> list[Case]:
 def _pair(
     name: str,
     *crash: Kill | Fault,
-    expected: Verdict = Verdict.STOOD,
+    expected: CrashVerdict = CrashVerdict.STOOD,
     why: str = _FREE,
     holds: bool = True,
     quick: bool = False,
-) -> Case:
+) -> CrashCase:
     """Return the case of two things that are lost at once."""
-    return Case(
+    return CrashCase(
         name=f"pair-{name}",
         kind="pair",
         crash=crash,
@@ -276,8 +282,8 @@ def _pair(
     )
 
 
-def _pairs() -> list[Case]:
-    fell, knees = Verdict.FELL, ("knee_right", "knee_left")
+def _pairs() -> list[CrashCase]:
+    fell, knees = CrashVerdict.FELL, ("knee_right", "knee_left")
     limp_hip = fault("hip_left", "disarmed")
     return [
         _pair("knees", *killed(*knees)),
@@ -309,7 +315,7 @@ def _pairs() -> list[Case]:
     ]
 
 
-CASES: Final[Sequence[Case]] = (
+CASES: Final[Sequence[CrashCase]] = (
     *(_of_service(service, "KILL") for service in CRASHED),
     *(_of_service(service, "STOP") for service in CRASHED),
     *_drives(),

@@ -15,7 +15,7 @@ from shared.config import RobotConfig
 from shared.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
 from shared.scenario import lead
 from shared.trip_table import JOINT_TRIPS
-from tools.crash.cases import CRASH_S, REQUEST_S, Case, Verdict, story_of
+from tools.crash.cases import CRASH_S, REQUEST_S, CrashCase, CrashVerdict, story_of
 from tools.runs.standing import is_tipping
 from tools.runs.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
 
@@ -41,13 +41,13 @@ class Heard(NamedTuple):
     """Services that ended without being told to."""
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class CrashResult(msgspec.Struct, frozen=True, kw_only=True):
     """The figures of a case; None where there is nothing to measure.
 
     What "before" and "after" are is told by the crash; what is brought back comes later.
     """
 
-    verdict: Verdict
+    verdict: CrashVerdict
     fell_after_s: float | None = None
     """From the crash to the fall."""
     safe_ms: float | None = None
@@ -73,17 +73,17 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """Start and stop of the fleet included."""
 
 
-def as_expected(case: Case, outcome: Outcome) -> bool:
+def as_expected(case: CrashCase, outcome: CrashResult) -> bool:
     """Return True if the robot came out of it no worse than it has to."""
     return outcome.verdict.badness <= case.expected.badness
 
 
-def unjudged(reason: str) -> Outcome:
+def unjudged(reason: str) -> CrashResult:
     """Return the outcome of a run that cannot be judged."""
-    return Outcome(verdict=Verdict.UNJUDGED, remarks=(reason,))
+    return CrashResult(verdict=CrashVerdict.UNJUDGED, remarks=(reason,))
 
 
-def measure(case: Case, heard: Heard, robot: RobotConfig) -> Outcome:
+def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
     """Return what came of a run."""
     truth = [row for row in heard.truth if row.scenario_s >= 0.0]
     if not truth:
@@ -107,26 +107,26 @@ def measure(case: Case, heard: Heard, robot: RobotConfig) -> Outcome:
     lowest_hand = min(lead(story, row.scenario_s).height for row in after)
     sank = max(0.0, min(after[0].torso[2], lowest_hand) - min(row.torso[2] for row in standing))
     last = truth[-1]
-    verdict = Verdict.STOOD
+    verdict = CrashVerdict.STOOD
     remarks = []
     if fell_at is not None:
-        verdict = Verdict.FELL
+        verdict = CrashVerdict.FELL
     elif last.scenario_s < story.duration - END_TOLERANCE_S:
         return unjudged(f"ended at {last.scenario_s:.1f} s of {story.duration:g} s")
     elif is_tipping(last, robot):
-        verdict = Verdict.FELL
+        verdict = CrashVerdict.FELL
         remarks.append("not down yet at the end, but tipping")
     elif sank > SANK_M:
-        verdict = Verdict.SANK
+        verdict = CrashVerdict.SANK
     remarks += _remarks(case, safe_ms, reaction)
     remarks += [f"{name} ended by itself" for name in heard.died]
     leads = all(mode == "T" for mode in heard.modes)
-    if verdict is not Verdict.FELL and not leads and case.leads_again:
+    if verdict is not CrashVerdict.FELL and not leads and case.leads_again:
         remarks.append(f"does not lead again: {''.join(heard.modes)}")
     tracks = [e.t_ns for _, e in later if e.mode_after == Mode.TRACK]
     backs = [row.t_ns for row in heard.said if _is(row, RunEventKind.RESTARTED, REQUEST_S)]
     x, y = ([1e3 * row.over[axis] for row in standing] for axis in (0, 1))
-    return Outcome(
+    return CrashResult(
         verdict=verdict,
         fell_after_s=None if fell_at is None else fell_at - crash_s,
         safe_ms=safe_ms,
@@ -146,7 +146,7 @@ def _is(row: RunEvent, kind: RunEventKind, since_s: float) -> bool:
     return row.kind == kind and row.scenario_s >= since_s
 
 
-def _crash_s(case: Case, said: Sequence[RunEvent]) -> float | None:
+def _crash_s(case: CrashCase, said: Sequence[RunEvent]) -> float | None:
     """Return the scenario time of the crash, s: of the chase, if there is one."""
     kills = [
         row.scenario_s
@@ -160,7 +160,7 @@ def _crash_s(case: Case, said: Sequence[RunEvent]) -> float | None:
 
 
 def _safe_ms(
-    case: Case, events: Sequence[tuple[str, JointEvent]], crash_ns: int, request_ns: int
+    case: CrashCase, events: Sequence[tuple[str, JointEvent]], crash_ns: int, request_ns: int
 ) -> float | None:
     """Return the time until every module that was not hit has left TRACK for HOLD, ms."""
     slowest = None
@@ -183,7 +183,7 @@ def _safe_ms(
 
 
 def _remarks(
-    case: Case, safe_ms: float | None, reaction: Sequence[tuple[str, JointEvent]]
+    case: CrashCase, safe_ms: float | None, reaction: Sequence[tuple[str, JointEvent]]
 ) -> list[str]:
     """Return what the modules that were not hit did and should not have done, in words."""
     words = []

@@ -11,17 +11,17 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from tools.crash.cases import BACK_S, CRASH_S, Case, Verdict, story_of
-from tools.crash.outcome import Outcome, as_expected
+from tools.crash.cases import BACK_S, CRASH_S, CrashCase, CrashVerdict, story_of
+from tools.crash.outcome import CrashResult, as_expected
 
 RESULTS: Final = "results.json"
 JUNIT: Final = "junit.xml"
 SUITE: Final = "xrl crashtest"
 COLOUR: Final = {
-    Verdict.STOOD: "green",
-    Verdict.SANK: "yellow",
-    Verdict.FELL: "red",
-    Verdict.UNJUDGED: "magenta",
+    CrashVerdict.STOOD: "green",
+    CrashVerdict.SANK: "yellow",
+    CrashVerdict.FELL: "red",
+    CrashVerdict.UNJUDGED: "magenta",
 }
 
 
@@ -37,8 +37,8 @@ LEGEND: Final = (
 class Result(NamedTuple):
     """A case and what came of it."""
 
-    case: Case
-    outcome: Outcome
+    case: CrashCase
+    outcome: CrashResult
 
     @property
     def good(self) -> bool:
@@ -46,7 +46,7 @@ class Result(NamedTuple):
         return as_expected(self.case, self.outcome)
 
 
-def in_words(case: Case) -> str:
+def describe(case: CrashCase) -> str:
     """Return what is done in a case."""
     story = story_of(case)
     words = [
@@ -61,7 +61,7 @@ def in_words(case: Case) -> str:
     return f"{', '.join(words)}; asked back at {BACK_S:g} s"
 
 
-def list_cases(cases: Sequence[Case], console: Console) -> None:
+def list_cases(cases: Sequence[CrashCase], console: Console) -> None:
     """Print the cases that would be run."""
     table = Table(title=f"{len(cases)} cases", title_justify="left")
     table.add_column("name", no_wrap=True)
@@ -100,7 +100,7 @@ def show(results: Sequence[Result], console: Console) -> None:
         table.add_row(
             case.name,
             f"[{COLOUR[outcome.verdict]}]{outcome.verdict}[/]",
-            "" if case.expected is Verdict.STOOD else str(case.expected),
+            "" if case.expected is CrashVerdict.STOOD else str(case.expected),
             _figure(outcome.fell_after_s, ".2f"),
             _figure(outcome.safe_ms, ".0f"),
             _figure(outcome.torque_step_nm, ".2f"),
@@ -128,7 +128,7 @@ def show(results: Sequence[Result], console: Console) -> None:
 def tally(results: Sequence[Result]) -> dict[str, int]:
     """Return how often each verdict was given."""
     verdicts = [outcome.verdict for _, outcome in results]
-    return {str(name): verdicts.count(name) for name in Verdict}
+    return {str(name): verdicts.count(name) for name in CrashVerdict}
 
 
 def write(results: Sequence[Result], out: Path, about: Mapping[str, str], *, planned: int) -> None:
@@ -150,7 +150,7 @@ def as_json(results: Sequence[Result], about: Mapping[str, str], *, planned: int
         {
             "name": case.name,
             "kind": case.kind,
-            "what": in_words(case),
+            "what": describe(case),
             "why": case.why,
             "expected": case.expected,
             "as_expected": as_expected(case, outcome),
@@ -171,7 +171,7 @@ def as_json(results: Sequence[Result], about: Mapping[str, str], *, planned: int
 def as_junit(results: Sequence[Result], about: Mapping[str, str]) -> bytes:
     """Return the results as JUnit XML: worse than expected is a failure, unjudged an error."""
     bad = [result for result in results if not result.good]
-    errors = sum(outcome.verdict is Verdict.UNJUDGED for _, outcome in bad)
+    errors = sum(outcome.verdict is CrashVerdict.UNJUDGED for _, outcome in bad)
     suite = ET.Element(
         "testsuite",
         name=SUITE,
@@ -194,12 +194,12 @@ def as_junit(results: Sequence[Result], about: Mapping[str, str]) -> bytes:
             time=f"{outcome.wall_s:.1f}",
         )
         if not result.good:
-            tag = "error" if outcome.verdict is Verdict.UNJUDGED else "failure"
+            tag = "error" if outcome.verdict is CrashVerdict.UNJUDGED else "failure"
             words = f"{outcome.verdict}; expected at worst: {case.expected}"
             fault = ET.SubElement(row, tag, message=words, type=str(outcome.verdict))
             fault.text = case.why
         figures = ET.SubElement(row, "system-out")
-        figures.text = f"{in_words(case)}\n" + "\n".join(
+        figures.text = f"{describe(case)}\n" + "\n".join(
             f"{name}: {value}" for name, value in msgspec.to_builtins(outcome).items()
         )
     suites = ET.Element("testsuites")
@@ -215,7 +215,7 @@ def _replace(path: Path, content: bytes) -> None:
     temporary.replace(path)
 
 
-def _remarks(outcome: Outcome) -> tuple[str, ...]:
+def _remarks(outcome: CrashResult) -> tuple[str, ...]:
     late = () if outcome.in_real_time else ("not in real time: the machine was too slow",)
     return (*outcome.remarks, *late)
 

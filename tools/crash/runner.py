@@ -18,14 +18,14 @@ from shared.config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
 from shared.messages import JointEvent, RunEvent, RunEventKind, SimTruth
-from tools.crash.cases import Case, Verdict, story_of
-from tools.crash.outcome import Heard, Outcome, as_expected, measure, unjudged
-from tools.runs.conductor import Conductor, Snapshot
+from tools.crash.cases import CrashCase, CrashVerdict, story_of
+from tools.crash.outcome import CrashResult, Heard, as_expected, measure, unjudged
 from tools.runs.live import run_live
-from tools.supervision.supervise import Fleet
+from tools.runs.scenario_runner import LiveSnapshot, ScenarioRunner
+from tools.supervision.supervise import SupervisedFleet
 from tools.supervision.supervisor_client import ServiceInfo
 
-Show = Callable[[Snapshot], None]
+Show = Callable[[LiveSnapshot], None]
 
 TRIES: Final = 2
 """A run that was disturbed by the machine, or could not be carried out, is made again; not one in
@@ -44,7 +44,7 @@ class Witness:
         self._decoder = Decoder(JointEvent)
         self._show = show
 
-    def see(self, snapshot: Snapshot) -> None:
+    def see(self, snapshot: LiveSnapshot) -> None:
         """Take in a moment of the run, and pass it on."""
         if snapshot.truth is not None:
             self.truth.append(snapshot.truth)
@@ -61,14 +61,14 @@ class Witness:
 
 
 def run_case(
-    case: Case,
+    case: CrashCase,
     robot: RobotConfig,
     out: Path,
     show: Show,
     *,
     seed: int = 0,
     true_plant: PlantConfig | None = None,
-) -> Outcome:
+) -> CrashResult:
     """Run a case, a second time if the first was disturbed and the robot stood.
 
     Args:
@@ -86,26 +86,26 @@ def run_case(
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
         outcome = _run_once(case, robot, out, show, seed, true_plant or PlantConfig())
-        judged = outcome.in_real_time and outcome.verdict is not Verdict.UNJUDGED
-        if judged or outcome.verdict is Verdict.FELL:
+        judged = outcome.in_real_time and outcome.verdict is not CrashVerdict.UNJUDGED
+        if judged or outcome.verdict is CrashVerdict.FELL:
             break
     wall_s = time.monotonic() - begin_s
     outcome = msgspec.structs.replace(outcome, tries=tries, wall_s=wall_s)
-    if as_expected(case, outcome) and outcome.verdict is not Verdict.FELL:
+    if as_expected(case, outcome) and outcome.verdict is not CrashVerdict.FELL:
         for log in out.glob("*.mcap"):
             log.unlink()  # 6 MB each, and there is nothing to look for in it
     return outcome
 
 
 def _run_once(
-    case: Case, robot: RobotConfig, out: Path, show: Show, seed: int, true_plant: PlantConfig
-) -> Outcome:
+    case: CrashCase, robot: RobotConfig, out: Path, show: Show, seed: int, true_plant: PlantConfig
+) -> CrashResult:
     story = story_of(case)
     down = {row.service for row in story.kill}
 
-    def lead(fleet: Fleet, session: Session) -> Heard:
+    def lead(fleet: SupervisedFleet, session: Session) -> Heard:
         witness = Witness(session, show)
-        conductor = Conductor(fleet, session, story, witness.see, case.chase)
+        conductor = ScenarioRunner(fleet, session, story, witness.see, case.chase)
         conductor.run()
         witness.listen()
         died = died_of(fleet.info(), conductor.said)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from services.recorder import mcap_records as mcap
 from services.recorder.files import SUFFIX
-from services.recorder.salvage import opened
+from services.recorder.reader import opened
 from shared.exceptions import RunError
 
 Metadata = dict[str, dict[str, str]]

@@ -10,10 +10,10 @@ import msgspec
 
 from services.recorder import mcap_records as mcap
 from services.recorder.files import in_use
-from services.recorder.gaps import KeyCount
 from services.recorder.mcap_log import PROFILE
 from services.recorder.mcap_records import Channel, Malformed
-from services.recorder.salvage import Loss, Piece, Salvage, opened
+from services.recorder.reader import LostBytes, Piece, Salvage, opened
+from services.recorder.sequence_stats import KeyCount
 from shared.clock import NS_PER_S
 from tools.logs.files import Metadata
 
@@ -62,8 +62,8 @@ class FileFacts(msgspec.Struct, kw_only=True):
     attachments: dict[str, int] = msgspec.field(default_factory=dict)
     """Sizes by name."""
     metadata: Metadata = msgspec.field(default_factory=dict)
-    cut: Loss | None = None
-    damage: list[Loss] = msgspec.field(default_factory=list)
+    cut: LostBytes | None = None
+    damage: list[LostBytes] = msgspec.field(default_factory=list)
 
     @property
     def ours(self) -> bool:

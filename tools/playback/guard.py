@@ -18,7 +18,7 @@ from shared.messages import JointState
 from shared.topics import Topic
 from tools.playback.selection import LIVE, short
 from tools.supervision.fleet import is_listening
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 
 IN_THE_LOOP: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND, topics.WRENCH, topics.ATTITUDE)
 """What makes a robot move by itself: never put beside a live drive, whatever is forced.
@@ -48,7 +48,7 @@ def those_of(rows: Iterable[Topic], keys: Iterable[str]) -> list[str]:
     return [key for key in keys if pattern.fullmatch(key)]
 
 
-class Watch:
+class LiveRobotWatch:
     """Listens for a live robot, in a session of its own: it does not hear the player."""
 
     def __init__(self, robot: RobotConfig, run_dir: Path) -> None:
@@ -75,7 +75,7 @@ class Watch:
     def look(self) -> str:
         """Return why a live drive is taken to be on the bus, in words; empty if it is not."""
         try:
-            fleet = Fleet.attach(self._run_dir)
+            fleet = SupervisedFleet.attach(self._run_dir)
         except FleetError:
             pass
         else:
@@ -105,7 +105,7 @@ def allowed(targets: Mapping[str, str], live: str, *, force: bool) -> dict[str, 
 
     Args:
         targets: key on the bus of each key of the log.
-        live: from `Watch.look`.
+        live: from `LiveRobotWatch.look`.
         force: also what a live robot acts on, but for what moves it by itself.
 
     Raises:
@@ -116,19 +116,19 @@ def allowed(targets: Mapping[str, str], live: str, *, force: bool) -> dict[str, 
         return dict(targets)
     if not force:
         raise FleetError(
-            f"{live}, and it acts on {in_words(refused)}: leave these out with --exclude, play "
+            f"{live}, and it acts on {describe(refused)}: leave these out with --exclude, play "
             "under a --prefix, or --force"
         )
     left = {key: target for key, target in targets.items() if target not in refused}
     if not left:
         raise FleetError(
-            f"{live}: {in_words(refused)} would move it, and is not put even with --force; "
+            f"{live}: {describe(refused)} would move it, and is not put even with --force; "
             "play under a --prefix, or `xrl down` first"
         )
     return left
 
 
-def in_words(keys: Iterable[str]) -> str:
+def describe(keys: Iterable[str]) -> str:
     """Return live keys as topics, each once."""
     names = (re.sub("^joint/[^/]+/", "joint/*/", short(key)) for key in keys)
     return ", ".join(sorted(set(names)))

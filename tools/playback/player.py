@@ -26,14 +26,14 @@ class Port(Protocol):
         """Send; False if it cannot be sent."""
 
 
-class Hand(Protocol):
+class KeyboardClock(Protocol):
     """Passes the time and tells what was pressed."""
 
     def wait(self, timeout_s: float) -> list[Press]:
         """Return at the latest after so long."""
 
 
-class Tally(msgspec.Struct):
+class PlaybackStats(msgspec.Struct):
     """What has been played."""
 
     put: int = 0
@@ -62,7 +62,7 @@ class Player:
         schedule: Schedule,
         head: Playhead,
         ports: Sequence[Port],
-        hand: Hand,
+        hand: KeyboardClock,
         *,
         now_ns: Callable[[], int],
         show: Callable[[], None],
@@ -82,7 +82,7 @@ class Player:
             clock_hz: so often, also while paused.
         """
         self.schedule, self.head = schedule, head
-        self.tally = Tally(counts=[0] * len(ports))
+        self.tally = PlaybackStats(counts=[0] * len(ports))
         self._puts = [port.put for port in ports]
         self._hand, self._now_ns, self._show = hand, now_ns, show
         self._clock = clock

@@ -12,7 +12,7 @@ import msgspec
 
 from services.recorder import mcap_records as mcap
 from services.recorder.mcap_records import Malformed
-from services.recorder.salvage import Piece, Salvage, opened
+from services.recorder.reader import Piece, Salvage, opened
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.logs.files import Metadata, files_in

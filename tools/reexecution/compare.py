@@ -36,7 +36,7 @@ class Difference(msgspec.Struct, frozen=True):
         """Distance in units in the last place; None where that means nothing."""
         return ulp(self.recorded, self.recomputed)
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return it in a line."""
         distance = f", {self.ulp} ULP apart" if self.ulp is not None else ""
         recorded, recomputed = (_short(value) for value in (self.recorded, self.recomputed))

@@ -7,26 +7,28 @@ from typing import Final
 
 import msgspec
 
+from services.joint.drive_manager import DriveManager
 from services.joint.drivers.base import DriveReading
-from services.joint.memory import ModuleMemory
-from services.joint.module import Module
-from services.joint.neighbours import Near
+from services.joint.neighbours import NeighbourView
+from services.joint.snapshots import DriveManagerState
 from shared import topics
 from shared.config import RobotConfig
 from shared.messages import DriveStatus, JointCommand, JointState, Message
 from shared.traces import CycleTrace, JointTrace
 from tools.reexecution.compare import Comparison
-from tools.reexecution.outcome import Outcome
+from tools.reexecution.outcome import ReexecutionResult
 from tools.runs.run_log import RunLog
 
-_decode = msgspec.json.Decoder(ModuleMemory).decode
+_decode = msgspec.json.Decoder(DriveManagerState).decode
 _encode: Final = msgspec.json.Encoder().encode
 
 
 class JointExecution:
     """One module's service, from its traces."""
 
-    def __init__(self, log: RunLog, robot: RobotConfig, name: str, outcome: Outcome) -> None:
+    def __init__(
+        self, log: RunLog, robot: RobotConfig, name: str, outcome: ReexecutionResult
+    ) -> None:
         """Take the log, the robot to execute with, the module's name and what to fill in."""
         self._robot, self._name, self._outcome = robot, name, outcome
         self._log = log
@@ -38,7 +40,7 @@ class JointExecution:
         self._events = {event.t_ns: event for event in log.messages(topics.JOINT_EVENT, name)}
         service = robot.joint_service
         self._state_every = round(service.rate_hz / service.state_rate_hz)
-        self._module: Module | None = None
+        self._module: DriveManager | None = None
 
     def run(self) -> Iterator[Message]:
         """Execute every cycle that can be; yield what comes out, where the log has its like."""
@@ -55,22 +57,22 @@ class JointExecution:
                 else:
                     yield from self._cycle(self._module, cycle)
 
-    def memory(self) -> ModuleMemory | None:
+    def memory(self) -> DriveManagerState | None:
         """Return what the service knows now; None while it cannot be executed."""
-        return None if self._module is None else self._module.remember()
+        return None if self._module is None else self._module.snapshot()
 
     def _remember(self, trace: JointTrace) -> None:
         """Go on from a recorded memory, or hold ours to it."""
         if self._module is None:
-            self._module = Module(self._robot, self._name)
-            self._module.recall(_decode(trace.memory))
+            self._module = DriveManager(self._robot, self._name)
+            self._module.restore(_decode(trace.memory))
             self._outcome.starts += 1
             return
         if self._outcome.exact:
-            mine = msgspec.structs.replace(trace, memory=_encode(self._module.remember()).decode())
+            mine = msgspec.structs.replace(trace, memory=_encode(self._module.snapshot()).decode())
             self._compare("trace", self._module.controller.cycle, trace, mine)
 
-    def _cycle(self, module: Module, cycle: CycleTrace) -> Iterator[Message]:
+    def _cycle(self, module: DriveManager, cycle: CycleTrace) -> Iterator[Message]:
         c, outcome = cycle, self._outcome
         command = None
         if c.command_seq >= 0:
@@ -80,7 +82,7 @@ class JointExecution:
                 outcome.skipped += 1
                 self._module = None
                 return
-        near = Near(c.below if c.knows_below else None, c.sinks, c.stiffen)
+        near = NeighbourView(c.below if c.knows_below else None, c.sinks, c.stiffen)
         step = module.step(c.now_ns, _reading(c), command, c.estop, near)
         controller = module.controller
         outcome.ticks += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tools.reexecution.compare import Comparison
 
 
-class Outcome:
+class ReexecutionResult:
     """Counts of one service, filled in as it is executed.
 
     Attributes:

@@ -8,29 +8,29 @@ from typing import Final
 import msgspec
 
 from services.planner.intents import Wish
-from services.planner.memory import TickMemory
 from services.planner.planner import Planner
+from services.planner.snapshots import TickState
 from shared import topics
 from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import JointCommand, Message, PlannerStatus
-from shared.traces import PlannerMemory
+from shared.traces import PlannerCheckpoint
 from tools.reexecution.found import BySeq
-from tools.reexecution.outcome import Outcome
+from tools.reexecution.outcome import ReexecutionResult
 from tools.runs.run_log import RunLog
 
-_decode = msgspec.json.Decoder(TickMemory).decode
+_decode = msgspec.json.Decoder(TickState).decode
 _encode: Final = msgspec.json.Encoder().encode
 
 
 class PlannerExecution:
     """The planner, from its statuses: each says what its tick took."""
 
-    def __init__(self, log: RunLog, robot: RobotConfig, outcome: Outcome) -> None:
+    def __init__(self, log: RunLog, robot: RobotConfig, outcome: ReexecutionResult) -> None:
         """Take the log, the robot to execute with and what to fill in."""
         self._robot, self._outcome = robot, outcome
         self._statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-        memories: list[PlannerMemory] = log.messages(topics.PLANNER_MEMORY)
+        memories: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
         self._memories = {(memory.session, memory.t_ns): memory for memory in memories}
         self._states = [BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
         self._wrenches = BySeq(log.messages(topics.WRENCH))
@@ -59,10 +59,10 @@ class PlannerExecution:
                 continue
             yield from self._tick(self._planner, status)
 
-    def memory(self) -> tuple[int, TickMemory] | None:
+    def memory(self) -> tuple[int, TickState] | None:
         """Return session and what the planner knows now; None while it cannot be executed."""
         planner = self._planner
-        return None if planner is None else (planner.session, planner.remember())
+        return None if planner is None else (planner.session, planner.snapshot())
 
     def _begin(self, status: PlannerStatus) -> None:
         """Go on from the memory after this tick, if the log has it."""
@@ -71,7 +71,7 @@ class PlannerExecution:
             return
         known = _decode(memory.memory)
         self._planner = Planner(self._robot, status.session)
-        self._planner.recall(known)
+        self._planner.restore(known)
         self._state_seq = [-1 if state is None else state.seq for state in known.states]
         self._wrench_seq = known.wrench_seq
         self._attitude_seq = known.attitude_seq
@@ -87,24 +87,24 @@ class PlannerExecution:
             if state is None:
                 self._outcome.lost_inputs += 1
                 return False
-            planner.hear_state(module, state, arrived_ns)
+            planner.receive_state(module, state, arrived_ns)
             self._state_seq[module] = seq
         if status.wrench_seq != self._wrench_seq:
             wrench = self._wrenches.at(status.wrench_seq, status.t_ns)
             if wrench is None:
                 self._outcome.lost_inputs += 1
                 return False
-            planner.hear_wrench(wrench, status.t_ns)
+            planner.receive_wrench(wrench, status.t_ns)
             self._wrench_seq = status.wrench_seq
         if status.attitude_seq != self._attitude_seq:
             attitude = self._attitudes.at(status.attitude_seq, status.t_ns)
             if attitude is None:
                 self._outcome.lost_inputs += 1
                 return False
-            planner.hear_attitude(attitude, status.t_ns)
+            planner.receive_attitude(attitude, status.t_ns)
             self._attitude_seq = status.attitude_seq
         wish = Wish(status.assist_wanted_n, status.shift_wanted, status.asked_by)
-        planner.hear_wish(wish)
+        planner.receive_wish(wish)
         return True
 
     def _tick(self, planner: Planner, status: PlannerStatus) -> Iterator[tuple[str, Message]]:
@@ -122,5 +122,5 @@ class PlannerExecution:
         yield "", mine
         memory = self._memories.get((status.session, status.t_ns))
         if memory is not None and outcome.exact:
-            text = _encode(planner.remember()).decode()
+            text = _encode(planner.snapshot()).decode()
             compare("planner/memory", tick, memory, msgspec.structs.replace(memory, memory=text))

@@ -13,14 +13,14 @@ from shared import topics
 from shared.clock import NS_PER_S
 from shared.links import GROUPS
 from shared.traces import LinkEvent
-from tools.reports.sheet import Row, Sheet
+from tools.reports.page_model import BarRow, Sheet
+from tools.reports.run_data import RunData
 from tools.reports.signals import GAP_S
-from tools.reports.source import Source
 
 NOTHING_DONE: Final = "nothing was injected into the network, as far as this log says"
 
 
-class Link(IntEnum):
+class ImpairedLink(IntEnum):
     """What is done to one direction of a link."""
 
     CLEAR = 0
@@ -29,11 +29,15 @@ class Link(IntEnum):
     CUT = 2
 
 
-COLOURS: Final[dict[int, str]] = {Link.CLEAR: "good", Link.IMPAIRED: "warn", Link.CUT: "bad"}
-History = tuple[tuple[float, Link], ...]
+COLOURS: Final[dict[int, str]] = {
+    ImpairedLink.CLEAR: "good",
+    ImpairedLink.IMPAIRED: "warn",
+    ImpairedLink.CUT: "bad",
+}
+History = tuple[tuple[float, ImpairedLink], ...]
 
 
-def add_network(source: Source, sheet: Sheet) -> None:
+def add_network(source: RunData, sheet: Sheet) -> None:
     """Add the directions that were impaired; those that fared alike in one row."""
     alike: dict[History, list[str]] = defaultdict(list)
     events: list[LinkEvent] = source.log.messages(topics.LINK_EVENT)
@@ -41,7 +45,7 @@ def add_network(source: Source, sheet: Sheet) -> None:
         alike[history].append(name)
     rows = [_row(source, label, history) for history, names in alike.items()
             for label in _labels(names)]  # fmt: skip
-    sheet.bars("Network, as injected", rows, Link, COLOURS, otherwise=NOTHING_DONE)
+    sheet.bars("Network, as injected", rows, ImpairedLink, COLOURS, otherwise=NOTHING_DONE)
 
 
 def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
@@ -56,26 +60,32 @@ def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
     Returns:
         Times in s.
     """
-    found: dict[str, list[tuple[float, Link]]] = defaultdict(list)
+    found: dict[str, list[tuple[float, ImpairedLink]]] = defaultdict(list)
     asked: dict[str, dict[int, bool]] = defaultdict(dict)
     for event in events:
         cuts = asked[event.link]
-        if event.in_force:
+        if event.active:
             cuts[event.number] = event.partition
         else:
             cuts.pop(event.number, None)
-        now = Link.CUT if any(cuts.values()) else Link.IMPAIRED if cuts else Link.CLEAR
+        now = (
+            ImpairedLink.CUT
+            if any(cuts.values())
+            else ImpairedLink.IMPAIRED
+            if cuts
+            else ImpairedLink.CLEAR
+        )
         found[event.link].append(((event.t_ns - zero_ns) / NS_PER_S, now))
     return {name: tuple(history) for name, history in found.items()}
 
 
-def _row(source: Source, label: str, history: History) -> Row:
+def _row(source: RunData, label: str, history: History) -> BarRow:
     """Return a history as samples that are close enough to be one bar."""
     begin, end = source.span
     changes = np.array([t for t, _ in history])
-    codes = np.array([Link.CLEAR, *(code for _, code in history)])
+    codes = np.array([ImpairedLink.CLEAR, *(code for _, code in history)])
     t = np.union1d(np.arange(begin, end, GAP_S / 2), changes)
-    return Row(label, t, codes[np.searchsorted(changes, t, side="right")])
+    return BarRow(label, t, codes[np.searchsorted(changes, t, side="right")])
 
 
 def _labels(names: Iterable[str]) -> list[str]:

@@ -8,10 +8,10 @@ from html import escape
 from pathlib import Path
 from typing import Final
 
-from tools.reports import facts, network, panels, timeline, times, torques
-from tools.reports.facts import Verdict
-from tools.reports.sheet import Happening, Sheet
-from tools.reports.source import Source
+from tools.reports import network, panels, summary, timeline, times, torques
+from tools.reports.page_model import Sheet, TimelineEvent
+from tools.reports.run_data import RunData
+from tools.reports.summary import RunVerdict
 from tools.runs import verdict_table
 from tools.runs.run_log import RunLog
 
@@ -47,10 +47,10 @@ def render(log: RunLog) -> str:
     Raises:
         RunError: a message is not of this version.
     """
-    source = Source(log)
+    source = RunData(log)
     sheet = fill(source)
     events = timeline.happenings(source)
-    judged = facts.judge(source)
+    judged = summary.judge(source)
     name = log.metadata["run"].get("scenario") or log.path.name
     fell_s = next((row.t for row in events if row.kind == "fall"), None)
     parts = (
@@ -66,7 +66,7 @@ def render(log: RunLog) -> str:
     return _document(f"{said}{name}, {log.robot}", "\n".join(parts), data)
 
 
-def fill(source: Source) -> Sheet:
+def fill(source: RunData) -> Sheet:
     """Return all panels of a run, in the order of the page."""
     sheet = Sheet(source.span)
     panels.add_body(source, sheet)
@@ -105,11 +105,11 @@ def _document(title: str, body: str, data: str) -> str:
 """
 
 
-def _head(source: Source, judged: Verdict, name: str) -> str:
+def _head(source: RunData, judged: RunVerdict, name: str) -> str:
     word = {True: "good", False: "bad", None: "none"}[judged.good]
     rows = "".join(
         f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>"
-        for key, value in facts.head(source)
+        for key, value in summary.head(source)
     )
     caution = f'<p class="caution">{escape(judged.caution)}</p>' if judged.caution else ""
     table = ""
@@ -126,7 +126,7 @@ def _head(source: Source, judged: Verdict, name: str) -> str:
     )
 
 
-def _tools(source: Source, fell_s: float | None) -> str:
+def _tools(source: RunData, fell_s: float | None) -> str:
     begin, end = source.span
     buttons = "".join(
         f'<button type="button" data-do="{do}" title="{title}" aria-label="{title}">{text}</button>'
@@ -164,7 +164,7 @@ def _left_out(sheet: Sheet) -> str:
     return f'<section id="left-out"><h2>Left out</h2><ul>{rows}</ul></section>'
 
 
-def _timeline(events: Sequence[Happening]) -> str:
+def _timeline(events: Sequence[TimelineEvent]) -> str:
     rows = "".join(
         f'<li class="{escape(row.kind)}"><button type="button" data-t="{row.t:.4f}"'
         f"{_before(row)}>"
@@ -179,13 +179,13 @@ def _timeline(events: Sequence[Happening]) -> str:
     )
 
 
-def _before(row: Happening) -> str:
+def _before(row: TimelineEvent) -> str:
     """A fall is looked at from before it; all else from a little before to what came of it."""
     return f' data-before="{BEFORE_FALL_S:g}"' if row.kind == "fall" else ""
 
 
-def _lost(source: Source) -> str:
-    rows = facts.lost(source)
+def _lost(source: RunData) -> str:
+    rows = summary.lost(source)
     missing = sum(row.lost for row in rows)
     cells = [
         (
@@ -197,14 +197,14 @@ def _lost(source: Source) -> str:
     ]  # fmt: skip
     title = f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
     names = ("topic", "messages", "Hz", "of Hz", "lost", "gaps", "restarts")
-    damage = "".join(f"<li>{escape(line)}</li>" for line in facts.damage(source))
+    damage = "".join(f"<li>{escape(line)}</li>" for line in summary.damage(source))
     body = (f"<ul>{damage}</ul>" if damage else "") + _table(names, cells, numbers=range(1, 7))
     return f'<section id="lost">{_details(title, body, opened=bool(missing or damage))}</section>'
 
 
-def _folded(source: Source) -> str:
-    parts = [_details(name, f"<pre>{escape(text)}</pre>") for name, text in facts.files(source)]
-    installed = facts.packages(source)
+def _folded(source: RunData) -> str:
+    parts = [_details(name, f"<pre>{escape(text)}</pre>") for name, text in summary.files(source)]
+    installed = summary.packages(source)
     if installed:
         table = _table(("package", "version"), installed, numbers=())
         parts.append(_details(f"{len(installed)} packages", table))

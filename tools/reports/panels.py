@@ -10,9 +10,9 @@ import numpy as np
 from shared import topics
 from shared.joints import MODULES
 from shared.messages import DriveStatus, Mode, PlannerMode, SplitSource
-from tools.reports.sheet import Limit, Line, Row, Sheet
+from tools.reports.page_model import BarRow, LevelLine, Line, Sheet
+from tools.reports.run_data import RunData
 from tools.reports.signals import Array
-from tools.reports.source import Source
 from tools.runs.verdict_limits import LIMITS
 
 NO_WORLD: Final = "no sim/truth in this log"
@@ -56,7 +56,7 @@ SENSE_COLOURS: Final[dict[int, str]] = {
 }  # fmt: skip
 
 
-def add_body(source: Source, sheet: Sheet) -> None:
+def add_body(source: RunData, sheet: Sheet) -> None:
     """Add the paper's Fig. 7: COM, height, torso angles, and the operator's hand."""
     com, torso, angles = _truth(source, "com", "torso", "angles")
     p, p_ref = _planner(source)
@@ -96,7 +96,7 @@ def add_body(source: Source, sheet: Sheet) -> None:
     _add_feet(source, sheet)
 
 
-def _add_hand(source: Source, sheet: Sheet) -> None:
+def _add_hand(source: RunData, sheet: Sheet) -> None:
     hand, load, given, push = _truth(source, "operator_force", "load_n", "harness_force_z", "push")
     t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
     wanted, assist = source.columns(topics.PLANNER_STATUS, "", "assist_wanted_n", "assist_n")
@@ -120,7 +120,7 @@ def _add_hand(source: Source, sheet: Sheet) -> None:
     )  # fmt: skip
 
 
-def _add_feet(source: Source, sheet: Sheet) -> None:
+def _add_feet(source: RunData, sheet: Sheet) -> None:
     """Add whether the soles lie flat, stay where they are, and agree about the torso."""
     right, left, slip = _truth(source, "foot_right_tilt", "foot_left_tilt", "feet_slip")
     t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
@@ -154,38 +154,38 @@ def _add_feet(source: Source, sheet: Sheet) -> None:
     )  # fmt: skip
 
 
-def _led(key: str, label: str) -> list[Limit]:
+def _led(key: str, label: str) -> list[LevelLine]:
     """Return a limit of the verdict to both sides; drawn once a line comes near it."""
     most = ALLOWED[key]
-    return [Limit(most, label, shown=False), Limit(-most, label, shown=False)]
+    return [LevelLine(most, label, shown=False), LevelLine(-most, label, shown=False)]
 
 
-def add_states(source: Source, sheet: Sheet) -> None:
+def add_states(source: RunData, sheet: Sheet) -> None:
     """Add the bars: services, drives, planner, gains, harness."""
     modes, drives = [], []
     for module in MODULES:
         t = source.times(topics.JOINT_STATE, module)
         mode, drive = source.columns(topics.JOINT_STATE, module, "mode", "drive")
-        modes.append(Row(module, t, mode))
-        drives.append(Row(module, t, drive))
+        modes.append(BarRow(module, t, mode))
+        drives.append(BarRow(module, t, drive))
     sheet.bars("Modes of the six services", modes, Mode, MODE_COLOURS, otherwise=NO_STATES)
     sheet.bars("Drives", drives, DriveStatus, DRIVE_COLOURS, otherwise=NO_STATES)
     t = source.times(topics.PLANNER_STATUS)
     mode, split = source.columns(topics.PLANNER_STATUS, "", "mode", "split")
     sheet.bars(
-        "Planner", [Row("planner", t, mode)], PlannerMode, PLANNER_COLOURS, otherwise=NO_PLANNER
+        "Planner", [BarRow("planner", t, mode)], PlannerMode, PLANNER_COLOURS, otherwise=NO_PLANNER
     )
     sheet.bars(
-        "Where the local gains come from", [Row("gains", t, split)], SplitSource, SPLIT_COLOURS,
+        "Where the local gains come from", [BarRow("gains", t, split)], SplitSource, SPLIT_COLOURS,
         otherwise=NO_PLANNER,
     )  # fmt: skip
     valid, saturated = source.columns(topics.WRENCH, "", "valid", "saturated")
     sense = np.where(saturated > 0.0, Sense.SATURATED, np.where(valid > 0.0, 0.0, 1.0))
-    row = Row("harness", source.times(topics.WRENCH), sense)
+    row = BarRow("harness", source.times(topics.WRENCH), sense)
     sheet.bars("Harness sensor", [row], Sense, SENSE_COLOURS, otherwise=NO_HARNESS)
 
 
-def add_harness(source: Source, sheet: Sheet) -> None:
+def add_harness(source: RunData, sheet: Sheet) -> None:
     """Add the operator's wrench on the torso, as measured."""
     t = source.times(topics.WRENCH)
     force, moment = source.columns(topics.WRENCH, "", "force", "moment")
@@ -196,7 +196,7 @@ def add_harness(source: Source, sheet: Sheet) -> None:
         sheet.plot(f"Harness {title}", unit, lines, note=note, otherwise=NO_HARNESS)
 
 
-def add_certificate(source: Source, sheet: Sheet) -> None:
+def add_certificate(source: RunData, sheet: Sheet) -> None:
     """Add the margins of the gains in force, the least allowed, and what is coupled beside them."""
     t = source.times(topics.PLANNER_STATUS)
     mode, service, onboard = source.columns(
@@ -204,12 +204,12 @@ def add_certificate(source: Source, sheet: Sheet) -> None:
     )
     for values in (service, onboard):
         values[mode == PlannerMode.WAITING] = np.nan
-    limits = [Limit(0.0, "a fall")]
+    limits = [LevelLine(0.0, "a fall")]
     if source.robot is not None:
         asked = source.robot.certificate
         limits += [
-            Limit(asked.margin_min, "least, services"),
-            Limit(asked.onboard_margin_min, "least, drives"),
+            LevelLine(asked.margin_min, "least, services"),
+            LevelLine(asked.onboard_margin_min, "least, drives"),
         ]
     sheet.plot(
         "Certificate margin", "",
@@ -220,7 +220,7 @@ def add_certificate(source: Source, sheet: Sheet) -> None:
     )  # fmt: skip
 
 
-def _truth(source: Source, *names: str) -> list[Array]:
+def _truth(source: RunData, *names: str) -> list[Array]:
     widths = {"com": 3, "torso": 3, "angles": 3, "operator_force": 3, "push": 3}
     found = source.columns(topics.SIM_TRUTH, "", *names)
     return [
@@ -229,7 +229,7 @@ def _truth(source: Source, *names: str) -> list[Array]:
     ]
 
 
-def _planner(source: Source) -> tuple[Array, Array]:
+def _planner(source: RunData) -> tuple[Array, Array]:
     """Return p and p_ref as the planner had them; NaN while it waited."""
     mode, p, p_ref = source.columns(topics.PLANNER_STATUS, "", "mode", "p", "p_ref")
     p, p_ref = _wide(p, 6), _wide(p_ref, 6)

@@ -51,7 +51,7 @@ MODES: Final[dict[int, Colour]] = {
 }
 
 
-class Pose(NamedTuple):
+class RobotPose(NamedTuple):
     """The robot at one moment."""
 
     t_ns: int
@@ -118,13 +118,13 @@ def messages(log: RunLog, robot: RobotConfig) -> Iterator[NewMessage]:
         yield NewMessage(STATE, ns, foxglove.scene(ns, state(pose)))
 
 
-def model(name: str, robot: RobotConfig, pose: Pose) -> str:
+def model(name: str, robot: RobotConfig, pose: RobotPose) -> str:
     """Return all bodies of a robot of some name as URDF; the modules in no mode's colour."""
     still = pose._replace(modes=(NO_MODE,) * len(MODULES))
     return urdf.urdf(name, frames(robot, pose), [*links(robot), *state(still)])
 
 
-def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
+def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
     """Yield the robot at the scene's rate, each time as it was known then.
 
     The torso is where the simulated world says; in a log without one, where the legs say,
@@ -139,10 +139,10 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
         raise RunError(f"{log.path}: no states of {missing}; a scene needs those of all six")
     truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
     wrenches: list[Wrench] = log.messages(topics.WRENCH)
-    newest = [Newest(rows) for rows in states]
-    wrench = Newest(wrenches)
+    newest = [NewestAt(rows) for rows in states]
+    wrench = NewestAt(wrenches)
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    status = Newest(statuses)
+    status = NewestAt(statuses)
     kinematics = None if truth else Kinematics(robot)
     # a service that has not heard its drive yet says 0
     first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
@@ -153,19 +153,19 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[Pose]:
         force = felt.force if felt is not None and felt.valid else (0.0, 0.0, 0.0)
         modes = tuple(state_now.mode for state_now in now)
         if kinematics is None:
-            yield Pose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
+            yield RobotPose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
             continue
         if statuses and statuses[0].t_ns <= row.t_ns:
             kinematics.stance[:] = status.at(row.t_ns).stance
         kinematics.update(np.array(q))
         torso, com, angles = kinematics.r_torso, kinematics.p[:3], kinematics.p[3:]
-        yield Pose(
+        yield RobotPose(
             row.t_ns, _vector(torso), _vector(angles), _vector(com), q, modes, force,
             ORIGIN,
         )  # fmt: skip
 
 
-class Newest:
+class NewestAt:
     """The newest message of a key at a time."""
 
     def __init__(self, rows: list[Any]) -> None:
@@ -187,7 +187,7 @@ def _thinned(rows: list[Any], first_ns: int) -> Iterator[Any]:
             yield row
 
 
-def frames(robot: RobotConfig, pose: Pose) -> list[Placed]:
+def frames(robot: RobotConfig, pose: RobotPose) -> list[Placed]:
     """Return every frame at a moment."""
     geometry = robot.geometry
     found = [
@@ -268,7 +268,7 @@ def links(robot: RobotConfig) -> list[Entity]:
     return found
 
 
-def state(pose: Pose) -> list[Entity]:
+def state(pose: RobotPose) -> list[Entity]:
     """Return what changes: the modules in their modes' colours, the COM, the forces."""
     size = (MODULE_RADIUS,) * 3
     found = []

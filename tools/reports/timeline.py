@@ -24,11 +24,11 @@ from shared.messages import (
     Tare,
     Wrench,
 )
-from tools.reports.crossings import crossings
-from tools.reports.sheet import Happening
+from tools.reports.limit_violations import crossings
+from tools.reports.page_model import TimelineEvent
+from tools.reports.run_data import RunData
 from tools.reports.signals import GAP_S, seconds
-from tools.reports.source import Source
-from tools.runs.impaired import impairments
+from tools.runs.impairment_intervals import impairments
 
 TOGETHER_S: Final = 0.1
 """The same change of several modules within this time is told in one line."""
@@ -51,7 +51,7 @@ KINDS: Final = {
 _USUAL: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
 
 
-def happenings(source: Source) -> list[Happening]:
+def happenings(source: RunData) -> list[TimelineEvent]:
     """Return what happened, in the order of time."""
     found = [
         *_from_outside(source),
@@ -68,21 +68,23 @@ def happenings(source: Source) -> list[Happening]:
     if len(found) > LINES_MAX:
         left = len(found) - LINES_MAX
         found = sorted([row for row in found if row.mark] + _spread(found), key=lambda row: row.t)
-        found.append(Happening(source.span.end, "note", f"about {left} more lines are left out"))
+        found.append(
+            TimelineEvent(source.span.end, "note", f"about {left} more lines are left out")
+        )
     return found
 
 
-def _spread(found: Sequence[Happening]) -> list[Happening]:
+def _spread(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
     """Return what marks nothing, but not more of it than a page can hold."""
     quiet = [row for row in found if not row.mark]
     return quiet[: max(0, LINES_MAX - (len(found) - len(quiet)))]
 
 
-def _at(source: Source, t_ns: int) -> float:
+def _at(source: RunData, t_ns: int) -> float:
     return (t_ns - source.zero_ns) / NS_PER_S
 
 
-def _from_outside(source: Source) -> Iterator[Happening]:
+def _from_outside(source: RunData) -> Iterator[TimelineEvent]:
     events: list[RunEvent] = source.log.messages(topics.RUN_EVENT)
     for event in events:
         kind = KINDS.get(_known(RunEventKind, event.kind), "note")
@@ -93,27 +95,29 @@ def _from_outside(source: Source) -> Iterator[Happening]:
             mark = mark or f"{event.subject} back"
         if kind == "push":
             mark = f"push {event.detail.partition(' for ')[0]}"
-        yield Happening(_at(source, event.t_ns), kind, text, mark)
+        yield TimelineEvent(_at(source, event.t_ns), kind, text, mark)
     last = None
     for stop in source.log.messages(topics.ESTOP):
         t = _at(source, stop.t_ns)
         if last is None or t - last > 1.0:  # it is said again and again
-            yield Happening(t, "estop", f"emergency stop by {stop.source}", "e-stop")
+            yield TimelineEvent(t, "estop", f"emergency stop by {stop.source}", "e-stop")
         last = t
     for request in source.log.messages(topics.HARNESS_TARE):
-        yield Happening(_at(source, request.t_ns), "note", f"tare asked for by {request.source}")
+        yield TimelineEvent(
+            _at(source, request.t_ns), "note", f"tare asked for by {request.source}"
+        )
 
 
-def _network(source: Source) -> Iterator[Happening]:
+def _network(source: RunData) -> Iterator[TimelineEvent]:
     """Tell when each impairment begins and ends; all its directions at once."""
     for row in impairments(source.log.messages(topics.LINK_EVENT)):
         begin_s, end_s = row.begin_s(source.zero_ns), row.end_s(source.zero_ns)
-        yield Happening(begin_s, "network", f"network, {row.title}", row.title)
+        yield TimelineEvent(begin_s, "network", f"network, {row.title}", row.title)
         if end_s is None:
             continue
         text = f"network, {row.title} ends; {row.counts()}"
         mark = f"{row.link} ends" if end_s < source.span.end - END_S else ""
-        yield Happening(end_s, "network" if mark else "note", text, mark)
+        yield TimelineEvent(end_s, "network" if mark else "note", text, mark)
 
 
 def _said(event: RunEvent) -> str:
@@ -129,7 +133,7 @@ def _said(event: RunEvent) -> str:
     return words.get(_known(RunEventKind, event.kind), other.strip())
 
 
-def _changes_of_mode(source: Source) -> Iterator[Happening]:
+def _changes_of_mode(source: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointEvent]] = sorted(
         (_at(source, event.t_ns), module, event)
         for module in MODULES
@@ -139,7 +143,7 @@ def _changes_of_mode(source: Source) -> Iterator[Happening]:
         changes, lambda row: (row[2].mode_before, row[2].mode_after, row[2].cause)
     ):
         t, _, first = alike[0]
-        yield Happening(t, _severity(first), _change_in_words(alike))
+        yield TimelineEvent(t, _severity(first), _describe_change(alike))
 
 
 def _together(changes: Sequence[Row], what: Callable[[Row], Any]) -> list[list[Row]]:
@@ -164,7 +168,7 @@ def _severity(event: JointEvent) -> str:
     return "bad" if event.mode_after in (Mode.FAULT, Mode.DAMP) else "note"
 
 
-def _change_in_words(alike: Sequence[tuple[float, str, JointEvent]]) -> str:
+def _describe_change(alike: Sequence[tuple[float, str, JointEvent]]) -> str:
     first = alike[0][2]
     who = _who(module for _, module, _ in alike)
     step = max(
@@ -185,7 +189,7 @@ def _change_in_words(alike: Sequence[tuple[float, str, JointEvent]]) -> str:
     return f"{text}; torque step {step:.2f} N m"
 
 
-def _drives(source: Source) -> Iterator[Happening]:
+def _drives(source: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointState, JointState]] = []
     for module in MODULES:
         states: list[JointState] = source.log.messages(topics.JOINT_STATE, module)
@@ -200,7 +204,7 @@ def _drives(source: Source) -> Iterator[Happening]:
         worse = after.drive != DriveStatus.ARMED and before.drive == DriveStatus.ARMED
         bad = worse or after.drive == DriveStatus.ERROR or after.drive_error != 0
         who = _who(module for _, module, _, _ in alike)
-        yield Happening(t_s, "bad" if bad else "note", f"{who}: {_what_of_drive(alike[0])}")
+        yield TimelineEvent(t_s, "bad" if bad else "note", f"{who}: {_what_of_drive(alike[0])}")
 
 
 def _what_of_drive(row: tuple[float, str, JointState, JointState]) -> str:
@@ -215,7 +219,7 @@ def _what_of_drive(row: tuple[float, str, JointState, JointState]) -> str:
     return ", ".join(parts)
 
 
-def _planner(source: Source) -> Iterator[Happening]:
+def _planner(source: RunData) -> Iterator[TimelineEvent]:
     rows: list[PlannerStatus] = source.log.messages(topics.PLANNER_STATUS)
     t = source.times(topics.PLANNER_STATUS)
     for index in _changes([(row.mode, row.session) for row in rows]):
@@ -223,14 +227,14 @@ def _planner(source: Source) -> Iterator[Happening]:
         fresh = " in a new session" if before.session != after.session else ""
         text = f"planner: {_word(PlannerMode, before.mode)} to {_word(PlannerMode, after.mode)}"
         bad = after.mode not in _USUAL
-        yield Happening(float(t[index]), "bad" if bad else "note", text + fresh)
+        yield TimelineEvent(float(t[index]), "bad" if bad else "note", text + fresh)
     for index in _changes([row.wait_s > 0.0 for row in rows]):
         if rows[index].wait_s >= WAIT_S:
             text = f"planner: leads again in {rows[index].wait_s:.1f} s at the earliest, for links"
-            yield Happening(float(t[index]), "note", f"{text} have dropped out")
+            yield TimelineEvent(float(t[index]), "note", f"{text} have dropped out")
 
 
-def _harness(source: Source) -> Iterator[Happening]:
+def _harness(source: RunData) -> Iterator[TimelineEvent]:
     rows: list[Wrench] = source.log.messages(topics.WRENCH)
     t = source.times(topics.WRENCH)
     for index in _changes([(row.valid, row.saturated, row.tare) for row in rows]):
@@ -238,18 +242,18 @@ def _harness(source: Source) -> Iterator[Happening]:
         word = "valid" if row.valid else "saturated" if row.saturated else "not valid"
         tare = "" if row.tare == Tare.DONE else f", tare {_word(Tare, row.tare)}"
         kind = "note" if row.valid else "bad"
-        yield Happening(float(t[index]), kind, f"harness sensor {word}{tare}")
+        yield TimelineEvent(float(t[index]), kind, f"harness sensor {word}{tare}")
 
 
-def _world(source: Source) -> Iterator[Happening]:
+def _world(source: RunData) -> Iterator[TimelineEvent]:
     rows: list[SimTruth] = source.log.messages(topics.SIM_TRUTH)
     for row in rows:
         if row.fallen:
-            yield Happening(_at(source, row.t_ns), "fall", "the robot fell", "fell")
+            yield TimelineEvent(_at(source, row.t_ns), "fall", "the robot fell", "fell")
             return
 
 
-def _silences(source: Source) -> Iterator[Happening]:
+def _silences(source: RunData) -> Iterator[TimelineEvent]:
     """Tell where topics with a rate said nothing for long, as the recorder heard them."""
     found: list[tuple[float, str, float]] = []
     for key, topic in topics.all_keys(source.log.robot).items():
@@ -266,7 +270,7 @@ def _silences(source: Source) -> Iterator[Happening]:
         names = _folded([name for _, name, _ in alike])
         longest = max(length for *_, length in alike)
         word = "silent for up to" if len(alike) > 1 else "silent for"
-        yield Happening(alike[0][0], "note", f"{', '.join(names)} {word} {longest:.2f} s")
+        yield TimelineEvent(alike[0][0], "note", f"{', '.join(names)} {word} {longest:.2f} s")
 
 
 def _folded(names: Sequence[str]) -> list[str]:

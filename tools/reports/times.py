@@ -10,9 +10,9 @@ from shared import topics
 from shared.clock import NS_PER_MS
 from shared.joints import MODULES
 from shared.topics import Topic
-from tools.reports.sheet import Limit, Line, Sheet
+from tools.reports.page_model import LevelLine, Line, Sheet
+from tools.reports.run_data import RunData, module_of
 from tools.reports.signals import Array, seconds
-from tools.reports.source import Source, module_of
 
 RATE_WINDOW_S: Final = 0.25
 AGE_REACH: Final = 4.0
@@ -25,20 +25,20 @@ REFUSED_NOTE: Final = (
 )
 
 
-def add_ages(source: Source, sheet: Sheet) -> None:
+def add_ages(source: RunData, sheet: Sheet) -> None:
     """Add ages both ways, to be read beside what was done to the network."""
     _add_command_ages(source, sheet)
     _add_state_ages(source, sheet)
 
 
-def add_times(source: Source, sheet: Sheet) -> None:
+def add_times(source: RunData, sheet: Sheet) -> None:
     """Add rates, late cycles, refused commands, the planner's tick."""
     _add_rates(source, sheet)
     _add_cycles(source, sheet)
     _add_tick(source, sheet)
 
 
-def _add_command_ages(source: Source, sheet: Sheet) -> None:
+def _add_command_ages(source: RunData, sheet: Sheet) -> None:
     lines = []
     for number, module in enumerate(MODULES):
         (age,) = source.columns(topics.JOINT_STATE, module, "age_ns")
@@ -50,7 +50,7 @@ def _add_command_ages(source: Source, sheet: Sheet) -> None:
     note = "Age of the newest command in use, by each joint service's own clock."
     if source.robot is not None:
         most_ms = source.robot.joint_service.max_command_age_ms
-        limits, reach = [Limit(most_ms, "HOLD")], AGE_REACH * most_ms
+        limits, reach = [LevelLine(most_ms, "HOLD")], AGE_REACH * most_ms
         note += f" The axis ends at {reach:g} ms."
     sheet.plot(
         "Command age", "ms", lines, limits=limits, reach=reach, note=note,
@@ -58,7 +58,7 @@ def _add_command_ages(source: Source, sheet: Sheet) -> None:
     )  # fmt: skip
 
 
-def _add_state_ages(source: Source, sheet: Sheet) -> None:
+def _add_state_ages(source: RunData, sheet: Sheet) -> None:
     """Add what the planner's inputs were worth when it used them."""
     (ages,) = source.columns(topics.PLANNER_STATUS, "", "state_age_ns")
     (sample,) = source.columns(topics.WRENCH, "", "age_ns")
@@ -82,7 +82,7 @@ def _add_state_ages(source: Source, sheet: Sheet) -> None:
     )
     if source.robot is not None:
         most_ms = source.robot.planner.state_stale_ms
-        limits, reach = [Limit(most_ms, "planner waits")], AGE_REACH * most_ms
+        limits, reach = [LevelLine(most_ms, "planner waits")], AGE_REACH * most_ms
         note += f" The axis ends at {reach:g} ms."
     sheet.plot(
         "Age of the planner's inputs", "ms", lines, limits=limits, reach=reach, note=note,
@@ -90,7 +90,7 @@ def _add_state_ages(source: Source, sheet: Sheet) -> None:
     )  # fmt: skip
 
 
-def _add_rates(source: Source, sheet: Sheet) -> None:
+def _add_rates(source: RunData, sheet: Sheet) -> None:
     lines = []
     for number, topic in enumerate(row for row in topics.TOPICS if row.rate_hz >= 10.0):
         t, rate = _rate(source, topic)
@@ -104,7 +104,7 @@ def _add_rates(source: Source, sheet: Sheet) -> None:
     )  # fmt: skip
 
 
-def _add_cycles(source: Source, sheet: Sheet) -> None:
+def _add_cycles(source: RunData, sheet: Sheet) -> None:
     """Add the control loops: how fast they ran, what came late, what they refused."""
     armed_s = source.armed_s()
     rates: list[Line] = []
@@ -147,7 +147,7 @@ def _grown(count: Array) -> Array:
     return np.asarray(np.cumsum(np.where(steps >= 0.0, steps, count)))
 
 
-def _add_tick(source: Source, sheet: Sheet) -> None:
+def _add_tick(source: RunData, sheet: Sheet) -> None:
     t = source.times(topics.PLANNER_STATUS)
     (tick,) = source.columns(topics.PLANNER_STATUS, "", "tick_us")
     if not tick.any():
@@ -159,7 +159,7 @@ def _add_tick(source: Source, sheet: Sheet) -> None:
     )  # fmt: skip
 
 
-def _rate(source: Source, topic: Topic) -> tuple[Array, Array]:
+def _rate(source: RunData, topic: Topic) -> tuple[Array, Array]:
     """Return messages per second in windows; of the slowest module that is there."""
     begin, end = source.span
     edges = np.arange(begin, end, RATE_WINDOW_S)

@@ -7,17 +7,17 @@ from typing import Final, TypeAlias
 import msgspec
 import numpy as np
 
-from services.joint import law
+from services.joint import pd_law
 from shared import topics
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import AXES, MODULES
 from shared.messages import JointCommand, JointState, Mode
-from tools.reports.sheet import Limit, Line, Sheet
+from tools.reports.page_model import LevelLine, Line, Sheet
+from tools.reports.run_data import RunData
 from tools.reports.signals import Array
-from tools.reports.source import Source
 
-Sets: TypeAlias = dict[str, tuple[list[Line], list[Limit]]]
+Sets: TypeAlias = dict[str, tuple[list[Line], list[LevelLine]]]
 """Lines and levels of each joint."""
 
 NO_STATES: Final = "no joint/*/state in this log"
@@ -36,7 +36,7 @@ class Origins(msgspec.Struct):
     a service that was frozen did not make."""
 
 
-def add_joints(source: Source, sheet: Sheet) -> None:
+def add_joints(source: RunData, sheet: Sheet) -> None:
     """Add the joints' panels."""
     robot = source.robot
     most = robot.joint.tau_module_max if robot is not None else None
@@ -67,7 +67,7 @@ def add_joints(source: Source, sheet: Sheet) -> None:
             )
     sheet.plot(
         "Torque of each module against its limit", "N m", sums,
-        limits=[Limit(most, "limit")] if most is not None else [],
+        limits=[LevelLine(most, "limit")] if most is not None else [],
         note="|tau_phi| + |tau_theta|: both motors of a module add up along one axis.",
         otherwise=NO_STATES,
     )  # fmt: skip
@@ -84,7 +84,7 @@ def add_joints(source: Source, sheet: Sheet) -> None:
     sheet.choice("Rate of one joint", "rad/s", "joint", rates, initial=hardest, otherwise=NO_STATES)
 
 
-def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
+def origins(source: RunData, robot: RobotConfig, module: str) -> Origins:
     """Return the law's terms at each state of a module; NaN where the log does not tell.
 
     They are those of the command that the state names, aged as the service ages it, and
@@ -108,10 +108,10 @@ def origins(source: Source, robot: RobotConfig, module: str) -> Origins:
         if command is None or state.t_ns - tracking_since_ns < blend_ns or state.age_ns < 0:
             continue
         age_s = min(state.age_ns / NS_PER_S, aging_max_s)
-        used = law.aged(command, age_s)
+        used = pd_law.extrapolate(command, age_s)
         found.feedforward[index] = used.tau_ff
         found.coupled[index] = used.tau_coupled
-        found.local[index] = law.torque(used, state.q, state.v)
+        found.local[index] = pd_law.torque(used, state.q, state.v)
     sent = np.array([state.tau for state in states]).reshape(shape)
     found.local -= found.feedforward + found.coupled
     found.taken_off = sent - found.feedforward - found.coupled - found.local
@@ -131,13 +131,13 @@ def _torques(t: Array, tau: Array, found: Origins | None, axis: int) -> list[Lin
     return [*lines, Line(sibling, t, tau[:, 1 - axis], 4, hidden=True, dashed=True)]
 
 
-def _torque_limits(most: float | None) -> list[Limit]:
+def _torque_limits(most: float | None) -> list[LevelLine]:
     if most is None:
         return []
-    return [Limit(most, "limit", shown=False), Limit(-most, "limit", shown=False)]
+    return [LevelLine(most, "limit", shown=False), LevelLine(-most, "limit", shown=False)]
 
 
-def _references(source: Source, module: str) -> tuple[Array, Array, Array]:
+def _references(source: RunData, module: str) -> tuple[Array, Array, Array]:
     t = source.times(topics.JOINT_COMMAND, module)
     q_ref, v_ref = source.columns(topics.JOINT_COMMAND, module, "q_ref", "v_ref")
     if q_ref.ndim != 2:
@@ -145,8 +145,8 @@ def _references(source: Source, module: str) -> tuple[Array, Array, Array]:
     return t, q_ref, v_ref
 
 
-def _stops(source: Source, module: str, axis: int) -> list[Limit]:
+def _stops(source: RunData, module: str, axis: int) -> list[LevelLine]:
     if source.robot is None:
         return []
     low, high = source.robot.joint_limits()[2 * MODULES.index(module) + axis]
-    return [Limit(low, "soft stop", shown=False), Limit(high, "soft stop", shown=False)]
+    return [LevelLine(low, "soft stop", shown=False), LevelLine(high, "soft stop", shown=False)]

@@ -15,7 +15,7 @@ from services.planner.dynamic_certificate import (
     Condition,
     Design,
     DynamicCertificate,
-    Node,
+    StiffnessNode,
 )
 from services.planner.sampled_loop import NO_HAND, NOMINAL
 from shared.config import RobotConfig
@@ -28,7 +28,7 @@ FREQUENCY_HZ: Final = (0.1, 125.0)
 """Up to half of the planner's rate: what a period can tell apart."""
 
 
-def draw(robot: RobotConfig, nodes: list[Node], design: Design, path: Path) -> None:
+def draw(robot: RobotConfig, nodes: list[StiffnessNode], design: Design, path: Path) -> None:
     """Draw decay over frequency of every motion while the planner leads, into a PNG file.
 
     Args:

@@ -22,7 +22,7 @@ from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
 from shared.scenario import FAULT_KINDS, SIGNALS, Fault, Inject, Kill, Push, Restart, Scenario
-from tools.runs.inject_words import in_words_of, parse_inject
+from tools.runs.describe_inject import in_words_of, parse_inject
 from tools.verbs import add_config
 
 E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
@@ -240,7 +240,7 @@ def _inside(rows: tuple[E, ...], duration: float) -> tuple[E, ...]:
     return tuple(row for row in rows if row.at < duration)
 
 
-def in_words(story: Scenario) -> str:
+def describe(story: Scenario) -> str:
     """Return what is done to the run, as a clause for its first line."""
     done = [f"{row.service} {row.signal} at {row.at:g} s" for row in story.kill]
     done += [f"{row.service} back at {row.at:g} s" for row in story.restart]

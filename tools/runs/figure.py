@@ -17,7 +17,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import ConfigError
 from shared.joints import MODULES
 from shared.messages import JointState, Mode, PlannerMode, RunEvent, RunEventKind
-from tools.runs.impaired import Impaired, impairments
+from tools.runs.impairment_intervals import Impaired, impairments
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary, course
 

@@ -28,7 +28,7 @@ from shared.messages import (
 from shared.topics import JOINT_STATE, PLANNER_STATUS, TOPICS
 from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools.runs.injector_client import InjectorClient
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 
 TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
 """Who holds a module up: the planner (1) or its joint service alone (2). In every other
@@ -77,7 +77,7 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """(phi, theta), rad; None if its drive does not know."""
     way_out: str
     """What a person does to have it track again; empty if nothing has to be done."""
-    braced: bool = False
+    stiffened: bool = False
     """It holds with all of its stand gains, for another may be limp."""
     outside: str = ""
     """Name of what it does not believe of the newest command (`Outside`); empty if it does."""
@@ -111,7 +111,7 @@ class FleetStatus(msgspec.Struct, frozen=True):
     """How fast the fleet's clock goes; below 1 it is in slow motion."""
 
 
-class Ear:
+class RateMonitor:
     """Listens to one service: newest message, first and last of the present window."""
 
     def __init__(self, latest: Latest[Message]) -> None:
@@ -150,7 +150,7 @@ class Ear:
         return (self.newest.seq - self._first.seq) * NS_PER_S / span_ns if span_ns > 0 else 0.0
 
 
-def ears_of(session: Session, topics: Mapping[str, str]) -> dict[str, Ear]:
+def ears_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMonitor]:
     """Return an ear for each service that publishes something steadily.
 
     Args:
@@ -164,16 +164,16 @@ def ears_of(session: Session, topics: Mapping[str, str]) -> dict[str, Ear]:
         if name:
             topic = by_name[name]
             module = service if topic.per_module else ""
-            ears[service] = Ear(session.latest(topic, topic.type, module))
+            ears[service] = RateMonitor(session.latest(topic, topic.type, module))
     return ears
 
 
-def listen_for_all(ears: Mapping[str, Ear]) -> None:
+def listen_for_all(ears: Mapping[str, RateMonitor]) -> None:
     """Wait for a first message of each, but not for long."""
     _listen(ears, _LINKS_S, until=lambda: all(ear.newest for ear in ears.values()))
 
 
-def look(fleet: Fleet, ears: Mapping[str, Ear]) -> FleetStatus:
+def look(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> FleetStatus:
     """Listen for one window and return the fleet's status."""
     for ear in ears.values():
         ear.new_window()
@@ -203,12 +203,12 @@ def look(fleet: Fleet, ears: Mapping[str, Ear]) -> FleetStatus:
     return FleetStatus(str(fleet.run.path), config, services, modules, lead, network, pace())
 
 
-def impairments(fleet: Fleet) -> tuple[str, ...]:
+def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
     """Return what is done to the network now, in words; nothing where there is no injector."""
     if "injector" not in fleet.manifest.services:
         return ()
     try:
-        return tuple(row.in_words() for row in InjectorClient(fleet.run.path).list())
+        return tuple(row.describe() for row in InjectorClient(fleet.run.path).list())
     except FleetError:
         return (SILENT_INJECTOR,)
 
@@ -237,9 +237,9 @@ def module_status(state: Message | None) -> ModuleStatus:
         way_out = f"{told}: by itself after a push or a stall; if it lasts, xrl kill planner"
     knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
     q = state.q if knows else None
-    braced = state.braced and mode in (Mode.HOLD, Mode.DAMP)
+    stiffened = state.stiffened and mode in (Mode.HOLD, Mode.DAMP)
     tier = TIERS.get(mode)
-    return ModuleStatus(mode.name, tier, cause.name, drive.name, q, way_out, braced, outside)
+    return ModuleStatus(mode.name, tier, cause.name, drive.name, q, way_out, stiffened, outside)
 
 
 def lead_status(message: Message | None) -> LeadStatus | None:
@@ -254,7 +254,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
 
 
 def _listen(
-    ears: Mapping[str, Ear], duration_s: float, until: Callable[[], bool] = lambda: False
+    ears: Mapping[str, RateMonitor], duration_s: float, until: Callable[[], bool] = lambda: False
 ) -> None:
     deadline = time.monotonic() + duration_s
     while time.monotonic() < deadline and not until():

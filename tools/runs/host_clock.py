@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Generic, TypeVar
 
 from shared.messages import Message
-from tools.runs.network import Link
+from tools.runs.network import VirtualLink
 
 M = TypeVar("M", bound=Message)
 
@@ -39,7 +39,7 @@ class HostClock:
 class HostLink(Generic[M]):
     """A link as a process sees it that knows its own host's time only."""
 
-    def __init__(self, link: Link[M]) -> None:
+    def __init__(self, link: VirtualLink[M]) -> None:
         """Take the link, which is in virtual time."""
         self._link = link
         self.now_ns = 0

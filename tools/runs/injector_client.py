@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from shared.exceptions import FleetError
-from shared.injector_protocol import SOCKET, Asked, Begin, Clear, List, Reply, Request
+from shared.injector_protocol import SOCKET, Begin, Clear, List, Reply, Request, RequestedImpairment
 from shared.scenario import Inject
 from tools.supervision.run_dir import RunDir
 
@@ -24,7 +24,7 @@ class InjectorClient:
         """Name the fleet's run directory; nothing is opened yet."""
         self._path = run_dir / SOCKET
 
-    def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[Asked, ...]:
+    def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[RequestedImpairment, ...]:
         """Put an impairment in force, in so many s; return all that is asked for then.
 
         Raises:
@@ -32,7 +32,7 @@ class InjectorClient:
         """
         return self._ask(Begin(inject, in_s))
 
-    def clear(self, link: str) -> tuple[Asked, ...]:
+    def clear(self, link: str) -> tuple[RequestedImpairment, ...]:
         """End all that touches a link; return what is left.
 
         Raises:
@@ -40,7 +40,7 @@ class InjectorClient:
         """
         return self._ask(Clear(link))
 
-    def list(self) -> tuple[Asked, ...]:
+    def list(self) -> tuple[RequestedImpairment, ...]:
         """Return what is asked for.
 
         Raises:
@@ -48,7 +48,7 @@ class InjectorClient:
         """
         return self._ask(List())
 
-    def _ask(self, request: Request) -> tuple[Asked, ...]:
+    def _ask(self, request: Request) -> tuple[RequestedImpairment, ...]:
         try:
             with socket.socket(socket.AF_UNIX) as asking:
                 asking.settimeout(_PATIENCE_S)

@@ -17,7 +17,7 @@ from shared.scenario import Scenario
 from tools.runs import experiment
 from tools.runs.experiment import PLANT_FILE
 from tools.supervision.pace import PACE_MIN, PACE_VARIABLE, SLOWER, CoresFullError, usual_pace
-from tools.supervision.supervise import Fleet
+from tools.supervision.supervise import SupervisedFleet
 
 T = TypeVar("T")
 
@@ -26,7 +26,7 @@ def run_live(
     out: Path,
     robot: RobotConfig,
     story: Scenario,
-    lead: Callable[[Fleet, Session], T],
+    lead: Callable[[SupervisedFleet, Session], T],
     *,
     verb: str,
     seed: int,
@@ -77,7 +77,7 @@ def _run_once(
     out: Path,
     robot: RobotConfig,
     story: Scenario,
-    lead: Callable[[Fleet, Session], T],
+    lead: Callable[[SupervisedFleet, Session], T],
     *,
     verb: str,
     seed: int,
@@ -93,7 +93,7 @@ def _run_once(
     model_path.write_text(mjcf(robot), encoding="utf-8")
     run_dir = Path(tempfile.mkdtemp(prefix=f"xrl-{verb}-", dir="/tmp"))
     try:
-        fleet = Fleet.start(
+        fleet = SupervisedFleet.start(
             robot_path.absolute(),
             run_dir,
             overrides={

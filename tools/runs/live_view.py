@@ -12,7 +12,7 @@ from rich.text import Text
 
 from shared.messages import PlannerStatus
 from shared.scenario import Inject
-from tools.runs.conductor import Snapshot
+from tools.runs.scenario_runner import LiveSnapshot
 
 PERIOD_S = 0.1
 PLAIN_PERIOD_S = 1.0
@@ -20,7 +20,7 @@ UNHEARD_S = 0.5
 """What a planner said that is silent for so long is not shown."""
 
 
-class Newest(Protocol):
+class PlannerNews(Protocol):
     """Gives what the planner said last (`shared.bus.Latest`)."""
 
     def take(self) -> PlannerStatus | None:
@@ -31,7 +31,7 @@ class LiveView:
     """A line that is renewed in a terminal, or printed once a second into a file."""
 
     def __init__(
-        self, console: Console, injects: Sequence[Inject] = (), planner: Newest | None = None
+        self, console: Console, injects: Sequence[Inject] = (), planner: PlannerNews | None = None
     ) -> None:
         """Begin.
 
@@ -61,7 +61,7 @@ class LiveView:
         if self._live is not None:
             self._live.__exit__(None, None, None)
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, snapshot: LiveSnapshot) -> None:
         """Show the run as it is now, unless that was done a moment ago."""
         now = time.monotonic()
         if now < self._next_s or snapshot.truth is None:
@@ -69,7 +69,7 @@ class LiveView:
         self._next_s = now + self._period_s
         words = (
             snapshot.note,
-            in_force(self._injects, snapshot.truth.scenario_s),
+            active(self._injects, snapshot.truth.scenario_s),
             waiting(self._hear(now)),
         )
         line = _line(snapshot, "; ".join(word for word in words if word))
@@ -86,10 +86,10 @@ class LiveView:
         return self._status if now_s - self._heard_s < UNHEARD_S else None
 
 
-def in_force(injects: Sequence[Inject], scenario_s: float) -> str:
+def active(injects: Sequence[Inject], scenario_s: float) -> str:
     """Return what a scenario does to the network at a time, in words; empty if nothing."""
     found = [row for row in injects if row.at <= scenario_s < row.until]
-    return ", ".join(f"{row.link} {row.in_words()}" for row in found)
+    return ", ".join(f"{row.link} {row.describe()}" for row in found)
 
 
 def waiting(status: PlannerStatus | None) -> str:
@@ -99,7 +99,7 @@ def waiting(status: PlannerStatus | None) -> str:
     return f"leads again in {status.wait_s:.0f} s" if status.wait_s >= 1.0 else "leads again soon"
 
 
-def _line(snapshot: Snapshot, note: str) -> str:
+def _line(snapshot: LiveSnapshot, note: str) -> str:
     truth = snapshot.truth
     assert truth is not None  # noqa: S101 - `show` has looked
     clock = f"{truth.scenario_s:6.2f} s" if truth.scenario_s >= 0.0 else "   --  s"

@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import ClassVar
 
 from services.joint.controller import JointController
-from services.joint.memory import ModuleMemory
-from services.joint.module import Module
+from services.joint.drive_manager import DriveManager
+from services.joint.snapshots import DriveManagerState
 from services.joint.tracer import Tracer
+from services.planner.checkpoint import Checkpoints
 from services.planner.intents import Wish
-from services.planner.memory import TickMemory
 from services.planner.planner import Planner
-from services.planner.remembrance import Remembrance
+from services.planner.snapshots import TickState
 from services.simulator.axis_bank import AxisBank
 from services.simulator.body import body_of
 from services.simulator.fault_injector import FaultInjector
@@ -67,7 +67,7 @@ class Lockstep:
     """A whole fleet in virtual time; a subclass may be made of other parts."""
 
     planner_type: ClassVar[type[Planner]] = Planner
-    module_type: ClassVar[type[Module]] = Module
+    module_type: ClassVar[type[DriveManager]] = DriveManager
     traced: ClassVar[bool] = True
     """What is recorded has all that it takes to execute the services again."""
 
@@ -113,7 +113,7 @@ class Lockstep:
         self._modules = [self.module_type(config, module) for module in MODULES]
         self._traces = self.traced and record is not forget
         self._tracers = [Tracer(module) for module in self._modules]
-        self._remembrance = Remembrance(config.planner.rate_hz)
+        self._remembrance = Checkpoints(config.planner.rate_hz)
         self.planner: Planner | None = self.planner_type(config, session=1)
         self.events: list[tuple[str, JointEvent]] = []
         self.estop = False
@@ -171,15 +171,15 @@ class Lockstep:
         """Each module's control law."""
         return [module.controller for module in self._modules]
 
-    def memory_of(self, module: str) -> ModuleMemory:
+    def memory_of(self, module: str) -> DriveManagerState:
         """Return what a joint service knows now, for `go_on`; it shares what still changes."""
-        return self._modules[MODULE_INDEX[module]].remember()
+        return self._modules[MODULE_INDEX[module]].snapshot()
 
     def go_on(
         self,
         state: SimState,
-        modules: Mapping[str, ModuleMemory],
-        planner: tuple[int, TickMemory] | None,
+        modules: Mapping[str, DriveManagerState],
+        planner: tuple[int, TickState] | None,
     ) -> None:
         """Go on from a moment of another run, before the first step; links are empty then.
 
@@ -192,7 +192,7 @@ class Lockstep:
         restored(self.world, self.bank, state)
         for index, name in enumerate(MODULES):
             if name in modules:
-                self._modules[index].recall(modules[name])
+                self._modules[index].restore(modules[name])
             else:
                 self._frozen.add(name)
                 self._dead.add(name)
@@ -201,7 +201,7 @@ class Lockstep:
         else:
             self._sessions = planner[0]
             self.planner = self.planner_type(self.config, planner[0])
-            self.planner.recall(planner[1])
+            self.planner.restore(planner[1])
         for drive in self._drives:
             drive.heard(self.now_ns)
         self.harness.go_on()
@@ -269,7 +269,7 @@ class Lockstep:
         if service == "planner":
             self._sessions += 1
             self.planner = self.planner_type(self.config, self._sessions)
-            self._remembrance = Remembrance(self.config.planner.rate_hz)
+            self._remembrance = Checkpoints(self.config.planner.rate_hz)
             return
         index = MODULE_INDEX[service]
         self._modules[index] = self.module_type(self.config, service)
@@ -315,17 +315,17 @@ class Lockstep:
         for index, link in enumerate(self._states):
             state = link.take(now)
             if state is not None:
-                planner.hear_state(index, state, host_ns)
+                planner.receive_state(index, state, host_ns)
         if not planner.is_due(host_ns):
             return
         wrench = self._wrenches.take(now)
         if wrench is not None:
-            planner.hear_wrench(wrench, host_ns)
+            planner.receive_wrench(wrench, host_ns)
         attitude = self._attitudes.take(now)
         if attitude is not None:
-            planner.hear_attitude(attitude, host_ns)
+            planner.receive_attitude(attitude, host_ns)
         wanted = self.world.lead()
-        planner.hear_wish(Wish(wanted.assist, wanted.shift, SCENARIO))
+        planner.receive_wish(Wish(wanted.assist, wanted.shift, SCENARIO))
         for index, command in enumerate(planner.tick(host_ns)):
             self._commands[index].put(now, command)
             self._record(topics.JOINT_COMMAND, MODULES[index], command)
@@ -333,7 +333,7 @@ class Lockstep:
         self._record(topics.PLANNER_STATUS, "", status)
         memory = self._remembrance.after(planner, host_ns) if self._traces else None
         if memory is not None:
-            self._record(topics.PLANNER_MEMORY, "", memory)
+            self._record(topics.PLANNER_CHECKPOINT, "", memory)
 
     def _begin_when_tracking(self, now: int) -> None:
         if self.world.scenario_s >= 0.0:

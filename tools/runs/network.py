@@ -23,7 +23,7 @@ OVERHEAD_BYTES: Final = 40
 """Key and header that travel with a payload."""
 
 
-class Link(Generic[M]):
+class VirtualLink(Generic[M]):
     """One direction between two processes; the receiver keeps the newest arrival only.
 
     What comes behind a message that was sent later is dropped, as Zenoh does by its own
@@ -72,7 +72,7 @@ class Link(Generic[M]):
         """Let out what a partition has held back, if it is over: in order, and as late as all."""
         if not self._held:
             return
-        impairer = self.direction.in_force
+        impairer = self.direction.active
         release_ns = now_ns if impairer is None else impairer.delays(now_ns)
         if release_ns == HELD:
             return
@@ -88,7 +88,7 @@ class Link(Generic[M]):
         """
         if now_ns < self._stream_ns:
             release_ns = max(release_ns, self._stream_ns)
-        impairer = self.direction.in_force
+        impairer = self.direction.active
         if impairer is not None and impairer.what.ordered:
             self._stream_ns = release_ns
         return release_ns
@@ -98,7 +98,7 @@ class Link(Generic[M]):
             heapq.heappush(self._queue, (arrival_ns, number, message))
 
     def _size(self, message: M) -> int:
-        impairer = self.direction.in_force
+        impairer = self.direction.active
         if impairer is None or not impairer.what.rate:
             return 0
         return len(encode(message)) + OVERHEAD_BYTES

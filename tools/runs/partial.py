@@ -13,8 +13,8 @@ from typing import Final, Literal
 import msgspec
 
 from services.joint.differential import joint_torque
-from services.joint.memory import ModuleMemory
-from services.planner.memory import TickMemory
+from services.joint.snapshots import DriveManagerState
+from services.planner.snapshots import TickState
 from services.simulator.state import taken
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
@@ -58,14 +58,14 @@ SQUAT: Final = (
 )
 
 
-class Case(msgspec.Struct, frozen=True):
+class PartialCase(msgspec.Struct, frozen=True):
     """One partial failure."""
 
     kind: FailureKind
     modules: tuple[str, ...]
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class PartialResult(msgspec.Struct, frozen=True, kw_only=True):
     """The figures of a case; None where there was nothing of the kind."""
 
     stood: bool
@@ -87,22 +87,22 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """
 
 
-class Start(msgspec.Struct, frozen=True):
+class PartialStart(msgspec.Struct, frozen=True):
     """What every case goes on from."""
 
     state: SimState
-    modules: dict[str, ModuleMemory]
-    planner: tuple[int, TickMemory]
+    modules: dict[str, DriveManagerState]
+    planner: tuple[int, TickState]
 
 
-def cases() -> Iterator[Case]:
+def cases() -> Iterator[PartialCase]:
     """Yield every case: 64 subsets of each kind."""
     for kind in KINDS:
         for modules in SUBSETS:
-            yield Case(kind, modules)
+            yield PartialCase(kind, modules)
 
 
-def story_of(case: Case) -> Scenario:
+def story_of(case: PartialCase) -> Scenario:
     """Return the case as a scenario, from its beginning: `xrl sim` would run it too."""
     service = [name for name in case.modules if case.kind == "frozen"]
     return Scenario(
@@ -132,7 +132,7 @@ def _links(kind: FailureKind, module: str) -> tuple[str, ...]:
     return cut[kind]
 
 
-class Fleet(Lockstep):
+class PartialFleet(Lockstep):
     """Records for the verdict alone, and watches the drives as modes change.
 
     A service that was frozen knows nothing of what its drive did meanwhile: the torque before
@@ -165,13 +165,13 @@ class Fleet(Lockstep):
         return joint_torque((a * a_sign, b * b_sign), self.config.joint.gear_ratio)
 
 
-def start_of(robot: RobotConfig) -> Start:
+def start_of(robot: RobotConfig) -> PartialStart:
     """Run to the moment that all cases go on from.
 
     Raises:
         RunError: the robot did not come so far.
     """
-    fleet = Fleet(robot, story_of(Case("links", ())))
+    fleet = PartialFleet(robot, story_of(PartialCase("links", ())))
     for truth in fleet.run():
         if truth.scenario_s >= BEGIN_S:
             break
@@ -179,10 +179,10 @@ def start_of(robot: RobotConfig) -> Start:
         raise RunError(f"the robot did not stand and track until {BEGIN_S:g} s")
     modules = {name: fleet.memory_of(name) for name in MODULES}
     state = taken(fleet.world, fleet.bank, fleet.now_ns, 0)
-    return Start(state, modules, (fleet.planner.session, fleet.planner.remember()))
+    return PartialStart(state, modules, (fleet.planner.session, fleet.planner.snapshot()))
 
 
-def run_case(case: Case, robot: RobotConfig, start: Start) -> Outcome:
+def run_case(case: PartialCase, robot: RobotConfig, start: PartialStart) -> PartialResult:
     """Go on from the common moment, with the case's failure, to its end or to the fall.
 
     Args:
@@ -196,7 +196,7 @@ def run_case(case: Case, robot: RobotConfig, start: Start) -> Outcome:
         if isinstance(message, PlannerStatus):
             statuses.append(message)
 
-    fleet = Fleet(robot, story_of(case), record=hear)
+    fleet = PartialFleet(robot, story_of(case), record=hear)
     fleet.go_on(start.state, start.modules, start.planner)
     begin_ns = fleet.now_ns - round(fleet.world.scenario_s * NS_PER_S)
     rows: list[SimTruth] = []
@@ -212,13 +212,13 @@ def run_case(case: Case, robot: RobotConfig, start: Start) -> Outcome:
 
 
 def _measure(
-    case: Case,
-    fleet: Fleet,
+    case: PartialCase,
+    fleet: PartialFleet,
     rows: list[SimTruth],
     statuses: list[PlannerStatus],
     begin_ns: int,
     led_ns: int | None,
-) -> Outcome:
+) -> PartialResult:
     cut_ns, heal_ns = (begin_ns + round(at * NS_PER_S) for at in (CUT_S, HEAL_S))
     held = [status.t_ns for status in statuses if status.hold and status.t_ns >= cut_ns]
     left = {
@@ -230,7 +230,7 @@ def _measure(
     awake = set(MODULES) - set(case.modules if case.kind == "frozen" else ())
     all_left = bool(left) and awake <= set(left)
     last_s = rows[-1].scenario_s - LAST_S
-    return Outcome(
+    return PartialResult(
         stood=ending_of(rows[-1], END_S, fleet.config) is Ending.STOOD,
         hold_shown_ms=(held[0] - cut_ns) / NS_PER_MS if held else None,
         track_left_ms=(max(left.values()) - cut_ns) / NS_PER_MS if all_left else None,

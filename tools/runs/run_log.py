@@ -2,7 +2,7 @@
 
 A killed file has no summary, and may end in the middle of a record; the readers of
 the mcap package find nothing in the first and may stumble over the second (design
-section 10). `services.recorder.salvage` walks the records from the start and keeps every
+section 10). `services.recorder.reader` walks the records from the start and keeps every
 whole one; here they are sorted by key.
 """
 
@@ -15,9 +15,10 @@ from typing import Any
 import msgspec
 
 from services.recorder import mcap_records as mcap
-from services.recorder.gaps import KeyCount
+from services.recorder.mcap_log import SCHEMA_VERSION
 from services.recorder.mcap_records import Malformed
-from services.recorder.salvage import Loss, Piece, opened
+from services.recorder.reader import LostBytes, Piece, opened
+from services.recorder.sequence_stats import KeyCount
 from shared.exceptions import RunError
 from shared.topics import Topic
 from tools.logs.files import files_in
@@ -55,14 +56,15 @@ class RunLog:
         self.attachments: dict[str, bytes] = {}
         self.complete = True
         """True if the recorder finished every file; False if it was killed."""
-        self.damage: list[Loss] = []
+        self.damage: list[LostBytes] = []
         """Places that could not be read: their contents are left out."""
-        self.cut: Loss | None = None
+        self.cut: LostBytes | None = None
         """What follows the last whole record of a file that was cut off."""
         self._series: dict[str, Series] = {}
         self._by_channel: dict[int, Series] = {}
         for file in self.files:
             self._read(file)
+        self._check_version(self._required("run", "schema_version"))
         self.robot = self._required("run", "robot")
         offset = self._required("clock", "offset_ns")
         if not offset.lstrip("-").isdecimal():
@@ -71,6 +73,13 @@ class RunLog:
         """wall clock in ns since 1970 = `t_ns` of a message + `offset_ns`."""
         for series in self._series.values():
             series.received_ns = [t - self.offset_ns for t in series.received_ns]
+
+    def _check_version(self, version: str) -> None:
+        if version != SCHEMA_VERSION:
+            raise RunError(
+                f"{self.path}: the log has schema version {version}, and this code reads "
+                f"{SCHEMA_VERSION}: read it with the checkout that wrote it"
+            )
 
     @property
     def damaged(self) -> int:

@@ -27,7 +27,7 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
-from tools.runs.impaired import Impaired, impairments, touches
+from tools.runs.impairment_intervals import Impaired, impairments, touches
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog
 from tools.runs.soundness import soundness, why_not_sound

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 
-class Limit(NamedTuple):
+class VerdictLimit(NamedTuple):
     """One row of the verdict table."""
 
     key: str
@@ -15,24 +15,24 @@ class Limit(NamedTuple):
 
 
 LIMITS: Final = (
-    Limit("alive_com_x_max_mm", 20.0, "mm", "COM x, planner leading"),
-    Limit("alive_com_y_max_mm", 10.0, "mm", "COM y, planner leading"),
-    Limit("alive_roll_max_rad", 0.02, "rad", "roll, planner leading"),
-    Limit("alive_yaw_max_rad", 0.02, "rad", "yaw, planner leading"),
-    Limit("alive_sole_tilt_max_rad", 0.02, "rad", "soles' tilt, planner leading"),
-    Limit("torque_at_limit_ms", 50.0, "ms", "module's torque at its limit, longest"),
-    Limit("shaking_nm", 15.0, "N m", "torque above 8 Hz, root mean square"),
-    Limit("sinking_m_s", 0.8, "m/s", "torso's fastest way down"),
-    Limit("operator_peak_n", 40.0, "N", "operator's force, planner leading"),
-    Limit("assist_error_n", 10.0, "N", "assist force against what was asked"),
-    Limit("hold_com_x_max_mm", 80.0, "mm", "COM x after the kill, or in HOLD"),
-    Limit("hold_com_y_max_mm", 100.0, "mm", "COM y after the kill, or in HOLD"),
-    Limit("handover_max_ms", 65.0, "ms", "kill to HOLD, slowest module"),
-    Limit("handover_torque_step_nm", 5.0, "N m", "torque step at hand-over"),
-    Limit("reengage_s", 1.5, "s", "restart to TRACK, slowest module"),
-    Limit("pd_cycles_late_pct", 0.5, "%", "PD cycles later than two periods"),
-    Limit("fleet_cpu_pct", 160.0, "%", "CPU of all processes, of 200"),
-    Limit("sequence_gaps", 0.0, "", "messages lost on the way to the log"),
+    VerdictLimit("alive_com_x_max_mm", 20.0, "mm", "COM x, planner leading"),
+    VerdictLimit("alive_com_y_max_mm", 10.0, "mm", "COM y, planner leading"),
+    VerdictLimit("alive_roll_max_rad", 0.02, "rad", "roll, planner leading"),
+    VerdictLimit("alive_yaw_max_rad", 0.02, "rad", "yaw, planner leading"),
+    VerdictLimit("alive_sole_tilt_max_rad", 0.02, "rad", "soles' tilt, planner leading"),
+    VerdictLimit("torque_at_limit_ms", 50.0, "ms", "module's torque at its limit, longest"),
+    VerdictLimit("shaking_nm", 15.0, "N m", "torque above 8 Hz, root mean square"),
+    VerdictLimit("sinking_m_s", 0.8, "m/s", "torso's fastest way down"),
+    VerdictLimit("operator_peak_n", 40.0, "N", "operator's force, planner leading"),
+    VerdictLimit("assist_error_n", 10.0, "N", "assist force against what was asked"),
+    VerdictLimit("hold_com_x_max_mm", 80.0, "mm", "COM x after the kill, or in HOLD"),
+    VerdictLimit("hold_com_y_max_mm", 100.0, "mm", "COM y after the kill, or in HOLD"),
+    VerdictLimit("handover_max_ms", 65.0, "ms", "kill to HOLD, slowest module"),
+    VerdictLimit("handover_torque_step_nm", 5.0, "N m", "torque step at hand-over"),
+    VerdictLimit("reengage_s", 1.5, "s", "restart to TRACK, slowest module"),
+    VerdictLimit("pd_cycles_late_pct", 0.5, "%", "PD cycles later than two periods"),
+    VerdictLimit("fleet_cpu_pct", 160.0, "%", "CPU of all processes, of 200"),
+    VerdictLimit("sequence_gaps", 0.0, "", "messages lost on the way to the log"),
 )
 """Live targets. Only `stood` decides the exit code: to the end, standing then
 (`tools.runs.standing`), and soundly all the way (`SOUND`)."""

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tools.runs.verdict import Summary
-from tools.runs.verdict_limits import LIMITS, Limit
+from tools.runs.verdict_limits import LIMITS, VerdictLimit
 
 OK: Final = "ok"
 OVER: Final = "over"
@@ -53,7 +53,7 @@ def show(summary: Summary, console: Console) -> None:
     console.print(_sentence(summary))
 
 
-def mark(row: Limit, summary: Summary) -> str:
+def mark(row: VerdictLimit, summary: Summary) -> str:
     """Return what a figure that is there is worth: `ok`, or `over` and perhaps why."""
     if summary[row.key] <= row.limit:
         return OK

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from services.joint.drive_manager import DriveAction, DriveCommand
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import LOST_MS
 from services.joint.drivers.signed import Signs, signed_reading, signed_target
 from services.joint.drivers.zeroed import from_zero, to_drive
-from services.joint.module import Order, Step
 from services.simulator.axis_bank import AxisBank
 from shared.cansimple import AxisState, ControlMode, InputMode
 from shared.clock import NS_PER_S
@@ -64,20 +64,20 @@ class VirtualDrive:
         )
         return from_zero(signed_reading(reading, self._signs), self._zero)
 
-    def carry_out(self, step: Step, *, onboard: bool) -> None:
+    def carry_out(self, step: DriveAction, *, onboard: bool) -> None:
         """Do what a cycle asks for, if the drive can hear it; any word feeds its watchdog."""
         bank, (a, b) = self._bank, self._axes
-        if step.order is Order.NOTHING or not bank.talks(a):
+        if step.order is DriveCommand.NOTHING or not bank.talks(a):
             return
         self._written = True
         if step.target is not None:
             self._aim(signed_target(to_drive(step.target, self._zero), self._signs))
-        elif step.order is Order.TORQUE:
+        elif step.order is DriveCommand.TORQUE:
             (a_torque, b_torque), (a_sign, b_sign) = step.torque, self._signs
             bank.input_torque[self._module] = (a_torque * a_sign, b_torque * b_sign)
-        elif step.order is Order.ARM:
+        elif step.order is DriveCommand.ARM:
             self._arm(onboard=onboard)
-        elif step.order is Order.FORGET_ZERO:
+        elif step.order is DriveCommand.FORGET_ZERO:
             for axis in self._axes:
                 bank.set_count(axis, 0.0)
         else:

@@ -17,7 +17,7 @@ from shared.loadcell_can import LegSample, SampleAssembler
 from shared.messages import Message, TareRequest, Vector6, Wrench
 from shared.topics import WRENCH, Topic
 from tools.runs.host_clock import HostClock, HostLink
-from tools.runs.network import Link
+from tools.runs.network import VirtualLink
 from tools.runs.virtual_can import VirtualCan, whole_steps_ns
 
 
@@ -42,7 +42,7 @@ class VirtualHarness:
     def __init__(
         self,
         config: RobotConfig,
-        wrenches: Link[Wrench],
+        wrenches: VirtualLink[Wrench],
         record: Callable[[Topic, str, Message], None],
         seed: int,
         clock: HostClock,

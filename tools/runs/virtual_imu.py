@@ -14,7 +14,7 @@ from shared.imu_can import ImuAssembler
 from shared.messages import Attitude, Message
 from shared.topics import ATTITUDE, Topic
 from tools.runs.host_clock import HostClock, HostLink
-from tools.runs.network import Link
+from tools.runs.network import VirtualLink
 from tools.runs.virtual_can import VirtualCan, whole_steps_ns
 
 
@@ -25,7 +25,7 @@ class VirtualImu:
         self,
         config: RobotConfig,
         errors: ImuErrors,
-        attitudes: Link[Attitude],
+        attitudes: VirtualLink[Attitude],
         record: Callable[[Topic, str, Message], None],
         seed: int,
         clock: HostClock,

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from shared.impairment import Impairment
-from shared.injections import Injections
+from shared.impairment_schedule import ImpairmentSchedule
 from shared.joints import MODULES
 from shared.links import ATTITUDES, DIRECTIONS, WRENCHES
 from shared.messages import Attitude, JointCommand, JointState, Wrench
 from shared.scenario import Inject
 from shared.traces import LinkEvent
-from tools.runs.network import Link
+from tools.runs.network import VirtualLink
 
 
 class VirtualNetwork:
@@ -33,26 +33,28 @@ class VirtualNetwork:
             seed: of all that is decided.
             record: takes an event whenever something begins or ends.
         """
-        self._links: dict[str, Link[Any]] = {name: Link(base, name, seed) for name in DIRECTIONS}
-        self._injections = Injections(
+        self._links: dict[str, VirtualLink[Any]] = {
+            name: VirtualLink(base, name, seed) for name in DIRECTIONS
+        }
+        self._injections = ImpairmentSchedule(
             {name: link.direction for name, link in self._links.items()}, record
         )
         for inject in sorted(injects, key=lambda inject: inject.at):
             self._injections.plan(inject.link, inject, inject.at, inject.until)
 
-    def commands(self) -> list[Link[JointCommand]]:
+    def commands(self) -> list[VirtualLink[JointCommand]]:
         """Return the links from the planner, in the order of the modules."""
         return [self._links[f"planner->{module}"] for module in MODULES]
 
-    def states(self) -> list[Link[JointState]]:
+    def states(self) -> list[VirtualLink[JointState]]:
         """Return the links to the planner, in the order of the modules."""
         return [self._links[f"{module}->planner"] for module in MODULES]
 
-    def wrenches(self) -> Link[Wrench]:
+    def wrenches(self) -> VirtualLink[Wrench]:
         """Return the link from the harness to the planner."""
         return self._links[WRENCHES]
 
-    def attitudes(self) -> Link[Attitude]:
+    def attitudes(self) -> VirtualLink[Attitude]:
         """Return the link from the IMU to the planner."""
         return self._links[ATTITUDES]
 

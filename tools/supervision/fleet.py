@@ -62,7 +62,7 @@ class Process(Section, frozen=True):
     """Topic that it publishes steadily, as in `shared.topics`; empty if there is none."""
 
 
-class Table(Section, frozen=True):
+class ProcessTable(Section, frozen=True):
     """The whole process table."""
 
     environment: dict[str, str]
@@ -70,7 +70,7 @@ class Table(Section, frozen=True):
     process: tuple[Process, ...]
 
 
-class Listener(NamedTuple):
+class ListenPoint(NamedTuple):
     """An endpoint that a service of the fleet will listen on."""
 
     service: str
@@ -80,7 +80,7 @@ class Listener(NamedTuple):
     """As Zenoh writes it: unixsock-stream/PATH or tcp/HOST:PORT."""
 
 
-class Plan(NamedTuple):
+class FleetPlan(NamedTuple):
     """A fleet that is to be started."""
 
     config_path: Path
@@ -88,7 +88,7 @@ class Plan(NamedTuple):
     processes: tuple[Process, ...]
     commands: dict[str, list[str]]
     """Arguments of each service, placeholders filled in."""
-    listeners: tuple[Listener, ...]
+    listeners: tuple[ListenPoint, ...]
     environment: dict[str, str]
     emulated_usb: bool = False
     """The services look for their drives on USB, and find emulated ones there."""
@@ -104,7 +104,7 @@ def make_plan(
     simulation: bool,
     injected: bool = False,
     table_path: Path,
-) -> Plan:
+) -> FleetPlan:
     """Return what is to be started; the arguments are those of `supervise.Fleet.start`.
 
     Raises:
@@ -135,16 +135,16 @@ def make_plan(
     }
     listeners = listeners_of(rows, config, run_dir)
     usb = emulated and config.joint_service.driver == "odrive_usb"
-    return Plan(path, rows, commands, listeners, table.environment, emulated_usb=usb)
+    return FleetPlan(path, rows, commands, listeners, table.environment, emulated_usb=usb)
 
 
-def load_table(path: Path = TABLE) -> Table:
+def load_table(path: Path = TABLE) -> ProcessTable:
     """Read the process table, with one row for each service: `{module}` rows are six.
 
     Raises:
         ConfigError: the table cannot be read, or a service stands in it twice.
     """
-    table = read_toml(path, Table)
+    table = read_toml(path, ProcessTable)
     topics = [topic.name for topic in TOPICS]
     rows: list[Process] = []
     for index, row in enumerate(table.process):
@@ -171,7 +171,7 @@ def is_simulated(config: RobotConfig) -> bool:
 
 
 def select(
-    table: Table,
+    table: ProcessTable,
     *,
     simulation: bool,
     injected: bool = False,
@@ -224,23 +224,20 @@ def command_of(process: Process, config_path: Path, run_dir: Path) -> list[str]:
 
 def listeners_of(
     processes: Iterable[Process], config: RobotConfig, run_dir: Path
-) -> tuple[Listener, ...]:
+) -> tuple[ListenPoint, ...]:
     """Return where these services will listen: on the bus, and the emulated drives' buses."""
     listeners = []
     for row in processes:
         if row.name in config.bus.endpoints:
             endpoint = expand(config.bus.endpoints[row.name], run_dir)
-            listeners.append(Listener(row.name, f"bus.endpoints.{row.name}", endpoint))
+            listeners.append(ListenPoint(row.name, f"bus.endpoints.{row.name}", endpoint))
         if row.kind == "injector":
-            listeners += [
-                Listener(row.name, "(the run directory)", expand(endpoint_through(pair), run_dir))
-                for pair in PAIRS
-            ]
-            control = f"{UNIX}{run_dir / SOCKET}"
-            listeners.append(Listener(row.name, "(the run directory)", control))
+            endpoints = [expand(endpoint_through(pair), run_dir) for pair in PAIRS]
+            endpoints.append(f"{UNIX}{run_dir / SOCKET}")
+            listeners += [ListenPoint(row.name, "(the run directory)", at) for at in endpoints]
         if row.kind == "simulator":
             listeners += [
-                Listener(row.name, f"can.{name}.channel", UNIX + expand(bus.channel, run_dir))
+                ListenPoint(row.name, f"can.{name}.channel", UNIX + expand(bus.channel, run_dir))
                 for name, bus in config.can.items()
                 if bus.interface == SIMULATED_CAN
             ]
@@ -274,7 +271,7 @@ def check_run_dir(run_dir: Path, config: RobotConfig) -> None:
         )
 
 
-def check_free(listeners: Iterable[Listener]) -> None:
+def check_free(listeners: Iterable[ListenPoint]) -> None:
     """Refuse endpoints that another process listens on.
 
     Raises:

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import msgspec
 
-from services.joint import neighbours, will
+from services.joint import neighbours, rearm_guard
 from shared.clock import PACE_FILE
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from tools.supervision.fleet import SUPERVISOR_SOCKET, UNIX, Plan, is_listening
+from tools.supervision.fleet import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_listening
 
 _NEVER_GIVE_UP = 1_000_000
 """Starts that may fail in a row; each waits a second longer than the one before."""
@@ -93,7 +93,7 @@ class RunDir:
         except FileNotFoundError:
             return False
 
-    def prepare(self, plan: Plan, pace: float = 1.0) -> None:
+    def prepare(self, plan: FleetPlan, pace: float = 1.0) -> None:
         """Start with empty logs and no dead sockets; write the manifest and the clock's pace."""
         self.pace.unlink(missing_ok=True)
         if pace != 1.0:
@@ -116,7 +116,7 @@ class RunDir:
     def _remove_shared_memory(self) -> None:
         """Forget what joint services of another time have left: a fleet is asked for anew."""
         for module in MODULES:
-            will.path_of(self.path, module).unlink(missing_ok=True)
+            rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
         neighbours.path_of(self.path).unlink(missing_ok=True)
 
     def read_manifest(self) -> Manifest | None:
@@ -141,7 +141,7 @@ class RunDir:
             self.path.rmdir()
 
 
-def supervisor_config(run: RunDir, plan: Plan, no_restart: Collection[str]) -> str:
+def supervisor_config(run: RunDir, plan: FleetPlan, no_restart: Collection[str]) -> str:
     """Return supervisord's configuration.
 
     Args:

@@ -1,7 +1,7 @@
 """A fleet of services under supervisord: start, look, signal, stop.
 
 supervisord restarts what ends, with a growing delay for what ends at once. It runs on a
-leash (`tools.supervision.leash`): if it is killed, so is every service.
+leash (`tools.supervision.parent_death`): if it is killed, so is every service.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
-from services.joint import will
+from services.joint import rearm_guard
 from services.simulator import usb_standin
 from shared.exceptions import FleetError
 from tools.supervision import fleet, procfs
@@ -30,7 +30,7 @@ _FAILED = ("backoff", "exited", "fatal")
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Fleet:
+class SupervisedFleet:
     """The services of one run directory."""
 
     def __init__(self, run_dir: Path) -> None:
@@ -163,12 +163,12 @@ class Fleet:
 
     def forget(self, service: str) -> None:
         """Have the next process of a joint service arm its drive, whatever the last left."""
-        will.forget(self.run.path, service)
+        rearm_guard.clear(self.run.path, service)
 
     def start_service(self, service: str) -> None:
         """Start a service that is down, without waiting for a restart that is delayed.
 
-        It is asked for: a drive that has let go is armed again (`services.joint.will`).
+        It is asked for: a drive that has let go is armed again (`services.joint.rearm_guard`).
         One that is suspended is continued; one that runs is left alone.
 
         Raises:
@@ -236,11 +236,18 @@ class Fleet:
 
     def _launch(self, environment: Mapping[str, str], lock: int, *, leashed: bool) -> None:
         leash = ["--parent", str(os.getpid())] if leashed else []
-        command = [sys.executable, "-m", "tools.supervision.leash", *leash, "--", "--nodaemon"]
+        command = [
+            sys.executable,
+            "-m",
+            "tools.supervision.parent_death",
+            *leash,
+            "--",
+            "--nodaemon",
+        ]
         command += ["--configuration", str(self.run.supervisor_config)]
         marked = {**os.environ, **environment, procfs.FLEET_VARIABLE: str(self.run.path)}
         # An interrupt between fork and exec would leave a process that nobody can find;
-        # `tools.supervision.leash` unblocks in the child.
+        # `tools.supervision.parent_death` unblocks in the child.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
         try:
             with self.run.supervisor_stderr.open("wb") as output:
@@ -256,7 +263,7 @@ class Fleet:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def _wait_until_up(self, plan: fleet.Plan, timeout_s: float) -> None:
+    def _wait_until_up(self, plan: fleet.FleetPlan, timeout_s: float) -> None:
         endpoints = {
             item.service: item.endpoint for item in plan.listeners if item.key.startswith("bus.")
         }

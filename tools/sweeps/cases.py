@@ -49,7 +49,7 @@ DIGITS: Final = 3
 """What is drawn is rounded to these: it can be read, typed in again, and is what was run."""
 
 
-class Pose(msgspec.Struct, frozen=True):
+class LeadPose(msgspec.Struct, frozen=True):
     """Where the operator leads."""
 
     height_m: float
@@ -57,13 +57,13 @@ class Pose(msgspec.Struct, frozen=True):
     assist_n: float
 
 
-class Case(msgspec.Struct, frozen=True, kw_only=True):
+class KillCase(msgspec.Struct, frozen=True, kw_only=True):
     """What was drawn. SI units; times are the scenario's."""
 
     number: int
     seed: int
     payload_kg: float
-    poses: tuple[Pose, ...]
+    poses: tuple[LeadPose, ...]
     """One or two, led to one after the other from standing."""
     pace: float
     moving: bool
@@ -91,7 +91,7 @@ def payloads(robot: RobotConfig) -> tuple[float, ...]:
     return tuple(round(highest * i / (PAYLOADS - 1), DIGITS) for i in range(PAYLOADS))
 
 
-class Cases:
+class KillCases:
     """The cases of a robot."""
 
     def __init__(self, robot: RobotConfig, push: float = SHARE) -> None:
@@ -104,7 +104,7 @@ class Cases:
         self._robot, self._push = robot, push
         self._by_payload: dict[float, tuple[RobotConfig, PushRange]] = {}
 
-    def draw(self, seed: int, number: int) -> Case:
+    def draw(self, seed: int, number: int) -> KillCase:
         """Return one case; no other case has to be drawn for it."""
         dice = random.Random(f"kill {seed} {number}")
         payload = dice.choice(payloads(self._robot))
@@ -119,7 +119,7 @@ class Cases:
         let_go = None
         if hand_off:
             let_go = kill if at_the_kill else _uniform(dice, max(0.0, kill - LET_GO_S), kill)
-        return Case(
+        return KillCase(
             number=number,
             seed=seed,
             payload_kg=payload,
@@ -140,7 +140,7 @@ class Cases:
         return self._by_payload[payload]
 
 
-def _draw_pose(dice: random.Random, robot: RobotConfig) -> Pose:
+def _draw_pose(dice: random.Random, robot: RobotConfig) -> LeadPose:
     """Draw a posture that the legs reach, and the weight rested on it in half of the cases."""
     while True:
         upright = dice.random() < 0.5
@@ -149,7 +149,7 @@ def _draw_pose(dice: random.Random, robot: RobotConfig) -> Pose:
         if reachable(robot, height, pitch):
             break
     resting = dice.random() < 0.5
-    return Pose(height, pitch, _uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0)
+    return LeadPose(height, pitch, _uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0)
 
 
 def _draw_pushes(dice: random.Random, kill_s: float, drawn_from: PushRange) -> list[Push]:
@@ -183,10 +183,12 @@ def reachable(robot: RobotConfig, height: float, pitch: float) -> bool:
     )
 
 
-def _legs(robot: RobotConfig, poses: tuple[Pose, ...], pace: float) -> list[tuple[float, float]]:
+def _legs(
+    robot: RobotConfig, poses: tuple[LeadPose, ...], pace: float
+) -> list[tuple[float, float]]:
     """Return when the way to each pose begins and ends, s."""
     legs, t = [], START_S
-    before = Pose(robot.simulation.stand_height, 0.0, 0.0)
+    before = LeadPose(robot.simulation.stand_height, 0.0, 0.0)
     for pose in poses:
         ways = zip(msgspec.structs.astuple(before), msgspec.structs.astuple(pose), strict=True)
         times = [abs(b - a) / speed for (a, b), speed in zip(ways, SPEED, strict=True)]
@@ -195,7 +197,7 @@ def _legs(robot: RobotConfig, poses: tuple[Pose, ...], pace: float) -> list[tupl
     return legs
 
 
-def story_of(robot: RobotConfig, case: Case) -> Scenario:
+def story_of(robot: RobotConfig, case: KillCase) -> Scenario:
     """Return the case as a scenario; the hand that lets go is not in it."""
     frames = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
     for pose, (_, end) in zip(case.poses, _legs(robot, case.poses, case.pace), strict=True):
@@ -212,7 +214,7 @@ def story_of(robot: RobotConfig, case: Case) -> Scenario:
     )
 
 
-def network_of(case: Case) -> Impairment:
+def network_of(case: KillCase) -> Impairment:
     """Return what every link does in a case."""
     return Impairment(delay_ms=case.delay_ms)
 
@@ -223,7 +225,7 @@ def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
     return msgspec.structs.replace(robot, mass=mass)
 
 
-def row_of(case: Case) -> dict[str, object]:
+def row_of(case: KillCase) -> dict[str, object]:
     """Return every draw by its column; None where there was no such draw."""
     row: dict[str, object] = {
         "number": case.number,
@@ -238,7 +240,7 @@ def row_of(case: Case) -> dict[str, object]:
     }
     for index in range(POSES_MAX):
         pose = case.poses[index] if index < len(case.poses) else None
-        for key in Pose.__struct_fields__:
+        for key in LeadPose.__struct_fields__:
             row[f"pose{index + 1}_{key}"] = getattr(pose, key, None)
     for index in range(PUSHES_MAX):
         push = case.pushes[index] if index < len(case.pushes) else None

@@ -14,8 +14,8 @@ from shared import config_file
 from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.sweeps import certificate_study, study
-from tools.sweeps.certificate_study import Cases, Outcome
-from tools.sweeps.table import Table, code_digest, code_of
+from tools.sweeps.certificate_study import CertificateCases, CertificateResult
+from tools.sweeps.table import CaseTable, code_digest, code_of
 from tools.verbs import add_config
 
 N: Final = 200
@@ -33,7 +33,7 @@ EXAMPLES: Final = """
 """
 
 
-class Batch(NamedTuple):
+class CaseBatch(NamedTuple):
     """Cases to run in one go."""
 
     robot: RobotConfig
@@ -61,18 +61,20 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if a case fell that was said to stand."""
     study.check_least(("--n", args.n, 1))
-    crew = study.crew_of(args, CODE)
+    crew = study.executor_of(args, CODE)
     robot = config_file.load(args.config)
     plant = IDEAL if args.friction else certificate_study.FRICTIONLESS
     console = Console()
     out = study.folder(args.out, "certificate")
     first = row_of(
-        certificate_study.run(robot, Cases(robot).draw(args.seed, 0), rigid=args.rigid, plant=plant)
+        certificate_study.run(
+            robot, CertificateCases(robot).draw(args.seed, 0), rigid=args.rigid, plant=plant
+        )
     )
-    with Table(out, TABLE, tuple(first), _inputs(args, robot), WORDS) as table:
+    with CaseTable(out, TABLE, tuple(first), _inputs(args, robot), WORDS) as table:
         missing = [number for number in range(args.n) if number not in table.numbers]
         batches = [
-            Batch(robot, args.seed, tuple(missing[start : start + BATCH]), args.rigid, plant)
+            CaseBatch(robot, args.seed, tuple(missing[start : start + BATCH]), args.rigid, plant)
             for start in range(0, len(missing), BATCH)
         ]
         with study.resumable(table, out, _command(args), crew, console):
@@ -98,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     return 1 if found.stand_fell else 0
 
 
-def row_of(outcome: Outcome) -> dict[str, object]:
+def row_of(outcome: CertificateResult) -> dict[str, object]:
     """Return an outcome as a row of the table."""
     case, posture, weakest = outcome.case, outcome.case.posture, outcome.case.weakest
     row: dict[str, object] = {
@@ -121,8 +123,8 @@ def row_of(outcome: Outcome) -> dict[str, object]:
     return row | {f"D{joint}": float(value) for joint, value in enumerate(case.D[:6])}
 
 
-def _run_batch(batch: Batch) -> list[Outcome]:
-    cases = Cases(batch.robot)
+def _run_batch(batch: CaseBatch) -> list[CertificateResult]:
+    cases = CertificateCases(batch.robot)
     return [
         certificate_study.run(
             batch.robot, cases.draw(batch.seed, number), rigid=batch.rigid, plant=batch.plant
@@ -131,11 +133,11 @@ def _run_batch(batch: Batch) -> list[Outcome]:
     ]
 
 
-def _name(batch: Batch) -> str:
+def _name(batch: CaseBatch) -> str:
     return f"cases {batch.numbers[0]} to {batch.numbers[-1]} (seed {batch.seed})"
 
 
-def _rows(_batch: Batch, outcomes: list[Outcome]) -> list[dict[str, object]]:
+def _rows(_batch: CaseBatch, outcomes: list[CertificateResult]) -> list[dict[str, object]]:
     return [row_of(outcome) for outcome in outcomes]
 
 

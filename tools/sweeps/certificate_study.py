@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from services.joint import differential
-from services.joint.gate import gate, limits_of
-from services.joint.law import ZERO, Setpoint, torque
+from services.joint.pd_law import ZERO, Setpoint, torque
+from services.joint.torque_limiter import limit_torque, limits_of
 from services.planner.certificate import Certificate, Weakest
 from services.planner.gains import GainLaw
 from services.planner.inverse_kinematics import InverseKinematics
@@ -102,7 +102,7 @@ class Posture(NamedTuple):
     """(12,) N m"""
 
 
-class Case(NamedTuple):
+class CertificateCase(NamedTuple):
     """A posture with local gains and a nudge."""
 
     number: int
@@ -117,10 +117,10 @@ class Case(NamedTuple):
     """With tier 2's margin (`services.planner.certificate`)."""
 
 
-class Outcome(NamedTuple):
+class CertificateResult(NamedTuple):
     """What the simulation did."""
 
-    case: Case
+    case: CertificateCase
     stood: bool
     fallen: bool
     """True if it lay on the floor within the time; False also for a drift away."""
@@ -160,7 +160,7 @@ def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
     return msgspec.structs.replace(robot, mass=mass)
 
 
-class Cases:
+class CertificateCases:
     """Draws cases of a robot; each number is its own, whatever was drawn before."""
 
     def __init__(self, robot: RobotConfig) -> None:
@@ -169,7 +169,7 @@ class Cases:
         self._kinematics = [Kinematics(loaded) for loaded in self._robots]
         self._limits: Array = np.array(robot.joint_limits())
 
-    def draw(self, seed: int, number: int) -> Case:
+    def draw(self, seed: int, number: int) -> CertificateCase:
         """Return a case; raise `RunError` if the robot can hardly stand in any posture."""
         rng, (low, high) = np.random.default_rng((seed, number)), FACTORS
         for _ in range(DRAWS_MAX):
@@ -189,7 +189,7 @@ class Cases:
             T = np.asarray(np.linalg.solve(chain, np.eye(N_JOINTS)[:, :6]), float)
             certificate.at(T, hessian_O)
             D_B = np.minimum(DAMPING_S * D, DAMPING_MAX)
-            return Case(number, posture, D, D_B, _nudge(rng), certificate.weakest(D))
+            return CertificateCase(number, posture, D, D_B, _nudge(rng), certificate.weakest(D))
         raise RunError(
             f"case {number}: of {DRAWS_MAX} postures none can be reached and carried; "
             "see limits, geometry and mass in the robot file"
@@ -225,7 +225,7 @@ def _nudge(rng: np.random.Generator) -> tuple[float, float]:
 class _Module:
     """A joint service that holds: its law frozen, its gate and its differential."""
 
-    def __init__(self, robot: RobotConfig, case: Case, index: int) -> None:
+    def __init__(self, robot: RobotConfig, case: CertificateCase, index: int) -> None:
         def pair(values: Array) -> Pair:
             return float(values[2 * index]), float(values[2 * index + 1])
 
@@ -238,13 +238,13 @@ class _Module:
     def motor_torque(self, turns: Pair, turns_per_s: Pair) -> Pair:
         q = differential.joint_from_motor(turns, self._gear_ratio)
         v = differential.joint_from_motor(turns_per_s, self._gear_ratio)
-        self._tau = gate(torque(self._setpoint, q, v), q, self._tau, self._limits)
+        self._tau = limit_torque(torque(self._setpoint, q, v), q, self._tau, self._limits)
         return differential.motor_torque(self._tau, self._gear_ratio)
 
 
 def world_of(
     robot: RobotConfig,
-    case: Case,
+    case: CertificateCase,
     nudge_share: float,
     *,
     rigid: bool,
@@ -274,12 +274,12 @@ def world_of(
 
 def run(
     robot: RobotConfig,
-    case: Case,
+    case: CertificateCase,
     nudge_share: float = 1.0,
     *,
     rigid: bool = False,
     plant: PlantConfig = FRICTIONLESS,
-) -> Outcome:
+) -> CertificateResult:
     """Simulate a case; arguments as for `world_of`."""
     world = world_of(robot, case, nudge_share, rigid=rigid, plant=plant)
     modules = [_Module(robot, case, index) for index in range(len(MODULES))]
@@ -300,7 +300,7 @@ def run(
     return judge(case, rows)
 
 
-def judge(case: Case, rows: Sequence[SimTruth]) -> Outcome:
+def judge(case: CertificateCase, rows: Sequence[SimTruth]) -> CertificateResult:
     """Return the outcome of a run, whose first row is from before the nudge."""
     com = np.array([row.com for row in rows])
     angles = np.array([row.angles for row in rows])
@@ -311,7 +311,7 @@ def judge(case: Case, rows: Sequence[SimTruth]) -> Outcome:
     late = 2 * len(rows) // 3
     growth = float(departure[late:].max(initial=0.0) / departure[:late].max(initial=STILL))
     stays = departure.max() < 1.0 and tilt < TILT_BOUND and growth < GROWTH_BOUND
-    return Outcome(
+    return CertificateResult(
         case=case,
         stood=bool(stays and not rows[-1].fallen),
         fallen=rows[-1].fallen,

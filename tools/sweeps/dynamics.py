@@ -17,8 +17,8 @@ from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.sweeps import study
-from tools.sweeps.dynamics_trial import ENDINGS, Outcome, Trial, draw, run_trial
-from tools.sweeps.table import Row, Table, code_digest, code_of
+from tools.sweeps.dynamics_trial import ENDINGS, DynamicsResult, DynamicsTrial, draw, run_trial
+from tools.sweeps.table import CaseTable, Row, code_digest, code_of
 from tools.verbs import add_config
 
 mpl.use("Agg")
@@ -33,7 +33,7 @@ WORDS: Final = {
     "said_stable": {"True", "False"},
     "grew": {"True", "False"},
 }
-Task: TypeAlias = "tuple[Trial, RobotConfig]"
+Task: TypeAlias = "tuple[DynamicsTrial, RobotConfig]"
 
 EXAMPLES: Final = """
     xrl sweep dynamics
@@ -53,7 +53,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if anything grew that was said to fade."""
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
-    crew = study.crew_of(args, CODE)
+    crew = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config)
     console = Console()
     if args.only is not None:
@@ -65,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
     out = study.folder(args.out, "dynamics")
     trials = [draw(args.seed, number) for number in range(args.n)]
     begins = [_begin(trial) for trial in trials]
-    columns = [*begins[0], *Outcome.__struct_fields__, "said_stable", "grew"]
-    with Table(out, TABLE, columns, _inputs(args, robot), WORDS, begins) as table:
+    columns = [*begins[0], *DynamicsResult.__struct_fields__, "said_stable", "grew"]
+    with CaseTable(out, TABLE, columns, _inputs(args, robot), WORDS, begins) as table:
         missing = [(trial, robot) for trial in trials if trial.number not in table.numbers]
         with study.resumable(table, out, f"{_command(args)} --n {args.n}", crew, console):
             study.fill(table, JOB, missing, crew, args.n, console)
@@ -121,19 +121,19 @@ def draw_picture(rows: Sequence[Row], title: str, path: Path) -> None:
     figure.savefig(path)
 
 
-def _begin(trial: Trial) -> dict[str, object]:
+def _begin(trial: DynamicsTrial) -> dict[str, object]:
     """Return a trial's draws by column."""
     row = msgspec.structs.asdict(trial)
     factors = row.pop("damping")
     return row | {f"damping_{joint}": factor for joint, factor in enumerate(factors)}
 
 
-def _row(task: Task, outcome: Outcome) -> dict[str, object]:
+def _row(task: Task, outcome: DynamicsResult) -> dict[str, object]:
     said = {"said_stable": outcome.said_stable, "grew": outcome.grew}
     return _begin(task[0]) | msgspec.structs.asdict(outcome) | said
 
 
-def _run_task(task: Task) -> Outcome:
+def _run_task(task: Task) -> DynamicsResult:
     return run_trial(*task)
 
 
@@ -141,7 +141,7 @@ def _name(task: Task) -> str:
     return f"case {task[0].number} (xrl sweep dynamics --only {task[0].number})"
 
 
-def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
+def _rows(task: Task, outcome: DynamicsResult) -> list[dict[str, object]]:
     return [_row(task, outcome)]
 
 

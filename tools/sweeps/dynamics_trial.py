@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from services.planner.dynamic_certificate import Condition, DynamicCertificate, nodes_of
 from services.planner.planner import Planner
-from services.planner.sampled_loop import NOMINAL, Hand
+from services.planner.sampled_loop import NOMINAL, HandModel
 from services.planner.split_program import design_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
 from shared.config import RobotConfig
@@ -66,7 +66,7 @@ SHAKES_RAD_S: Final = 0.1
 ENDINGS: Final = frozenset(("tracked", "left", "fell", "unready"))
 
 
-class Trial(msgspec.Struct, frozen=True, kw_only=True):
+class DynamicsTrial(msgspec.Struct, frozen=True, kw_only=True):
     """What is drawn."""
 
     number: int
@@ -82,7 +82,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
     coupling: float
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class DynamicsResult(msgspec.Struct, frozen=True, kw_only=True):
     """What was said, and what happened."""
 
     rate: float
@@ -109,10 +109,10 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
         return self.late_rad_s > least or self.ended in ("left", "fell")
 
 
-def draw(seed: int, number: int) -> Trial:
+def draw(seed: int, number: int) -> DynamicsTrial:
     """Return one trial; no other has to be drawn for it."""
     dice = random.Random(f"dynamics {seed} {number}")
-    return Trial(
+    return DynamicsTrial(
         number=number,
         seed=seed,
         height=round(dice.uniform(*HEIGHTS), 3),
@@ -129,7 +129,7 @@ def _log(dice: random.Random, low: float, high: float) -> float:
     return math.exp(dice.uniform(math.log(low), math.log(high)))
 
 
-def plant_of(robot: RobotConfig, trial: Trial) -> PlantConfig:
+def plant_of(robot: RobotConfig, trial: DynamicsTrial) -> PlantConfig:
     """Return the linear model's plant."""
     return changed(
         IDEAL,
@@ -145,7 +145,7 @@ def plant_of(robot: RobotConfig, trial: Trial) -> PlantConfig:
     )
 
 
-def drawn(robot: RobotConfig, trial: Trial) -> RobotConfig:
+def drawn(robot: RobotConfig, trial: DynamicsTrial) -> RobotConfig:
     """Return the robot with the trial's gains in its schedule."""
     schedule = robot.gain_schedule
     assert schedule is not None  # noqa: S101 - `load_robot` has seen to it
@@ -160,7 +160,7 @@ def drawn(robot: RobotConfig, trial: Trial) -> RobotConfig:
     return msgspec.structs.replace(robot, gain_schedule=new)
 
 
-def delay_s(robot: RobotConfig, trial: Trial) -> float:
+def delay_s(robot: RobotConfig, trial: DynamicsTrial) -> float:
     """Return the time from a sample to the first use of its command, s.
 
     A planner on the spot answers within the millisecond, for the next joint cycle.
@@ -169,7 +169,7 @@ def delay_s(robot: RobotConfig, trial: Trial) -> float:
     return cycle * max(1, math.ceil(2e-3 * trial.delay_ms / cycle - 1e-9))
 
 
-def story_of(robot: RobotConfig, trial: Trial) -> Scenario:
+def story_of(robot: RobotConfig, trial: DynamicsTrial) -> Scenario:
     """Return what happens."""
     tap = {"at": TAP_S, "duration": TAP_LASTS_S}
     return Scenario(
@@ -184,12 +184,12 @@ def story_of(robot: RobotConfig, trial: Trial) -> Scenario:
     )
 
 
-UNREADY: Final = Outcome(
+UNREADY: Final = DynamicsResult(
     rate=0.0, frequency_hz=0.0, mode="", early_rad_s=0.0, late_rad_s=0.0, ended="unready"
 )
 
 
-def run_trial(trial: Trial, robot: RobotConfig) -> Outcome:
+def run_trial(trial: DynamicsTrial, robot: RobotConfig) -> DynamicsResult:
     """Run a trial; its joint services believe gains that the law would never send."""
     fleet = Lockstep(
         believing(robot),
@@ -200,7 +200,7 @@ def run_trial(trial: Trial, robot: RobotConfig) -> Outcome:
     other = drawn(robot, trial)
     rates: list[float] = []
     times: list[float] = []
-    said: Outcome | None = None
+    said: DynamicsResult | None = None
     ended = "tracked"
     for row in fleet.run():
         if row.fallen or any(c.failsafe.mode is not Mode.TRACK for c in fleet.controllers):
@@ -240,10 +240,10 @@ def _take_over(fleet: Lockstep, robot: RobotConfig) -> None:
     before = fleet.planner
     assert before is not None  # noqa: S101 - nobody kills it
     fleet.planner = Planner(robot, before.session)
-    fleet.planner.recall(before.remember())
+    fleet.planner.restore(before.snapshot())
 
 
-def _said(fleet: Lockstep, robot: RobotConfig, trial: Trial) -> Outcome | None:
+def _said(fleet: Lockstep, robot: RobotConfig, trial: DynamicsTrial) -> DynamicsResult | None:
     """Ask the certificate about where the robot is now; None: no level stand is near."""
     assert fleet.planner is not None  # noqa: S101 - nobody kills it
     schedule = robot.gain_schedule
@@ -266,7 +266,7 @@ def _said(fleet: Lockstep, robot: RobotConfig, trial: Trial) -> Outcome | None:
                 half,
                 trial.stiffness,
                 delay_s(robot, trial),
-                Hand(hand.k_z, hand.b_z, hand.k_pitch, hand.b_pitch),
+                HandModel(hand.k_z, hand.b_z, hand.k_pitch, hand.b_pitch),
                 NOMINAL,
             ),
             design_of(schedule),
@@ -274,7 +274,7 @@ def _said(fleet: Lockstep, robot: RobotConfig, trial: Trial) -> Outcome | None:
         for half in (0, 1)
     ]
     worst = max(verdicts, key=lambda verdict: verdict.excess)
-    return Outcome(
+    return DynamicsResult(
         rate=worst.excess,
         frequency_hz=worst.growth.frequency_hz,
         mode=worst.condition.words().partition(":")[0],

@@ -13,12 +13,11 @@ from shared.config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.sweeps import cases, picture, plants, push_range, report, study
-from tools.sweeps.cases import Case
 from tools.sweeps.figures import ENDINGS, Ending
-from tools.sweeps.outcome import Outcome, plant_of, run_case
+from tools.sweeps.outcome import KillResult, plant_of, run_case
 from tools.sweeps.prepare import needs_schedule, prepare
 from tools.sweeps.record import run_alone
-from tools.sweeps.table import Table, code_digest, code_of
+from tools.sweeps.table import CaseTable, code_digest, code_of
 from tools.verbs import add_config
 
 N: Final = 500
@@ -26,9 +25,9 @@ TABLE: Final = "cases.csv"
 PICTURE: Final = "cases.png"
 CODE: Final = code_of("tools.sweeps.outcome")
 """What decides how a case comes out."""
-COLUMNS_OUT: Final = Outcome.__struct_fields__
+COLUMNS_OUT: Final = KillResult.__struct_fields__
 WORDS: Final = {"ending": ENDINGS}
-Task: TypeAlias = "tuple[Case, RobotConfig]"
+Task: TypeAlias = "tuple[cases.KillCase, RobotConfig]"
 
 EXAMPLES: Final = """
     xrl sweep kill
@@ -64,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the study, or one case of it; 1 if any fell."""
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
     push_range.check(args)
-    crew = study.crew_of(args, CODE)
+    crew = study.executor_of(args, CODE)
     robot = experiment.make_robot(args)
     console = Console()
     if args.only is not None:
@@ -73,14 +72,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_all(
-    args: argparse.Namespace, robot: RobotConfig, crew: study.Crew, console: Console
+    args: argparse.Namespace, robot: RobotConfig, crew: study.Executor, console: Console
 ) -> int:
     out = study.folder(args.out, "kill")
-    study_of = cases.Cases(robot, args.push)
+    study_of = cases.KillCases(robot, args.push)
     drawn = [study_of.draw(args.seed, number) for number in range(args.n)]
     rows_begin = [cases.row_of(case) for case in drawn]
     columns = [*rows_begin[0], *COLUMNS_OUT]
-    with Table(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
+    with CaseTable(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
         missing = [case for case in drawn if case.number not in table.numbers]
         with study.resumable(table, out, f"{_command(args)} --n {args.n}", crew, console):
             robots = _robots({case.payload_kg for case in missing}, robot, crew.workers, console)
@@ -89,7 +88,7 @@ def _run_all(
     rows = table.rows(args.n)
     fallen = report.falls(rows)
     title = f"Planner killed, {len(rows)} random cases, seed {args.seed}, "
-    title += f"{push_range.in_words(args)}: {len(fallen)} fell"
+    title += f"{push_range.describe(args)}: {len(fallen)} fell"
     picture.draw(rows, robot, title, out / PICTURE)
     report.show(rows, _command(args), console)
     pace = f"; {seconds:.2f} s a case" if missing else ""
@@ -114,7 +113,7 @@ def _robots(
 
 
 def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> int:
-    case = cases.Cases(robot, args.push).draw(args.seed, args.only)
+    case = cases.KillCases(robot, args.push).draw(args.seed, args.only)
     loaded = _robots({case.payload_kg}, robot, 1, console)[case.payload_kg]
     study.show(f"Case {case.number}, drawn", cases.row_of(case), console)
     words = f"{_command(args)} --only {case.number}; delay {case.delay_ms:g} ms, " + (
@@ -131,7 +130,7 @@ def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> 
     )
 
 
-def _run_task(task: Task) -> Outcome:
+def _run_task(task: Task) -> KillResult:
     case, robot = task
     return run_case(case, robot)
 
@@ -140,7 +139,7 @@ def _name(task: Task) -> str:
     return f"case {task[0].number} (xrl sweep kill --seed {task[0].seed} --only {task[0].number})"
 
 
-def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
+def _rows(task: Task, outcome: KillResult) -> list[dict[str, object]]:
     return [cases.row_of(task[0]) | msgspec.structs.asdict(outcome)]
 
 

@@ -21,16 +21,16 @@ from tools.sweeps.figures import ENDINGS, Ending
 from tools.sweeps.latency_trial import (
     CONTROLS,
     FLAG_DIGITS,
+    LatencyResult,
+    LatencyTrial,
     Network,
-    Outcome,
-    Trial,
     plain,
     plant_of,
     robot_of,
     run_trial,
 )
 from tools.sweeps.record import run_alone
-from tools.sweeps.table import Table, code_digest, code_of
+from tools.sweeps.table import CaseTable, code_digest, code_of
 from tools.verbs import add_config
 
 DELAYS_MS: Final = "0,10,20,30,50,100,200"
@@ -41,9 +41,9 @@ VALUES_MAX: Final = 1000
 TABLE: Final = "latency.csv"
 CODE: Final = code_of("tools.sweeps.latency_trial")
 """What decides how a trial comes out."""
-COLUMNS_OUT: Final = Outcome.__struct_fields__
+COLUMNS_OUT: Final = LatencyResult.__struct_fields__
 WORDS: Final = {"control": frozenset(CONTROLS), "ending": ENDINGS}
-Task: TypeAlias = "tuple[Trial, RobotConfig]"
+Task: TypeAlias = "tuple[LatencyTrial, RobotConfig]"
 
 EXAMPLES: Final = """
     xrl sweep latency
@@ -140,7 +140,7 @@ def parse_controls(text: str) -> tuple[str, ...]:
     return tuple(name for name in CONTROLS if name in names)
 
 
-def trials_of(args: argparse.Namespace) -> list[Trial]:
+def trials_of(args: argparse.Namespace) -> list[LatencyTrial]:
     """Return all trials, in the order of their numbers.
 
     The whole grid once, then once more: a study that is stopped has something of each network,
@@ -149,7 +149,7 @@ def trials_of(args: argparse.Namespace) -> list[Trial]:
     networks = [Network(d, j, p) for p, j, d in product(args.loss, args.jitter, args.delay)]
     grid = list(product(range(args.trials), networks, args.control))
     return [
-        Trial(number=number, repeat=repeat, seed=args.seed, control=control, network=network)
+        LatencyTrial(number=number, repeat=repeat, seed=args.seed, control=control, network=network)
         for number, (repeat, network, control) in enumerate(grid)
     ]
 
@@ -157,7 +157,7 @@ def trials_of(args: argparse.Namespace) -> list[Trial]:
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one trial of it; 1 if the shipped control fell."""
     study.check_least(("--trials", args.trials, 1), ("--only", args.only or 0, 0))
-    crew = study.crew_of(args, CODE)
+    crew = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config)
     if args.lead_easing is not None:
         law = msgspec.structs.replace(robot.law, lead_easing=args.lead_easing)
@@ -172,15 +172,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_all(
     args: argparse.Namespace,
-    trials: list[Trial],
+    trials: list[LatencyTrial],
     robot: RobotConfig,
-    crew: study.Crew,
+    crew: study.Executor,
     console: Console,
 ) -> int:
     out = study.folder(args.out, "latency")
     drawn = [row_of(trial) for trial in trials]
     columns = [*drawn[0], *COLUMNS_OUT]
-    with Table(out, TABLE, columns, _inputs(args, robot), WORDS, drawn) as table:
+    with CaseTable(out, TABLE, columns, _inputs(args, robot), WORDS, drawn) as table:
         robots = {name: robot_of(robot, name) for name in args.control}
         tasks = [(t, robots[t.control]) for t in trials if t.number not in table.numbers]
         again = f"{_command(args)} --trials {args.trials}"
@@ -198,7 +198,7 @@ def _run_all(
 
 
 def _run_one(
-    args: argparse.Namespace, trials: list[Trial], robot: RobotConfig, console: Console
+    args: argparse.Namespace, trials: list[LatencyTrial], robot: RobotConfig, console: Console
 ) -> int:
     if args.only >= len(trials):
         args.trials = 1 + args.only // (len(trials) // args.trials)
@@ -218,7 +218,7 @@ def _run_one(
     )
 
 
-def row_of(trial: Trial) -> dict[str, object]:
+def row_of(trial: LatencyTrial) -> dict[str, object]:
     """Return what a trial is, by column."""
     row: dict[str, object] = {
         "number": trial.number,
@@ -230,7 +230,7 @@ def row_of(trial: Trial) -> dict[str, object]:
     return row | {"impaired_from_s": trial.draw.impaired_from_s}
 
 
-def _run_task(task: Task) -> Outcome:
+def _run_task(task: Task) -> LatencyResult:
     return run_trial(*task)
 
 
@@ -243,7 +243,7 @@ def _name(task: Task) -> str:
     )
 
 
-def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
+def _rows(task: Task, outcome: LatencyResult) -> list[dict[str, object]]:
     return [row_of(task[0]) | msgspec.structs.asdict(outcome)]
 
 

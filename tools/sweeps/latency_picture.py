@@ -43,7 +43,7 @@ COUNTS_COLUMNS: Final = 24
 """of more than these, for nothing."""
 
 
-class Look(NamedTuple):
+class LineStyle(NamedTuple):
     """How a control is drawn; told apart without colour as well."""
 
     colour: str
@@ -53,9 +53,9 @@ class Look(NamedTuple):
 
 
 LOOKS: Final = {
-    "distributed": Look("#1b7f4b", "o", -0.12),
-    "diagonal": Look("#c77700", "s", 0.0),
-    "centralised": Look("#7b3fa0", "^", 0.12),
+    "distributed": LineStyle("#1b7f4b", "o", -0.12),
+    "diagonal": LineStyle("#c77700", "s", 0.0),
+    "centralised": LineStyle("#7b3fa0", "^", 0.12),
 }
 
 
@@ -118,7 +118,7 @@ def _draw_map(axis: Any, rows: Sequence[Row], name: str) -> None:
         title += f"; {', '.join(f'{jitter:g}' for jitter in jitters)} ms of jitter together"
     if len(delays) > BOUNDS_COLUMNS:
         none = Falls(0, max(cell.of for line in cells for cell in line))
-        title += f"; none of {none.of} is {none.bounds_in_words}"
+        title += f"; none of {none.of} is {none.describe_bounds}"
     axis.set_title(title, fontsize=10)
     for between in range(1, len(delays)):
         axis.axvline(between - 0.5, color="white", lw=0.8)
@@ -134,7 +134,7 @@ def _in_cell(cell: Falls, columns: int) -> str:
     if columns > COUNTS_COLUMNS:
         return ""
     count = f"{cell.fallen}/{cell.of}"
-    return count if columns > BOUNDS_COLUMNS else f"{count}   {cell.bounds_in_words}"
+    return count if columns > BOUNDS_COLUMNS else f"{count}   {cell.describe_bounds}"
 
 
 def _draw_shares(axis: Any, rows: Sequence[Row]) -> None:

@@ -36,7 +36,7 @@ class Falls(NamedTuple):
         return wilson(self.fallen, self.of)
 
     @property
-    def bounds_in_words(self) -> str:
+    def describe_bounds(self) -> str:
         """The bounds in %."""
         low, high = self.bounds
         return f"{100 * low:.0f}-{100 * high:.0f} %"
@@ -140,7 +140,7 @@ def _falls_table(rows: Sequence[Row]) -> Table:
 
     def cell(own: Sequence[Row]) -> str:
         fell = falls(own)
-        return f"{fell.fallen} of {fell.of} {fell.bounds_in_words:>9}" if fell.of else ""
+        return f"{fell.fallen} of {fell.of} {fell.describe_bounds:>9}" if fell.of else ""
 
     return _by_delay(what, rows, cell)
 

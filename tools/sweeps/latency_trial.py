@@ -65,7 +65,7 @@ FLAG_DIGITS: Final = 9
 """Decimals to which a number of a flag is taken."""
 
 
-class Control(msgspec.Struct, frozen=True):
+class ControlKind(msgspec.Struct, frozen=True):
     """One way to control the robot."""
 
     about: str
@@ -75,9 +75,11 @@ class Control(msgspec.Struct, frozen=True):
 
 
 CONTROLS: Final = {
-    "distributed": Control("as shipped: local gains certified, the rest by the planner", Lockstep),
-    "diagonal": Control("the paper's local gains, diag(K_q)", Lockstep, "diagonal"),
-    "centralised": Control(
+    "distributed": ControlKind(
+        "as shipped: local gains certified, the rest by the planner", Lockstep
+    ),
+    "diagonal": ControlKind("the paper's local gains, diag(K_q)", Lockstep, "diagonal"),
+    "centralised": ControlKind(
         "every torque by the planner, and nothing below it: gains not retuned for the delay, no "
         "damping on the drives, the last torques kept when no new ones come, overload ignored",
         CentralisedLockstep,
@@ -121,7 +123,7 @@ class Draw(msgspec.Struct, frozen=True):
     """Of what is lost, of jitter, and of the harness sensor's noise."""
 
 
-class Trial(msgspec.Struct, frozen=True, kw_only=True):
+class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
     """What is run."""
 
     number: int
@@ -160,7 +162,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-class Outcome(Ended, frozen=True, kw_only=True):
+class LatencyResult(Ended, frozen=True, kw_only=True):
     """The figures of a trial, over the bad network, to the end or the fall."""
 
     operator_peak_n: float | None = None
@@ -188,7 +190,7 @@ def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
     return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, split=split))
 
 
-class Ear:
+class LatencyRecorder:
     """Hears what the figures need of what would be on the bus, and passes all of it on."""
 
     def __init__(self, on_to: Record | None, impaired_from_s: float) -> None:
@@ -201,7 +203,7 @@ class Ear:
         self.fallen = False
         """From then on nothing counts."""
         self.torque_step = 0.0
-        """As `Outcome.torque_step_nm`."""
+        """As `LatencyResult.torque_step_nm`."""
 
     def __call__(self, topic: Topic, module: str, message: Message) -> None:
         """Take a message as the bus would."""
@@ -216,7 +218,7 @@ class Ear:
             self._on_to(topic, module, message)
 
 
-def fleet_of(trial: Trial, robot: RobotConfig, record: Record) -> Lockstep:
+def fleet_of(trial: LatencyTrial, robot: RobotConfig, record: Record) -> Lockstep:
     """Return the fleet of a trial, before its first step.
 
     Args:
@@ -236,19 +238,19 @@ def fleet_of(trial: Trial, robot: RobotConfig, record: Record) -> Lockstep:
     )
 
 
-def plant_of(trial: Trial) -> PlantConfig:
+def plant_of(trial: LatencyTrial) -> PlantConfig:
     """Return the trial's true robot: all errors drawn, the same for each control."""
     return plants.draw(f"latency {trial.draw.fleet_seed}")
 
 
 def run_trial(
-    trial: Trial,
+    trial: LatencyTrial,
     robot: RobotConfig,
     *,
     record: Record | None = None,
     watch: Watch | None = None,
     after_fall_s: float = 0.0,
-) -> Outcome:
+) -> LatencyResult:
     """Run a trial to its end or to the fall.
 
     Args:
@@ -259,7 +261,7 @@ def run_trial(
         after_fall_s: how long to go on after a fall; what is measured ends with it.
     """
     impaired_from_s = trial.draw.impaired_from_s
-    ear = Ear(record, impaired_from_s)
+    ear = LatencyRecorder(record, impaired_from_s)
     fleet = fleet_of(trial, robot, ear)
     rows: list[SimTruth] = []
     for row in that_count(fleet.run(), impaired_from_s, watch, after_fall_s):
@@ -271,9 +273,9 @@ def run_trial(
 def measure(
     rows: Sequence[SimTruth],
     events: Sequence[tuple[str, JointEvent]],
-    ear: Ear,
+    ear: LatencyRecorder,
     robot: RobotConfig,
-) -> Outcome:
+) -> LatencyResult:
     """Return the figures of a run.
 
     Args:
@@ -283,13 +285,13 @@ def measure(
         robot: for the size of its feet.
     """
     if not rows or ear.from_ns is None:
-        return Outcome(ending=Ending.FELL if rows else Ending.UNREADY)
+        return LatencyResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]
     hand = np.array([row.operator_force[2] for row in rows])
     within = [(m, e) for m, e in events if ear.from_ns <= e.t_ns <= last.t_ns]
     since = [(m, e) for m, e in within if e.mode_after in (Mode.HOLD, Mode.TRACK)]
     into_hold = [m for m, e in since if e.mode_after == Mode.HOLD]
-    return Outcome(
+    return LatencyResult(
         ending=ending_of(last, DURATION_S, robot),
         fell_at_s=last.scenario_s if last.fallen else None,
         operator_peak_n=operator_peak_n(rows),

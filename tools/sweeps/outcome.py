@@ -21,7 +21,7 @@ from shared.messages import (
 from shared.topics import Topic
 from tools.runs.lockstep import Lockstep, Record
 from tools.sweeps import plants
-from tools.sweeps.cases import Case, network_of, story_of
+from tools.sweeps.cases import KillCase, network_of, story_of
 from tools.sweeps.figures import (
     Ended,
     Ending,
@@ -35,7 +35,7 @@ from tools.sweeps.figures import (
 )
 
 
-class Outcome(Ended, frozen=True, kw_only=True):
+class KillResult(Ended, frozen=True, kw_only=True):
     """The figures of a case; None where there is nothing to measure.
 
     "After" is from the kill on, "before" from the scenario's start to the kill.
@@ -71,7 +71,7 @@ class Outcome(Ended, frozen=True, kw_only=True):
     """Of an ankle from where it stood."""
 
 
-class Ear:
+class KillRecorder:
     """Hears what the verdict needs of what would be on the bus, and passes all of it on."""
 
     def __init__(self, on_to: Record | None) -> None:
@@ -90,19 +90,19 @@ class Ear:
             self._on_to(topic, module, message)
 
 
-def plant_of(case: Case) -> PlantConfig:
+def plant_of(case: KillCase) -> PlantConfig:
     """Return the case's true robot: all errors drawn."""
     return plants.draw(f"kill {case.seed} {case.number}")
 
 
 def run_case(
-    case: Case,
+    case: KillCase,
     robot: RobotConfig,
     *,
     record: Record | None = None,
     watch: Watch | None = None,
     after_fall_s: float = 0.0,
-) -> Outcome:
+) -> KillResult:
     """Run a case to its end or to the fall.
 
     Args:
@@ -112,7 +112,7 @@ def run_case(
         watch: sees the world at its rate.
         after_fall_s: how long to go on after a fall; what is measured ends with it.
     """
-    ear = Ear(record)
+    ear = KillRecorder(record)
     fleet = Lockstep(
         robot,
         story_of(robot, case),
@@ -161,13 +161,13 @@ class FootLoads:
 
 
 def measure(
-    case: Case,
+    case: KillCase,
     rows: list[SimTruth],
     loads: list[float],
     events: list[tuple[str, JointEvent]],
-    ear: Ear,
+    ear: KillRecorder,
     robot: RobotConfig,
-) -> Outcome:
+) -> KillResult:
     """Return the figures of a run.
 
     Args:
@@ -179,7 +179,7 @@ def measure(
         robot: for the size of its feet.
     """
     if not rows or rows[0].scenario_s < 0.0:
-        return Outcome(ending=Ending.FELL if rows else Ending.UNREADY)
+        return KillResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]
     figures = _before([row for row in rows if row.scenario_s < case.kill_s])
     after = [row for row in rows if row.scenario_s >= case.kill_s]
@@ -191,7 +191,7 @@ def measure(
         figures["kill_margin_onboard"] = ear.status.margin_onboard
     start_ns = rows[0].t_ns
     until_ns = ear.kill_ns if ear.kill_ns is not None else rows[-1].t_ns
-    return Outcome(
+    return KillResult(
         ending=ending_of(last, case.end_s, robot),
         fell_at_s=last.scenario_s if last.fallen else None,
         holds_before=_drop_outs(events, start_ns, until_ns),

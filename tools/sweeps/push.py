@@ -23,8 +23,8 @@ from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.sweeps import study
-from tools.sweeps.push_trial import MODES, POSES, Outcome, Trial, run_trial
-from tools.sweeps.table import Row, Table, code_digest, code_of
+from tools.sweeps.push_trial import MODES, POSES, PushResult, PushTrial, run_trial
+from tools.sweeps.table import CaseTable, Row, code_digest, code_of
 from tools.verbs import add_config
 
 mpl.use("Agg")
@@ -40,7 +40,7 @@ CODE: Final = code_of("tools.sweeps.push_trial")
 COLOURS: Final = {"led": "#1f5f8b", "dead": "#c0392b"}
 SHORT: Final = {"led": "leads", "dead": "dead"}
 WORDS_OF: Final = {"led": "planner leads", "dead": "planner dead"}
-Task: TypeAlias = "tuple[Trial, RobotConfig, PlantConfig]"
+Task: TypeAlias = "tuple[PushTrial, RobotConfig, PlantConfig]"
 
 EXAMPLES: Final = """
     xrl sweep push
@@ -75,14 +75,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study; 0 once it is done."""
-    crew = study.crew_of(args, CODE)
+    crew = study.executor_of(args, CODE)
     robot, plant = experiment.load_robot(args.config), plant_from(args.plant)
     trials = trials_of(args)
     console = Console()
     out = study.folder(args.out, "push")
     rows_begin = [msgspec.structs.asdict(trial) for trial in trials]
-    columns = [*Trial.__struct_fields__, *Outcome.__struct_fields__]
-    with Table(out, TABLE, columns, _inputs(args, robot, plant), WORDS, rows_begin) as table:
+    columns = [*PushTrial.__struct_fields__, *PushResult.__struct_fields__]
+    with CaseTable(out, TABLE, columns, _inputs(args, robot, plant), WORDS, rows_begin) as table:
         missing = [trial for trial in trials if trial.number not in table.numbers]
         with study.resumable(table, out, _command(args), crew, console):
             tasks = [(trial, robot, plant) for trial in missing]
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def trials_of(args: argparse.Namespace) -> list[Trial]:
+def trials_of(args: argparse.Namespace) -> list[PushTrial]:
     """Return the points that are asked for.
 
     Raises:
@@ -106,7 +106,7 @@ def trials_of(args: argparse.Namespace) -> list[Trial]:
         raise RunError(f"--duration {min(durations):g}: must be more than 0 s")
     grid = product(args.pose or POSES, durations, args.angle or ANGLES_DEG, MODES)
     return [
-        Trial(number=number, pose=pose, angle_deg=angle, duration_s=duration, mode=mode)
+        PushTrial(number=number, pose=pose, angle_deg=angle, duration_s=duration, mode=mode)
         for number, (pose, duration, angle, mode) in enumerate(grid)
     ]
 
@@ -180,7 +180,7 @@ def _angles(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row["angle_deg"] for row in rows))
 
 
-def _run_task(task: Task) -> Outcome:
+def _run_task(task: Task) -> PushResult:
     return run_trial(*task)
 
 
@@ -189,7 +189,7 @@ def _name(task: Task) -> str:
     return f"{trial.pose}, {trial.angle_deg} degrees, {trial.duration_s:g} s, {trial.mode}"
 
 
-def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
+def _rows(task: Task, outcome: PushResult) -> list[dict[str, object]]:
     return [msgspec.structs.asdict(task[0]) | msgspec.structs.asdict(outcome)]
 
 

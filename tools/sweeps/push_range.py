@@ -99,7 +99,7 @@ def flags(args: argparse.Namespace) -> list[str]:
     return [] if args.push == SHARE else [f"--push {args.push:g}"]
 
 
-def in_words(args: argparse.Namespace) -> str:
+def describe(args: argparse.Namespace) -> str:
     """Return how hard a study pushes, for its picture."""
     return f"pushed with up to {args.push:.0%} of what soles and motors bear"
 

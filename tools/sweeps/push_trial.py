@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from services.joint.memory import ModuleMemory
-from services.planner.memory import TickMemory
+from services.joint.snapshots import DriveManagerState
 from services.planner.poses import Poses
 from services.planner.push_limit import LoadedStand, PushLimits, limits_along
+from services.planner.snapshots import TickState
 from services.planner.split import ScheduledGains
 from services.simulator.plant import PlantConfig
 from services.simulator.state import taken
@@ -46,7 +46,7 @@ FORCE_MAX_N: Final = 240.0
 STEP_N: Final = 5.0
 
 
-class Trial(msgspec.Struct, frozen=True, kw_only=True):
+class PushTrial(msgspec.Struct, frozen=True, kw_only=True):
     """A point of the envelope."""
 
     number: int
@@ -57,7 +57,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
     mode: str
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class PushResult(msgspec.Struct, frozen=True, kw_only=True):
     """How hard a push is stood."""
 
     stood_n: float
@@ -72,15 +72,15 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """What soles and motors bear in this pose if the push lasts, whatever the control."""
 
 
-class Start(NamedTuple):
+class PushStart(NamedTuple):
     """The moment before the push."""
 
     state: SimState
-    modules: dict[str, ModuleMemory]
-    planner: tuple[int, TickMemory] | None
+    modules: dict[str, DriveManagerState]
+    planner: tuple[int, TickState] | None
 
 
-def story_of(trial: Trial, force_n: float) -> Scenario:
+def story_of(trial: PushTrial, force_n: float) -> Scenario:
     """Return what happens for a push of this force."""
     height, pitch = POSES[trial.pose]
     angle = math.radians(trial.angle_deg)
@@ -102,7 +102,7 @@ def story_of(trial: Trial, force_n: float) -> Scenario:
     )
 
 
-def run_trial(trial: Trial, robot: RobotConfig, plant: PlantConfig) -> Outcome:
+def run_trial(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushResult:
     """Find the hardest push by bisection.
 
     Args:
@@ -123,7 +123,7 @@ def run_trial(trial: Trial, robot: RobotConfig, plant: PlantConfig) -> Outcome:
             fell = force
     limits = limits_of(trial, robot)
     held = limits.led if trial.mode == "led" else limits.held
-    return Outcome(
+    return PushResult(
         stood_n=stood,
         fell_n=fell if fell <= FORCE_MAX_N else None,
         held_limit_n=held.force_n,
@@ -132,7 +132,7 @@ def run_trial(trial: Trial, robot: RobotConfig, plant: PlantConfig) -> Outcome:
     )
 
 
-def limits_of(trial: Trial, robot: RobotConfig) -> PushLimits:
+def limits_of(trial: PushTrial, robot: RobotConfig) -> PushLimits:
     """Return the static limits of the trial's pose and direction, on the robot file's robot."""
     schedule = robot.gain_schedule
     if schedule is None:
@@ -150,7 +150,7 @@ def limits_of(trial: Trial, robot: RobotConfig) -> PushLimits:
     return limits_along(stand, robot, D, scheduled.D_B, direction)
 
 
-def _start_of(trial: Trial, robot: RobotConfig, plant: PlantConfig) -> Start:
+def _start_of(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushStart:
     fleet = Lockstep(robot, story_of(trial, 0.0), BASE, plant=plant)
     for truth in fleet.run():
         if truth.fallen:
@@ -161,12 +161,12 @@ def _start_of(trial: Trial, robot: RobotConfig, plant: PlantConfig) -> Start:
         raise RunError(f"{trial.pose}: the six modules never came to track")
     modules = {name: fleet.memory_of(name) for name in MODULES}
     planner = fleet.planner if trial.mode == "led" else None
-    memory = None if planner is None else (planner.session, planner.remember())
-    return Start(taken(fleet.world, fleet.bank, fleet.now_ns, 0), modules, memory)
+    memory = None if planner is None else (planner.session, planner.snapshot())
+    return PushStart(taken(fleet.world, fleet.bank, fleet.now_ns, 0), modules, memory)
 
 
 def _stands(
-    trial: Trial, robot: RobotConfig, plant: PlantConfig, start: Start, force_n: float
+    trial: PushTrial, robot: RobotConfig, plant: PlantConfig, start: PushStart, force_n: float
 ) -> bool:
     story = story_of(trial, force_n)
     fleet = Lockstep(robot, msgspec.structs.replace(story, kill=()), BASE, plant=plant)

@@ -45,7 +45,7 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
     """
     fallen = falls(rows)
     for row in fallen[:FALLS_SHOWN]:
-        console.print(f"[red]{row['ending']}[/] {in_words(row)}", highlight=False)
+        console.print(f"[red]{row['ending']}[/] {describe(row)}", highlight=False)
         console.print(f"    {command} --only {row['number']}", style="dim", soft_wrap=True)
     if len(fallen) > FALLS_SHOWN:
         console.print(f"... and {len(fallen) - FALLS_SHOWN} more in the table")
@@ -62,7 +62,7 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
     )
 
 
-def in_words(row: Row) -> str:
+def describe(row: Row) -> str:
     """Return a case in a line."""
     words = [f"case {row['number']}: payload {row['payload_kg']} kg"]
     if row["kill_height_m"]:

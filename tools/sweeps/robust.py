@@ -25,15 +25,15 @@ from tools.sweeps.figures import ENDINGS, Ending
 from tools.sweeps.push_range import PushRange
 from tools.sweeps.record import run_alone
 from tools.sweeps.robust_trial import (
-    Outcome,
-    Trial,
+    RobustResult,
+    RobustTrial,
     draw,
     plant_of,
     row_of,
     run_trial,
     story_of,
 )
-from tools.sweeps.table import Row, Table, code_digest, code_of
+from tools.sweeps.table import CaseTable, Row, code_digest, code_of
 from tools.sweeps.wilson import wilson
 from tools.verbs import add_config
 
@@ -54,7 +54,7 @@ FIGURES: Final = (
     ("sole_tilt_max_rad", "tilt of a sole", "rad"),
     ("hold_step_nm", "torque step into or out of HOLD", "N m"),
 )
-Task: TypeAlias = "tuple[Trial, RobotConfig]"
+Task: TypeAlias = "tuple[RobustTrial, RobotConfig]"
 
 EXAMPLES: Final = """
     xrl sweep robust
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     if not 0.0 <= args.slope <= SLOPE_MAX_DEG:
         raise RunError(f"--slope {args.slope:g}: 0 to {SLOPE_MAX_DEG:g} degrees")
     push_range.check(args)
-    crew = study.crew_of(args, CODE)
+    crew = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config, imu=args.imu)
     plants.draw("check", beyond=args.beyond)
     console = Console()
@@ -112,8 +112,8 @@ def run(args: argparse.Namespace) -> int:
     pushes = PushRange(robot, args.push)
     drawn = [draw(pushes, args.seed, number, args.beyond, args.slope) for number in range(args.n)]
     rows_begin = [row_of(trial) for trial in drawn]
-    columns = [*rows_begin[0], *Outcome.__struct_fields__]
-    with Table(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
+    columns = [*rows_begin[0], *RobustResult.__struct_fields__]
+    with CaseTable(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
         missing = [trial for trial in drawn if trial.number not in table.numbers]
         with study.resumable(table, out, f"{_command(args)} --n {args.n}", crew, console):
             tasks = [(trial, robot) for trial in missing]
@@ -184,7 +184,7 @@ def _draw(rows: Sequence[Row], args: argparse.Namespace, path: Path) -> None:
     fell = sum(row["ending"] != Ending.STOOD for row in rows)
     figure.suptitle(
         f"{len(rows)} trials, every error drawn, ranges x{args.beyond:g}, seed {args.seed}, "
-        f"{push_range.in_words(args)}: {fell} fell",
+        f"{push_range.describe(args)}: {fell} fell",
         x=0.01,
         ha="left",
     )
@@ -222,7 +222,7 @@ def _show(rows: Sequence[Row], command: str, console: Console) -> int:
     return len(fallen)
 
 
-def _run_task(task: Task) -> Outcome:
+def _run_task(task: Task) -> RobustResult:
     return run_trial(*task)
 
 
@@ -230,7 +230,7 @@ def _name(task: Task) -> str:
     return f"trial {task[0].number} (xrl sweep robust --only {task[0].number})"
 
 
-def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
+def _rows(task: Task, outcome: RobustResult) -> list[dict[str, object]]:
     return [row_of(task[0]) | msgspec.structs.asdict(outcome)]
 
 

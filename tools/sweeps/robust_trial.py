@@ -43,7 +43,7 @@ AFTER_KILL_S: Final = 2.5
 DIGITS: Final = 3
 
 
-class Trial(msgspec.Struct, frozen=True, kw_only=True):
+class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
     """What is run; the plant follows from seed, number and `beyond`."""
 
     number: int
@@ -58,7 +58,7 @@ class Trial(msgspec.Struct, frozen=True, kw_only=True):
     pushes: tuple[Push, ...]
 
 
-class Outcome(Ended, frozen=True, kw_only=True):
+class RobustResult(Ended, frozen=True, kw_only=True):
     """The figures of a trial; None where there is nothing to measure."""
 
     operator_peak_n: float | None = None
@@ -74,7 +74,7 @@ class Outcome(Ended, frozen=True, kw_only=True):
 
 def draw(
     pushes: PushRange, seed: int, number: int, beyond: float = 1.0, slope_deg: float = 0.0
-) -> Trial:
+) -> RobustTrial:
     """Return one trial; no other trial has to be drawn for it."""
     dice = random.Random(f"robust {seed} {number}")
     kind = KINDS[number % len(KINDS)]
@@ -83,7 +83,7 @@ def draw(
     share, lasting = (LEAN_SHARE, LEAN_S) if kind == "lean" else (PUSH_SHARE, PUSH_S)
     led = pushes.draw(dice, share, 1.0, lasting)
     held = pushes.draw(dice, PUSH_SHARE, kill + _uniform(dice, 0.2, 0.8), PUSH_S)
-    return Trial(
+    return RobustTrial(
         number=number,
         seed=seed,
         beyond=beyond,
@@ -99,7 +99,7 @@ def _uniform(dice: random.Random, low: float, high: float) -> float:
     return round(dice.uniform(low, high), DIGITS)
 
 
-def plant_of(trial: Trial) -> PlantConfig:
+def plant_of(trial: RobustTrial) -> PlantConfig:
     """Return the trial's true robot."""
     seed = f"robust {trial.seed} {trial.number}"
     plant = plants.draw(seed, beyond=trial.beyond)
@@ -111,7 +111,7 @@ def plant_of(trial: Trial) -> PlantConfig:
     return changed(plant, {"floor.slope": towards})
 
 
-def story_of(robot: RobotConfig, trial: Trial) -> Scenario:
+def story_of(robot: RobotConfig, trial: RobustTrial) -> Scenario:
     """Return what happens."""
     stand = robot.simulation.stand_height
     frames: tuple[Keyframe, ...]
@@ -139,13 +139,13 @@ def story_of(robot: RobotConfig, trial: Trial) -> Scenario:
 
 
 def run_trial(
-    trial: Trial,
+    trial: RobustTrial,
     robot: RobotConfig,
     *,
     record: Record | None = None,
     watch: Watch | None = None,
     after_fall_s: float = 0.0,
-) -> Outcome:
+) -> RobustResult:
     """Run a trial to its end or to the fall; arguments as for the other studies."""
     story = story_of(robot, trial)
     fleet = Lockstep(
@@ -160,7 +160,9 @@ def run_trial(
     return measure(trial, rows, fleet, robot)
 
 
-def measure(trial: Trial, rows: Sequence[SimTruth], fleet: Lockstep, robot: RobotConfig) -> Outcome:
+def measure(
+    trial: RobustTrial, rows: Sequence[SimTruth], fleet: Lockstep, robot: RobotConfig
+) -> RobustResult:
     """Return the figures of a run.
 
     Args:
@@ -170,12 +172,12 @@ def measure(trial: Trial, rows: Sequence[SimTruth], fleet: Lockstep, robot: Robo
         robot: for the size of its feet.
     """
     if not rows or rows[0].scenario_s < 0.0:
-        return Outcome(ending=Ending.FELL if rows else Ending.UNREADY)
+        return RobustResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]
     led = [row for row in rows if row.scenario_s < trial.kill_s]
     held = [row for row in rows if row.scenario_s >= trial.kill_s]
     events = [event for _, event in fleet.events if event.t_ns >= rows[0].t_ns]
-    return Outcome(
+    return RobustResult(
         ending=ending_of(last, fleet.scenario.duration, robot),
         fell_at_s=last.scenario_s if last.fallen else None,
         operator_peak_n=operator_peak_n(led),
@@ -186,7 +188,7 @@ def measure(trial: Trial, rows: Sequence[SimTruth], fleet: Lockstep, robot: Robo
     )
 
 
-def row_of(trial: Trial) -> dict[str, object]:
+def row_of(trial: RobustTrial) -> dict[str, object]:
     """Return every draw by its column: the trial's, then the plant's errors."""
     row: dict[str, object] = {
         "number": trial.number,

@@ -19,13 +19,13 @@ from shared import config_file
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from tools.sweeps import cluster, pool
-from tools.sweeps.table import Table
+from tools.sweeps.table import CaseTable
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
-class Crew(NamedTuple):
+class Executor(NamedTuple):
     """Who runs a study."""
 
     workers: int
@@ -77,7 +77,7 @@ def add_flags(parser: argparse.ArgumentParser, name: str, files: str, more: str 
     )
 
 
-def crew_of(args: argparse.Namespace, code: tuple[str, ...]) -> Crew:
+def executor_of(args: argparse.Namespace, code: tuple[str, ...]) -> Executor:
     """Return who runs the study, by its flags.
 
     Raises:
@@ -89,7 +89,7 @@ def crew_of(args: argparse.Namespace, code: tuple[str, ...]) -> Crew:
         raise RunError("--workers are of this machine, --cluster has its own; leave one out")
     if args.cluster is not None and getattr(args, "only", None) is not None:
         raise RunError("--only runs here, in one process; leave --cluster out")
-    return Crew(args.workers or pool.cores(), args.cluster, code)
+    return Executor(args.workers or pool.cores(), args.cluster, code)
 
 
 def check_least(*flags: tuple[str, int, int]) -> None:
@@ -114,7 +114,7 @@ def folder(out: Path | None, name: str) -> Path:
     return out or Path("out") / time.strftime(f"sweep-{name}-%Y%m%d-%H%M%S")
 
 
-def results(job: Job[T, R], tasks: Sequence[T], crew: Crew) -> Iterator[tuple[T, R]]:
+def results(job: Job[T, R], tasks: Sequence[T], crew: Executor) -> Iterator[tuple[T, R]]:
     """Yield each task with its result as it is done; as `pool.results`."""
     if crew.cluster is None:
         return pool.results(job.work, tasks, crew.workers, job.name)
@@ -122,7 +122,12 @@ def results(job: Job[T, R], tasks: Sequence[T], crew: Crew) -> Iterator[tuple[T,
 
 
 def fill(
-    table: Table, job: Job[T, R], tasks: Sequence[T], crew: Crew, total: int, console: Console
+    table: CaseTable,
+    job: Job[T, R],
+    tasks: Sequence[T],
+    crew: Executor,
+    total: int,
+    console: Console,
 ) -> float:
     """Run tasks into a table under a progress bar.
 
@@ -161,7 +166,7 @@ def fill(
 
 @contextmanager
 def resumable(
-    table: Table, out: Path, command: str, crew: Crew, console: Console
+    table: CaseTable, out: Path, command: str, crew: Executor, console: Console
 ) -> Iterator[None]:
     """Say what is kept, and how to go on, at Ctrl-C, SIGTERM and when a worker is lost.
 

@@ -63,7 +63,7 @@ def code_digest(parts: Sequence[str]) -> str:
     return digest.hexdigest()
 
 
-class Table:
+class CaseTable:
     """The open table; use it as a context."""
 
     def __init__(
@@ -111,7 +111,7 @@ class Table:
                 raise _unusable(folder, error) from None
             raise
 
-    def __enter__(self) -> Table:
+    def __enter__(self) -> CaseTable:
         """Return the table."""
         return self
 

@@ -17,8 +17,8 @@ from shared.messages import Cause, Trip
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.sweeps import study
-from tools.sweeps.table import Row, Table, code_digest, code_of
-from tools.sweeps.trips_trial import PLANTS, TROUBLES, Outcome, run_trial
+from tools.sweeps.table import CaseTable, Row, code_digest, code_of
+from tools.sweeps.trips_trial import PLANTS, TROUBLES, TripResult, run_trial
 from tools.verbs import add_config
 
 TABLE: Final = "trips.csv"
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         RunError: on this robot nothing trips.
     """
-    crew = study.crew_of(args, CODE)
+    crew = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config)
     if robot.gain_schedule is None:
         raise RunError(
@@ -62,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
         for number, (trouble, plant) in enumerate(grid)
     ]
     out = study.folder(args.out, "trips")
-    columns = [*begins[0], *Outcome.__struct_fields__]
-    with Table(out, TABLE, columns, _inputs(args, robot, grid), WORDS, begins) as table:
+    columns = [*begins[0], *TripResult.__struct_fields__]
+    with CaseTable(out, TABLE, columns, _inputs(args, robot, grid), WORDS, begins) as table:
         missing = [
             (number, trouble, plant, robot, args.seed)
             for number, (trouble, plant) in enumerate(grid)
@@ -131,7 +131,7 @@ def _cell(row: Row) -> str:
     return f"{with_trips}\n[dim]{without}[/]"
 
 
-def _run_task(task: Task) -> Outcome:
+def _run_task(task: Task) -> TripResult:
     _, trouble, plant, robot, seed = task
     return run_trial(trouble, plant, robot, seed)
 
@@ -140,7 +140,7 @@ def _name(task: Task) -> str:
     return f"{task[1]} on {task[2]}"
 
 
-def _rows(task: Task, outcome: Outcome) -> list[dict[str, object]]:
+def _rows(task: Task, outcome: TripResult) -> list[dict[str, object]]:
     number, trouble, plant, *_ = task
     begin = {"number": number, "trouble": trouble, "on": plant}
     return [begin | msgspec.structs.asdict(outcome)]

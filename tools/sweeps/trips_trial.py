@@ -65,7 +65,7 @@ class Trouble(NamedTuple):
     """With the gains of before the dynamic certificate, and joints that believe any command."""
 
 
-class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+class TripResult(msgspec.Struct, frozen=True, kw_only=True):
     """How it came out."""
 
     led: bool
@@ -188,7 +188,7 @@ class _Seen:
                 return
 
     def tripped_after_s(self) -> float | None:
-        """Return when it tripped first, as `Outcome` says; None: never."""
+        """Return when it tripped first, as `TripResult` says; None: never."""
         if not self.trips:
             return None
         first_ns = min(self.trips.values())
@@ -205,7 +205,7 @@ class _Seen:
                 self.trips.setdefault(Cause(event.cause).name, event.t_ns)
 
 
-def run_trial(trouble: str, plant: str, robot: RobotConfig, seed: int) -> Outcome:
+def run_trial(trouble: str, plant: str, robot: RobotConfig, seed: int) -> TripResult:
     """Run one trouble on one plant, with trips and without.
 
     Args:
@@ -218,7 +218,7 @@ def run_trial(trouble: str, plant: str, robot: RobotConfig, seed: int) -> Outcom
     robot = unfiltered(robot) if told.unfiltered else robot
     seen = _Seen(robot, told, PLANTS[plant], seed)
     without = _Seen(untripped(robot), told, PLANTS[plant], seed)
-    return Outcome(
+    return TripResult(
         led=seen.fleet.world.scenario_s > BEGINS_S,
         tripped=" ".join(sorted(seen.trips, key=lambda name: seen.trips[name])),
         tripped_after_s=seen.tripped_after_s(),

@@ -15,15 +15,15 @@ from services.joint.drivers import odrive_frames
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.can_link import RETRY_MS, CanLink, message
 from services.joint.drivers.encoder_pair import EncoderPair
-from services.joint.drivers.odrive_answers import NOTHING, Answers
-from services.joint.drivers.odrive_dialects import (
+from services.joint.drivers.firmware import (
     HEARTBEAT_BYTES,
     VERSION_BYTES,
     AxesReport,
     Dialect,
 )
-from services.joint.drivers.odrive_due import Due, Row
 from services.joint.drivers.odrive_frames import Frames
+from services.joint.drivers.replies import NOTHING, Replies
+from services.joint.drivers.resend_policy import GainRow, ResendPolicy
 from shared import cansimple
 from shared.cansimple import AxisState, Command
 from shared.cansimple_06 import Command06
@@ -99,7 +99,7 @@ class OdriveCan:
         self._frames = Frames(node_ids, drive)
         # The firmware takes it as food for the watchdog, and 0.6 tells its version besides.
         self._food = [message(n, Command06.GET_VERSION, b"") for n in node_ids]
-        self._answers = Answers(node_ids, drive.torque_constant, encoder_counts_per_turn)
+        self._answers = Replies(node_ids, drive.torque_constant, encoder_counts_per_turn)
         take: dict[int, Callable[[int, bytes], None]] = {
             Command.GET_ENCODER_ESTIMATES: self._take_estimates,
             Command.GET_ENCODER_COUNT: self._answers.take_count,
@@ -114,7 +114,7 @@ class OdriveCan:
         }
         self._link = CanLink(can_config, node_ids)
         self._report = AxesReport()
-        self._due = Due()
+        self._due = ResendPolicy()
         self._first = 0  # the axis that is written first
         self._insist_until_ns = 0
         self._believe_from_ns = 0
@@ -186,7 +186,7 @@ class OdriveCan:
         if not self._link.send(messages):
             self.write_failures += 1
             if settles:
-                self._due.cut_off(Row.ANEW)
+                self._due.cut_off(GainRow.ANEW)
 
     def write(self, target: MotorTarget) -> None:
         """Send what both motors' own loops are to do; gains before what they act on.
@@ -200,7 +200,7 @@ class OdriveCan:
             return
         frames.fill_inputs(target)
         row = self._due.with_target((target.pos_gain, target.vel_gain), now_ns())
-        if row is not Row.INPUTS:
+        if row is not GainRow.INPUTS:
             frames.fill_gains(target)
         if not self._link.send(frames.rows[row][self._first]):
             self.write_failures += 1
@@ -298,7 +298,7 @@ class OdriveCan:
 
     def _take_version(self, _axis: int, data: bytes) -> None:
         if len(data) == VERSION_BYTES:  # a request that we or others sent has none
-            self._report.hear_version(data)
+            self._report.receive_version(data)
 
     def _silence(self, now: int) -> DriveReading | None:
         """Return None while the drive may yet come back as it was, then LOST.

@@ -12,7 +12,7 @@ import can
 
 from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.can_link import message
-from services.joint.drivers.odrive_dialects import Dialect
+from services.joint.drivers.firmware import Dialect
 from shared import cansimple
 from shared.cansimple import AxisState, Command, ControlMode, InputMode
 from shared.config_sections import DriveConfig

@@ -1,0 +1,219 @@
+"""One direction of one connection: what came in, when it goes out."""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+from typing import Final, NamedTuple
+
+from services.injector.wire import Splitter, carries_messages
+from shared.impairment import HELD, Direction, Impairer
+
+PENDING_MAX: Final = 262_144
+"""Bytes that are due and wait for a receiver that takes none: then the sender is read no
+more, as on a link of its own."""
+WAITING_MAX: Final = 4_194_304
+"""Bytes that are not due yet: then, too, the sender is read no more. Ten seconds of states."""
+_READ: Final = 65_536
+
+
+class Waiting(NamedTuple):
+    """A batch on its way."""
+
+    release_ns: int
+    batch: bytes
+    """Empty: the end, seen on the other side as late as all else."""
+    counted: Impairer | None = None
+    """Who said that it passes; None: nobody, or it is the second of two."""
+
+    def lose(self) -> None:
+        """It never comes out, for its connection is gone: it is lost, and has not passed."""
+        if self.counted is not None:
+            self.counted.drop()
+
+
+class Flow:
+    """Reads batches from one end, and writes each to the other end when it is due."""
+
+    def __init__(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
+        """Take two connected sockets that do not block.
+
+        Args:
+            source: where batches come from.
+            sink: where they go.
+            direction: what is done to them.
+        """
+        self.source, self.sink, self.direction = source, sink, direction
+        self.ended = False
+        """The source has nothing more to say."""
+        self.broken = False
+        """The sink takes nothing any more. What comes is still read, to see its end."""
+        self._closing = False
+        self._splitter = Splitter()
+        self._held: list[Waiting] = []
+        self._waits = 0
+        self._pending = bytearray()
+        self._unsent: deque[tuple[int, Waiting]] = deque()
+        self._sent = 0
+        self._since_ns: int | None = None
+        self._own_ns = 0
+        """When the last of what the link says for itself comes out."""
+        self._stream_ns = 0
+        """When the last comes out that nothing may overtake."""
+
+    @property
+    def writes(self) -> bool:
+        """True while bytes wait for the sink."""
+        return bool(self._pending)
+
+    @property
+    def reads(self) -> bool:
+        """True while the source is to be read: not while too much waits for the sink."""
+        return not self.ended and len(self._pending) < PENDING_MAX and self._waits < WAITING_MAX
+
+    @property
+    def over(self) -> bool:
+        """True once the sink has all, and the end is due."""
+        return self._closing and not self._pending
+
+    def take(self, now_ns: int) -> list[Waiting]:
+        """Read what there is; return what waits now, in the order in which it came."""
+        found = self.release(now_ns)
+        try:
+            data = self.source.recv(_READ)
+        except BlockingIOError:
+            return found
+        except OSError:
+            data = b""
+        if not data:
+            self.ended = True
+            return found + self._keep([Waiting(self._later(now_ns), b"")])
+        rows = []
+        for batch in self._splitter.feed(data):
+            if carries_messages(batch):
+                rows += self._message(now_ns, batch)
+            else:
+                rows.append(Waiting(self._later(now_ns), batch))
+        return found + self._keep(rows)
+
+    def release(self, now_ns: int) -> list[Waiting]:
+        """Return what a partition that is over has held back; it comes out as what comes now."""
+        impairer = self.direction.active
+        if not self._held or (impairer is not None and impairer.what.partition):
+            return []
+        found, self._held = self._held, []
+        return [self._resumed(row, now_ns) for row in found]
+
+    def put(self, row: Waiting) -> None:
+        """Write a batch that is due, or keep what the sink does not take."""
+        self._waits -= len(row.batch)
+        if self.broken:
+            row.lose()
+        if not row.batch:
+            self._closing = True
+        elif self._pending:
+            self._put_off(row, row.batch)
+        elif not self.broken:
+            self._send(row)
+
+    def flush(self) -> None:
+        """Write what the sink takes."""
+        try:
+            sent = self.sink.send(self._pending)
+        except BlockingIOError:
+            return
+        except OSError:
+            self._break()
+            return
+        del self._pending[:sent]
+        self._sent += sent
+        self._since_ns = None
+        while self._unsent and self._unsent[0][0] <= self._sent:
+            self._unsent.popleft()
+
+    def stuck_ns(self, now_ns: int) -> int:
+        """Return for how long the sink has taken nothing of what waits for it.
+
+        Tried with each call: a UNIX socket is not called ready before most of it is read.
+        Measured from one call to the next.
+        """
+        if self._pending:
+            self.flush()
+        if not self._pending:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = now_ns
+        return 0 if self._since_ns is None else now_ns - self._since_ns
+
+    def drop(self) -> None:
+        """Count as lost what is held or not yet written: the connection is gone."""
+        self._break()
+        for row in self._held:
+            row.lose()
+        self._held.clear()
+
+    def _break(self) -> None:
+        self.broken = True
+        for _, row in self._unsent:
+            row.lose()
+        self._unsent.clear()
+        self._pending.clear()
+
+    def _put_off(self, row: Waiting, rest: bytes) -> None:
+        self._pending += rest
+        self._unsent.append((self._sent + len(self._pending), row))
+
+    def _send(self, row: Waiting) -> None:
+        try:
+            sent = self.sink.send(row.batch)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self._break()
+            row.lose()
+            return
+        if sent < len(row.batch):
+            self._put_off(row, row.batch[sent:])
+
+    def _keep(self, rows: list[Waiting]) -> list[Waiting]:
+        """Hold back what a partition holds; return the rest."""
+        found: list[Waiting] = []
+        for row in rows:
+            self._waits += len(row.batch)
+            (self._held if row.release_ns == HELD else found).append(row)
+        return found
+
+    def _message(self, now_ns: int, batch: bytes) -> list[Waiting]:
+        """Return a message as often as it comes out; the first time is the one that counts."""
+        impairer = self.direction.active
+        times = sorted(self._not_before(t) for t in self.direction.passes(now_ns, len(batch)))
+        return [Waiting(t, batch, None if n else impairer) for n, t in enumerate(times)]
+
+    def _resumed(self, row: Waiting, now_ns: int) -> Waiting:
+        release_ns = self._later(now_ns)
+        if row.counted is not None:  # a message that was held: it is on a stream
+            self._stream_ns = release_ns
+        return row._replace(release_ns=release_ns)
+
+    def _later(self, now_ns: int) -> int:
+        """Return when what must not be lost comes out; in order with all that must not be."""
+        impairer = self.direction.active
+        release_ns = now_ns if impairer is None else impairer.delays(now_ns)
+        if release_ns != HELD:
+            release_ns = self._own_ns = max(release_ns, self._own_ns, self._stream_ns)
+            if impairer is not None and impairer.what.ordered:
+                self._stream_ns = release_ns
+        return release_ns
+
+    def _not_before(self, release_ns: int) -> int:
+        """Return a message's release; never before what is on a stream and went before it.
+
+        Also once that impairment is over: what it has delayed still stands before it.
+        """
+        if release_ns == HELD:
+            return HELD
+        release_ns = max(release_ns, self._stream_ns)
+        impairer = self.direction.active
+        if impairer is not None and impairer.what.ordered:
+            release_ns = self._stream_ns = max(release_ns, self._own_ns)
+        return release_ns

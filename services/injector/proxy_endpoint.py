@@ -1,0 +1,81 @@
+"""Where the injector stands: one process of a pair dials it, and it dials the other."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from typing import Any, NamedTuple
+
+from services.injector.listener import SocketListener
+from shared.exceptions import BusError
+from shared.links import Pair
+
+
+class Address(NamedTuple):
+    """Where a process listens, looked up already: to dial it, nobody is asked."""
+
+    family: socket.AddressFamily
+    where: Any
+    """What sockets of the family connect to: a path, or a numeric host with its port."""
+
+
+class Place:
+    """Between the two processes of a pair."""
+
+    def __init__(self, pair: Pair, listener: SocketListener, beyond: Address) -> None:
+        """Take where the one dials to, and where the other one listens."""
+        self.pair, self.listener = pair, listener
+        self.missing = 0
+        """Connections to a process that was not there."""
+        self._beyond = beyond
+
+    def link(self) -> tuple[socket.socket, socket.socket] | None:
+        """Accept who dials, and dial the other; return both ends, which do not block.
+
+        None: not both are there. Who dialled sees the end of its connection and tries again.
+        """
+        dialling = self.listener.accept()
+        if dialling is None:
+            return None
+        try:
+            return dialling, self._dial()
+        except OSError:
+            self.missing += 1
+            dialling.close()
+            return None
+
+    def _dial(self) -> socket.socket:
+        beyond = socket.socket(self._beyond.family)
+        try:
+            beyond.setblocking(False)
+            failed = beyond.connect_ex(self._beyond.where)
+            if failed not in (0, errno.EINPROGRESS):
+                raise OSError(failed, os.strerror(failed))
+            if self._beyond.family != socket.AF_UNIX:
+                beyond.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        except OSError:
+            beyond.close()
+            raise
+        return beyond
+
+
+def address_of(endpoint: str) -> Address:
+    """Return where a Zenoh endpoint is. Looks names up, so it may block: at the start only.
+
+    Raises:
+        BusError: it is neither a UNIX socket nor TCP, or there is no such host.
+    """
+    kind, _, place = endpoint.partition("/")
+    if kind == "unixsock-stream":
+        return Address(socket.AF_UNIX, place)
+    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+    if kind != "tcp" or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+        said = "cannot be stood before; unixsock-stream/PATH or tcp/HOST:PORT can"
+        raise BusError(f"{endpoint}: {said}")
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        raise BusError(f"{endpoint}: {error}; a host that can be found is needed") from None
+    family, _, _, _, where = found[0]
+    return Address(family, where)

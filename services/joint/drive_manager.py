@@ -1,0 +1,290 @@
+"""What one module's service does in a cycle, without any I/O: the controller, and its drive's care.
+
+Arming, taking over what a service before this one left holding, idling what has disarmed, and
+whether torques or the onboard loop's targets go out. The loop carries the orders out on a real
+drive, lockstep on an emulated one. Pure.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final, NamedTuple
+
+import msgspec
+
+from services.joint.controller import CycleResult, JointController
+from services.joint.differential import motor_torque
+from services.joint.drive_fallback import DriveFallback
+from services.joint.drive_setpoint import DriveSetpointLaw
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.neighbours import UNKNOWN, NeighbourView
+from services.joint.rearm_guard import LastState
+from services.joint.snapshots import DriveManagerState
+from shared.cansimple import AxisError
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.messages import Cause, JointCommand, JointEvent, Mode, Pair
+
+ARM_EVERY_NS: Final = 500 * NS_PER_MS
+"""Arming is asked for again after this long, while DISARMED."""
+IDLE_EVERY_NS: Final = 500 * NS_PER_MS
+"""A drive one of whose axes has disarmed is told to go idle this often: its sibling goes on."""
+GAP_NS: Final = 20 * NS_PER_MS
+"""A service that ran no cycle for so long was frozen: its drive has gone on by itself."""
+LISTEN_NS: Final = 10 * NS_PER_MS
+"""Then it listens for so long before it speaks: what waits in the link's buffer is old."""
+ARM_TRIES: Final = 10
+"""A drive that has not armed by then needs a person."""
+
+
+class DriveCommand(Enum):
+    """What the drive is to be told in a cycle."""
+
+    NOTHING = 0
+    TORQUE = 1
+    TARGET = 2
+    IDLE = 3
+    ARM = 4
+    FORGET_ZERO = 5
+
+
+class ArmingInhibit(Enum):
+    """Why a drive is not armed; the loop puts it into words."""
+
+    NONE = 0
+    UNZEROED = 1
+    OUTSIDE_LIMITS = 2
+    WILL_NOT = 3
+    LET_GO = 4
+    """It held the robot and does not any more; it is armed again when a person asks for it."""
+    WAITING = 5
+    """It holds by its own loop; it is taken over once a planner is heard."""
+
+
+class DriveAction(NamedTuple):
+    """What came of a cycle."""
+
+    event: JointEvent | None
+    order: DriveCommand
+    torque: Pair
+    """Motor torques of `DriveCommand.TORQUE`, N m."""
+    target: MotorTarget | None
+    """Of `DriveCommand.TARGET`."""
+    obstacle: ArmingInhibit
+
+
+_NO_TORQUE: Pair = (0.0, 0.0)
+_MAY_HOLD: Final = (DriveStatus.LOST, DriveStatus.HOLDING, DriveStatus.ARMED)
+_UNCONTROLLED: Final = (Mode.DISARMED, Mode.FAULT)
+
+
+class DriveManager:
+    """One module's service between its drive and the bus.
+
+    Attributes:
+        controller: the control law and its memory.
+        onboard: True if the motors' own loops hold the module.
+    """
+
+    def __init__(
+        self, config: RobotConfig, name: str, last_state: LastState = LastState.NOTHING
+    ) -> None:
+        """Take what the service before this one left, if it died; start DISARMED."""
+        self.last_state = last_state
+        self.controller = JointController(config, name)
+        self._left_alone = DriveFallback(config, name)
+        self.onboard = config.joint_service.loop == "onboard"
+        drive = config.drive
+        self._law = DriveSetpointLaw(
+            config.joint.gear_ratio, drive.vel_limit, drive.current_lim * drive.torque_constant
+        )
+        self._gear_ratio = config.joint.gear_ratio
+        self._estop = last_state is LastState.DAMP
+        self._holding = False
+        """The drive was found armed, and has not been taken over."""
+        self._arm_at_ns = 0
+        self._idle_at_ns = 0
+        self._tries = 0
+        self._forgets = config.drive.zero_mark_turns > 0.0
+        self._target: MotorTarget | None = None
+        """The last that the drive was told."""
+        self._last_cycle_ns = 0
+        self._listen_until_ns = 0
+        """Listening after a gap; 0: not."""
+
+    @property
+    def needs_neighbours(self) -> bool:
+        """True while it matters what the neighbours do: in HOLD and DAMP."""
+        return self.controller.failsafe.mode in (Mode.HOLD, Mode.DAMP)
+
+    @property
+    def leaves_holding(self) -> bool:
+        """True if the drive holds the robot by its own loop should the service end now."""
+        mode, lost = self.controller.failsafe.mode, self.controller.cause is Cause.DRIVE_LOST
+        holds = mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP) or (mode is Mode.FAULT and lost)
+        return self.onboard and (holds or self._holding)
+
+    def step(
+        self,
+        now_ns: int,
+        reading: DriveReading | None,
+        command: JointCommand | None,
+        estop: bool,
+        near: NeighbourView = UNKNOWN,
+    ) -> DriveAction:
+        """Run one cycle; arguments as for `JointController.step`, and `estop` is remembered."""
+        self._estop = self._estop or estop
+        if self._tries == 0 and reading is not None and reading.status is DriveStatus.ARMED:
+            reading = self._found_armed(now_ns, reading)
+        if self._last_cycle_ns and now_ns - self._last_cycle_ns > GAP_NS:
+            self._listen_until_ns = now_ns + LISTEN_NS
+        self._last_cycle_ns = now_ns
+        controller = self.controller
+        tau_before = controller.tau
+        estop = self._estop and not self._is_to_be_taken_over(reading)
+        flushing = self._listen_until_ns > 0
+        result = controller.step(now_ns, reading, command, estop, flushing=flushing, near=near)
+        mode = controller.failsafe.mode
+        if result.event is not None:
+            self.last_state = self._new_last_state(mode)
+        if self._listen_until_ns:
+            if mode in _UNCONTROLLED:
+                self._listen_until_ns = 0
+            else:
+                result = self._resumed(now_ns, result, tau_before)
+                if now_ns < self._listen_until_ns or reading is None:
+                    return DriveAction(
+                        result.event, DriveCommand.NOTHING, _NO_TORQUE, None, ArmingInhibit.NONE
+                    )
+                self._listen_until_ns = 0
+        if mode is Mode.DISARMED and now_ns >= self._arm_at_ns:
+            obstacle = self._obstacle(now_ns, reading)
+            if obstacle is not None:
+                order = DriveCommand.ARM if obstacle is ArmingInhibit.NONE else DriveCommand.NOTHING
+                return DriveAction(result.event, order, _NO_TORQUE, None, obstacle)
+        order, torque, target = DriveCommand.NOTHING, _NO_TORQUE, None
+        if mode is Mode.FAULT:
+            order = self._in_fault(now_ns)
+        elif not self.onboard:
+            order, torque = DriveCommand.TORQUE, motor_torque(result.tau, self._gear_ratio)
+        elif mode is not Mode.DISARMED:
+            samples = controller.samples
+            order = DriveCommand.TARGET
+            left = self._left_alone.law(controller.setpoint, mode)
+            target = self._law.target(now_ns, left, result.tau, samples.pos, samples.vel)
+            self._target = target
+        return DriveAction(result.event, order, torque, target, ArmingInhibit.NONE)
+
+    def snapshot(self) -> DriveManagerState:
+        """Return the memory as it is now; it shares what still changes, so use it at once."""
+        return DriveManagerState(
+            controller=self.controller.snapshot(),
+            gains=self._law.gains,
+            estop=self._estop,
+            arm_at_ns=self._arm_at_ns,
+            idle_at_ns=self._idle_at_ns,
+            tries=self._tries,
+            forgets=self._forgets,
+            target=self._target,
+            last_cycle_ns=self._last_cycle_ns,
+            listen_until_ns=self._listen_until_ns,
+            last_state=self.last_state,
+            holding=self._holding,
+            gains_changed_ns=self._law.changed_ns,
+        )
+
+    def restore(self, memory: DriveManagerState) -> None:
+        """Go on from a memory, bit for bit."""
+        m = memory
+        self.controller.restore(m.controller)
+        self._law.gains, self._law.changed_ns = m.gains, m.gains_changed_ns
+        self._estop, self._arm_at_ns, self._idle_at_ns = m.estop, m.arm_at_ns, m.idle_at_ns
+        self._tries, self._forgets = m.tries, m.forgets
+        self._target, self._last_cycle_ns = m.target, m.last_cycle_ns
+        self._listen_until_ns = m.listen_until_ns
+        self.last_state, self._holding = m.last_state, m.holding
+
+    def _resumed(self, now_ns: int, result: CycleResult, tau_before: Pair) -> CycleResult:
+        """Return the cycle's result with the torque that the drive, left alone, carries."""
+        samples, carried = self.controller.samples, tau_before
+        if self._target is not None:
+            carried = self._law.carried(self._target, samples.pos, samples.vel)
+        tau = self.controller.resume(now_ns, carried)
+        event = result.event
+        if event is not None:
+            event = msgspec.structs.replace(event, tau_before=carried, tau_after=tau)
+        return CycleResult(tau, event)
+
+    def _in_fault(self, now_ns: int) -> DriveCommand:
+        """Return what the drive of a module in FAULT is to be told.
+
+        A lost one that holds by its own loop is left alone: should the link come back, it
+        holds still, unless it has let go in the meantime, and be it one axis. Any other is to
+        be idle, and one that has lost its position is to know no zero: an encoder that comes
+        back may have missed turns.
+        """
+        samples, cause = self.controller.samples, self.controller.cause
+        if cause is Cause.DRIVE_LOST and self.onboard and samples.status in _MAY_HOLD:
+            return DriveCommand.NOTHING
+        if now_ns >= self._idle_at_ns:
+            self._idle_at_ns = now_ns + IDLE_EVERY_NS
+            return DriveCommand.IDLE
+        astray = cause is Cause.POSITION_LOST or samples.error & AxisError.ENCODER_FAILED
+        if self._forgets and astray:
+            self._forgets = False
+            return DriveCommand.FORGET_ZERO
+        return DriveCommand.NOTHING
+
+    def _found_armed(self, now_ns: int, reading: DriveReading) -> DriveReading:
+        """Return the reading of a drive that somebody else has armed.
+
+        One that holds the robot by its own loop, after the service before this one died, is
+        taken over as it is, once it has told its torques, and with the gains that the planner has
+        the other five hold on. Until one is heard it is left alone: a knee taken over with its
+        stand gains beside one that holds on soft ones rolled the torso, and the robot tipped
+        while the hand led on. Any other drive is not armed by us.
+        """
+        if not self.onboard:
+            return msgspec.structs.replace(reading, status=DriveStatus.IDLE)
+        failsafe, timing = self.controller.failsafe, self.controller.timing
+        led = self._estop or failsafe.usable(now_ns, timing)
+        self._holding = reading.torque is None or not led
+        if self._holding:
+            return msgspec.structs.replace(reading, status=DriveStatus.HOLDING)
+        self._tries = 1
+        return reading
+
+    def _is_to_be_taken_over(self, reading: DriveReading | None) -> bool:
+        """Return True if the drive may hold the module by its own loop: first it is taken over.
+
+        An emergency stop of a module whose drive is not known would make a law of nothing.
+        """
+        if not self.onboard or self.controller.failsafe.mode is not Mode.DISARMED:
+            return False
+        return reading is None or reading.status in _MAY_HOLD
+
+    def _new_last_state(self, mode: Mode) -> LastState:
+        """Return what a service that dies now leaves to the next."""
+        if mode is Mode.DISARMED:
+            return self.last_state
+        return LastState.DAMP if mode is Mode.DAMP or self._estop else LastState.HELD
+
+    def _obstacle(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
+        """Return what keeps the drive from being armed now; None: nothing is known of it."""
+        if reading is None or reading.status is DriveStatus.LOST:
+            return None
+        self._arm_at_ns = now_ns + ARM_EVERY_NS
+        if reading.status is DriveStatus.HOLDING:
+            return ArmingInhibit.WAITING if reading.torque is not None else None
+        self._holding = False
+        if reading.status is DriveStatus.UNZEROED:
+            self.last_state = LastState.NOTHING  # whoever zeroes it asks for it
+            return ArmingInhibit.UNZEROED
+        if self.last_state is not LastState.NOTHING:
+            return ArmingInhibit.LET_GO
+        if not self.controller.inside_limits():
+            return ArmingInhibit.OUTSIDE_LIMITS
+        self._tries += 1
+        if self._tries <= ARM_TRIES:
+            return ArmingInhibit.NONE
+        return ArmingInhibit.WILL_NOT if self._tries == ARM_TRIES + 1 else None

@@ -1,0 +1,126 @@
+"""The local law split once more, between joint service and drive (design section 5). Pure.
+
+Each motor's own loop holds a module's mean stiffness and damping about the references; the
+rest (the difference of the two axes, the feedforward, what the gate took off) goes in as
+torque, worked out for the sample at hand. So at every sample the drive gives the very torque
+that the service asks for, and between samples, and when the service has died, its own law
+
+    torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel)
+
+goes on. In motor space a module's stiffness is 1/4N^2 [[k1 + k2, k1 - k2], [k1 - k2, k1 + k2]]
+per rad, with k1 and k2 of theta and phi.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from services.joint.differential import joint_torque, motor_from_joint, motor_torque
+from services.joint.drivers.base import MotorTarget
+from services.joint.pd_law import Setpoint
+from shared.clock import NS_PER_MS
+from shared.messages import Pair
+
+GAIN_CHANGE: Final = 0.02
+"""Gains that have changed by less than this share are left as they are on the drive: what is
+missing goes in as torque, and the bus is spared."""
+FOLLOW_MS: Final = 8
+"""Between two changes of the drive's gains. In a blend they would change in every cycle, and three
+modules on one CAN bus were 15 to 20 ms behind by its end; what is missing goes in as torque."""
+POS_GAIN_MAX: Final = 400.0
+"""1/s; a stiffness with hardly a damping is given the damping that this asks for."""
+INPUT_TORQUE_SHARE: Final = 0.75
+"""Of what current_lim gives, as much goes in as input_torque: the firmware clamps that by itself.
+A hip held with (900, 26) N m/rad has 463 on both motors, and from 0.25 rad off its reference the
+rest is more than the clamp lets through: its theta was 463 stiff instead of 26."""
+
+
+class DriveSetpointLaw:
+    """Makes the drive's targets; remembers the gains that the drive has.
+
+    Attributes:
+        changed_ns: monotonic time of their last change; 0: none yet.
+    """
+
+    def __init__(self, gear_ratio: float, vel_limit: float, torque_max: float = math.inf) -> None:
+        """Take the gear ratio N, the drive's velocity limit, turn/s, and its torque limit, N m."""
+        self._input_max = INPUT_TORQUE_SHARE * torque_max
+        self._gear_ratio = gear_ratio
+        self._per_turn = 2.0 * math.pi / (4.0 * gear_ratio * gear_ratio)
+        self._vel_limit = vel_limit
+        self._stiffness = 0.0
+        self._vel_gain = 0.0
+        self.changed_ns = 0
+
+    @property
+    def gains(self) -> Pair:
+        """Stiffness and damping that the drive has, N m and N m s a turn."""
+        return (self._stiffness, self._vel_gain)
+
+    @gains.setter
+    def gains(self, gains: Pair) -> None:
+        self._stiffness, self._vel_gain = gains
+
+    def target(
+        self, now_ns: int, setpoint: Setpoint, tau: Pair, pos: Pair, vel: Pair
+    ) -> MotorTarget:
+        """Return the target under which the motors give the joint torques tau at this sample.
+
+        Args:
+            now_ns: this module's monotonic clock.
+            setpoint: the local law of this instant.
+            tau: joint torques (phi, theta) that are to act now, N m, after the gate.
+            pos: motor positions of the sample, turns.
+            vel: motor velocities of the sample, turn/s.
+        """
+        s = setpoint
+        if now_ns - self.changed_ns >= FOLLOW_MS * NS_PER_MS or not self.changed_ns:
+            stiffness, damping = s.k_p[0] + s.k_p[1], s.k_d[0] + s.k_d[1]
+            self._follow(now_ns, self._per_turn * stiffness, self._per_turn * damping)
+        vel_gain = self._vel_gain
+        pos_gain = self._stiffness / vel_gain if vel_gain > 0.0 else 0.0
+        pos_ref = motor_from_joint(s.q_ref, self._gear_ratio)
+        vel_ref = motor_from_joint(s.v_ref, self._gear_ratio)
+        wanted = motor_torque(tau, self._gear_ratio)
+        limit = self._vel_limit
+        a = min(limit, max(-limit, vel_ref[0] + pos_gain * (pos_ref[0] - pos[0])))
+        b = min(limit, max(-limit, vel_ref[1] + pos_gain * (pos_ref[1] - pos[1])))
+        torque = (wanted[0] - vel_gain * (a - vel[0]), wanted[1] - vel_gain * (b - vel[1]))
+        most = self._input_max
+        if (abs(torque[0]) > most or abs(torque[1]) > most) and pos_gain > 0.0:
+            # what the firmware would clamp goes in by way of the position
+            a += (torque[0] - min(most, max(-most, torque[0]))) / vel_gain
+            b += (torque[1] - min(most, max(-most, torque[1]))) / vel_gain
+            a, b = min(limit, max(-limit, a)), min(limit, max(-limit, b))
+            pos_ref = (
+                pos[0] + (a - vel_ref[0]) / pos_gain,
+                pos[1] + (b - vel_ref[1]) / pos_gain,
+            )
+            torque = (wanted[0] - vel_gain * (a - vel[0]), wanted[1] - vel_gain * (b - vel[1]))
+        return MotorTarget(pos_ref, vel_ref, torque, (pos_gain, pos_gain), (vel_gain, vel_gain))
+
+    def carried(self, target: MotorTarget, pos: Pair, vel: Pair) -> Pair:
+        """Return the joint torques, N m, that a drive left with this target gives at a sample.
+
+        Args:
+            target: the last that was sent.
+            pos: motor positions of the sample, turns.
+            vel: motor velocities of the sample, turn/s.
+        """
+        t, limit = target, self._vel_limit
+        a = t.vel_turns[0] + t.pos_gain[0] * (t.pos_turns[0] - pos[0])
+        b = t.vel_turns[1] + t.pos_gain[1] * (t.pos_turns[1] - pos[1])
+        motors = (
+            t.torque[0] + t.vel_gain[0] * (min(limit, max(-limit, a)) - vel[0]),
+            t.torque[1] + t.vel_gain[1] * (min(limit, max(-limit, b)) - vel[1]),
+        )
+        return joint_torque(motors, self._gear_ratio)
+
+    def _follow(self, now_ns: int, stiffness: float, damping: float) -> None:
+        """Take over gains that have changed by more than `GAIN_CHANGE`; N m and N m s a turn."""
+        damping = max(damping, stiffness / POS_GAIN_MAX)
+        if abs(stiffness - self._stiffness) > GAIN_CHANGE * self._stiffness:
+            self._stiffness, self.changed_ns = stiffness, now_ns
+        if abs(damping - self._vel_gain) > GAIN_CHANGE * self._vel_gain:
+            self._vel_gain, self.changed_ns = damping, now_ns

@@ -1,0 +1,208 @@
+"""What an ODrive's two axes report over CANSimple, whichever firmware speaks. Pure.
+
+Firmware 0.5 and 0.6 share set-points, gains, limits, estimates and the axis state in byte 4 of
+a heartbeat. They differ in what its other bytes say and in the numbers of the errors. Which
+one speaks is found out, not configured:
+
+- 0.6 answers a request for its version (0x000); to 0.5 the same frame is food for the watchdog.
+- Byte 7 of a heartbeat is reserved in 0.6, and 0.5 sets its top bit while no trajectory runs.
+- Byte 5 is a flag in 0.5; a procedure result of 2 and more can only be 0.6.
+- A drive that leaves `UNANSWERED` requests without an answer is taken for 0.5: should it be
+  0.6 after all, its heartbeats look like errors, and its next answer corrects it.
+
+The other way round would be dangerous: 0.6's byte 5 says "busy" where 0.5's says that the motor
+has failed. So 0.6 is believed on evidence only.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+from services.joint.drivers.base import DriveStatus
+from shared import cansimple, cansimple_06
+from shared.cansimple import AxisError, AxisState
+from shared.cansimple_06 import DriveError06, ProcedureResult
+
+Dialect = Literal["", "0.5", "0.6"]
+"""The firmware's generation; "" while it is not known."""
+
+HEARTBEAT_BYTES: Final = 8
+VERSION_BYTES: Final = 8
+UNANSWERED: Final = 10
+"""Requests for the version, one for each heartbeat that tells nothing: so many are not lost."""
+
+OTHER_ERROR: Final = 0x8000_0000
+"""An error that `AxisError` has no name for, or of a drive whose dialect is not known yet."""
+
+_UNHEARD: Final = -1
+_TRAJECTORY_DONE: Final = 0x80
+_FINE: Final = (ProcedureResult.SUCCESS, ProcedureResult.BUSY, ProcedureResult.CANCELLED)
+
+_FROM_06: Final[tuple[tuple[DriveError06, int], ...]] = (
+    (DriveError06.INITIALIZING, AxisError.INVALID_STATE),
+    (DriveError06.SYSTEM_LEVEL, AxisError.MOTOR_FAILED),
+    (DriveError06.TIMING_ERROR, AxisError.MOTOR_FAILED),
+    (DriveError06.MISSING_ESTIMATE, AxisError.ENCODER_FAILED),
+    (DriveError06.BAD_CONFIG, AxisError.CONTROLLER_FAILED),
+    (DriveError06.DRV_FAULT, AxisError.MOTOR_FAILED),
+    (DriveError06.MISSING_INPUT, AxisError.CONTROLLER_FAILED),
+    (DriveError06.DC_BUS_OVER_VOLTAGE, AxisError.MOTOR_FAILED),
+    (DriveError06.DC_BUS_UNDER_VOLTAGE, AxisError.MOTOR_FAILED),
+    (DriveError06.DC_BUS_OVER_CURRENT, AxisError.MOTOR_FAILED),
+    (DriveError06.DC_BUS_OVER_REGEN_CURRENT, AxisError.MOTOR_FAILED),
+    (DriveError06.CURRENT_LIMIT_VIOLATION, AxisError.MOTOR_FAILED),
+    (DriveError06.MOTOR_OVER_TEMP, AxisError.OVER_TEMP),
+    (DriveError06.INVERTER_OVER_TEMP, AxisError.OVER_TEMP),
+    (DriveError06.VELOCITY_LIMIT_VIOLATION, AxisError.CONTROLLER_FAILED),
+    (DriveError06.POSITION_LIMIT_VIOLATION, AxisError.CONTROLLER_FAILED),
+    (DriveError06.WATCHDOG_TIMER_EXPIRED, AxisError.WATCHDOG_TIMER_EXPIRED),
+    (DriveError06.ESTOP_REQUESTED, AxisError.ESTOP_REQUESTED),
+    (DriveError06.SPINOUT_DETECTED, AxisError.CONTROLLER_FAILED),
+    (DriveError06.BRAKE_RESISTOR_DISARMED, AxisError.MOTOR_FAILED),
+    (DriveError06.THERMISTOR_DISCONNECTED, AxisError.OVER_TEMP),
+    (DriveError06.CALIBRATION_ERROR, AxisError.ENCODER_FAILED),
+)
+_NAMED_06: Final = sum(error for error, _ in _FROM_06)
+
+
+def errors_from_06(errors: int) -> int:
+    """Return 0.6's errors as `AxisError` bits; what has no counterpart is `OTHER_ERROR`.
+
+    No error ever becomes no error.
+    """
+    if not errors:
+        return 0
+    found = OTHER_ERROR if errors & ~_NAMED_06 else 0
+    for error, axis_error in _FROM_06:
+        if errors & error:
+            found |= axis_error
+    return int(found)
+
+
+def dialect_of(heartbeat: bytes) -> Dialect:
+    """Return the dialect that a heartbeat is in; "" if both could have sent it."""
+    if heartbeat[7]:
+        return "0.5"
+    return "0.6" if heartbeat[5] > 1 else ""
+
+
+def judged(dialect: Dialect, heartbeat: bytes, *, wanted_armed: bool) -> tuple[int, int]:
+    """Return an axis's state and its errors, `AxisError` bits and `OTHER_ERROR`.
+
+    Out of closed loop, where nobody has asked for it, a watchdog that ran out only says that
+    nobody has written yet. While the dialect is not known, whatever could be an error is one.
+
+    Args:
+        dialect: which firmware speaks.
+        heartbeat: its eight bytes.
+        wanted_armed: closed loop was asked for, and IDLE not since.
+    """
+    state = heartbeat[4]
+    closed = state == AxisState.CLOSED_LOOP_CONTROL
+    if dialect == "":
+        # In closed loop bytes 5 and 6 are no errors in either: an axis with one disarms.
+        suspect = any(heartbeat[:4]) or (not closed and any(heartbeat[5:]))
+        return state, OTHER_ERROR if suspect else 0
+    if dialect == "0.5":
+        errors = int(cansimple.unpack_heartbeat(heartbeat).errors)
+    else:
+        said = cansimple_06.unpack_heartbeat(heartbeat)
+        errors = errors_from_06(said.axis_error)
+        if wanted_armed and not closed and said.procedure_result not in _FINE:
+            errors |= AxisError.INVALID_STATE  # asked for, and refused or ended
+    if not closed and not wanted_armed:
+        errors &= ~AxisError.WATCHDOG_TIMER_EXPIRED
+    return state, int(errors)
+
+
+class AxesReport:
+    """What both axes have reported, and what it says of the module.
+
+    An axis that was armed and is no longer in closed loop is an error even without an error
+    bit, in either dialect. Both axes of an ODrive speak the same.
+
+    Attributes:
+        dialect: "" until it is known.
+        firmware: (major, minor, revision) as 0.6 told it; None: not told.
+        status: by the last heartbeats.
+    """
+
+    def __init__(self) -> None:
+        self.dialect: Dialect = ""
+        self.firmware: tuple[int, int, int] | None = None
+        self.status = DriveStatus.LOST
+        self._wanted_armed = False
+        self._unanswered = 0
+        self._heartbeats: list[bytes | None] = [None, None]
+        self._states = [_UNHEARD, _UNHEARD]
+        self._errors = [0, 0]
+        self._was_armed = [False, False]
+
+    @property
+    def errors(self) -> int:
+        """Errors of both axes, or-ed: `AxisError` bits and `OTHER_ERROR`."""
+        return self._errors[0] | self._errors[1]
+
+    def forget(self) -> None:
+        """Believe nothing until both have sent a heartbeat: it may be another drive by now."""
+        self.dialect = ""
+        self.firmware = None
+        self._unanswered = 0
+        self._discard_reports()
+        self.status = DriveStatus.LOST
+
+    def requested(self, *, armed: bool) -> None:
+        """Begin anew: closed loop or IDLE was asked for, and heartbeats are to tell what came."""
+        self._wanted_armed = armed
+        self._discard_reports()
+        self._errors = [0, 0]
+        self._was_armed = [False, False]
+        self.status = DriveStatus.IDLE
+
+    def hear(self, axis: int, heartbeat: bytes) -> None:
+        """Take in a heartbeat of axis 0 or 1 and judge again."""
+        self._heartbeats[axis] = heartbeat
+        if self.dialect == "":
+            self._unanswered += 1
+            found = dialect_of(heartbeat)
+            if found == "" and self._unanswered > UNANSWERED:
+                found = "0.5"
+            if found:
+                self._learn(found)
+                return
+        self._take(axis, heartbeat)
+        self._judge()
+
+    def receive_version(self, data: bytes) -> None:
+        """Take in an answer to 0x000; what was heard before is judged again if need be."""
+        self.firmware = cansimple_06.unpack_version(data).firmware
+        if self.dialect != "0.6":
+            self._learn("0.6")
+
+    def _learn(self, dialect: Dialect) -> None:
+        self.dialect = dialect
+        for axis, heartbeat in enumerate(self._heartbeats):
+            if heartbeat is not None:
+                self._take(axis, heartbeat)
+        self._judge()
+
+    def _take(self, axis: int, heartbeat: bytes) -> None:
+        state, errors = judged(self.dialect, heartbeat, wanted_armed=self._wanted_armed)
+        self._states[axis], self._errors[axis] = state, errors
+        self._was_armed[axis] |= state == AxisState.CLOSED_LOOP_CONTROL
+
+    def _judge(self) -> None:
+        states = self._states
+        left = any(
+            was and state not in (AxisState.CLOSED_LOOP_CONTROL, _UNHEARD)
+            for was, state in zip(self._was_armed, states, strict=True)
+        )
+        if left or any(self._errors):
+            self.status = DriveStatus.ERROR
+        elif _UNHEARD not in states:
+            closed = all(state == AxisState.CLOSED_LOOP_CONTROL for state in states)
+            self.status = DriveStatus.ARMED if closed else DriveStatus.IDLE
+
+    def _discard_reports(self) -> None:
+        self._heartbeats = [None, None]
+        self._states = [_UNHEARD, _UNHEARD]

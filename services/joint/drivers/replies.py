@@ -1,0 +1,82 @@
+"""What an ODrive's two axes answer when they are asked over CANSimple: counts and currents. Pure.
+
+Counts stand in for estimates of firmware 0.5.6: it sends what its controller sees of the encoder,
+exactly 0, 0 from each start-up until the first closed loop, wherever the motor is.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import Final
+
+from services.joint.drivers.can_link import request_of
+from shared import cansimple
+from shared.cansimple import Command
+from shared.cansimple_06 import Command06
+from shared.messages import Pair
+
+NOTHING: Final = (0.0, 0.0)
+"""The estimate of an axis that has not been in closed loop yet, turns and turn/s."""
+
+_BYTES: Final = 8
+
+
+class Replies:
+    """Both axes' newest answers; axis0, then axis1.
+
+    Attributes:
+        ask_version: the requests that have the firmware's version for an answer.
+        ask_currents: those that have the currents.
+        ask_counts: those that have what the encoders have counted.
+        counted: position in turns and no velocity of an axis whose estimates say nothing;
+            None: it has not told, or its own estimates are there by now.
+    """
+
+    def __init__(
+        self, node_ids: tuple[int, int], torque_constant: float, counts_per_turn: int | None
+    ) -> None:
+        """Begin with nothing told.
+
+        Args:
+            node_ids: CAN nodes of axis0 and axis1.
+            torque_constant: N m/A.
+            counts_per_turn: of the encoders; None: no count is taken.
+        """
+        self.ask_version = [request_of(n, Command06.GET_VERSION) for n in node_ids]
+        self.ask_currents = [request_of(n, Command.GET_IQ) for n in node_ids]
+        self.ask_counts = [request_of(n, Command.GET_ENCODER_COUNT) for n in node_ids]
+        self.counted: list[Pair | None] = [None, None]
+        self._torques: list[float | None] = [None, None]
+        self._torque_constant = torque_constant
+        self._counts_per_turn = counts_per_turn
+
+    @property
+    def torques(self) -> Pair | None:
+        """What both motors' own loops ask for, N m; None: not told."""
+        a, b = self._torques
+        return (a, b) if a is not None and b is not None else None
+
+    def forget_counts(self) -> None:
+        """Forget what was counted: the drive may have restarted, or be another one."""
+        self.counted[:] = None, None
+
+    def forget_torques(self) -> None:
+        """Forget the currents: they were of the time before."""
+        self._torques[:] = None, None
+
+    def take_count(self, axis: int, data: bytes) -> None:
+        """Take in what axis 0 or 1 has counted; it does not tell how fast."""
+        if len(data) == _BYTES and self._counts_per_turn is not None:
+            shadow_count, _ = cansimple.unpack_two_ints(data)
+            self.counted[axis] = (shadow_count / self._counts_per_turn, 0.0)
+
+    def take_current(self, axis: int, data: bytes) -> None:
+        """Take in the current that axis 0 or 1 asks for; what is no number is no answer.
+
+        Its sign is the torque's where `encoder.config.direction` is 1: CAN of firmware 0.5 cannot
+        ask for that, `xrl doctor` looks over USB.
+        """
+        if len(data) == _BYTES:
+            current, _ = cansimple.unpack_two_floats(data)
+            if isfinite(current):
+                self._torques[axis] = current * self._torque_constant

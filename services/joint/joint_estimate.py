@@ -1,0 +1,90 @@
+"""What a drive's samples say of the joint, and which of them are believed. Pure.
+
+A drive that does not know where it is goes on reporting numbers: firmware 0.5.6 repeats the last
+of an encoder that it has lost until a heartbeat tells, and begins anew, turns away, when it is
+back; one that has restarted says 0. Believed for 40 ms, a knee at 0 was asked for -107 N m. So a
+sample that the joint cannot have come to is not used, and after a few of them the position counts
+as lost.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+from services.joint.differential import joint_from_motor
+from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.failsafe import Event
+from shared.clock import NS_PER_S
+from shared.messages import Pair
+
+JUMP_TURNS: Final = 0.1
+"""At the motor, beyond what the last velocity explains: 0.02 rad at the joint."""
+JUMP_SPEED: Final = 10.0
+"""turn/s that a motor may have gained since the last sample, which may be 100 ms old: a leg
+in free fall gains 8."""
+ODD_MAX: Final = 3
+"""So many unbelievable samples, one after the other, and the position is lost."""
+
+_EVENT: Final = {
+    DriveStatus.LOST: Event.DRIVE_LOST,
+    DriveStatus.IDLE: Event.DRIVE_DISARMED,
+    DriveStatus.ARMED: Event.DRIVE_ARMED,
+    DriveStatus.ERROR: Event.DRIVE_DISARMED,
+    DriveStatus.UNZEROED: Event.POSITION_LOST,
+    DriveStatus.HOLDING: Event.NONE,
+}
+
+
+class JointEstimate(msgspec.Struct):
+    """The newest believed sample of a module, at the joint."""
+
+    gear_ratio: float
+    q: Pair = (0.0, 0.0)
+    """Angles (phi, theta), rad."""
+    v: Pair = (0.0, 0.0)
+    """rad/s"""
+    pos: Pair = (0.0, 0.0)
+    """Of the motors, turns."""
+    vel: Pair = (0.0, 0.0)
+    """turn/s"""
+    t_ns: int = 0
+    """When the drive's newest sample came, believed or not; 0 before the first."""
+    status: DriveStatus = DriveStatus.LOST
+    error: int = 0
+    """The drive's error bits."""
+    accepted_ns: int = 0
+    """When the newest believed sample came."""
+    rejected_count: int = 0
+    """Samples since then that were not believed."""
+
+    def take(self, reading: DriveReading, *, armed: bool) -> Event:
+        """Take in a sample; return what it means for the failsafe.
+
+        Args:
+            reading: of the drive.
+            armed: the module is controlled; else a joint may be found anywhere.
+        """
+        self.status, self.error, self.t_ns = reading.status, reading.error, reading.t_ns
+        event = _EVENT[reading.status]
+        if event is Event.DRIVE_LOST or event is Event.POSITION_LOST:
+            return event  # with positions that are old, or mean nothing
+        if armed and not self._is_plausible(reading):
+            self.rejected_count += 1
+            if event is not Event.DRIVE_ARMED:
+                return event
+            return Event.POSITION_LOST if self.rejected_count >= ODD_MAX else Event.NONE
+        self.rejected_count = 0
+        self.pos, self.vel, self.accepted_ns = reading.pos_turns, reading.vel_turns, self.t_ns
+        self.q = joint_from_motor(reading.pos_turns, self.gear_ratio)
+        self.v = joint_from_motor(reading.vel_turns, self.gear_ratio)
+        return event
+
+    def _is_plausible(self, reading: DriveReading) -> bool:
+        dt_s = (reading.t_ns - self.accepted_ns) / NS_PER_S
+        (a, b), (was_a, was_b), (vel_a, vel_b) = reading.pos_turns, self.pos, self.vel
+        free = JUMP_TURNS + JUMP_SPEED * dt_s
+        return abs(a - was_a) <= free + abs(vel_a) * dt_s and (
+            abs(b - was_b) <= free + abs(vel_b) * dt_s
+        )

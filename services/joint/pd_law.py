@@ -1,0 +1,243 @@
+"""The local law of one module: diagonal PD plus feedforward (design sections 3 e, 4).
+
+A `Setpoint` is the law at one instant. Setpoints are closed under blending: a blend of
+two PD laws is the PD law of the blended gains, so what a drive's own loop can hold
+stays one law at every moment of a hand-over. Pure.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from shared.messages import JointCommand, Pair
+
+ZERO: Pair = (0.0, 0.0)
+
+
+class Setpoint(msgspec.Struct, gc=False, frozen=True):
+    """PD law of the two axes (phi, theta) at one instant."""
+
+    q_ref: Pair
+    """rad"""
+    v_ref: Pair
+    """rad/s"""
+    tau_ff: Pair
+    """N m"""
+    tau_coupled: Pair
+    """N m"""
+    k_p: Pair
+    """N m/rad"""
+    k_d: Pair
+    """N m s/rad"""
+
+
+def torque(setpoint: Setpoint | JointCommand, q: Pair, v: Pair) -> Pair:
+    """Return tau = k_p (q_ref - q) + k_d (v_ref - v) + tau_ff + tau_coupled, N m.
+
+    Of a command: as it was when the planner sent it.
+    """
+    s = setpoint
+    return (
+        s.k_p[0] * (s.q_ref[0] - q[0])
+        + s.k_d[0] * (s.v_ref[0] - v[0])
+        + s.tau_ff[0]
+        + s.tau_coupled[0],
+        s.k_p[1] * (s.q_ref[1] - q[1])
+        + s.k_d[1] * (s.v_ref[1] - v[1])
+        + s.tau_ff[1]
+        + s.tau_coupled[1],
+    )
+
+
+def extrapolate(command: JointCommand, age_s: float) -> Setpoint:
+    """Return the command's law at this age: references moved on by their rates.
+
+    Args:
+        command: references and rates at age zero.
+        age_s: age in s, already capped by `joint_service.command_aging_max_ms`.
+    """
+    c = command
+    return Setpoint(
+        (c.q_ref[0] + c.v_ref[0] * age_s, c.q_ref[1] + c.v_ref[1] * age_s),
+        c.v_ref,
+        (c.tau_ff[0] + c.dtau_ff[0] * age_s, c.tau_ff[1] + c.dtau_ff[1] * age_s),
+        c.tau_coupled,
+        c.k_p,
+        c.k_d,
+    )
+
+
+def stand(q: Pair, k_p: Pair, k_d: Pair) -> Setpoint:
+    """Return the law of a stand at q with no planner."""
+    return Setpoint(q, ZERO, ZERO, ZERO, k_p, k_d)
+
+
+def take_over(q: Pair, v: Pair, tau: Pair, k_p: Pair, k_d: Pair) -> Setpoint:
+    """Return the law of a stand at q that at a rate v gives tau: frozen, v_ref will fade."""
+    return Setpoint(q, v, tau, ZERO, k_p, k_d)
+
+
+def freeze(setpoint: Setpoint, moving_share: float) -> Setpoint:
+    """Return a setpoint frozen: q_ref, tau_ff and gains stay, the rest fades.
+
+    Args:
+        setpoint: what was in force when the references froze.
+        moving_share: what is left of v_ref and tau_coupled, 1 .. 0. v_ref fades as well,
+            for in the middle of a squat k_d v_ref is 10 N m, which at once is a blow.
+    """
+    s, share = setpoint, moving_share
+    if share <= 0.0:
+        return Setpoint(s.q_ref, ZERO, s.tau_ff, ZERO, s.k_p, s.k_d)
+    v_ref = (s.v_ref[0] * share, s.v_ref[1] * share)
+    coupled = (s.tau_coupled[0] * share, s.tau_coupled[1] * share)
+    return Setpoint(s.q_ref, v_ref, s.tau_ff, coupled, s.k_p, s.k_d)
+
+
+def raise_gains(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoint:
+    """Return a setpoint whose gains have risen by `share` (0 .. 1) to at least k_p and k_d.
+
+    Gains only ever rise: adding to D can only add to the stiffness that stands.
+    """
+    s = setpoint
+    return Setpoint(
+        s.q_ref,
+        s.v_ref,
+        s.tau_ff,
+        s.tau_coupled,
+        (
+            s.k_p[0] + share * max(0.0, k_p[0] - s.k_p[0]),
+            s.k_p[1] + share * max(0.0, k_p[1] - s.k_p[1]),
+        ),
+        (
+            s.k_d[0] + share * max(0.0, k_d[0] - s.k_d[0]),
+            s.k_d[1] + share * max(0.0, k_d[1] - s.k_d[1]),
+        ),
+    )
+
+
+def limit_stiffening(setpoint: Setpoint, q: Pair, k_p: Pair, added_max: float) -> Setpoint:
+    """Return a setpoint that may stiffen: no spring then pulls harder by more than `added_max`.
+
+    An axis that is too far from its reference for that holds where it is: what its spring carries
+    becomes feedforward, the torque stays as it is.
+
+    Args:
+        setpoint: in force until now.
+        q: where the joint is, rad.
+        k_p: to which the gains are going to rise, N m/rad.
+        added_max: N m
+    """
+    s = setpoint
+    away = (s.q_ref[0] - q[0], s.q_ref[1] - q[1])
+    far = (
+        (k_p[0] - s.k_p[0]) * abs(away[0]) > added_max,
+        (k_p[1] - s.k_p[1]) * abs(away[1]) > added_max,
+    )
+    if far == (False, False):
+        return s
+    carried = load_to_feedforward(s, far, q)
+    q_ref = (q[0] if far[0] else s.q_ref[0], q[1] if far[1] else s.q_ref[1])
+    return Setpoint(q_ref, s.v_ref, carried.tau_ff, s.tau_coupled, s.k_p, s.k_d)
+
+
+def load_to_feedforward(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:
+    """Return a setpoint in which the axes that are to sink carry their load as feedforward.
+
+    DAMP lets go of their springs, but not of the load: a stand without a planner has no
+    other feedforward to fade.
+
+    Args:
+        setpoint: in force until now.
+        sinks: for (phi, theta), True if the axis is to sink.
+        q: where it is, rad.
+    """
+    s = setpoint
+    tau_ff = (
+        s.tau_ff[0] + (s.k_p[0] * (s.q_ref[0] - q[0]) if sinks[0] else 0.0),
+        s.tau_ff[1] + (s.k_p[1] * (s.q_ref[1] - q[1]) if sinks[1] else 0.0),
+    )
+    return Setpoint(s.q_ref, s.v_ref, tau_ff, s.tau_coupled, s.k_p, s.k_d)
+
+
+def damp(
+    setpoint: Setpoint,
+    sinks: tuple[bool, bool],
+    k_d: float,
+    feedforward_share: float,
+    risen: float,
+) -> Setpoint:
+    """Return DAMP's law: axes that sink lose their stiffness, the others hold.
+
+    Args:
+        setpoint: what `load_to_feedforward` gave, its rates and coupling faded.
+        sinks: for (phi, theta), True if the axis is to sink.
+        k_d: damping of an axis that sinks, N m s/rad.
+        feedforward_share: what is left of its feedforward, 1 .. 0.
+        risen: how far its damping has come from what it was to k_d, 0 .. 1.
+    """
+    s, share = setpoint, feedforward_share
+    phi, theta = sinks
+    return Setpoint(
+        s.q_ref,
+        s.v_ref,
+        (s.tau_ff[0] * (share if phi else 1.0), s.tau_ff[1] * (share if theta else 1.0)),
+        s.tau_coupled,
+        (0.0 if phi else s.k_p[0], 0.0 if theta else s.k_p[1]),
+        (
+            s.k_d[0] + risen * (k_d - s.k_d[0]) if phi else s.k_d[0],
+            s.k_d[1] + risen * (k_d - s.k_d[1]) if theta else s.k_d[1],
+        ),
+    )
+
+
+def hold_theta(setpoint: Setpoint, q_ref: float, v_ref: float, k_p: float) -> Setpoint:
+    """Return DAMP's law with theta held to a reference that moves: rad, rad/s, N m/rad."""
+    s = setpoint
+    return Setpoint(
+        (s.q_ref[0], q_ref),
+        (s.v_ref[0], v_ref),
+        s.tau_ff,
+        s.tau_coupled,
+        (s.k_p[0], k_p),
+        s.k_d,
+    )
+
+
+def add_stop(setpoint: Setpoint, stop: float, k_p: float, k_d: float) -> Setpoint:
+    """Return DAMP's law with theta caught by a spring at a stop, rad, N m/rad, N m s/rad."""
+    s = setpoint
+    return Setpoint(
+        (s.q_ref[0], stop),
+        s.v_ref,
+        s.tau_ff,
+        s.tau_coupled,
+        (s.k_p[0], k_p),
+        (s.k_d[0], k_d),
+    )
+
+
+def blend(a: Setpoint, b: Setpoint, share: float) -> Setpoint:
+    """Return the PD law whose torque is (1 - share) a + share b at every q and v."""
+    k_p = _mix(a.k_p, b.k_p, share)
+    k_d = _mix(a.k_d, b.k_d, share)
+    return Setpoint(
+        _mix_weighted(a.q_ref, b.q_ref, a.k_p, b.k_p, k_p, share),
+        _mix_weighted(a.v_ref, b.v_ref, a.k_d, b.k_d, k_d, share),
+        _mix(a.tau_ff, b.tau_ff, share),
+        _mix(a.tau_coupled, b.tau_coupled, share),
+        k_p,
+        k_d,
+    )
+
+
+def _mix(a: Pair, b: Pair, share: float) -> Pair:
+    return (a[0] + (b[0] - a[0]) * share, a[1] + (b[1] - a[1]) * share)
+
+
+def _mix_weighted(a: Pair, b: Pair, w_a: Pair, w_b: Pair, w: Pair, share: float) -> Pair:
+    """Mix two references by share and gain; with no gain at all the reference is b."""
+    rest = 1.0 - share
+    return (
+        (rest * w_a[0] * a[0] + share * w_b[0] * b[0]) / w[0] if w[0] > 0.0 else b[0],
+        (rest * w_a[1] * a[1] + share * w_b[1] * b[1]) / w[1] if w[1] > 0.0 else b[1],
+    )

@@ -1,0 +1,149 @@
+"""What a joint service is told, and tells, without a bus: a few bytes of shared memory.
+
+The first is what a service that dies leaves to its successor.
+
+What has let go of the robot never takes hold of it again by itself (`shared.fault_table`). A
+service that crashes is started again by the supervisor, and a drive may have disarmed in the
+meantime, or an emergency stop be in force: the new service would arm it, and stiffen, unasked.
+So each writes down what it last was, and a person who asks for the module (`xrl kill`, `xrl start`,
+`xrl up`) wipes it out.
+
+The second is the emergency stop of whoever is on the robot's own host (`xrl estop`): it is heard
+with the planner dead and every link of the bus cut, and stays in force until a person starts the
+module again. The third is how often a pendant has said that a person still holds it
+(`services.joint.pendant`).
+
+A mapped file: reading and writing it are loads and stores, which the control path may do.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Sequence
+from contextlib import suppress
+from enum import IntEnum
+from pathlib import Path
+from typing import Final
+
+_WILL, _STOP = range(2)
+_BEATS: Final = struct.Struct("<Q")
+_BEATS_AT: Final = 8
+"""Aligned, so that a store of it is whole."""
+_NEW: Final = bytes(_BEATS_AT + _BEATS.size)
+
+
+class LastState(IntEnum):
+    """What the service before this one was."""
+
+    NOTHING = 0
+    """There was none, or it ended in order, or a person has asked for the module anew."""
+    HELD = 1
+    """It held the robot: a drive that does not any more has let go."""
+    DAMP = 2
+    """It sank after an emergency stop: so does the next."""
+
+
+def path_of(run_dir: Path, module: str) -> Path:
+    """Return where a module's will is kept."""
+    return run_dir / f"{module}.rearm"
+
+
+class RearmGuard:
+    """A module's will, in its run directory."""
+
+    def __init__(self, run_dir: Path, module: str) -> None:
+        """Open it, or make it; the directory is there."""
+        path = path_of(run_dir, module)
+        with path.open("a+b") as file:
+            file.write(_NEW[file.seek(0, 2) :])
+            file.flush()
+            self._memory = mmap.mmap(file.fileno(), len(_NEW))
+        self._written = self.read()
+
+    def read(self) -> LastState:
+        """Return what was left; what is no will is the most careful one that holds."""
+        value = self._memory[_WILL]
+        return LastState(value) if value in tuple(LastState) else LastState.HELD
+
+    def write(self, last_state: LastState) -> None:
+        """Leave this to whoever comes next; what is left already is not written again.
+
+        So `clear` stands, and a service that has nothing new to say does not undo it.
+        """
+        if last_state is not self._written:
+            self._memory[_WILL] = self._written = last_state
+
+    @property
+    def stop_asked(self) -> bool:
+        """True if someone on this host has asked for the emergency stop."""
+        return self._memory[_STOP] != 0
+
+    @property
+    def beats(self) -> int:
+        """How often a pendant has beaten; 0: there is none."""
+        return int(_BEATS.unpack_from(self._memory, _BEATS_AT)[0])
+
+
+def clear(run_dir: Path, module: str) -> None:
+    """Wipe out what a module's services have left: a person asks for it anew.
+
+    In place, for a service that runs has the file mapped.
+    """
+    with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
+        file.write(_NEW)
+
+
+def ask_stop(run_dir: Path, module: str) -> bool:
+    """Stop a module, with or without a bus; return False if it has no service on this host.
+
+    Raises:
+        OSError: the file is there and cannot be written.
+    """
+    path = path_of(run_dir, module)
+    if not path.exists():
+        return False
+    with path.open("r+b") as file:
+        file.seek(_STOP)
+        file.write(b"\x01")
+    return True
+
+
+class Pendant:
+    """The pendant's end, for the modules whose services are on this host."""
+
+    def __init__(self, run_dir: Path, modules: Sequence[str]) -> None:
+        """Open the modules' files; those without one have no service here.
+
+        Raises:
+            OSError: a file is there and cannot be written.
+        """
+        self._memories = {}
+        self._beats = 0
+        for module in modules:
+            with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
+                file.truncate(len(_NEW))  # from before there were pendants: it is shorter
+                self._memories[module] = mmap.mmap(file.fileno(), len(_NEW))
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Those that hear it."""
+        return tuple(self._memories)
+
+    @property
+    def beats(self) -> tuple[int, ...]:
+        """What the modules hear, of this pendant or of another."""
+        return tuple(_BEATS.unpack_from(row, _BEATS_AT)[0] for row in self._memories.values())
+
+    def beat(self) -> None:
+        """Say that it is held: from the first time on, its silence stops them."""
+        self._beats += 1
+        self._tell(self._beats)
+
+    def lay_down(self) -> None:
+        """Take it that nobody has to hold it any more."""
+        self._tell(0)
+
+    def _tell(self, beats: int) -> None:
+        for memory in self._memories.values():
+            _BEATS.pack_into(memory, _BEATS_AT, beats)

@@ -1,0 +1,76 @@
+"""The last gate before the drive: but for the soft stop it only reduces (design section 4).
+
+In order: a one-sided spring at the joint's soft stop, finite, the rate, and last the torque
+diamond |tau_phi| + |tau_theta| <= tau_module_max, which nothing may exceed. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from shared.config import RobotConfig
+from shared.joints import kind_of
+from shared.messages import Pair
+
+
+class GateLimits(msgspec.Struct, frozen=True):
+    """What one module's gate allows."""
+
+    phi: Pair
+    """Soft stops (low, high) in rad."""
+    theta: Pair
+    soft_stop_k_p: float
+    """N m/rad beyond a stop."""
+    tau_module_max: float
+    """N m"""
+    tau_step_max: float
+    """N m from one cycle to the next."""
+
+
+def limits_of(config: RobotConfig, module: str) -> GateLimits:
+    """Return a module's limits from the configuration."""
+    limit = getattr(config.limits, kind_of(module))
+    service = config.joint_service
+    return GateLimits(
+        phi=limit.phi,
+        theta=limit.theta,
+        soft_stop_k_p=service.soft_stop_k_p,
+        tau_module_max=config.joint.tau_module_max,
+        tau_step_max=service.torque_rate_max / service.rate_hz,
+    )
+
+
+def limit_torque(tau: Pair, q: Pair, tau_last: Pair, limits: GateLimits) -> Pair:
+    """Return the torque that may go to the drive, N m.
+
+    Args:
+        tau: wanted (tau_phi, tau_theta), N m; may be anything, also NaN.
+        q: measured (phi, theta), rad.
+        tau_last: what went out in the last cycle, N m.
+        limits: the module's limits.
+    """
+    phi = tau[0] + _soft_stop(q[0], limits.phi, limits.soft_stop_k_p)
+    theta = tau[1] + _soft_stop(q[1], limits.theta, limits.soft_stop_k_p)
+    if not (math.isfinite(phi) and math.isfinite(theta)):
+        return tau_last
+    step = limits.tau_step_max
+    phi = min(tau_last[0] + step, max(tau_last[0] - step, phi))
+    theta = min(tau_last[1] + step, max(tau_last[1] - step, theta))
+    return limit_differential((phi, theta), limits.tau_module_max)
+
+
+def limit_differential(tau: Pair, tau_module_max: float) -> Pair:
+    """Clip each motor's torque: |tau_phi + tau_theta| and |tau_theta - tau_phi| <= max."""
+    total = min(tau_module_max, max(-tau_module_max, tau[1] + tau[0]))
+    difference = min(tau_module_max, max(-tau_module_max, tau[1] - tau[0]))
+    return ((total - difference) * 0.5, (total + difference) * 0.5)
+
+
+def _soft_stop(q: float, stops: Pair, k_p: float) -> float:
+    if q < stops[0]:
+        return k_p * (stops[0] - q)
+    if q > stops[1]:
+        return k_p * (stops[1] - q)
+    return 0.0

@@ -1,0 +1,134 @@
+"""What the planner knows beyond its configuration, as data: it goes on from there bit for bit."""
+
+from __future__ import annotations
+
+import msgspec
+
+from services.planner.engagement_fsm import Engagement
+from services.planner.intents import Wish
+from services.planner.limp_leg_watch import LimpLegWatch
+from shared.joints import N_JOINTS
+from shared.messages import (
+    AS_CONFIGURED,
+    STRAIGHT,
+    Attitude,
+    JointState,
+    Pair,
+    SplitSource,
+    Trip,
+    Vector4,
+    Vector6,
+    Wrench,
+)
+from shared.trip_table import PLANNER_TRIPS
+
+
+class AssistState(msgspec.Struct, frozen=True):
+    """Of `AssistLaw`."""
+
+    ramp: float | None
+    wanted: float
+    still_s: float
+    integral: float
+
+
+class EasingState(msgspec.Struct, frozen=True):
+    """Of `LeadEasing`."""
+
+    lead: Pair
+    left: float
+
+
+class OverloadState(msgspec.Struct, frozen=True):
+    """Of `Overload`."""
+
+    beyond_since_ns: int | None
+    below_since_ns: int | None
+    hold: bool
+
+
+class ShiftState(msgspec.Struct, frozen=True):
+    """State of `ShiftReference`: x, y in m, roll, yaw in rad, and their rates."""
+
+    at: Vector4 = STRAIGHT
+    rate: Vector4 = STRAIGHT
+
+
+class TripsState(msgspec.Struct, frozen=True):
+    """State of `Trips`."""
+
+    since_ns: tuple[int, ...] = (0,) * len(PLANNER_TRIPS)
+    """Since when each is beyond its limit; 0: it is not."""
+    calm_ns: int = 0
+    """Since when none is."""
+    tripped: Trip = Trip.NONE
+    why: str = ""
+    stands: bool = False
+    """Both legs have been seen to bear the torso since leading began."""
+    light: bool = False
+    """The person has been seen not to press on it since leading began."""
+
+
+class UnattendedState(msgspec.Struct, frozen=True):
+    """Of `Unattended`."""
+
+    felt_ns: int = 0
+    """When a hand was felt last."""
+    left: Pair | None = None
+    """Where it left the robot: height of the COM, m, and the torso's pitch, rad."""
+
+
+class LoadState(msgspec.Struct, frozen=True):
+    """Of `Load`."""
+
+    kg: float = 0.0
+    a: float = 0.0
+    b: float = 0.0
+    rates: Pair | None = None
+    refused: bool = False
+    weighing_s: float = 0.0
+    looked: bool = True
+
+
+class LawState(msgspec.Struct, frozen=True):
+    """Of `Hocca`."""
+
+    p_C0: tuple[float, ...]
+    since_align_s: float
+    aligned: bool
+    q: tuple[float, ...]
+    """Where the inverse kinematics starts from, rad."""
+    assist: AssistState
+    easing: EasingState
+    has_led: bool = False
+    coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS)
+    """Of `CouplingFilter`, N m."""
+    levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
+    """Whether a slope is known, and the slope, rad: the memory of `Levelling`."""
+    shift: ShiftState = ShiftState()
+    stance: tuple[Vector6, bool] = (AS_CONFIGURED, False)
+    """Memory of `Stance`: what is taken, m and rad, and whether it is refused."""
+    load: LoadState = LoadState()
+
+
+class TickState(msgspec.Struct, frozen=True):
+    """Of `Planner`, before a tick."""
+
+    states: tuple[JointState | None, ...]
+    arrived_ns: tuple[int, ...]
+    wrench: Wrench | None
+    wrench_ns: int
+    wrench_seq: int
+    last_ns: int
+    seq: int
+    source: SplitSource | None
+    engagement: Engagement
+    overload: OverloadState
+    law: LawState
+    limp_legs: LimpLegWatch = msgspec.field(default_factory=LimpLegWatch)
+    attitude: Attitude | None = None
+    attitude_ns: int = 0
+    attitude_seq: int = -1
+    trips: TripsState = TripsState()
+    wish: Wish = Wish()
+    unattended: UnattendedState = UnattendedState()

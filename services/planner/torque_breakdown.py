@@ -1,0 +1,133 @@
+"""One tick laid open: every matrix of the law and each joint's torque by origin. Pure.
+
+What `Hocca.tick` computes on its way and does not keep, computed again from what is in
+the log: the joints, the references and the assist (design section 3).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner.certificate import Certificate, Weakest, motor_mean
+from services.planner.coupling import UncoupledGains
+from services.planner.gains import GainLaw
+from services.planner.kinematics import Kinematics
+from services.planner.levelling import up_of
+from services.planner.push_limit import PushLimits, limits_at
+from services.planner.split import GainSplit, LocalGains
+from shared.config import GRAVITY, RobotConfig
+from shared.messages import AS_CONFIGURED, Pair, Vector6
+
+Array = NDArray[np.float64]
+
+
+class TorqueBreakdown(NamedTuple):
+    """A tick; torques (12,) in N m, poses (6,) in m and rad."""
+
+    p: Array
+    """Measured."""
+    pdot: Array
+    p_ref: Array
+    F: Array
+    """K_p (p_ref - p) + B_p (pdot_ref - pdot) + F_O (6,), N and N m."""
+    singular_values: Array
+    """Of J (6,): per rad, with m and rad mixed."""
+    K_q: Array
+    """(12, 12) N m/rad."""
+    B_q: Array
+    """(12, 12) N m s/rad."""
+    local: LocalGains
+    weakest: Weakest
+    """With the joint services alone."""
+    weakest_onboard: Weakest
+    """With the drives alone."""
+    pushes: dict[str, PushLimits]
+    """The hardest constant push along each direction, without assist."""
+    gravity: Array
+    assist: Array
+    local_pd: Array
+    coupled: Array
+    """What the planner adds, before its low-pass."""
+    eased: Array
+    """What the low-pass takes off that, and what eases the operator's lead: not computed here,
+    for the log holds neither filter."""
+
+    @property
+    def total(self) -> Array:
+        """What the module is asked for at age zero (12,), N m."""
+        return self.gravity + self.assist + self.local_pd + self.coupled + self.eased
+
+
+def torque_breakdown(
+    config: RobotConfig,
+    q: Array,
+    v: Array,
+    q_ref: Array,
+    v_ref: Array,
+    assist: float,
+    slope: Pair = (0.0, 0.0),
+    stance: Vector6 = AS_CONFIGURED,
+) -> TorqueBreakdown:
+    """Return the account of a tick.
+
+    Args:
+        config: the robot.
+        q: measured joint angles (12,), rad.
+        v: measured joint rates (12,), rad/s.
+        q_ref: references (12,), rad.
+        v_ref: their rates (12,), rad/s.
+        assist: assist force in the feedforward, N.
+        slope: of the floor along x and y, as the planner took it, rad.
+        stance: the right foot against the left, as the planner took it, m and rad.
+
+    Raises:
+        ConfigError: the gain split lacks its schedule.
+    """
+    measured, at_ref = Kinematics(config), Kinematics(config)
+    for kinematics in (measured, at_ref):
+        kinematics.stance[:] = stance
+    measured.update(q)
+    at_ref.update(q_ref, measured.D_left)
+    law, split = GainLaw(config), GainSplit(config)
+    pdot = measured.J @ v
+    up = np.array(up_of(slope))
+    F_O, F_assist = np.zeros(6), assist * up
+    F_O[:3] = config.total_mass * GRAVITY * up
+    F = law.K_p * (at_ref.p - measured.p) + law.B_p * (at_ref.J @ v_ref - pdot) + F_O
+    hessian_O = at_ref.hessian_times(F_O, F_assist).copy()
+    hessian_weight = at_ref.hessian_times(F_O, np.zeros(3)).copy()
+    body = law.gains(at_ref, at_ref.hessian_times(F, F_assist))
+    T = per_unit_of_p(at_ref)
+    local = split.split(lambda: body, float(at_ref.p[2]), float(at_ref.p[4]), T, hessian_O)
+    certificate: Certificate = split.certificate
+    missing = UncoupledGains(law.K_p, law.B_p, law.S, split.coupling.damping)
+    K_fail = certificate.failsafe_stiffness(local.D)
+    K_c, B_c = missing.at(K_fail, (T.T * local.D_B) @ T)
+    e_q, e_v, e_pdot = q_ref - q, v_ref - v, at_ref.J @ v_ref - pdot
+    return TorqueBreakdown(
+        p=measured.p,
+        pdot=pdot,
+        p_ref=at_ref.p,
+        F=F,
+        singular_values=np.asarray(np.linalg.svd(at_ref.J, compute_uv=False), float),
+        K_q=body.K_q,
+        B_q=body.B_q,
+        local=local,
+        weakest=certificate.weakest(local.D),
+        weakest_onboard=certificate.weakest(motor_mean(local.D)),
+        pushes=limits_at(config, at_ref, T, hessian_weight, local.D, local.D_B),
+        gravity=F_O @ at_ref.J,
+        assist=F_assist @ at_ref.J_harness,
+        local_pd=local.D * e_q + local.D_B * e_v,
+        coupled=(K_c @ (at_ref.p - measured.p) + B_c @ e_pdot) @ at_ref.J,
+        eased=np.zeros(12),
+    )
+
+
+def per_unit_of_p(kinematics: Kinematics) -> Array:
+    """Return T (12, 6): joint rates per unit of p along the closed chain, undamped."""
+    A = np.vstack((kinematics.J, kinematics.C))
+    return np.asarray(np.linalg.lstsq(A, np.eye(12)[:, :6], rcond=None)[0], float)

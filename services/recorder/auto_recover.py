@@ -1,0 +1,94 @@
+"""Recovers what earlier recorders did not finish, while this one records.
+
+A thread, for what is happening now must not wait for what happened before: a file of an
+hour takes a minute. It leaves half of its time to the recorder's loop.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from pathlib import Path
+
+from services.recorder import recover
+from services.recorder.files import RECOVERED, SUFFIX, locked, recovered_name
+from services.recorder.recover import Interrupted
+from shared.exceptions import RunError
+
+
+class Rescue(threading.Thread):
+    """Looks through a directory once, and ends."""
+
+    def __init__(self, directory: Path, keep_free: int, logger: logging.Logger) -> None:
+        """Recover the unfinished files of a directory.
+
+        Args:
+            directory: of the runs.
+            keep_free: bytes that are to stay free beside a copy.
+            logger: for what was recovered.
+        """
+        super().__init__(name="rescue", daemon=True)
+        self._directory, self._keep_free = directory, keep_free
+        self._logger = logger
+        self._halt = threading.Event()
+        self._resumed = time.monotonic()
+
+    def halt(self) -> None:
+        """Stop, and wait until that is done: an unfinished copy goes, the original stays."""
+        self._halt.set()
+        if self.is_alive():
+            self.join()
+
+    def run(self) -> None:
+        """Recover one file after the other."""
+        for path in sorted(self._directory.glob(f"*{SUFFIX}")):
+            if self._halt.is_set():
+                return
+            if path.name.endswith(RECOVERED) or path.is_symlink():
+                continue
+            try:
+                rescue(path, self._keep_free, self._logger, self._pace)
+            except Interrupted:
+                self._logger.info("%s: recovery goes on at the next start", path)
+                return
+            except (RunError, OSError) as error:
+                self._logger.warning("left as it is: %s", error)
+
+    def _pace(self) -> bool:
+        """Rest for as long as the last piece took; return True if it is time to stop."""
+        stopped = self._halt.wait(time.monotonic() - self._resumed)
+        self._resumed = time.monotonic()
+        return stopped
+
+
+def rescue(path: Path, keep_free: int, logger: logging.Logger, stop: recover.Stop) -> None:
+    """Recover one file, if it is unfinished and nobody writes it.
+
+    What was only cut off is replaced by its recovered copy once that is on the disk. If
+    there is damage in the middle as well, the original stays and the copy goes beside it.
+
+    Raises:
+        RunError: it cannot be read, or the copy cannot be written.
+        Interrupted: `stop` said so.
+        OSError: it cannot be opened.
+    """
+    beside = recovered_name(path)
+    with locked(path) as free:
+        if not free or beside.exists() or recover.is_finished(path):
+            return
+        size = path.stat().st_size
+        if shutil.disk_usage(path.parent).free < size + keep_free:
+            logger.warning("%s was not finished; there is no space to recover it", path)
+            return
+        outcome = recover.recover(path, beside, stop)
+        if not outcome.damage and not outcome.orphans:
+            beside.replace(path)
+            beside = path
+    logger.info(
+        "%s was not finished; recovered to %s: %s",
+        path,
+        beside.name,
+        "; ".join(recover.describe(outcome)),
+    )

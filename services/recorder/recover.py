@@ -1,0 +1,179 @@
+"""Gives a file that was never finished its end, so that every reader opens it.
+
+Chunks are taken over as they are. The original stays until the copy is complete and on
+the disk; a recovery that is killed leaves it as it was, and the next one begins anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import BinaryIO, Final, TypeAlias
+
+import msgspec
+
+from services.recorder.reader import LostBytes, Salvage, opened
+from services.recorder.recovered_copy import Copy
+from shared.clock import NS_PER_S
+from shared.exceptions import RunError
+
+Stop: TypeAlias = Callable[[], bool]
+
+_LINE_MAX: Final = 3  # places of damage that are told one by one
+
+
+class Interrupted(Exception):  # noqa: N818 - not an error: the recorder is to stop
+    """The recovery was asked to stop; the original is as it was."""
+
+
+class RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What a recovery kept, and what it had to leave."""
+
+    source: Path
+    out: Path
+    finished: bool
+    """The file had its end already."""
+    messages: int
+    channels: int
+    attachments: int
+    first_ns: int
+    """Log time of the first and the last message kept; 0 without any."""
+    last_ns: int
+    orphans: int
+    """Messages of channels that are nowhere described; left out."""
+    cut: LostBytes | None
+    damage: tuple[LostBytes, ...]
+
+
+def is_finished(path: Path) -> bool:
+    """Return True if an MCAP file has its end.
+
+    Raises:
+        RunError: it cannot be read.
+    """
+    with opened(path) as salvage:
+        return salvage.finished
+
+
+def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult:
+    """Copy what can be read of a file into a finished one.
+
+    Args:
+        path: an MCAP file; not touched, unless `out` is the same.
+        out: the file to write; one of that name is replaced when the copy is complete.
+        stop: asked between chunks.
+
+    Raises:
+        RunError: the file cannot be read, or the copy cannot be written.
+        Interrupted: `stop` said so.
+    """
+    part = out.with_name(f".{out.name}.part")
+    with opened(path) as salvage:
+        try:
+            with part.open("wb") as file:
+                copy = _copied(salvage, file, stop)
+                copy.finish(path.name, _lost_bytes(salvage))
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(out)
+            _sync_directory(out.parent)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise RunError(
+                f"{out}: cannot be written: {error.strerror or error}; {path} is as it was; "
+                "free space there, or recover elsewhere with -o"
+            ) from None
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+    return RecoveryResult(
+        source=path,
+        out=out,
+        finished=salvage.finished,
+        messages=copy.messages,
+        channels=len(copy.channels),
+        attachments=copy.attachments,
+        first_ns=copy.first_ns,
+        last_ns=copy.last_ns,
+        orphans=copy.orphans,
+        cut=salvage.cut,
+        damage=tuple(salvage.damage),
+    )
+
+
+def describe(outcome: RecoveryResult) -> list[str]:
+    """Return what was kept and what was lost, in one line each."""
+    kept = f"{outcome.messages} messages"
+    if outcome.messages:
+        seconds = (outcome.last_ns - outcome.first_ns) / NS_PER_S
+        kept += f" over {seconds:.2f} s, the last at {clock_time(outcome.last_ns)}"
+    lines = [f"kept: {kept}; {outcome.attachments} attachments"]
+    lines += describe_lost(outcome.cut, outcome.damage, finished=outcome.finished)
+    if outcome.orphans:
+        lines.append(f"lost: {outcome.orphans} messages of channels that are nowhere described")
+    return lines
+
+
+def describe_lost(
+    cut: LostBytes | None, damage: tuple[LostBytes, ...] | list[LostBytes], *, finished: bool
+) -> list[str]:
+    """Return a line for each place of a file that cannot be read."""
+    lines = []
+    if cut is not None:
+        lines.append(f"lost: the last {cut.end - cut.start} bytes, cut off{_when(cut)}")
+    lines += [
+        f"lost: {loss.end - loss.start} damaged bytes from {loss.start} on{_when(loss)}"
+        for loss in damage[:_LINE_MAX]
+    ]
+    if len(damage) > _LINE_MAX:
+        more = damage[_LINE_MAX:]
+        size = sum(loss.end - loss.start for loss in more)
+        lines.append(f"lost: {size} damaged bytes at {len(more)} more places")
+    if not lines:
+        lines.append("lost: nothing" if finished else "lost: nothing that had reached the file")
+    return lines
+
+
+def clock_time(time_ns: int) -> str:
+    """Return a log time as local time of day, or as seconds where it is no date."""
+    if time_ns < 10**17:  # lockstep: virtual time from 0
+        return f"{time_ns / NS_PER_S:.3f} s"
+    try:
+        date = datetime.fromtimestamp(time_ns / NS_PER_S).astimezone()
+    except (OverflowError, ValueError, OSError):
+        return f"{time_ns} ns"
+    return date.isoformat(sep=" ", timespec="milliseconds")
+
+
+def _copied(salvage: Salvage, file: BinaryIO, stop: Stop) -> Copy:
+    copy = Copy(file, salvage.raw)
+    for piece in salvage:
+        if stop():
+            raise Interrupted
+        copy.take(piece)
+    return copy
+
+
+def _lost_bytes(salvage: Salvage) -> int:
+    losses = [*salvage.damage, *([salvage.cut] if salvage.cut else [])]
+    return sum(loss.end - loss.start for loss in losses)
+
+
+def _when(loss: LostBytes) -> str:
+    if not loss.last_ns >= loss.first_ns > 0:
+        return ""
+    seconds = (loss.last_ns - loss.first_ns) / NS_PER_S
+    return f": {seconds:.3f} s up to {clock_time(loss.last_ns)}"
+
+
+def _sync_directory(directory: Path) -> None:
+    """Make the new name last: it is in the directory, not in the file."""
+    with contextlib.suppress(OSError):  # not every file system can
+        descriptor = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,283 @@
+"""What is asked of the injector, what it answers, and what it tells the log."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from services.injector.commands import ASKED_MAX, Orders
+from services.injector.control import ASKERS_MAX, ControlSocket
+from services.injector.event_loop import SocketWatch
+from shared.exceptions import FleetError
+from shared.impairment import Direction
+from shared.impairment_schedule import ImpairmentSchedule
+from shared.injector_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
+from shared.links import COMMANDS, DIRECTIONS
+from shared.scenario import Inject
+from shared.traces import LinkEvent
+from tools.runs.injector_client import InjectorClient
+
+DELAY = Inject(link="planner->joints", at=0.0, delay_ms=30.0)
+LOSS = Inject(link="all", at=0.0, loss=0.5, duration=2.0)
+
+
+class Rig:
+    def __init__(self) -> None:
+        self.directions = {name: Direction(name, 0) for name in DIRECTIONS}
+        self.told: list[LinkEvent] = []
+        self.injections = ImpairmentSchedule(self.directions, self.told.append)
+        self.orders = Orders(self.injections)
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_what_begins_is_in_force_on_every_direction_of_the_link_and_told(rig: Rig) -> None:
+    reply = rig.orders.obey(Begin(DELAY))
+    assert [row.link for row in reply.asked] == ["planner->joints"]
+    assert reply.asked[0].left_s is None
+    impaired = {name for name, one in rig.directions.items() if one.active is not None}
+    assert impaired == set(COMMANDS)
+    assert [(e.link, e.active, e.delay_ms) for e in rig.told] == [
+        (name, True, 30.0) for name in COMMANDS
+    ]
+    assert [e.seq for e in rig.told] == list(range(1, 7))
+
+
+def test_what_has_its_time_ends_by_itself_and_tells_what_it_took(rig: Rig) -> None:
+    rig.orders.obey(Begin(LOSS))
+    for number in range(100):
+        rig.directions["knee_left->planner"].passes(number, 10)
+    end_ns = round(rig.injections.next_due)
+    assert not rig.injections.advance(end_ns - 1, end_ns - 1)
+    assert rig.injections.advance(end_ns, end_ns)
+    assert all(one.active is None for one in rig.directions.values())
+    (ended,) = [e for e in rig.told if not e.active and e.link == "knee_left->planner"]
+    assert ended.passed + ended.lost == 100
+    assert 30 < ended.lost < 70
+
+
+def test_clearing_a_link_ends_what_touches_it_and_leaves_the_rest(rig: Rig) -> None:
+    rig.orders.obey(Begin(DELAY))
+    rig.orders.obey(Begin(Inject(link="harness->planner", at=0.0, loss=0.1)))
+    reply = rig.orders.obey(Clear("planner->knee_left"))
+    assert [row.link for row in reply.asked] == ["harness->planner"]
+    assert rig.orders.obey(Clear()).asked == ()
+
+
+def test_counts_are_told_while_it_lasts(rig: Rig) -> None:
+    rig.orders.obey(Begin(LOSS))
+    for number in range(50):
+        rig.directions["planner->knee_left"].passes(number, 10)
+    (row,) = rig.orders.obey(List()).asked
+    assert row.passed + row.lost == 50
+    assert row.detail == "loss=50%"
+    assert 0.0 < (row.left_s or 0.0) <= 2.0
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        (Begin(Inject(link="planner->elbow", at=0.0, delay_ms=1.0)), "planner->MODULE"),
+        (Begin(Inject(link="all", at=0.0, ordered=True, reorder=0.1)), "leave one out"),
+        (Begin(Inject(link="all", at=0.0, loss=7.0)), "loss: 7.0 is out of range; must be"),
+        (Begin(Inject(link="all", at=0.0, delay_ms=-5.0)), "delay_ms: -5.0 is out of range"),
+        (Begin(Inject(link="all", at=0.0, rate=-1.0)), "rate: -1.0 is out of range"),
+        (Begin(Inject(link="all", at=0.0, loss=0.1, duration=-1.0)), "duration: -1.0 is out"),
+        (Begin(Inject(link="all", at=0.0, loss=0.1), in_s=1e12), "from now to 86400 s"),
+        (Begin(Inject(link="all", at=0.0, loss=0.1), in_s=-1.0), "from now to 86400 s"),
+        (Clear("nothing"), "planner->MODULE"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_and_nothing_changes(
+    rig: Rig, request_: Begin | Clear, words: str
+) -> None:
+    assert words in rig.orders.obey(request_).error
+    assert rig.told == []
+    assert rig.injections.asked == {}
+
+
+def test_what_is_asked_for_later_begins_and_ends_when_it_is_due(rig: Rig) -> None:
+    (row,) = rig.orders.obey(Begin(LOSS, in_s=5.0)).asked
+    assert 4.9 < row.in_s <= 5.0
+    assert 6.9 < (row.left_s or 0.0) <= 7.0
+    assert rig.told == []
+    begins_ns = round(rig.injections.next_due)
+    assert rig.injections.advance(begins_ns, begins_ns)
+    assert {one.active is None for one in rig.directions.values()} == {False}
+    assert rig.injections.next_due == begins_ns + 2_000_000_000
+    assert rig.orders.obey(List()).asked[0].hidden == ()
+
+
+def test_what_another_one_hides_is_told(rig: Rig) -> None:
+    rig.orders.obey(Begin(LOSS))
+    first, second = rig.orders.obey(Begin(DELAY)).asked
+    assert first.hidden == COMMANDS
+    assert second.hidden == ()
+
+
+def test_there_is_a_bound_to_what_is_asked_for_at_once(rig: Rig) -> None:
+    for _ in range(ASKED_MAX):
+        assert rig.orders.obey(Begin(LOSS)).error == ""
+    assert "clear some" in rig.orders.obey(Begin(LOSS)).error
+    assert rig.orders.obey(Clear()).error == ""
+    assert rig.orders.obey(Begin(LOSS)).error == ""
+
+
+@pytest.fixture
+def served(rig: Rig, tmp_path: Path) -> Iterator[tuple[Rig, Path]]:
+    watch = SocketWatch()
+    control = ControlSocket(tmp_path / SOCKET, rig.orders.obey, watch)
+    over = threading.Event()
+
+    def serve() -> None:
+        while not over.is_set():
+            for call, events in watch.wait(0.01):
+                call(events, 0)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield rig, tmp_path
+    over.set()
+    thread.join()
+    control.close()
+    watch.close()
+    assert not (tmp_path / SOCKET).exists()
+
+
+def test_the_client_asks_and_is_answered(served: tuple[Rig, Path]) -> None:
+    client = InjectorClient(served[1])
+    assert client.list() == ()
+    assert [row.detail for row in client.begin(DELAY)] == ["delay=30ms"]
+    assert client.clear("all") == ()
+    with pytest.raises(FleetError, match="refused"):
+        client.clear("elbow")
+
+
+def test_rubbish_is_answered_with_an_error_and_the_next_is_heard(
+    served: tuple[Rig, Path],
+) -> None:
+    with socket.socket(socket.AF_UNIX) as asking:
+        asking.settimeout(5.0)
+        asking.connect(str(served[1] / SOCKET))
+        asking.sendall(b'nonsense\n{"type":"list"}\n')
+        with asking.makefile("rb") as answers:
+            first, second = (msgspec.json.decode(answers.readline(), type=Reply) for _ in range(2))
+    assert "not understood" in first.error
+    assert second == Reply()
+    assert InjectorClient(served[1]).list() == ()
+
+
+def test_without_an_injector_the_client_says_how_to_get_one(tmp_path: Path) -> None:
+    with pytest.raises(FleetError, match="xrl up --injectable"):
+        InjectorClient(tmp_path).list()
+
+
+def test_a_long_answer_comes_whole_to_one_who_reads_late(served: tuple[Rig, Path]) -> None:
+    for _ in range(ASKED_MAX):
+        served[0].orders.obey(Begin(LOSS))
+    asked = 200
+    with socket.socket(socket.AF_UNIX) as asking:
+        asking.settimeout(5.0)
+        asking.connect(str(served[1] / SOCKET))
+        asking.sendall(asked * b'{"type":"list"}\n')
+        time.sleep(0.1)
+        assert len(InjectorClient(served[1]).list()) == ASKED_MAX, "nobody waits for it"
+        with asking.makefile("rb") as answers:
+            for _ in range(asked):
+                reply = msgspec.json.decode(answers.readline(), type=Reply)
+                assert len(reply.asked) == ASKED_MAX
+
+
+def test_who_asks_in_one_piece_too_long_or_leaves_in_the_middle_is_let_go(
+    served: tuple[Rig, Path],
+) -> None:
+    for rubbish in (b"x" * (2 * LINE_MAX), b'{"type":'):
+        with socket.socket(socket.AF_UNIX) as asking:
+            asking.settimeout(5.0)
+            asking.connect(str(served[1] / SOCKET))
+            with contextlib.suppress(OSError):
+                asking.sendall(rubbish)
+                asking.shutdown(socket.SHUT_WR)
+                assert asking.recv(1) == b""
+    assert InjectorClient(served[1]).list() == ()
+
+
+LONG = Reply(error="x" * 1_000_000)
+"""More than a socket takes at once."""
+
+
+class Served:
+    """A control socket whose answers are long, turn by turn."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path, self.watch = folder / SOCKET, SocketWatch()
+        self.control = ControlSocket(self.path, lambda _: LONG, self.watch)
+
+    def turn(self) -> None:
+        while ready := self.watch.wait(0.002):
+            for call, events in ready:
+                call(events, 0)
+
+    def ask(self, text: bytes = b"") -> socket.socket:
+        asking = socket.socket(socket.AF_UNIX)
+        asking.connect(str(self.path))
+        asking.sendall(text)
+        asking.setblocking(False)
+        self.turn()
+        return asking
+
+
+def test_an_answer_longer_than_a_socket_takes_is_not_cut(tmp_path: Path) -> None:
+    served, got = Served(tmp_path), b""
+    with served.ask(2 * b'{"type":"list"}\n') as asking:
+        while got.count(b"\n") < 2:
+            got += asking.recv(1 << 20)
+            served.turn()
+    assert [msgspec.json.decode(line, type=Reply) for line in got.splitlines()] == [LONG, LONG]
+    served.control.close()
+
+
+def test_for_one_who_asks_and_never_reads_one_answer_is_kept(tmp_path: Path) -> None:
+    served = Served(tmp_path)
+    with served.ask(1000 * b'{"type":"list"}\n'):
+        assert len(served.control._askers[0].answer) <= len(msgspec.json.encode(LONG)) + 1
+        served.control.close()
+
+
+def test_those_who_ask_nothing_keep_nobody_else_out(tmp_path: Path) -> None:
+    served = Served(tmp_path)
+    idle = [served.ask() for _ in range(2 * ASKERS_MAX)]
+    assert len(served.control._askers) == ASKERS_MAX
+    with served.ask(b'{"type":"list"}\n') as asking:
+        assert asking.recv(100)
+    served.control.close()
+    for end in idle:
+        end.close()
+
+
+@pytest.mark.parametrize("answer", [b"nonsense\n", b'{"asked": 3}\n', b"\xff\n", b'{"asked": [\n'])
+def test_an_answer_that_is_none_is_told_as_such(tmp_path: Path, answer: bytes) -> None:
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / SOCKET))
+        listener.listen()
+
+        def serve() -> None:
+            with listener.accept()[0] as end:
+                end.recv(100)
+                end.sendall(answer)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with pytest.raises(FleetError, match="none of an injector"):
+            InjectorClient(tmp_path).list()
+        thread.join()

@@ -1,0 +1,174 @@
+"""Where the injector dials to, and what it does when nothing is left to dial with."""
+
+from __future__ import annotations
+
+import resource
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from services.injector.listener import SocketListener
+from services.injector.proxy_endpoint import Address, Place, address_of
+from shared.exceptions import BusError
+from tests.injector.rig import MESSAGE, PAIR, WAIT_S, Rig, batch, heard, listening
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "address"),
+    [
+        ("unixsock-stream//run/knee.zenoh", (socket.AF_UNIX, "/run/knee.zenoh")),
+        ("tcp/127.0.0.1:7447", (socket.AF_INET, ("127.0.0.1", 7447))),
+        ("tcp/[::1]:7447", (socket.AF_INET6, ("::1", 7447, 0, 0))),
+        ("tcp/127.0.0.1:7447?rel=1#iface=lo", (socket.AF_INET, ("127.0.0.1", 7447))),
+    ],
+)
+def test_an_endpoint_is_an_address(endpoint: str, address: object) -> None:
+    assert address_of(endpoint) == address
+
+
+def test_a_host_name_is_looked_up_once_before_anybody_dials() -> None:
+    found = address_of("tcp/localhost:7447")
+    socket.inet_pton(found.family, found.where[0])
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    [
+        "tcp/no-such-host.invalid:7447",
+        "tcp/127.0.0.1",
+        "tcp/127.0.0.1:http",
+        "tcp/127.0.0.1:0",
+        "tcp/127.0.0.1:65536",
+        "tcp/:7447",
+        "udp/127.0.0.1:7447",
+    ],
+)
+def test_an_endpoint_that_cannot_be_stood_before_is_refused_by_name(endpoint: str) -> None:
+    with pytest.raises(BusError) as caught:
+        address_of(endpoint)
+    assert endpoint in str(caught.value)
+
+
+HOSTS = [(socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")]
+
+
+@pytest.fixture(params=HOSTS, ids=["IPv4", "IPv6"])
+def tcp(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+    family, host = request.param
+    try:
+        beyond = listening(family, (host, 0))
+    except OSError:
+        pytest.skip(f"this machine has no {host}")
+    made = Rig(tmp_path, beyond)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def hear(rig: Rig, end: socket.socket, size: int) -> bytes:
+    got = b""
+    for _ in range(500):
+        rig.turn()
+        got += heard(end) or b""
+        if len(got) >= size:
+            break
+    return got
+
+
+def test_over_tcp_everything_passes_both_ways_to_the_end(tcp: Rig) -> None:
+    planner, knee = tcp.link()
+    sent = b"".join(batch(MESSAGE + bytes(500), n) for n in range(100))
+    planner.send(sent)
+    knee.send(batch(MESSAGE, 7))
+    assert hear(tcp, knee, len(sent)) == sent
+    assert hear(tcp, planner, 1) == batch(MESSAGE, 7)
+    planner.close()
+    tcp.turn()
+    knee.settimeout(WAIT_S)
+    assert knee.recv(10) == b""
+
+
+def test_over_tcp_who_dials_one_that_is_not_there_sees_the_end(tcp: Rig) -> None:
+    tcp.beyond.close()
+    dialling = tcp.dial()
+    for _ in range(500):
+        tcp.turn()
+        if not tcp.relay.links:
+            break
+    dialling.settimeout(WAIT_S)
+    assert dialling.recv(10) == b""
+
+
+def test_a_place_that_cannot_be_listened_on_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "not there" / "t"
+    with pytest.raises(BusError, match="not there/t"):
+        SocketListener(path)
+
+
+def test_what_a_killed_injector_left_is_removed_and_so_is_ones_own(tmp_path: Path) -> None:
+    path = tmp_path / "t"
+    path.write_text("left")
+    listener = SocketListener(path)
+    with socket.socket(socket.AF_UNIX) as dialling:
+        dialling.connect(str(path))
+    listener.close()
+    assert not path.exists()
+
+
+@contextmanager
+def descriptors_left(count: int) -> Iterator[None]:
+    """Only so many more can be opened; those below the highest that is open are used up."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with socket.socket() as lowest_free:
+        limit = lowest_free.fileno() + count
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+def test_without_descriptors_who_dials_is_turned_away_and_the_loop_rests(rig: Rig) -> None:
+    dialling = [socket.socket(socket.AF_UNIX) for _ in range(3)]
+    rig.ends += dialling
+    with descriptors_left(0):
+        for end in dialling:
+            end.connect(str(rig.through))
+        rig.turn()
+        assert rig.watch.wait(0.0) == []
+    assert rig.relay.refused == 3
+    assert rig.relay.links == 0
+    assert [end.recv(1) for end in dialling] == [b""] * 3
+    planner, knee = rig.link()
+    rig.say(planner, 1)
+    assert heard(knee) == batch(MESSAGE, 1)
+
+
+def test_with_a_descriptor_for_one_end_only_neither_is_kept(rig: Rig) -> None:
+    dialling = socket.socket(socket.AF_UNIX)
+    rig.ends.append(dialling)
+    with descriptors_left(1):
+        dialling.connect(str(rig.through))
+        rig.turn()
+    assert rig.relay.refused == 1
+    assert dialling.recv(1) == b""
+
+
+def test_a_place_dials_where_it_was_told(tmp_path: Path) -> None:
+    where = str(tmp_path / "b")
+    with listening(socket.AF_UNIX, where) as beyond:
+        place = Place(PAIR, SocketListener(tmp_path / "t"), Address(socket.AF_UNIX, where))
+        with socket.socket(socket.AF_UNIX) as dialling:
+            dialling.connect(str(tmp_path / "t"))
+            ends = place.link()
+        assert ends is not None
+        beyond.settimeout(WAIT_S)
+        beyond.accept()[0].close()
+        for end in ends:
+            assert not end.getblocking()
+            end.close()
+        place.listener.close()

@@ -1,0 +1,220 @@
+"""The onboard loop: drive and service hold one law between them (design section 5)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from services.joint.differential import joint_torque, motor_from_joint, motor_torque
+from services.joint.drive_setpoint import (
+    FOLLOW_MS,
+    GAIN_CHANGE,
+    INPUT_TORQUE_SHARE,
+    POS_GAIN_MAX,
+    DriveSetpointLaw,
+)
+from services.joint.drivers.base import MotorTarget
+from services.joint.drivers.resend_policy import DRIFT_MS
+from services.joint.pd_law import ZERO, Setpoint
+from services.joint.pd_law import torque as law_torque
+from shared.clock import NS_PER_MS
+from shared.messages import Pair
+
+N = 17.5
+VEL_LIMIT = 60.0
+NOW = 5_000_000_000
+CYCLE_NS = 2 * NS_PER_MS
+TORQUE_MAX = 3.3
+"""What current_lim gives, N m a motor; the firmware clamps input_torque to it."""
+
+angle = st.floats(-3.0, 3.0)
+rate = st.floats(-5.0, 5.0)
+gain = st.floats(0.0, 6000.0)
+damping = st.floats(0.0, 400.0)
+torque = st.floats(-115.0, 115.0)
+
+
+def pairs(values: st.SearchStrategy[float]) -> st.SearchStrategy[Pair]:
+    return st.tuples(values, values)
+
+
+setpoints = st.builds(
+    Setpoint, pairs(angle), pairs(rate), pairs(torque), pairs(torque), pairs(gain), pairs(damping)
+)
+
+
+def firmware(target: MotorTarget, pos: Pair, vel: Pair, input_torque_max: float = math.inf) -> Pair:
+    """Return the motors' torques by the firmware's law, as its documentation writes it, N m."""
+    torques = []
+    for i in range(2):
+        wanted = target.vel_turns[i] + target.pos_gain[i] * (target.pos_turns[i] - pos[i])
+        wanted = max(-VEL_LIMIT, min(VEL_LIMIT, wanted))
+        torque = max(-input_torque_max, min(input_torque_max, target.torque[i]))
+        torques.append(torque + target.vel_gain[i] * (wanted - vel[i]))
+    return torques[0], torques[1]
+
+
+@given(setpoints, pairs(angle), pairs(rate), pairs(torque))
+def test_the_drive_gives_the_torque_that_the_service_asks_for(
+    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
+) -> None:
+    """At the sample, for any gains, references and rates, whatever the clamp does."""
+    pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
+    target = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, tau, pos, vel)
+    np.testing.assert_allclose(joint_torque(firmware(target, pos, vel), N), tau, atol=1e-7)
+
+
+@given(setpoints, pairs(torque), pairs(angle), pairs(rate), pairs(angle), pairs(rate))
+def test_the_service_knows_what_a_drive_that_it_left_alone_gives_anywhere(
+    setpoint: Setpoint, tau: Pair, q: Pair, v: Pair, later_q: Pair, later_v: Pair
+) -> None:
+    onboard = DriveSetpointLaw(N, VEL_LIMIT)
+    target = onboard.target(NOW, setpoint, tau, motor_from_joint(q, N), motor_from_joint(v, N))
+    pos, vel = motor_from_joint(later_q, N), motor_from_joint(later_v, N)
+    given_by_drive = joint_torque(firmware(target, pos, vel), N)
+    np.testing.assert_allclose(onboard.carried(target, pos, vel), given_by_drive, atol=1e-7)
+
+
+@given(st.lists(setpoints, min_size=2, max_size=5), pairs(angle), pairs(torque))
+def test_it_does_so_with_the_gains_that_the_drive_happens_to_have(
+    course: list[Setpoint], q: Pair, tau: Pair
+) -> None:
+    law = DriveSetpointLaw(N, VEL_LIMIT)
+    pos = motor_from_joint(q, N)
+    for cycle, setpoint in enumerate(course):
+        target = law.target(NOW + cycle * CYCLE_NS, setpoint, tau, pos, ZERO)
+        np.testing.assert_allclose(joint_torque(firmware(target, pos, ZERO), N), tau, atol=1e-7)
+
+
+@given(pairs(st.floats(1.0, 1500.0)), pairs(st.floats(8.0, 200.0)), pairs(torque))
+def test_with_the_service_gone_the_module_holds_with_the_mean_of_its_two_axes(
+    k_p: Pair, k_d: Pair, tau: Pair
+) -> None:
+    """And carries on with the last torque: the target stays, only the motors move."""
+    setpoint = Setpoint((0.1, -1.0), ZERO, ZERO, ZERO, k_p, k_d)
+    at = motor_from_joint(setpoint.q_ref, N)
+    target = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, tau, at, ZERO)
+    mean_p, mean_d = sum(k_p) / 2.0, sum(k_d) / 2.0
+    for axis in range(2):
+        e = np.eye(2)[axis]
+        moved = motor_from_joint((0.1 + 1e-4 * e[0], -1.0 + 1e-4 * e[1]), N)
+        held = np.subtract(joint_torque(firmware(target, moved, ZERO), N), tau) / 1e-4
+        np.testing.assert_allclose(held, -mean_p * e, rtol=1e-4, atol=0.05)
+        turning = motor_from_joint((1e-3 * e[0], 1e-3 * e[1]), N)
+        damped = np.subtract(joint_torque(firmware(target, at, turning), N), tau) / 1e-3
+        np.testing.assert_allclose(damped, -mean_d * e, rtol=1e-4, atol=0.05)
+
+
+def test_small_changes_of_the_gains_are_not_sent_and_large_ones_are() -> None:
+    law = DriveSetpointLaw(N, VEL_LIMIT)
+    sent = []
+    for at, share in enumerate((1.0, 1.0 + 0.9 * GAIN_CHANGE, 1.0 + 1.1 * GAIN_CHANGE)):
+        now_ns = NOW + at * FOLLOW_MS * NS_PER_MS
+        k_p = (500.0 * share, 700.0 * share)
+        setpoint = Setpoint(ZERO, ZERO, ZERO, ZERO, k_p, (5.0, 7.0))
+        sent.append(law.target(now_ns, setpoint, ZERO, ZERO, ZERO).pos_gain)
+    assert sent[0] == sent[1] != sent[2]
+
+
+def test_in_a_blend_the_gains_change_at_most_every_few_ms_and_in_the_end_they_are_there() -> None:
+    """A bus that three modules share has no room for them in every cycle."""
+    law = DriveSetpointLaw(N, VEL_LIMIT)
+    changed, before = [], None
+    for cycle in range(150):
+        share = min(1.0, cycle / 100)
+        setpoint = Setpoint(
+            ZERO, ZERO, ZERO, ZERO, (900.0 * share, 26.0), (60.0, 5.0 + 55.0 * share)
+        )
+        target = law.target(NOW + cycle * CYCLE_NS, setpoint, ZERO, ZERO, ZERO)
+        if (target.pos_gain, target.vel_gain) != before:
+            before = (target.pos_gain, target.vel_gain)
+            changed.append(cycle)
+    assert min(np.diff(changed)) * CYCLE_NS == FOLLOW_MS * NS_PER_MS
+    after = DriveSetpointLaw(N, VEL_LIMIT)
+    after.target(NOW, setpoint, ZERO, ZERO, ZERO)
+    assert law.gains == pytest.approx(after.gains, rel=GAIN_CHANGE)
+
+
+def test_gains_that_change_after_a_pause_change_at_once() -> None:
+    law = DriveSetpointLaw(N, VEL_LIMIT)
+    law.target(NOW, Setpoint(ZERO, ZERO, ZERO, ZERO, (900.0, 26.0), (60.0, 60.0)), ZERO, ZERO, ZERO)
+    later = NOW + FOLLOW_MS * NS_PER_MS
+    law.target(later, Setpoint(ZERO, ZERO, ZERO, ZERO, ZERO, (60.0, 60.0)), ZERO, ZERO, ZERO)
+    assert law.gains[0] == 0.0
+
+
+def test_changing_gains_come_sooner_than_a_drive_on_can_is_told_drifting_ones_again() -> None:
+    """Else each change would go out twice."""
+    assert FOLLOW_MS < DRIFT_MS
+
+
+@pytest.mark.parametrize("k_d", [0.0, 1e-6])
+def test_stiffness_without_damping_gets_a_little_and_no_endless_position_gain(k_d: float) -> None:
+    setpoint = Setpoint((0.0, 0.5), ZERO, ZERO, ZERO, (100.0, 50.0), (k_d, k_d))
+    target = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, ZERO, ZERO, ZERO)
+    assert max(target.pos_gain) <= POS_GAIN_MAX + 1e-9
+    stiffness = target.pos_gain[0] * target.vel_gain[0] * (2 * N) ** 2 / (2 * math.pi)
+    assert stiffness == pytest.approx(150.0)
+
+
+def test_without_any_gains_only_torque_is_left() -> None:
+    setpoint = Setpoint((0.1, 0.2), (1.0, 1.0), ZERO, ZERO, ZERO, ZERO)
+    target = DriveSetpointLaw(N, VEL_LIMIT).target(
+        NOW, setpoint, (3.0, -4.0), (1.0, 2.0), (3.0, 4.0)
+    )
+    assert target.vel_gain == (0.0, 0.0)
+    assert joint_torque(target.torque, N) == pytest.approx((3.0, -4.0))
+
+
+@given(setpoints, pairs(angle), pairs(rate), pairs(torque))
+def test_the_firmware_clamps_no_input_torque_if_any_target_gives_the_torque_asked_for(
+    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
+) -> None:
+    """Else the module got another torque; without a spring nothing but input torque gives it."""
+    assume(sum(setpoint.k_p) > 1.0)
+    pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
+    target = DriveSetpointLaw(N, VEL_LIMIT, TORQUE_MAX).target(NOW, setpoint, tau, pos, vel)
+    most = INPUT_TORQUE_SHARE * TORQUE_MAX
+    for wanted, gain, now in zip(motor_torque(tau, N), target.vel_gain, vel, strict=True):
+        assume(gain * (-VEL_LIMIT - now) - most <= wanted <= gain * (VEL_LIMIT - now) + most)
+    assert max(map(abs, target.torque)) <= most + 1e-9
+    given_by_drive = joint_torque(firmware(target, pos, vel, TORQUE_MAX), N)
+    np.testing.assert_allclose(given_by_drive, tau, atol=1e-6)
+
+
+@given(setpoints, pairs(angle), pairs(rate), pairs(torque))
+def test_targets_within_the_firmwares_clamp_are_the_ones_without_it(
+    setpoint: Setpoint, q: Pair, v: Pair, tau: Pair
+) -> None:
+    pos, vel = motor_from_joint(q, N), motor_from_joint(v, N)
+    free = DriveSetpointLaw(N, VEL_LIMIT).target(NOW, setpoint, tau, pos, vel)
+    most = max(map(abs, free.torque)) + 1e-9
+    ample = DriveSetpointLaw(N, VEL_LIMIT, most / INPUT_TORQUE_SHARE).target(
+        NOW, setpoint, tau, pos, vel
+    )
+    assert ample == free
+    assert free.pos_turns == motor_from_joint(setpoint.q_ref, N), "the reference as it is"
+
+
+@pytest.mark.parametrize("phi_off", [0.0, 0.05])
+@pytest.mark.parametrize("off", [-0.35, -0.3, 0.3])
+def test_a_hip_far_off_its_reference_stays_as_soft_as_it_is_told(
+    off: float, phi_off: float
+) -> None:
+    """HOLD's (900, 26) N m/rad is 463 on both motors: its theta was 463 stiff from 0.25 rad on."""
+    hip = Setpoint(ZERO, ZERO, (0.0, -10.0), ZERO, (900.0, 26.0), (30.0, 4.0))
+    law = DriveSetpointLaw(N, VEL_LIMIT, TORQUE_MAX)
+    thetas = np.linspace(off, off + 0.05, 11)
+    given_by_drive = []
+    for theta in thetas:
+        q = (phi_off, float(theta))
+        pos = motor_from_joint(q, N)
+        target = law.target(NOW, hip, law_torque(hip, q, ZERO), pos, ZERO)
+        given_by_drive.append(joint_torque(firmware(target, pos, ZERO, TORQUE_MAX), N))
+    torques = np.array(given_by_drive)
+    np.testing.assert_allclose(np.diff(torques[:, 1]) / np.diff(thetas), -26.0, rtol=1e-6)
+    np.testing.assert_allclose(torques[:, 0], -900.0 * phi_off, atol=1e-7)

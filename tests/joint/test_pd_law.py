@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from services.joint import pd_law
+from services.joint.pd_law import Setpoint
+from shared.messages import Pair
+from tests.joint.helpers import command
+
+shares = st.floats(0.0, 1.0)
+gains = st.just(0.0) | st.floats(1e-3, 6000.0)
+
+
+def pairs(elements: st.SearchStrategy[float]) -> st.SearchStrategy[Pair]:
+    return st.tuples(elements, elements)
+
+
+angles = pairs(st.floats(-6.0, 6.0))
+rates = pairs(st.floats(-20.0, 20.0))
+torques = pairs(st.floats(-200.0, 200.0))
+setpoints = st.builds(Setpoint, angles, rates, torques, torques, pairs(gains), pairs(gains))
+
+SOFT = Setpoint((0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 0.0), (10.0, 0.0))
+
+FULL = Setpoint(
+    (0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 800.0), (10.0, 50.0)
+)  # fmt: skip
+
+
+@given(s=setpoints, q=angles, v=rates)
+def test_torque_is_pd_plus_feedforward_plus_coupled(s: Setpoint, q: Pair, v: Pair) -> None:
+    k_p, k_d = np.diag(s.k_p), np.diag(s.k_d)
+    expected = k_p @ np.subtract(s.q_ref, q) + k_d @ np.subtract(s.v_ref, v)
+    expected += np.add(s.tau_ff, s.tau_coupled)
+    np.testing.assert_allclose(pd_law.torque(s, q, v), expected, rtol=1e-12, atol=1e-9)
+
+
+@given(a=setpoints, b=setpoints, share=shares, q=angles, v=rates)
+@example(a=SOFT, b=SOFT, share=0.5, q=(0.0, 0.0), v=(0.0, 0.0))
+def test_blend_of_two_laws_gives_the_blended_torque_everywhere(
+    a: Setpoint, b: Setpoint, share: float, q: Pair, v: Pair
+) -> None:
+    blended = pd_law.torque(pd_law.blend(a, b, share), q, v)
+    apart = np.array([pd_law.torque(a, q, v), pd_law.torque(b, q, v)])
+    np.testing.assert_allclose(blended, [1.0 - share, share] @ apart, rtol=1e-9, atol=1e-6)
+
+
+def test_with_no_gain_at_all_a_blend_goes_to_the_later_reference() -> None:
+    limp = msgspec.structs.replace(FULL, k_p=(0.0, 0.0), k_d=(0.0, 0.0))
+    later = msgspec.structs.replace(limp, q_ref=(0.3, 0.5), v_ref=(0.7, 0.9))
+    blended = pd_law.blend(limp, later, 0.5)
+    assert (blended.q_ref, blended.v_ref) == ((0.3, 0.5), (0.7, 0.9))
+
+
+@given(a=setpoints, b=setpoints, share=shares)
+def test_blend_of_two_laws_has_no_negative_gain(a: Setpoint, b: Setpoint, share: float) -> None:
+    blended = pd_law.blend(a, b, share)
+    assert min(*blended.k_p, *blended.k_d) >= 0.0
+
+
+@given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains), share=shares)
+def test_stiffened_never_lowers_a_gain(s: Setpoint, k_p: Pair, k_d: Pair, share: float) -> None:
+    risen = pd_law.raise_gains(s, k_p, k_d, share)
+    assert np.all(np.subtract(risen.k_p, s.k_p) >= 0.0)
+    assert np.all(np.subtract(risen.k_d, s.k_d) >= 0.0)
+    changed = Setpoint(s.q_ref, s.v_ref, s.tau_ff, s.tau_coupled, risen.k_p, risen.k_d)
+    assert risen == changed, "only gains are changed"
+
+
+@given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains))
+def test_stiffened_fully_has_at_least_the_gains_asked_for(
+    s: Setpoint, k_p: Pair, k_d: Pair
+) -> None:
+    risen = pd_law.raise_gains(s, k_p, k_d, 1.0)
+    np.testing.assert_allclose(risen.k_p, np.maximum(s.k_p, k_p), rtol=1e-12)
+    np.testing.assert_allclose(risen.k_d, np.maximum(s.k_d, k_d), rtol=1e-12)
+
+
+@given(s=setpoints, share=shares)
+def test_held_keeps_references_feedforward_and_gains(s: Setpoint, share: float) -> None:
+    kept = pd_law.freeze(s, share)
+    assert (kept.q_ref, kept.tau_ff, kept.k_p, kept.k_d) == (s.q_ref, s.tau_ff, s.k_p, s.k_d)
+
+
+@given(s=setpoints, share=shares)
+def test_held_drops_rates_and_coupled_torque_by_share(s: Setpoint, share: float) -> None:
+    kept = pd_law.freeze(s, share)
+    np.testing.assert_allclose(kept.v_ref, share * np.array(s.v_ref), rtol=1e-12)
+    np.testing.assert_allclose(kept.tau_coupled, share * np.array(s.tau_coupled), rtol=1e-12)
+
+
+@pytest.mark.parametrize("share", [0.0, -0.1])
+def test_held_with_nothing_left_moving_has_neither_rate_nor_coupled_torque(share: float) -> None:
+    kept = pd_law.freeze(SOFT, share)
+    assert kept.v_ref == (0.0, 0.0)
+    assert kept.tau_coupled == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("age_s", [0.0, 0.004, 0.03])
+def test_aged_moves_references_on_by_their_rates(age_s: float) -> None:
+    sent = command(v_ref=(0.5, -2.0), dtau_ff=(100.0, -40.0), tau_coupled=(1.0, -2.0))
+    now = pd_law.extrapolate(sent, age_s)
+    np.testing.assert_allclose(now.q_ref, np.add(sent.q_ref, age_s * np.array(sent.v_ref)))
+    np.testing.assert_allclose(now.tau_ff, np.add(sent.tau_ff, age_s * np.array(sent.dtau_ff)))
+    assert (now.v_ref, now.tau_coupled) == (sent.v_ref, sent.tau_coupled)
+    assert (now.k_p, now.k_d) == (sent.k_p, sent.k_d)
+
+
+@given(s=setpoints, share=shares, q=angles, v=rates)
+def test_damped_has_no_stiffness_and_only_what_is_left_of_the_feedforward(
+    s: Setpoint, share: float, q: Pair, v: Pair
+) -> None:
+    expected = share * np.array(s.tau_ff) - 60.0 * np.array(v)
+    damped = pd_law.damp(pd_law.freeze(s, 0.0), (True, True), 60.0, share, 1.0)
+    np.testing.assert_allclose(pd_law.torque(damped, q, v), expected, rtol=1e-12, atol=1e-9)
+
+
+@given(s=setpoints, share=shares, q=angles, v=rates)
+def test_axes_that_do_not_sink_hold_as_they_did(
+    s: Setpoint, share: float, q: Pair, v: Pair
+) -> None:
+    frozen = pd_law.freeze(s, 0.0)
+    tau = pd_law.torque(pd_law.damp(frozen, (False, True), 60.0, share, 1.0), q, v)
+    assert tau[0] == pd_law.torque(frozen, q, v)[0]
+    swapped = pd_law.torque(pd_law.damp(frozen, (True, False), 60.0, share, 1.0), q, v)
+    assert swapped[1] == pd_law.torque(frozen, q, v)[1]
+
+
+@given(s=setpoints, q=angles, v=rates, k_d=gains)
+def test_damping_begins_with_the_torque_that_was_in_force(
+    s: Setpoint, q: Pair, v: Pair, k_d: float
+) -> None:
+    both = (True, True)
+    begun = pd_law.torque(
+        pd_law.damp(pd_law.load_to_feedforward(s, both, q), both, k_d, 1.0, 0.0), q, v
+    )
+    np.testing.assert_allclose(begun, pd_law.torque(s, q, v), rtol=1e-12, atol=1e-9)
+
+
+@given(q=angles)
+def test_stand_asks_for_no_torque_where_it_stands(q: Pair) -> None:
+    s = pd_law.stand(q, (900.0, 1500.0), (40.0, 60.0))
+    assert pd_law.torque(s, q, (0.0, 0.0)) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("away_phi", [-0.126, -0.125, 0.0, 0.125, 0.126])
+@pytest.mark.parametrize("away_theta", [-0.063, -0.0625, 0.0, 0.0625, 0.063])
+def test_where_a_stiffer_spring_would_pull_too_hard_the_axis_holds_where_it_is(
+    away_phi: float, away_theta: float
+) -> None:
+    """50 N m more are allowed: phi rises by 400 N m/rad, theta by 800."""
+    s = msgspec.structs.replace(FULL, q_ref=(0.0, 0.0))
+    q = (-away_phi, -away_theta)
+    near = pd_law.limit_stiffening(s, q, (500.0, 1600.0), 50.0)
+    far = abs(away_phi) > 0.1255, abs(away_theta) > 0.06275
+    carried = (3.0 + 100.0 * away_phi, -20.0 + 800.0 * away_theta)
+    expected = msgspec.structs.replace(
+        s,
+        q_ref=(q[0] if far[0] else 0.0, q[1] if far[1] else 0.0),
+        tau_ff=(carried[0] if far[0] else 3.0, carried[1] if far[1] else -20.0),
+    )
+    assert near == expected
+    np.testing.assert_allclose(
+        pd_law.torque(near, q, (0, 0)), pd_law.torque(s, q, (0, 0)), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("sinks", [(False, False), (True, False), (False, True), (True, True)])
+def test_each_axis_that_is_to_sink_carries_its_own_load_on(sinks: tuple[bool, bool]) -> None:
+    q = (0.3, -1.5)
+    tau_ff = (3.0 - 20.0 if sinks[0] else 3.0, -20.0 + 400.0 if sinks[1] else -20.0)
+    carried = pd_law.load_to_feedforward(FULL, sinks, q)
+    assert carried == msgspec.structs.replace(FULL, tau_ff=pytest.approx(tau_ff))
+
+
+def test_a_theta_that_is_levelled_or_caught_leaves_phi_as_it_was() -> None:
+    assert pd_law.hold_theta(FULL, -0.7, 0.3, 900.0) == Setpoint(
+        (0.1, -0.7), (0.2, 0.3), FULL.tau_ff, FULL.tau_coupled, (100.0, 900.0), FULL.k_d
+    )
+    assert pd_law.add_stop(FULL, -2.5, 900.0, 60.0) == Setpoint(
+        (0.1, -2.5), FULL.v_ref, FULL.tau_ff, FULL.tau_coupled, (100.0, 900.0), (10.0, 60.0)
+    )

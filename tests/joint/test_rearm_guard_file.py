@@ -1,0 +1,232 @@
+"""The file of what a joint service left, and the verbs that ask for a module anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from services.joint import neighbours
+from services.joint.rearm_guard import LastState, Pendant, RearmGuard, ask_stop, clear, path_of
+from shared.joints import MODULES
+from tools import kill
+from tools.supervision import fleet as fleets
+from tools.supervision import procfs, supervise
+from tools.supervision.run_dir import RunDir
+from tools.supervision.supervise import SupervisedFleet
+
+MODULE = "knee_left"
+PID = 4711
+
+
+@pytest.fixture
+def left(tmp_path: Path) -> RearmGuard:
+    """Return what a service of MODULE left that held, mapped as by one that runs."""
+    file = RearmGuard(tmp_path, MODULE)
+    file.write(LastState.HELD)
+    return file
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> RearmGuard:
+    return RearmGuard(tmp_path, MODULE)
+
+
+def test_where_nobody_was_nothing_is_left(file: RearmGuard) -> None:
+    assert file.read() is LastState.NOTHING
+
+
+@pytest.mark.parametrize("last_state", list(LastState))
+def test_what_a_process_leaves_the_next_one_reads(tmp_path: Path, last_state: LastState) -> None:
+    RearmGuard(tmp_path, MODULE).write(last_state)
+    assert RearmGuard(tmp_path, MODULE).read() is last_state
+    assert RearmGuard(tmp_path, "ankle_left").read() is LastState.NOTHING
+
+
+@pytest.mark.parametrize("byte", [3, 0x20, 0xFF])
+def test_what_is_no_will_counts_as_held(tmp_path: Path, byte: int) -> None:
+    path_of(tmp_path, MODULE).write_bytes(bytes([byte]))
+    assert RearmGuard(tmp_path, MODULE).read() is LastState.HELD
+
+
+@pytest.mark.parametrize("last_state", [LastState.HELD, LastState.DAMP])
+def test_what_is_forgotten_is_so_for_a_process_that_has_it_mapped(
+    tmp_path: Path, file: RearmGuard, last_state: LastState
+) -> None:
+    file.write(last_state)
+    clear(tmp_path, MODULE)
+    assert file.read() is LastState.NOTHING
+    file.write(last_state)
+    assert file.read() is LastState.NOTHING, "it has nothing new to say: that undoes nothing"
+    other = LastState.HELD if last_state is LastState.DAMP else LastState.DAMP
+    file.write(other)
+    assert RearmGuard(tmp_path, MODULE).read() is other, "still the same file"
+
+
+def test_a_will_that_was_never_made_is_forgotten_without_a_word(tmp_path: Path) -> None:
+    clear(tmp_path, MODULE)
+    assert list(tmp_path.iterdir()) == []
+
+
+class Calls:
+    """Stands for the supervisor and the system: takes what they are asked to do."""
+
+    def __init__(self, pids: dict[str, int], *, suspended: bool) -> None:
+        self.pids = pids
+        self.suspended = suspended
+        self.made: list[tuple[object, ...]] = []
+
+    def call(self, *asked: object) -> None:
+        self.made.append(asked)
+
+    def kill(self, *asked: object) -> None:
+        self.made.append(("kill", *asked))
+
+
+def fleet_of(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch, calls: Calls, services: tuple[str, ...]
+) -> SupervisedFleet:
+    fleet = SupervisedFleet(run_dir)
+    monkeypatch.setattr(fleet, "_supervisor", SimpleNamespace(call=calls.call))
+    monkeypatch.setattr(fleet, "pids", lambda: calls.pids)
+    monkeypatch.setattr(SupervisedFleet, "manifest", SimpleNamespace(services=services))
+    monkeypatch.setattr(SupervisedFleet, "attach", lambda _run_dir: fleet)
+    monkeypatch.setattr(procfs, "is_suspended", lambda _pid: calls.suspended)
+    monkeypatch.setattr(supervise, "os", SimpleNamespace(kill=calls.kill))
+    return fleet
+
+
+def test_a_stop_is_seen_by_a_process_that_has_it_mapped_until_it_is_forgotten(
+    tmp_path: Path, file: RearmGuard
+) -> None:
+    assert not file.stop_asked
+    assert ask_stop(tmp_path, MODULE)
+    assert file.stop_asked
+    assert RearmGuard(tmp_path, MODULE).stop_asked, "and by whoever is started in its stead"
+    file.write(LastState.HELD)
+    assert file.stop_asked, "what the service leaves does not undo it"
+    clear(tmp_path, MODULE)
+    assert not file.stop_asked
+
+
+def test_where_no_service_is_nothing_is_stopped(tmp_path: Path) -> None:
+    assert not ask_stop(tmp_path, MODULE)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pendant_is_heard_by_those_that_are_there(tmp_path: Path, file: RearmGuard) -> None:
+    other = RearmGuard(tmp_path, "hip_left")
+    pendant = Pendant(tmp_path, MODULES)
+    assert set(pendant.modules) == {MODULE, "hip_left"}
+    assert file.beats == 0, "it is not missed before it was heard"
+    for beats in range(1, 300):
+        pendant.beat()
+        assert (file.beats, other.beats) == (beats, beats)
+    assert (file.read(), file.stop_asked) == (LastState.NOTHING, False)
+    pendant.lay_down()
+    assert (file.beats, other.beats) == (0, 0)
+
+
+def test_a_pendant_from_before_is_forgotten_with_the_rest(tmp_path: Path, file: RearmGuard) -> None:
+    Pendant(tmp_path, MODULES).beat()
+    clear(tmp_path, MODULE)
+    assert file.beats == 0
+
+
+def test_a_pendant_is_heard_through_a_file_of_before_pendants(tmp_path: Path) -> None:
+    path_of(tmp_path, MODULE).write_bytes(bytes([LastState.HELD, 0]))
+    Pendant(tmp_path, MODULES).beat()
+    found = RearmGuard(tmp_path, MODULE)
+    assert (found.read(), found.stop_asked, found.beats) == (LastState.HELD, False, 1)
+
+
+def test_the_file_does_not_grow_and_a_stop_is_one_byte_of_it(tmp_path: Path) -> None:
+    for _ in range(3):
+        RearmGuard(tmp_path, MODULE)
+        ask_stop(tmp_path, MODULE)
+    assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14)
+
+
+def test_what_was_found_is_not_said_again(tmp_path: Path, left: RearmGuard) -> None:
+    successor = RearmGuard(tmp_path, MODULE)
+    clear(tmp_path, MODULE)
+    successor.write(LastState.HELD)
+    assert left.read() is LastState.NOTHING
+
+
+def test_a_file_of_one_byte_is_read_as_before(tmp_path: Path) -> None:
+    path_of(tmp_path, MODULE).write_bytes(bytes([LastState.HELD]))
+    old = RearmGuard(tmp_path, MODULE)
+    assert (old.read(), old.stop_asked) == (LastState.HELD, False)
+
+
+def test_a_service_that_is_down_is_started_as_if_none_had_been_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: RearmGuard
+) -> None:
+    calls = Calls({}, suspended=False)
+    fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
+    assert ("startProcess", MODULE, False) in calls.made
+    assert left.read() is LastState.NOTHING
+
+
+@pytest.mark.parametrize("suspended", [True, False])
+def test_a_service_that_is_up_is_not_asked_for_anew_by_starting_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: RearmGuard, suspended: bool
+) -> None:
+    """It knows itself what it has held; should it crash after, the next has to know as well."""
+    calls = Calls({MODULE: PID}, suspended=suspended)
+    fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
+    assert [made[0] for made in calls.made] == ["kill"] * suspended
+    assert left.read() is LastState.HELD
+
+
+@pytest.mark.parametrize(
+    ("signal", "after"),
+    [
+        ("KILL", LastState.NOTHING),
+        ("TERM", LastState.NOTHING),
+        ("STOP", LastState.HELD),
+        ("CONT", LastState.HELD),
+    ],
+)
+def test_the_verb_that_ends_a_service_asks_for_the_next_and_one_that_suspends_it_does_not(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    left: RearmGuard,
+    signal: str,
+    after: LastState,
+) -> None:
+    calls = Calls({MODULE: PID}, suspended=False)
+    fleet_of(tmp_path, monkeypatch, calls, (MODULE,))
+    args = SimpleNamespace(run_dir=tmp_path, service=MODULE, signal=signal)
+    assert kill.run(cast("kill.argparse.Namespace", args)) == 0
+    assert calls.made == [("kill", PID, kill.SIGNALS[signal])]
+    assert left.read() is after
+
+
+def test_a_service_without_a_drive_leaves_nothing_to_forget(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = Calls({"planner": PID}, suspended=False)
+    fleet_of(tmp_path, monkeypatch, calls, ("planner",))
+    args = SimpleNamespace(run_dir=tmp_path, service="planner", signal="KILL")
+    assert kill.run(cast("kill.argparse.Namespace", args)) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ends", ["a new fleet", "a fleet that goes down"])
+def test_a_fleet_does_not_hear_of_what_held_before_it(
+    tmp_path: Path, left: RearmGuard, ends: str
+) -> None:
+    assert left.read() is LastState.HELD
+    neighbours.Neighbours(tmp_path, MODULE)
+    if ends == "a new fleet":
+        plan = SimpleNamespace(listeners=(), processes=(), config_path=tmp_path / "robot.toml")
+        plan.processes = (SimpleNamespace(name=MODULE, topic="", stop_s=1.0),)
+        RunDir(tmp_path).prepare(cast("fleets.FleetPlan", plan))
+    else:
+        RunDir(tmp_path).clear(keep_logs=True)
+    assert not path_of(tmp_path, MODULE).exists()
+    assert not neighbours.path_of(tmp_path).exists()

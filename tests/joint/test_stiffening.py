@@ -1,0 +1,209 @@
+"""HOLD and DAMP while a knee may be limp: the module rises to all support gains, and stays."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.joint.controller import JointController
+from services.joint.neighbours import NeighbourView
+from services.joint.snapshots import ControllerState
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.joints import MODULES, kind_of
+from shared.messages import Mode, Pair
+from tests.joint.helpers import Bench
+
+SOFT_P: Pair = (500.0, 12.0)
+SOFT_D: Pair = (20.0, 0.8)
+POSES = {"ankle": (0.02, 0.1), "knee": (0.02, -1.0), "hip": (0.02, 0.4)}
+
+gain = st.floats(0.0, 3000.0)
+damping = st.floats(0.0, 200.0)
+
+
+def holding(robot: RobotConfig, module: str, k_p: Pair = SOFT_P, k_d: Pair = SOFT_D) -> Bench:
+    """Bring a module from TRACK on these gains to HOLD, at its reference."""
+    bench = Bench(robot, module)
+    bench.q = POSES[kind_of(module)]
+    bench.to_track(q_ref=bench.q, k_p=k_p, k_d=k_d)
+    bench.run(1, fresh=True, hold=True, q_ref=bench.q, k_p=k_p, k_d=k_d)
+    assert bench.mode is Mode.HOLD
+    return bench
+
+
+def blended(bench: Bench, robot: RobotConfig) -> int:
+    """Return how many cycles `blend_ms` takes."""
+    return round(robot.joint_service.blend_ms * NS_PER_MS / bench.cycle_ns)
+
+
+def is_stiffened(bench: Bench) -> bool:
+    return bench.controller.state(bench.now_ns).stiffened
+
+
+def at_least(robot: RobotConfig, module: str, k_p: Pair, k_d: Pair) -> tuple[Pair, Pair]:
+    support_p, support_d = robot.support_gains(module)
+    return (
+        (max(k_p[0], support_p[0]), max(k_p[1], support_p[1])),
+        (max(k_d[0], support_d[0]), max(k_d[1], support_d[1])),
+    )
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_told_to_it_rises_to_its_support_gains_within_the_blend_time(
+    robot: RobotConfig, module: str
+) -> None:
+    bench = holding(robot, module)
+    bench.run(2 * blended(bench, robot), fresh=True, hold=True, k_p=SOFT_P, k_d=SOFT_D)
+    plain = bench.controller.setpoint
+    assert not is_stiffened(bench)
+    for _ in range(blended(bench, robot) + 1):
+        bench.run(1, fresh=True, hold=True, stiffen=True)
+        assert is_stiffened(bench)
+    stiffened = bench.controller.setpoint
+    assert (stiffened.k_p, stiffened.k_d) == at_least(robot, module, SOFT_P, SOFT_D)
+    frozen = (plain.q_ref, plain.v_ref, plain.tau_ff, plain.tau_coupled)
+    assert (stiffened.q_ref, stiffened.v_ref, stiffened.tau_ff, stiffened.tau_coupled) == frozen
+
+
+def test_a_hip_that_is_not_told_to_stays_as_soft_as_the_hand_needs_it(robot: RobotConfig) -> None:
+    bench = holding(robot, "hip_left")
+    bench.run(1000, fresh=True, hold=True)
+    assert bench.controller.setpoint.k_p[1] == SOFT_P[1]
+
+
+@settings(max_examples=25)
+@given(st.sampled_from(MODULES), st.tuples(gain, gain), st.tuples(damping, damping))
+def test_no_gain_is_ever_lowered_and_none_jumps(
+    robot: RobotConfig, module: str, k_p: Pair, k_d: Pair
+) -> None:
+    bench = holding(robot, module, k_p, k_d)
+    gains, cycles = robot.support_gains(module), blended(bench, robot)
+    steps = [max(p, d) / cycles for p, d in zip(*gains, strict=True)]
+    last = bench.controller.setpoint
+    for _ in range(cycles + 5):
+        bench.run(1, fresh=True, hold=True, stiffen=True)
+        now = bench.controller.setpoint
+        for before, after in ((last.k_p, now.k_p), (last.k_d, now.k_d)):
+            for i in (0, 1):  # HOLD's own rise comes on top
+                assert before[i] - 1e-9 <= after[i] <= before[i] + 2.0 * steps[i] + 1e-9
+        last = now
+    wanted = at_least(robot, module, k_p, k_d)
+    assert last.k_p == pytest.approx(wanted[0])
+    assert last.k_d == pytest.approx(wanted[1])
+
+
+@pytest.mark.parametrize("after", ["told so no more", "told nothing"])
+def test_it_stays_braced_until_it_tracks_again(robot: RobotConfig, after: str) -> None:
+    """A knee that a restarted service reports for a moment is not to loosen the other five."""
+    bench = holding(robot, "hip_right")
+    bench.run(1, fresh=True, hold=True, stiffen=True)
+    bench.run(500, fresh=after == "told so no more", hold=True)
+    assert is_stiffened(bench)
+    assert bench.controller.setpoint.k_p == robot.support_gains("hip_right")[0]
+    while bench.mode is Mode.HOLD:
+        bench.run(1, fresh=True, k_p=SOFT_P, k_d=SOFT_D)
+    assert bench.mode is Mode.TRACK
+    assert not is_stiffened(bench)
+    bench.run(2 * blended(bench, robot), fresh=True, k_p=SOFT_P, k_d=SOFT_D)
+    assert bench.controller.setpoint.k_p == SOFT_P
+
+
+def test_it_is_not_braced_anew_by_what_it_was_told_before_it_tracked(robot: RobotConfig) -> None:
+    bench = holding(robot, "hip_right")
+    bench.run(1, fresh=True, hold=True, stiffen=True)
+    while bench.mode is Mode.HOLD:
+        bench.run(1, fresh=True, k_p=SOFT_P, k_d=SOFT_D)
+    bench.run(1000)
+    assert bench.mode is Mode.HOLD
+    assert not is_stiffened(bench)
+
+
+def test_track_does_not_brace(robot: RobotConfig) -> None:
+    """Its gains are certified together: the hold that comes with it is what braces."""
+    bench = Bench(robot, "hip_right")
+    bench.q = POSES["hip"]
+    sent = {"q_ref": bench.q, "k_p": SOFT_P, "k_d": SOFT_D}
+    bench.to_track(**sent)
+    before = bench.controller.setpoint
+    bench.run(100, fresh=True, stiffen=True, **sent)
+    assert bench.mode is Mode.TRACK
+    assert not is_stiffened(bench)
+    assert bench.controller.setpoint == before
+    bench.run(1, fresh=True, hold=True, stiffen=True, **sent)
+    assert is_stiffened(bench)
+
+
+def test_bracing_and_going_on_to_track_is_without_a_step(robot: RobotConfig) -> None:
+    """With the joint off its reference, where a gain is a torque."""
+    bench = holding(robot, "hip_right")
+    bench.move((bench.q[0] + 0.02, bench.q[1] - 0.05))
+    off = {"q_ref": (bench.q[0], bench.q[1] + 0.03), "k_p": SOFT_P, "k_d": SOFT_D}
+    bench.run(blended(bench, robot), fresh=True, hold=True, **off)
+    last, largest = bench.controller.tau, 0.0
+    for told in ({"hold": True, "stiffen": True}, {}):
+        for _ in range(2 * blended(bench, robot)):
+            bench.run(1, fresh=True, **(off | told))
+            tau = bench.controller.tau
+            largest = max(largest, *(abs(b - a) for a, b in zip(last, tau, strict=True)))
+            last = tau
+    assert bench.mode is Mode.TRACK
+    whole = robot.support_gains("hip_right")[0][1] * 0.05
+    assert largest < 3.0 * whole / blended(bench, robot), "a share of it in each cycle"
+
+
+def test_a_controller_that_goes_on_from_its_memory_goes_on_bracing(robot: RobotConfig) -> None:
+    bench = holding(robot, "hip_right")
+    bench.run(20, fresh=True, hold=True, stiffen=True)
+    text = msgspec.json.encode(bench.controller.snapshot())
+    twin = JointController(robot, "hip_right")
+    twin.restore(msgspec.json.decode(text, type=ControllerState))
+    for _ in range(200):
+        bench.cycle()
+        twin.step(bench.now_ns, bench.reading(), None, estop=False)
+        assert twin.setpoint == bench.controller.setpoint
+    assert twin.state(bench.now_ns).stiffened
+
+
+@pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
+def test_an_emergency_stop_of_a_braced_module_goes_on_holding(
+    robot: RobotConfig, module: str
+) -> None:
+    """Its planner has told it of a limp knee, which may be on another host."""
+    bench = holding(robot, module)
+    bench.run(300, fresh=True, hold=True, stiffen=True)
+    bench.cycle(bench.fresh(hold=True, stiffen=True), estop=True)
+    assert bench.mode is Mode.DAMP
+    bench.run(2 * blended(bench, robot))
+    assert is_stiffened(bench)
+    assert bench.controller.setpoint.k_p == pytest.approx(robot.support_gains(module)[0])
+
+
+@pytest.mark.parametrize("mode", [Mode.HOLD, Mode.DAMP])
+@pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
+def test_a_limp_neighbour_braces_it_without_a_planner(
+    robot: RobotConfig, module: str, mode: Mode
+) -> None:
+    bench = holding(robot, module)
+    if mode is Mode.DAMP:
+        bench.cycle(estop=True)
+    bench.run(10)
+    assert not is_stiffened(bench)
+    bench.cycle(near=NeighbourView(stiffen=True))
+    assert is_stiffened(bench)
+    bench.run(2 * blended(bench, robot))
+    assert bench.mode is mode
+    assert is_stiffened(bench), "once is enough: its row may be lost with its service"
+    k_p, k_d = at_least(robot, module, (0.0, 0.0), (0.0, 0.0))
+    assert bench.controller.setpoint.k_p == pytest.approx(k_p)
+    assert bench.controller.setpoint.k_d == pytest.approx(k_d)
+
+
+def test_in_track_a_limp_neighbour_is_the_planners_business(robot: RobotConfig) -> None:
+    bench = Bench(robot, "hip_right")
+    bench.to_track()
+    bench.cycle(bench.fresh(), near=NeighbourView(stiffen=True))
+    assert bench.mode is Mode.TRACK
+    assert not is_stiffened(bench)

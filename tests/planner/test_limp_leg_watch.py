@@ -1,0 +1,167 @@
+"""Which modules the planner has brace: all for a limp knee, the knees for a limp ankle."""
+
+from __future__ import annotations
+
+import itertools
+
+import msgspec
+import pytest
+
+from services.planner.limp_leg_watch import DISARMED_NS, LimpLegWatch
+from services.planner.planner import Planner
+from services.planner.snapshots import TickState
+from shared.clock import NS_PER_MS
+from shared.config import RobotConfig
+from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
+from shared.limp_leg_support import Support
+from shared.messages import DriveStatus, JointState, Mode
+from tests.planner.conftest import Closed
+from tests.planner.oracle import Array
+from tests.planner.test_planner import SESSION, START_NS, hear_all, lead, state
+
+TICK_NS = 4 * NS_PER_MS
+FOR = {"ankle": Support.KNEES, "knee": Support.ALL, "hip": Support.NONE}
+"""Who braces for a limp one of a kind."""
+BRACED_FOR = [name for name in MODULES if FOR[kind_of(name)]]
+HIPS = [name for name in MODULES if kind_of(name) == "hip"]
+KNEES = [name for name in MODULES if kind_of(name) == "knee"]
+
+
+@pytest.fixture
+def q(closed: Closed) -> Array:
+    return closed(1.188, x=0.01, pitch=0.1)
+
+
+def states(q: Array, module: str, mode: Mode, drive: DriveStatus) -> list[JointState]:
+    rows = [state(index, q) for index in range(N_MODULES)]
+    index = MODULE_INDEX[module]
+    rows[index] = state(index, q, mode=int(mode), drive=int(drive))
+    return rows
+
+
+@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("drive", list(DriveStatus))
+def test_a_module_in_fault_is_braced_for_at_once_whatever_its_drive_says(
+    q: Array, module: str, drive: DriveStatus
+) -> None:
+    """One that is silent may hold or have no power."""
+    told = LimpLegWatch().advance(START_NS, states(q, module, Mode.FAULT, drive))
+    assert told is FOR[kind_of(module)]
+
+
+@pytest.mark.parametrize("module", BRACED_FOR)
+@pytest.mark.parametrize("drive", [d for d in DriveStatus if d is not DriveStatus.HOLDING])
+def test_one_that_stays_disarmed_is_braced_for_after_the_time_a_takeover_may_take(
+    q: Array, module: str, drive: DriveStatus
+) -> None:
+    limp_legs, rows = LimpLegWatch(), states(q, module, Mode.DISARMED, drive)
+    told = [limp_legs.advance(START_NS + off, rows) for off in range(0, DISARMED_NS + 1, TICK_NS)]
+    assert told == [Support.NONE] * (DISARMED_NS // TICK_NS) + [FOR[kind_of(module)]]
+    well = states(q, module, Mode.HOLD, DriveStatus.ARMED)
+    assert not limp_legs.advance(START_NS + 2 * DISARMED_NS, well)
+    assert not limp_legs.advance(START_NS + 3 * DISARMED_NS, rows), "counted anew"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_one_that_waits_to_be_taken_over_is_not_braced_for_its_drive_holds_it(
+    q: Array, module: str
+) -> None:
+    limp_legs, rows = LimpLegWatch(), states(q, module, Mode.DISARMED, DriveStatus.HOLDING)
+    assert not any(limp_legs.advance(START_NS + i * TICK_NS, rows) for i in range(1000))
+
+
+@pytest.mark.parametrize("module", BRACED_FOR)
+def test_a_restarted_service_that_knows_its_drive_in_time_is_not_braced_for(
+    q: Array, module: str
+) -> None:
+    limp_legs = LimpLegWatch()
+    course = [
+        (0, Mode.DISARMED, DriveStatus.LOST),
+        (DISARMED_NS - TICK_NS, Mode.DISARMED, DriveStatus.LOST),
+        (DISARMED_NS, Mode.DISARMED, DriveStatus.HOLDING),
+        (2 * DISARMED_NS, Mode.HOLD, DriveStatus.ARMED),
+    ]
+    for off_ns, mode, drive in course:
+        assert not limp_legs.advance(START_NS + off_ns, states(q, module, mode, drive))
+
+
+@pytest.mark.parametrize("module", HIPS)
+@pytest.mark.parametrize("mode", [Mode.FAULT, Mode.DISARMED])
+def test_nobody_braces_for_a_hip(q: Array, module: str, mode: Mode) -> None:
+    limp_legs = LimpLegWatch()
+    for tick, drive in itertools.product(range(300), DriveStatus):
+        now_ns = START_NS + tick * TICK_NS
+        assert not limp_legs.advance(now_ns, states(q, module, mode, drive))
+
+
+@pytest.mark.parametrize("ankle", ["ankle_left", "ankle_right"])
+def test_a_knee_counts_before_an_ankle(q: Array, ankle: str) -> None:
+    rows = states(q, ankle, Mode.FAULT, DriveStatus.ERROR)
+    index = MODULE_INDEX["knee_left"]
+    rows[index] = state(index, q, mode=int(Mode.FAULT))
+    assert LimpLegWatch().advance(START_NS, rows) is Support.ALL
+
+
+def test_a_knee_that_restarts_beside_an_ankle_long_out_is_given_its_own_time(q: Array) -> None:
+    """Else the hips brace, and stay so: with one ankle 12 of 12 fell."""
+    limp_legs, out = LimpLegWatch(), states(q, "ankle_left", Mode.DISARMED, DriveStatus.LOST)
+    limp_legs.advance(START_NS, out)
+    assert limp_legs.advance(START_NS + 2 * DISARMED_NS, out) is Support.KNEES
+    index = MODULE_INDEX["knee_left"]
+    out[index] = state(index, q, mode=int(Mode.DISARMED), drive=int(DriveStatus.LOST))
+    for off_ns, asked in ((0, Support.KNEES), (DISARMED_NS, Support.ALL)):
+        assert limp_legs.advance(START_NS + 2 * DISARMED_NS + TICK_NS + off_ns, out) is asked
+
+
+@pytest.mark.parametrize("mode", [Mode.TRACK, Mode.HOLD, Mode.DAMP])
+def test_modules_that_are_controlled_do_not_brace(q: Array, mode: Mode) -> None:
+    rows = [state(index, q, mode=int(mode)) for index in range(N_MODULES)]
+    limp_legs = LimpLegWatch()
+    assert not any(limp_legs.advance(START_NS + i * TICK_NS, rows) for i in range(200))
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_the_commands_of_those_that_are_to_brace_carry_it_with_the_hold(
+    robot: RobotConfig, q: Array, module: str
+) -> None:
+    planner = Planner(robot, SESSION)
+    now_ns = lead(planner, q)
+    assert not any(command.stiffen for command in planner.tick(now_ns))
+    now_ns += TICK_NS
+    hear_all(planner, q, now_ns, seq=9)
+    index = MODULE_INDEX[module]
+    gone = state(index, q, 9, mode=int(Mode.FAULT), drive=int(DriveStatus.ERROR))
+    planner.receive_state(index, gone, now_ns)
+    told = [(command.hold, command.stiffen) for command in planner.tick(now_ns)]
+    asked = FOR[kind_of(module)]
+    assert told == [(True, asked.includes(name)) for name in MODULES]
+
+
+def test_knees_are_knees() -> None:
+    assert [name for name in MODULES if Support.KNEES.includes(name)] == KNEES
+    assert [name for name in MODULES if Support.ALL.includes(name)] == list(MODULES)
+    assert not any(Support.NONE.includes(name) for name in MODULES)
+
+
+def test_a_planner_that_goes_on_from_its_memory_goes_on_counting(
+    robot: RobotConfig, q: Array
+) -> None:
+    planner, now_ns = Planner(robot, SESSION), START_NS
+    for tick in range(40):
+        now_ns += TICK_NS
+        hear_all(planner, q, now_ns, seq=tick, mode=int(Mode.DISARMED), drive=int(DriveStatus.IDLE))
+        planner.tick(now_ns)
+    text = msgspec.json.encode(planner.snapshot())
+    twin = Planner(robot, SESSION)
+    twin.restore(msgspec.json.decode(text, type=TickState))
+    told = []
+    for tick in range(40, 60):
+        now_ns += TICK_NS
+        for each in (planner, twin):
+            hear_all(
+                each, q, now_ns, seq=tick, mode=int(Mode.DISARMED), drive=int(DriveStatus.IDLE)
+            )
+        both = [each.tick(now_ns)[0].stiffen for each in (planner, twin)]
+        assert both[0] is both[1]
+        told.append(both[0])
+    assert (told[0], told[-1]) == (False, True)

@@ -1,0 +1,231 @@
+"""Recovery: what was flushed comes back, and the mcap package reads it."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+from pathlib import Path
+
+import pytest
+from mcap.reader import SeekingReader, make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from services.recorder import auto_recover, recover
+from services.recorder.recover import Interrupted
+from shared import topics
+from shared.exceptions import RunError
+from tests.recorder import runs
+from tests.recorder.runs import ATTACHMENTS, STATE_KEY, Queue, item
+from tools.runs.run_log import read_run
+
+LOGGER = logging.getLogger("test")
+
+
+@pytest.fixture(autouse=True)
+def no_wait_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.fsync", lambda _descriptor: None)
+
+
+def by_the_package(path: Path) -> list[int]:
+    """Return the sequence numbers that the mcap package's seeking reader finds."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert isinstance(reader, SeekingReader)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        found = [message.sequence for _, _, message in reader.iter_messages()]
+        assert summary.statistics.message_count == len(found)
+        assert len(summary.chunk_indexes) == summary.statistics.chunk_count
+        assert summary.statistics.attachment_count == len(list(reader.iter_attachments()))
+        assert summary.statistics.metadata_count == len(list(reader.iter_metadata()))
+    with path.open("rb") as file:
+        assert list(StreamReader(file, validate_crcs=True).records)
+    return found
+
+
+def test_a_killed_file_comes_back_whole(tmp_path: Path) -> None:
+    killed = runs.killed_file(tmp_path)
+    outcome = recover.recover(killed.path, tmp_path / "out.mcap")
+    assert by_the_package(outcome.out) == list(range(1200))
+    assert (outcome.messages, outcome.cut, outcome.damage) == (1200, None, ())
+    log = read_run(outcome.out)
+    assert log.complete
+    assert log.attachments == ATTACHMENTS
+    assert log.metadata["recovered"]["from"] == "killed.mcap"
+    assert log.messages(topics.JOINT_STATE, "knee_right")[-1] == runs.state(1199)
+
+
+def test_whole_chunks_are_taken_over_byte_for_byte(tmp_path: Path) -> None:
+    killed = runs.killed_file(tmp_path, batches=2)
+    original = killed.path.read_bytes()
+    outcome = recover.recover(killed.path, tmp_path / "out.mcap")
+    start = original.index(b"zstd", killed.flushed[1][0])
+    assert original[start : start + 2000] in outcome.out.read_bytes()
+
+
+def test_the_messages_before_the_cut_in_a_chunk_come_back(tmp_path: Path) -> None:
+    """zstd gives back whole blocks of up to 128 KiB of a chunk that is cut."""
+    with runs.writer(tmp_path / "written", chunk_kib=4096) as run:
+        run.take_from(Queue(item(seq) for seq in range(3000)), 3000)
+        run.flush()
+        data = run.path.read_bytes()
+    start = data.index(b"zstd") + 4
+    length = int.from_bytes(data[start : start + 8], "little")
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: start + 8 + length * 3 // 4])
+    outcome = recover.recover(cut, tmp_path / "out.mcap")
+    found = by_the_package(outcome.out)
+    assert 500 < len(found) < 3000
+    assert found == list(range(len(found)))
+    assert outcome.cut is not None
+    # the chunk's head says when it ends: 1 ms per message
+    lost_s = (outcome.cut.last_ns - outcome.cut.first_ns) / 1e9
+    assert lost_s == pytest.approx((3000 - len(found)) * 1e-3, abs=2e-3)
+    assert f"{lost_s:.3f} s" in "\n".join(recover.describe(outcome))
+
+
+def test_garbage_after_a_power_cut_is_no_message(tmp_path: Path) -> None:
+    """The chunk's length reached the disk, and its content did not."""
+    killed = runs.killed_file(tmp_path)
+    data = killed.path.read_bytes()
+    start = data.index(b"zstd", killed.flushed[-2][0])
+    killed.path.write_bytes(data[: start + 30] + bytes(5000))
+    outcome = recover.recover(killed.path, tmp_path / "out.mcap")
+    assert by_the_package(outcome.out) == list(range(1100))
+
+
+def test_a_recovered_file_recovers_to_the_same(tmp_path: Path) -> None:
+    killed = runs.killed_file(tmp_path)
+    first = recover.recover(killed.path, tmp_path / "a.mcap")
+    second = recover.recover(first.out, tmp_path / "b.mcap")
+    assert second.finished
+    assert by_the_package(second.out) == by_the_package(first.out)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_foreign_file_is_recovered_too(
+    tmp_path: Path, compression: CompressionType, chunked: bool
+) -> None:
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000, compression=compression, use_chunking=chunked)
+        writer.start("ros2")
+        schema = writer.register_schema("std_msgs/String", "ros2msg", b"string data")
+        channels = [
+            writer.register_channel("/a", "cdr", schema), writer.register_channel("/b", "x", 0)
+        ]  # fmt: skip
+        for seq in range(200):
+            writer.add_message(channels[seq % 2], 1000 + seq, b"\0\1 payload", 7, seq)
+        writer.flush()
+    outcome = recover.recover(path, tmp_path / "out.mcap")
+    assert by_the_package(outcome.out) == list(range(200))
+    with outcome.out.open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        names = {
+            channel.topic: schema and schema.name for schema, channel, _ in reader.iter_messages()
+        }
+    assert names == {"/a": "std_msgs/String", "/b": None}
+
+
+def test_an_unfinished_file_at_the_start_is_replaced_by_its_recovery(tmp_path: Path) -> None:
+    path = runs.killed_file(tmp_path).path
+    auto_recover.rescue(path, 0, LOGGER, lambda: False)
+    assert by_the_package(path) == list(range(1200))
+    assert [p.name for p in tmp_path.glob("*.mcap")] == ["killed.mcap"]
+
+
+def test_a_damaged_original_stays_and_its_recovery_goes_beside_it_once(tmp_path: Path) -> None:
+    killed = runs.killed_file(tmp_path)
+    data = bytearray(killed.path.read_bytes())
+    data[data.index(b"zstd", killed.flushed[5][0]) + 100] ^= 1
+    killed.path.write_bytes(data)
+    for _ in range(2):
+        auto_recover.rescue(killed.path, 0, LOGGER, lambda: False)
+    assert killed.path.read_bytes() == data
+    beside = tmp_path / "killed.recovered.mcap"
+    assert len(by_the_package(beside)) >= 1100
+    assert {p.name for p in tmp_path.glob("*.mcap")} == {"killed.mcap", beside.name}
+
+
+def test_a_file_that_a_recorder_is_writing_is_left_alone(tmp_path: Path) -> None:
+    path = runs.killed_file(tmp_path).path
+    before = path.read_bytes()
+    with path.open("rb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        auto_recover.rescue(path, 0, LOGGER, lambda: False)
+    assert path.read_bytes() == before
+
+
+def test_without_space_for_a_copy_the_original_stays(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = runs.killed_file(tmp_path).path
+    before = path.read_bytes()
+    auto_recover.rescue(path, 1 << 62, LOGGER, lambda: False)
+    assert path.read_bytes() == before
+    assert "no space to recover it" in caplog.text
+
+
+def test_a_recovery_that_is_stopped_leaves_the_original_and_nothing_else(tmp_path: Path) -> None:
+    path = runs.killed_file(tmp_path).path
+    before, there = path.read_bytes(), sorted(tmp_path.iterdir())
+    asked = iter([False] * 9 + [True])
+    with pytest.raises(Interrupted):
+        auto_recover.rescue(path, 0, LOGGER, lambda: next(asked))
+    assert path.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == there
+
+
+def test_a_full_disk_while_recovering_leaves_the_original_and_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = runs.killed_file(tmp_path).path
+    before, there = path.read_bytes(), sorted(tmp_path.iterdir())
+
+    def full(*_arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("services.recorder.recover.os.fsync", full)
+    with pytest.raises(RunError, match="cannot be written: No space left") as caught:
+        recover.recover(path, tmp_path / "out.mcap")
+    assert "\n" not in str(caught.value)
+    assert path.read_bytes() == before
+    assert sorted(tmp_path.iterdir()) == there
+
+
+def test_the_rescue_of_a_directory_takes_what_is_unfinished_and_survives_the_rest(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    path = runs.killed_file(tmp_path).path
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    (tmp_path / "folder.mcap").mkdir()
+    (tmp_path / "other.mcap").write_bytes(b"no mcap file at all")
+    finished = runs.write(tmp_path / "written2", [item(0)])
+    target = tmp_path / "finished.mcap"
+    target.write_bytes(finished.read_bytes())
+    thread = auto_recover.Rescue(tmp_path, 0, LOGGER)
+    thread.start()
+    thread.join(60.0)
+    assert not thread.is_alive()
+    assert by_the_package(path) == list(range(1200))
+    assert target.read_bytes() == finished.read_bytes()
+    warned = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert len(warned) == 3
+    assert "killed.mcap was not finished; recovered to killed.mcap: kept: 1200" in caplog.text
+
+
+def test_a_key_is_still_there_after_its_first_chunk_was_lost(tmp_path: Path) -> None:
+    killed = runs.killed_file(tmp_path)
+    data = bytearray(killed.path.read_bytes())
+    data[data.index(b"zstd") + 40] ^= 0xFF
+    killed.path.write_bytes(data)
+    outcome = recover.recover(killed.path, tmp_path / "out.mcap")
+    found = by_the_package(outcome.out)
+    assert (outcome.orphans, len(outcome.damage)) == (0, 1)
+    assert len(found) > 1000
+    assert read_run(outcome.out).count(STATE_KEY) == len(found)

@@ -1,0 +1,210 @@
+"""What a page shows, as plain values: panels with lines, bars, a timeline. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tools.reports.signals import Array, Span, packed, segments
+
+
+class Line(NamedTuple):
+    """One line of a panel."""
+
+    label: str
+    t: Array
+    values: Array
+    colour: int
+    hidden: bool = False
+    """Off until it is switched on in the legend."""
+    dashed: bool = False
+
+
+class LevelLine(NamedTuple):
+    """A level to hold the lines against."""
+
+    value: float
+    label: str
+    shown: bool = True
+    """False: only if the lines come near; the axis does not reach out for it."""
+
+
+class BarRow(NamedTuple):
+    """One row of a panel of bars."""
+
+    label: str
+    t: Array
+    codes: Array
+
+
+class TimelineEvent(NamedTuple):
+    """One line of the timeline."""
+
+    t: float
+    kind: str
+    """`kill`, `restart`, `push`, `fault`, `network`, `estop`, `fall`: also a mark in the plots;
+    `limit`, `bad` and `note` are not."""
+    text: str
+    mark: str = ""
+    """What the mark says; empty: no mark."""
+
+
+class Sheet:
+    """Panels in the order in which they are added."""
+
+    def __init__(self, span: Span) -> None:
+        self.span = span
+        self.signals: list[dict[str, Any]] = []
+        self.panels: list[dict[str, Any]] = []
+        self._places: dict[tuple[Any, ...], int] = {}
+        self.left_out: list[tuple[str, str]] = []
+        """(panel, why) of what the log has no data for."""
+
+    def plot(
+        self,
+        title: str,
+        unit: str,
+        lines: Sequence[Line],
+        *,
+        limits: Sequence[LevelLine] = (),
+        reach: float | None = None,
+        note: str = "",
+        otherwise: str = "",
+    ) -> None:
+        """Add a panel; without data it is left out.
+
+        Args:
+            title: of the panel.
+            unit: of the axis.
+            lines: those without data are left out.
+            limits: levels.
+            reach: the axis goes no higher; a line may.
+            note: a sentence for those who do not know the panel.
+            otherwise: why it is left out, if it has no data.
+        """
+        found = self._lines(lines)
+        if not found:
+            self.left_out.append((title, otherwise))
+            return
+        self.panels.append(
+            _panel("plot", title, note, unit=unit, lines=found, limits=_levels(limits), reach=reach)
+        )
+
+    def choice(
+        self,
+        title: str,
+        unit: str,
+        group: str,
+        choices: Mapping[str, tuple[Sequence[Line], Sequence[LevelLine]]],
+        *,
+        initial: str,
+        note: str = "",
+        otherwise: str = "",
+    ) -> None:
+        """Add a panel of which one of several sets of lines is shown at a time.
+
+        Args:
+            title: of the panel.
+            unit: of the axis.
+            group: panels of one group show the same choice.
+            choices: lines and levels by name.
+            initial: which is shown first.
+            note: a sentence for those who do not know the panel.
+            otherwise: why it is left out, if it has no data.
+        """
+        found = [
+            {"label": label, "lines": self._lines(lines), "limits": _levels(limits)}
+            for label, (lines, limits) in choices.items()
+        ]
+        found = [choice for choice in found if choice["lines"]]
+        if not found:
+            self.left_out.append((title, otherwise))
+            return
+        labels = [choice["label"] for choice in found]
+        index = labels.index(initial) if initial in labels else 0
+        self.panels.append(
+            _panel("plot", title, note, unit=unit, group=group, choices=found, initial=index)
+        )
+
+    def bars(
+        self,
+        title: str,
+        rows: Sequence[BarRow],
+        names: type[IntEnum],
+        colours: Mapping[int, str],
+        *,
+        otherwise: str = "",
+    ) -> None:
+        """Add a panel of coloured bars; rows without data are left out.
+
+        Args:
+            title: of the panel.
+            rows: from top to bottom.
+            names: of the codes.
+            colours: name of the colour of each code.
+            otherwise: why it is left out, if it has no data.
+        """
+        found: list[dict[str, Any]] = []
+        for row in rows:
+            there = (row.t >= self.span.begin) & (row.t <= self.span.end)
+            spans = segments(row.t[there], np.asarray(row.codes[there], dtype=np.int64))
+            if spans:
+                found.append({"label": row.label, "spans": spans})
+        if not found:
+            self.left_out.append((title, otherwise))
+            return
+        used = sorted({int(span[2]) for row in found for span in row["spans"]})
+        codes = {
+            str(code): [_name(names, code), colours.get(code, "idle")] for code in used
+        }  # an unknown code is of another version
+        self.panels.append(_panel("bars", title, "", rows=found, codes=codes))
+
+    def as_data(self, happenings: Sequence[TimelineEvent]) -> dict[str, Any]:
+        """Return all that the page's plots are made from."""
+        return {
+            "span": [self.span.begin, self.span.end],
+            "signals": self.signals,
+            "panels": self.panels,
+            "marks": [[row.t, row.kind, row.mark] for row in happenings if row.mark],
+        }
+
+    def _lines(self, lines: Sequence[Line]) -> list[dict[str, Any]]:
+        found = []
+        for line in lines:
+            signal = packed(line.t, line.values, self.span)
+            if signal is not None:
+                found.append(
+                    {
+                        "label": line.label,
+                        "signal": self._place(signal),
+                        "colour": line.colour,
+                        "hidden": line.hidden,
+                        "dashed": line.dashed,
+                    }
+                )
+        return found
+
+    def _place(self, signal: dict[str, Any]) -> int:
+        """Return where a signal is among all; one that is there already is not kept twice."""
+        place = self._places.setdefault(tuple(signal.values()), len(self.signals))
+        if place == len(self.signals):
+            self.signals.append(signal)
+        return place
+
+
+def _levels(limits: Sequence[LevelLine]) -> list[dict[str, Any]]:
+    return [limit._asdict() for limit in limits]
+
+
+def _panel(kind: str, title: str, note: str, **rest: Any) -> dict[str, Any]:
+    return {"kind": kind, "title": title, "note": note, **rest}
+
+
+def _name(names: type[IntEnum], code: int) -> str:
+    try:
+        return names(code).name
+    except ValueError:
+        return f"unknown ({code})"

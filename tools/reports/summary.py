@@ -1,0 +1,196 @@
+"""The head and the foot of a page: verdict, where the run comes from, what was lost."""
+
+from __future__ import annotations
+
+import io
+import json
+import tomllib
+from datetime import datetime
+from typing import Any, Final, NamedTuple
+
+from rich.console import Console
+
+from services.recorder.recover import describe_lost
+from shared import topics
+from shared.clock import NS_PER_S
+from shared.exceptions import XrlError
+from tools.reports.run_data import RunData
+from tools.runs import verdict, verdict_table
+from tools.runs.verdict import Summary
+from tools.runs.verdict_limits import LIMITS
+
+REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
+"""Figures that mean nothing in virtual time."""
+
+MACHINE: Final = {
+    "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
+}  # fmt: skip
+
+
+class RunVerdict(NamedTuple):
+    """What a run was worth."""
+
+    sentence: str
+    good: bool | None
+    """None: there is nothing to judge."""
+    rows: list[tuple[str, str, str, str]]
+    """(what, measured, limit, `ok`, or `over` and perhaps why)."""
+    caution: str = ""
+    """Why the figures are not to be trusted."""
+
+
+class Lost(NamedTuple):
+    """One topic, as the recorder heard it."""
+
+    name: str
+    messages: int
+    rate_hz: float | None
+    """Mean from the first to the last message."""
+    nominal_hz: float
+    lost: int
+    gaps: int
+    restarts: int
+
+
+def judge(source: RunData) -> RunVerdict:
+    """Return the verdict as the verbs that made the run print it."""
+    log = source.log
+    if source.course is None:
+        return RunVerdict(f"No verdict: {source.without_course}", None, [])
+    try:
+        summary = verdict.summarise(log, _duration_s(source))
+    except XrlError as error:
+        return RunVerdict(f"No verdict: {error}", None, [])
+    if log.metadata["run"].get("lockstep"):
+        summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+    said = _said(summary)
+    caution = "" if summary["in_real_time"] else said[-2]
+    return RunVerdict(said[-1], bool(summary["stood"]), _rows(summary), caution)
+
+
+def _duration_s(source: RunData) -> float:
+    """Return how long the scenario was to be; without one, as long as it was."""
+    raw = source.log.attachments.get("scenario.toml", b"")
+    try:
+        return float(tomllib.loads(raw.decode())["duration"])
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
+        assert source.course is not None  # noqa: S101 - asked for with a course only
+        return float(source.course.t[-1])
+
+
+def _said(summary: Summary) -> list[str]:
+    """Return the lines of the verdict as the other verbs print it; the last is the verdict."""
+    text = io.StringIO()
+    console = Console(file=text, width=200, color_system=None, soft_wrap=True)
+    verdict_table.show(summary, console)
+    return [line.strip() for line in text.getvalue().strip().splitlines()]
+
+
+def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for limit in LIMITS:
+        value = summary.get(limit.key)
+        if value is None:
+            continue
+        unit = f" {limit.unit}" if limit.unit else ""
+        measured = f"{verdict_table.digits(value)}{unit}"
+        mark = verdict_table.mark(limit, summary)
+        rows.append((limit.what, measured, f"{limit.limit:g}{unit}", mark))
+    return rows
+
+
+def head(source: RunData) -> list[tuple[str, str]]:
+    """Return (name, value) of what a reader needs to know first."""
+    log, about = source.log, source.log.metadata["run"]
+    begin, end = source.span
+    rows = [
+        ("scenario", _scenario(source)),
+        ("started", _moment(about.get("started", ""))),
+        ("virtual time", about.get("lockstep", "")),
+        ("length", f"{end - begin:.1f} s"),
+        ("file", log.path.name),
+        ("recording", "finished" if log.complete else "not finished: the recorder did not end it"),
+        ("git commit", _commit(about)),
+        ("robot", log.robot),
+        ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
+        ("log version", about.get("schema_version", "")),
+    ]
+    rows += [(name, about.get(key, "")) for key, name in MACHINE.items()]
+    rows.append(("threads", _threads(about.get("thread_env", ""))))
+    return [(name, value) for name, value in rows if value]
+
+
+def _threads(raw: str) -> str:
+    """Return the environment that limits threads in words; as it is, if it is not JSON."""
+    try:
+        found = json.loads(raw or "{}")
+        return ", ".join(f"{name}={value}" for name, value in sorted(found.items()))
+    except (json.JSONDecodeError, AttributeError):
+        return raw
+
+
+def _moment(started: str) -> str:
+    """Return a time as people write it; as it is, if it is written otherwise."""
+    try:
+        return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
+    except ValueError:
+        return started
+
+
+def _scenario(source: RunData) -> str:
+    name = source.log.metadata["run"].get("scenario", "")
+    raw = source.log.attachments.get("scenario.toml", b"")
+    try:
+        about = str(tomllib.loads(raw.decode()).get("about", ""))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        about = ""
+    return ": ".join(part for part in (name, about) if part)
+
+
+def _commit(about: dict[str, str]) -> str:
+    commit = about.get("git_commit", "")
+    return f"{commit} with changes" if about.get("git_dirty") == "true" else commit
+
+
+def lost(source: RunData) -> list[Lost]:
+    """Return what was recorded of each key, and what is missing, by sequence numbers."""
+    log, rows = source.log, []
+    known = topics.all_keys(log.robot)
+    for key, count in sorted(log.gaps().items()):
+        received = [row[0] for row in log.raw(key)]
+        span_s = (max(received) - min(received)) / NS_PER_S
+        nominal_hz = known[key].rate_hz if key in known else 0.0
+        rate = (len(received) - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
+        name = key.removeprefix(f"xrl/{log.robot}/")
+        rows.append(
+            Lost(name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts)
+        )
+    return rows
+
+
+def damage(source: RunData) -> list[str]:
+    """Return what of the file cannot be read, a line for each place."""
+    log = source.log
+    if log.complete and not log.damage:
+        return []
+    return describe_lost(log.cut, log.damage, finished=log.complete)
+
+
+def files(source: RunData) -> list[tuple[str, str]]:
+    """Return (name, text) of the files that the run was made from, as they are in its log."""
+    found = []
+    for name, raw in sorted(source.log.attachments.items(), key=lambda row: _order(row[0])):
+        if name.endswith((".toml", ".json")):
+            found.append((name, raw.decode(errors="replace")))
+    return found
+
+
+def _order(name: str) -> tuple[bool, str]:
+    """What people wrote goes before what was computed from it."""
+    return not name.endswith(".toml"), name
+
+
+def packages(source: RunData) -> list[tuple[str, str]]:
+    """Return (name, version) of all packages that were installed."""
+    found: dict[str, Any] = source.log.metadata.get("packages", {})
+    return sorted(found.items(), key=lambda row: row[0].lower())
