@@ -237,7 +237,7 @@ def up_in_a_process(run_dir: Path, table: Path, *, then: str = "") -> subprocess
         "import sys, time, tools.cli, tools.up, tools.supervision.supervise as s\n"
         "from pathlib import Path\n"
         "def run(args):\n"
-        f"    s.Fleet.start(args.config, args.run_dir, table_path=Path({str(table)!r}),"
+        f"    s.SupervisedFleet.start(args.config, args.run_dir, table_path=Path({str(table)!r}),"
         f" leashed={bool(then)}, timeout_s=60)\n"
         f"    {then or 'return 0'}\n"
         "tools.up.run = run\n"
@@ -297,7 +297,7 @@ def test_status_shows_mode_tier_age_and_rate(
     assert 0 <= ankle["age_s"] < 1
     assert status["modules"]["ankle_right"] == {
         "mode": "HOLD", "tier": 2, "cause": "NONE", "drive": "ARMED", "q": [0.0, 0.0],
-        "way_out": "", "braced": False, "outside": "",
+        "way_out": "", "stiffened": False, "outside": "",
     }  # fmt: skip
     assert status["services"]["planner"]["rate_hz"] is None
     assert cli.main(["status", "--run-dir", str(run_dir)]) == 0

@@ -105,7 +105,7 @@ def make_plan(
     injected: bool = False,
     table_path: Path,
 ) -> FleetPlan:
-    """Return what is to be started; the arguments are those of `supervise.Fleet.start`.
+    """Return what is to be started; the arguments are those of `SupervisedFleet.start`.
 
     Raises:
         ConfigError: the robot file or the table cannot be used.
