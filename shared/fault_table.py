@@ -21,9 +21,9 @@ class DriveFault(NamedTuple):
     """What comes of a fault of a module's ODrive.
 
     In every one the module's own mode is FAULT, and the planner has the other five go to HOLD:
-    no leg works against the other. If it is a knee they brace: it may be limp, and then its leg
-    stands as a strut between an ankle and a hip that are stiff; if it is an ankle the knees do
-    (`shared.limp_leg_support`).
+    no leg works against the other. If it is a knee the other five stiffen: it may be limp, and
+    then its leg stands as a strut between an ankle and a hip that are stiff. If it is an ankle
+    the knees stiffen (`shared.limp_leg_support`).
     """
 
     drive: str

@@ -122,7 +122,8 @@ class PlannerMode(IntEnum):
     TRIPPED = 6
     """Something was beyond its limit (`PlannerStatus.trip`): `hold` until all has been calm."""
     MISLOADED = 7
-    """It carries more or less than `law.load_correction` beyond the robot file: `hold`."""
+    """Its load is farther from the robot file than `law.load_correction`, or not known yet because
+    it hung on a hoist: `hold`."""
 
 
 class SplitSource(IntEnum):

@@ -42,9 +42,9 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     knows_below: bool = False
     """if this says so."""
     sinks: bool = True
-    """Of a knee: nothing that it knew of the others kept it from sinking."""
+    """For a knee: it knew of no reason not to sink."""
     stiffen: bool = False
-    """It knew of a limp module for which it is to stiffen."""
+    """It knew of a limp module that it stiffens for."""
 
 
 class JointTrace(Message, frozen=True):

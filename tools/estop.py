@@ -67,7 +67,10 @@ def run(args: argparse.Namespace) -> int:
             going = wait_here(run_dir, here)
     if going:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
-    Console().print("all six modules are stopped: DAMP, a slow sink; `xrl down` ends it")
+    Console().print(
+        "all six modules are stopped: DAMP. It sinks slowly, or holds beside a limp or dead "
+        "module; `xrl down` ends it"
+    )
     return 0
 
 

@@ -75,7 +75,9 @@ def run(args: argparse.Namespace) -> int:
     going = wait_here(args.run_dir, list(pendant.modules))
     if going := [words for words in going if words in pendant.modules]:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
-    console.print("stopped: DAMP, a slow sink; `xrl down` ends it")
+    console.print(
+        "stopped: DAMP. It sinks slowly, or holds beside a limp or dead module; `xrl down` ends it"
+    )
     return 0
 
 

@@ -114,7 +114,7 @@ def tables(status: FleetStatus) -> Group:
     for name, module in status.modules.items():
         mode = module.mode or "not heard"
         if module.stiffened:
-            mode = f"{mode}, braced"
+            mode = f"{mode}, stiffened"
         drive = module.drive or "-"
         angles = ("-", "-") if module.q is None else (f"{a:+.3f}" for a in module.q)
         modules.add_row(

@@ -212,7 +212,7 @@ class JointController:
         )
 
     def snapshot(self) -> ControllerState:
-        """Return the memory as it is now; `restore` goes on from there."""
+        """Return the state; `restore` continues from it."""
         return ControllerState(
             failsafe=self.failsafe,
             samples=self._samples,
@@ -235,7 +235,7 @@ class JointController:
         )
 
     def restore(self, memory: ControllerState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         m = memory
         self.failsafe = msgspec.structs.replace(m.failsafe)  # copies: these go on changing
         self._samples = msgspec.structs.replace(m.samples)

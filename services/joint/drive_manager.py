@@ -176,7 +176,7 @@ class DriveManager:
         return DriveAction(result.event, order, torque, target, ArmingInhibit.NONE)
 
     def snapshot(self) -> DriveManagerState:
-        """Return the memory as it is now; it shares what still changes, so use it at once."""
+        """Return the state; it shares what still changes, so use it at once."""
         return DriveManagerState(
             controller=self.controller.snapshot(),
             gains=self._law.gains,
@@ -194,7 +194,7 @@ class DriveManager:
         )
 
     def restore(self, memory: DriveManagerState) -> None:
-        """Go on from a memory, bit for bit."""
+        """Continue from a state, bit for bit."""
         m = memory
         self.controller.restore(m.controller)
         self._law.gains, self._law.changed_ns = m.gains, m.gains_changed_ns

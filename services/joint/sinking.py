@@ -127,14 +127,14 @@ class Sinking:
         return pd_law.blend(sunk, stands, risen)
 
     def snapshot(self) -> SinkingState:
-        """Return the memory as it is now."""
+        """Return the state."""
         stop = self.stop if math.isfinite(self.stop) else None
         return SinkingState(
             stop, self.upright, self.held, self.below, self.caught, self.doubt_ns, self.held_ns
         )
 
     def restore(self, memory: SinkingState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         self.stop = -math.inf if memory.stop is None else memory.stop
         self.upright, self.held, self.below = memory.upright, memory.held, memory.below
         self.caught, self.doubt_ns = memory.caught, memory.doubt_ns

@@ -111,11 +111,11 @@ class AssistLaw:
         """N"""
 
     def snapshot(self) -> AssistState:
-        """Return the memory as it is now."""
+        """Return the state."""
         return AssistState(self._ramp, self._wanted, self._still_s, self.integral)
 
     def restore(self, memory: AssistState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         m = memory
         self._ramp, self._wanted, self._still_s, self.integral = (
             m.ramp, m.wanted, m.still_s, m.integral
@@ -175,11 +175,11 @@ class LeadEasing:
         self._left = 0.0
 
     def snapshot(self) -> EasingState:
-        """Return the memory as it is now."""
+        """Return the state."""
         return EasingState(self._lead, self._left)
 
     def restore(self, memory: EasingState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         self._lead, self._left = memory.lead, memory.left
 
     def ease(
@@ -233,11 +233,11 @@ class Overload:
         return cls(harness.overload_force, harness.overload_moment, after_ns, release_ns)
 
     def snapshot(self) -> OverloadState:
-        """Return the memory as it is now."""
+        """Return the state."""
         return OverloadState(self._beyond_since_ns, self._below_since_ns, self.hold)
 
     def restore(self, memory: OverloadState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         m = memory
         self._beyond_since_ns, self._below_since_ns = m.beyond_since_ns, m.below_since_ns
         self.hold = m.hold

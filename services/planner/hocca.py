@@ -288,7 +288,7 @@ class Hocca:
         return float(self._measured.J_harness[2] @ v)
 
     def snapshot(self) -> LawState:
-        """Return the memory as it is now."""
+        """Return the state."""
         return LawState(
             tuple(self._p_C0.tolist()),
             self._since_align_s,
@@ -305,7 +305,7 @@ class Hocca:
         )
 
     def restore(self, memory: LawState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         self._p_C0 = np.array(memory.p_C0)
         self._since_align_s, self._aligned = memory.since_align_s, memory.aligned
         self._has_led = memory.has_led

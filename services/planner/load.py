@@ -187,13 +187,13 @@ class Load:
         return hangs
 
     def snapshot(self) -> LoadState:
-        """Return the memory as it is now."""
+        """Return the state."""
         return LoadState(
             self.kg, self.a, self.b, self._rates, self._refused, self._weighing_s, self._looked
         )
 
     def restore(self, memory: LoadState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         self.kg, self.a, self.b = memory.kg, memory.a, memory.b
         self._rates, self._refused = memory.rates, memory.refused
         self._weighing_s, self._looked = memory.weighing_s, memory.looked

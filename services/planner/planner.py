@@ -186,7 +186,7 @@ class Planner:
         return commands_of(common, states, self._output, self._support)
 
     def snapshot(self) -> TickState:
-        """Return the memory as it is between two ticks; `restore` goes on from there."""
+        """Return the state between two ticks; `restore` continues from it."""
         return TickState(
             tuple(self._states),
             tuple(self._arrived_ns),
@@ -209,7 +209,7 @@ class Planner:
         )
 
     def restore(self, memory: TickState) -> None:
-        """Go on from a memory, bit for bit."""
+        """Continue from a state, bit for bit."""
         m = memory
         for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
             if state is not None:

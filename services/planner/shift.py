@@ -66,11 +66,11 @@ class ShiftReference:
             pdot[row] += rate
 
     def snapshot(self) -> ShiftState:
-        """Return the memory as it is now."""
+        """Return the state."""
         return ShiftState(_four(self._at), _four(self._rate))
 
     def restore(self, memory: ShiftState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         self._at, self._rate = list(memory.at), list(memory.rate)
 
 

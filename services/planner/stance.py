@@ -100,10 +100,10 @@ class Stance:
         )
 
     def snapshot(self) -> tuple[Vector6, bool]:
-        """Return the memory as it is now."""
+        """Return the state."""
         a, b, c, d, e, f = self.taken.tolist()
         return (a, b, c, d, e, f), self.refused
 
     def restore(self, memory: tuple[Vector6, bool]) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         self.taken[:], self.refused = memory

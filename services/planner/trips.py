@@ -74,11 +74,11 @@ class PlannerTrips:
         return self._memory.why
 
     def snapshot(self) -> TripsState:
-        """Return the memory as it is now."""
+        """Return the state."""
         return self._memory
 
     def restore(self, memory: TripsState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         self._memory = memory
 
     def advance(self, now_ns: int, values: tuple[float, ...], *, leads: bool) -> None:

@@ -48,9 +48,9 @@ class Unattended:
         return max(abs(pose[0] - left[0]), ARM * abs(pose[1] - left[1]))
 
     def snapshot(self) -> UnattendedState:
-        """Return the memory as it is now."""
+        """Return the state."""
         return self._memory
 
     def restore(self, memory: UnattendedState) -> None:
-        """Go on from a memory."""
+        """Continue from a state."""
         self._memory = memory

@@ -96,7 +96,7 @@ def test_no_gain_is_ever_lowered_and_none_jumps(
 
 
 @pytest.mark.parametrize("after", ["told so no more", "told nothing"])
-def test_it_stays_braced_until_it_tracks_again(robot: RobotConfig, after: str) -> None:
+def test_it_stays_stiff_until_it_tracks_again(robot: RobotConfig, after: str) -> None:
     """A knee that a restarted service reports for a moment is not to loosen the other five."""
     bench = holding(robot, "hip_right")
     bench.run(1, fresh=True, hold=True, stiffen=True)
@@ -111,7 +111,7 @@ def test_it_stays_braced_until_it_tracks_again(robot: RobotConfig, after: str) -
     assert bench.controller.setpoint.k_p == SOFT_P
 
 
-def test_it_is_not_braced_anew_by_what_it_was_told_before_it_tracked(robot: RobotConfig) -> None:
+def test_it_is_not_stiffened_again_by_an_old_command(robot: RobotConfig) -> None:
     bench = holding(robot, "hip_right")
     bench.run(1, fresh=True, hold=True, stiffen=True)
     while bench.mode is Mode.HOLD:
@@ -136,7 +136,7 @@ def test_track_does_not_brace(robot: RobotConfig) -> None:
     assert is_stiffened(bench)
 
 
-def test_bracing_and_going_on_to_track_is_without_a_step(robot: RobotConfig) -> None:
+def test_stiffening_and_tracking_again_is_without_a_step(robot: RobotConfig) -> None:
     """With the joint off its reference, where a gain is a torque."""
     bench = holding(robot, "hip_right")
     bench.move((bench.q[0] + 0.02, bench.q[1] - 0.05))
@@ -154,7 +154,7 @@ def test_bracing_and_going_on_to_track_is_without_a_step(robot: RobotConfig) -> 
     assert largest < 3.0 * whole / blended(bench, robot), "a share of it in each cycle"
 
 
-def test_a_controller_that_goes_on_from_its_memory_goes_on_bracing(robot: RobotConfig) -> None:
+def test_a_controller_that_is_restored_stays_stiff(robot: RobotConfig) -> None:
     bench = holding(robot, "hip_right")
     bench.run(20, fresh=True, hold=True, stiffen=True)
     text = msgspec.json.encode(bench.controller.snapshot())
@@ -168,7 +168,7 @@ def test_a_controller_that_goes_on_from_its_memory_goes_on_bracing(robot: RobotC
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_right"])
-def test_an_emergency_stop_of_a_braced_module_goes_on_holding(
+def test_an_emergency_stop_of_a_stiffened_module_goes_on_holding(
     robot: RobotConfig, module: str
 ) -> None:
     """Its planner has told it of a limp knee, which may be on another host."""

@@ -1,4 +1,4 @@
-"""Which modules the planner has brace: all for a limp knee, the knees for a limp ankle."""
+"""Which modules the planner asks to stiffen: all for a limp knee, the knees for a limp ankle."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def states(q: Array, module: str, mode: Mode, drive: DriveStatus) -> list[JointS
 
 @pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("drive", list(DriveStatus))
-def test_a_module_in_fault_is_braced_for_at_once_whatever_its_drive_says(
+def test_a_module_in_fault_is_stiffened_for_at_once_whatever_its_drive_says(
     q: Array, module: str, drive: DriveStatus
 ) -> None:
     """One that is silent may hold or have no power."""
@@ -51,7 +51,7 @@ def test_a_module_in_fault_is_braced_for_at_once_whatever_its_drive_says(
 
 @pytest.mark.parametrize("module", BRACED_FOR)
 @pytest.mark.parametrize("drive", [d for d in DriveStatus if d is not DriveStatus.HOLDING])
-def test_one_that_stays_disarmed_is_braced_for_after_the_time_a_takeover_may_take(
+def test_one_that_stays_disarmed_is_stiffened_for_after_the_time_a_takeover_may_take(
     q: Array, module: str, drive: DriveStatus
 ) -> None:
     limp_legs, rows = LimpLegWatch(), states(q, module, Mode.DISARMED, drive)
@@ -59,11 +59,11 @@ def test_one_that_stays_disarmed_is_braced_for_after_the_time_a_takeover_may_tak
     assert told == [Support.NONE] * (DISARMED_NS // TICK_NS) + [FOR[kind_of(module)]]
     well = states(q, module, Mode.HOLD, DriveStatus.ARMED)
     assert not limp_legs.advance(START_NS + 2 * DISARMED_NS, well)
-    assert not limp_legs.advance(START_NS + 3 * DISARMED_NS, rows), "counted anew"
+    assert not limp_legs.advance(START_NS + 3 * DISARMED_NS, rows), "the count starts again"
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_one_that_waits_to_be_taken_over_is_not_braced_for_its_drive_holds_it(
+def test_one_that_waits_to_be_taken_over_is_not_stiffened_for_its_drive_holds_it(
     q: Array, module: str
 ) -> None:
     limp_legs, rows = LimpLegWatch(), states(q, module, Mode.DISARMED, DriveStatus.HOLDING)
@@ -71,7 +71,7 @@ def test_one_that_waits_to_be_taken_over_is_not_braced_for_its_drive_holds_it(
 
 
 @pytest.mark.parametrize("module", BRACED_FOR)
-def test_a_restarted_service_that_knows_its_drive_in_time_is_not_braced_for(
+def test_a_restarted_service_that_knows_its_drive_in_time_is_not_stiffened_for(
     q: Array, module: str
 ) -> None:
     limp_legs = LimpLegWatch()
@@ -103,7 +103,7 @@ def test_a_knee_counts_before_an_ankle(q: Array, ankle: str) -> None:
 
 
 def test_a_knee_that_restarts_beside_an_ankle_long_out_is_given_its_own_time(q: Array) -> None:
-    """Else the hips brace, and stay so: with one ankle 12 of 12 fell."""
+    """Otherwise the hips stiffen, and stay so: with one ankle 12 of 12 fell."""
     limp_legs, out = LimpLegWatch(), states(q, "ankle_left", Mode.DISARMED, DriveStatus.LOST)
     limp_legs.advance(START_NS, out)
     assert limp_legs.advance(START_NS + 2 * DISARMED_NS, out) is Support.KNEES

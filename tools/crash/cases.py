@@ -154,7 +154,7 @@ LIMP: Final = {
     ),
     "knee": (
         CrashVerdict.STOOD,
-        "the other five brace, and its leg stands as a strut on a stiff hip",
+        "the other five stiffen, and its leg stands as a strut on a stiff hip",
     ),
     "hip": (CrashVerdict.STOOD, "the other hip carries the torso's pitch alone"),
 }

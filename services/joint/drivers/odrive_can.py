@@ -186,7 +186,7 @@ class OdriveCan:
         if not self._link.send(messages):
             self.write_failures += 1
             if settles:
-                self._due.cut_off(GainRow.ANEW)
+                self._due.cut_off(GainRow.ALL)
 
     def write(self, target: MotorTarget) -> None:
         """Send what both motors' own loops are to do; gains before what they act on.

@@ -33,7 +33,7 @@ class GainRow(IntEnum):
     INPUTS = 0
     GAINS = 1
     """Inputs with gains."""
-    ANEW = 2
+    ALL = 2
     """Inputs with gains, limits and modes."""
 
 
@@ -77,7 +77,7 @@ class ResendPolicy:
             self.gains, self._told_ns = gains, now_ns
             self._gains_at_ns = now_ns + wait_ms * NS_PER_MS
         if self.with_torques(now_ns):
-            return GainRow.ANEW
+            return GainRow.ALL
         return GainRow.GAINS if due else GainRow.INPUTS
 
     def with_torques(self, now_ns: int) -> bool:
@@ -91,7 +91,7 @@ class ResendPolicy:
         """Take back what was told last: the bus did not take all of it."""
         if row >= GainRow.GAINS:
             self._gains_at_ns = 0
-        if row is GainRow.ANEW:
+        if row is GainRow.ALL:
             self._settle_at_ns = 0
 
     def _settle(self, now_ns: int) -> None:
