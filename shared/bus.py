@@ -1,4 +1,4 @@
-"""The bus: publishers, subscribers and the links between processes (design section 6).
+"""The bus: publishers, subscribers and the links between processes (docs/networks.md).
 
 The only file that knows Zenoh. Every process is a peer with a fixed endpoint; there is
 no router, no scouting and no gossip, and a peer does not pass on what is not for it, so
@@ -59,7 +59,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     "transport/shared_memory/enabled": False,
 }
-"""Zenoh settings that are the same for every process; measured in design section 6."""
+"""Zenoh settings that are the same for every process; measured in docs/networks.md."""
 
 _ONE_RUNTIME: Final = (
     "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
@@ -335,7 +335,7 @@ def open_session(
         run_dir: replaces `{run}` in endpoints; made if it is not there.
         listen: further endpoints to listen on: with them a tool serves other tools.
         connect: further endpoints to dial: those of such a tool.
-        injected: dial through the injector where it stands (`shared.links.PAIRS`).
+        injected: dial through the network proxy where it stands (`shared.links.PAIRS`).
 
     Raises:
         BusError: the name cannot be used, or the endpoint is taken, too long or not

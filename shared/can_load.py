@@ -1,4 +1,4 @@
-"""How much of a CAN bus the drives on it take, at 1 Mbit/s (design section 5). Pure.
+"""How much of a CAN bus the drives on it take, at 1 Mbit/s (docs/drives.md). Pure.
 
 A standard data frame with n bytes is 47 + 8n bits long, the gap after it included. After five
 equal bits the sender stuffs one more; up to the end of the checksum, over 34 + 8n bits, that is

@@ -1,4 +1,4 @@
-"""CANSimple, the CAN protocol of ODrive firmware 0.5.6 (design section 5).
+"""CANSimple, the CAN protocol of ODrive firmware 0.5.6 (docs/drives.md).
 
 Pure packing and unpacking of frame payloads; no bus, no state. A frame's arbitration
 id is `node_id << 5 | command`; payloads are little-endian. Positions are in motor

@@ -1,4 +1,4 @@
-"""Messages to bytes and back, refusing what is not finite (design section 6)."""
+"""Messages to bytes and back, refusing what is not finite (docs/networks.md)."""
 
 from __future__ import annotations
 

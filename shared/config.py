@@ -107,7 +107,7 @@ class RobotConfig(Section, frozen=True):
         """Return (k_p, k_d) that a module's gains rise to where no tau_coupled holds it.
 
         The stand gains of ankles, knees and every phi, zero elsewhere; (phi, theta), N m/rad and
-        N m s/rad. With gains as they were (design section 4), the operator's 60 N m of pitch
+        N m s/rad. With the commanded gains unchanged the operator's 60 N m of pitch
         moment in the crawl leaned the COM back by 42 mm and the soles tipped, and pushes from the
         side tipped them in 15 of 500 random cases. With the knees' theta soft, one leg gave under a
         lasting push from the side: 25 N for 3 s stood, now 75 N. The hips' theta stays soft: a

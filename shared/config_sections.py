@@ -101,7 +101,7 @@ Stance6 = tuple[StanceLength, StanceLength, StanceLength, StanceAngle, StanceAng
 
 
 class LawConfig(Section, frozen=True):
-    """Gains and choices of the law (design section 3)."""
+    """Gains and choices of the law (docs/law.md)."""
 
     K_p: Stiffness6
     B_p: Stiffness6
@@ -111,7 +111,7 @@ class LawConfig(Section, frozen=True):
     damping_lambda: Annotated[float, Range(1e-6, 0.5, "m")]
     jacobian: Literal["load_sharing", "average"]
     split: Literal["certified", "diagonal"]
-    local_damping_share: Annotated[float, Range(0.0, 1.0, "1")]
+    local_damping_fraction: Annotated[float, Range(0.0, 1.0, "1")]
     load_sharing_moment_arms: tuple[Share, Share, Annotated[float, Range(0.001, 0.5, "m")]]
     recentre_s: Seconds
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
@@ -133,11 +133,11 @@ RequiredStiffness6 = tuple[
 
 
 class CertificateConfig(Section, frozen=True):
-    """What local gains must hold alone (design sections 3 c and 3 d)."""
+    """What local gains must hold alone (docs/law.md#gain-split and docs/law.md#certificate)."""
 
     K_required: RequiredStiffness6
-    onboard_share: Share
-    k_q_share_max: Annotated[float, Range(0.1, 10.0, "1")]
+    onboard_fraction: Share
+    k_q_fraction_max: Annotated[float, Range(0.1, 10.0, "1")]
     margin_min: Share
     onboard_margin_min: Share
 
@@ -208,7 +208,7 @@ class AxisGains(Section, frozen=True):
 
 
 class JointServiceConfig(Section, frozen=True):
-    """Timing and limits of the joint service (design section 4)."""
+    """Timing and limits of the joint service (docs/architecture.md#age-rule)."""
 
     driver: Literal["odrive_can", "odrive_usb"]
     loop: Literal["onboard", "service"]
@@ -240,7 +240,7 @@ class JointServiceConfig(Section, frozen=True):
 class EnvelopeConfig(Section, frozen=True):
     """What a joint service believes of its planner, beyond `GainSchedule.bounds`."""
 
-    tau_ff_room: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
+    tau_ff_margin: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
     """Beyond the bounds of straight stands: leans, slopes, and feet that stand otherwise."""
     q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
     spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 40.0
@@ -324,7 +324,7 @@ class ImuConfig(Section, frozen=True):
 
 
 class DriveConfig(Section, frozen=True):
-    """ODrive settings that the joint service relies on (design section 5)."""
+    """ODrive settings that the joint service relies on (docs/drives.md)."""
 
     torque_constant: Annotated[float, Range(0.001, 5.0, "N m/A")]
     current_lim: Annotated[float, Range(1.0, 200.0, "A")]
@@ -353,7 +353,7 @@ class BusConfig(Section, frozen=True):
 
 
 class RecorderConfig(Section, frozen=True):
-    """MCAP file parameters (design section 10)."""
+    """MCAP file parameters (docs/logs.md)."""
 
     chunk_kib: Annotated[int, Range(1, 65_536, "KiB")]
     flush_ms: Milliseconds
@@ -369,7 +369,7 @@ class RecorderConfig(Section, frozen=True):
 
 
 class OperatorConfig(Section, frozen=True):
-    """The simulated operator's hand: a clipped spring-damper (design section 8)."""
+    """The simulated operator's hand: a clipped spring-damper (docs/simulator.md)."""
 
     k_z: Annotated[float, Range(0.0, 1e5, "N/m")]
     b_z: Annotated[float, Range(0.0, 1e4, "N s/m")]

@@ -1,8 +1,8 @@
 """What this robot wants of its ODrives: one table, by the names of firmware 0.5.6.
 
-An ODrive as shipped disarms, limits or answers in ways that this robot cannot stand on (design
-section 5, traps). The simulator's drives are set by this table, `xrl doctor` compares a drive
-with it and `xrl configure` writes it, so that the three cannot disagree.
+With factory settings an ODrive disarms, limits or answers in ways that make this robot fall
+(docs/drives.md#traps). The simulator's drives are set by this table, `xrl doctor` compares a drive
+with it and `xrl configure` writes it, so the three cannot disagree.
 
 What the joint services write at arming or in every cycle (modes, gains, limits) stands here
 too where a drive that was armed by somebody else would be wrong without it.

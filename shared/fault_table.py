@@ -1,4 +1,4 @@
-"""What goes wrong, and what then happens: one table (design sections 4 and 5).
+"""What goes wrong, and what then happens: one table (docs/drives.md).
 
 Each row is a claim. `tests/lockstep/test_faults.py` brings the robot into every drive's fault
 and holds module, others and drive to the row; `xrl crashtest` does so live, processes and
@@ -14,7 +14,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from shared.messages import Cause
-from shared.scenario import FaultKind
+from shared.scenarios import FaultKind
 
 
 class DriveFault(NamedTuple):

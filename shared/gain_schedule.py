@@ -1,6 +1,6 @@
 """The certified gain schedule: a file beside the robot's, made offline by `xrl gains`.
 
-Local joint stiffnesses over COM height and torso pitch (design section 3 c). The file
+Local joint stiffnesses over COM height and torso pitch (docs/law.md#gain-split). The file
 holds what it was made from; a robot that differs is refused until it is made again.
 """
 
@@ -31,8 +31,8 @@ def inputs_of(config: RobotConfig) -> dict[str, Any]:
         "geometry": msgspec.to_builtins(config.geometry),
         "certificate": {
             "K_required": config.certificate.K_required,
-            "onboard_share": config.certificate.onboard_share,
-            "k_q_share_max": config.certificate.k_q_share_max,
+            "onboard_fraction": config.certificate.onboard_fraction,
+            "k_q_fraction_max": config.certificate.k_q_fraction_max,
         },
         "law": {
             "K_p": law.K_p,

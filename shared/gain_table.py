@@ -25,7 +25,7 @@ class ModuleBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Between which a kind of module's commands lie, over all poses and every assist."""
 
     k_p: Bounds
-    """N m/rad; up to the stand gains and k_q_share_max of K_q, to which a split is stiffened."""
+    """N m/rad; up to the stand gains and k_q_fraction_max of K_q, to which a split is stiffened."""
     k_d: Bounds
     """N m s/rad"""
     theta: tuple[float, float]

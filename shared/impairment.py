@@ -1,9 +1,9 @@
 """What a bad network does to messages: delay, jitter, loss, partitions; seeded. Pure.
 
 The words are those of tc-netem where it has them. One object decides for the modelled network
-of lockstep and for the injector on the wire, so that both mean the same (design sections 6 and
-7). A message is one that is put in lockstep, and a batch of Zenoh's on the wire: what is sent at
-once travels, and is lost, as one.
+of lockstep and for the network proxy on the wire, so that both mean the same
+(docs/networks.md). In lockstep it acts on messages; on the wire it acts on Zenoh's batches: what is
+sent at once travels, and is lost, as one.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ class Direction:
         self._choose()
         return ended
 
-    def asked(self, number: int) -> Impairer | None:
+    def requested(self, number: int) -> Impairer | None:
         """Return what was asked for under a number, in force or not; None if it is over."""
         return self._asked.get(number)
 

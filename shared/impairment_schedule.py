@@ -1,6 +1,6 @@
 """What is done to links at the moment, and until when; told as events. Pure.
 
-Lockstep and the injector both keep it so.
+Lockstep and the network proxy both keep it so.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class ImpairmentSchedule:
             directions: every one, by name.
             tell: takes an event for each direction whenever something begins or ends.
         """
-        self.asked: dict[int, PendingImpairment] = {}
+        self.requested: dict[int, PendingImpairment] = {}
         self.next_due = math.inf
         """When the first of them begins or ends, on the owner's clock."""
         self._directions = directions
@@ -78,22 +78,22 @@ class ImpairmentSchedule:
         """
         directions_of(link)
         self._count += 1
-        self.asked[self._count] = PendingImpairment(begins, until, link, what)
+        self.requested[self._count] = PendingImpairment(begins, until, link, what)
         self._coming.append(self._count)
         self._find_next()
         return self._count
 
     def end(self, number: int, now_ns: int) -> None:
         """End one, or keep it from beginning; nothing if it is over already."""
-        asked = self.asked.pop(number, None)
-        if asked is None:
+        requested = self.requested.pop(number, None)
+        if requested is None:
             return
         if number in self._coming:
             self._coming.remove(number)
-        for name in directions_of(asked.link):
+        for name in directions_of(requested.link):
             impairer = self._directions[name].end(number)
             if impairer is not None:
-                self._say(name, number, asked, now_ns, impairer)
+                self._say(name, number, requested, now_ns, impairer)
         self._find_next()
 
     def advance(self, clock: float, now_ns: int) -> bool:
@@ -103,10 +103,10 @@ class ImpairmentSchedule:
         """
         if clock < self.next_due:
             return False
-        for number in [n for n, asked in self.asked.items() if asked.until <= clock]:
+        for number in [n for n, requested in self.requested.items() if requested.until <= clock]:
             self.end(number, now_ns)
-        due = [number for number in self._coming if self.asked[number].begins <= clock]
-        for number in sorted(due, key=lambda number: self.asked[number].begins):
+        due = [number for number in self._coming if self.requested[number].begins <= clock]
+        for number in sorted(due, key=lambda number: self.requested[number].begins):
             self._begin(number, now_ns)
         self._find_next()
         return True
@@ -118,14 +118,14 @@ class ImpairmentSchedule:
             ConfigError: there is no such link.
         """
         names = set(directions_of(link))
-        found = [n for n, asked in self.asked.items() if names & set(directions_of(asked.link))]
+        found = [n for n, row in self.requested.items() if names & set(directions_of(row.link))]
         for number in found:
             self.end(number, now_ns)
         return len(found)
 
     def counts(self, number: int) -> tuple[int, int]:
         """Return the messages that have passed, and that were lost, while it was in force."""
-        found = [direction.asked(number) for direction in self._directions.values()]
+        found = [direction.requested(number) for direction in self._directions.values()]
         counted = [impairer for impairer in found if impairer is not None]
         return sum(one.passed for one in counted), sum(one.lost for one in counted)
 
@@ -133,34 +133,39 @@ class ImpairmentSchedule:
         """Return the directions on which another one is in force, though this one has begun."""
         found = []
         for name, direction in self._directions.items():
-            impairer = direction.asked(number)
+            impairer = direction.requested(number)
             if impairer is not None and impairer is not direction.active:
                 found.append(name)
         return tuple(found)
 
     def _begin(self, number: int, now_ns: int) -> None:
         self._coming.remove(number)
-        asked = self.asked[number]
-        for name in directions_of(asked.link):
-            self._directions[name].begin(number, asked.what)
-            self._say(name, number, asked, now_ns, None)
+        requested = self.requested[number]
+        for name in directions_of(requested.link):
+            self._directions[name].begin(number, requested.what)
+            self._say(name, number, requested, now_ns, None)
 
     def _find_next(self) -> None:
-        times = [asked.until for asked in self.asked.values()]
-        times += [self.asked[number].begins for number in self._coming]
+        times = [requested.until for requested in self.requested.values()]
+        times += [self.requested[number].begins for number in self._coming]
         self.next_due = min(times, default=math.inf)
 
     def _say(
-        self, name: str, number: int, asked: PendingImpairment, now_ns: int, ended: Impairer | None
+        self,
+        name: str,
+        number: int,
+        requested: PendingImpairment,
+        now_ns: int,
+        ended: Impairer | None,
     ) -> None:
         self._told += 1
-        what = asked.what
+        what = requested.what
         self._tell(
             LinkEvent(
                 t_ns=now_ns,
                 seq=self._told,
                 link=name,
-                asked=asked.link,
+                requested=requested.link,
                 number=number,
                 active=ended is None,
                 delay_ms=what.delay_ms,

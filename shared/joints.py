@@ -1,4 +1,4 @@
-"""The joint order, defined once (design section 2).
+"""The joint order, defined once (docs/law.md#the-robot).
 
 q, v and tau are vectors in R^12: six modules, each (phi, theta), in `MODULES` order.
 phi turns about x (frontal), theta about y (sagittal); positive theta leans forward.

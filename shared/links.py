@@ -56,7 +56,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def endpoint_through(pair: Pair) -> str:
-    """Return where the injector listens for a pair: what `bus.endpoints` is without it."""
+    """Return where the network proxy listens for a pair: what `bus.endpoints` is without it."""
     return f"unixsock-stream/{{run}}/through-{pair.dials}-{pair.flushing}.zenoh"
 
 

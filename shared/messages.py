@@ -1,4 +1,4 @@
-"""Every message on the bus (design section 6).
+"""Every message on the bus (docs/networks.md).
 
 Payloads are JSON by msgspec. SI units; times are integers in ns; enumerations are
 integers. No field is optional: a `null` in a payload can then only be a number that
@@ -25,7 +25,7 @@ Modules = tuple[int, int, int, int, int, int]
 
 
 class Mode(IntEnum):
-    """State of a joint service (design section 4)."""
+    """State of a joint service (docs/architecture.md#age-rule)."""
 
     DISARMED = 0
     HOLD = 1
@@ -127,7 +127,7 @@ class PlannerMode(IntEnum):
 
 
 class SplitSource(IntEnum):
-    """Where the local gains of a tick come from (design section 3 c)."""
+    """Where the local gains of a tick come from (docs/law.md#gain-split)."""
 
     DIAGONAL = 0
     """diag(K_q), as configured."""
@@ -189,7 +189,7 @@ class JointState(Message, frozen=True):
     ready: bool
     """True if fresh commands have come for long enough to track, were `hold` lifted."""
     age_ns: int
-    """Age of the newest command in use (design section 4); -1 if there is none."""
+    """Age of the newest command in use (docs/architecture.md#age-rule); -1 if there is none."""
     session: int
     """Session of the newest command in use; 0 if there is none."""
     command_seq: int
@@ -213,7 +213,7 @@ class JointState(Message, frozen=True):
 
 
 class JointCommand(Message, frozen=True):
-    """References, local gains and torques for one module (design section 3 e)."""
+    """References, local gains and torques for one module (docs/law.md#references-and-age)."""
 
     session: int
     """Drawn at random when the planner starts."""
@@ -237,7 +237,7 @@ class JointCommand(Message, frozen=True):
     k_d: Pair
     """Local damping in N m s/rad."""
     margin: float
-    """Failsafe certificate of these gains, all six modules (design section 3 d): 1 is the
+    """Failsafe certificate of these gains, all six modules (docs/law.md#certificate): 1 is the
     stiffness required, 0 is a fall."""
     margin_onboard: float
     """The same with the joint services gone and the drives' own loops left."""
@@ -329,7 +329,7 @@ class PlannerStatus(Message, frozen=True):
     state_seq: Modules
     """Sequence number of the state consumed from each module."""
     wrench_seq: int
-    assist_wanted_n: float
+    assist_requested_n: float
     """Assist that the operator asked for, N, as this tick took it."""
     state_age_ns: Modules
     """Time since each module's newest state arrived, by the planner's clock; -1 if none yet."""
@@ -339,7 +339,7 @@ class PlannerStatus(Message, frozen=True):
     """Sequence number of the attitude that this tick knew; -1: none yet."""
     slope: Pair = (0.0, 0.0)
     """Rise of the floor along x and y that the law reckons with, rad."""
-    shift_wanted: Vector4 = STRAIGHT
+    shift_requested: Vector4 = STRAIGHT
     """What the operator asked for, as this tick took it: x, y, m, roll, yaw, rad."""
     stance: Vector6 = AS_CONFIGURED
     """The right foot against the left as the law takes them, beyond the robot file: x, y, z in m
@@ -351,7 +351,7 @@ class PlannerStatus(Message, frozen=True):
     load: Vector3 = (0.0, 0.0, 0.0)
     """What it carries beyond the robot file: kg, and its moments a and b about pitch, N m
     (`services.planner.load`)."""
-    asked_by: str = ""
+    requested_by: str = ""
     """`OperatorIntent.source` of the intent that is given now; "": none, or it has gone stale."""
 
 

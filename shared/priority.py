@@ -1,4 +1,4 @@
-"""How a process gets the processor in time, with privilege and without (design section 6).
+"""How a process gets the processor in time, with privilege and without (docs/networks.md).
 
 Call it before the bus is opened: the bus's threads inherit what was granted.
 """

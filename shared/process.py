@@ -43,9 +43,11 @@ def service_parser(description: str, example: str) -> argparse.ArgumentParser:
 
 
 def add_injected(parser: argparse.ArgumentParser) -> None:
-    """Add the flag of a service whose links the injector can stand before."""
+    """Add the flag of a service whose links the network proxy can stand before."""
     parser.add_argument(
-        "--injected", action="store_true", help="dial through the injector (services.injector)"
+        "--injected",
+        action="store_true",
+        help="dial through the network proxy (services.network_proxy)",
     )
 
 

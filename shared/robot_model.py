@@ -1,7 +1,7 @@
 """The one generated model of the robot, as MJCF, for Pinocchio and MuJoCo alike.
 
 The torso is the free root; each leg hangs from it: hip, knee, ankle. The paper writes
-the joints from the foot up (design section 2: R_torso = prod Rx(phi) Ry(theta)), so
+the joints from the foot up (docs/law.md#the-robot: R_torso = prod Rx(phi) Ry(theta)), so
 here, from the torso down, each module is theta first, about -y, then phi, about -x:
 the joint angles keep the paper's meaning and sign.
 

@@ -1,4 +1,4 @@
-"""Geometry of the six-leg harness sensor: leg forces to a wrench and back (design section 3 f).
+"""Geometry of the six-leg harness sensor: leg forces to a wrench and back (docs/law.md#harness).
 
 The sensor is a Stewart platform of six load cells between the torso and the operator's
 harness, with ball joints at both ends of each leg, so that a leg carries force along its

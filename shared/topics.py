@@ -1,4 +1,4 @@
-"""The one table of topics: key, type, rate, priority, recorded (design section 6)."""
+"""The one table of topics: key, type, rate, priority, recorded (docs/networks.md)."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     command_seq: int
     """and its number; -1: none came."""
     estop: bool
-    order: int
+    drive_command: int
     """What the drive was told: 0 nothing, 1 torques, 2 a target, 3 idle, 4 to arm, 5 no zero."""
     tau: Pair
     """Joint torques of this cycle, N m, after the gate."""
@@ -50,7 +50,7 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
 class JointTrace(Message, frozen=True):
     """Cycles of a joint service, one after the other: from these it is executed again."""
 
-    memory: str
+    snapshot: str
     """Once in a while, what the service knew before the first of these cycles, as JSON; else
     empty."""
     cycles: tuple[CycleTrace, ...]
@@ -60,7 +60,7 @@ class PlannerCheckpoint(Message, frozen=True):
     """What the planner knew before a tick: from here it is executed again."""
 
     session: int
-    memory: str
+    snapshot: str
     """JSON."""
 
 
@@ -100,7 +100,7 @@ class LinkEvent(Message, frozen=True):
 
     link: str
     """One direction, of `shared.links`."""
-    asked: str
+    requested: str
     """As it was asked for: that direction, or a group of them."""
     number: int
     """The same for all directions of one impairment, and for its beginning and its end."""

@@ -1,4 +1,4 @@
-"""A CAN bus on one host: python-can over a UNIX socket (design section 5).
+"""A CAN bus on one host: python-can over a UNIX socket (docs/drives.md).
 
 `UnixCanBus` is the client, `can.Bus(interface="xrl_unix", channel=path)`; the bus itself is
 `shared.unix_can_hub.UnixCanHub`, held by the simulator. The code that drives a real bus

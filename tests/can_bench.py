@@ -109,7 +109,7 @@ class Bench:
         self.wait(ms * 1e-3)
         return self.driver.read(0.0)
 
-    def hear(self, state: int | None = AxisState.IDLE, error: int = 0) -> DriveReading | None:
+    def receive(self, state: int | None = AxisState.IDLE, error: int = 0) -> DriveReading | None:
         """Have both axes send an estimate, and a heartbeat if there is a state, and read them."""
         for node in NODES:
             if state is not None:
@@ -121,10 +121,10 @@ class Bench:
         return self.after(1)
 
     def armed(self, *, onboard: bool = True) -> None:
-        self.hear()
+        self.receive()
         self.driver.arm(onboard=onboard)
         self.wait(2e-3 * ARM_GRACE_MS)
-        reading = self.hear(AxisState.CLOSED_LOOP_CONTROL)
+        reading = self.receive(AxisState.CLOSED_LOOP_CONTROL)
         assert reading is not None
         assert reading.status is DriveStatus.ARMED
         self.bus.sent.clear()

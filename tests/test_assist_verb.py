@@ -12,7 +12,7 @@ from services.planner.planner import Planner
 from shared.config import RobotConfig
 from shared.exceptions import FleetError
 from shared.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
-from shared.scenario import SCENARIO
+from shared.scenarios import SCENARIO
 from tools import assist
 
 WISH = OperatorIntent(t_ns=1, seq=0, assist_n=80.0, shift=(0.02, 0.0, 0.0, 0.0), source="me")
@@ -43,10 +43,10 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assist, "HEARD_S", 0.05)
 
 
-def status(robot: RobotConfig, asked_by: str, given: float = 0.0) -> PlannerStatus:
+def status(robot: RobotConfig, requested_by: str, given: float = 0.0) -> PlannerStatus:
     blank = Planner(robot, 1).status(0, 0.0)
     return msgspec.structs.replace(
-        blank, asked_by=asked_by, assist_n=given, mode=int(PlannerMode.LEADING)
+        blank, requested_by=requested_by, assist_n=given, mode=int(PlannerMode.LEADING)
     )
 
 

@@ -19,7 +19,7 @@ from shared.config import RobotConfig, expand
 from shared.config_check import INTERFACES
 from shared.exceptions import ConfigError
 from shared.joints import MODULES
-from shared.scenario import Fault, Scenario
+from shared.scenarios import Fault, Scenario
 from shared.toml_file import Range
 from tests.conftest import ROBOT_FILE
 

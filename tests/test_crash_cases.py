@@ -6,12 +6,20 @@ import re
 
 import pytest
 
-from shared import scenario
+from shared import scenarios
 from shared.config import OPTIONAL, SERVICES
 from shared.joints import MODULES
-from shared.scenario import FAULT_KINDS, Fault, FaultKind, Kill
+from shared.scenarios import FAULT_KINDS, Fault, FaultKind, Kill
 from tools import crashtest
-from tools.crash.cases import BACK_S, CASES, CRASH_S, REQUEST_S, CrashCase, CrashVerdict, story_of
+from tools.crash.cases import (
+    BACK_S,
+    CASES,
+    CRASH_S,
+    REQUEST_S,
+    CrashCase,
+    CrashVerdict,
+    scenario_of,
+)
 
 BY_NAME = {case.name: case for case in CASES}
 
@@ -80,17 +88,17 @@ def test_a_robot_may_fall_only_where_a_module_is_limp() -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_case_is_a_scenario_that_asks_back_whatever_was_lost(case: CrashCase) -> None:
-    story = story_of(case)
-    scenario.check(case.name, story)
-    assert {row.service for row in story.restart if row.at == BACK_S} == case.hit
+    scenario = scenario_of(case)
+    scenarios.check(case.name, scenario)
+    assert {row.service for row in scenario.restart if row.at == BACK_S} == case.hit
     assert case.why
-    for row in story.fault:
+    for row in scenario.fault:
         assert row.at + row.lasts_s < REQUEST_S, "over before it is asked for"
 
 
 def test_the_crash_comes_on_the_way_down_and_the_pushes_before_the_request() -> None:
-    story = story_of(BY_NAME["kill-planner"])
-    hand = scenario.lead(story, CRASH_S)
+    scenario = scenario_of(BY_NAME["kill-planner"])
+    hand = scenarios.lead(scenario, CRASH_S)
     assert hand.height == pytest.approx(1.0, abs=0.02)
     assert hand.height_rate < -0.05
-    assert all(CRASH_S + 0.5 < push.at < REQUEST_S - 0.5 for push in story.push)
+    assert all(CRASH_S + 0.5 < push.at < REQUEST_S - 0.5 for push in scenario.push)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 import pytest
 
-from shared import scenario
+from shared import scenarios
 from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
@@ -19,7 +19,7 @@ from tools.crash.cases import (
     HAND,
     CrashCase,
     CrashVerdict,
-    story_of,
+    scenario_of,
 )
 from tools.crash.outcome import Heard, as_expected, measure
 
@@ -35,7 +35,7 @@ def truth(t: float, **changes: object) -> SimTruth:
         seq=round(t * 100),
         scenario_s=t,
         com=(0.0, 0.0, 0.8),
-        torso=(0.0, 0.0, scenario.lead(story_of(BY_NAME["kill-planner"]), t).height),
+        torso=(0.0, 0.0, scenarios.lead(scenario_of(BY_NAME["kill-planner"]), t).height),
         angles=(0.0, 0.0, 0.0),
         operator_force=(0.0, 0.0, 0.0),
         operator_moment=(0.0, 0.0, 0.0),
@@ -89,9 +89,9 @@ def heard(
 ) -> Heard:
     rows = [world(index / 100) for index in range(round(end * 100) + 1)]
     marks = [said(0.0, RunEventKind.STARTED)]
-    story = story_of(case)
-    marks += [said(row.at, RunEventKind.KILLED, row.service) for row in story.kill]
-    marks += [said(row.at, RunEventKind.RESTARTED, row.service) for row in story.restart]
+    scenario = scenario_of(case)
+    marks += [said(row.at, RunEventKind.KILLED, row.service) for row in scenario.kill]
+    marks += [said(row.at, RunEventKind.RESTARTED, row.service) for row in scenario.restart]
     return Heard(rows, list(events), marks, tuple(modes))
 
 

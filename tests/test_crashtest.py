@@ -15,11 +15,11 @@ from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.messages import Mode, RunEvent, RunEventKind
-from shared.scenario import Kill
+from shared.scenarios import Kill
 from tests.test_cli import assert_one_line_error, xrl
 from tools import crashtest
 from tools.crash import report, runner
-from tools.crash.cases import CASES, CrashCase, CrashVerdict, story_of
+from tools.crash.cases import CASES, CrashCase, CrashVerdict, scenario_of
 from tools.crash.outcome import CrashResult
 from tools.crash.report import Result
 from tools.runs.scenario_runner import Chase, ScenarioRunner
@@ -104,9 +104,9 @@ def test_what_is_chased_is_killed_once_as_the_modules_track_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     session = SimpleNamespace(latest=lambda *_: None, publisher=lambda *_: None)
-    story = story_of(BY_NAME["reengaging-first"])
+    scenario = scenario_of(BY_NAME["reengaging-first"])
     chase = Chase("planner", modules=2, after_s=0.0)
-    conductor = ScenarioRunner(None, session, story, print, chase)  # type: ignore[arg-type]
+    conductor = ScenarioRunner(None, session, scenario, print, chase)  # type: ignore[arg-type]
     killed: list[object] = []
     monkeypatch.setattr(conductor, "_act", killed.append)
     for tracking, expected in ((6, 0), (3, 0), (0, 0), (1, 0), (2, 1), (6, 1)):

@@ -11,7 +11,7 @@ import pytest
 from shared.exceptions import ConfigError
 from shared.gain_schedule import path_beside
 from shared.process import DEFAULT_CONFIG
-from shared.scenario import FAULT_KINDS, Fault
+from shared.scenarios import FAULT_KINDS, Fault
 from tools.runs import experiment
 
 
@@ -38,9 +38,9 @@ def test_a_fault_is_read_from_its_flag(text: str, fault: Fault) -> None:
 
 @pytest.mark.parametrize("kind", FAULT_KINDS)
 def test_every_kind_of_fault_can_be_asked_for(kind: str) -> None:
-    story = experiment.make_scenario(parse("--fault", f"ankle_left:{kind}@1"))
-    assert [row.kind for row in story.fault] == [kind]
-    assert f"ankle_left {kind} at 1 s" in experiment.describe(story)
+    scenario = experiment.make_scenario(parse("--fault", f"ankle_left:{kind}@1"))
+    assert [row.kind for row in scenario.fault] == [kind]
+    assert f"ankle_left {kind} at 1 s" in experiment.describe(scenario)
 
 
 @pytest.mark.parametrize(
@@ -52,10 +52,13 @@ def test_a_fault_that_makes_no_sense_is_refused_with_modules_and_kinds(text: str
 
 
 def test_several_faults_can_be_asked_for() -> None:
-    story = experiment.make_scenario(
+    scenario = experiment.make_scenario(
         parse("--fault", "knee_left:encoder@1", "--fault", "hip_left:watchdog@2")
     )
-    assert [(row.module, row.at) for row in story.fault] == [("knee_left", 1.0), ("hip_left", 2.0)]
+    assert [(row.module, row.at) for row in scenario.fault] == [
+        ("knee_left", 1.0),
+        ("hip_left", 2.0),
+    ]
 
 
 def test_an_imu_is_not_fitted_to_a_robot_without_a_bus_for_it(tmp_path: Path) -> None:

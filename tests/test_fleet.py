@@ -46,14 +46,14 @@ def test_the_injector_stands_between_those_that_dial_only_where_it_is_asked_for(
     run_dir: Path,
 ) -> None:
     plain, injected = plan(run_dir), plan(run_dir, injected=True)
-    assert "injector" not in plain.commands
+    assert "network_proxy" not in plain.commands
     assert [name for name, words in plain.commands.items() if "--injected" in words] == []
     dialling = {name for name, words in injected.commands.items() if "--injected" in words}
     assert dialling == {"planner", "harness"}, "no IMU is fitted"
     new = {item.endpoint for item in injected.listeners} - {i.endpoint for i in plain.listeners}
     assert len(new) == len(PAIRS) + 1, "a socket for each pair, and its own"
     names = [row.name for row in injected.processes]
-    assert names.index("injector") < names.index("planner")
+    assert names.index("network_proxy") < names.index("planner")
 
 
 def test_joint_commands_name_their_module_and_no_placeholder_is_left(run_dir: Path) -> None:

@@ -13,7 +13,7 @@ from shared.impairment import Direction, Impairment
 from shared.impairment_schedule import ImpairmentSchedule
 from shared.links import DIRECTIONS, directions_of
 from shared.messages import PlannerMode, PlannerStatus, SimTruth
-from shared.scenario import Inject
+from shared.scenarios import Inject
 from shared.traces import LinkEvent
 from tests.recorder.runs import sample
 from tools.runs import verdict_table
@@ -31,11 +31,11 @@ def told(*asked: tuple[str, Impairment, float, float], until_s: int = 10) -> lis
     """Return the events of (link, what, begin, end), with a message a second on every link."""
     directions = {name: Direction(name, 0) for name in DIRECTIONS}
     events: list[LinkEvent] = []
-    injections = ImpairmentSchedule(directions, events.append)
+    impairments = ImpairmentSchedule(directions, events.append)
     for link, what, begins, ends in asked:
-        injections.plan(link, what, begins, ends)
+        impairments.plan(link, what, begins, ends)
     for s in range(until_s):
-        injections.advance(float(s), s * NS_PER_S)
+        impairments.advance(float(s), s * NS_PER_S)
         for direction in directions.values():
             direction.passes(s * NS_PER_S, 1)
     return events

@@ -164,7 +164,7 @@ def test_what_was_injected_is_told_with_its_counts(
     for seq, (t_ms, begins) in enumerate(((100, True), (150, False))):
         event = runs.sample(
             LinkEvent, t_ns=t_ms * MS, seq=seq, link="planner->knee_left", number=1,
-            asked="planner->left", detail="delay=5ms", active=begins, passed=20, lost=7,
+            requested="planner->left", detail="delay=5ms", active=begins, passed=20, lost=7,
         )  # fmt: skip
         items.append((topics.LINK_EVENT.key(ROBOT), codec.encode(event), t_ms * MS))
     said = " ".join(as_text(capsys, runs.write(tmp_path, items)).split())

@@ -1,4 +1,4 @@
-"""`xrl inject`: what its flags ask of the injector, and what it shows."""
+"""`xrl inject`: what its flags ask of the network proxy, and what it shows."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from shared.injector_protocol import RequestedImpairment
 from shared.links import COMMANDS
-from shared.scenario import Inject
+from shared.proxy_protocol import RequestedImpairment
+from shared.scenarios import Inject
 from tools import cli, inject
 
 BEGUN = RequestedImpairment(1, "planner->joints", "delay=30ms", None, 10, 0, hidden=COMMANDS[:3])
 COMING = RequestedImpairment(2, "all", "loss=100%", 7.0, 0, 0, in_s=2.0)
 
 
-class Injector:
+class FakeProxy:
     """In place of the client of one that is there."""
 
     began: tuple[Inject, float] | None = None
@@ -25,11 +25,11 @@ class Injector:
         pass
 
     def begin(self, what: Inject, in_s: float) -> tuple[RequestedImpairment, ...]:
-        Injector.began = (what, in_s)
+        FakeProxy.began = (what, in_s)
         return (BEGUN, COMING)
 
     def clear(self, link: str) -> tuple[RequestedImpairment, ...]:
-        Injector.cleared = link
+        FakeProxy.cleared = link
         return (COMING,)
 
     def list(self) -> tuple[RequestedImpairment, ...]:
@@ -37,9 +37,9 @@ class Injector:
 
 
 @pytest.fixture(autouse=True)
-def injector(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inject, "InjectorClient", Injector)
-    monkeypatch.setattr(Injector, "began", None)
+def proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inject, "ProxyClient", FakeProxy)
+    monkeypatch.setattr(FakeProxy, "began", None)
     monkeypatch.setenv("COLUMNS", "150")
 
 
@@ -49,7 +49,7 @@ def test_the_flags_say_what_where_and_when_and_the_injector_does_the_waiting() -
     what = Inject(
         link="left->planner", at=500.0, duration=4.0, delay_ms=30.0, loss=0.2, ordered=True
     )
-    assert Injector.began == (what, 500.0)
+    assert FakeProxy.began == (what, 500.0)
 
 
 @pytest.mark.parametrize(
@@ -83,12 +83,12 @@ def test_what_is_wrong_or_without_effect_is_refused_by_its_flag(
     words = flags.replace("all loss", "all_loss").split()
     assert cli.main(["inject", *(word.replace("_", " ") for word in words)]) == 2
     assert said in " ".join(capsys.readouterr().err.split())
-    assert Injector.began is None
+    assert FakeProxy.began is None
 
 
 def test_the_words_of_other_verbs_are_taken_too() -> None:
     assert cli.main(["inject", "all loss=20% at=2 for=3"]) == 0
-    assert Injector.began == (Inject(link="all", at=2.0, duration=3.0, loss=0.2), 2.0)
+    assert FakeProxy.began == (Inject(link="all", at=2.0, duration=3.0, loss=0.2), 2.0)
 
 
 def test_clearing_tells_what_it_ended_with_its_counts_and_what_is_left(
@@ -96,7 +96,7 @@ def test_clearing_tells_what_it_ended_with_its_counts_and_what_is_left(
 ) -> None:
     for words, link in (("--clear", "all"), ("--clear --link planner->left", "planner->left")):
         assert cli.main(["inject", *words.split()]) == 0
-        assert Injector.cleared == link
+        assert FakeProxy.cleared == link
         ended, left = capsys.readouterr().out.split("\n", 1)
         assert ended == "ended: planner->joints delay=30ms; 10 passed, 0 lost"
         assert "loss=100%" in left

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from shared import scenario, topics
+from shared import scenarios, topics
 from shared.config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.impairment import Impairment
 from shared.links import DIRECTIONS
 from shared.messages import Mode
-from shared.scenario import Inject
+from shared.scenarios import Inject
 from tests.lockstep.runs import still
 from tools import sim
 from tools.runs import describe_inject, experiment, verdict
@@ -141,18 +141,18 @@ def test_what_is_done_is_told_with_units_and_shares_in_percent() -> None:
 def test_a_flag_replaces_the_impairments_of_the_scenario_and_is_told() -> None:
     shipped = experiment.make_scenario(parse("--scenario", "bad_network"))
     assert len(shipped.inject) == 4
-    story = experiment.make_scenario(
+    scenario = experiment.make_scenario(
         parse("--scenario", "bad_network", "--inject", "all loss=0.1 at=2 for=1")
     )
-    assert [row.link for row in story.inject] == ["all"]
-    assert "all loss=10% at 2 s for 1 s" in experiment.describe(story)
+    assert [row.link for row in scenario.inject] == ["all"]
+    assert "all loss=10% at 2 s for 1 s" in experiment.describe(scenario)
 
 
 def test_a_scenario_with_impairments_comes_back_from_its_own_toml(tmp_path: Path) -> None:
-    story = experiment.make_scenario(parse("--scenario", "bad_network"))
+    scenario = experiment.make_scenario(parse("--scenario", "bad_network"))
     path = tmp_path / "x.toml"
-    path.write_text(scenario.to_toml(story))
-    assert scenario.load(path) == story
+    path.write_text(scenarios.to_toml(scenario))
+    assert scenarios.load(path) == scenario
 
 
 @pytest.mark.parametrize(
@@ -167,14 +167,14 @@ def test_a_scenario_with_impairments_comes_back_from_its_own_toml(tmp_path: Path
 )
 def test_a_scenario_refuses_an_impairment_by_its_key(inject: Inject, key: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        scenario.check("x.toml", still(2.0, inject=(inject,)))
+        scenarios.check("x.toml", still(2.0, inject=(inject,)))
     assert caught.value.key == key
 
 
 @pytest.fixture(scope="module")
 def cut(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> RunLog:
     """Record a stand with one leg cut off for a while, and a delay on top of it."""
-    story = still(
+    scenario = still(
         3.0,
         inject=(
             Inject(link="planner->left", at=0.5, duration=0.6, partition=True),
@@ -183,14 +183,14 @@ def cut(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> RunLog:
         ),
     )
     folder = tmp_path_factory.mktemp("cut")
-    sim.simulate(robot, story, BASE, 0, folder, Console(quiet=True))
+    sim.simulate(robot, scenario, BASE, 0, folder, Console(quiet=True))
     return read_run(folder / "run.mcap")
 
 
 def test_every_beginning_and_end_is_in_the_log_with_what_was_lost(cut: RunLog) -> None:
     events = cut.messages(topics.LINK_EVENT)
     assert [event.seq for event in events] == list(range(1, len(events) + 1))
-    left = [event for event in events if event.asked == "planner->left"]
+    left = [event for event in events if event.requested == "planner->left"]
     assert {event.link for event in left} < set(DIRECTIONS)
     assert [event.active for event in left] == [True] * 3 + [False] * 3
     assert len({event.number for event in left}) == 1
@@ -224,14 +224,14 @@ def test_the_time_in_hold_is_not_judged_as_the_planner_leading(cut: RunLog) -> N
 def test_impairments_that_overlap_end_each_at_its_own_time(robot: RobotConfig) -> None:
     inner = Inject(link="planner->knee_left", at=0.4, duration=0.2, delay_ms=20.0)
     outer = Inject(link="planner->joints", at=0.2, duration=1.0, delay_ms=5.0)
-    story = still(1.5, inject=(inner, outer))
+    scenario = still(1.5, inject=(inner, outer))
     ages: list[tuple[float, float]] = []
 
     def take(topic: topics.Topic, module: str, message: object) -> None:
         if topic is topics.JOINT_STATE and module == "knee_left":
             ages.append((fleet.world.scenario_s, message.age_ns / 1e6))  # type: ignore[attr-defined]
 
-    fleet = Lockstep(robot, story, Impairment(delay_ms=1.0), record=take)
+    fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0), record=take)
     for _ in fleet.run():
         pass
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.impairment import Impairment
 from shared.messages import SimControl
-from shared.scenario import Inject
+from shared.scenarios import Inject
 from shared.traces import LinkEvent
 from tools.runs.network import BASE, VirtualLink
 from tools.runs.virtual_network import VirtualNetwork
@@ -161,7 +161,7 @@ def test_nothing_on_a_stream_is_ever_overtaken_or_lost(
             one.put(now_ns, message(sent))
         elif change == "end":
             one.direction.end(number)
-        elif one.direction.asked(number) is None:
+        elif one.direction.requested(number) is None:
             one.direction.begin(number, what)
         one.release(now_ns)
         found = one.take(now_ns)

@@ -93,15 +93,15 @@ def test_a_count_is_forgotten_with_the_link_and_in_a_long_silence(counting: Benc
 
 
 def test_what_a_drive_holds_is_asked_for_anew_over_a_new_link(bench: Bench) -> None:
-    bench.hear(AxisState.CLOSED_LOOP_CONTROL)
+    bench.receive(AxisState.CLOSED_LOOP_CONTROL)
     for node in NODES:
         bench.bus.waiting.append(frame(node, Command.GET_IQ, pack_two_floats(2.0, 0.0)))
-    reading = bench.hear(None)
+    reading = bench.receive(None)
     assert reading is not None
     assert reading.torque == pytest.approx((2.0 * DRIVE.torque_constant,) * 2)
     renew_the_link(bench)
     bench.commands()
-    reading = bench.hear(AxisState.CLOSED_LOOP_CONTROL)
+    reading = bench.receive(AxisState.CLOSED_LOOP_CONTROL)
     assert reading is not None
     assert reading.torque is None
     assert Command.GET_IQ in bench.commands()

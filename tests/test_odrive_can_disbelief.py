@@ -54,7 +54,7 @@ def test_a_heartbeat_from_before_idle_brings_no_second_order(bench: Bench) -> No
     bench.armed()
     bench.driver.idle()
     bench.commands()
-    bench.hear(CLOSED)
+    bench.receive(CLOSED)
     assert bench.commands() == []
 
 
@@ -80,13 +80,13 @@ def test_estimates_without_heartbeats_are_a_lost_drive_for_nobody_would_see_it_d
     bench.armed()
     statuses = []
     for _ in range(REBOOT_MS + 20):
-        reading = bench.hear(None)
+        reading = bench.receive(None)
         assert reading is not None
         statuses.append(reading.status)
     assert statuses[: REBOOT_MS - 20] == [DriveStatus.ARMED] * (REBOOT_MS - 20)
     assert statuses[-10:] == [DriveStatus.LOST] * 10
-    bench.hear(CLOSED)
-    reading = bench.hear(CLOSED)
+    bench.receive(CLOSED)
+    reading = bench.receive(CLOSED)
     assert reading is not None
     assert reading.status is DriveStatus.ARMED
 
@@ -97,7 +97,7 @@ def test_the_heartbeats_of_one_axis_do_not_speak_for_the_other(bench: Bench, mut
     speaks = NODES[1 - NODES.index(mute)]
     for _ in range(2 * REBOOT_MS // (2 * ARM_GRACE_MS)):
         say(bench, speaks, CLOSED)
-    reading = bench.hear(None)
+    reading = bench.receive(None)
     assert reading is not None
     assert reading.status is DriveStatus.LOST
 
@@ -106,14 +106,14 @@ def test_the_heartbeats_of_one_axis_do_not_speak_for_the_other(bench: Bench, mut
 
 
 def test_a_drive_is_not_taken_over_by_a_current_that_is_no_number(bench: Bench) -> None:
-    bench.hear(CLOSED)
+    bench.receive(CLOSED)
     for node, current in zip(NODES, (float("nan"), 1.0), strict=True):
         bench.bus.waiting.append(frame(node, Command.GET_IQ, pack_two_floats(current, 0.0)))
-    reading = bench.hear(None)
+    reading = bench.receive(None)
     assert reading is not None
     assert reading.torque is None
     bench.bus.waiting.append(frame(NODES[0], Command.GET_IQ, pack_two_floats(2.0, 0.0)))
-    reading = bench.hear(None)
+    reading = bench.receive(None)
     assert reading is not None
     assert reading.torque is not None
 

@@ -40,7 +40,7 @@ def heard(*pairs: tuple[int, bytes], armed: bool = False) -> AxesReport:
     report = AxesReport()
     report.requested(armed=armed)
     for axis, heartbeat in pairs:
-        report.hear(axis, heartbeat)
+        report.receive(axis, heartbeat)
     return report
 
 
@@ -77,9 +77,9 @@ def test_a_version_is_an_answer_of_0_6_and_tells_the_firmware() -> None:
 def test_a_drive_that_never_answers_is_taken_for_0_5_after_many_requests() -> None:
     report = AxesReport()
     for _ in range(UNANSWERED):
-        report.hear(0, old(IDLE, done=False))
+        report.receive(0, old(IDLE, done=False))
         assert report.dialect == ""
-    report.hear(1, old(IDLE, done=False))
+    report.receive(1, old(IDLE, done=False))
     assert report.dialect == "0.5"
 
 
@@ -88,7 +88,7 @@ def test_0_6_taken_for_0_5_looks_like_an_error_until_its_answer_comes() -> None:
     busy = new(CLOSED, result=ProcedureResult.BUSY)
     for _ in range(UNANSWERED):
         for axis in (0, 1):
-            report.hear(axis, busy)
+            report.receive(axis, busy)
     assert (report.dialect, report.status) == ("0.5", DriveStatus.ERROR)
     report.receive_version(VERSION)  # and what was heard is judged again
     assert (report.dialect, report.status) == ("0.6", DriveStatus.ARMED)
@@ -99,7 +99,7 @@ def test_what_is_forgotten_is_found_out_anew() -> None:
     report.forget()
     assert (report.dialect, report.status) == ("", DriveStatus.LOST)
     for axis in (0, 1):
-        report.hear(axis, new(IDLE, DriveError06.DRV_FAULT, ProcedureResult.DISARMED))
+        report.receive(axis, new(IDLE, DriveError06.DRV_FAULT, ProcedureResult.DISARMED))
     assert (report.dialect, report.status) == ("0.6", DriveStatus.ERROR)
 
 
@@ -188,6 +188,6 @@ def test_an_axis_that_left_closed_loop_without_an_error_bit_is_an_error(
 ) -> None:
     report = heard((0, closed), (1, closed))
     statuses = [report.status]
-    report.hear(1, left)
+    report.receive(1, left)
     statuses.append(report.status)
     assert statuses == [DriveStatus.ARMED, DriveStatus.ERROR]

@@ -57,7 +57,7 @@ def test_a_bus_that_fails_is_silence_then_a_lost_drive_and_is_opened_again(
     assert reading.status is DriveStatus.LOST
     bench.after(RETRY_MS)
     assert bench.driver.connections == 2
-    reading = bench.hear(AxisState.CLOSED_LOOP_CONTROL)
+    reading = bench.receive(AxisState.CLOSED_LOOP_CONTROL)
     assert reading is not None
     assert reading.status is DriveStatus.ARMED, "the drive has held on all the while"
 
@@ -108,19 +108,19 @@ def test_a_bus_that_is_back_at_once_is_gone_on_with_before_the_next_heartbeat(
     assert bench.after(1) is None
     bench.after(1)
     assert bench.driver.connections == 2
-    reading = bench.hear(None)
+    reading = bench.receive(None)
     assert reading is not None
     assert (reading.status, bench.driver.dialect) == (DriveStatus.ARMED, "0.5")
 
 
 def test_a_heartbeat_from_before_an_order_is_not_believed_after_it(bench: Bench) -> None:
-    bench.hear()
+    bench.receive()
     bench.driver.arm(onboard=True)
-    reading = bench.hear(AxisState.IDLE, error=0x40)
+    reading = bench.receive(AxisState.IDLE, error=0x40)
     assert reading is not None
     assert (reading.status, reading.error) == (DriveStatus.IDLE, 0)
     bench.wait(1e-3 * ARM_GRACE_MS)
-    reading = bench.hear(AxisState.IDLE, error=0x40)
+    reading = bench.receive(AxisState.IDLE, error=0x40)
     assert reading is not None
     assert (reading.status, reading.error) == (DriveStatus.ERROR, 0x40)
 
@@ -136,7 +136,7 @@ def test_trouble_on_the_wire_that_leaves_the_controller_on_it_is_counted_only(be
     bench.armed()
     passive = error_frame(0x04, bytes((0, 0x20, 0, 0, 0, 0, 0, 0)))
     bench.bus.waiting.extend([passive, passive])
-    reading = bench.hear(AxisState.CLOSED_LOOP_CONTROL)
+    reading = bench.receive(AxisState.CLOSED_LOOP_CONTROL)
     assert reading is not None
     assert reading.status is DriveStatus.ARMED
     assert bench.driver._link.error_frames == 2
@@ -145,14 +145,14 @@ def test_trouble_on_the_wire_that_leaves_the_controller_on_it_is_counted_only(be
 
 def test_an_error_frame_is_not_taken_for_a_frame_of_a_node(bench: Bench) -> None:
     """Class 0x80 (an error on the bus) has the number of node 4's version."""
-    bench.hear()
+    bench.receive()
     bench.bus.waiting.append(error_frame(arbitration_id(NODES[0], 0)))
     bench.after(1)
     assert bench.driver.dialect == "0.5"
 
 
 def test_extended_and_remote_frames_of_the_same_number_are_not_ours(bench: Bench) -> None:
-    bench.hear()
+    bench.receive()
     estimate = pack_two_floats(99.0, 0.0)
     for node in NODES:
         bench.bus.waiting.append(

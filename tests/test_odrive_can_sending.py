@@ -23,7 +23,7 @@ __all__ = ["bench"]  # fixtures
 def test_arming_goes_on_as_the_queue_empties_and_closed_loop_is_asked_for_last(
     bench: Bench,
 ) -> None:
-    bench.hear()
+    bench.receive()
     bench.commands()
     bench.bus.room = 1 << 30
     bench.driver.arm(onboard=True)
@@ -56,7 +56,7 @@ def test_nothing_overtakes_an_order_that_waits(bench: Bench) -> None:
 
 
 def test_an_order_takes_the_place_of_one_that_waits(bench: Bench) -> None:
-    bench.hear()
+    bench.receive()
     bench.commands()
     bench.bus.room = 0
     bench.driver.arm(onboard=True)
@@ -68,7 +68,7 @@ def test_an_order_takes_the_place_of_one_that_waits(bench: Bench) -> None:
 
 def test_an_order_that_waited_too_long_is_given_up(bench: Bench) -> None:
     """A drive must not arm long after it was asked to."""
-    bench.hear()
+    bench.receive()
     bench.commands()
     bench.bus.room = 0
     bench.driver.arm(onboard=True)
@@ -80,7 +80,7 @@ def test_an_order_that_waited_too_long_is_given_up(bench: Bench) -> None:
 
 def test_an_order_does_not_go_to_the_next_bus(bench: Bench) -> None:
     bench.wait(1e-3 * RETRY_MS)
-    bench.hear()
+    bench.receive()
     bench.bus.room = 0
     bench.driver.arm(onboard=True)
     bench.bus.waiting.append(can.CanOperationError("Failed to receive"))
@@ -136,7 +136,7 @@ def test_limits_and_modes_are_told_again_for_a_while_after_arming_and_then_no_mo
 
 
 def test_a_drive_that_was_found_armed_is_told_its_limits_and_modes(bench: Bench) -> None:
-    bench.hear(AxisState.CLOSED_LOOP_CONTROL)
+    bench.receive(AxisState.CLOSED_LOOP_CONTROL)
     bench.commands()
     bench.driver.write(TARGET)
     sent = bench.commands()

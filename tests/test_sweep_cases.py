@@ -14,12 +14,12 @@ from services.planner.kinematics import Kinematics
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL
 from services.simulator.world import World
-from shared import scenario
+from shared import scenarios
 from shared.clock import NS_PER_S
 from shared.config import GRAVITY, RobotConfig
 from shared.messages import SimTruth
 from shared.robot_model import stand_pose
-from shared.scenario import Keyframe, Push, Scenario, lead
+from shared.scenarios import Keyframe, Push, Scenario, lead
 from tools.runs import lockstep
 from tools.runs.lockstep import Lockstep
 from tools.runs.standing import is_tipping
@@ -43,8 +43,8 @@ def diagonal(robot: RobotConfig) -> RobotConfig:
     return msgspec.structs.replace(robot, law=law)
 
 
-def frames(story: Scenario, case: KillCase) -> Iterator[tuple[cases.LeadPose, Keyframe]]:
-    return zip(case.poses, story.keyframe[1:], strict=True)
+def frames(scenario: Scenario, case: KillCase) -> Iterator[tuple[cases.LeadPose, Keyframe]]:
+    return zip(case.poses, scenario.keyframe[1:], strict=True)
 
 
 def test_a_case_is_the_same_without_the_others(robot: RobotConfig, drawn: list[KillCase]) -> None:
@@ -101,25 +101,25 @@ def test_every_kind_of_case_is_drawn(drawn: list[KillCase]) -> None:
 
 def test_the_planner_dies_on_the_way_or_after_it(robot: RobotConfig, drawn: list[KillCase]) -> None:
     for case in drawn:
-        there = cases.story_of(robot, case).keyframe[-1].at
+        there = cases.scenario_of(robot, case).keyframe[-1].at
         assert there == case.way_end_s
         assert (case.kill_s < there) if case.moving else (case.kill_s >= there + 0.3)
 
 
 def test_a_case_is_a_scenario(robot: RobotConfig, drawn: list[KillCase]) -> None:
     for case in drawn:
-        story = cases.story_of(robot, case)
-        scenario.check("case", story)
-        assert [row.at for row in story.kill] == [case.kill_s]
-        assert story.push == case.pushes
-        for pose, frame in frames(story, case):
-            led = lead(story, frame.at)
+        scenario = cases.scenario_of(robot, case)
+        scenarios.check("case", scenario)
+        assert [row.at for row in scenario.kill] == [case.kill_s]
+        assert scenario.push == case.pushes
+        for pose, frame in frames(scenario, case):
+            led = lead(scenario, frame.at)
             assert (led.height, led.pitch, led.assist) == msgspec.structs.astuple(pose)
 
 
 def test_nobody_leads_faster_than_the_pace(robot: RobotConfig, drawn: list[KillCase]) -> None:
     for case in drawn:
-        for a, b in pairwise(cases.story_of(robot, case).keyframe):
+        for a, b in pairwise(cases.scenario_of(robot, case).keyframe):
             for way, speed in zip(
                 (b.height - a.height, b.pitch - a.pitch, b.assist - a.assist),
                 cases.SPEED,
@@ -148,10 +148,10 @@ def test_what_the_joint_limits_forbid_is_not_drawn(
 
 
 def test_the_feet_carry_the_robot(diagonal: RobotConfig) -> None:
-    story = Scenario(
+    scenario = Scenario(
         name="stand", about="", duration=0.5, keyframe=(Keyframe(at=0.0, height=1.188),)
     )
-    fleet = Lockstep(diagonal, story, plant=IDEAL)
+    fleet = Lockstep(diagonal, scenario, plant=IDEAL)
     feet = FootLoads(fleet.world)
     last = list(fleet.run())[-1]
     weight = diagonal.total_mass * GRAVITY - last.operator_force[2]
@@ -197,7 +197,7 @@ def test_a_robot_on_its_way_down_at_the_end_does_not_stand(
     robot: RobotConfig, drawn: list[KillCase], com: tuple[float, float], tilt: float, tipping: bool
 ) -> None:
     """The soles end 0.127 m before and behind the ankles, and 0.41 m to the sides."""
-    row = World(body_of(robot, IDEAL), cases.story_of(robot, drawn[0])).truth(0, 1.0, 0.0)
+    row = World(body_of(robot, IDEAL), cases.scenario_of(robot, drawn[0])).truth(0, 1.0, 0.0)
     row = msgspec.structs.replace(row, com=(*com, 0.8), foot_right_tilt=tilt, foot_left_tilt=0.0)
     assert is_tipping(row, robot) is tipping
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from shared import scenario
+from shared import scenarios
 from shared.config import RobotConfig
 from shared.links import DIRECTIONS
 from shared.messages import JointEvent, Mode
@@ -123,7 +123,7 @@ def test_trials_are_paired_over_delays_and_controls_and_independent_at_one_delay
     robot: RobotConfig,
 ) -> None:
     """So that curves over the delay compare like with like, and their bounds are true."""
-    pushes = {trial(control=name).story(robot_of(robot, name)).push for name in CONTROLS}
+    pushes = {trial(control=name).scenario(robot_of(robot, name)).push for name in CONTROLS}
     assert len(pushes) == 1
     by_draw: dict[object, set[tuple[float, str]]] = {}
     for t in grid("--trials", "2"):
@@ -195,18 +195,18 @@ def test_no_draw_is_beyond_the_study() -> None:
 def test_the_network_is_good_until_the_scenario_has_begun_and_then_bad_to_its_end(
     robot: RobotConfig,
 ) -> None:
-    story = trial(network=Network(30.0, 5.0, 0.2)).story(robot)
-    scenario.check("trial", story)
-    (inject,) = story.inject
+    scenario = trial(network=Network(30.0, 5.0, 0.2)).scenario(robot)
+    scenarios.check("trial", scenario)
+    (inject,) = scenario.inject
     assert (inject.delay_ms, inject.jitter_ms, inject.loss) == (30.0, 5.0, 0.2)
     begins = trial(network=Network(30.0, 5.0, 0.2)).draw.impaired_from_s
     assert (inject.link, inject.at, inject.duration) == ("all", begins, None)
     assert not inject.ordered, "datagrams: what is late does not hold up the rest"
-    assert trial().story(robot).inject == ()
+    assert trial().scenario(robot).inject == ()
 
 
 def test_all_links_take_the_delay_that_was_asked_for(robot: RobotConfig) -> None:
-    fleet = Lockstep(robot, trial(network=Network(30.0, 0.0, 0.0)).story(robot))
+    fleet = Lockstep(robot, trial(network=Network(30.0, 0.0, 0.0)).scenario(robot))
     fleet.network.advance(3.0, 10**9)
     releases = {
         name: link.direction.passes(10**9, 0)[0] - 10**9

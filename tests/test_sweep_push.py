@@ -14,7 +14,7 @@ from shared.config import RobotConfig
 from shared.exceptions import RunError
 from tools import cli
 from tools.sweeps import push, push_trial
-from tools.sweeps.push_trial import PushResult, PushTrial, limits_of, run_trial, story_of
+from tools.sweeps.push_trial import PushResult, PushTrial, limits_of, run_trial, scenario_of
 
 
 def asked(**changes: object) -> argparse.Namespace:
@@ -82,9 +82,9 @@ def test_with_the_planner_dead_a_lasting_push_from_the_side_is_stood(robot: Robo
 
 
 def test_the_push_is_in_the_direction_that_was_asked_for() -> None:
-    x, y, _ = story_of(point(angle_deg=180), 40.0).push[0].force
+    x, y, _ = scenario_of(point(angle_deg=180), 40.0).push[0].force
     assert (x, y) == pytest.approx((-40.0, 0.0), abs=1e-9)
-    assert story_of(point(mode="led"), 40.0).kill == ()
+    assert scenario_of(point(mode="led"), 40.0).kill == ()
 
 
 def test_a_table_is_drawn_with_both_modes_and_the_limits(tmp_path: Path) -> None:

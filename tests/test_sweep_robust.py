@@ -15,7 +15,7 @@ from tools import cli
 from tools.sweeps import plants, robust
 from tools.sweeps.figures import Ending
 from tools.sweeps.push_range import PushRange
-from tools.sweeps.robust_trial import KINDS, draw, plant_of, row_of, run_trial, story_of
+from tools.sweeps.robust_trial import KINDS, draw, plant_of, row_of, run_trial, scenario_of
 
 
 @pytest.fixture(scope="module")
@@ -45,9 +45,9 @@ def test_every_trial_is_a_scenario_that_ends_after_its_kill(
 ) -> None:
     for number in range(30):
         trial = draw(pushes, 1, number)
-        story = story_of(robot, trial)
-        assert story.duration > trial.kill_s + 2.0
-        assert all(push.at + push.duration < story.duration for push in story.push)
+        scenario = scenario_of(robot, trial)
+        assert scenario.duration > trial.kill_s + 2.0
+        assert all(push.at + push.duration < scenario.duration for push in scenario.push)
 
 
 @pytest.mark.parametrize("cause", ["body.com_offset", "drive.lag_s", "floor.slope"])

@@ -14,7 +14,7 @@ from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared.config import RobotConfig
 from shared.messages import SimTruth
-from shared.scenario import Push
+from shared.scenarios import Push
 from tests.lockstep.runs import still
 from tools import cli
 from tools.runs import verdict, verdict_table

@@ -22,7 +22,7 @@ from shared.config_file import load
 from shared.exceptions import FleetError
 from shared.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
 from shared.process import StopFlag
-from shared.scenario import SCENARIO
+from shared.scenarios import SCENARIO
 from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
@@ -145,8 +145,8 @@ def ask(
     status = _first(statuses, stop)
     if status is None:
         return 0.0
-    if status.asked_by not in ("", SCENARIO):
-        raise FleetError(f"{status.asked_by} asks already; end that first")
+    if status.requested_by not in ("", SCENARIO):
+        raise FleetError(f"{status.requested_by} asks already; end that first")
     start = heard = time.monotonic()
     while not stop() and (for_s is None or time.monotonic() - start < for_s):
         now = time.monotonic()
@@ -163,10 +163,12 @@ def ask(
         if newest is not None:
             status = newest
             shown.update(Text(describe(wish, status)))
-            if status.asked_by == wish.source:
+            if status.requested_by == wish.source:
                 heard = now
         if now - heard > HEARD_S:
-            taken = f"it follows {status.asked_by}" if status.asked_by else "see `xrl status`"
+            taken = (
+                f"it follows {status.requested_by}" if status.requested_by else "see `xrl status`"
+            )
             raise FleetError(f"the planner does not take what is asked; {taken}")
         time.sleep(REPEAT_S)
     return status.assist_n

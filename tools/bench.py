@@ -21,12 +21,12 @@ from rich.progress import track
 from rich.table import Table
 
 from services.planner.planner import Planner
-from shared import config_file, gain_schedule, scenario, topics
+from shared import config_file, gain_schedule, scenarios, topics
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.messages import JointState, Message, Tare, Wrench
-from shared.scenario import Scenario
+from shared.scenarios import Scenario
 from shared.topics import Topic
 from tools.runs.experiment import scenario_file
 from tools.runs.lockstep import Lockstep
@@ -34,7 +34,7 @@ from tools.verbs import Subparsers, add_config, add_verb
 
 TICK_US: Final = 500.0
 SPEED: Final = 3.0
-"""Targets of design section 9: planner tick, median; lockstep, in times of real time."""
+"""Targets of docs/results.md#targets: planner tick, median; lockstep, in times of real time."""
 TICKS: Final = 750
 """Of a recorded squat: 3 s at 250 Hz, on the way down and up."""
 YARDSTICK_CALLS: Final = 20
@@ -102,8 +102,8 @@ def run(args: argparse.Namespace) -> int:
 
 def measure(robot: RobotConfig, rounds: int, console: Console) -> list[Figure]:
     """Return the figures; every round measures each thing once."""
-    story = scenario.load(scenario_file("squat"))
-    record = recorded_inputs(robot, story)
+    scenario = scenarios.load(scenario_file("squat"))
+    record = recorded_inputs(robot, scenario)
     law = msgspec.structs.replace(robot.law, split="diagonal")
     paper = msgspec.structs.replace(robot, law=law)
     ticks: dict[str, list[float]] = {"certified": [], "diagonal": []}
@@ -114,7 +114,7 @@ def measure(robot: RobotConfig, rounds: int, console: Console) -> list[Figure]:
             yards.append(yardstick_s())
             ticks[name] += tick_times(variant, record)
         yards.append(yardstick_s())
-        speeds.append(lockstep_speed(robot, story))
+        speeds.append(lockstep_speed(robot, scenario))
     yard = float(np.median(yards))
     return [
         _timing("planner tick, certified", ticks["certified"], yard, TICK_US),
@@ -123,7 +123,7 @@ def measure(robot: RobotConfig, rounds: int, console: Console) -> list[Figure]:
     ]
 
 
-def recorded_inputs(robot: RobotConfig, story: Scenario) -> list[tuple[int, list[JointState]]]:
+def recorded_inputs(robot: RobotConfig, scenario: Scenario) -> list[tuple[int, list[JointState]]]:
     """Return the six states of every tick of a squat, with the time of the tick, ns."""
     latest: dict[str, JointState] = {}
     inputs: list[tuple[int, list[JointState]]] = []
@@ -134,7 +134,7 @@ def recorded_inputs(robot: RobotConfig, story: Scenario) -> list[tuple[int, list
         elif topic is topics.PLANNER_STATUS and len(latest) == len(MODULES):
             inputs.append((message.t_ns, [latest[name] for name in MODULES]))
 
-    fleet = Lockstep(robot, story, record=take)
+    fleet = Lockstep(robot, scenario, record=take)
     for truth in fleet.run():
         if truth.scenario_s < 0.0:
             inputs.clear()
@@ -159,12 +159,12 @@ def tick_times(robot: RobotConfig, inputs: Sequence[tuple[int, list[JointState]]
     return times
 
 
-def lockstep_speed(robot: RobotConfig, story: Scenario) -> float:
+def lockstep_speed(robot: RobotConfig, scenario: Scenario) -> float:
     """Return how many times faster than real time a squat runs on a core of its own, no log."""
-    fleet = Lockstep(robot, story)
+    fleet = Lockstep(robot, scenario)
     begin, started_ns = time.process_time(), fleet.now_ns
     for truth in fleet.run():
-        if truth.scenario_s >= story.keyframe[-1].at:
+        if truth.scenario_s >= scenario.keyframe[-1].at:
             break
     return (fleet.now_ns - started_ns) / 1e9 / (time.process_time() - begin)
 

@@ -13,7 +13,7 @@ from shared import topics
 from shared.bus import Session
 from shared.config import RobotConfig
 from shared.messages import PlannerStatus
-from shared.scenario import Scenario
+from shared.scenarios import Scenario
 from tools.runs import experiment, figure, verdict, verdict_table
 from tools.runs.live import run_live
 from tools.runs.live_view import LiveView
@@ -59,25 +59,25 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
     console = Console()
-    robot, story = experiment.make_robot(args), experiment.make_scenario(args)
+    robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
     plant_from(args.plant)  # refused before anything is started
     out = experiment.make_out(args.out, "demo")
-    console.print(f"[bold]{story.name}[/]: {story.about}{experiment.describe(story)}")
+    console.print(f"[bold]{scenario.name}[/]: {scenario.about}{experiment.describe(scenario)}")
     for other in procfs.fleets():
         console.print(
             f"[yellow]another fleet runs in {other}: two do not fit on two cores; "
             f"`xrl down --run-dir {other}` stops it[/]"
         )
     try:
-        cpu_pct = lead_run(args, robot, story, out, console)
+        cpu_pct = lead_run(args, robot, scenario, out, console)
     except KeyboardInterrupt:
         console.print(f"interrupted; what was recorded until then is in {out}")
         raise
-    return judge(out, story, cpu_pct, console)
+    return judge(out, scenario, cpu_pct, console)
 
 
 def lead_run(
-    args: argparse.Namespace, robot: RobotConfig, story: Scenario, out: Path, console: Console
+    args: argparse.Namespace, robot: RobotConfig, scenario: Scenario, out: Path, console: Console
 ) -> float | None:
     """Run the scenario on a fleet of its own, and show it.
 
@@ -92,29 +92,29 @@ def lead_run(
 
     def lead(fleet: SupervisedFleet, session: Session) -> float | None:
         planner = session.latest(topics.PLANNER_STATUS, PlannerStatus)
-        with LiveView(console, story.inject, planner) as view:
-            return ScenarioRunner(fleet, session, story, view.show).run()
+        with LiveView(console, scenario.inject, planner) as view:
+            return ScenarioRunner(fleet, session, scenario, view.show).run()
 
     return run_live(
         out,
         robot,
-        story,
+        scenario,
         lead,
         verb="demo",
         seed=args.seed,
         true_plant=plant_from(args.plant),
         pace=args.pace,
         tell=lambda text: console.print(f"[yellow]{text}[/]", highlight=False, soft_wrap=True),
-        no_restart=robot.services if args.no_restart else {kill.service for kill in story.kill},
+        no_restart=robot.services if args.no_restart else {kill.service for kill in scenario.kill},
     )
 
 
-def judge(out: Path, story: Scenario, cpu_pct: float | None, console: Console) -> int:
+def judge(out: Path, scenario: Scenario, cpu_pct: float | None, console: Console) -> int:
     """Write summary and picture from the log, print the verdict, return the exit code."""
     log = read_run(out / "run.mcap")
-    summary = verdict.summarise(log, story.duration) | {"fleet_cpu_pct": cpu_pct}
+    summary = verdict.summarise(log, scenario.duration) | {"fleet_cpu_pct": cpu_pct}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    figure.draw(log, story.name, summary, out / "run.png")
+    figure.draw(log, scenario.name, summary, out / "run.png")
     verdict_table.show(summary, console)
     console.print(f"{out}/run.mcap, run.png, summary.json, logs/", style="dim", highlight=False)
     return 0 if summary["stood"] else EXIT_FELL

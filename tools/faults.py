@@ -12,7 +12,7 @@ from rich.table import Table
 from shared.config_file import load
 from shared.config_sections import TripLimit
 from shared.fault_table import DRIVE_FAULTS, LOSSES
-from shared.scenario import FAULT_KINDS
+from shared.scenarios import FAULT_KINDS
 from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
 from tools.verbs import Subparsers, add_config, add_verb
 

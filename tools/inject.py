@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.table import Table
 
 from shared.exceptions import ConfigError, RunError
-from shared.injector_protocol import RequestedImpairment
 from shared.links import GROUPS
-from shared.scenario import Inject
+from shared.proxy_protocol import RequestedImpairment
+from shared.scenarios import Inject
 from tools.runs.describe_inject import (
     DISTRIBUTION,
     NUMBERS,
@@ -22,7 +22,7 @@ from tools.runs.describe_inject import (
     make,
     parse_inject,
 )
-from tools.runs.injector_client import InjectorClient
+from tools.runs.proxy_client import ProxyClient
 from tools.verbs import Subparsers, add_run_dir, add_verb
 
 ALL: Final = "all"
@@ -104,7 +104,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Do it, or end it, and show what is done then."""
     console = Console()
-    client = InjectorClient(args.run_dir)
+    client = ProxyClient(args.run_dir)
     if args.list:
         _refuse(args, "--list", "link", "words")
         show(client.list(), console)
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _clear(client: InjectorClient, link: str, console: Console) -> None:
+def _clear(client: ProxyClient, link: str, console: Console) -> None:
     """End what touches a link; show what it was, and what is left."""
     try:
         check_link(link, "--")

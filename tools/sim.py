@@ -22,7 +22,7 @@ from shared.exceptions import RunError
 from shared.impairment import Impairment
 from shared.messages import Message
 from shared.robot_model import mjcf
-from shared.scenario import Scenario
+from shared.scenarios import Scenario
 from shared.topics import Topic
 from tools.centralised.fleet import CONTROLS, SHIPPED
 from tools.runs import experiment, figure, verdict, verdict_table
@@ -105,19 +105,21 @@ def run(args: argparse.Namespace) -> int:
     if args.delay < 0.0 or args.jitter < 0.0 or not 0.0 <= args.loss <= 1.0:
         raise RunError("--delay and --jitter must be at least 0 ms, --loss from 0 to 1")
     console = Console()
-    robot, story = experiment.make_robot(args), experiment.make_scenario(args)
+    robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
     true_plant = plant_from(args.plant)
     network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
     out = experiment.make_out(args.out, "sim")
-    console.print(f"[bold]{story.name}[/]: {story.about}{experiment.describe(story)}")
+    console.print(f"[bold]{scenario.name}[/]: {scenario.about}{experiment.describe(scenario)}")
     begin = time.monotonic()
-    simulated_s = simulate(robot, story, network, args.seed, out, console, args.control, true_plant)
+    simulated_s = simulate(
+        robot, scenario, network, args.seed, out, console, args.control, true_plant
+    )
     factor = simulated_s / (time.monotonic() - begin)
     log = read_run(out / "run.mcap")
-    summary = verdict.summarise(log, story.duration)
+    summary = verdict.summarise(log, scenario.duration)
     summary |= dict.fromkeys(NOT_HERE) | {"in_real_time": True, "speed": factor}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    figure.draw(log, f"{story.name} in lockstep", summary, out / "run.png")
+    figure.draw(log, f"{scenario.name} in lockstep", summary, out / "run.png")
     verdict_table.show(summary, console)
     console.print(f"{factor:.1f} x real time; {out}/run.mcap, run.png, summary.json", style="dim")
     return 0 if summary["stood"] else 1
@@ -125,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
 
 def simulate(
     robot: RobotConfig,
-    story: Scenario,
+    scenario: Scenario,
     network: Impairment,
     seed: int,
     out: Path,
@@ -135,9 +137,11 @@ def simulate(
 ) -> float:
     """Run lockstep into a log with a progress bar; return the time simulated, s."""
     true_plant = true_plant or PlantConfig()
-    inputs = experiment.write_inputs(out, robot, story, true_plant)
+    inputs = experiment.write_inputs(out, robot, scenario, true_plant)
     outbox = Outbox(robot.name)
-    fleet = CONTROLS[control](robot, story, network, seed=seed, record=outbox.put, plant=true_plant)
+    fleet = CONTROLS[control](
+        robot, scenario, network, seed=seed, record=outbox.put, plant=true_plant
+    )
     bar = Progress(
         BarColumn(), TextColumn("{task.completed:5.1f} of {task.total:g} s"),
         TimeRemainingColumn(), console=console, transient=True,
@@ -148,14 +152,14 @@ def simulate(
             out,
             recorded,
             offset_ns=0,
-            metadata=_metadata(robot.name, story.name, network, seed, control),
+            metadata=_metadata(robot.name, scenario.name, network, seed, control),
             attachments={file.name: file.read_bytes() for file in inputs}
             | {"model.xml": mjcf(robot).encode()},
             chunk_kib=robot.recorder.chunk_kib,
         ) as writer,
         bar as progress,
     ):
-        task = progress.add_task("", total=story.duration)
+        task = progress.add_task("", total=scenario.duration)
         fallen_at_s = None
         for truth in fleet.run():
             if len(outbox) >= DRAIN_EVERY:

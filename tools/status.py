@@ -17,7 +17,7 @@ from shared.bus import open_session
 from shared.config_file import load
 from shared.messages import DriveStatus
 from tools.runs.fleet_status import (
-    SILENT_INJECTOR,
+    SILENT_PROXY,
     FleetStatus,
     LeadStatus,
     RateMonitor,
@@ -126,7 +126,7 @@ def tables(status: FleetStatus) -> Group:
             *angles,
             module.way_out.replace("MODULE", name),
         )
-    way_out = "kill injector" if SILENT_INJECTOR in status.network else "inject --clear"
+    way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear"
     said = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
     slow = f" in slow motion: the fleet's clock goes at {status.pace:g} of real time"
     lines = [f" {describe_lead(status.lead)}"]

@@ -76,7 +76,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--injectable",
         action="store_true",
-        help="with the injector on the links between planner, joints and sensors, for `xrl inject`",
+        help="put the network proxy between planner, joints and sensors, for `xrl inject`",
     )
     parser.add_argument(
         "--readonly",
@@ -156,7 +156,7 @@ def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
             why = "--no-sim" if only is None or service in only else "--only"
             raise FleetError(f"{option} is for the {service}, and {why} starts none; leave one")
     if only is not None and args.injectable:
-        return (*only, "injector")
+        return (*only, "network_proxy")
     return only
 
 

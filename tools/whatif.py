@@ -12,10 +12,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from services.simulator.plant import PlantConfig
-from shared import scenario
+from shared import scenarios
 from shared.exceptions import RunError
 from shared.joints import MODULES
-from shared.scenario import Scenario
+from shared.scenarios import Scenario
 from shared.toml_file import parse_toml
 from tools.counterfactual import picture
 from tools.counterfactual.moments import moments_of
@@ -73,11 +73,11 @@ def run(args: argparse.Namespace) -> int:
         raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
     console = Console()
     log = read_run(args.log)
-    robot, story = robot_of(log), story_of(log)
+    robot, scenario = robot_of(log), scenario_of(log)
     moments = moments_of(log, robot, args.every)
     kill = tuple(dict.fromkeys(args.kill))
     true_plant = plant_of(log)
-    tasks = [Task(robot, story, true_plant, moment, kill, args.for_s) for moment in moments]
+    tasks = [Task(robot, scenario, true_plant, moment, kill, args.for_s) for moment in moments]
     counterfactuals: list[Counterfactual] = []
     bar = Progress(
         TextColumn("{task.fields[fell]}"), BarColumn(), MofNCompleteColumn(),
@@ -112,7 +112,7 @@ def _name(task: Task) -> str:
     return f"{task.moment.at_s:g} s"
 
 
-def story_of(log: RunLog) -> Scenario:
+def scenario_of(log: RunLog) -> Scenario:
     """Return the scenario of a run.
 
     Raises:
@@ -120,10 +120,10 @@ def story_of(log: RunLog) -> Scenario:
     """
     text = log.attachments.get("scenario.toml")
     if text is None:
-        raise RunError(f"{log.path}: holds no scenario.toml; a run that was led by one has it")
-    story = parse_toml(text.decode(), f"{log.path}: scenario.toml", Scenario)
-    scenario.check(str(log.path), story)
-    return story
+        raise RunError(f"{log.path}: holds no scenarios.toml; a run that was led by one has it")
+    scenario = parse_toml(text.decode(), f"{log.path}: scenarios.toml", Scenario)
+    scenarios.check(str(log.path), scenario)
+    return scenario
 
 
 def plant_of(log: RunLog) -> PlantConfig:

@@ -1,1 +1,1 @@
-"""The harness service: six leg forces in, the operator's wrench out (design section 3 f)."""
+"""The harness service: six leg forces in, the operator's wrench out (docs/law.md#harness)."""

@@ -1,7 +1,7 @@
 """From leg forces to a wrench that can be trusted: tare, low-pass, saturation, staleness.
 
 Pure: a state, the time and a sample go in, the next state and a reading come out
-(design section 3 f). The rules:
+(docs/law.md#harness). The rules:
 
 - *Tare*: the mean leg forces over `tare_s` become the zero. A saturated cell, a gap
   longer than `stale_ms`, or forces that moved too much begin it anew. Nothing is valid

@@ -1,4 +1,4 @@
-"""The differential between two motors and a module's two axes (design section 2).
+"""The differential between two motors and a module's two axes (docs/law.md#the-robot).
 
 q_phi, q_theta = (m1 - m2) / 2N, (m1 + m2) / 2N, in turns at the motors. Power is the
 same on both sides, so tau_1 = (tau_theta + tau_phi) / 2N, tau_2 = (tau_theta - tau_phi) / 2N.

@@ -1,4 +1,4 @@
-"""The local law split once more, between joint service and drive (design section 5). Pure.
+"""The local law split once more, between joint service and drive (docs/drives.md). Pure.
 
 Each motor's own loop holds a module's mean stiffness and damping about the references; the
 rest (the difference of the two axes, the feedforward, what the gate took off) goes in as

@@ -33,7 +33,7 @@ class Envelope:
         table = schedule.bounds if config.law.split == "certified" and schedule else None
         self._bounds = table[kind_of(module)] if table else None
         own, least = config.envelope, config.certificate
-        self._room = own.tau_ff_room
+        self._room = own.tau_ff_margin
         self._distance, self._spring = own.q_ref_distance, own.spring_torque
         self._coupled, self._dtau_ff, self._v_ref = own.tau_coupled, own.dtau_ff, own.v_ref
         self._step, self._rate = own.torque_step, own.torque_rate

@@ -1,4 +1,4 @@
-"""States of a joint service and what makes a command usable (design section 4).
+"""States of a joint service and what makes a command usable (docs/architecture.md#age-rule).
 
 Pure: state, now, inputs -> state. The transitions are one table; `tests/safety` sweeps
 every state against every event.
@@ -107,7 +107,7 @@ def timing_of(config: RobotConfig) -> Timing:
 
 
 class Refusal(IntEnum):
-    """Why a command is not taken; the one rule of design section 4."""
+    """Why a command is not taken; the one rule of docs/architecture.md#age-rule."""
 
     NONE = 0
     TOO_OLD = 1

@@ -1,4 +1,4 @@
-"""The local law of one module: diagonal PD plus feedforward (design sections 3 e, 4).
+"""The local law of one module: diagonal PD plus feedforward (docs/law.md#references-and-age).
 
 A `Setpoint` is the law at one instant. Setpoints are closed under blending: a blend of
 two PD laws is the PD law of the blended gains, so what a drive's own loop can hold

@@ -1,4 +1,4 @@
-"""The last gate before the drive: but for the soft stop it only reduces (design section 4).
+"""The last step before the drive: apart from the soft stop it only reduces torque.
 
 In order: a one-sided spring at the joint's soft stop, finite, the rate, and last the torque
 diamond |tau_phi| + |tau_theta| <= tau_module_max, which nothing may exceed. Pure.

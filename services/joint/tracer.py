@@ -1,7 +1,7 @@
 """Writes down what each cycle was given and decided, so that it can be executed again. Pure.
 
 The order in which a service took its inputs is nowhere else: in the log's order 22 to 97 % of the
-ticks came out wrong (design section 10).
+ticks came out wrong (docs/logs.md).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Tracer:
         self._encode = msgspec.json.Encoder().encode
         self._cycles: list[CycleTrace] = []
         self._seq = 0
-        self._memory = ""
+        self._snapshot = ""
         self._remember()
 
     def after(
@@ -79,7 +79,7 @@ class Tracer:
         trace = JointTrace(
             t_ns=self._cycles[-1].now_ns,
             seq=self._seq,
-            memory=self._memory,
+            snapshot=self._snapshot,
             cycles=tuple(self._cycles),
         )
         self._cycles.clear()
@@ -89,4 +89,4 @@ class Tracer:
     def _remember(self) -> None:
         """Take down the memory if the next message is to have it."""
         due = self._seq % MEMORY_EVERY == 0
-        self._memory = self._encode(self._module.snapshot()).decode() if due else ""
+        self._snapshot = self._encode(self._module.snapshot()).decode() if due else ""

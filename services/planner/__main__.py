@@ -51,7 +51,7 @@ def main() -> int:
             intent=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
             commands=[session.publisher(topics.JOINT_COMMAND, JointCommand, m) for m in MODULES],
             status=session.publisher(topics.PLANNER_STATUS, PlannerStatus),
-            memory=session.publisher(topics.PLANNER_CHECKPOINT, PlannerCheckpoint),
+            checkpoint=session.publisher(topics.PLANNER_CHECKPOINT, PlannerCheckpoint),
         )
         session_id = secrets.randbelow(1 << 53) + 1  # JSON readers keep 53 bits
         loop = PlannerLoop(robot, Planner(robot, session_id), ports)

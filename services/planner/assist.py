@@ -1,4 +1,4 @@
-"""The harness in the loop: assist, easing of the lead, overload (design section 3 f).
+"""The harness in the loop: assist, easing of the lead, overload (docs/law.md#harness).
 
 The wrench is what the operator does to the torso at the harness point, in torso axes. The
 robot's upward force on him is minus its part along the world's z. Pure: inputs -> outputs.
@@ -157,7 +157,7 @@ class AssistLaw:
 
 
 class LeadEasing:
-    """The lead made lighter: F_O += alpha S w_h (design section 3 f).
+    """The lead made lighter: F_O += alpha S w_h (docs/law.md#harness).
 
     w_h is what the operator does in the directions he leads: his upward force beyond the
     load that the assist carries, f + assist, and his moment about the torso's pitch axis.
@@ -242,7 +242,7 @@ class Overload:
         self._beyond_since_ns, self._below_since_ns = m.beyond_since_ns, m.below_since_ns
         self.hold = m.hold
 
-    def hear(self, wrench: Wrench, now_ns: int) -> None:
+    def receive(self, wrench: Wrench, now_ns: int) -> None:
         """Take a wrench that arrived now."""
         share = max(
             math.hypot(*wrench.force) / self._force_max,

@@ -1,4 +1,4 @@
-"""The failsafe certificate: do these local gains stand alone? (design section 3 d). Pure.
+"""The failsafe certificate: do these local gains stand alone? (docs/law.md#certificate). Pure.
 
 With the planner gone, tau = D (q_ref - q) + tau_ff, and both feet stay where they are.
 T (12, 6) are the joint rates per unit of p along the closed chain: [J; C] T = [I; 0].
@@ -12,7 +12,7 @@ K_fail > 0. A margin is its smallest eigenvalue with every direction measured by
 required of it (`certificate.K_required`): 1 is all that is required, 0 is a fall.
 
 Tier 3: with its joint service gone too, each motor of a module holds with the mean of the
-two joints' stiffnesses (design section 5), so D is averaged module by module.
+two joints' stiffnesses (docs/drives.md), so D is averaged module by module.
 """
 
 from __future__ import annotations

@@ -33,5 +33,5 @@ class Checkpoints:
             t_ns=now_ns,
             seq=self._seq,
             session=planner.session,
-            memory=self._encode(planner.snapshot()).decode(),
+            snapshot=self._encode(planner.snapshot()).decode(),
         )

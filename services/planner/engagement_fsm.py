@@ -1,4 +1,4 @@
-"""When the planner leads and when it asks all six modules to hold (design section 4).
+"""When the planner leads and when it asks all six modules to hold (docs/architecture.md#age-rule).
 
 All six track or none does: while one module's state is stale, or one is not in TRACK,
 every command carries `hold`, so that no leg works against the other. Modules tell

@@ -1,4 +1,4 @@
-"""The whole-body law: Hybrid Open-Loop Closed-Loop Control (paper, design section 3).
+"""The whole-body law: Hybrid Open-Loop Closed-Loop Control (paper, docs/law.md).
 
 One tick, in the paper's letters:
 
@@ -143,7 +143,7 @@ class Hocca:
         assist_wanted: float,
         dt: float,
         *,
-        shift_wanted: Vector4 = STRAIGHT,
+        shift_requested: Vector4 = STRAIGHT,
         align: bool = False,
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
@@ -156,14 +156,14 @@ class Hocca:
             assist_wanted: assist force that the operator asks for, N; rate limited here,
                 but for the first tick, which takes over what HOLD carries.
             dt: time since the last tick, s.
-            shift_wanted: where x, y (m), roll and yaw (rad) are asked to be; limited here.
+            shift_requested: where x, y (m), roll and yaw (rad) are asked to be; limited here.
             align: start from the measured pose, so that taking over makes no step: p_C is
                 where the robot is, and glides to zero (COM over the ankles, no roll, no
                 yaw; height and pitch stay) in `law.recentre_s` of ticks without `align`. A
                 planner that has led before starts from zero: where it finds the robot is a
                 sway, and if it is lost again, HOLD would stay where the sway was. A robot
                 held off centre by 25 mm fell at the second push; the modules' blend makes
-                no step of it. Where it was asked to be (`shift_wanted`) it stays.
+                no step of it. Where it was asked to be (`shift_requested`) it stays.
             wrench: of the operator on the torso, if it is fresh and valid.
             up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
@@ -182,7 +182,7 @@ class Hocca:
             self._shift.rest()
         else:
             self._has_led = True
-            self._shift.advance(shift_wanted, dt)
+            self._shift.advance(shift_requested, dt)
         pdot = measured.J @ v
         p_C, pdot_C = self._closed_loop_reference(dt)
         self._shift.add_to(p_C, pdot_C)

@@ -37,7 +37,7 @@ class Intents:
         self._wish = Wish()
         self._heard_ns = 0
 
-    def hear(self, intent: OperatorIntent, now_ns: int) -> None:
+    def receive(self, intent: OperatorIntent, now_ns: int) -> None:
         """Take an intent that has arrived; one that holds what is no number is none."""
         if all(map(math.isfinite, (intent.assist_n, *intent.shift))):
             self._wish = Wish(intent.assist_n, intent.shift, intent.source)

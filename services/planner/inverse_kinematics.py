@@ -1,4 +1,4 @@
-"""Inverse kinematics with both feet on the ground (design section 3).
+"""Inverse kinematics with both feet on the ground (docs/law.md).
 
 Six task rows (p = p_ref) and six closure rows (both legs agree on the torso) make a
 square system in the 12 joint angles. Two ways to solve it:

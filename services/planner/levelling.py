@@ -1,6 +1,6 @@
 """Which way is up, seen from the floor under the feet. Pure.
 
-The planner's axes are the floor's: z is its normal (design section 3 a). On a slope gravity leans
+The planner's axes are the floor's: z is its normal (docs/law.md#slopes). On a slope gravity leans
 in them by the slope's angle, and a COM above the ankles by the floor's normal is not above them by
 gravity: at a height of 1 m and 5 degrees it is 87 mm off, and the weight pulls it along the floor.
 

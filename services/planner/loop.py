@@ -33,7 +33,7 @@ class PlannerPorts(msgspec.Struct, frozen=True):
     intent: Latest[OperatorIntent]
     commands: Sequence[Publisher[JointCommand]]
     status: Publisher[PlannerStatus]
-    memory: Publisher[PlannerCheckpoint]
+    checkpoint: Publisher[PlannerCheckpoint]
 
 
 POLL_NS = 400 * NS_PER_US
@@ -50,7 +50,7 @@ class PlannerLoop:
         self._ports = ports
         self._rest_ns = round(REST_SHARE * NS_PER_S / config.planner.rate_hz)
         self._intents = Intents(config.assist)
-        self._remembrance = Checkpoints(config.planner.rate_hz)
+        self._checkpoints = Checkpoints(config.planner.rate_hz)
 
     def run(self, stop: StopFlag) -> None:
         """Run until told to stop."""
@@ -82,11 +82,11 @@ class PlannerLoop:
             planner.receive_attitude(attitude, now)
         intent = ports.intent.take()
         if intent is not None:
-            self._intents.hear(intent, now)
+            self._intents.receive(intent, now)
         planner.receive_wish(self._intents.wish(now))
         for publisher, command in zip(ports.commands, planner.tick(now), strict=False):
             publisher.put(command)
         ports.status.put(planner.status(now, (now_ns() - now) / NS_PER_US))
-        memory = self._remembrance.after(planner, now)
-        if memory is not None:
-            ports.memory.put(memory)
+        checkpoint = self._checkpoints.after(planner, now)
+        if checkpoint is not None:
+            ports.checkpoint.put(checkpoint)

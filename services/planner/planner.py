@@ -108,7 +108,7 @@ class Planner:
         """Take the harness's newest wrench."""
         self._wrench_seq = wrench.seq
         self._wrench, self._wrench_ns = wrench, now_ns
-        self._overload.hear(wrench, now_ns)
+        self._overload.receive(wrench, now_ns)
 
     def receive_attitude(self, attitude: Attitude, now_ns: int) -> None:
         """Take the IMU's newest attitude."""
@@ -162,7 +162,7 @@ class Planner:
             self._v,
             self._wish.assist_n,
             dt,
-            shift_wanted=self._wish.shift,
+            shift_requested=self._wish.shift,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -311,14 +311,14 @@ class Planner:
             tick_us=tick_us,
             state_seq=(seqs[0], seqs[1], seqs[2], seqs[3], seqs[4], seqs[5]),
             wrench_seq=self._wrench_seq,
-            assist_wanted_n=self._wish.assist_n,
+            assist_requested_n=self._wish.assist_n,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
             wait_s=0.0 if leads else self._engagement.wait_ns(now_ns) / NS_PER_S,
             attitude_seq=self._attitude_seq,
             slope=output.slope if output is not None else (0.0, 0.0),
-            shift_wanted=self._wish.shift,
+            shift_requested=self._wish.shift,
             load=self._law.load,
-            asked_by=self._wish.source,
+            requested_by=self._wish.source,
             stance=stance,
             why=self._law.stance_refusal() or self._law.load_refusal() or self._trips.why,
             trip=int(self._trips.tripped),

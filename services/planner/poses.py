@@ -101,6 +101,6 @@ class Poses:
         ]
         diagonals = [np.diagonal(self._gains.gains(kinematics, h).K_q) for h in hessians]
         K_q: Array = np.max(diagonals, axis=0)
-        share = self._config.certificate.k_q_share_max
+        share = self._config.certificate.k_q_fraction_max
         D_max = np.clip(share * K_q[:N_LEG], 0.0, self._config.joint_service.k_p_max)
         return PoseNode(T, (hessians[0], hessians[1]), np.asarray(D_max, float))

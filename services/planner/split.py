@@ -1,4 +1,4 @@
-"""The gain split: what of K_q and B_q the joint services hold alone (design section 3 c).
+"""The gain split: what of K_q and B_q the joint services hold alone (docs/law.md#gain-split).
 
 `certified` takes D from the schedule made offline, `diagonal` is the paper's diag(K_q).
 Either way no gains leave without their certificate: where the margin is not met, D is
@@ -104,8 +104,8 @@ class GainSplit:
             self.coupling = CouplingGains(made.coupling_bandwidth_hz, made.coupling_damping)
         limits = config.certificate
         self._margins_min = Margins(limits.margin_min, limits.onboard_margin_min)
-        self._k_q_share_max = limits.k_q_share_max
-        self._damping_share = config.law.local_damping_share
+        self._k_q_fraction_max = limits.k_q_fraction_max
+        self._damping_fraction = config.law.local_damping_fraction
         self._k_max = config.joint_service.k_p_max
         self._d_max = config.joint_service.k_d_max
         stand = [config.stand_gains(module).k_p for module in MODULES]
@@ -147,7 +147,7 @@ class GainSplit:
 
     def _of_body(self, body: JointGains) -> tuple[Array, Array]:
         """Return diag(K_q) and the configured share of diag(B_q), as far as they are allowed."""
-        own = self._damping_share * np.diagonal(body.B_q)
+        own = self._damping_fraction * np.diagonal(body.B_q)
         return (
             np.minimum(np.maximum(np.diagonal(body.K_q), 0.0), self._k_max),
             np.minimum(np.maximum(own, 0.0), self._d_max),
@@ -161,7 +161,7 @@ class GainSplit:
         self, D: Array, diagonal: Array, margins: Margins
     ) -> tuple[Array, Margins, SplitSource]:
         """Return the nearest certified gains on the way to the stiffest that are allowed."""
-        stiff = np.maximum(np.maximum(D, self._stand), self._k_q_share_max * diagonal)
+        stiff = np.maximum(np.maximum(D, self._stand), self._k_q_fraction_max * diagonal)
         stiff = np.minimum(stiff, self._k_max)
         for share in STIFFEN:
             D_near = D + share * (stiff - D)

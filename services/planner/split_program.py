@@ -1,12 +1,12 @@
-"""The certified gain schedule, computed offline (design section 3 c).
+"""The certified gain schedule, computed offline (docs/law.md#gain-split).
 
 At each node of a grid over COM height and torso pitch, the local stiffnesses D of one leg
 (the other is alike) solve a semidefinite program:
 
     minimise    K_loc[z, z] / 1000 + K_loc[pitch, pitch] / 10 + 1e-3 sum(D)
     subject to  K_loc(D) + K_geo >= diag(K_required)
-                K_loc(motor mean of D) + K_geo >= onboard_share diag(K_required)
-                0 <= D <= k_q_share_max diag(K_q)
+                K_loc(motor mean of D) + K_geo >= onboard_fraction diag(K_required)
+                0 <= D <= k_q_fraction_max diag(K_q)
 
 K_loc = T^T D T, K_geo as in `services.planner.certificate`, both without and with the full
 assist (K_geo is linear in it, so every assist in between is covered).
@@ -190,7 +190,7 @@ def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Arr
         K_geo = 0.5 * (K_geo + K_geo.T)
         constraints += [
             K_loc + K_geo >> np.eye(6),
-            K_onboard + K_geo >> config.certificate.onboard_share * np.eye(6),
+            K_onboard + K_geo >> config.certificate.onboard_fraction * np.eye(6),
         ]
     cost = (
         K_loc[2, 2] * K_required[2] / 1e3
@@ -209,7 +209,7 @@ def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Arr
     if D.value is None:
         raise RunError(
             f"{where}: no local gains meet the certificate ({problem.status}); "
-            "lower certificate.K_required, or raise certificate.k_q_share_max or law.K_p"
+            "lower certificate.K_required, or raise certificate.k_q_fraction_max or law.K_p"
         )
     return np.asarray(np.clip(FULL_SCALE * D.value, 0.0, node.D_max), float)
 

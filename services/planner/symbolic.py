@@ -1,6 +1,6 @@
 """The kinematics as expression graphs, built once and run without Python in between.
 
-The equations of design section 3 a in CasADi: both legs as products of exponentials, the
+The equations of docs/law.md#load-sharing in CasADi: both legs as products of exponentials, the
 torso mixed from them by the load-sharing matrices D, p and its Jacobian, and the Hessian
 term of K_q. In NumPy, calls on 3-vectors cost more than their arithmetic: a planner tick
 took 0.5 ms alone and 1.5 ms among the other processes of the fleet on two cores.
@@ -225,7 +225,7 @@ def _by_rotation(config: RobotConfig, rotation: ca.SX, moment: ca.SX, F_harness:
 
 
 def _share(config: RobotConfig, feet: list[_Foot], legs: list[_Leg]) -> ca.SX:
-    """Return D_L, how much of a torso wrench the left leg takes (design section 3 a).
+    """Return D_L, how much of a torso wrench the left leg takes (docs/law.md#load-sharing).
 
     Leg i can give the torso the wrench X_i w_i, w_i at its foot. Foot moments are dear:
     beyond a few centimetres of lever the sole tips. With W weighting them, the least-

@@ -1,7 +1,7 @@
 """One tick laid open: every matrix of the law and each joint's torque by origin. Pure.
 
 What `Hocca.tick` computes on its way and does not keep, computed again from what is in
-the log: the joints, the references and the assist (design section 3).
+the log: the joints, the references and the assist (docs/law.md).
 """
 
 from __future__ import annotations

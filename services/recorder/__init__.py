@@ -1,1 +1,1 @@
-"""The recorder: everything on the bus into MCAP files (design section 10)."""
+"""The recorder: everything on the bus into MCAP files (docs/logs.md)."""

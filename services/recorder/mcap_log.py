@@ -38,7 +38,7 @@ from services.recorder.sequence_stats import KeyCount
 from shared.exceptions import RunError
 from shared.topics import Topic
 
-SCHEMA_VERSION: Final = "4"
+SCHEMA_VERSION: Final = "5"
 """Of the layout above and of the messages in `shared/messages.py`."""
 
 FILE_NAME: Final = files.FIRST

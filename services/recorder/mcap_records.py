@@ -1,7 +1,7 @@
 """MCAP records as bytes, decoded without trusting one of them. Pure.
 
 The mcap package reads what is right: a wrong length makes it read on, allocate or
-stumble (design section 10). Here a record is decoded only if it fits its length to the
+stumble (docs/logs.md). Here a record is decoded only if it fits its length to the
 byte; everything else is `Malformed`.
 """
 

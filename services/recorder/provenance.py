@@ -1,7 +1,7 @@
 """Where a run comes from: code, packages, machine. Written first into its log.
 
 Two runs can only be expected to agree bit by bit if these do: OpenBLAS picks its
-kernels by CPU and thread count (design section 10).
+kernels by CPU and thread count (docs/logs.md).
 """
 
 from __future__ import annotations

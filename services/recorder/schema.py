@@ -2,7 +2,7 @@
 
 Foxglove reads an object whose properties are booleans, strings, numbers, integers,
 objects, or arrays of one of these: no `$ref`, no unions, no null, no tuples and no
-array in an array. msgspec's own schemas have most of these (design section 10), so
+array in an array. msgspec's own schemas have most of these (docs/logs.md), so
 these are made from the types themselves.
 """
 

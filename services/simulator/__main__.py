@@ -18,7 +18,7 @@ from services.simulator.loop import SimulatorLoop, SimulatorPorts
 from services.simulator.plant import plant_from
 from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
-from shared import config_file, log, scenario, topics
+from shared import config_file, log, scenarios, topics
 from shared.bus import open_session
 from shared.config import RobotConfig, expand
 from shared.joints import MODULE_INDEX, N_JOINTS
@@ -73,7 +73,7 @@ def main() -> int:
     arguments = parser.parse_args()
     logger = log.setup("simulator")
     robot = config_file.load(arguments.config)
-    story = scenario.load(arguments.scenario)
+    scenario = scenarios.load(arguments.scenario)
     true_plant = plant_from(arguments.plant)
     stop = StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
@@ -108,8 +108,8 @@ def main() -> int:
         imu = None
         if robot.imu.fitted:
             imu = ImuFront(robot.imu, true_plant.imu, hubs[robot.imu.bus], arguments.seed)
-        world = World(body_of(robot, true_plant), story)
-        logger.info("up, %s, scenario %s", granted, story.name)
+        world = World(body_of(robot, true_plant), scenario)
+        logger.info("up, %s, scenario %s", granted, scenario.name)
         freeze_garbage()
         loop = SimulatorLoop(robot, world, bank, front, usb, (harness, imu), ports)
         loop.autostart_s = arguments.autostart

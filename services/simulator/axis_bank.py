@@ -1,4 +1,4 @@
-"""Twelve emulated ODrive axes: state machine, watchdogs, checks and errors (design section 5).
+"""Twelve emulated ODrive axes: state machine, watchdogs, checks and errors (docs/drives.md).
 
 Firmware 0.5.6; the traps are kept on purpose: OVERSPEED disarms in torque mode too, a
 disarmed axis floats while its sibling keeps its torque, the watchdog runs in IDLE as well,

@@ -1,4 +1,4 @@
-"""Estimators and control law of the emulated axes, as arrays (design section 5).
+"""Estimators and control law of the emulated axes, as arrays (docs/drives.md).
 
 Firmware 0.5.6, pass-through: torque = input_torque + vel_gain (clamp(input_vel +
 pos_gain (input_pos - pos)) - vel) + integrator, clamped to current_lim; input_vel and

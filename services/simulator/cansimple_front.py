@@ -1,4 +1,4 @@
-"""The CAN side of the emulated drives: frames to and from an `AxisBank` (design section 5)."""
+"""The CAN side of the emulated drives: frames to and from an `AxisBank` (docs/drives.md)."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from services.simulator.axis_conditions import OVER_TEMP_MARGIN, ROOM_TEMPERATUR
 from services.simulator.axis_faults import AXIS_NAMES
 from services.simulator.dc_bus import SUPPLY_VOLTAGE
 from shared.joints import MODULE_INDEX
-from shared.scenario import Fault
+from shared.scenarios import Fault
 
 _AT_ONCE: Final = {"watchdog": "WATCHDOG", "disarmed": "DISARM", "overspeed": "OVERSPEED"}
 """Kinds that are of a moment, and the fault of the bank that each is."""

@@ -1,4 +1,4 @@
-"""The native (Fibre, legacy packet format) side of the emulated drives (design section 5).
+"""The native (Fibre, legacy packet format) side of the emulated drives (docs/drives.md).
 
 `FibreFront` is the protocol of one board, bytes in and bytes out; little-endian throughout.
 

@@ -20,7 +20,7 @@ from shared.clock import NS_PER_MS, NS_PER_S, now_ns, sleep_until
 from shared.config import RobotConfig
 from shared.messages import OperatorIntent, SimControl, SimTruth
 from shared.process import StopFlag
-from shared.scenario import SCENARIO
+from shared.scenarios import SCENARIO
 from shared.topics import SIM_STATE
 from shared.traces import SimState
 

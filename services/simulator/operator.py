@@ -1,7 +1,7 @@
 """The simulated operator: a hand that leads, and weight rested on the harness.
 
 The hand is a clipped spring-damper between a path and the harness point, in height and
-pitch (design section 8). Behind it is a person with a mass. Pure.
+pitch (docs/simulator.md#reference-scenario). Behind it is a person with a mass. Pure.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from services.simulator.plant import Person
 from shared.config_sections import OperatorConfig
 from shared.messages import Vector3
-from shared.scenario import Lead
+from shared.scenarios import Lead
 
 
 class HandForce(NamedTuple):

@@ -20,7 +20,7 @@ from services.simulator.hoist import Hoist
 from services.simulator.operator import HandForce, Operator, Wearer
 from shared.joints import JOINTS, N_LEG, SIDES
 from shared.messages import SimTruth, Vector3, Vector4
-from shared.scenario import Lead, Scenario, lead, push_at
+from shared.scenarios import Lead, Scenario, lead, push_at
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ TRAPS = (
     "controller.config.spinout_electrical_power_threshold",
     "controller.config.spinout_mechanical_power_threshold",
 )
-"""Of design section 5, of each axis: what an ODrive ships is wrong."""
+"""Of docs/drives.md, of each axis: what an ODrive ships is wrong."""
 
 
 @pytest.mark.parametrize("module", MODULES)

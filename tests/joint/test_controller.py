@@ -217,7 +217,7 @@ def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> Non
     for _ in range(20):
         sent = bench.fresh(session=SESSION + 1, q_ref=(0.02, -0.97))
         taus.append(bench.cycle(sent).tau)
-    assert np.abs(np.diff(np.array(taus), axis=0)).max() < 5.0  # design section 9
+    assert np.abs(np.diff(np.array(taus), axis=0)).max() < 5.0  # docs/results.md#targets
 
 
 # ---- the rest of a cycle

@@ -1,4 +1,4 @@
-"""A service that was frozen goes on from what its drive carries (design sections 4 and 5)."""
+"""A service that was frozen goes on from what its drive carries (docs/drives.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The onboard loop: drive and service hold one law between them (design section 5)."""
+"""The onboard loop: drive and service hold one law between them (docs/drives.md)."""
 
 from __future__ import annotations
 

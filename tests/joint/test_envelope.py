@@ -104,8 +104,8 @@ def edges(robot: RobotConfig, module: str, axis: int) -> dict[str, tuple[float, 
         "k_p": (0.98 * bounds.k_p[0][axis], 1.02 * bounds.k_p[1][axis]),
         "k_d": (0.98 * bounds.k_d[0][axis], 1.02 * bounds.k_d[1][axis]),
         "tau_ff": (
-            tau_ff_at(bounds, Q[1])[0][axis] - own.tau_ff_room,
-            tau_ff_at(bounds, Q[1])[1][axis] + own.tau_ff_room,
+            tau_ff_at(bounds, Q[1])[0][axis] - own.tau_ff_margin,
+            tau_ff_at(bounds, Q[1])[1][axis] + own.tau_ff_margin,
         ),
         "dtau_ff": (-own.dtau_ff, own.dtau_ff),
         "tau_coupled": (-own.tau_coupled, own.tau_coupled),
@@ -139,7 +139,7 @@ def test_each_number_is_believed_up_to_its_bound_and_not_beyond(
 def test_at_its_very_bound_each_number_is_believed(robot: RobotConfig, axis: int, end: int) -> None:
     bounds, own, least = bounds_of(robot), robot.envelope, robot.certificate
     side, share = (-1.0, 1.0)[end], 1.0 + (-ROUNDING, ROUNDING)[end]
-    tau_ff = tau_ff_at(bounds, Q[1])[end][axis] + side * own.tau_ff_room
+    tau_ff = tau_ff_at(bounds, Q[1])[end][axis] + side * own.tau_ff_margin
     at_bound = {
         "k_p": share * bounds.k_p[end][axis],
         "k_d": share * bounds.k_d[end][axis],
@@ -199,7 +199,7 @@ def test_a_torque_that_jumps_is_not_believed(
 def test_the_feedforward_is_that_of_the_joints_own_angle(robot: RobotConfig, theta: float) -> None:
     """A knee that is bent to a right angle carries more than one that is straight."""
     (_, low), (_, high) = tau_ff_at(bounds_of(robot), theta)
-    room, envelope = robot.envelope.tau_ff_room, Envelope(robot, MODULE)
+    room, envelope = robot.envelope.tau_ff_margin, Envelope(robot, MODULE)
     for tau, outside in (
         (low - room - 0.01, Outside.TAU_FF),
         (low - room + 0.01, Outside.NOTHING),

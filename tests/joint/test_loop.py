@@ -329,5 +329,5 @@ def test_every_cycle_is_traced_and_the_rest_when_the_service_ends(rig: Rig) -> N
     assert [len(trace.cycles) for trace in rig.traces.sent] == [10, 10]
     rig.loop.run(cast("Any", Stop(3, interrupted=False)))
     assert [len(trace.cycles) for trace in rig.traces.sent] == [10, 10, 8]
-    assert [bool(trace.memory) for trace in rig.traces.sent] == [True, False, False]
+    assert [bool(trace.snapshot) for trace in rig.traces.sent] == [True, False, False]
     assert [trace.seq for trace in rig.traces.sent] == [1, 2, 3]

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from services.simulator.plant import PlantConfig
 from services.simulator.plant import to_toml as plant_to_toml
 from services.simulator.state import taken
-from shared import scenario
+from shared import scenarios
 from shared.config import RobotConfig
 from shared.config_file import to_toml
 from shared.impairment import Impairment
 from shared.joints import MODULES
 from shared.messages import SimTruth
-from shared.scenario import Keyframe, Kill, Push, Restart, Scenario
+from shared.scenarios import Keyframe, Kill, Push, Restart, Scenario
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
 from tools.runs.partial import PartialStart
@@ -54,9 +54,9 @@ class Run(NamedTuple):
         return done and not any(row.fallen for row in self.rows)
 
 
-def story(name: str, **changes: object) -> Scenario:
+def variant(name: str, **changes: object) -> Scenario:
     """Return a shipped scenario with fields replaced."""
-    return msgspec.structs.replace(scenario.load(SCENARIOS / f"{name}.toml"), **changes)
+    return msgspec.structs.replace(scenarios.load(SCENARIOS / f"{name}.toml"), **changes)
 
 
 def kill(at: float) -> tuple[Kill, ...]:
@@ -75,7 +75,7 @@ def push(at: float, *force: float) -> Push:
 def still(duration: float, height: float = 1.188, **changes: object) -> Scenario:
     """Return a scenario in which the hand goes to a height and stays there."""
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.0, height=height))
-    return story("stand", duration=duration, keyframe=frames, **changes)
+    return variant("stand", duration=duration, keyframe=frames, **changes)
 
 
 def standing(robot: RobotConfig, plant: PlantConfig) -> PartialStart:
@@ -88,7 +88,7 @@ def standing(robot: RobotConfig, plant: PlantConfig) -> PartialStart:
         assert fleet.planner is not None
         _standing[key] = PartialStart(
             taken(fleet.world, fleet.bank, fleet.now_ns, 0),
-            {module: fleet.memory_of(module) for module in MODULES},
+            {module: fleet.snapshot_of(module) for module in MODULES},
             (fleet.planner.session, fleet.planner.snapshot()),
         )
     return _standing[key]

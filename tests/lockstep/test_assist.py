@@ -11,11 +11,11 @@ from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared.config import RobotConfig
 from shared.messages import Cause, Mode, SimTruth
-from shared.scenario import Keyframe, Scenario
-from tests.lockstep.runs import run, story
+from shared.scenarios import Keyframe, Scenario
+from tests.lockstep.runs import run, variant
 from tools.runs.lockstep import Lockstep
 
-RESTING = story(
+RESTING = variant(
     "stand",
     duration=19.0,
     keyframe=(Keyframe(at=0.0, height=1.1), Keyframe(at=4.0, height=1.0, assist=200.0)),
@@ -58,7 +58,7 @@ def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: f
         msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, lead_easing=alpha))
         for alpha in (0.0, 0.5)
     )
-    squat = story("squat", duration=6.0, kill=(), push=())
+    squat = variant("squat", duration=6.0, kill=(), push=())
     plain, eased = run(plain_law, squat, delay_ms), run(easy_law, squat, delay_ms)
     assert eased.stood
     assert np.abs(eased.operator_n).max() < 0.8 * np.abs(plain.operator_n).max()
@@ -73,7 +73,7 @@ def test_an_overloaded_harness_makes_all_six_hold_and_lets_them_lead_again(
         Keyframe(at=t, height=1.1, assist=a)
         for t, a in ((0.0, 0.0), (2.0, 190.0), (3.0, 190.0), (5.0, 0.0))
     )
-    overloading = story("stand", duration=9.0, keyframe=frames)
+    overloading = variant("stand", duration=9.0, keyframe=frames)
     fleet = Lockstep(msgspec.structs.replace(robot, harness=tight), overloading)
     held = False
     for truth in fleet.run():

@@ -19,9 +19,9 @@ from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import JointState, Mode, Pair, PlannerMode, SimTruth
 from shared.robot_model import stand_pose
-from shared.scenario import Inject, Scenario
+from shared.scenarios import Inject, Scenario
 from tests.joint.helpers import command
-from tests.lockstep.runs import push, story
+from tests.lockstep.runs import push, variant
 from tests.planner.conftest import standing_torque
 from tests.test_architecture import IMPORTS, Import, imports_in
 from tools import cli
@@ -54,7 +54,7 @@ def run(
 @pytest.fixture(scope="module")
 def beginning() -> Scenario:
     """The first of the squat's way down, with the hand's largest force, and a push."""
-    return story("squat", duration=1.6, kill=(), push=(push(0.8, 30.0, 20.0, 0.0),))
+    return variant("squat", duration=1.6, kill=(), push=(push(0.8, 30.0, 20.0, 0.0),))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_with_100_ms_each_way_it_falls_and_the_shipped_control_stands(
     robot: RobotConfig, control: str, falls: bool
 ) -> None:
     late = Inject(link="all", at=0.05, delay_ms=100.0)
-    pushed = story(
+    pushed = variant(
         "squat", duration=2.5, kill=(), inject=(late,), push=(push(0.2, 40.0, 0.0, 0.0),)
     )
     assert run(control, robot, pushed, 0.0)[-1].fallen is falls
@@ -192,7 +192,7 @@ def states(robot: RobotConfig, now_ns: int, seq: int) -> list[JointState]:
     """Return six states of a robot that stands on its feet, each joint moving."""
     q = stand_pose(robot, 1.1)
     tau = standing_torque(tuple(q))
-    fleet = Lockstep(robot, story("stand"))
+    fleet = Lockstep(robot, variant("stand"))
     blank = [module.state(now_ns) for module in fleet.controllers]
     return [
         msgspec.structs.replace(

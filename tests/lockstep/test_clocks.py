@@ -27,7 +27,7 @@ from tools.runs.partial import PartialCase, PartialStart
 
 HOUR_NS = 3600 * NS_PER_S
 HOSTS = ("planner", "harness", *MODULES)
-SQUAT = partial.story_of(PartialCase("links", ()))
+SQUAT = partial.scenario_of(PartialCase("links", ()))
 
 
 class Fleet(Lockstep):
@@ -64,8 +64,8 @@ def squat(
         elif isinstance(message, PlannerStatus):
             statuses.append(message)
 
-    story = msgspec.structs.replace(SQUAT, duration=seconds)
-    fleet = Fleet(robot, story, record=record, clocks=clocks)
+    scenario = msgspec.structs.replace(SQUAT, duration=seconds)
+    fleet = Fleet(robot, scenario, record=record, clocks=clocks)
     rows: list[SimTruth] = []
     for row in fleet.run():
         rows.append(row)

@@ -7,12 +7,12 @@ import pytest
 
 from shared.config import RobotConfig
 from shared.messages import Mode
-from tests.lockstep.runs import Run, kill, run, story
+from tests.lockstep.runs import Run, kill, run, variant
 
 
 @pytest.fixture(scope="module")
 def crawl(robot: RobotConfig) -> Run:
-    return run(robot, story("crawl"))
+    return run(robot, variant("crawl"))
 
 
 def test_the_robot_goes_down_to_crawling_and_back(crawl: Run) -> None:
@@ -37,14 +37,14 @@ def test_the_assist_carries_the_operators_weight(crawl: Run) -> None:
 
 @pytest.mark.parametrize("at", [3.5, 8.0])
 def test_the_robot_stands_if_the_planner_dies_in_the_crawl(robot: RobotConfig, at: float) -> None:
-    outcome = run(robot, story("crawl", duration=at + 3.0, kill=kill(at)))
+    outcome = run(robot, variant("crawl", duration=at + 3.0, kill=kill(at)))
     assert outcome.stood
     assert all(c.failsafe.mode is Mode.HOLD for c in outcome.lockstep.controllers)
 
 
 def test_the_ankles_hold_against_an_operator_who_pulls_himself_up(robot: RobotConfig) -> None:
     """With the gains frozen as they were, the soles tipped at 13 s of this run."""
-    outcome = run(robot, story("crawl", duration=15.5, kill=kill(8.0)))
+    outcome = run(robot, variant("crawl", duration=15.5, kill=kill(8.0)))
     assert outcome.stood
     hold = outcome.t >= 8.0
     assert np.abs(outcome.operator_n[hold]).max() == pytest.approx(150.0), "he must pull"

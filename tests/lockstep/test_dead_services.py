@@ -7,8 +7,8 @@ import pytest
 from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import Mode
-from shared.scenario import Kill, Push, Restart
-from tests.lockstep.runs import push, run, story
+from shared.scenarios import Kill, Push, Restart
+from tests.lockstep.runs import push, run, variant
 from tools.sweeps.figures import Ending, ending_of
 
 
@@ -20,7 +20,7 @@ def test_all_six_dead_stand_through_two_pushes_in_step_with_the_sway(robot: Robo
     """With TRACK's gains left on the drives sway was hardly damped: 7 of 26 such pairs fell."""
     pushes = (push(0.354, -24.5, 31.6, 0.0), push(2.074, -2.3, 39.9, 0.0))
     kills = killed(0.313, "planner", *MODULES)
-    result = run(robot, story("squat", duration=4.5, kill=kills, push=pushes))
+    result = run(robot, variant("squat", duration=4.5, kill=kills, push=pushes))
     assert result.stood
     assert abs(result.com_mm[:, :2]).max() < 45.0
 
@@ -45,7 +45,7 @@ def test_a_service_that_comes_back_while_all_hold_is_no_stiffer_than_they_are(
 ) -> None:
     """With stand gains on one, and a hand that leads on, one leg gave and the other did not."""
     name, dies, returns = back
-    scenario = story(
+    scenario = variant(
         "squat",
         duration=5.2,
         kill=(*killed(dies, name), *killed(away[1], away[0])),
@@ -59,7 +59,7 @@ def test_a_service_that_comes_back_while_all_hold_is_no_stiffer_than_they_are(
 
 def test_a_service_that_comes_back_takes_its_drive_over_without_a_step(robot: RobotConfig) -> None:
     """In the middle of the squat, while five hold."""
-    scenario = story(
+    scenario = variant(
         "squat",
         duration=2.0,
         kill=killed(1.2, "knee_left"),

@@ -12,7 +12,7 @@ from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.messages import Mode
-from shared.scenario import Fault, Keyframe, Kill, Restart
+from shared.scenarios import Fault, Keyframe, Kill, Restart
 from tests.lockstep.runs import still
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants
@@ -41,8 +41,8 @@ def test_the_robot_sinks_slowly_and_does_not_topple(
 
 
 def test_a_stop_without_a_planner_sinks_as_well(robot: RobotConfig) -> None:
-    story = msgspec.structs.replace(still(10.0), hand=False)
-    fleet = Lockstep(robot, story)
+    scenario = msgspec.structs.replace(still(10.0), hand=False)
+    fleet = Lockstep(robot, scenario)
     fleet.planner = None
     heights = []
     for step in range(10_000):

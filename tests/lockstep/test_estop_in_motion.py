@@ -8,14 +8,14 @@ import pytest
 
 from shared.config import RobotConfig
 from shared.messages import Mode
-from tests.lockstep.runs import story
+from tests.lockstep.runs import variant
 from tools.runs.lockstep import Lockstep
 
 
 @pytest.mark.parametrize(("name", "at"), [("squat", 0.6), ("squat", 1.5), ("crawl", 1.0)])
 def test_no_joint_is_jerked(robot: RobotConfig, name: str, at: float) -> None:
     """With damping, rates and coupling changed in one cycle, one had a blow of 18 to 33 N m."""
-    fleet = Lockstep(robot, story(name, duration=at + 0.5, kill=(), push=()))
+    fleet = Lockstep(robot, variant(name, duration=at + 0.5, kill=(), push=()))
     taus: list[list[float]] = []
     for _ in range(10_000):
         fleet.estop = fleet.world.scenario_s >= at

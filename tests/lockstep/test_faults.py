@@ -10,7 +10,7 @@ from shared.config import RobotConfig
 from shared.fault_table import DRIVE_FAULTS
 from shared.joints import MODULE_INDEX
 from shared.messages import Cause, DriveStatus, Mode
-from shared.scenario import FAULT_KINDS, Fault, FaultKind, Kill, Restart
+from shared.scenarios import FAULT_KINDS, Fault, FaultKind, Kill, Restart
 from tests.lockstep.runs import Run, run, still
 
 MODULE = "hip_left"

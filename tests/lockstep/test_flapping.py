@@ -1,7 +1,7 @@
 """A link that comes and goes: no more than six drop-outs a minute, and nothing shaken down.
 
-Design section 8 found 39 drop-outs in 11 s. Hysteresis of each module by itself was not enough:
-six links that took turns gave 14 to 24 a minute, and under ages of 4 to 46 ms, all within the
+A study found 39 drop-outs in 11 s (docs/results.md). Hysteresis of each module by itself was not
+enough: six links that took turns gave 14 to 24 a minute. With ages of 4 to 46 ms, all within the
 rule, the robot fell in TRACK (by 12 s with 20 ms of jitter on streams).
 """
 
@@ -18,7 +18,7 @@ from services.planner.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engag
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.messages import Cause, Mode, PlannerMode, SimTruth
-from shared.scenario import Inject, Keyframe, Scenario
+from shared.scenarios import Inject, Keyframe, Scenario
 from tests.joint.helpers import T0
 from tools.runs.lockstep import Lockstep
 
@@ -167,8 +167,8 @@ def test_a_minute_of_20_ms_jitter_and_10_percent_loss(
     left out, 99 % with one drop-out, and the coupled torques faded to a quarter.
     """
     link = Inject(link="all", at=0.0, jitter_ms=20.0, loss=0.1, ordered=ordered)
-    story = Scenario(name="flap", about="", duration=60.0, keyframe=squats(60.0), inject=(link,))
-    fleet = Lockstep(robot, story)
+    scenario = Scenario(name="flap", about="", duration=60.0, keyframe=squats(60.0), inject=(link,))
+    fleet = Lockstep(robot, scenario)
     rows, tracking = list[SimTruth](), list[bool]()
     for row in fleet.run():
         if row.scenario_s >= 0.0:

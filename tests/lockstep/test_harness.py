@@ -10,9 +10,9 @@ from shared import topics
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import Message, PlannerStatus, SimTruth, Tare, TareRequest, Wrench
-from shared.scenario import Keyframe, Scenario
+from shared.scenarios import Keyframe, Scenario
 from shared.topics import Topic
-from tests.lockstep.runs import still, story
+from tests.lockstep.runs import still, variant
 from tools.runs.lockstep import Lockstep
 
 
@@ -22,7 +22,7 @@ def leaning(assist: float) -> Scenario:
         Keyframe(at=0.0, height=1.188),
         Keyframe(at=2.0, height=1.1, pitch=0.4, assist=assist),
     )
-    return story("stand", duration=3.5, keyframe=frames)
+    return variant("stand", duration=3.5, keyframe=frames)
 
 
 def record(

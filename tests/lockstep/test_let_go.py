@@ -15,8 +15,8 @@ from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import PlannerMode, PlannerStatus, Trip
-from shared.scenario import Keyframe
-from tests.lockstep.runs import story
+from shared.scenarios import Keyframe
+from tests.lockstep.runs import variant
 from tools.runs.lockstep import Lockstep
 
 LET_GO_S = 3.0
@@ -27,7 +27,7 @@ def run(
 ) -> tuple[Lockstep, list[tuple[float, float, float]]]:
     """Return the fleet after 8 s, and (time, torso's height, pitch) from letting go on."""
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.0, height=height))
-    told = story("stand", duration=8.0, keyframe=frames, kill=(), push=())
+    told = variant("stand", duration=8.0, keyframe=frames, kill=(), push=())
     plant = changed(PlantConfig(), errors)
     fleet = Lockstep(robot, told, Impairment(delay_ms=1.0), plant=plant)
     poses = []
@@ -78,7 +78,7 @@ def test_without_its_payload_it_holds_as_the_hoist_lets_go(
 ) -> None:
     """Led on the hoist, it rose by 0.1 m to straight legs, where torques tell nothing."""
     plant = changed(PlantConfig(), {"body.payload_scale": scale})
-    heights, fleet = [], Lockstep(robot, story("stand", duration=4.0), plant=plant)
+    heights, fleet = [], Lockstep(robot, variant("stand", duration=4.0), plant=plant)
     for row in fleet.run():
         assert not row.fallen
         heights.append(row.torso[2])

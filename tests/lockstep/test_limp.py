@@ -10,8 +10,8 @@ import pytest
 from shared.config import RobotConfig
 from shared.joints import MODULE_INDEX, MODULES
 from shared.messages import Mode
-from shared.scenario import Fault, FaultKind, Kill
-from tests.lockstep.runs import Run, kill, push, run, story
+from shared.scenarios import Fault, FaultKind, Kill
+from tests.lockstep.runs import Run, kill, push, run, variant
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants
 
@@ -30,7 +30,7 @@ def limp(
     kill: tuple[Kill, ...] = (),
 ) -> Run:
     """Run a scenario to a fault and on, with a push a while after it."""
-    scenario = story(
+    scenario = variant(
         name,
         duration=at + LASTING,
         kill=kill,
@@ -113,7 +113,7 @@ def test_on_drawn_plants_a_limp_knee_stands_with_a_hand_and_without(
     at, angle = draw.uniform(0.3, 3.0), draw.uniform(0.0, math.tau)
     pushed = push(at + 1.5, 30.0 * math.cos(angle), 30.0 * math.sin(angle), 0.0)
     knee = draw.choice(("knee_left", "knee_right"))
-    scenario = story(
+    scenario = variant(
         "squat",
         duration=at + 4.0,
         kill=kill(at - 0.1) if number % 2 else (),

@@ -10,8 +10,8 @@ from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.messages import Mode
-from shared.scenario import Kill, Restart
-from tests.lockstep.runs import push, run, story
+from shared.scenarios import Kill, Restart
+from tests.lockstep.runs import push, run, variant
 from tools.runs.lockstep import Lockstep
 
 PUSHES = (push(3.6, 30.0, 0.0, 0.0), push(4.6, 0.0, 30.0, 0.0))
@@ -25,7 +25,7 @@ def dead(at: float, *services: str) -> tuple[Kill, ...]:
 def test_all_six_services_dead_at_any_phase_of_a_squat_stand_through_pushes(
     robot: RobotConfig, at: float
 ) -> None:
-    result = run(robot, story("squat", duration=7.0, kill=dead(at, *MODULES), push=PUSHES))
+    result = run(robot, variant("squat", duration=7.0, kill=dead(at, *MODULES), push=PUSHES))
     assert result.stood
     after = result.t > at
     assert np.abs(result.com_mm[after, :2]).max() < 80.0
@@ -38,7 +38,7 @@ def test_one_dead_service_stands_and_its_successor_leads_again(
     """Taken over without a step: no module's torque jumps, and all six track in the end."""
     result = run(
         robot,
-        story(
+        variant(
             "squat",
             duration=7.5,
             kill=dead(2.2, module),
@@ -57,7 +57,7 @@ def test_one_dead_service_stands_and_its_successor_leads_again(
 def test_a_successor_carries_on_with_what_its_drive_carries(robot: RobotConfig) -> None:
     fleet = Lockstep(
         robot,
-        story(
+        variant(
             "squat",
             duration=4.0,
             kill=dead(2.2, "knee_right"),
@@ -82,4 +82,4 @@ def test_with_torques_only_a_dead_service_cannot_be_run(robot: RobotConfig) -> N
     service = msgspec.structs.replace(robot.joint_service, loop="service")
     torques_only = msgspec.structs.replace(robot, joint_service=service)
     with pytest.raises(RunError, match="only the planner"):
-        Lockstep(torques_only, story("squat", kill=dead(1.0, "knee_left"), restart=()))
+        Lockstep(torques_only, variant("squat", kill=dead(1.0, "knee_left"), restart=()))

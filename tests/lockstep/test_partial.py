@@ -96,7 +96,7 @@ def test_who_tips_at_the_end_or_does_not_come_so_far_has_not_stood(
     flat = {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0, "lean": (0.0, 0.0)}
     row = sample_of(SimTruth, **(good | flat | changes))
     case = PartialCase("links", ())
-    fleet = partial.PartialFleet(robot, partial.story_of(case))
+    fleet = partial.PartialFleet(robot, partial.scenario_of(case))
     outcome = partial._measure(case, fleet, [row], [], 0, None)
     assert outcome.stood is stands
 
@@ -116,7 +116,7 @@ def test_there_are_64_subsets_and_each_kind_fails_what_it_says() -> None:
     cut = {
         kind: {
             direction
-            for row in partial.story_of(PartialCase(kind, MODULES)).inject
+            for row in partial.scenario_of(PartialCase(kind, MODULES)).inject
             for direction in directions_of(row.link)
         }
         for kind in KINDS
@@ -124,7 +124,7 @@ def test_there_are_64_subsets_and_each_kind_fails_what_it_says() -> None:
     assert cut["links"] == cut["commands"] | cut["states"]
     assert cut["links"] == set(DIRECTIONS) - {WRENCHES, ATTITUDES}
     assert not cut["commands"] & cut["states"]
-    frozen = partial.story_of(PartialCase("frozen", MODULES))
+    frozen = partial.scenario_of(PartialCase("frozen", MODULES))
     assert {row.service for row in frozen.kill if row.signal == "STOP"} == set(MODULES)
     assert not cut["frozen"]
 

@@ -16,9 +16,9 @@ from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import Cause, Outside, PlannerMode
-from shared.scenario import Inject, Keyframe, Push, Scenario
+from shared.scenarios import Inject, Keyframe, Push, Scenario
 from shared.trip_table import JOINT_TRIPS
-from tests.lockstep.runs import kill, push, restart, story
+from tests.lockstep.runs import kill, push, restart, variant
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants
 from tools.sweeps.push_range import PushRange
@@ -81,12 +81,12 @@ def believed(judged: Judged) -> None:
 @pytest.mark.parametrize("name", ["squat", "crawl"])
 def test_while_the_hand_leads(robot: RobotConfig, judged: Judged, name: str) -> None:
     pushes = (push(1.0, 0.0, 40.0, 0.0), push(2.0, 40.0, 0.0, 0.0))
-    run(robot, story(name, duration=5.0, kill=(), push=pushes), Impairment(delay_ms=1.0))
+    run(robot, variant(name, duration=5.0, kill=(), push=pushes), Impairment(delay_ms=1.0))
     believed(judged)
 
 
 def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: Judged) -> None:
-    told = story("squat", duration=5.0, kill=kill(1.0), restart=restart(1.6), push=())
+    told = variant("squat", duration=5.0, kill=kill(1.0), restart=restart(1.6), push=())
     fleet = run(robot, told, Impairment(delay_ms=1.0))
     believed(judged)
     assert fleet.planner is not None
@@ -103,7 +103,7 @@ def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: 
     ids=lambda network: f"{network.delay_ms:g}-{network.jitter_ms:g}-{network.loss:g}",
 )
 def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairment) -> None:
-    told = story("stand", duration=4.0, keyframe=DOWN, push=(push(1.0, 0.0, 40.0, 0.0),))
+    told = variant("stand", duration=4.0, keyframe=DOWN, push=(push(1.0, 0.0, 40.0, 0.0),))
     run(robot, told, network)
     believed(judged)
 
@@ -114,7 +114,7 @@ def test_at_the_corners_of_a_lean(
 ) -> None:
     x, y, roll, yaw = (sign * most for sign, most in zip(signs, robot.law.shift_max, strict=True))
     leans = (*DOWN, Keyframe(at=3.0, height=1.05, shift=(x, y, roll, yaw)))
-    run(robot, story("stand", duration=4.0, keyframe=leans, push=()), Impairment(delay_ms=1.0))
+    run(robot, variant("stand", duration=4.0, keyframe=leans, push=()), Impairment(delay_ms=1.0))
     believed(judged)
 
 
@@ -123,7 +123,7 @@ def test_at_the_corners_of_a_stance(
     robot: RobotConfig, judged: Judged, right: tuple[float, float, float]
 ) -> None:
     plant = changed(PlantConfig(), {"feet.offset_right": list(right)})
-    told = story("stand", duration=4.0, keyframe=DOWN, push=())
+    told = variant("stand", duration=4.0, keyframe=DOWN, push=())
     run(robot, told, Impairment(delay_ms=1.0), plant)
     believed(judged)
 
@@ -135,7 +135,7 @@ def test_on_drawn_plants_under_pushes_of_three_quarters_of_the_physical_limit(
     pushes = PushRange(robot)
     angles = (0.0, math.pi, math.pi / 2, -2.0)
     hard: tuple[Push, ...] = (pushes.push(2.0, 0.3, 0.75, angles[number]),)
-    told = story("stand", duration=4.5, keyframe=DOWN, push=hard)
+    told = variant("stand", duration=4.5, keyframe=DOWN, push=hard)
     run(robot, told, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
     believed(judged)
 
@@ -146,7 +146,7 @@ def test_held_off_centre_it_is_believed_and_leads_again(
 ) -> None:
     """Cut off as a push has moved it, it holds there; led again it begins from the middle."""
     x, y = (50.0 * part for part in direction)
-    told = story(
+    told = variant(
         "stand",
         duration=7.0,
         push=(Push(at=0.5, duration=0.4, force=(x, y, 0.0)),),

@@ -7,8 +7,8 @@ import pytest
 
 from shared.config import RobotConfig
 from shared.messages import Vector4
-from shared.scenario import Keyframe
-from tests.lockstep.runs import kill, push, restart, run, story
+from shared.scenarios import Keyframe
+from tests.lockstep.runs import kill, push, restart, run, variant
 from tools.sweeps import plants
 
 
@@ -20,7 +20,7 @@ def test_it_comes_to_the_farthest_corner_and_stands_pushed_there_without_a_plann
     asked: Vector4 = (x, y, 2.0 * roll, yaw)  # beyond the limit: the limit
     outcome = run(
         robot,
-        story(
+        variant(
             "stand",
             duration=6.5,
             keyframe=(
@@ -45,7 +45,7 @@ def test_a_planner_that_comes_back_to_a_leaning_robot_leads_it_to_the_same_lean(
 ) -> None:
     asked: Vector4 = (0.02, 0.03, 0.0, 0.08)
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=1.1, shift=asked))
-    there_and_back = story(
+    there_and_back = variant(
         "stand", duration=8.0, keyframe=frames, kill=kill(3.0), restart=restart(3.4), push=()
     )
     outcome = run(robot, there_and_back)
@@ -69,7 +69,7 @@ def test_it_stands_at_the_corner_on_plants_with_every_error_drawn(
         Keyframe(at=2.0, height=1.188, shift=(x, y, roll, yaw)),
     )
     pushes = (push(4.2, 30.0, 0.0, 0.0), push(5.2, -30.0, 0.0, 0.0))
-    leaned = story("stand", duration=6.5, keyframe=frames, kill=kill(3.8), push=pushes)
+    leaned = variant("stand", duration=6.5, keyframe=frames, kill=kill(3.8), push=pushes)
     outcome = run(robot, leaned, plant=plants.draw(drawn))
     assert outcome.stood
     assert np.hypot(*outcome.com_mm[-1, :2]) > 20.0, "it leans to the end"

@@ -9,9 +9,9 @@ import pytest
 
 from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
-from shared.scenario import Inject, Keyframe, Kill
+from shared.scenarios import Inject, Keyframe, Kill
 from tests.imu.robots import with_imu
-from tests.lockstep.runs import Run, push, run, story
+from tests.lockstep.runs import Run, push, run, variant
 
 DEG = math.radians(1.0)
 WRONG = [0.5 * DEG, -0.5 * DEG]
@@ -31,7 +31,7 @@ def over_mm(outcome: Run) -> float:
 def test_with_an_imu_it_squats_on_five_degrees_is_pushed_and_stands_when_the_planner_dies(
     robot: RobotConfig, slope: tuple[float, float]
 ) -> None:
-    told = story(
+    told = variant(
         "squat",
         duration=6.0,
         kill=(Kill(service="planner", at=4.0),),
@@ -48,7 +48,7 @@ def test_when_the_imu_falls_silent_the_last_slope_stands(robot: RobotConfig) -> 
     cut = (Inject(link="imu->planner", at=0.5, partition=True),)
     leans = (Keyframe(at=0.5, height=1.188), Keyframe(at=2.5, height=1.0, pitch=0.4))
     pushed = (push(2.8, 0.0, 30.0, 0.0),)
-    told = story("stand", duration=4.0, keyframe=leans, inject=cut, push=pushed)
+    told = variant("stand", duration=4.0, keyframe=leans, inject=cut, push=pushed)
     outcome = run(with_imu(robot), told, plant=sloping(5.0, 0.0))
     assert outcome.stood
     assert over_mm(outcome) < 30.0
@@ -58,7 +58,7 @@ def test_when_the_imu_falls_silent_the_last_slope_stands(robot: RobotConfig) -> 
 
 
 def test_on_a_level_floor_an_imu_changes_little_that_the_hand_feels(robot: RobotConfig) -> None:
-    told = story("squat", duration=4.0, kill=(), push=())
+    told = variant("squat", duration=4.0, kill=(), push=())
     outcome = run(with_imu(robot), told, plant=sloping(0.0, 0.0))
     assert outcome.stood
     assert np.abs(outcome.operator_n).max() < 26.0, "23 N measured, 19 without an IMU"

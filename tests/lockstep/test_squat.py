@@ -8,13 +8,13 @@ import pytest
 
 from shared.config import RobotConfig
 from shared.messages import Cause, Mode
-from tests.lockstep.runs import Run, kill, push, restart, run, still, story
+from tests.lockstep.runs import Run, kill, push, restart, run, still, variant
 
 
 @pytest.fixture(scope="module")
 def squat(robot: RobotConfig) -> Run:
     """The whole of Fig. 7: two squats, the planner killed at 10 s, three pushes."""
-    return run(robot, story("squat"))
+    return run(robot, variant("squat"))
 
 
 def test_the_robot_balances_while_the_operator_leads_two_squats(squat: Run) -> None:
@@ -77,13 +77,13 @@ def test_runs_are_bit_identical(robot: RobotConfig) -> None:
 @pytest.mark.parametrize("at", [0.7, 1.3, 2.5, 3.9])
 def test_the_robot_stands_whenever_the_planner_dies(robot: RobotConfig, at: float) -> None:
     pushes = (push(at + 0.5, 40, 0, 0), push(at + 1.5, 0, -40, 0))
-    outcome = run(robot, story("squat", duration=at + 3.0, kill=kill(at), push=pushes))
+    outcome = run(robot, variant("squat", duration=at + 3.0, kill=kill(at), push=pushes))
     assert outcome.stood
 
 
 def test_a_restarted_planner_takes_over_without_a_step(robot: RobotConfig) -> None:
     outcome = run(
-        robot, story("squat", duration=8.0, kill=kill(2.2), restart=restart(4.0), push=())
+        robot, variant("squat", duration=8.0, kill=kill(2.2), restart=restart(4.0), push=())
     )
     assert outcome.stood
     assert all(c.failsafe.mode is Mode.TRACK for c in outcome.lockstep.controllers)
@@ -110,5 +110,5 @@ def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
 
 @pytest.mark.parametrize("delay_ms", [0.0, 5.0, 10.0])
 def test_the_robot_stands_at_any_delay_of_the_bus(robot: RobotConfig, delay_ms: float) -> None:
-    scenario = story("squat", duration=5.0, kill=(), push=(push(2.0, 40, 0, 0),))
+    scenario = variant("squat", duration=5.0, kill=(), push=(push(2.0, 40, 0, 0),))
     assert run(robot, scenario, delay_ms).stood

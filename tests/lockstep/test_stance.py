@@ -9,8 +9,8 @@ from services.simulator.plant import PlantConfig
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import PlannerMode
-from shared.scenario import Keyframe
-from tests.lockstep.runs import kill, push, restart, run, story
+from shared.scenarios import Keyframe
+from tests.lockstep.runs import kill, push, restart, run, variant
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants
 
@@ -38,7 +38,7 @@ def test_every_error_drawn_it_squats_in_its_stance_and_stands_pushed_without_a_p
 ) -> None:
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.0, height=0.95))
     pushes = (push(4.2, 30.0, 0.0, 0.0), push(5.2, 0.0, 30.0, 0.0))
-    squat = story("stand", duration=6.5, keyframe=frames, kill=kill(3.8), push=pushes)
+    squat = variant("stand", duration=6.5, keyframe=frames, kill=kill(3.8), push=pushes)
     outcome = run(robot, squat, plant=with_foot(plants.draw(drawn), right, step), stands=False)
     assert outcome.stood
     assert outcome.com_mm[outcome.t < 3.7][-1, 2] < 800.0, "it was led down"
@@ -47,7 +47,7 @@ def test_every_error_drawn_it_squats_in_its_stance_and_stands_pushed_without_a_p
 
 def test_a_planner_that_comes_back_leads_on_in_the_same_stance(robot: RobotConfig) -> None:
     plant = with_foot(PlantConfig(), (0.1, 0.0, 0.2))
-    there = story("stand", duration=6.0, kill=kill(2.0), restart=restart(2.5), push=())
+    there = variant("stand", duration=6.0, kill=kill(2.0), restart=restart(2.5), push=())
     outcome = run(robot, there, plant=plant, stands=False)
     assert outcome.stood
     planner = outcome.lockstep.planner
@@ -66,7 +66,7 @@ def test_beyond_the_limit_it_is_not_led_and_stands_in_hold(
     robot: RobotConfig, right: Foot, words: str
 ) -> None:
     plant = with_foot(PlantConfig(), right)
-    fleet = Lockstep(robot, story("stand", duration=2.0), Impairment(delay_ms=1.0), plant=plant)
+    fleet = Lockstep(robot, variant("stand", duration=2.0), Impairment(delay_ms=1.0), plant=plant)
     row = None
     for row, _ in zip(fleet.run(), range(1200), strict=False):
         assert not row.fallen

@@ -16,9 +16,9 @@ from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
-from shared.scenario import Keyframe, Push, Scenario
+from shared.scenarios import Keyframe, Push, Scenario
 from shared.trip_table import JOINT_TRIPS, untripped
-from tests.lockstep.runs import still, story
+from tests.lockstep.runs import still, variant
 from tools.runs.lockstep import Lockstep, Record, forget
 from tools.sweeps.trips_trial import PLANTS, unfiltered
 
@@ -135,7 +135,7 @@ def _sags(height: float) -> Scenario:
         Keyframe(at=2.5, height=height),
         Keyframe(at=2.7, height=height, assist=100.0),
     )
-    return story("stand", duration=6.0, keyframe=frames, kill=(), push=())
+    return variant("stand", duration=6.0, keyframe=frames, kill=(), push=())
 
 
 def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
@@ -146,7 +146,7 @@ def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
         Keyframe(at=1.6, height=1.1, pitch=1.2),
     )
     fleet, _, fell = run(
-        robot, story("stand", duration=4.0, keyframe=frames, kill=(), push=()), PlantConfig()
+        robot, variant("stand", duration=4.0, keyframe=frames, kill=(), push=()), PlantConfig()
     )
     assert not fell
     assert Cause.HOLD_ALL in causes(fleet)
@@ -166,7 +166,7 @@ def test_a_fast_lead_and_one_beyond_what_legs_reach_are_followed(
         Keyframe(at=1.0, height=1.188),
         Keyframe(at=1.0 + ways_s, height=height, pitch=pitch),
     )
-    told = story("stand", duration=4.0, keyframe=frames, kill=(), push=())
+    told = variant("stand", duration=4.0, keyframe=frames, kill=(), push=())
     fleet, _, fell = run(robot, told, PlantConfig())
     assert not fell
     assert causes(fleet) == {Cause.DRIVE_ARMED, Cause.COMMANDS_FRESH}

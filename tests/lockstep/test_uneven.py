@@ -14,8 +14,8 @@ from scipy.signal import find_peaks
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import Mode
-from shared.scenario import Inject, Keyframe, Push, Scenario
-from tests.lockstep.runs import Run, push, run, still, story
+from shared.scenarios import Inject, Keyframe, Push, Scenario
+from tests.lockstep.runs import Run, push, run, still, variant
 from tools.runs.lockstep import Lockstep
 
 
@@ -53,7 +53,7 @@ def assert_it_stood_and_tracked(result: Run) -> None:
 def test_it_stands_through_pushes_while_all_six_track(
     robot: RobotConfig, network: str, pushes: tuple[Push, ...]
 ) -> None:
-    told = story("squat", duration=7.0, kill=(), push=pushes, inject=UNEVEN[network])
+    told = variant("squat", duration=7.0, kill=(), push=pushes, inject=UNEVEN[network])
     assert_it_stood_and_tracked(run(robot, told))
 
 
@@ -92,13 +92,13 @@ def test_two_hips_a_little_late_do_not_make_the_legs_shake(
 ) -> None:
     """At 49 Hz, by 40 N m a cycle, it did from 4.5 s on, unpushed, with all of tau_coupled."""
     late = (*one_late("hip_right", delay_ms), *one_late("hip_left", delay_ms))
-    assert steps(robot, story("squat", duration=6.0, kill=(), push=(), inject=late)) < 5.0
+    assert steps(robot, variant("squat", duration=6.0, kill=(), push=(), inject=late)) < 5.0
 
 
 def test_a_drop_out_in_the_middle_of_a_sway_is_not_held_off_centre(robot: RobotConfig) -> None:
     """Led from where the sway was, and lost again, HOLD stood 25 mm to the side, and fell."""
     frames = tuple(Keyframe(at=t, height=h) for t, h in ((0.0, 1.188), (1.0, 1.188), (3.0, 0.948)))
-    told = story(
+    told = variant(
         "stand",
         duration=6.0,
         keyframe=frames,

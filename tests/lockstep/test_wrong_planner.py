@@ -24,7 +24,7 @@ from shared.gain_schedule import believing
 from shared.joints import MODULES
 from shared.messages import Mode, Outside
 from shared.traces import SimState
-from tests.lockstep.runs import push, story
+from tests.lockstep.runs import push, variant
 from tests.lockstep.wrong_planners import faults, wrong
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
@@ -63,13 +63,13 @@ def begins(robot: RobotConfig) -> list[Begin]:
 
 
 def begin(robot: RobotConfig, name: str, at: float) -> Begin:
-    fleet = Lockstep(robot, story(name, duration=20.0, kill=(), push=()), BASE)
+    fleet = Lockstep(robot, variant(name, duration=20.0, kill=(), push=()), BASE)
     for row in fleet.run():
         if row.scenario_s >= at:
             break
     assert fleet.planner is not None
     planner = fleet.planner.session, fleet.planner.snapshot()
-    modules = {module: fleet.memory_of(module) for module in MODULES}
+    modules = {module: fleet.snapshot_of(module) for module in MODULES}
     return Begin(name, at, taken(fleet.world, fleet.bank, fleet.now_ns, 0), modules, planner)
 
 
@@ -81,7 +81,7 @@ def end(robot: RobotConfig, moment: Begin, name: str) -> End:
 
     at = moment.at
     pushed = (push(at + 0.8, 0.0, 30.0, 0.0),)
-    fleet = Fleet(robot, story(moment.name, duration=at + WRONG_S, kill=(), push=pushed), BASE)
+    fleet = Fleet(robot, variant(moment.name, duration=at + WRONG_S, kill=(), push=pushed), BASE)
     fleet.go_on(moment.state, moment.modules, moment.planner)
     fell, outside = False, set()
     for row in fleet.run():

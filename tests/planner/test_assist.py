@@ -250,23 +250,23 @@ def test_hold_is_asked_for_beyond_a_limit_for_its_time(
 ) -> None:
     overload = make_overload()
     for t_ns in sorted({0, for_ns // 3, for_ns}):
-        overload.hear(at(share, kind), T0 + t_ns)
+        overload.receive(at(share, kind), T0 + t_ns)
     assert overload.hold is (share > 1.0 and for_ns >= AFTER)
 
 
 def test_a_moment_below_the_limit_begins_the_time_anew() -> None:
     overload = make_overload()
     for t_ns, share in ((0, 1.1), (60, 1.1), (64, 0.99), (68, 1.1), (167, 1.1)):
-        overload.hear(at(share, "force"), T0 + t_ns * NS_PER_MS)
+        overload.receive(at(share, "force"), T0 + t_ns * NS_PER_MS)
         assert not overload.hold
-    overload.hear(at(1.1, "force"), T0 + 168 * NS_PER_MS)
+    overload.receive(at(1.1, "force"), T0 + 168 * NS_PER_MS)
     assert overload.hold
 
 
 @pytest.mark.parametrize("valid", [True, False])
 def test_a_saturated_cell_asks_for_hold_at_once(valid: bool) -> None:
     overload = make_overload()
-    overload.hear(wrench(valid=valid, saturated=True), T0)
+    overload.receive(wrench(valid=valid, saturated=True), T0)
     assert overload.hold
 
 
@@ -275,9 +275,9 @@ def test_a_saturated_cell_asks_for_hold_at_once(valid: bool) -> None:
 @pytest.mark.parametrize("for_ns", [RELEASE - 1, RELEASE, 3 * RELEASE])
 def test_hold_ends_below_the_lower_limit_for_its_time(kind: str, share: float, for_ns: int) -> None:
     overload = make_overload()
-    overload.hear(wrench(valid=False, saturated=True), T0)
-    overload.hear(at(share, kind), T0)
-    overload.hear(at(share, kind), T0 + for_ns)
+    overload.receive(wrench(valid=False, saturated=True), T0)
+    overload.receive(at(share, kind), T0)
+    overload.receive(at(share, kind), T0 + for_ns)
     assert overload.hold is not (share < RELEASE_SHARE and for_ns >= RELEASE)
 
 
@@ -285,9 +285,9 @@ def test_numbers_that_are_not_valid_neither_begin_nor_end_it() -> None:
     overload = make_overload()
     old = msgspec.structs.replace(at(2.0, "force"), valid=False)
     for t_ns in (0, AFTER, 10 * AFTER):
-        overload.hear(old, T0 + t_ns)
+        overload.receive(old, T0 + t_ns)
     assert not overload.hold
-    overload.hear(wrench(valid=False, saturated=True), T0 + 20 * AFTER)
+    overload.receive(wrench(valid=False, saturated=True), T0 + 20 * AFTER)
     for t_ns in (0, RELEASE, 10 * RELEASE):
-        overload.hear(wrench(valid=False), T0 + 30 * AFTER + t_ns)
+        overload.receive(wrench(valid=False), T0 + 30 * AFTER + t_ns)
     assert overload.hold

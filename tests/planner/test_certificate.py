@@ -97,7 +97,7 @@ def test_margins_are_the_smallest_eigenvalues_in_shares_of_what_is_required(
 def in_motor_space(D_module: Array, gear_ratio: float) -> Array:
     """Return a module's joint stiffness (2, 2) when each motor springs back on its own.
 
-    Of the stiffness at the motors only the diagonal runs on the drives (design section 5).
+    Of the stiffness at the motors only the diagonal runs on the drives (docs/drives.md).
     """
     columns = [motor_from_joint((1.0, 0.0), gear_ratio), motor_from_joint((0.0, 1.0), gear_ratio)]
     motors = 2.0 * np.pi * np.array(columns).T  # rad at the motors per rad of the joint

@@ -86,7 +86,7 @@ def test_feet_carry_the_weight_and_the_assist(
 
 
 def test_assist_acts_at_the_harness_point(robot: RobotConfig, law: Hocca, q: Array) -> None:
-    """Design section 3 b: all of the 150 N, at the harness point and not at the COM."""
+    """docs/law.md#feedforward: all of the 150 N, at the harness point and not at the COM."""
     output = law.tick(q, STILL, 150.0, DT)
     total = sum(oracle.torso_wrench(robot, side, q, output.tau_ff) for side in (RIGHT, LEFT))
     leg = oracle.leg(robot, RIGHT, q)

@@ -30,7 +30,7 @@ def test_nobody_heard_is_nothing_asked(robot: RobotConfig) -> None:
 
 def test_what_is_heard_is_given_until_it_is_stale(robot: RobotConfig) -> None:
     intents = Intents(robot.assist)
-    intents.hear(intent(80.0, (0.01, 0.0, 0.0, -0.02)), T0)
+    intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02)), T0)
     for now in (T0, T0 + 1, late_ns(robot, 0.0)):
         assert intents.wish(now) == Wish(80.0, (0.01, 0.0, 0.0, -0.02), "a test")
 
@@ -38,7 +38,7 @@ def test_what_is_heard_is_given_until_it_is_stale(robot: RobotConfig) -> None:
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0, 1.5, 1000.0])
 def test_then_it_fades_to_nothing_and_stays_there(robot: RobotConfig, share: float) -> None:
     intents = Intents(robot.assist)
-    intents.hear(intent(80.0, (0.01, 0.0, 0.0, -0.02)), T0)
+    intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02)), T0)
     wish = intents.wish(late_ns(robot, share))
     left = max(0.0, 1.0 - share)
     assert wish.assist_n == pytest.approx(80.0 * left)
@@ -52,15 +52,15 @@ def test_the_fade_is_slower_than_the_assist_may_fall(robot: RobotConfig) -> None
 
 def test_heard_again_it_is_given_again(robot: RobotConfig) -> None:
     intents = Intents(robot.assist)
-    intents.hear(intent(80.0), T0)
-    intents.hear(intent(60.0), late_ns(robot, 0.9))
+    intents.receive(intent(80.0), T0)
+    intents.receive(intent(60.0), late_ns(robot, 0.9))
     assert intents.wish(late_ns(robot, 0.95)).assist_n == 60.0
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_what_is_no_number_is_no_intent(robot: RobotConfig, bad: float) -> None:
     intents = Intents(robot.assist)
-    intents.hear(intent(80.0), T0)
-    intents.hear(intent(bad), T0 + 1)
-    intents.hear(intent(1.0, (0.0, bad, 0.0, 0.0)), T0 + 2)
+    intents.receive(intent(80.0), T0)
+    intents.receive(intent(bad), T0 + 1)
+    intents.receive(intent(1.0, (0.0, bad, 0.0, 0.0)), T0 + 2)
     assert intents.wish(T0 + 3).assist_n == 80.0

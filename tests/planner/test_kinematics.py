@@ -91,7 +91,7 @@ def test_jacobians_err_by_no_more_than_the_opening_of_the_legs(
 
 
 def test_the_legs_shares_sum_to_one(robot: RobotConfig, kinematics: Kinematics, q: Array) -> None:
-    """D_R + D_L = I, D_R by the same formula from the right foot (design section 3 a)."""
+    """D_R + D_L = I, D_R by the same formula from the right foot (docs/law.md#load-sharing)."""
     kinematics.update(q)
     share_x, share_y, l_z = robot.law.load_sharing_moment_arms
     l_x, l_y = share_x * robot.geometry.l_foot / 2, share_y * robot.geometry.w_foot / 2
@@ -148,7 +148,7 @@ def test_load_sharing_asks_each_foot_for_less_than_its_edge_gives_and_average_fo
         f" average {max(asked['average']):.1f}, edge {min(capacity):.1f} N m"
     )
     print(figures)  # noqa: T201  # shown by pytest -rP
-    assert max(asked["average"]) == pytest.approx(127, abs=1.0)  # design section 3 a
+    assert max(asked["average"]) == pytest.approx(127, abs=1.0)  # docs/law.md#load-sharing
     assert min(capacity) == pytest.approx(23, abs=0.5)
 
 

@@ -17,7 +17,7 @@ from shared.limp_leg_support import Support
 from shared.messages import DriveStatus, JointState, Mode
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
-from tests.planner.test_planner import SESSION, START_NS, hear_all, lead, state
+from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state
 
 TICK_NS = 4 * NS_PER_MS
 FOR = {"ankle": Support.KNEES, "knee": Support.ALL, "hip": Support.NONE}
@@ -128,7 +128,7 @@ def test_the_commands_of_those_that_are_to_brace_carry_it_with_the_hold(
     now_ns = lead(planner, q)
     assert not any(command.stiffen for command in planner.tick(now_ns))
     now_ns += TICK_NS
-    hear_all(planner, q, now_ns, seq=9)
+    receive_all(planner, q, now_ns, seq=9)
     index = MODULE_INDEX[module]
     gone = state(index, q, 9, mode=int(Mode.FAULT), drive=int(DriveStatus.ERROR))
     planner.receive_state(index, gone, now_ns)
@@ -149,7 +149,9 @@ def test_a_planner_that_goes_on_from_its_memory_goes_on_counting(
     planner, now_ns = Planner(robot, SESSION), START_NS
     for tick in range(40):
         now_ns += TICK_NS
-        hear_all(planner, q, now_ns, seq=tick, mode=int(Mode.DISARMED), drive=int(DriveStatus.IDLE))
+        receive_all(
+            planner, q, now_ns, seq=tick, mode=int(Mode.DISARMED), drive=int(DriveStatus.IDLE)
+        )
         planner.tick(now_ns)
     text = msgspec.json.encode(planner.snapshot())
     twin = Planner(robot, SESSION)
@@ -158,7 +160,7 @@ def test_a_planner_that_goes_on_from_its_memory_goes_on_counting(
     for tick in range(40, 60):
         now_ns += TICK_NS
         for each in (planner, twin):
-            hear_all(
+            receive_all(
                 each, q, now_ns, seq=tick, mode=int(Mode.DISARMED), drive=int(DriveStatus.IDLE)
             )
         both = [each.tick(now_ns)[0].stiffen for each in (planner, twin)]

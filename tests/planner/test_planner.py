@@ -65,7 +65,7 @@ def state(module: int, q: Array, seq: int = 1, **changes: object) -> JointState:
     return JointState(**(fields | changes))  # type: ignore[arg-type]
 
 
-def hear_all(planner: Planner, q: Array, now_ns: int, seq: int = 1, **changes: object) -> None:
+def receive_all(planner: Planner, q: Array, now_ns: int, seq: int = 1, **changes: object) -> None:
     for module in range(N_MODULES):
         planner.receive_state(module, state(module, q, seq, **changes), now_ns)
 
@@ -74,7 +74,7 @@ def lead(planner: Planner, q: Array, now_ns: int = START_NS) -> int:
     """Bring the planner to lead; return the time of its last tick."""
     for tick in range(3):
         now_ns += 4 * NS_PER_MS
-        hear_all(planner, q, now_ns, seq=tick)
+        receive_all(planner, q, now_ns, seq=tick)
         planner.tick(now_ns)
     assert planner.status(now_ns, 0.0).mode == PlannerMode.LEADING
     return now_ns
@@ -98,7 +98,7 @@ def test_no_commands_before_all_six_were_heard(planner: Planner, q: Array) -> No
 
 
 def test_each_command_echoes_its_own_modules_stamp(planner: Planner, q: Array) -> None:
-    hear_all(planner, q, START_NS)
+    receive_all(planner, q, START_NS)
     stamps = [command.echo_t_ns for command in planner.tick(START_NS)]
     assert stamps == [1000 * (module + 1) + 1 for module in range(N_MODULES)]
     planner.receive_state(3, state(3, q, seq=7), START_NS + 1)
@@ -110,7 +110,7 @@ def test_commands_count_up_and_tell_the_session(planner: Planner, q: Array) -> N
     seen = []
     for tick in range(5):
         now = START_NS + tick * 4 * NS_PER_MS
-        hear_all(planner, q, now, seq=tick)
+        receive_all(planner, q, now, seq=tick)
         commands = planner.tick(now)
         assert {command.session for command in commands} == {SESSION}
         assert {command.t_ns for command in commands} == {now}
@@ -123,10 +123,10 @@ def test_commands_count_up_and_tell_the_session(planner: Planner, q: Array) -> N
 def test_all_hold_until_all_are_ready(planner: Planner, q: Array) -> None:
     for tick in range(5):
         now = START_NS + tick * 4 * NS_PER_MS
-        hear_all(planner, q, now, seq=tick)
+        receive_all(planner, q, now, seq=tick)
         planner.receive_state(2, state(2, q, seq=tick, ready=False), now)
         assert all(command.hold for command in planner.tick(now))
-    hear_all(planner, q, now, seq=9)
+    receive_all(planner, q, now, seq=9)
     assert not any(command.hold for command in planner.tick(now + 4 * NS_PER_MS))
 
 
@@ -145,7 +145,7 @@ def test_all_hold_while_one_is_stale(
 
 
 def test_commands_carry_each_modules_part_of_the_law(planner: Planner, q: Array) -> None:
-    hear_all(planner, q, START_NS)
+    receive_all(planner, q, START_NS)
     commands = planner.tick(START_NS)
     np.testing.assert_allclose(joined(commands, "q_ref"), q, atol=1e-5)
     np.testing.assert_allclose(joined(commands, "v_ref"), 0.0, atol=1e-6)
@@ -160,11 +160,11 @@ def test_leading_again_starts_from_the_measured_height_and_pitch_and_from_the_mi
 ) -> None:
     now = lead(planner, q) + NS_PER_S
     elsewhere = closed(1.0, x=-0.03, y=0.02, roll=0.04, pitch=0.4)
-    hear_all(planner, elsewhere, now, seq=90)
+    receive_all(planner, elsewhere, now, seq=90)
     planner.tick(now)
-    hear_all(planner, elsewhere, now, seq=91, ready=False, mode=int(Mode.HOLD))
+    receive_all(planner, elsewhere, now, seq=91, ready=False, mode=int(Mode.HOLD))
     planner.tick(now + 200 * NS_PER_MS)
-    hear_all(planner, elsewhere, now + 201 * NS_PER_MS, seq=92, ready=False, mode=int(Mode.HOLD))
+    receive_all(planner, elsewhere, now + 201 * NS_PER_MS, seq=92, ready=False, mode=int(Mode.HOLD))
     commands = planner.tick(now + 201 * NS_PER_MS)
     assert all(command.hold for command in commands)
     status = planner.status(now + 201 * NS_PER_MS, 0.0)
@@ -178,7 +178,7 @@ def test_six_new_states_are_due_after_half_a_period(
 ) -> None:
     last = lead(planner, q)
     half = round(EARLY_SHARE * NS_PER_S / robot.planner.rate_hz)
-    hear_all(planner, q, last + 1, seq=50)
+    receive_all(planner, q, last + 1, seq=50)
     assert not planner.is_due(last + half - 1)
     assert planner.is_due(last + half)
 
@@ -198,7 +198,7 @@ def test_fewer_than_six_are_due_after_a_period_and_a_quarter(
 
 def test_a_tick_uses_states_up(planner: Planner, q: Array) -> None:
     last = lead(planner, q)
-    hear_all(planner, q, last + 1, seq=50)
+    receive_all(planner, q, last + 1, seq=50)
     planner.tick(last + 3 * NS_PER_MS)
     assert not planner.is_due(last + 6 * NS_PER_MS)  # 3 ms later, none new
 
@@ -208,7 +208,7 @@ def test_a_long_gap_is_not_integrated(robot: RobotConfig, planner: Planner, q: A
     last = lead(planner, q)
     planner.receive_wish(Wish(200.0))
     now = last + 5 * NS_PER_S
-    hear_all(planner, q, now, seq=50)
+    receive_all(planner, q, now, seq=50)
     planner.tick(now)
     assist = planner.status(now, 0.0).assist_n
     assert 0.0 < assist <= robot.assist.rate_max * TICK_GAP_MAX_S + 1e-9
@@ -221,13 +221,13 @@ def test_assist_rises_by_the_time_between_ticks(
     planner.receive_wish(Wish(200.0))
     for tick in range(1, 11):
         now = last + tick * 4 * NS_PER_MS
-        hear_all(planner, q, now, seq=50 + tick)
+        receive_all(planner, q, now, seq=50 + tick)
         planner.tick(now)
     assert planner.status(now, 0.0).assist_n == pytest.approx(robot.assist.rate_max * 0.04)
 
 
 def test_status_tells_what_the_tick_saw(planner: Planner, q: Array) -> None:
-    hear_all(planner, q, START_NS, seq=7)
+    receive_all(planner, q, START_NS, seq=7)
     planner.receive_wrench(
         Wrench(
             t_ns=1,
@@ -263,7 +263,7 @@ def test_commands_and_status_tell_both_margins_and_where_the_gains_come_from(
     robot: RobotConfig, planner: Planner, q: Array
 ) -> None:
     now = lead(planner, q)
-    hear_all(planner, q, now, seq=50)
+    receive_all(planner, q, now, seq=50)
     commands = planner.tick(now + 4 * NS_PER_MS)
     status = planner.status(now + 4 * NS_PER_MS, 0.0)
     assert {command.margin for command in commands} == {status.margin}
@@ -284,7 +284,7 @@ def test_gains_that_would_not_stand_ask_for_hold_in_that_very_tick(
     for tick, fails in enumerate((False, True, True, False, False, False)):
         split._margins_min = Margins(1e9, 1e9) if fails else least
         now += 4 * NS_PER_MS
-        hear_all(planner, q, now, seq=50 + tick)
+        receive_all(planner, q, now, seq=50 + tick)
         commands = planner.tick(now)
         status = planner.status(now, 0.0)
         assert (status.split == SplitSource.UNCERTIFIED) == fails
@@ -310,7 +310,7 @@ def test_a_robot_that_nothing_holds_is_never_lead(robot: RobotConfig, q: Array) 
     planner = Planner(msgspec.structs.replace(stiff, gain_schedule=fitting), SESSION)
     for tick in range(10):
         now = START_NS + tick * 4 * NS_PER_MS
-        hear_all(planner, q, now, seq=tick)
+        receive_all(planner, q, now, seq=tick)
         assert all(command.hold for command in planner.tick(now))
     status = planner.status(now, 0.0)
     assert status.mode == PlannerMode.UNCERTIFIED

@@ -12,7 +12,7 @@ from shared.config import RobotConfig
 from shared.messages import Attitude
 from tests.imu.robots import with_imu
 from tests.planner.conftest import Closed
-from tests.planner.test_planner import SESSION, START_NS, hear_all
+from tests.planner.test_planner import SESSION, START_NS, receive_all
 
 
 def attitude(roll: float, seq: int, *, valid: bool = True) -> Attitude:
@@ -29,14 +29,14 @@ def test_an_attitude_is_heeded_while_it_is_fresh_and_valid(
 ) -> None:
     q = closed(1.188)
     planner = Planner(with_imu(robot, stale_ms=100.0), SESSION)
-    hear_all(planner, q, START_NS)
+    receive_all(planner, q, START_NS)
     planner.receive_attitude(attitude(0.0, 1), START_NS)
     planner.tick(START_NS)
     before = planner.status(START_NS, 0.0)
     assert before.attitude_seq == 1
     planner.receive_attitude(attitude(0.05, 2, valid=valid), START_NS + 1)
     later = START_NS + 1 + round(late_ms * NS_PER_MS)
-    hear_all(planner, q, later, seq=2)
+    receive_all(planner, q, later, seq=2)
     planner.tick(later)
     after = planner.status(later, 0.0)
     assert after.attitude_seq == 2

@@ -16,7 +16,7 @@ from shared.config import RobotConfig
 from shared.joints import N_JOINTS, N_MODULES
 from shared.messages import PlannerMode
 from tests.planner.conftest import Closed
-from tests.planner.test_planner import SESSION, START_NS, hear_all, lead, state
+from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state
 
 STEP_NS = 4 * NS_PER_MS
 ANY = st.one_of(
@@ -65,7 +65,7 @@ def test_a_module_that_tells_only_such_angles_goes_stale_and_the_planner_holds(
     commands = []
     for seq in range(10, 40):
         now_ns += STEP_NS
-        hear_all(planner, wrong, now_ns, seq)
+        receive_all(planner, wrong, now_ns, seq)
         commands = planner.tick(now_ns)
     assert all(command.hold for command in commands)
     status = planner.status(now_ns, 0.0)
@@ -83,11 +83,11 @@ def test_whatever_angles_come_no_tick_ends_and_it_leads_again_by_good_ones(
     now_ns = lead(planner, good) if led else START_NS
     for seq in range(10, 14):
         now_ns += STEP_NS
-        hear_all(planner, np.array(angles), now_ns, seq, v=(speed, 0.0))
+        receive_all(planner, np.array(angles), now_ns, seq, v=(speed, 0.0))
         planner.tick(now_ns)
     for seq in range(20, 2600):
         now_ns += STEP_NS
-        hear_all(planner, good, now_ns, seq)
+        receive_all(planner, good, now_ns, seq)
         commands = planner.tick(now_ns)
         if seq > 22 and not commands[0].hold:
             break

@@ -18,7 +18,7 @@ from services.simulator.plant import NAMED, changed
 from services.simulator.world import World
 from shared.config import GRAVITY, RobotConfig
 from shared.joints import N_JOINTS, N_LEG
-from shared.scenario import Keyframe, Push, Scenario
+from shared.scenarios import Keyframe, Push, Scenario
 
 Array = NDArray[np.float64]
 
@@ -53,13 +53,13 @@ def poses(robot: RobotConfig) -> dict[float, Posed]:
 
 def torques_at_rest(robot: RobotConfig, posed: Posed, force: Array) -> Array:
     """Return the torques (12,), N m, of springs at the joints that hold a pose under a push."""
-    story = Scenario(
+    scenario = Scenario(
         name="push", about="", duration=60.0, hand=False,
         keyframe=(Keyframe(at=0.0, height=1.0),),
         push=(Push(at=0.0, duration=60.0, force=(float(force[0]), float(force[1]), 0.0)),),
     )  # fmt: skip
     body = body_of(robot, changed(NAMED["ideal"], {"floor.contact_time": FLOOR_S}))
-    world = World(body, story)
+    world = World(body, scenario)
     world.stand_at(posed.q)
     world.start()
     to_motor = np.linalg.inv(2.0 * np.pi * body.motor_from_joint.T)

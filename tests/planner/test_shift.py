@@ -92,7 +92,7 @@ def test_a_follower_that_goes_on_from_its_memory_goes_on_bit_for_bit() -> None:
 def test_a_planner_goes_on_with_the_wish_it_had(robot: RobotConfig) -> None:
     planner = Planner(robot, 1)
     planner.receive_wish(Wish(0.0, (0.01, 0.0, 0.0, 0.02)))
-    assert planner.status(0, 0.0).shift_wanted == (0.01, 0.0, 0.0, 0.02)
+    assert planner.status(0, 0.0).shift_requested == (0.01, 0.0, 0.0, 0.02)
     twin = Planner(robot, 1)
     twin.restore(planner.snapshot())
-    assert twin.status(0, 0.0).shift_wanted == (0.01, 0.0, 0.0, 0.02)
+    assert twin.status(0, 0.0).shift_requested == (0.01, 0.0, 0.0, 0.02)

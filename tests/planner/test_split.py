@@ -185,7 +185,7 @@ def test_the_margins_told_are_the_certificates_of_what_is_sent(
 def test_scheduled_gains_are_far_softer_than_the_papers_where_the_person_leads(
     robot: RobotConfig, stand: Stand
 ) -> None:
-    """Design section 3 c: along z; diag(K_q) gives 2-3e5 N/m there."""
+    """docs/law.md#gain-split: along z; diag(K_q) gives 2-3e5 N/m there."""
     soft = stand.split(GainSplit(robot)).D
     stiff = stand.split(GainSplit(with_law(robot, split="diagonal"))).D
     K_z = [float(stand.T[:, 2] @ (D * stand.T[:, 2])) for D in (soft, stiff)]
@@ -253,7 +253,7 @@ def test_uncertified_gains_are_the_stiffest_that_are_allowed(
     power_up = np.tile(
         [*robot.stand.ankle.k_p, *robot.stand.knee.k_p, *robot.stand.hip.k_p], 2
     )  # fmt: skip
-    share = robot.certificate.k_q_share_max
+    share = robot.certificate.k_q_fraction_max
     for least in (own, power_up, share * np.diagonal(stand.gains().K_q)):
         np.testing.assert_array_less(np.minimum(least, robot.joint_service.k_p_max), D + 1e-9)
 
@@ -304,7 +304,7 @@ def test_the_papers_split_is_the_diagonal_and_needs_no_schedule(
     bare = msgspec.structs.replace(with_law(robot, split="diagonal"), gain_schedule=None)
     local = stand.split(GainSplit(bare))
     K_q, B_q = stand.gains()
-    share = robot.law.local_damping_share
+    share = robot.law.local_damping_fraction
     assert local.source is SplitSource.DIAGONAL
     np.testing.assert_array_equal(
         local.D, np.clip(np.diagonal(K_q), 0.0, bare.joint_service.k_p_max)

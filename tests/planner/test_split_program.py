@@ -60,14 +60,14 @@ def margins(D: Array, stands: tuple[Stand, ...]) -> Margins:
 
 
 def cost(D: Array, stand: Stand) -> float:
-    """Return what design section 3 c minimises."""
+    """Return what docs/law.md#gain-split minimises."""
     K_loc = stand.T.T @ np.diag(np.tile(D, 2)) @ stand.T
     return float(K_loc[2, 2] / 1000.0 + K_loc[4, 4] / 10.0 + 1e-3 * 2.0 * D.sum())
 
 
 def D_max(robot: RobotConfig, stands: tuple[Stand, ...]) -> Array:  # noqa: N802 - the paper's letter
     diagonals = [np.diagonal(stand.gains().K_q)[:6] for stand in stands]
-    return np.asarray(robot.certificate.k_q_share_max * np.max(diagonals, axis=0), float)
+    return np.asarray(robot.certificate.k_q_fraction_max * np.max(diagonals, axis=0), float)
 
 
 def test_the_shipped_schedule_is_what_the_program_makes(
@@ -105,7 +105,7 @@ def test_each_node_meets_all_that_is_required(
     D, *stands = node
     found = margins(D, tuple(stands))
     assert found.service >= 1.0 - SOLVED
-    assert found.onboard >= robot.certificate.onboard_share - SOLVED
+    assert found.onboard >= robot.certificate.onboard_fraction - SOLVED
     assert D.min() >= 0.0
     np.testing.assert_array_less(D, D_max(robot, tuple(stands)) + 0.01)
 
@@ -116,7 +116,7 @@ def test_no_gains_nearby_are_softer_and_stand(
     """The program is convex: a softer neighbour would be there if a softer one were anywhere."""
     D, unloaded, loaded = node
     most = D_max(robot, (unloaded, loaded))
-    least, onboard = cost(D, unloaded), robot.certificate.onboard_share
+    least, onboard = cost(D, unloaded), robot.certificate.onboard_fraction
     rng = np.random.default_rng(7)
     standing = 0
     for _ in range(400):

@@ -26,7 +26,7 @@ POSES = (
 )
 SQUAT = [(height, 0.0) for height in np.linspace(1.188, 0.948, 13)]
 CRAWL = [(1.188 - 0.398 * share, 1.2 * share) for share in np.linspace(0.0, 1.0, 13)]
-"""Design section 8: torso height in m and pitch in rad."""
+"""docs/simulator.md#reference-scenario: torso height in m and pitch in rad."""
 
 
 @pytest.fixture(params=POSES, ids=lambda p: f"{p['height']:g}m-{p.get('pitch', 0):g}rad")

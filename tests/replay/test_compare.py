@@ -79,12 +79,12 @@ def test_first_and_largest_are_kept() -> None:
 
 
 def test_a_memory_is_compared_value_by_value() -> None:
-    def memory(x: float) -> PlannerCheckpoint:
+    def snapshot(x: float) -> PlannerCheckpoint:
         text = msgspec.json.encode({"law": {"q": [1.0, x]}}).decode()
-        return PlannerCheckpoint(t_ns=1, seq=1, session=3, memory=text)
+        return PlannerCheckpoint(t_ns=1, seq=1, session=3, snapshot=text)
 
     comparison = Comparison()
-    comparison.take("planner/memory", 4, memory(2.0), memory(3.0))
+    comparison.take("planner/memory", 4, snapshot(2.0), snapshot(3.0))
     assert comparison.first is not None
     assert comparison.first.field == "memory.law.q[1]"
 
@@ -92,7 +92,7 @@ def test_a_memory_is_compared_value_by_value() -> None:
 def test_a_long_value_is_cut_in_words() -> None:
     comparison = Comparison()
     one, other = (
-        PlannerCheckpoint(t_ns=1, seq=1, session=3, memory=text) for text in ("", "x" * 999)
+        PlannerCheckpoint(t_ns=1, seq=1, session=3, snapshot=text) for text in ("", "x" * 999)
     )
     comparison.take("k", 1, one, other)
     assert comparison.first is not None

@@ -15,7 +15,7 @@ from shared import topics
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.joints import MODULES
-from shared.scenario import Fault, Kill, Restart
+from shared.scenarios import Fault, Kill, Restart
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tools import resim, sim
@@ -27,7 +27,7 @@ from tools.runs.run_log import RunLog, read_run
 @pytest.fixture(scope="module")
 def recorded(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record a run with a dead planner, a dead joint service and a fault in it, on a slope."""
-    story = still(
+    scenario = still(
         5.0,
         height=1.1,
         kill=(Kill(service="planner", at=1.0), Kill(service="knee_left", at=2.5)),
@@ -37,7 +37,7 @@ def recorded(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Pa
     folder = tmp_path_factory.mktemp("resim")
     sim.simulate(
         with_imu(robot),
-        story,
+        scenario,
         Impairment(delay_ms=1.0, jitter_ms=0.5),
         3,
         folder,

@@ -12,7 +12,7 @@ from shared import topics
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
-from shared.scenario import Kill, Restart
+from shared.scenarios import Kill, Restart
 from tests.lockstep.runs import still
 from tests.recorder.runs import Queue
 from tools import cli, resim, sim
@@ -24,14 +24,14 @@ from tools.runs.run_log import RunLog, read_run
 
 @pytest.fixture(scope="module")
 def whole(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> RunLog:
-    story = still(
+    scenario = still(
         2.5,
         height=1.1,
         kill=(Kill(service="planner", at=0.5),),
         restart=(Restart(service="planner", at=0.8),),
     )
     folder = tmp_path_factory.mktemp("whole")
-    sim.simulate(robot, story, BASE, 3, folder, Console(quiet=True))
+    sim.simulate(robot, scenario, BASE, 3, folder, Console(quiet=True))
     return read_run(folder / "run.mcap")
 
 

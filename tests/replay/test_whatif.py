@@ -13,7 +13,7 @@ from shared import topics
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.messages import SimTruth
-from shared.scenario import Scenario
+from shared.scenarios import Scenario
 from tests.lockstep.runs import kill, push, run, still
 from tools import sim, whatif
 from tools.counterfactual.moments import Moment, moments_of
@@ -26,19 +26,19 @@ HARD = push(2.6, 150.0, 0.0, 0.0)
 """That the robot falls over by."""
 
 
-def record(robot: RobotConfig, story: Scenario, folder: Path) -> RunLog:
-    sim.simulate(robot, story, BASE, 0, folder, Console(quiet=True))
+def record(robot: RobotConfig, scenario: Scenario, folder: Path) -> RunLog:
+    sim.simulate(robot, scenario, BASE, 0, folder, Console(quiet=True))
     return read_run(folder / "run.mcap")
 
 
 @pytest.fixture(scope="module")
-def story() -> Scenario:
+def scenario() -> Scenario:
     return still(3.0, height=1.1, push=(push(1.5, 30.0, 0.0, 0.0),))
 
 
 @pytest.fixture(scope="module")
-def log(robot: RobotConfig, story: Scenario, tmp_path_factory: pytest.TempPathFactory) -> RunLog:
-    return record(robot, story, tmp_path_factory.mktemp("whatif"))
+def log(robot: RobotConfig, scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> RunLog:
+    return record(robot, scenario, tmp_path_factory.mktemp("whatif"))
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +56,9 @@ def test_moments_are_as_far_apart_as_asked_and_have_everybody_in_them(
 
 
 def test_gone_on_with_unchanged_it_comes_out_as_it_was(
-    robot: RobotConfig, log: RunLog, moments: list[Moment], story: Scenario
+    robot: RobotConfig, log: RunLog, moments: list[Moment], scenario: Scenario
 ) -> None:
-    fate = counterfactual_of(Task(robot_of(log), story, PlantConfig(), moments[2], (), 1.5))
+    fate = counterfactual_of(Task(robot_of(log), scenario, PlantConfig(), moments[2], (), 1.5))
     truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
     late = [row for row in truth if moments[2].at_s <= row.scenario_s < moments[2].at_s + 1.5]
     assert fate.stood
@@ -66,12 +66,14 @@ def test_gone_on_with_unchanged_it_comes_out_as_it_was(
 
 
 def test_a_kill_in_a_counterfactual_is_the_kill_in_a_run(
-    robot: RobotConfig, log: RunLog, moments: list[Moment], story: Scenario
+    robot: RobotConfig, log: RunLog, moments: list[Moment], scenario: Scenario
 ) -> None:
     fate = counterfactual_of(
-        Task(robot_of(log), story, PlantConfig(), moments[2], ("planner",), 1.5)
+        Task(robot_of(log), scenario, PlantConfig(), moments[2], ("planner",), 1.5)
     )
-    killed = run(robot, still(2.5, height=1.1, push=story.push, kill=kill(moments[2].at_s + 1e-3)))
+    killed = run(
+        robot, still(2.5, height=1.1, push=scenario.push, kill=kill(moments[2].at_s + 1e-3))
+    )
     after = killed.com_mm[killed.t >= moments[2].at_s]
     assert fate.stood
     assert killed.stood
@@ -79,18 +81,18 @@ def test_a_kill_in_a_counterfactual_is_the_kill_in_a_run(
 
 
 def test_a_joint_service_can_die_in_it_too(
-    log: RunLog, moments: list[Moment], story: Scenario
+    log: RunLog, moments: list[Moment], scenario: Scenario
 ) -> None:
     assert counterfactual_of(
-        Task(robot_of(log), story, PlantConfig(), moments[1], ("planner", "knee_left"), 2.0)
+        Task(robot_of(log), scenario, PlantConfig(), moments[1], ("planner", "knee_left"), 2.0)
     ).stood
 
 
 def test_a_fall_is_a_fall_there_as_well(
     robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    story = still(2.8, push=(HARD,))
-    record(robot, story, tmp_path)
+    scenario = still(2.8, push=(HARD,))
+    record(robot, scenario, tmp_path)
     arguments = ["--kill", "planner", "--every", "1.2", "--for", "1.6", "--workers", "1"]
     assert _main([str(tmp_path / "run.mcap"), *arguments]) == 1
     text = capsys.readouterr().out

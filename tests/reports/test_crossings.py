@@ -122,7 +122,7 @@ def test_hold_is_not_led_only_where_the_network_was_impaired_on_purpose(
     zero_ns = RunData(log).zero_ns
     link = "planner->ankle_right"
     event = LinkEvent(
-        t_ns=zero_ns, seq=1, link=link, asked=link, number=1, active=True, delay_ms=1.0,
+        t_ns=zero_ns, seq=1, link=link, requested=link, number=1, active=True, delay_ms=1.0,
         jitter_ms=0.0, loss=0.0, partition=False, detail="delay=1", passed=0, lost=0,
     )  # fmt: skip
     more = [(zero_ns, topics.LINK_EVENT.name, msgspec.json.encode(event))]

@@ -19,12 +19,12 @@ def test_cut_is_shown_when_nothing_passes_and_only_then(
 ) -> None:
     directions = {name: Direction(name, 0) for name in DIRECTIONS}
     told: list[LinkEvent] = []
-    injections = ImpairmentSchedule(directions, told.append)
+    impairments = ImpairmentSchedule(directions, told.append)
     for cut, begins, lasts in asked:
         what = Impairment(delay_ms=0.0 if cut else 5.0, partition=cut)
-        injections.plan(WRENCHES, what, float(begins), float(begins + lasts))
+        impairments.plan(WRENCHES, what, float(begins), float(begins + lasts))
     for s in range(20):
-        injections.advance(float(s), s * NS_PER_S)
+        impairments.advance(float(s), s * NS_PER_S)
         rows = histories(told, 0).get(WRENCHES, ())
         shown = rows[-1][1] if rows else ImpairedLink.CLEAR
         now_ns = s * NS_PER_S

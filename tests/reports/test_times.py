@@ -95,7 +95,7 @@ def test_drives_that_come_up_together_are_one_line_and_no_alarm(
 
 def impairment(number: int, link: str, t_ns: int, *, begins: bool, cut: bool) -> LinkEvent:
     return LinkEvent(
-        t_ns=t_ns, seq=number, link=link, asked="planner->left", number=number, active=begins,
+        t_ns=t_ns, seq=number, link=link, requested="planner->left", number=number, active=begins,
         delay_ms=0.0 if cut else 5.0, jitter_ms=0.0, loss=0.0, partition=cut,
         detail="partition" if cut else "delay=5", passed=0 if begins else 20,
         lost=0 if begins else 7,

@@ -1,7 +1,7 @@
 """Stamps that cannot be, sessions that are over, commands that come again: refused and counted.
 
-An age is told on one clock, the module's own (design section 4). That is its host's monotonic
-clock, which cannot step. Runs with clocks of several hosts: `tests/lockstep/test_clocks.py`.
+An age is measured on one clock, the host's monotonic (docs/architecture.md#age-rule): a
+clock that cannot step. Runs with clocks of several hosts: `tests/lockstep/test_clocks.py`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The one rule of design section 4: when is a command usable?"""
+"""The one rule of docs/architecture.md#age-rule: when is a command usable?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drop-outs: who may track, after how long, and what is remembered (design sections 4 and 8)."""
+"""Drop-outs: who may track, after how long, and what is remembered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must never happen after a fault or an emergency stop (design section 4)."""
+"""What must never happen after a fault or an emergency stop (docs/architecture.md#age-rule)."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from shared.joints import MODULES, kind_of
 from shared.messages import Cause, Mode, PlannerMode, Wrench
 from shared.robot_model import stand_pose
 from tests.joint.helpers import SESSION, T0, Bench, command
-from tests.planner.test_planner import START_NS, hear_all, lead
+from tests.planner.test_planner import START_NS, lead, receive_all
 
 GENTLE = (3.0, -5.0)
 """N m"""
@@ -167,7 +167,7 @@ def test_a_wrench_that_was_heard_long_ago_eases_nothing(robot: RobotConfig) -> N
         now_ns += 4 * NS_PER_MS
         torques = []
         for planner in (heard, deaf):
-            hear_all(planner, q, now_ns, seq)
+            receive_all(planner, q, now_ns, seq)
             torques.append([c.tau_coupled for c in planner.tick(now_ns)])
         eased.append(float(np.abs(np.subtract(*torques)).max()))
     assert max(eased[:5]) > 0.1, "it was heard at first"

@@ -49,7 +49,7 @@ SITUATIONS = [
 
 
 def section_4(s: Situation) -> Mode:
-    """Return the state that design section 4 asks for.
+    """Return the state that docs/architecture.md#age-rule asks for.
 
     DISARMED -> HOLD (at power-up, once armed) <-> TRACK (fresh commands); DAMP (e-stop):
     stiffness never comes back by itself; FAULT (drive lost), which nothing leaves.

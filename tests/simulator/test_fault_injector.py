@@ -20,7 +20,7 @@ from shared.cansimple import (
     OdriveError,
 )
 from shared.joints import MODULES
-from shared.scenario import FAULT_KINDS, Fault
+from shared.scenarios import FAULT_KINDS, Fault
 from tests.simulator.banks import DT, ZERO, make_bank
 
 FAILED = AxisError.MOTOR_FAILED

@@ -17,7 +17,7 @@ from services.simulator.plant import IDEAL
 from services.simulator.world import World
 from shared.cansimple import AxisState, ControlMode, InputMode
 from shared.config import RobotConfig
-from shared.scenario import Fault, Keyframe, Scenario
+from shared.scenarios import Fault, Keyframe, Scenario
 
 
 class Silent:

@@ -14,7 +14,7 @@ from services.simulator.plant import IDEAL, PlantConfig, changed, load, plant_fr
 from services.simulator.world import World
 from shared.config import RobotConfig
 from shared.exceptions import ConfigError
-from tests.lockstep.runs import story
+from tests.lockstep.runs import variant
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants
 
@@ -76,7 +76,7 @@ def test_the_world_takes_no_robot_file() -> None:
 
 
 def test_the_world_keeps_nothing_of_the_robot_file(robot: RobotConfig) -> None:
-    world = World(body_of(robot, PlantConfig()), story("stand"))
+    world = World(body_of(robot, PlantConfig()), variant("stand"))
     parts = [*vars(world).values(), *vars(world._actuation).values()]
     assert not any(isinstance(part, RobotConfig) for part in parts)
 
@@ -84,7 +84,7 @@ def test_the_world_keeps_nothing_of_the_robot_file(robot: RobotConfig) -> None:
 def test_no_controller_sees_the_plant(robot: RobotConfig) -> None:
     """Planner and joint services are made of the robot file alone, whatever the plant."""
     right, wrong = (
-        Lockstep(robot, story("stand"), plant=plant)
+        Lockstep(robot, variant("stand"), plant=plant)
         for plant in (PlantConfig(), changed(PlantConfig(), WRONG))
     )
     assert right.planner is not None
@@ -93,7 +93,7 @@ def test_no_controller_sees_the_plant(robot: RobotConfig) -> None:
         wrong.planner.snapshot()
     )
     for name in ("ankle_left", "knee_right"):
-        assert right.memory_of(name) == wrong.memory_of(name)
+        assert right.snapshot_of(name) == wrong.snapshot_of(name)
     assert right.config is wrong.config is robot
 
 
@@ -112,7 +112,7 @@ def test_errors_change_the_true_robot_and_not_the_file(robot: RobotConfig) -> No
 def test_wrong_zeros_show_in_what_the_encoders_tell(robot: RobotConfig) -> None:
     errors = np.linspace(-0.01, 0.01, 12)
     plant = changed(IDEAL, {"encoder.zero_errors": errors.tolist()})
-    wrong, right = (World(body_of(robot, one), story("stand")) for one in (plant, IDEAL))
+    wrong, right = (World(body_of(robot, one), variant("stand")) for one in (plant, IDEAL))
     told = wrong.motor_turns()[0] - right.motor_turns()[0]
     joints = np.linalg.solve(body_of(robot, IDEAL).motor_from_joint, told)
     np.testing.assert_allclose(joints, errors, atol=1e-9)
@@ -120,7 +120,7 @@ def test_wrong_zeros_show_in_what_the_encoders_tell(robot: RobotConfig) -> None:
 
 def test_a_foot_on_a_step_stands_flat_on_it(robot: RobotConfig) -> None:
     for step in (0.01, -0.01):
-        world = World(body_of(robot, changed(IDEAL, {"floor.step": step})), story("stand"))
+        world = World(body_of(robot, changed(IDEAL, {"floor.step": step})), variant("stand"))
         truth = world.truth(0, 1.0, 0.0)
         assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
         right, left = (world.data.body(f"foot_{side}").xpos[2] for side in ("right", "left"))

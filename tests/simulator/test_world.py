@@ -15,7 +15,7 @@ from services.simulator.world import World
 from shared.config import GRAVITY, RobotConfig
 from shared.joints import JOINTS, SIDES
 from shared.messages import SimTruth
-from shared.scenario import Keyframe, Push, Scenario
+from shared.scenarios import Keyframe, Push, Scenario
 
 Array = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ def test_at_the_start_the_torso_is_level_at_the_stand_height(robot: RobotConfig)
 
 
 def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
-    """q_phi, q_theta = (m1 - m2) / 2N, (m1 + m2) / 2N (design section 2)."""
+    """q_phi, q_theta = (m1 - m2) / 2N, (m1 + m2) / 2N (docs/law.md#the-robot)."""
     world = world_of(robot)
     rng = np.random.default_rng(1)
     q, v = rng.uniform(-1, 1, 12), rng.uniform(-1, 1, 12)

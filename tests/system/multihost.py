@@ -25,13 +25,13 @@ import msgspec
 import tomli_w
 
 from services.simulator.plant import PlantConfig
-from shared import scenario
+from shared import scenarios
 from shared.bus import open_session
 from shared.clock import now_ns
 from shared.config import RobotConfig
 from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
-from shared.scenario import Push, Scenario
+from shared.scenarios import Push, Scenario
 from tests.system.namespaces import Network
 from tools.runs import experiment
 from tools.runs.scenario_runner import LiveSnapshot, ScenarioRunner
@@ -160,9 +160,9 @@ def write_table(path: Path, network: Network) -> Path:
     return path
 
 
-def story() -> Scenario:
+def scenario() -> Scenario:
     """Return the squat, led by the operator throughout and pushed every two seconds."""
-    squat = scenario.load(experiment.scenario_file("squat"))
+    squat = scenarios.load(experiment.scenario_file("squat"))
     pushes = [Push(at=t, duration=0.2, force=(25.0, 0.0, 0.0)) for t in range(2, 40, 2)]
     return msgspec.structs.replace(
         squat, duration=40.0, kill=(), restart=(), fault=(), push=tuple(pushes)
@@ -181,7 +181,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
     # Before it starts a service, the supervisor tries whether its endpoint can be bound.
     network.allow_foreign_addresses()
     robot = spread(experiment.load_robot(DEFAULT_CONFIG), network)
-    told = story()
+    told = scenario()
     robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, told, PlantConfig())
     started = SupervisedFleet.start(
         robot_path,

@@ -26,15 +26,15 @@ from shared.bus import Publisher, Session, open_session
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.codec import Decoder
 from shared.impairment import Impairer, Impairment
-from shared.injector_protocol import SOCKET
 from shared.joints import MODULES
 from shared.links import DIRECTIONS
 from shared.messages import JointState
 from shared.process import DEFAULT_CONFIG
-from shared.scenario import Inject
+from shared.proxy_protocol import SOCKET
+from shared.scenarios import Inject
 from tests.recorder.runs import sample
 from tests.system.stalls import has_stalled, stalled_before_it_began
-from tools.runs.injector_client import InjectorClient
+from tools.runs.proxy_client import ProxyClient
 from tools.runs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
@@ -170,17 +170,17 @@ def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
     assert shares == pytest.approx([0.05, 0.05], abs=0.015)
 
 
-# ---- the network alone: the injector between two sessions, against the object that decides
+# ---- the network alone: the network proxy between two sessions, against the object that decides
 
 LATE, NEAR = "knee_left", "knee_right"
-"""Of two links through one injector the first is impaired: a stall of the machine meets both."""
+"""The proxy impairs the first of two links; a stall of the machine meets both."""
 COUNT = 800
 PERIOD_S = 0.004
 PATIENCE_S = 20.0
 LATE_PCT = (10, 50, 90)
 LATE_MS = 2.5
 """How far a quantile may be from the modelled one, on top of half of what the link beside scatters:
-1.4 of 4.6 measured on a busy machine, 2.7 of 5.6 with the injector stopped 50 ms of each second."""
+1.4 of 4.6 measured on a busy machine, 2.7 of 5.6 with the proxy stopped 50 ms of each second."""
 SHARE = 0.06
 """How far the share of the messages that come may be: the others are overtaken (0.03 measured)."""
 MODELLED = 30
@@ -195,10 +195,10 @@ JITTERS = {
 
 
 class Wire:
-    """Two joint services' sessions, a planner's that dials them through the injector."""
+    """Two joint services' sessions, a planner's that dials them through the network proxy."""
 
     def __init__(self, run_dir: Path, planner: Session, modules: dict[str, Session]) -> None:
-        self.client = InjectorClient(run_dir)
+        self.client = ProxyClient(run_dir)
         self._put: dict[str, Publisher[JointState]] = {
             module: session.publisher(topics.JOINT_STATE, JointState, module)
             for module, session in modules.items()
@@ -241,9 +241,9 @@ def wire() -> Iterator[Wire]:
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-a-") as folder, ExitStack() as stack:
         run_dir = Path(folder) / "r"
         run_dir.mkdir()
-        command = [sys.executable, "-m", "services.injector", "--run-dir", str(run_dir)]
-        injector = stack.enter_context(subprocess.Popen([*command, "--seed", "3"], cwd=ROOT))
-        stack.callback(injector.kill)
+        command = [sys.executable, "-m", "services.network_proxy", "--run-dir", str(run_dir)]
+        proxy = stack.enter_context(subprocess.Popen([*command, "--seed", "3"], cwd=ROOT))
+        stack.callback(proxy.kill)
         modules = {
             module: stack.enter_context(open_session(ROBOT, module, run_dir))
             for module in (LATE, NEAR)
@@ -303,7 +303,7 @@ def test_on_the_wire_messages_come_as_late_as_the_modelled_network_says(
 def test_without_a_word_the_modelled_network_says_what_the_bands_tell_apart(
     name: str, without: dict[str, object]
 ) -> None:
-    """Else an injector that passes over the word would pass the test above."""
+    """Else a network proxy that passes over the word would pass the test above."""
     sent_ns = [n * round(PERIOD_S * NS_PER_S) for n in range(MODELLED * COUNT)]
     what = JITTERS[name]
     rows = [modelled(one, 1, sent_ns) for one in (what, msgspec.structs.replace(what, **without))]

@@ -1,7 +1,6 @@
 """Planner and joint modules of the centralised control.
 
-The planner's law is the shipped one. What its commands leave to the joint services (design
-section 3 e)
+The planner's law is the shipped one. What its commands leave to the joint services
 
     tau = D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled
 

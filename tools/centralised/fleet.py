@@ -11,7 +11,7 @@ from services.simulator.plant import PlantConfig
 from shared.config import RobotConfig
 from shared.gain_schedule import believing
 from shared.impairment import Impairment
-from shared.scenario import Scenario
+from shared.scenarios import Scenario
 from shared.trip_table import untripped
 from tools.centralised.control import CentralPlanner, PassThrough
 from tools.runs.lockstep import Lockstep, Record, forget

@@ -72,12 +72,12 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
     for name in MODULES:
         joint = JointExecution(log, robot, name, ReexecutionResult(name, 0.0, exact=False))
         rows = ((message.t_ns, joint) for message in joint.run())
-        for moment, memory in _at(found, rows, _copy):
-            if memory is not None:
-                moment.modules[name] = memory
+        for moment, snapshot in _at(found, rows, _copy):
+            if snapshot is not None:
+                moment.modules[name] = snapshot
     planner = PlannerExecution(log, robot, ReexecutionResult("planner", 0.0, exact=False))
     ticks = ((m.t_ns, planner) for _, m in planner.run() if isinstance(m, PlannerStatus))
-    for moment, known in _at(found, ticks, PlannerExecution.memory):
+    for moment, known in _at(found, ticks, PlannerExecution.snapshot):
         moment.planner = known
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
     published = ((status.t_ns, status) for status in statuses)
@@ -88,10 +88,10 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
 
 def _copy(execution: JointExecution) -> DriveManagerState | None:
     """Return a copy of what a service knows now: its own goes on changing."""
-    memory = execution.memory()
-    if memory is None:
+    snapshot = execution.snapshot()
+    if snapshot is None:
         return None
-    return msgspec.json.decode(msgspec.json.encode(memory), type=DriveManagerState)
+    return msgspec.json.decode(msgspec.json.encode(snapshot), type=DriveManagerState)
 
 
 def _at(

@@ -9,7 +9,7 @@ import msgspec
 from services.simulator.plant import PlantConfig
 from shared.config import RobotConfig
 from shared.messages import SimTruth
-from shared.scenario import Kill, Scenario
+from shared.scenarios import Kill, Scenario
 from tools.counterfactual.moments import Moment
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
@@ -21,7 +21,7 @@ class Task(msgspec.Struct, frozen=True):
     """What a worker is given."""
 
     robot: RobotConfig
-    story: Scenario
+    scenario: Scenario
     plant: PlantConfig
     moment: Moment
     kill: tuple[str, ...]
@@ -44,23 +44,23 @@ class Counterfactual(msgspec.Struct, frozen=True):
     """Of the failsafe certificate when it was killed; None: nothing was published then."""
 
 
-def story_from(story: Scenario, at_s: float, kill: tuple[str, ...], for_s: float) -> Scenario:
+def scenario_from(scenario: Scenario, at_s: float, kill: tuple[str, ...], for_s: float) -> Scenario:
     """Return the scenario from a time on: its pushes and faults to come, and these kills."""
     return msgspec.structs.replace(
-        story,
+        scenario,
         duration=at_s + for_s,
         kill=tuple(Kill(service=name, at=at_s + KILL_AFTER_S) for name in kill),
         restart=(),
-        push=tuple(push for push in story.push if push.at + push.duration > at_s),
-        fault=tuple(fault for fault in story.fault if fault.at >= at_s),
+        push=tuple(push for push in scenario.push if push.at + push.duration > at_s),
+        fault=tuple(fault for fault in scenario.fault if fault.at >= at_s),
     )
 
 
 def counterfactual_of(task: Task) -> Counterfactual:
     """Go on from the moment, and judge."""
     moment = task.moment
-    story = story_from(task.story, moment.at_s, task.kill, task.for_s)
-    fleet = Lockstep(task.robot, story, BASE, plant=task.plant)
+    scenario = scenario_from(task.scenario, moment.at_s, task.kill, task.for_s)
+    fleet = Lockstep(task.robot, scenario, BASE, plant=task.plant)
     fleet.go_on(moment.state, moment.modules, moment.planner)
     fell_at_s = None
     rows: list[SimTruth] = []

@@ -15,7 +15,7 @@ import msgspec
 from shared.config import OPTIONAL, SERVICES
 from shared.fault_table import DRIVE_FAULTS
 from shared.joints import MODULES, kind_of
-from shared.scenario import FAULT_KINDS, Fault, FaultKind, Keyframe, Kill, Push, Restart, Scenario
+from shared.scenarios import FAULT_KINDS, Fault, FaultKind, Keyframe, Kill, Push, Restart, Scenario
 from tools.runs.scenario_runner import Chase
 
 CRASH_S: Final = 2.4
@@ -90,7 +90,7 @@ class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
         return tuple(module for module in MODULES if module not in self.hit)
 
 
-def story_of(case: CrashCase) -> Scenario:
+def scenario_of(case: CrashCase) -> Scenario:
     """Return the case as a scenario, with the requests that bring back what was lost."""
     kills = [row for row in (*case.before, *case.crash) if isinstance(row, Kill)]
     down = [row.service for row in case.crash if isinstance(row, Kill)]

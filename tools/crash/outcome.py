@@ -13,9 +13,9 @@ import msgspec
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
-from shared.scenario import lead
+from shared.scenarios import lead
 from shared.trip_table import JOINT_TRIPS
-from tools.crash.cases import CRASH_S, REQUEST_S, CrashCase, CrashVerdict, story_of
+from tools.crash.cases import CRASH_S, REQUEST_S, CrashCase, CrashVerdict, scenario_of
 from tools.runs.standing import is_tipping
 from tools.runs.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN
 
@@ -103,16 +103,16 @@ def measure(case: CrashCase, heard: Heard, robot: RobotConfig) -> CrashResult:
     later = [(name, e) for name, e in heard.events if e.t_ns >= request_ns]
     fell_at = next((row.scenario_s for row in truth if row.fallen), None)
     standing = [row for row in after if not row.fallen] or after[:1]
-    story = story_of(case)
-    lowest_hand = min(lead(story, row.scenario_s).height for row in after)
+    scenario = scenario_of(case)
+    lowest_hand = min(lead(scenario, row.scenario_s).height for row in after)
     sank = max(0.0, min(after[0].torso[2], lowest_hand) - min(row.torso[2] for row in standing))
     last = truth[-1]
     verdict = CrashVerdict.STOOD
     remarks = []
     if fell_at is not None:
         verdict = CrashVerdict.FELL
-    elif last.scenario_s < story.duration - END_TOLERANCE_S:
-        return unjudged(f"ended at {last.scenario_s:.1f} s of {story.duration:g} s")
+    elif last.scenario_s < scenario.duration - END_TOLERANCE_S:
+        return unjudged(f"ended at {last.scenario_s:.1f} s of {scenario.duration:g} s")
     elif is_tipping(last, robot):
         verdict = CrashVerdict.FELL
         remarks.append("not down yet at the end, but tipping")
@@ -154,7 +154,7 @@ def _crash_s(case: CrashCase, said: Sequence[RunEvent]) -> float | None:
         if row.kind == RunEventKind.KILLED and row.scenario_s < REQUEST_S - END_TOLERANCE_S
     ]
     if case.chase is not None:
-        led_up = sum(1 for row in story_of(case).kill if row.at < CRASH_S)
+        led_up = sum(1 for row in scenario_of(case).kill if row.at < CRASH_S)
         return kills[led_up] if len(kills) > led_up else None
     return kills[0] if kills else CRASH_S
 

@@ -11,7 +11,7 @@ import msgspec
 from rich.console import Console
 from rich.table import Table
 
-from tools.crash.cases import BACK_S, CRASH_S, CrashCase, CrashVerdict, story_of
+from tools.crash.cases import BACK_S, CRASH_S, CrashCase, CrashVerdict, scenario_of
 from tools.crash.outcome import CrashResult, as_expected
 
 RESULTS: Final = "results.json"
@@ -48,16 +48,16 @@ class Result(NamedTuple):
 
 def describe(case: CrashCase) -> str:
     """Return what is done in a case."""
-    story = story_of(case)
+    scenario = scenario_of(case)
     words = [
-        f"{row.service} {row.signal} at {row.at:g} s" for row in story.kill if row.at <= CRASH_S
+        f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill if row.at <= CRASH_S
     ]
-    words += [f"{row.service} back at {row.at:g} s" for row in story.restart if row.at < CRASH_S]
+    words += [f"{row.service} back at {row.at:g} s" for row in scenario.restart if row.at < CRASH_S]
     if case.chase is not None:
         when = f"{case.chase.after_s:g} s after" if case.chase.after_s else "as"
         many = "all modules track" if case.chase.modules > 1 else "the first module tracks"
         words.append(f"{case.chase.service} KILL {when} {many} again")
-    words += [f"{row.module} {row.kind} at {row.at:g} s" for row in story.fault]
+    words += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
     return f"{', '.join(words)}; asked back at {BACK_S:g} s"
 
 

@@ -18,7 +18,7 @@ from shared.config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
 from shared.messages import JointEvent, RunEvent, RunEventKind, SimTruth
-from tools.crash.cases import CrashCase, CrashVerdict, story_of
+from tools.crash.cases import CrashCase, CrashVerdict, scenario_of
 from tools.crash.outcome import CrashResult, Heard, as_expected, measure, unjudged
 from tools.runs.live import run_live
 from tools.runs.scenario_runner import LiveSnapshot, ScenarioRunner
@@ -100,12 +100,12 @@ def run_case(
 def _run_once(
     case: CrashCase, robot: RobotConfig, out: Path, show: Show, seed: int, true_plant: PlantConfig
 ) -> CrashResult:
-    story = story_of(case)
-    down = {row.service for row in story.kill}
+    scenario = scenario_of(case)
+    down = {row.service for row in scenario.kill}
 
     def lead(fleet: SupervisedFleet, session: Session) -> Heard:
         witness = Witness(session, show)
-        conductor = ScenarioRunner(fleet, session, story, witness.see, case.chase)
+        conductor = ScenarioRunner(fleet, session, scenario, witness.see, case.chase)
         conductor.run()
         witness.listen()
         died = died_of(fleet.info(), conductor.said)
@@ -115,7 +115,7 @@ def _run_once(
         heard = run_live(
             out,
             robot,
-            story,
+            scenario,
             lead,
             verb="crash",
             seed=seed,

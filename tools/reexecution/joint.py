@@ -49,7 +49,7 @@ class JointExecution:
             if trace.seq != expected:
                 self._module = None  # the log lacks what came between, or it was started anew
             expected = trace.seq + 1
-            if trace.memory:
+            if trace.snapshot:
                 self._remember(trace)
             for cycle in trace.cycles:
                 if self._module is None:
@@ -57,7 +57,7 @@ class JointExecution:
                 else:
                     yield from self._cycle(self._module, cycle)
 
-    def memory(self) -> DriveManagerState | None:
+    def snapshot(self) -> DriveManagerState | None:
         """Return what the service knows now; None while it cannot be executed."""
         return None if self._module is None else self._module.snapshot()
 
@@ -65,11 +65,13 @@ class JointExecution:
         """Go on from a recorded memory, or hold ours to it."""
         if self._module is None:
             self._module = DriveManager(self._robot, self._name)
-            self._module.restore(_decode(trace.memory))
+            self._module.restore(_decode(trace.snapshot))
             self._outcome.starts += 1
             return
         if self._outcome.exact:
-            mine = msgspec.structs.replace(trace, memory=_encode(self._module.snapshot()).decode())
+            mine = msgspec.structs.replace(
+                trace, snapshot=_encode(self._module.snapshot()).decode()
+            )
             self._compare("trace", self._module.controller.cycle, trace, mine)
 
     def _cycle(self, module: DriveManager, cycle: CycleTrace) -> Iterator[Message]:
@@ -107,7 +109,7 @@ class JointExecution:
 
 
 def _single(cycle: CycleTrace) -> JointTrace:
-    return JointTrace(t_ns=cycle.now_ns, seq=0, memory="", cycles=(cycle,))
+    return JointTrace(t_ns=cycle.now_ns, seq=0, snapshot="", cycles=(cycle,))
 
 
 def _reading(c: CycleTrace) -> DriveReading | None:

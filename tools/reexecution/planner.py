@@ -31,7 +31,7 @@ class PlannerExecution:
         self._robot, self._outcome = robot, outcome
         self._statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
         memories: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
-        self._memories = {(memory.session, memory.t_ns): memory for memory in memories}
+        self._memories = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in memories}
         self._states = [BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
         self._wrenches = BySeq(log.messages(topics.WRENCH))
         self._attitudes = BySeq(log.messages(topics.ATTITUDE))
@@ -59,17 +59,17 @@ class PlannerExecution:
                 continue
             yield from self._tick(self._planner, status)
 
-    def memory(self) -> tuple[int, TickState] | None:
+    def snapshot(self) -> tuple[int, TickState] | None:
         """Return session and what the planner knows now; None while it cannot be executed."""
         planner = self._planner
         return None if planner is None else (planner.session, planner.snapshot())
 
     def _begin(self, status: PlannerStatus) -> None:
         """Go on from the memory after this tick, if the log has it."""
-        memory = self._memories.get((status.session, status.t_ns))
-        if memory is None:
+        snapshot = self._memories.get((status.session, status.t_ns))
+        if snapshot is None:
             return
-        known = _decode(memory.memory)
+        known = _decode(snapshot.snapshot)
         self._planner = Planner(self._robot, status.session)
         self._planner.restore(known)
         self._state_seq = [-1 if state is None else state.seq for state in known.states]
@@ -103,7 +103,7 @@ class PlannerExecution:
                 return False
             planner.receive_attitude(attitude, status.t_ns)
             self._attitude_seq = status.attitude_seq
-        wish = Wish(status.assist_wanted_n, status.shift_wanted, status.asked_by)
+        wish = Wish(status.assist_requested_n, status.shift_requested, status.requested_by)
         planner.receive_wish(wish)
         return True
 
@@ -120,7 +120,9 @@ class PlannerExecution:
         mine = planner.status(status.t_ns, status.tick_us)  # tick_us is a time that was measured
         compare("planner/status", tick, status, mine)
         yield "", mine
-        memory = self._memories.get((status.session, status.t_ns))
-        if memory is not None and outcome.exact:
+        snapshot = self._memories.get((status.session, status.t_ns))
+        if snapshot is not None and outcome.exact:
             text = _encode(planner.snapshot()).decode()
-            compare("planner/memory", tick, memory, msgspec.structs.replace(memory, memory=text))
+            compare(
+                "planner/memory", tick, snapshot, msgspec.structs.replace(snapshot, snapshot=text)
+            )

@@ -52,7 +52,7 @@ class Crossing(NamedTuple):
 def crossings(source: RunData) -> Iterator[TimelineEvent]:
     """Yield when each figure first went beyond its limit, not in the order of time.
 
-    The limits are the verdict's (design section 9) for the world, and the robot file's for
+    The limits are the verdict's (docs/results.md#targets) for the world, and the robot file's for
     torques, joints and margins.
     """
     yield from _world(source)

@@ -99,7 +99,7 @@ def add_body(source: RunData, sheet: Sheet) -> None:
 def _add_hand(source: RunData, sheet: Sheet) -> None:
     hand, load, given, push = _truth(source, "operator_force", "load_n", "harness_force_z", "push")
     t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
-    wanted, assist = source.columns(topics.PLANNER_STATUS, "", "assist_wanted_n", "assist_n")
+    wanted, assist = source.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
     lines = [Line("hand, z", t, hand[:, 2], 0)]
     if load.any():
         lines += [Line("weight on the harness", t, load, 1), Line("carried", t, given, 2)]

@@ -1,6 +1,6 @@
 """The robot as a 3-D scene: a frame for each module, a body for each link, COM and forces.
 
-Frames (design section 2): `world`; `torso`; from it down each leg `hip_*` (it carries the
+Frames (docs/law.md#the-robot): `world`; `torso`; from it down each leg `hip_*` (it carries the
 thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso; `com` with the
 world's axes. The links are those of `shared.robot_model`.
 """

@@ -14,7 +14,7 @@ import msgspec
 from shared.exceptions import ConfigError
 from shared.impairment import Distribution
 from shared.links import DIRECTIONS, GROUPS, directions_of
-from shared.scenario import Inject
+from shared.scenarios import Inject
 from shared.toml_file import check_ranges
 
 

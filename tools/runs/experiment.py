@@ -15,13 +15,13 @@ import msgspec
 
 from services.simulator import plant
 from services.simulator.plant import NAMED, PlantConfig
-from shared import config_check, config_file, gain_schedule, scenario
+from shared import config_check, config_file, gain_schedule, scenarios
 from shared.config import SERVICES, RobotConfig
 from shared.config_sections import LawConfig
 from shared.exceptions import FleetError, RunError
 from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
-from shared.scenario import FAULT_KINDS, SIGNALS, Fault, Inject, Kill, Push, Restart, Scenario
+from shared.scenarios import FAULT_KINDS, SIGNALS, Fault, Inject, Kill, Push, Restart, Scenario
 from tools.runs.describe_inject import in_words_of, parse_inject
 from tools.verbs import add_config
 
@@ -214,17 +214,17 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
         ConfigError: the file or the flags make no scenario.
     """
     path = scenario_file(args.scenario)
-    story = scenario.load(path)
-    duration = args.duration if args.duration is not None else story.duration
+    scenario = scenarios.load(path)
+    duration = args.duration if args.duration is not None else scenario.duration
     if duration <= 0.0:
         raise RunError(f"--duration {duration:g}: must be more than 0 s")
-    kills = tuple(args.kill) if args.kill is not None else _inside(story.kill, duration)
-    restarts = tuple(args.restart or ()) if args.kill or args.restart else story.restart
-    pushes = tuple(args.push) if args.push is not None else _inside(story.push, duration)
-    faults = tuple(args.fault) if args.fault is not None else _inside(story.fault, duration)
-    injects = tuple(args.inject) if args.inject is not None else _inside(story.inject, duration)
-    story = msgspec.structs.replace(
-        story,
+    kills = tuple(args.kill) if args.kill is not None else _inside(scenario.kill, duration)
+    restarts = tuple(args.restart or ()) if args.kill or args.restart else scenario.restart
+    pushes = tuple(args.push) if args.push is not None else _inside(scenario.push, duration)
+    faults = tuple(args.fault) if args.fault is not None else _inside(scenario.fault, duration)
+    injects = tuple(args.inject) if args.inject is not None else _inside(scenario.inject, duration)
+    scenario = msgspec.structs.replace(
+        scenario,
         duration=duration,
         fault=faults,
         inject=injects,
@@ -232,21 +232,21 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
         restart=_inside(restarts, duration) if not args.restart else restarts,
         push=pushes,
     )
-    scenario.check(str(path), story)
-    return story
+    scenarios.check(str(path), scenario)
+    return scenario
 
 
 def _inside(rows: tuple[E, ...], duration: float) -> tuple[E, ...]:
     return tuple(row for row in rows if row.at < duration)
 
 
-def describe(story: Scenario) -> str:
+def describe(scenario: Scenario) -> str:
     """Return what is done to the run, as a clause for its first line."""
-    done = [f"{row.service} {row.signal} at {row.at:g} s" for row in story.kill]
-    done += [f"{row.service} back at {row.at:g} s" for row in story.restart]
-    done += [f"{row.module} {row.kind} at {row.at:g} s" for row in story.fault]
-    done += [in_words_of(row) for row in story.inject]
-    done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in story.push]
+    done = [f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill]
+    done += [f"{row.service} back at {row.at:g} s" for row in scenario.restart]
+    done += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
+    done += [in_words_of(row) for row in scenario.inject]
+    done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in scenario.push]
     return f"; {', '.join(done)}" if done else ""
 
 
@@ -303,7 +303,7 @@ def make_out(out: Path | None, verb: str) -> Path:
 
 
 def write_inputs(
-    out: Path, robot: RobotConfig, story: Scenario, true_plant: PlantConfig
+    out: Path, robot: RobotConfig, scenario: Scenario, true_plant: PlantConfig
 ) -> tuple[Path, ...]:
     """Write what the run is made from beside its results.
 
@@ -314,7 +314,7 @@ def write_inputs(
     plant_path = out / PLANT_FILE
     plant_path.write_text(plant.to_toml(true_plant), encoding="utf-8")
     robot_path.write_text(config_file.to_toml(robot), encoding="utf-8")
-    scenario_path.write_text(scenario.to_toml(story), encoding="utf-8")
+    scenario_path.write_text(scenarios.to_toml(scenario), encoding="utf-8")
     if robot.gain_schedule is None:
         return robot_path, scenario_path, plant_path
     schedule_path = gain_schedule.path_beside(robot_path)

@@ -27,7 +27,7 @@ from shared.messages import (
 )
 from shared.topics import JOINT_STATE, PLANNER_STATUS, TOPICS
 from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
-from tools.runs.injector_client import InjectorClient
+from tools.runs.proxy_client import ProxyClient
 from tools.supervision.supervise import SupervisedFleet
 
 TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
@@ -35,7 +35,7 @@ TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
 mode the joint service does not, and the mode says why."""
 
 PLANNER: Final = "planner"
-SILENT_INJECTOR: Final = "not known, for the injector does not answer"
+SILENT_PROXY: Final = "not known, for the network proxy does not answer"
 
 _LINKS_S: Final = 1.0
 """Longest wait for the first message of each service."""
@@ -106,7 +106,7 @@ class FleetStatus(msgspec.Struct, frozen=True):
     lead: LeadStatus | None = None
     """None if no planner is heard now."""
     network: tuple[str, ...] = ()
-    """What the injector does to links now, in words."""
+    """What the network proxy does to links now, in words."""
     pace: float = 1.0
     """How fast the fleet's clock goes; below 1 it is in slow motion."""
 
@@ -204,13 +204,13 @@ def look(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> FleetStatus
 
 
 def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
-    """Return what is done to the network now, in words; nothing where there is no injector."""
-    if "injector" not in fleet.manifest.services:
+    """Return what is done to the network now, in words; nothing where there is no network proxy."""
+    if "network_proxy" not in fleet.manifest.services:
         return ()
     try:
-        return tuple(row.describe() for row in InjectorClient(fleet.run.path).list())
+        return tuple(row.describe() for row in ProxyClient(fleet.run.path).list())
     except FleetError:
-        return (SILENT_INJECTOR,)
+        return (SILENT_PROXY,)
 
 
 def module_status(state: Message | None) -> ModuleStatus:

@@ -1,7 +1,8 @@
 """Clocks of hosts in virtual time: each counts from somewhere else, and at its own pace. Pure.
 
 Live, a service reads its host's monotonic clock. That one cannot step, whatever is done to the
-time of day, but no two hosts agree on it: an age is told on one clock only (design section 4).
+time of day, but no two hosts agree on it: an age is measured on one clock
+only (docs/architecture.md#age-rule).
 """
 
 from __future__ import annotations

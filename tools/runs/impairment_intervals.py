@@ -76,7 +76,7 @@ class Impaired(NamedTuple):
 def impairments(events: Iterable[LinkEvent]) -> list[Impaired]:
     """Return all impairments in the order in which they began.
 
-    An injector that was killed tells no end, and its successor counts from 1 again: a number
+    A network proxy that was killed tells no end, and its successor counts from 1 again: a number
     that begins again ends what it stood for.
 
     Args:
@@ -107,7 +107,7 @@ def _of(
     if ended:
         end_ns = ended[0].t_ns
     return Impaired(
-        link=first.asked,
+        link=first.requested,
         words=first.detail,
         directions=frozenset(event.link for event in begun),
         begin_ns=first.t_ns,

@@ -13,7 +13,7 @@ from services.simulator.plant import PlantConfig
 from shared.bus import Session, open_session
 from shared.config import RobotConfig
 from shared.robot_model import mjcf
-from shared.scenario import Scenario
+from shared.scenarios import Scenario
 from tools.runs import experiment
 from tools.runs.experiment import PLANT_FILE
 from tools.supervision.pace import PACE_MIN, PACE_VARIABLE, SLOWER, CoresFullError, usual_pace
@@ -25,7 +25,7 @@ T = TypeVar("T")
 def run_live(
     out: Path,
     robot: RobotConfig,
-    story: Scenario,
+    scenario: Scenario,
     lead: Callable[[SupervisedFleet, Session], T],
     *,
     verb: str,
@@ -42,7 +42,7 @@ def run_live(
     Args:
         out: for the log of the run, what it is made from, and the services' logs.
         robot: the robot.
-        story: what the simulated operator and the drives do; kills are for `lead` to do.
+        scenario: what the simulated operator and the drives do; kills are for `lead` to do.
         lead: leads the run; it is given the fleet and a session on its bus.
         verb: of the command line; names the run directory and the session.
         seed: of the sensors' noise.
@@ -60,7 +60,7 @@ def run_live(
         at_pace = pace if pace is not None else usual_pace()
         try:
             return _run_once(
-                out, robot, story, lead,
+                out, robot, scenario, lead,
                 verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, pace=at_pace,
             )  # fmt: skip
         except CoresFullError as error:
@@ -76,7 +76,7 @@ def run_live(
 def _run_once(
     out: Path,
     robot: RobotConfig,
-    story: Scenario,
+    scenario: Scenario,
     lead: Callable[[SupervisedFleet, Session], T],
     *,
     verb: str,
@@ -87,7 +87,7 @@ def _run_once(
 ) -> T:
     """Run at one pace."""
     robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
-        out, robot, story, true_plant
+        out, robot, scenario, true_plant
     )
     model_path = out / "model.xml"
     model_path.write_text(mjcf(robot), encoding="utf-8")
@@ -98,17 +98,17 @@ def _run_once(
             run_dir,
             overrides={
                 "recorder": _recorder_arguments(
-                    out, story, scenario_path, {"model.xml": model_path, PLANT_FILE: plant_path}
+                    out, scenario, scenario_path, {"model.xml": model_path, PLANT_FILE: plant_path}
                 ),
                 "simulator": [
                     *("--scenario", str(scenario_path.absolute())),
                     *("--plant", str(plant_path.absolute())),
                     *("--seed", str(seed)),
                 ],
-                **({"injector": ["--seed", str(seed)]} if story.inject else {}),
+                **({"network_proxy": ["--seed", str(seed)]} if scenario.inject else {}),
             },
             no_restart=frozenset(no_restart),
-            injected=bool(story.inject),
+            injected=bool(scenario.inject),
             pace=pace,
             leashed=True,
         )
@@ -125,7 +125,7 @@ def _run_once(
 
 
 def _recorder_arguments(
-    out: Path, story: Scenario, scenario_path: Path, attached: Mapping[str, Path]
+    out: Path, scenario: Scenario, scenario_path: Path, attached: Mapping[str, Path]
 ) -> list[str]:
     return [
         "--out",
@@ -133,7 +133,7 @@ def _recorder_arguments(
         "--scenario",
         str(scenario_path.absolute()),
         "--scenario-text",
-        story.name,
+        scenario.name,
         *(
             word
             for name, path in attached.items()

@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.text import Text
 
 from shared.messages import PlannerStatus
-from shared.scenario import Inject
+from shared.scenarios import Inject
 from tools.runs.scenario_runner import LiveSnapshot
 
 PERIOD_S = 0.1

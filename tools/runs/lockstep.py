@@ -1,4 +1,4 @@
-"""Lockstep: the same objects as live, in one process under virtual time (design section 7).
+"""Lockstep: the same objects as live, in one process under virtual time (docs/architecture.md).
 
 World, twelve emulated axes, six joint controllers, the harness sensor and the planner step
 in a fixed order; messages between them pass a modelled network. No process, clock or bus:
@@ -39,7 +39,7 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
-from shared.scenario import SCENARIO, Kill, Push, Restart, Scenario
+from shared.scenarios import SCENARIO, Kill, Push, Restart, Scenario
 from shared.topics import Topic
 from shared.traces import SimState
 from tools.runs.host_clock import HostClock
@@ -171,7 +171,7 @@ class Lockstep:
         """Each module's control law."""
         return [module.controller for module in self._modules]
 
-    def memory_of(self, module: str) -> DriveManagerState:
+    def snapshot_of(self, module: str) -> DriveManagerState:
         """Return what a joint service knows now, for `go_on`; it shares what still changes."""
         return self._modules[MODULE_INDEX[module]].snapshot()
 

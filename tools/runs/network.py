@@ -1,7 +1,7 @@
-"""A modelled network link, seeded (design section 7). Pure.
+"""A modelled network link, seeded (docs/architecture.md). Pure.
 
 What a link does by itself, and what is done to it meanwhile (`xrl sim --inject`), are both
-`shared.impairment`: the injector of a live fleet decides with the same objects. A link here is
+`shared.impairment`: the network proxy of a live fleet decides with the same objects. A link here is
 never given up: there is neither lease nor dialling again, and a stream delivers all that a
 partition held back, however long it was.
 """

@@ -1,7 +1,7 @@
 """Partial failures: some of the six modules' links cut or services frozen, the others well.
 
 In virtual time, in the middle of a squat and under a push: every case goes on from one moment
-of one run, so that none has to stand up first (design sections 4 and 7).
+of one run, so that none has to stand up first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from shared.links import Pair as Link
 from shared.messages import Message, Mode, Pair, PlannerStatus, SimTruth
-from shared.scenario import Inject, Keyframe, Kill, Push, Restart, Scenario
+from shared.scenarios import Inject, Keyframe, Kill, Push, Restart, Scenario
 from shared.topics import Topic
 from shared.traces import SimState
 from tools.runs.lockstep import Lockstep, Record, forget
@@ -102,7 +102,7 @@ def cases() -> Iterator[PartialCase]:
             yield PartialCase(kind, modules)
 
 
-def story_of(case: PartialCase) -> Scenario:
+def scenario_of(case: PartialCase) -> Scenario:
     """Return the case as a scenario, from its beginning: `xrl sim` would run it too."""
     service = [name for name in case.modules if case.kind == "frozen"]
     return Scenario(
@@ -171,13 +171,13 @@ def start_of(robot: RobotConfig) -> PartialStart:
     Raises:
         RunError: the robot did not come so far.
     """
-    fleet = PartialFleet(robot, story_of(PartialCase("links", ())))
+    fleet = PartialFleet(robot, scenario_of(PartialCase("links", ())))
     for truth in fleet.run():
         if truth.scenario_s >= BEGIN_S:
             break
     if fleet.world.scenario_s < BEGIN_S or fleet.planner is None:
         raise RunError(f"the robot did not stand and track until {BEGIN_S:g} s")
-    modules = {name: fleet.memory_of(name) for name in MODULES}
+    modules = {name: fleet.snapshot_of(name) for name in MODULES}
     state = taken(fleet.world, fleet.bank, fleet.now_ns, 0)
     return PartialStart(state, modules, (fleet.planner.session, fleet.planner.snapshot()))
 
@@ -192,11 +192,11 @@ def run_case(case: PartialCase, robot: RobotConfig, start: PartialStart) -> Part
     """
     statuses: list[PlannerStatus] = []
 
-    def hear(_topic: Topic, _module: str, message: Message) -> None:
+    def receive(_topic: Topic, _module: str, message: Message) -> None:
         if isinstance(message, PlannerStatus):
             statuses.append(message)
 
-    fleet = PartialFleet(robot, story_of(case), record=hear)
+    fleet = PartialFleet(robot, scenario_of(case), record=receive)
     fleet.go_on(start.state, start.modules, start.planner)
     begin_ns = fleet.now_ns - round(fleet.world.scenario_s * NS_PER_S)
     rows: list[SimTruth] = []

@@ -1,9 +1,9 @@
 """Reads a run's MCAP file, or all of its files, into memory: finished or killed.
 
 A killed file has no summary, and may end in the middle of a record; the readers of
-the mcap package find nothing in the first and may stumble over the second (design
-section 10). `services.recorder.reader` walks the records from the start and keeps every
-whole one; here they are sorted by key.
+the mcap package find nothing in the first and may stumble over the second (docs/logs.md).
+`services.recorder.reader` walks the records from the start and keeps every whole one; here they are
+sorted by key.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ from shared.messages import (
     SimControl,
     SimTruth,
 )
-from shared.scenario import Fault, Inject, Kill, Push, Restart, Scenario
-from tools.runs.injector_client import InjectorClient
+from shared.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
+from tools.runs.proxy_client import ProxyClient
 from tools.supervision import procfs
 from tools.supervision.pace import IDLE_LEAST, CoresFullError, IdleMeter
 from tools.supervision.supervise import SupervisedFleet
@@ -296,7 +296,7 @@ class ScenarioRunner:
             self._next_pids_s = 0.0
             self._note = f"{row.service} back"
         elif isinstance(row, Inject):
-            InjectorClient(self._fleet.run.path).begin(row)
+            ProxyClient(self._fleet.run.path).begin(row)
         elif isinstance(row, Fault):
             self._say(RunEventKind.FAULTED, row.module, row.kind)
             self._note = f"{row.module}: {row.kind}"

@@ -170,7 +170,7 @@ def _asked(log: RunLog, truth: Sequence[SimTruth]) -> Array:
     """
     asked = np.zeros((len(truth), 6))
     rows: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    if not any(any(row.shift_wanted) for row in rows):
+    if not any(any(row.shift_requested) for row in rows):
         return asked
     t, p_ref = [row.t_ns for row in rows], np.array([row.p_ref for row in rows])
     times_ns = [row.t_ns for row in truth]

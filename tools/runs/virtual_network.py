@@ -1,4 +1,4 @@
-"""The links of lockstep, and what a scenario does to them (design section 7)."""
+"""The links of lockstep, and what a scenario does to them (docs/architecture.md)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.impairment_schedule import ImpairmentSchedule
 from shared.joints import MODULES
 from shared.links import ATTITUDES, DIRECTIONS, WRENCHES
 from shared.messages import Attitude, JointCommand, JointState, Wrench
-from shared.scenario import Inject
+from shared.scenarios import Inject
 from shared.traces import LinkEvent
 from tools.runs.network import VirtualLink
 

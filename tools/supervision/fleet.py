@@ -18,10 +18,10 @@ import msgspec
 from shared.config import RobotConfig, expand
 from shared.config_file import load
 from shared.exceptions import ConfigError, FleetError
-from shared.injector_protocol import SOCKET
 from shared.joints import MODULES
 from shared.links import PAIRS, endpoint_through
 from shared.process import DEFAULT_CONFIG, SOCKET_PATH_MAX
+from shared.proxy_protocol import SOCKET
 from shared.toml_file import Range, Section, read_toml
 from shared.topics import TOPICS
 
@@ -43,7 +43,7 @@ class Process(Section, frozen=True):
 
     name: str
     """Service name, or `{module}` for one service per module."""
-    kind: Literal["joint", "planner", "harness", "imu", "recorder", "simulator", "injector"]
+    kind: Literal["joint", "planner", "harness", "imu", "recorder", "simulator", "network_proxy"]
     command: tuple[str, ...]
     """Arguments with the placeholders {python}, {config}, {run} and {module}."""
     autostart: bool
@@ -231,7 +231,7 @@ def listeners_of(
         if row.name in config.bus.endpoints:
             endpoint = expand(config.bus.endpoints[row.name], run_dir)
             listeners.append(ListenPoint(row.name, f"bus.endpoints.{row.name}", endpoint))
-        if row.kind == "injector":
+        if row.kind == "network_proxy":
             endpoints = [expand(endpoint_through(pair), run_dir) for pair in PAIRS]
             endpoints.append(f"{UNIX}{run_dir / SOCKET}")
             listeners += [ListenPoint(row.name, "(the run directory)", at) for at in endpoints]

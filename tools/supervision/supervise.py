@@ -68,7 +68,7 @@ class SupervisedFleet:
             services: which to start; None for all that the table starts by itself.
             asleep: of these, which wait for `start_service`.
             simulation: False leaves the simulator out; where all drives are real it always is.
-            injected: with the injector on the links of planner, joints and sensors.
+            injected: with the network proxy on the links of planner, joints and sensors.
             pace: how fast the clock of a simulated fleet goes; None: `usual_pace` where it is
                 simulated, else as the machine's.
             leashed: stop the fleet if this process dies.

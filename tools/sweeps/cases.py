@@ -10,7 +10,7 @@ import msgspec
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.robot_model import stand_pose
-from shared.scenario import Keyframe, Kill, Push, Scenario
+from shared.scenarios import Keyframe, Kill, Push, Scenario
 from tools.sweeps.push_range import SHARE, PushRange
 
 PAYLOADS: Final = 5
@@ -197,7 +197,7 @@ def _legs(
     return legs
 
 
-def story_of(robot: RobotConfig, case: KillCase) -> Scenario:
+def scenario_of(robot: RobotConfig, case: KillCase) -> Scenario:
     """Return the case as a scenario; the hand that lets go is not in it."""
     frames = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
     for pose, (_, end) in zip(case.poses, _legs(robot, case.poses, case.pace), strict=True):

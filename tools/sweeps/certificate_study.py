@@ -1,7 +1,7 @@
 """The certificate on trial: the sign of K_fail against a simulated fall or stand.
 
 A case is a random posture, payload, assist and set of local gains. The robot starts in the
-posture, on free feet, with what is left without a planner (design section 3 d):
+posture, on free feet, with what is left without a planner (docs/law.md#certificate):
 
     tau = D (q_ref - q) - D_B v + tau_ff
 
@@ -37,7 +37,7 @@ from shared.exceptions import RunError
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from shared.messages import Pair, SimTruth
 from shared.robot_model import stand_pose
-from shared.scenario import Keyframe, Push, Scenario
+from shared.scenarios import Keyframe, Push, Scenario
 
 mpl.use("Agg")
 

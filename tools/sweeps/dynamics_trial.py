@@ -30,7 +30,7 @@ from shared.gain_table import GainSchedule
 from shared.impairment import Impairment
 from shared.joints import N_LEG
 from shared.messages import Mode
-from shared.scenario import Keyframe, Push, Scenario
+from shared.scenarios import Keyframe, Push, Scenario
 from tools.runs.lockstep import Lockstep
 
 HEIGHTS: Final = (0.95, 1.188)
@@ -169,7 +169,7 @@ def delay_s(robot: RobotConfig, trial: DynamicsTrial) -> float:
     return cycle * max(1, math.ceil(2e-3 * trial.delay_ms / cycle - 1e-9))
 
 
-def story_of(robot: RobotConfig, trial: DynamicsTrial) -> Scenario:
+def scenario_of(robot: RobotConfig, trial: DynamicsTrial) -> Scenario:
     """Return what happens."""
     tap = {"at": TAP_S, "duration": TAP_LASTS_S}
     return Scenario(
@@ -193,7 +193,7 @@ def run_trial(trial: DynamicsTrial, robot: RobotConfig) -> DynamicsResult:
     """Run a trial; its joint services believe gains that the law would never send."""
     fleet = Lockstep(
         believing(robot),
-        story_of(robot, trial),
+        scenario_of(robot, trial),
         Impairment(delay_ms=float(trial.delay_ms)),
         plant=plant_of(robot, trial),
     )

@@ -121,7 +121,7 @@ def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> 
     )
     return run_alone(
         partial(run_case, case, loaded),
-        cases.story_of(loaded, case),
+        cases.scenario_of(loaded, case),
         loaded,
         args.out,
         {"lockstep": words},

@@ -209,7 +209,7 @@ def _run_one(
     facts = {"lockstep": f"{_command(args)} --only {trial.number}", "control": trial.control}
     return run_alone(
         partial(run_trial, trial, robot),
-        trial.story(robot),
+        trial.scenario(robot),
         robot,
         args.out,
         facts,

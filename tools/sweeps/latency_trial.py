@@ -31,7 +31,7 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
-from shared.scenario import Inject, Keyframe, Scenario
+from shared.scenarios import Inject, Keyframe, Scenario
 from shared.topics import Topic
 from tools.centralised.fleet import CentralisedLockstep
 from tools.runs.lockstep import Lockstep, Record
@@ -146,7 +146,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
             shoves.append(Shove(at, dice.uniform(*PUSH_SHARE), dice.uniform(-math.pi, math.pi)))
         return Draw(begin, tuple(shoves), dice.getrandbits(48))
 
-    def story(self, robot: RobotConfig) -> Scenario:
+    def scenario(self, robot: RobotConfig) -> Scenario:
         """Return the trial as a scenario."""
         stand = robot.simulation.stand_height
         draw, pushes = self.draw, PushRange(robot)
@@ -230,7 +230,7 @@ def fleet_of(trial: LatencyTrial, robot: RobotConfig, record: Record) -> Lockste
     seed = trial.draw.fleet_seed
     return fleet_type(
         robot,
-        trial.story(robot),
+        trial.scenario(robot),
         Impairment(),
         seed=seed,
         record=record,

@@ -21,7 +21,7 @@ from shared.messages import (
 from shared.topics import Topic
 from tools.runs.lockstep import Lockstep, Record
 from tools.sweeps import plants
-from tools.sweeps.cases import KillCase, network_of, story_of
+from tools.sweeps.cases import KillCase, network_of, scenario_of
 from tools.sweeps.figures import (
     Ended,
     Ending,
@@ -45,7 +45,7 @@ class KillResult(Ended, frozen=True, kw_only=True):
     """Torso, as it was at the kill."""
     kill_pitch_rad: float | None = None
     kill_margin: float | None = None
-    """Failsafe certificate of the last commands (design section 3 d)."""
+    """Failsafe certificate of the last commands (docs/law.md#certificate)."""
     kill_margin_onboard: float | None = None
     holds_before: int = 0
     """Drop-outs from TRACK of the busiest module, the planner alive."""
@@ -115,7 +115,7 @@ def run_case(
     ear = KillRecorder(record)
     fleet = Lockstep(
         robot,
-        story_of(robot, case),
+        scenario_of(robot, case),
         network_of(case),
         seed=case.number,
         record=ear,

@@ -11,7 +11,7 @@ from services.planner.poses import Poses
 from services.planner.push_limit import LoadedStand
 from shared.config import RobotConfig
 from shared.exceptions import RunError
-from shared.scenario import Push
+from shared.scenarios import Push
 
 DIGITS: Final = 3
 REACHED_M: Final = 1e-4

@@ -23,7 +23,7 @@ from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.messages import SimTruth
-from shared.scenario import Keyframe, Kill, Push, Scenario
+from shared.scenarios import Keyframe, Kill, Push, Scenario
 from shared.traces import SimState
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
@@ -80,7 +80,7 @@ class PushStart(NamedTuple):
     planner: tuple[int, TickState] | None
 
 
-def story_of(trial: PushTrial, force_n: float) -> Scenario:
+def scenario_of(trial: PushTrial, force_n: float) -> Scenario:
     """Return what happens for a push of this force."""
     height, pitch = POSES[trial.pose]
     angle = math.radians(trial.angle_deg)
@@ -151,7 +151,7 @@ def limits_of(trial: PushTrial, robot: RobotConfig) -> PushLimits:
 
 
 def _start_of(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushStart:
-    fleet = Lockstep(robot, story_of(trial, 0.0), BASE, plant=plant)
+    fleet = Lockstep(robot, scenario_of(trial, 0.0), BASE, plant=plant)
     for truth in fleet.run():
         if truth.fallen:
             raise RunError(f"{trial.pose}: the robot fell before it was pushed")
@@ -159,7 +159,7 @@ def _start_of(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushS
             break
     if fleet.world.scenario_s < BEGIN_S - 0.1:
         raise RunError(f"{trial.pose}: the six modules never came to track")
-    modules = {name: fleet.memory_of(name) for name in MODULES}
+    modules = {name: fleet.snapshot_of(name) for name in MODULES}
     planner = fleet.planner if trial.mode == "led" else None
     memory = None if planner is None else (planner.session, planner.snapshot())
     return PushStart(taken(fleet.world, fleet.bank, fleet.now_ns, 0), modules, memory)
@@ -168,11 +168,11 @@ def _start_of(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushS
 def _stands(
     trial: PushTrial, robot: RobotConfig, plant: PlantConfig, start: PushStart, force_n: float
 ) -> bool:
-    story = story_of(trial, force_n)
-    fleet = Lockstep(robot, msgspec.structs.replace(story, kill=()), BASE, plant=plant)
+    scenario = scenario_of(trial, force_n)
+    fleet = Lockstep(robot, msgspec.structs.replace(scenario, kill=()), BASE, plant=plant)
     fleet.go_on(start.state, start.modules, start.planner)
     rows = list(_until_down(fleet.run()))
-    return bool(rows) and ending_of(rows[-1], story.duration, robot) is Ending.STOOD
+    return bool(rows) and ending_of(rows[-1], scenario.duration, robot) is Ending.STOOD
 
 
 def _until_down(rows: Iterator[SimTruth]) -> Iterator[SimTruth]:

@@ -18,7 +18,7 @@ from shared import topics
 from shared.config import RobotConfig
 from shared.messages import SimTruth
 from shared.robot_model import mjcf
-from shared.scenario import Scenario
+from shared.scenarios import Scenario
 from tools.runs import experiment, figure, verdict
 from tools.runs.lockstep import Record
 from tools.runs.run_log import read_run
@@ -48,7 +48,7 @@ class Run(Protocol[Outcome_co]):
 
 def run_alone(
     run: Run[Ended],
-    story: Scenario,
+    scenario: Scenario,
     robot: RobotConfig,
     out: Path | None,
     facts: dict[str, str],
@@ -59,7 +59,7 @@ def run_alone(
 
     Args:
         run: runs it.
-        story: what happens.
+        scenario: what happens.
         robot: ready to run.
         out: folder for its log; None: no log.
         facts: for the log, as for `record_run`.
@@ -73,7 +73,7 @@ def run_alone(
         RunError: the log cannot be written.
     """
     with study.bar("{task.completed:.1f} of {task.total:.1f} s", console) as bar:
-        shown = bar.add_task("", total=story.duration)
+        shown = bar.add_task("", total=scenario.duration)
 
         def watch(truth: SimTruth) -> None:
             bar.update(shown, completed=max(0.0, truth.scenario_s))
@@ -83,7 +83,7 @@ def run_alone(
         else:
             experiment.make_out(out, "sweep")
             outcome, _ = record_run(
-                story,
+                scenario,
                 robot,
                 out,
                 facts,
@@ -99,7 +99,7 @@ def run_alone(
 
 
 def record_run(
-    story: Scenario,
+    scenario: Scenario,
     robot: RobotConfig,
     out: Path,
     facts: dict[str, str],
@@ -110,7 +110,7 @@ def record_run(
     """Run a case into `run.mcap`, with `summary.json` and `run.png` beside it.
 
     Args:
-        story: what happens.
+        scenario: what happens.
         robot: ready to run.
         out: an empty folder.
         facts: for the log, beside robot and scenario: `lockstep` with the command, at least.
@@ -124,14 +124,14 @@ def record_run(
     Raises:
         RunError: the log cannot be written, or holds nothing to judge.
     """
-    inputs = experiment.write_inputs(out, robot, story, true_plant)
+    inputs = experiment.write_inputs(out, robot, scenario, true_plant)
     outbox = Outbox(robot.name)
     recorded = {key: topic for key, topic in topics.all_keys(robot.name).items() if topic.recorded}
     run_facts = {
         "schema_version": SCHEMA_VERSION,
         "robot": robot.name,
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
-        "scenario": story.name,
+        "scenario": scenario.name,
     }
     with RunWriter(
         out,
@@ -154,8 +154,8 @@ def record_run(
         outcome = run(outbox.put, drain)
         writer.take_from(outbox, len(outbox))
     log = read_run(out / "run.mcap")
-    summary = verdict.summarise(log, story.duration)
+    summary = verdict.summarise(log, scenario.duration)
     summary |= dict.fromkeys(NOT_HERE) | {"in_real_time": True}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    figure.draw(log, f"{story.name} in lockstep", summary, out / "run.png")
+    figure.draw(log, f"{scenario.name} in lockstep", summary, out / "run.png")
     return outcome, summary

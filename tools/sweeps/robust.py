@@ -31,7 +31,7 @@ from tools.sweeps.robust_trial import (
     plant_of,
     row_of,
     run_trial,
-    story_of,
+    scenario_of,
 )
 from tools.sweeps.table import CaseTable, Row, code_digest, code_of
 from tools.sweeps.wilson import wilson
@@ -131,7 +131,7 @@ def _run_one(args: argparse.Namespace, robot: RobotConfig, console: Console) -> 
     study.show(f"Trial {trial.number}, drawn", row_of(trial), console)
     return run_alone(
         partial(run_trial, trial, robot),
-        story_of(robot, trial),
+        scenario_of(robot, trial),
         robot,
         args.out,
         {"lockstep": f"{_command(args)} --only {trial.number}; delay {trial.delay_ms:g} ms"},

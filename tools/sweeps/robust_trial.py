@@ -13,7 +13,7 @@ from services.simulator.plant import PlantConfig, changed
 from shared.config import RobotConfig
 from shared.impairment import Impairment
 from shared.messages import SimTruth
-from shared.scenario import Keyframe, Kill, Push, Scenario
+from shared.scenarios import Keyframe, Kill, Push, Scenario
 from tools.runs.lockstep import Lockstep, Record, forget
 from tools.sweeps import plants
 from tools.sweeps.figures import (
@@ -111,7 +111,7 @@ def plant_of(trial: RobustTrial) -> PlantConfig:
     return changed(plant, {"floor.slope": towards})
 
 
-def story_of(robot: RobotConfig, trial: RobustTrial) -> Scenario:
+def scenario_of(robot: RobotConfig, trial: RobustTrial) -> Scenario:
     """Return what happens."""
     stand = robot.simulation.stand_height
     frames: tuple[Keyframe, ...]
@@ -147,10 +147,10 @@ def run_trial(
     after_fall_s: float = 0.0,
 ) -> RobustResult:
     """Run a trial to its end or to the fall; arguments as for the other studies."""
-    story = story_of(robot, trial)
+    scenario = scenario_of(robot, trial)
     fleet = Lockstep(
         robot,
-        story,
+        scenario,
         Impairment(delay_ms=trial.delay_ms),
         seed=trial.number,
         record=record or forget,

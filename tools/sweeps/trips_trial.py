@@ -12,14 +12,14 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from services.simulator.plant import IDEAL, PlantConfig, changed
-from shared import scenario
+from shared import scenarios
 from shared.clock import NS_PER_S
 from shared.config import RobotConfig
 from shared.exceptions import RunError
 from shared.gain_schedule import believing
 from shared.messages import STRAIGHT, Cause, Message, Mode, PlannerStatus, SimTruth, Trip
 from shared.process import DEFAULT_CONFIG
-from shared.scenario import Keyframe, Push, Scenario
+from shared.scenarios import Keyframe, Push, Scenario
 from shared.topics import Topic
 from shared.trip_table import JOINT_TRIPS, untripped
 from tools.runs.lockstep import Lockstep
@@ -120,7 +120,7 @@ def _at(at: float, height: float = UP, pitch: float = 0.0, assist: float = 0.0) 
 
 
 def _shipped(name: str) -> Scenario:
-    return scenario.load(DEFAULT_CONFIG.parent / "scenarios" / f"{name}.toml")
+    return scenarios.load(DEFAULT_CONFIG.parent / "scenarios" / f"{name}.toml")
 
 
 _SHOVE: Final = Push(at=3.0, duration=0.3, force=(40.0, 0.0, 0.0))

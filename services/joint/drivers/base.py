@@ -1,4 +1,4 @@
-"""The one interface of all drives (design section 5)."""
+"""The one interface of all drives (docs/drives.md)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
 
 
 class MotorTarget(msgspec.Struct, gc=False, frozen=True):
-    """What both motors' own loops are to do, axis0 and axis1 (design section 5).
+    """What both motors' own loops are to do, axis0 and axis1 (docs/drives.md).
 
     torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel), no integrator.
     """

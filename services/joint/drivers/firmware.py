@@ -159,7 +159,7 @@ class AxesReport:
         self._was_armed = [False, False]
         self.status = DriveStatus.IDLE
 
-    def hear(self, axis: int, heartbeat: bytes) -> None:
+    def receive(self, axis: int, heartbeat: bytes) -> None:
         """Take in a heartbeat of axis 0 or 1 and judge again."""
         self._heartbeats[axis] = heartbeat
         if self.dialect == "":

@@ -1,4 +1,4 @@
-"""One ODrive over CANSimple and python-can (design section 5).
+"""One ODrive over CANSimple and python-can (docs/drives.md).
 
 The same code on the robot (socketcan) and in the demo (`xrl_unix`): only the configured
 interface and channel differ. It speaks to firmware 0.5 and 0.6 (`odrive_dialects`).
@@ -289,7 +289,7 @@ class OdriveCan:
             self._order(odrive_frames.IDLING, armed=False)  # it was lost on the way
             return
         report = self._report
-        report.hear(axis, bytes(data))
+        report.receive(axis, bytes(data))
         if report.dialect == "":
             self._link.send(self._answers.ask_version)
         found_armed = report.status is DriveStatus.ARMED and self._due.gains is None

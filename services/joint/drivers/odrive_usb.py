@@ -1,4 +1,4 @@
-"""One ODrive v3 over USB and the `odrive` package, unmodified (design section 5).
+"""One ODrive v3 over USB and the `odrive` package, unmodified (docs/drives.md).
 
 Threads. The rule is that a service has one; this driver is the exception. The package
 brings its own asyncio loop in a thread (and libodrive a second one under it), and a
@@ -36,7 +36,7 @@ from shared.exceptions import DriveError
 from shared.messages import Pair
 
 EXCHANGE_HZ: Final = 200
-"""At most; more than a v3 board answers over USB helps nobody (design section 5)."""
+"""At most; more than a v3 board answers over USB helps nobody (docs/drives.md)."""
 PATIENCE: Final = 1.5
 """Periods of the exchange for which `read` waits at least: one alone is often just missed."""
 FEED_MS: Final = 1000

@@ -9,8 +9,8 @@ import pytest
 from shared.exceptions import ConfigError
 from shared.impairment import Direction, Impairment
 from shared.impairment_schedule import ImpairmentSchedule
-from shared.injector_protocol import RequestedImpairment
 from shared.links import COMMANDS, DIRECTIONS, WRENCHES
+from shared.proxy_protocol import RequestedImpairment
 from shared.traces import LinkEvent
 
 CUT = Impairment(partition=True)
@@ -21,7 +21,7 @@ class Rig:
     def __init__(self) -> None:
         self.directions = {name: Direction(name, 0) for name in DIRECTIONS}
         self.told: list[LinkEvent] = []
-        self.injections = ImpairmentSchedule(self.directions, self.told.append)
+        self.impairments = ImpairmentSchedule(self.directions, self.told.append)
 
     def begun(self) -> list[tuple[int, bool]]:
         return [(event.number, event.active) for event in self.told]
@@ -33,59 +33,59 @@ def rig() -> Rig:
 
 
 def test_what_is_planned_begins_when_it_is_due_and_ends_at_its_time(rig: Rig) -> None:
-    number = rig.injections.plan(WRENCHES, LATE, 2.0, 3.0)
-    assert rig.injections.next_due == 2.0
-    assert not rig.injections.advance(1.9, 19)
+    number = rig.impairments.plan(WRENCHES, LATE, 2.0, 3.0)
+    assert rig.impairments.next_due == 2.0
+    assert not rig.impairments.advance(1.9, 19)
     assert rig.told == []
-    assert rig.injections.advance(2.0, 20)
+    assert rig.impairments.advance(2.0, 20)
     assert rig.directions[WRENCHES].active is not None
-    assert rig.injections.next_due == 3.0
-    assert rig.injections.advance(3.1, 31)
+    assert rig.impairments.next_due == 3.0
+    assert rig.impairments.advance(3.1, 31)
     assert rig.begun() == [(number, True), (number, False)]
     assert [event.t_ns for event in rig.told] == [20, 31]
-    assert rig.injections.next_due == math.inf
+    assert rig.impairments.next_due == math.inf
 
 
 def test_what_is_due_together_begins_in_the_order_of_its_times(rig: Rig) -> None:
-    late = rig.injections.plan(WRENCHES, LATE, 2.0, 9.0)
-    early = rig.injections.plan(WRENCHES, LATE, 1.0, 9.0)
-    rig.injections.advance(5.0, 5)
+    late = rig.impairments.plan(WRENCHES, LATE, 2.0, 9.0)
+    early = rig.impairments.plan(WRENCHES, LATE, 1.0, 9.0)
+    rig.impairments.advance(5.0, 5)
     assert rig.begun() == [(early, True), (late, True)]
 
 
 def test_what_would_be_over_before_it_is_seen_never_begins(rig: Rig) -> None:
-    rig.injections.plan(WRENCHES, LATE, 1.0, 1.5)
-    assert rig.injections.advance(2.0, 2)
+    rig.impairments.plan(WRENCHES, LATE, 1.0, 1.5)
+    assert rig.impairments.advance(2.0, 2)
     assert rig.told == []
-    assert rig.injections.asked == {}
+    assert rig.impairments.requested == {}
 
 
 def test_clearing_keeps_what_has_not_begun_from_beginning(rig: Rig) -> None:
-    rig.injections.plan("planner->joints", LATE, 1.0, math.inf)
-    kept = rig.injections.plan(WRENCHES, LATE, 1.0, math.inf)
-    assert rig.injections.clear("planner->knee_left", 0) == 1
-    rig.injections.advance(1.0, 1)
+    rig.impairments.plan("planner->joints", LATE, 1.0, math.inf)
+    kept = rig.impairments.plan(WRENCHES, LATE, 1.0, math.inf)
+    assert rig.impairments.clear("planner->knee_left", 0) == 1
+    rig.impairments.advance(1.0, 1)
     assert rig.begun() == [(kept, True)]
 
 
 def test_what_is_planned_for_no_link_is_refused_and_not_kept(rig: Rig) -> None:
     with pytest.raises(ConfigError):
-        rig.injections.plan("elbow", LATE, 1.0, 2.0)
-    assert rig.injections.asked == {}
-    assert rig.injections.next_due == math.inf
+        rig.impairments.plan("elbow", LATE, 1.0, 2.0)
+    assert rig.impairments.requested == {}
+    assert rig.impairments.next_due == math.inf
 
 
 def test_what_is_hidden_is_told_with_the_directions_on_which_it_is(rig: Rig) -> None:
-    everywhere = rig.injections.begin("all", LATE, math.inf, 0)
-    cut = rig.injections.begin("planner->joints", CUT, math.inf, 0)
-    later = rig.injections.begin("planner->knee_left", LATE, math.inf, 0)
-    waits = rig.injections.plan("all", CUT, 5.0, math.inf)
-    assert set(rig.injections.hidden(everywhere)) == set(COMMANDS)
-    assert rig.injections.hidden(cut) == ()
-    assert rig.injections.hidden(later) == ("planner->knee_left",)
-    assert rig.injections.hidden(waits) == ()
-    rig.injections.end(cut, 0)
-    assert rig.injections.hidden(everywhere) == ("planner->knee_left",)
+    everywhere = rig.impairments.begin("all", LATE, math.inf, 0)
+    cut = rig.impairments.begin("planner->joints", CUT, math.inf, 0)
+    later = rig.impairments.begin("planner->knee_left", LATE, math.inf, 0)
+    waits = rig.impairments.plan("all", CUT, 5.0, math.inf)
+    assert set(rig.impairments.hidden(everywhere)) == set(COMMANDS)
+    assert rig.impairments.hidden(cut) == ()
+    assert rig.impairments.hidden(later) == ("planner->knee_left",)
+    assert rig.impairments.hidden(waits) == ()
+    rig.impairments.end(cut, 0)
+    assert rig.impairments.hidden(everywhere) == ("planner->knee_left",)
 
 
 @pytest.mark.parametrize(
@@ -100,5 +100,5 @@ def test_what_is_hidden_is_told_with_the_directions_on_which_it_is(rig: Rig) -> 
 def test_one_that_is_not_in_force_says_why(
     link: str, in_s: float, hidden: tuple[str, ...], words: str
 ) -> None:
-    asked = RequestedImpairment(1, link, LATE.describe(), None, 0, 0, in_s, hidden)
-    assert asked.describe() == words
+    requested = RequestedImpairment(1, link, LATE.describe(), None, 0, 0, in_s, hidden)
+    assert requested.describe() == words

@@ -7,10 +7,10 @@ import socket
 import struct
 from pathlib import Path
 
-from services.injector.event_loop import SocketWatch
-from services.injector.listener import SocketListener
-from services.injector.proxy_endpoint import Address, Place
-from services.injector.relay import Relay
+from services.network_proxy.event_loop import SocketWatch
+from services.network_proxy.listener import SocketListener
+from services.network_proxy.proxy_endpoint import Address, Place
+from services.network_proxy.relay import Relay
 from shared.clock import NS_PER_MS
 from shared.impairment import Direction
 from shared.links import Pair

@@ -1,4 +1,4 @@
-"""What is said where no injector answers: why not, and the way out."""
+"""What is said where no network proxy answers: why not, and the way out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
-from tools.runs.injector_client import InjectorClient
+from tools.runs.proxy_client import ProxyClient
 from tools.supervision.fleet import TABLE, make_plan
 from tools.supervision.run_dir import RunDir
 
@@ -33,16 +33,16 @@ def pretend_up(run_dir: Path, *, injected: bool) -> None:
 
 def test_without_a_fleet_it_says_how_to_start_one(run_dir: Path) -> None:
     with pytest.raises(FleetError, match=r"no fleet is up in .*; `xrl up --injectable` starts one"):
-        InjectorClient(run_dir).list()
+        ProxyClient(run_dir).list()
 
 
 def test_a_fleet_without_injector_has_to_go_down_first(run_dir: Path) -> None:
     pretend_up(run_dir, injected=False)
-    with pytest.raises(FleetError, match="without an injector; `xrl down`, then"):
-        InjectorClient(run_dir).list()
+    with pytest.raises(FleetError, match="without a network proxy; `xrl down`, then"):
+        ProxyClient(run_dir).list()
 
 
 def test_an_injector_that_is_down_is_said_so_and_what_went_with_it(run_dir: Path) -> None:
     pretend_up(run_dir, injected=True)
     with pytest.raises(FleetError, match="all that was done to links is over; `xrl status`"):
-        InjectorClient(run_dir).list()
+        ProxyClient(run_dir).list()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.injector.wire import Splitter, carries_messages
+from services.network_proxy.wire import Splitter, carries_messages
 
 INIT = "81 09 f1 31 a2 df 8b 99 09"
 OPEN = "42 01 81 9c ca 4a 31 30 79"

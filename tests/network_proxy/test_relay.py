@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from services.injector.direction import PENDING_MAX, WAITING_MAX
+from services.network_proxy.direction import PENDING_MAX, WAITING_MAX
 from shared.impairment import Impairment
-from tests.injector.rig import DECLARE, MESSAGE, Rig, batch, heard, numbers
+from tests.network_proxy.rig import DECLARE, MESSAGE, Rig, batch, heard, numbers
 
 
 def test_unimpaired_everything_passes_at_once_both_ways(rig: Rig) -> None:

@@ -8,7 +8,7 @@ from typing import Final
 from shared.clock import NS_PER_S, now_ns
 from shared.exceptions import ConfigError
 from shared.impairment_schedule import ImpairmentSchedule
-from shared.injector_protocol import Begin, Clear, Reply, Request, RequestedImpairment
+from shared.proxy_protocol import Begin, Clear, Reply, Request, RequestedImpairment
 from shared.toml_file import check_ranges
 
 ASKED_MAX: Final = 64
@@ -20,9 +20,9 @@ WAIT_MAX_S: Final = 86_400.0
 class Orders:
     """Obeys, or says why not."""
 
-    def __init__(self, injections: ImpairmentSchedule) -> None:
+    def __init__(self, impairments: ImpairmentSchedule) -> None:
         """Take where it is kept."""
-        self._injections = injections
+        self._injections = impairments
         self.changed = False
         """Something has begun or ended; the loop clears it."""
 
@@ -39,7 +39,7 @@ class Orders:
         except ConfigError as error:
             return Reply(error=f"{error.key}: {error.found}; {error.expected}")
         self.changed = True
-        return Reply(asked=tuple(self._asked(at_ns)))
+        return Reply(requested=tuple(self._asked(at_ns)))
 
     def _amiss(self, request: Begin) -> str:
         """Return why not; empty if it can be done.
@@ -50,7 +50,7 @@ class Orders:
         check_ranges("inject", request.inject)
         if not 0.0 <= request.in_s <= WAIT_MAX_S:
             return f"in {request.in_s:g} s; from now to {WAIT_MAX_S:g} s on"
-        if len(self._injections.asked) >= ASKED_MAX:
+        if len(self._injections.requested) >= ASKED_MAX:
             return f"{ASKED_MAX} impairments are asked for already; clear some of them first"
         return request.inject.fault()
 
@@ -65,7 +65,7 @@ class Orders:
 
     def _asked(self, at_ns: int) -> list[RequestedImpairment]:
         rows = []
-        for number, row in self._injections.asked.items():
+        for number, row in self._injections.requested.items():
             passed, lost = self._injections.counts(number)
             left_s = None if math.isinf(row.until) else (row.until - at_ns) / NS_PER_S
             in_s = max(0.0, (row.begins - at_ns) / NS_PER_S)

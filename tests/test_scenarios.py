@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import tomli_w
 
-from shared import scenario
+from shared import scenarios
 from shared.config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.scenario import (
+from shared.scenarios import (
     FAULT_KINDS,
     Fault,
     FaultKind,
@@ -49,7 +49,7 @@ def load_changed(tmp_path: Path, change: Callable[[Table], object]) -> Scenario:
     change(raw)
     path = tmp_path / "scenario.toml"
     path.write_text(tomli_w.dumps(raw), encoding="utf-8")
-    return scenario.load(path)
+    return scenarios.load(path)
 
 
 def row(table: str, **changes: object) -> Callable[[Table], object]:
@@ -118,8 +118,8 @@ def test_the_scenario_that_the_refusals_start_from_is_itself_taken(tmp_path: Pat
 def test_a_scenario_comes_back_from_its_own_toml(tmp_path: Path) -> None:
     first = load_changed(tmp_path, dict.copy)
     path = tmp_path / "again.toml"
-    path.write_text(scenario.to_toml(first), encoding="utf-8")
-    assert scenario.load(path) == first
+    path.write_text(scenarios.to_toml(first), encoding="utf-8")
+    assert scenarios.load(path) == first
 
 
 # ---- faults
@@ -140,8 +140,8 @@ def test_a_fault_that_leaves_things_out_comes_back_from_its_own_toml(tmp_path: P
         lambda raw: raw.update(fault=[{"module": "hip_left", "kind": "watchdog", "at": 1}]),
     )
     path = tmp_path / "again.toml"
-    path.write_text(scenario.to_toml(plain), encoding="utf-8")
-    assert scenario.load(path) == plain
+    path.write_text(scenarios.to_toml(plain), encoding="utf-8")
+    assert scenarios.load(path) == plain
 
 
 def test_every_kind_in_the_type_is_in_the_table() -> None:
@@ -153,7 +153,7 @@ def test_every_kind_in_the_type_is_in_the_table() -> None:
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_lead_passes_through_every_keyframe_at_rest(path: Path) -> None:
-    shipped = scenario.load(path)
+    shipped = scenarios.load(path)
     for frame in shipped.keyframe:
         at = lead(shipped, frame.at)
         assert (at.height, at.pitch) == pytest.approx((frame.height, frame.pitch))
@@ -164,7 +164,7 @@ def test_lead_passes_through_every_keyframe_at_rest(path: Path) -> None:
 
 @pytest.mark.parametrize("path", [SQUAT, CRAWL, SHIFT], ids=lambda path: path.stem)
 def test_lead_and_its_rates_are_continuous_and_fit_each_other(path: Path) -> None:
-    shipped = scenario.load(path)
+    shipped = scenarios.load(path)
     dt = 1e-4
     times = np.arange(-1.0, shipped.duration + 1.0, dt)
     rows = np.array([(*lead(shipped, t)[:5], *lead(shipped, t).shift) for t in times])
@@ -180,7 +180,7 @@ def test_lead_and_its_rates_are_continuous_and_fit_each_other(path: Path) -> Non
 
 
 def test_squat_is_the_cosine_of_the_reference_scenario() -> None:
-    squat = scenario.load(SQUAT)
+    squat = scenarios.load(SQUAT)
     for t in np.linspace(0.0, 10.0, 1001):
         expected = 1.188 - 0.12 * (1.0 - math.cos(2.0 * math.pi * t / 5.0))
         assert lead(squat, t).height == pytest.approx(expected, abs=1e-12)
@@ -188,7 +188,7 @@ def test_squat_is_the_cosine_of_the_reference_scenario() -> None:
 
 
 def test_squat_kills_the_planner_and_pushes_as_in_the_reference_scenario() -> None:
-    squat = scenario.load(SQUAT)
+    squat = scenarios.load(SQUAT)
     assert [(kill.service, kill.at, kill.signal) for kill in squat.kill] == [
         ("planner", 10.0, "KILL")
     ]
@@ -202,7 +202,7 @@ def test_squat_kills_the_planner_and_pushes_as_in_the_reference_scenario() -> No
 
 
 def test_crawl_is_the_reference_scenarios() -> None:
-    crawl = scenario.load(CRAWL)
+    crawl = scenarios.load(CRAWL)
     for t in (5.0, 7.5, 10.0):
         assert lead(crawl, t)[:5] == pytest.approx((0.79, 0.0, 1.2, 0.0, 200.0), abs=1e-12)
     assert lead(crawl, 15.0).height == pytest.approx(1.188)
@@ -226,7 +226,7 @@ def test_one_keyframe_is_a_stand() -> None:
 
 
 def test_a_push_acts_from_its_start_up_to_its_end() -> None:
-    squat = scenario.load(SQUAT)
+    squat = scenarios.load(SQUAT)
     before, start = push_at(squat, math.nextafter(12.0, 0.0)), push_at(squat, 12.0)
     last, end = push_at(squat, math.nextafter(12.3, 0.0)), push_at(squat, 12.3)
     assert before == end == (0.0, 0.0, 0.0)
@@ -256,7 +256,7 @@ def test_the_reference_scenarios_are_shipped() -> None:
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_every_shipped_scenario_loads_under_its_own_name(path: Path, robot: RobotConfig) -> None:
-    shipped = scenario.load(path)
+    shipped = scenarios.load(path)
     assert shipped.name == path.stem
     assert shipped.keyframe[0].height == robot.simulation.stand_height
     assert shipped.keyframe[-1].at <= shipped.duration

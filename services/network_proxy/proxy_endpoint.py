@@ -1,4 +1,4 @@
-"""Where the injector stands: one process of a pair dials it, and it dials the other."""
+"""Where the network proxy stands: one process of a pair dials it, and it dials the other."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import socket
 from typing import Any, NamedTuple
 
-from services.injector.listener import SocketListener
+from services.network_proxy.listener import SocketListener
 from shared.exceptions import BusError
 from shared.links import Pair
 

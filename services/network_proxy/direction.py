@@ -6,7 +6,7 @@ import socket
 from collections import deque
 from typing import Final, NamedTuple
 
-from services.injector.wire import Splitter, carries_messages
+from services.network_proxy.wire import Splitter, carries_messages
 from shared.impairment import HELD, Direction, Impairer
 
 PENDING_MAX: Final = 262_144

@@ -1,4 +1,4 @@
-"""What is asked of the injector, what it answers, and what it tells the log."""
+"""What is asked of the network proxy, what it answers, and what it tells the log."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.injector.commands import ASKED_MAX, Orders
-from services.injector.control import ASKERS_MAX, ControlSocket
-from services.injector.event_loop import SocketWatch
+from services.network_proxy.commands import ASKED_MAX, Orders
+from services.network_proxy.control import ASKERS_MAX, ControlSocket
+from services.network_proxy.event_loop import SocketWatch
 from shared.exceptions import FleetError
 from shared.impairment import Direction
 from shared.impairment_schedule import ImpairmentSchedule
-from shared.injector_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
 from shared.links import COMMANDS, DIRECTIONS
-from shared.scenario import Inject
+from shared.proxy_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
+from shared.scenarios import Inject
 from shared.traces import LinkEvent
-from tools.runs.injector_client import InjectorClient
+from tools.runs.proxy_client import ProxyClient
 
 DELAY = Inject(link="planner->joints", at=0.0, delay_ms=30.0)
 LOSS = Inject(link="all", at=0.0, loss=0.5, duration=2.0)
@@ -32,8 +32,8 @@ class Rig:
     def __init__(self) -> None:
         self.directions = {name: Direction(name, 0) for name in DIRECTIONS}
         self.told: list[LinkEvent] = []
-        self.injections = ImpairmentSchedule(self.directions, self.told.append)
-        self.orders = Orders(self.injections)
+        self.impairments = ImpairmentSchedule(self.directions, self.told.append)
+        self.orders = Orders(self.impairments)
 
 
 @pytest.fixture
@@ -43,8 +43,8 @@ def rig() -> Rig:
 
 def test_what_begins_is_in_force_on_every_direction_of_the_link_and_told(rig: Rig) -> None:
     reply = rig.orders.obey(Begin(DELAY))
-    assert [row.link for row in reply.asked] == ["planner->joints"]
-    assert reply.asked[0].left_s is None
+    assert [row.link for row in reply.requested] == ["planner->joints"]
+    assert reply.requested[0].left_s is None
     impaired = {name for name, one in rig.directions.items() if one.active is not None}
     assert impaired == set(COMMANDS)
     assert [(e.link, e.active, e.delay_ms) for e in rig.told] == [
@@ -57,9 +57,9 @@ def test_what_has_its_time_ends_by_itself_and_tells_what_it_took(rig: Rig) -> No
     rig.orders.obey(Begin(LOSS))
     for number in range(100):
         rig.directions["knee_left->planner"].passes(number, 10)
-    end_ns = round(rig.injections.next_due)
-    assert not rig.injections.advance(end_ns - 1, end_ns - 1)
-    assert rig.injections.advance(end_ns, end_ns)
+    end_ns = round(rig.impairments.next_due)
+    assert not rig.impairments.advance(end_ns - 1, end_ns - 1)
+    assert rig.impairments.advance(end_ns, end_ns)
     assert all(one.active is None for one in rig.directions.values())
     (ended,) = [e for e in rig.told if not e.active and e.link == "knee_left->planner"]
     assert ended.passed + ended.lost == 100
@@ -70,15 +70,15 @@ def test_clearing_a_link_ends_what_touches_it_and_leaves_the_rest(rig: Rig) -> N
     rig.orders.obey(Begin(DELAY))
     rig.orders.obey(Begin(Inject(link="harness->planner", at=0.0, loss=0.1)))
     reply = rig.orders.obey(Clear("planner->knee_left"))
-    assert [row.link for row in reply.asked] == ["harness->planner"]
-    assert rig.orders.obey(Clear()).asked == ()
+    assert [row.link for row in reply.requested] == ["harness->planner"]
+    assert rig.orders.obey(Clear()).requested == ()
 
 
 def test_counts_are_told_while_it_lasts(rig: Rig) -> None:
     rig.orders.obey(Begin(LOSS))
     for number in range(50):
         rig.directions["planner->knee_left"].passes(number, 10)
-    (row,) = rig.orders.obey(List()).asked
+    (row,) = rig.orders.obey(List()).requested
     assert row.passed + row.lost == 50
     assert row.detail == "loss=50%"
     assert 0.0 < (row.left_s or 0.0) <= 2.0
@@ -103,24 +103,24 @@ def test_what_makes_no_sense_is_refused_and_nothing_changes(
 ) -> None:
     assert words in rig.orders.obey(request_).error
     assert rig.told == []
-    assert rig.injections.asked == {}
+    assert rig.impairments.requested == {}
 
 
 def test_what_is_asked_for_later_begins_and_ends_when_it_is_due(rig: Rig) -> None:
-    (row,) = rig.orders.obey(Begin(LOSS, in_s=5.0)).asked
+    (row,) = rig.orders.obey(Begin(LOSS, in_s=5.0)).requested
     assert 4.9 < row.in_s <= 5.0
     assert 6.9 < (row.left_s or 0.0) <= 7.0
     assert rig.told == []
-    begins_ns = round(rig.injections.next_due)
-    assert rig.injections.advance(begins_ns, begins_ns)
+    begins_ns = round(rig.impairments.next_due)
+    assert rig.impairments.advance(begins_ns, begins_ns)
     assert {one.active is None for one in rig.directions.values()} == {False}
-    assert rig.injections.next_due == begins_ns + 2_000_000_000
-    assert rig.orders.obey(List()).asked[0].hidden == ()
+    assert rig.impairments.next_due == begins_ns + 2_000_000_000
+    assert rig.orders.obey(List()).requested[0].hidden == ()
 
 
 def test_what_another_one_hides_is_told(rig: Rig) -> None:
     rig.orders.obey(Begin(LOSS))
-    first, second = rig.orders.obey(Begin(DELAY)).asked
+    first, second = rig.orders.obey(Begin(DELAY)).requested
     assert first.hidden == COMMANDS
     assert second.hidden == ()
 
@@ -155,7 +155,7 @@ def served(rig: Rig, tmp_path: Path) -> Iterator[tuple[Rig, Path]]:
 
 
 def test_the_client_asks_and_is_answered(served: tuple[Rig, Path]) -> None:
-    client = InjectorClient(served[1])
+    client = ProxyClient(served[1])
     assert client.list() == ()
     assert [row.detail for row in client.begin(DELAY)] == ["delay=30ms"]
     assert client.clear("all") == ()
@@ -174,28 +174,28 @@ def test_rubbish_is_answered_with_an_error_and_the_next_is_heard(
             first, second = (msgspec.json.decode(answers.readline(), type=Reply) for _ in range(2))
     assert "not understood" in first.error
     assert second == Reply()
-    assert InjectorClient(served[1]).list() == ()
+    assert ProxyClient(served[1]).list() == ()
 
 
 def test_without_an_injector_the_client_says_how_to_get_one(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match="xrl up --injectable"):
-        InjectorClient(tmp_path).list()
+        ProxyClient(tmp_path).list()
 
 
 def test_a_long_answer_comes_whole_to_one_who_reads_late(served: tuple[Rig, Path]) -> None:
     for _ in range(ASKED_MAX):
         served[0].orders.obey(Begin(LOSS))
-    asked = 200
+    requested = 200
     with socket.socket(socket.AF_UNIX) as asking:
         asking.settimeout(5.0)
         asking.connect(str(served[1] / SOCKET))
-        asking.sendall(asked * b'{"type":"list"}\n')
+        asking.sendall(requested * b'{"type":"list"}\n')
         time.sleep(0.1)
-        assert len(InjectorClient(served[1]).list()) == ASKED_MAX, "nobody waits for it"
+        assert len(ProxyClient(served[1]).list()) == ASKED_MAX, "nobody waits for it"
         with asking.makefile("rb") as answers:
-            for _ in range(asked):
+            for _ in range(requested):
                 reply = msgspec.json.decode(answers.readline(), type=Reply)
-                assert len(reply.asked) == ASKED_MAX
+                assert len(reply.requested) == ASKED_MAX
 
 
 def test_who_asks_in_one_piece_too_long_or_leaves_in_the_middle_is_let_go(
@@ -209,7 +209,7 @@ def test_who_asks_in_one_piece_too_long_or_leaves_in_the_middle_is_let_go(
                 asking.sendall(rubbish)
                 asking.shutdown(socket.SHUT_WR)
                 assert asking.recv(1) == b""
-    assert InjectorClient(served[1]).list() == ()
+    assert ProxyClient(served[1]).list() == ()
 
 
 LONG = Reply(error="x" * 1_000_000)
@@ -265,7 +265,9 @@ def test_those_who_ask_nothing_keep_nobody_else_out(tmp_path: Path) -> None:
         end.close()
 
 
-@pytest.mark.parametrize("answer", [b"nonsense\n", b'{"asked": 3}\n', b"\xff\n", b'{"asked": [\n'])
+@pytest.mark.parametrize(
+    "answer", [b"nonsense\n", b'{"requested": 3}\n', b"\xff\n", b'{"requested": [\n']
+)
 def test_an_answer_that_is_none_is_told_as_such(tmp_path: Path, answer: bytes) -> None:
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(tmp_path / SOCKET))
@@ -278,6 +280,6 @@ def test_an_answer_that_is_none_is_told_as_such(tmp_path: Path, answer: bytes) -
 
         thread = threading.Thread(target=serve)
         thread.start()
-        with pytest.raises(FleetError, match="none of an injector"):
-            InjectorClient(tmp_path).list()
+        with pytest.raises(FleetError, match="none of a network proxy"):
+            ProxyClient(tmp_path).list()
         thread.join()

@@ -1,12 +1,12 @@
-"""The injector's loop: let through what is due, do what is asked, begin and end what is due."""
+"""The loop: forward due batches, carry out commands, begin and end impairments."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from services.injector.commands import Orders
-from services.injector.event_loop import SocketWatch
-from services.injector.relay import Relay
+from services.network_proxy.commands import Orders
+from services.network_proxy.event_loop import SocketWatch
+from services.network_proxy.relay import Relay
 from shared.clock import NS_PER_S, machine_s, now_ns
 from shared.impairment_schedule import ImpairmentSchedule
 from shared.process import StopFlag
@@ -17,24 +17,28 @@ recorder, which listens for 0.1 s after its own stop."""
 
 
 def run(
-    watch: SocketWatch, relay: Relay, orders: Orders, injections: ImpairmentSchedule, stop: StopFlag
+    watch: SocketWatch,
+    relay: Relay,
+    orders: Orders,
+    impairments: ImpairmentSchedule,
+    stop: StopFlag,
 ) -> None:
     """Run until `stop`."""
     while not stop:
-        ready = watch.wait(_patience_s(relay, injections))
+        ready = watch.wait(_patience_s(relay, impairments))
         at_ns = now_ns()
         relay.let_out_due(at_ns)
         for call, events in ready:
             call(events, at_ns)
         relay.give_up(at_ns)
-        if injections.advance(at_ns, at_ns) or orders.changed:
+        if impairments.advance(at_ns, at_ns) or orders.changed:
             orders.changed = False
             relay.release(at_ns)
 
 
-def _patience_s(relay: Relay, injections: ImpairmentSchedule) -> float:
+def _patience_s(relay: Relay, impairments: ImpairmentSchedule) -> float:
     """Return how long there is nothing to do."""
     at_ns = now_ns()
     due_ns = relay.next_ns()
-    next_ns = injections.next_due if due_ns is None else min(due_ns, injections.next_due)
+    next_ns = impairments.next_due if due_ns is None else min(due_ns, impairments.next_due)
     return max(0.0, min(LOOK_S, machine_s((next_ns - at_ns) / NS_PER_S)))

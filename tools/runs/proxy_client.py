@@ -1,4 +1,4 @@
-"""Speaks to the injector of a fleet that is up."""
+"""Speaks to the network proxy of a fleet that is up."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Final
 import msgspec
 
 from shared.exceptions import FleetError
-from shared.injector_protocol import SOCKET, Begin, Clear, List, Reply, Request, RequestedImpairment
-from shared.scenario import Inject
+from shared.proxy_protocol import SOCKET, Begin, Clear, List, Reply, Request, RequestedImpairment
+from shared.scenarios import Inject
 from tools.supervision.run_dir import RunDir
 
 _PATIENCE_S: Final = 2.0
 _decode = msgspec.json.Decoder(Reply).decode
 
 
-class InjectorClient:
+class ProxyClient:
     """One question, one answer, one connection each."""
 
     def __init__(self, run_dir: Path) -> None:
@@ -28,7 +28,7 @@ class InjectorClient:
         """Put an impairment in force, in so many s; return all that is asked for then.
 
         Raises:
-            FleetError: the injector is not there, or refuses.
+            FleetError: the network proxy is not there, or refuses.
         """
         return self._ask(Begin(inject, in_s))
 
@@ -36,7 +36,7 @@ class InjectorClient:
         """End all that touches a link; return what is left.
 
         Raises:
-            FleetError: the injector is not there, or knows no such link.
+            FleetError: the network proxy is not there, or knows no such link.
         """
         return self._ask(Clear(link))
 
@@ -44,7 +44,7 @@ class InjectorClient:
         """Return what is asked for.
 
         Raises:
-            FleetError: the injector is not there.
+            FleetError: the network proxy is not there.
         """
         return self._ask(List())
 
@@ -59,19 +59,22 @@ class InjectorClient:
         except (FileNotFoundError, ConnectionRefusedError):
             raise FleetError(self._why_absent()) from None
         except OSError as error:
-            out = "`xrl kill injector --signal CONT` if it was stopped, or `xrl kill injector`"
-            said = f"{self._path}: the injector does not answer: {error}; {out}"
+            kill = "`xrl kill network_proxy`"
+            out = f"{kill[:-1]} --signal CONT` if it was stopped, or {kill}"
+            said = f"{self._path}: the network proxy does not answer: {error}; {out}"
             raise FleetError(said) from None
         if not line:
-            raise FleetError(f"{self._path}: the injector ended without an answer; see its log")
+            raise FleetError(
+                f"{self._path}: the network proxy ended without an answer; see its log"
+            )
         try:
             reply = _decode(line)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            said = f"{self._path}: the answer is none of an injector of this version: {error}"
+            said = f"{self._path}: the answer is none of a network proxy of this version: {error}"
             raise FleetError(said) from None
         if reply.error:
             raise FleetError(f"refused: {reply.error}")
-        return reply.asked
+        return reply.requested
 
     def _why_absent(self) -> str:
         """Return why nobody listens there, and the way out."""
@@ -81,12 +84,12 @@ class InjectorClient:
             return (
                 f"no fleet is up in {folder.path}; `xrl up --injectable` starts one to inject into"
             )
-        if "injector" not in manifest.services:
+        if "network_proxy" not in manifest.services:
             return (
-                f"the fleet in {folder.path} was started without an injector; `xrl down`, then "
+                f"the fleet in {folder.path} was started without a network proxy; `xrl down`, then "
                 "`xrl up --injectable`"
             )
         return (
-            f"the injector in {folder.path} is down, or being started again, and all that was done "
-            "to links is over; `xrl status`, `xrl start injector`"
+            f"the network proxy in {folder.path} is down or restarting, and every impairment "
+            "is over; `xrl status`, `xrl start network_proxy`"
         )

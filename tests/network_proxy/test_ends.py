@@ -6,9 +6,9 @@ import socket
 
 import pytest
 
-from services.injector.relay import LINKS_MAX
+from services.network_proxy.relay import LINKS_MAX
 from shared.impairment import Impairment
-from tests.injector.rig import LEASE_NS, MESSAGE, WAIT_S, Rig, batch, heard, numbers
+from tests.network_proxy.rig import LEASE_NS, MESSAGE, WAIT_S, Rig, batch, heard, numbers
 
 CUT = Impairment(partition=True)
 CUT_STREAM = Impairment(partition=True, ordered=True)

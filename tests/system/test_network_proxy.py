@@ -1,4 +1,4 @@
-"""The injector as a process, between two real sessions of the bus."""
+"""The network proxy as a process, between two real sessions of the bus."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from shared import config_file, topics
 from shared.bus import Publisher, Session, Stream, open_session
 from shared.clock import NS_PER_MS, now_ns
 from shared.codec import Decoder
-from shared.injector_protocol import SOCKET
 from shared.messages import JointState
 from shared.process import DEFAULT_CONFIG
-from shared.scenario import Inject
+from shared.proxy_protocol import SOCKET
+from shared.scenarios import Inject
 from shared.traces import LinkEvent
 from tests.recorder.runs import sample
 from tools import cli
-from tools.runs.injector_client import InjectorClient
+from tools.runs.proxy_client import ProxyClient
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 
@@ -40,11 +40,11 @@ SPARE = 12
 
 
 class Rig:
-    """A joint service's session, a planner's that dials it through the injector, and that."""
+    """A joint service's session, a planner's that dials it through the network proxy, and that."""
 
     def __init__(self, run_dir: Path, knee: Session, planner: Session, tool: Session) -> None:
         self.run_dir = run_dir
-        self.client = InjectorClient(run_dir)
+        self.client = ProxyClient(run_dir)
         self._events = tool.stream([topics.LINK_EVENT.key(ROBOT.name)])
         self._put: Publisher[JointState] = knee.publisher(topics.JOINT_STATE, JointState, KNEE)
         self._stream: Stream = planner.stream([topics.JOINT_STATE.key(ROBOT.name, KNEE)])
@@ -56,24 +56,22 @@ class Rig:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "services.injector", "--run-dir", str(self.run_dir)]
-        self.injector = subprocess.Popen(
-            [*command, "--seed", "3"], stderr=subprocess.PIPE, text=True
-        )
+        command = [sys.executable, "-m", "services.network_proxy", "--run-dir", str(self.run_dir)]
+        self.proxy = subprocess.Popen([*command, "--seed", "3"], stderr=subprocess.PIPE, text=True)
 
     def stop(self) -> None:
-        """End the injector as the supervisor does; what it leaves is what it should."""
-        if self.injector.returncode is not None:
+        """End the network proxy as the supervisor does; what it leaves is what it should."""
+        if self.proxy.returncode is not None:
             return
-        self.injector.send_signal(signal.SIGTERM)
-        said = self.injector.communicate(timeout=PATIENCE_S)[1]
-        assert self.injector.returncode == 0, said
+        self.proxy.send_signal(signal.SIGTERM)
+        said = self.proxy.communicate(timeout=PATIENCE_S)[1]
+        assert self.proxy.returncode == 0, said
         assert not list(self.run_dir.glob("through-*"))
         assert not (self.run_dir / SOCKET).exists()
 
     def kill(self) -> None:
-        self.injector.kill()
-        self.injector.communicate()
+        self.proxy.kill()
+        self.proxy.communicate()
 
     def send(self, count: int) -> list[tuple[int, float]]:
         """Send states at 250 Hz, listening; return what is heard, and for a moment after."""
@@ -152,7 +150,7 @@ def numbers(rows: list[tuple[int, float]]) -> list[int]:
 
 
 def descriptors(rig: Rig) -> int:
-    return len(list(Path(f"/proc/{rig.injector.pid}/fd").iterdir()))
+    return len(list(Path(f"/proc/{rig.proxy.pid}/fd").iterdir()))
 
 
 def test_unimpaired_nothing_is_lost_and_with_a_delay_it_comes_so_much_later(rig: Rig) -> None:
@@ -202,7 +200,7 @@ def test_a_stream_keeps_the_order_and_loses_nothing(rig: Rig) -> None:
 
 
 def test_a_partition_is_total_and_once_it_is_over_the_link_is_whole_again(rig: Rig) -> None:
-    """Longer than the lease: the link itself is given up, and made anew through the injector."""
+    """Longer than the lease: Zenoh gives the link up and dials again through the proxy."""
     inject(rig, partition=True)
     assert rig.send(500) == []
     rig.client.clear("all")
@@ -222,7 +220,7 @@ def test_what_a_partition_held_on_a_stream_that_is_given_up_is_told_as_lost(rig:
 def test_a_partition_may_last_though_all_dial_again_and_again(rig: Rig) -> None:
     """Both ways, with few descriptors, for many dials: it neither ends early nor kills."""
     full = descriptors(rig) + SPARE
-    resource.prlimit(rig.injector.pid, resource.RLIMIT_NOFILE, (full, full))
+    resource.prlimit(rig.proxy.pid, resource.RLIMIT_NOFILE, (full, full))
     begun = time.monotonic()
     rig.client.begin(Inject(link="all", at=0.0, duration=12.0, partition=True))
     most = 0
@@ -231,7 +229,7 @@ def test_a_partition_may_last_though_all_dial_again_and_again(rig: Rig) -> None:
         assert not heard or time.monotonic() > begun + 12.0
         most = max(most, descriptors(rig))
     assert most < full, "none was turned away for want of one"
-    assert rig.injector.poll() is None
+    assert rig.proxy.poll() is None
     rig.wait(rig.linked)
     assert time.monotonic() > begun + 12.0
     assert len(rig.send_to_the_last(100)) == 100

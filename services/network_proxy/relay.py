@@ -8,10 +8,10 @@ from functools import partial
 from itertools import count
 from typing import Final, NamedTuple
 
-from services.injector.connection import Connection
-from services.injector.direction import Flow, Waiting
-from services.injector.event_loop import READ, SocketWatch
-from services.injector.proxy_endpoint import Place
+from services.network_proxy.connection import Connection
+from services.network_proxy.direction import Flow, Waiting
+from services.network_proxy.event_loop import READ, SocketWatch
+from services.network_proxy.proxy_endpoint import Place
 from shared.impairment import Direction
 
 LINKS_MAX: Final = 16

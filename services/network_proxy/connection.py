@@ -6,8 +6,8 @@ import socket
 from collections.abc import Callable
 from functools import partial
 
-from services.injector.direction import Flow, Waiting
-from services.injector.event_loop import READ, WRITE, Ready, SocketWatch
+from services.network_proxy.direction import Flow, Waiting
+from services.network_proxy.event_loop import READ, WRITE, Ready, SocketWatch
 from shared.impairment import Direction
 
 

@@ -1,4 +1,4 @@
-"""`python -m services.injector`: a bad network on purpose, between planner, joints and sensors.
+"""`python -m services.network_proxy`: a bad network on purpose.
 
 They dial it (`--injected`) in place of one another; `xrl inject` says what it is to do.
 """
@@ -7,22 +7,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.injector.commands import Orders
-from services.injector.control import ControlSocket
-from services.injector.event_loop import SocketWatch
-from services.injector.listener import SocketListener
-from services.injector.loop import run
-from services.injector.proxy_endpoint import Place, address_of
-from services.injector.relay import Relay
+from services.network_proxy.commands import Orders
+from services.network_proxy.control import ControlSocket
+from services.network_proxy.event_loop import SocketWatch
+from services.network_proxy.listener import SocketListener
+from services.network_proxy.loop import run
+from services.network_proxy.proxy_endpoint import Place, address_of
+from services.network_proxy.relay import Relay
 from shared import bus, log, process, topics
 from shared.clock import NS_PER_MS, now_ns
 from shared.config import RobotConfig, expand
 from shared.config_file import load
 from shared.impairment import Direction
 from shared.impairment_schedule import ImpairmentSchedule
-from shared.injector_protocol import SOCKET
 from shared.links import DIRECTIONS, PAIRS, Pair, endpoint_through
 from shared.priority import raise_priority
+from shared.proxy_protocol import SOCKET
 from shared.traces import LinkEvent
 
 FIFO_PRIORITY = 15
@@ -32,10 +32,10 @@ _UNIX = "unixsock-stream/"
 
 def main() -> int:
     """Run until SIGTERM or SIGINT; return the exit code."""
-    parser = process.service_parser(__doc__ or "", "python -m services.injector")
+    parser = process.service_parser(__doc__ or "", "python -m services.network_proxy")
     parser.add_argument("--seed", type=int, default=0, help="of what is lost, and how late (0)")
     arguments = parser.parse_args()
-    logger = log.setup("injector")
+    logger = log.setup("network_proxy")
     config = load(arguments.config)
     stop = process.StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
@@ -43,20 +43,20 @@ def main() -> int:
     places = [_place(pair, config, arguments.run_dir) for pair in PAIRS]
     watch = SocketWatch()
     relay = Relay(places, directions, watch, round(config.bus.lease_ms * NS_PER_MS))
-    with bus.open_session(config, "injector", arguments.run_dir) as session:
-        injections = ImpairmentSchedule(
+    with bus.open_session(config, "network_proxy", arguments.run_dir) as session:
+        impairments = ImpairmentSchedule(
             directions, session.publisher(topics.LINK_EVENT, LinkEvent).put
         )
-        orders = Orders(injections)
+        orders = Orders(impairments)
         control = ControlSocket(arguments.run_dir / SOCKET, orders.obey, watch)
         logger.info("between %d pairs, priority %s", len(places), granted)
         process.freeze_garbage()
         try:
-            run(watch, relay, orders, injections, stop)
+            run(watch, relay, orders, impairments, stop)
         finally:
             control.close()
             relay.close()
-            injections.clear("all", now_ns())  # the log is to have what each of them did
+            impairments.clear("all", now_ns())  # the log is to have what each of them did
             watch.close()
     logger.info(
         "stopped: %d connections to a process that was not there, %d that stood still",

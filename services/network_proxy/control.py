@@ -1,4 +1,4 @@
-"""The injector's socket: requests in, answers out. Never waits for anybody."""
+"""The network proxy's socket: requests in, answers out. Never waits for anybody."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Final
 
 import msgspec
 
-from services.injector.event_loop import READ, WRITE, SocketWatch
-from services.injector.listener import SocketListener
-from shared.injector_protocol import LINE_MAX, Reply, Request
+from services.network_proxy.event_loop import READ, WRITE, SocketWatch
+from services.network_proxy.listener import SocketListener
+from shared.proxy_protocol import LINE_MAX, Reply, Request
 
 ASKERS_MAX: Final = 16
 """Who asks at once; one more, and the one that came first has to go."""
@@ -67,7 +67,7 @@ class ControlSocket:
         """Listen.
 
         Args:
-            path: of the socket; what a killed injector left there is removed.
+            path: of the socket; what a killed network proxy left there is removed.
             obey: carries a request out.
             watch: of the loop.
 

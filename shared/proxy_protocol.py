@@ -1,4 +1,4 @@
-"""What is said to the injector on its socket, and what it answers: one JSON line each."""
+"""What is said to the network proxy on its socket, and what it answers: one JSON line each."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Final, TypeAlias
 import msgspec
 
 from shared.links import directions_of
-from shared.scenario import Inject
+from shared.scenarios import Inject
 
-SOCKET: Final = "injector.sock"
+SOCKET: Final = "network_proxy.sock"
 """Name of the socket in the run directory of the fleet."""
 LINE_MAX: Final = 65536
 
@@ -19,7 +19,7 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
 
     inject: Inject
     in_s: float = 0.0
-    """From now, s; the injector waits, not the one that asks."""
+    """From now, s; the network proxy waits, not the one that asks."""
 
 
 class Clear(msgspec.Struct, frozen=True, tag="clear"):
@@ -72,5 +72,5 @@ class Reply(msgspec.Struct, frozen=True):
     """The answer to every request."""
 
     error: str = ""
-    asked: tuple[RequestedImpairment, ...] = ()
+    requested: tuple[RequestedImpairment, ...] = ()
     """What is asked for after the request was carried out, the newest last."""

@@ -1,4 +1,4 @@
-"""Where the injector dials to, and what it does when nothing is left to dial with."""
+"""Where the network proxy dials to, and what it does when nothing is left to dial with."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from services.injector.listener import SocketListener
-from services.injector.proxy_endpoint import Address, Place, address_of
+from services.network_proxy.listener import SocketListener
+from services.network_proxy.proxy_endpoint import Address, Place, address_of
 from shared.exceptions import BusError
-from tests.injector.rig import MESSAGE, PAIR, WAIT_S, Rig, batch, heard, listening
+from tests.network_proxy.rig import MESSAGE, PAIR, WAIT_S, Rig, batch, heard, listening
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def tcp(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
         made.close()
 
 
-def hear(rig: Rig, end: socket.socket, size: int) -> bytes:
+def receive(rig: Rig, end: socket.socket, size: int) -> bytes:
     got = b""
     for _ in range(500):
         rig.turn()
@@ -84,8 +84,8 @@ def test_over_tcp_everything_passes_both_ways_to_the_end(tcp: Rig) -> None:
     sent = b"".join(batch(MESSAGE + bytes(500), n) for n in range(100))
     planner.send(sent)
     knee.send(batch(MESSAGE, 7))
-    assert hear(tcp, knee, len(sent)) == sent
-    assert hear(tcp, planner, 1) == batch(MESSAGE, 7)
+    assert receive(tcp, knee, len(sent)) == sent
+    assert receive(tcp, planner, 1) == batch(MESSAGE, 7)
     planner.close()
     tcp.turn()
     knee.settimeout(WAIT_S)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.injector.rig import Rig
+from tests.network_proxy.rig import Rig
 
 
 @pytest.fixture

@@ -1,1 +1,0 @@
-"""The injector: a bad network on purpose, on the wire between real processes."""

@@ -1,0 +1,1 @@
+"""The network proxy: a bad network on purpose, on the wire between real processes."""
