@@ -44,5 +44,5 @@ def test_a_fleet_without_injector_has_to_go_down_first(run_dir: Path) -> None:
 
 def test_an_injector_that_is_down_is_said_so_and_what_went_with_it(run_dir: Path) -> None:
     pretend_up(run_dir, injected=True)
-    with pytest.raises(FleetError, match="all that was done to links is over; `xrl status`"):
+    with pytest.raises(FleetError, match="every impairment is over; `xrl status`"):
         ProxyClient(run_dir).list()

@@ -84,9 +84,9 @@ def test_a_memory_is_compared_value_by_value() -> None:
         return PlannerCheckpoint(t_ns=1, seq=1, session=3, snapshot=text)
 
     comparison = Comparison()
-    comparison.take("planner/memory", 4, snapshot(2.0), snapshot(3.0))
+    comparison.take("planner/checkpoint", 4, snapshot(2.0), snapshot(3.0))
     assert comparison.first is not None
-    assert comparison.first.field == "memory.law.q[1]"
+    assert comparison.first.field == "snapshot.law.q[1]"
 
 
 def test_a_long_value_is_cut_in_words() -> None:

@@ -136,7 +136,7 @@ def _apart(a: Message, b: Message) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _walk(name: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
-    if name == "memory" and isinstance(a, str) and isinstance(b, str) and a and b:
+    if name == "snapshot" and isinstance(a, str) and isinstance(b, str) and a and b:
         a, b = msgspec.json.decode(a), msgspec.json.decode(b)
     if isinstance(a, dict) and isinstance(b, dict):
         for field, value in a.items():

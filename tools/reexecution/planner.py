@@ -124,5 +124,5 @@ class PlannerExecution:
         if snapshot is not None and outcome.exact:
             text = _encode(planner.snapshot()).decode()
             compare(
-                "planner/memory", tick, snapshot, msgspec.structs.replace(snapshot, snapshot=text)
+                "planner/checkpoint", tick, snapshot, msgspec.structs.replace(snapshot, snapshot=text)
             )
