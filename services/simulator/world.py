@@ -44,7 +44,7 @@ class World:
         self.data = mujoco.MjData(self.model)
         self.timestep = body.timestep
         self._steps = body.steps
-        self._operator = Operator(body.hand, body.harness_point)
+        self.operator = Operator(body.hand, body.harness_point)
         self._wearer = Wearer(body.person)
         joints = [self.model.joint(name) for name in JOINTS]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])
@@ -266,7 +266,7 @@ class World:
             self._wearer.take_hold(height - wanted.height - z)
             above, rising = self._wearer.motion()
             height, rate = height - above, rate - rising
-            self.hand = self._operator.force(wanted, height, rate, math.atan2(-r[6], r[8]), w_y)
+            self.hand = self.operator.force(wanted, height, rate, math.atan2(-r[6], r[8]), w_y)
         self._wearer.step(self._dt, self.hand.force_z, wanted.assist)
         self.load_n = self._wearer.load_n
         self.push = push_at(self._scenario, t) if t >= 0.0 else (0.0, 0.0, 0.0)

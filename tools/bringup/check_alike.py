@@ -88,7 +88,7 @@ def _measured_rows(name: str, boards: Boards) -> list[Finding]:
         return []
     usual = median(found.values())
     rows = []
-    fix = "look at its three phase wires; calibrate it again (deploy/bring-up.md, section 5)"
+    fix = "look at its three phase wires; calibrate it again (docs/bring-up.md, section 5)"
     for (module, axis), value in found.items():
         subject, words = f"{module}.{axis}", describe_value(value)
         if not value > 0.0:

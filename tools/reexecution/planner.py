@@ -123,6 +123,5 @@ class PlannerExecution:
         snapshot = self._memories.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:
             text = _encode(planner.snapshot()).decode()
-            compare(
-                "planner/checkpoint", tick, snapshot, msgspec.structs.replace(snapshot, snapshot=text)
-            )
+            mine_then = msgspec.structs.replace(snapshot, snapshot=text)
+            compare("planner/checkpoint", tick, snapshot, mine_then)

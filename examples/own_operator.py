@@ -1,0 +1,45 @@
+"""Write your own operator: a hand that leads, but lets the robot have its way above 12 N.
+
+The simulated person is a class with one method, `force`. No controller sees it; they meet only the
+wrench at the harness. Run it: python examples/own_operator.py
+"""
+
+from __future__ import annotations
+
+import math
+
+from services.simulator.operator import HandForce, Operator
+from shared.config_file import load
+from shared.process import DEFAULT_CONFIG
+from shared.scenarios import Keyframe, Lead, Scenario
+from tools.runs.lockstep import Lockstep
+
+LIMIT = 12.0  # N
+
+
+class GentleHand(Operator):
+    """The shipped hand, softened: its force along z bends towards a limit."""
+
+    def force(
+        self, wanted: Lead, height: float, rate: float, pitch: float, pitch_rate: float
+    ) -> HandForce:
+        """Return the hand's force; see `Operator.force`."""
+        firm = super().force(wanted, height, rate, pitch, pitch_rate)
+        return HandForce(LIMIT * math.tanh(firm.force_z / LIMIT), firm.moment_pitch)
+
+
+def main() -> None:
+    """Lead a squat with both hands and print how far each came, and with what force."""
+    robot = load(DEFAULT_CONFIG)
+    down = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.5, height=0.988))
+    scenario = Scenario(name="gentle", about="down by 0.2 m", duration=3.5, keyframe=down)
+    for name, hand in (("shipped", Operator), ("gentle", GentleHand)):
+        fleet = Lockstep(robot, scenario, seed=1)
+        fleet.world.operator = hand(robot.simulation.operator, robot.geometry.harness_point)
+        rows = [row for row in fleet.run() if row.scenario_s >= 0.0]
+        peak = max(abs(row.operator_force[2]) for row in rows)
+        print(f"{name:8} hand: {peak:5.1f} N at most, torso at {rows[-1].torso[2]:.3f} m")
+
+
+if __name__ == "__main__":
+    main()

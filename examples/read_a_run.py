@@ -1,0 +1,32 @@
+"""Read a run into NumPy: the COM's range and the age of the commands that a knee used.
+
+Run it: xrl sim --out out/first && python examples/read_a_run.py out/first/run.mcap
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from shared import topics
+from tools.runs.run_log import read_run
+
+
+def main(path: Path) -> None:
+    """Print a summary of a finished, killed or split log."""
+    log = read_run(path)
+    truth = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
+    t = np.array([row.scenario_s for row in truth])  # (n,), s
+    com = np.array([row.com for row in truth])  # (n, 3), m, world
+    states = log.messages(topics.JOINT_STATE, "knee_left")
+    age = np.array([row.age_ns for row in states if row.age_ns >= 0]) / 1e6  # ms
+    print(f"{t[-1]:.1f} s, COM x {1e3 * com[:, 0].min():.1f} .. {1e3 * com[:, 0].max():.1f} mm")
+    print(f"knee_left: {len(states)} states, age {np.median(age):.1f} ms in the median")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: read_a_run.py RUN.mcap")
+    main(Path(sys.argv[1]))

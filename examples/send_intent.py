@@ -1,0 +1,41 @@
+"""Send an intent over Zenoh: ask a fleet that is up to carry 40 N of the person for five seconds.
+
+First `xrl up`; when `xrl status` shows the planner leading: python examples/send_intent.py
+An intent fades out once it is no longer repeated, so it is published at 50 Hz.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from shared import topics
+from shared.bus import open_session
+from shared.clock import now_ns
+from shared.config_file import load
+from shared.messages import OperatorIntent, PlannerStatus
+from shared.process import default_run_dir
+from tools.supervision.supervise import SupervisedFleet
+
+FOR_S, ASSIST_N = 5.0, 40.0
+
+
+def main(run_dir: Path) -> None:
+    """Publish the intent and print what the planner gives."""
+    fleet = SupervisedFleet.attach(run_dir)
+    robot = load(Path(fleet.manifest.config))
+    with open_session(robot, "assist", run_dir) as session:
+        intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
+        statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
+        end, given = time.monotonic() + FOR_S, 0.0
+        for seq in range(round(FOR_S * 50)):
+            intents.put(OperatorIntent(t_ns=now_ns(), seq=seq, assist_n=ASSIST_N, source="example"))
+            status = statuses.take()
+            if status is not None:
+                given = status.assist_n
+            time.sleep(max(0.0, min(0.02, end - time.monotonic())))
+    print(f"the planner gives {given:.0f} of {ASSIST_N:.0f} N")
+
+
+if __name__ == "__main__":
+    main(default_run_dir())

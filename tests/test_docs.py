@@ -1,0 +1,88 @@
+"""The documentation: generated pages are up to date, and every reference leads somewhere."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tools.reference.__main__ import FOLDER, PAGES
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+_PAGE = re.compile(r"docs/([\w/-]+\.md)(?:#([\w-]+))?")
+_PATH = re.compile(r"`((?:services|shared|tools|tests|deploy|docs|examples)/[\w./-]+?)/?`")
+_OLD = re.compile(r"design,?\s+(?:#\s+)?sections?\s+\d", re.IGNORECASE)
+
+
+def _tracked(*suffixes: str) -> Iterator[Path]:
+    names = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True,
+        check=True,
+    ).stdout  # fmt: skip
+    for name in names.splitlines():
+        path = ROOT / name
+        if path.suffix in suffixes and path.is_file() and path != Path(__file__):
+            yield path
+
+
+def _slug(heading: str) -> str:
+    """Return a heading's anchor, as GitHub and MyST make it."""
+    kept = re.sub(r"[^\w\- ]", "", heading.strip().lower().replace("`", ""))
+    return kept.replace(" ", "-")
+
+
+def _anchors(page: Path) -> set[str]:
+    text = page.read_text(encoding="utf-8")
+    labels = set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
+    return labels | {_slug(title) for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE)}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_generated_page_is_up_to_date(name: str) -> None:
+    path = FOLDER / name
+    assert path.read_text(encoding="utf-8") == PAGES[name](), "run `python -m tools.reference`"
+
+
+def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:
+    broken = []
+    for path in _tracked(".py", ".md", ".toml", ".sh"):
+        for page, anchor in _PAGE.findall(path.read_text(encoding="utf-8")):
+            target = DOCS / page
+            if not target.exists() or (anchor and anchor not in _anchors(target)):
+                broken.append(f"{path.relative_to(ROOT)}: docs/{page}#{anchor}")
+    assert broken == []
+
+
+def test_no_design_section_is_left() -> None:
+    found = [
+        str(path.relative_to(ROOT))
+        for path in _tracked(".py", ".md", ".toml", ".sh")
+        if _OLD.search(path.read_text(encoding="utf-8"))
+    ]
+    assert found == []
+
+
+def test_every_file_that_a_page_names_exists() -> None:
+    missing = [
+        f"{page.relative_to(ROOT)}: {name}"
+        for page in [*DOCS.rglob("*.md"), ROOT / "README.md"]
+        for name in _PATH.findall(page.read_text(encoding="utf-8"))
+        if not (ROOT / name).exists()
+    ]
+    assert missing == []
+
+
+def test_the_pages_build_without_a_warning(tmp_path: Path) -> None:
+    made = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", DOCS, tmp_path],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert made.returncode == 0, made.stderr
+    page = (tmp_path / "law.html").read_text(encoding="utf-8")
+    sources = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="(https?:[^"]+)"', page)
+    assert sources == [], "the page must open without a network"

@@ -1,0 +1,79 @@
+"""Each script in examples/ runs as a user would run it, and does what it says."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+
+
+def run(name: str, *arguments: str) -> str:
+    """Return what a script prints."""
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / name, *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_example_is_listed_and_tested() -> None:
+    scripts = {path.name for path in EXAMPLES.glob("*.py")}
+    listed = {name for name in scripts if f"`{name}`" in (EXAMPLES / "README.md").read_text()}
+    here = Path(__file__)
+    tests = here.read_text() + (here.parent / "system/test_examples_live.py").read_text()
+    assert listed == scripts == {name for name in scripts if f'"{name}"' in tests}
+
+
+def test_the_drive_of_its_own_holds_its_target_under_load() -> None:
+    assert run("own_drive.py").startswith("ARMED: theta -0.99")
+
+
+def test_one_module_holds_and_gives_back_what_the_load_takes() -> None:
+    lines = run("hold_one_module.py").splitlines()
+    assert all("HOLD" in line for line in lines)
+    assert "torque  -20.00" in lines[2]
+    assert "theta  -1.0000" in lines[-1]
+
+
+def test_the_robot_in_virtual_time_holds_while_the_planner_is_dead_and_is_led_again() -> None:
+    lines = run("virtual_planner.py").splitlines()
+    assert lines[-1] == "stood"
+    assert "HHHHHH" in lines[2]
+    assert lines[-2].endswith("TTTTTT")
+
+
+def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
+    shipped, gentle = (line.split() for line in run("own_operator.py").splitlines())
+    force, height = 2, 8
+    assert float(gentle[force]) <= 12.0 < float(shipped[force])
+    assert float(gentle[height]) == pytest.approx(float(shipped[height]), abs=0.005)
+
+
+def test_a_run_is_read_into_numpy(tmp_path: Path) -> None:
+    simulate = [
+        sys.executable,
+        "-m",
+        "tools.cli",
+        "sim",
+        "--duration",
+        "1",
+        "--out",
+        tmp_path / "run",
+    ]
+    subprocess.run(simulate, cwd=ROOT, capture_output=True, check=True)
+    lines = run("read_a_run.py", str(tmp_path / "run" / "run.mcap")).splitlines()
+    assert lines[0].startswith("1.0 s, COM x ")
+    assert "states, age 4." in lines[1]
+
+
+def test_without_a_log_the_reader_says_how_to_call_it() -> None:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "read_a_run.py"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "usage: read_a_run.py RUN.mcap" in done.stderr

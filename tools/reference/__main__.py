@@ -1,0 +1,47 @@
+"""`python -m tools.reference`: writes the generated pages of the documentation, or checks them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from tools.reference import faults, modes, robot_file, topics, verbs
+
+FOLDER: Final = Path(__file__).resolve().parents[2] / "docs" / "reference"
+PAGES: Final[dict[str, Callable[[], str]]] = {
+    "topics.md": topics.page,
+    "robot-file.md": robot_file.page,
+    "verbs.md": verbs.page,
+    "faults.md": faults.page,
+    "modes.md": modes.page,
+    "modes.svg": modes.diagram,
+}
+"""Generated files, by name."""
+
+
+def main() -> int:
+    """Write the pages; with `--check` say which differ and exit with 1."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.reference",
+        description="Write docs/reference from the code. A test holds that it is up to date.",
+    )
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if old")
+    args = parser.parse_args()
+    old = []
+    for name, make in PAGES.items():
+        path, text = FOLDER / name, make()
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            old.append(name)
+            if not args.check:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text, encoding="utf-8")
+    for name in old:
+        print(f"{'out of date' if args.check else 'written'}: docs/reference/{name}")
+    return 1 if args.check and old else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

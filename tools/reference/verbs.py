@@ -1,0 +1,56 @@
+"""The page of the command line: each verb's own help, from its parser."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+from typing import Any, Final
+
+from tools.verbs import VERBS
+
+_WIDTH: Final = "96"
+_INTRODUCTION: Final = """\
+# Verbs
+
+`xrl` is `.venv/bin/xrl`; `./deploy/demo`, `up`, `down`, `status` and `kill` are the same verbs with
+the environment made first. Exit codes: 0 good; 1 the robot fell, or something is not as it should
+be; 2 bad input, or a fleet that cannot be started; 130 interrupted.
+"""
+
+
+def page() -> str:
+    """Return the page in Markdown."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = _WIDTH  # argparse wraps by it
+    try:
+        parsers = _parsers()
+    finally:
+        if before is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before
+    lines = [_INTRODUCTION, "| verb | what it does |", "|---|---|"]
+    lines += [f"| [`{verb.name}`](#xrl-{verb.name}) | {verb.help} |" for verb in VERBS]
+    for name, text in parsers:
+        lines += ["", f"## xrl {name}", "", "```text", text.rstrip(), "```"]
+    return "\n".join(lines) + "\n"
+
+
+def _parsers() -> list[tuple[str, str]]:
+    parser = argparse.ArgumentParser(prog="xrl")
+    subparsers = parser.add_subparsers()
+    for verb in VERBS:
+        importlib.import_module(verb.module).add_parser(subparsers)
+    found = []
+    for verb in VERBS:
+        one = subparsers.choices[verb.name]
+        found.append((verb.name, one.format_help()))
+        found += [(f"{verb.name} {name}", sub.format_help()) for name, sub in _below(one)]
+    return found
+
+
+def _below(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.ArgumentParser]]:
+    actions = parser._subparsers._group_actions if parser._subparsers else []  # noqa: SLF001
+    choices: list[Any] = [action.choices for action in actions]  # of sub-parsers it is a dictionary
+    return [(name, sub) for found in choices for name, sub in found.items()]
