@@ -156,7 +156,7 @@ LONG_FILES = {
 }
 """Files of 350 lines and more, each with the reason."""
 
-FOLDERS = {"services", "shared", "deploy", "tests", "tools", "docs", ".ci"}
+FOLDERS = {"services", "shared", "deploy", "tests", "tools", "docs", "examples", ".ci"}
 
 
 def service_of(file: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import Progress
 
 from services.recorder.files import SUFFIX
 from services.recorder.scene import extended
@@ -17,6 +18,7 @@ from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
 from tools.report import write
 from tools.reports import scene
+from tools.runs.moving_picture import write_gif
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.verbs import Subparsers, add_verb
@@ -35,6 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
         """
         xrl export out/a/run.mcap --scene
         xrl export out/a/run.mcap --scene -o shown.mcap --layout layout.json
+        xrl export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
         """,
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a run's record; it is not touched")
@@ -58,13 +61,19 @@ def add_parser(subparsers: Subparsers) -> None:
         help="also write Foxglove's layout for this robot's name (deploy/foxglove/xrl.json "
         "is the one for `xrl`)",
     )
+    parser.add_argument(
+        "--gif",
+        type=Path,
+        metavar="FILE",
+        help="also draw the robot from the side and the front, as an animated picture",
+    )
     parser.add_argument("--force", action="store_true", help="replace what exists")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write what was asked for."""
-    if not args.scene and args.layout is None:
-        raise RunError("say what to write: --scene, --layout FILE, or both")
+    if not args.scene and args.layout is None and args.gif is None:
+        raise RunError("say what to write: --scene, --layout FILE, --gif FILE, or several of them")
     path: Path = args.file
     if path.is_dir():
         raise RunError(f"{path}: is a directory; give one of its files")
@@ -75,11 +84,22 @@ def run(args: argparse.Namespace) -> int:
         _free(out, path, force=args.force)
         count = export_scene(log, robot_of(log), out)
         console.print(f"[bold]{escape(str(out))}[/]: {count} messages", soft_wrap=True)
+    if args.gif is not None:
+        _free(args.gif, path, force=args.force)
+        _draw(log, args.gif, console)
     if args.layout is not None:
         _free(args.layout, path, force=args.force)
         write(args.layout, json.dumps(layout_for(log.robot), indent=2).encode() + b"\n")
         console.print(f"[bold]{escape(str(args.layout))}[/]: import it in Foxglove")
     return 0
+
+
+def _draw(log: RunLog, out: Path, console: Console) -> None:
+    """Draw the run's moving picture, with progress."""
+    with Progress(console=console, transient=True) as shown:
+        bar = shown.add_task("drawing", total=1.0)
+        count = write_gif(log, robot_of(log), out, lambda part: shown.update(bar, completed=part))
+    console.print(f"[bold]{escape(str(out))}[/]: {count} frames", soft_wrap=True)
 
 
 def export_scene(log: RunLog, robot: RobotConfig, out: Path) -> int:
