@@ -53,7 +53,7 @@ def force_up(force: Vector3, roll: float, pitch: float) -> float:
     return math.sin(roll) * y + math.cos(roll) * (z * math.cos(pitch) - x * math.sin(pitch))
 
 
-def in_world(wrench: Wrench, roll: float, pitch: float) -> tuple[Array, float]:
+def wrench_in_world(wrench: Wrench, roll: float, pitch: float) -> tuple[Array, float]:
     """Return the person's force in the torso's plane (3,), N, world but for yaw, and moment, N m.
 
     Args:

@@ -65,7 +65,7 @@ def choose(
         rough = DynamicCertificate(_rough(config), asked)
         found = _descend(rough, best, progress)
         progress("every pose and drivetrain")
-        verdict = full.worst_in_track(found, enough=0.0)
+        verdict = full.worst_in_track(found, stop_above=0.0)
         if verdict.stable:
             return found
         if any(node is verdict.condition.node for node in asked):
@@ -97,7 +97,7 @@ def _descend(rough: DynamicCertificate, design: Design, progress: Progress) -> D
         before = cost
         for candidate in _neighbours(design):
             wanted = _cost(rough, candidate)
-            if wanted < cost - 0.01 and rough.worst_in_track(candidate, enough=0.0).stable:
+            if wanted < cost - 0.01 and rough.worst_in_track(candidate, stop_above=0.0).stable:
                 design, cost = candidate, wanted
                 progress(f"damping, round {turn + 1}: hand and sway cost {cost:.1f} N")
         if before - cost < 0.05:

@@ -71,7 +71,7 @@ class Load:
             inertia: of its torso about pitch, kg m^2.
         """
         self._kg_max, self._moment_max = largest
-        self.looked_for = any(largest)
+        self.enabled = any(largest)
         self._weight, self._mass, self._inertia = weight, mass, inertia
         self._rates: Pair | None = None
         self._refused = False
@@ -154,7 +154,7 @@ class Load:
         if self._weighing_s > 0.0:
             self._weighing_s = WEIGHING_S if self._refused else max(0.0, self._weighing_s - dt)
 
-    def miss(self) -> None:
+    def pause(self) -> None:
         """Take it that nothing can be known now; what was found stands."""
         self._rates = None
 

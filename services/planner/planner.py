@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import Overload, force_up
-from services.planner.commands import Common, commands_of
+from services.planner.commands import CommandHeader, commands_of
 from services.planner.engagement_fsm import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.intents import Wish
@@ -176,13 +176,15 @@ class Planner:
         if known:
             self._law.weigh(self._tau, self._v, self._usable_wrench(now_ns), dt, led=leads)
         else:
-            self._law.miss_load()
+            self._law.pause_load_estimate()
         rate = self._law.harness_rate(self._v)
         drift = self._drift(now_ns, lifted)
         values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)
         self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
-        common = Common(now_ns, self._seq, self.session, self._hold(), self._output.local.margins)
+        common = CommandHeader(
+            now_ns, self._seq, self.session, self._hold(), self._output.local.margins
+        )
         return commands_of(common, states, self._output, self._support)
 
     def snapshot(self) -> TickState:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 from services.planner.dynamic_certificate import (
-    LEAST_DELAY_S,
+    DELAY_MIN_S,
     Condition,
     Design,
     DynamicCertificate,
@@ -16,7 +16,7 @@ from services.planner.sampled_loop import Gains
 LADDER: Final = (1.0, 1.41, 2.0, 2.82, 4.0, 5.64, 8.0)
 """Factors tried on gains, one after the other."""
 DELAYS: Final = (1.0, 5.0, 10.0, 15.0, 20.0, 24.0)
-"""Times `LEAST_DELAY_S`: up to the age at which a command is refused."""
+"""Times `DELAY_MIN_S`: up to the age at which a command is refused."""
 
 
 class Room(NamedTuple):
@@ -51,14 +51,14 @@ def room_of(certificate: DynamicCertificate, design: Design) -> list[Room]:
     for stiffness in certificate.stiffnesses:
         nominal = [c for c in certificate.conditions(margins=False) if c.stiffness == stiffness]
         led = [c for c in nominal if c.mode == "TRACK"]
-        soonest = [c for c in led if c.delay_s == LEAST_DELAY_S]
+        soonest = [c for c in led if c.delay_s == DELAY_MIN_S]
         rooms.append(
             Room(
                 stiffness,
                 last(nominal, LADDER, lambda c, f: c._replace(gains=Gains(torque=f))),
                 last(led, LADDER, lambda c, f: c._replace(gains=Gains(coupling=f))),
-                LEAST_DELAY_S
-                * last(soonest, DELAYS, lambda c, f: c._replace(delay_s=LEAST_DELAY_S * f)),
+                DELAY_MIN_S
+                * last(soonest, DELAYS, lambda c, f: c._replace(delay_s=DELAY_MIN_S * f)),
             )
         )
     return rooms

@@ -38,9 +38,9 @@ _ROWS: Final = (
 """The right foot against the left, a positive and a negative row of a stance, and its unit."""
 _TO_UNIT: Final = {"mm": 1e3, "deg": 180.0 / math.pi}
 
-FOLLOWED_S: Final = 2.0
+FOLLOW_S: Final = 2.0
 """A planner that has led takes a new stance in about this time, s."""
-FOLLOWED: Final = 0.03
+FOLLOW_MIN: Final = 0.03
 """m or rad: until the stance taken is so near to the one measured, it is not led."""
 
 
@@ -81,7 +81,7 @@ class Stance:
         wanted = np.where(heeded, measured, 0.0)
         if not beyond:  # what is refused is not followed: it may be a broken encoder
             self.taken += share * (wanted - self.taken)
-        self.refused = beyond or bool((np.abs(wanted - self.taken) > FOLLOWED).any())
+        self.refused = beyond or bool((np.abs(wanted - self.taken) > FOLLOW_MIN).any())
 
     def refusal(self) -> str:
         """Return in words why the stance measured last is not led."""
