@@ -7,9 +7,7 @@ from pathlib import Path
 from services.joint.drive_manager import DriveManager
 from services.joint.drivers.base import Drive
 from services.joint.drivers.odrive_can import OdriveCan
-from services.joint.drivers.readonly import ReadOnly
-from services.joint.drivers.signed import Signed
-from services.joint.drivers.zeroed import Zeroed
+from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import LastState, RearmGuard
@@ -57,9 +55,7 @@ def main() -> int:
             events=session.publisher(topics.JOINT_EVENT, JointEvent, module),
             traces=session.publisher(topics.JOINT_TRACE, JointTrace, module),
         )
-        drive = open_drive(robot, module, arguments.run_dir)
-        if arguments.readonly:
-            drive = ReadOnly(drive)
+        drive = open_drive(robot, module, arguments.run_dir, read_only=arguments.readonly)
         last_state = None if arguments.readonly else RearmGuard(arguments.run_dir, module)
         left = LastState.NOTHING if last_state is None else last_state.read()
         neighbours = None if arguments.readonly else Neighbours(arguments.run_dir, module)
@@ -74,13 +70,10 @@ def main() -> int:
     return 0
 
 
-def open_drive(robot: RobotConfig, module: str, run_dir: Path) -> Drive:
-    """Return the module's drive, on its CAN bus or on USB, counted from the joint's zero."""
-    drive = _open(robot, module, run_dir)
-    signs = robot.module_named(module).motor_signs
-    if signs != (1, 1):
-        drive = Signed(drive, signs)
-    return Zeroed(drive, robot.drive.zero_mark_turns)
+def open_drive(robot: RobotConfig, module: str, run_dir: Path, *, read_only: bool = False) -> Drive:
+    """Return the module's drive, on its CAN bus or on USB, in turns from the joint's zero."""
+    frame = MotorFrame(robot.drive.zero_mark_turns, robot.module_named(module).motor_signs)
+    return WiredDrive(_open(robot, module, run_dir), frame, read_only=read_only)
 
 
 def _open(robot: RobotConfig, module: str, run_dir: Path) -> Drive:

@@ -1,6 +1,6 @@
 """Telling a drive where its joint is: look, judge, set, read back.
 
-Positions here are as the drive itself counts them; `services.joint.drivers.zeroed` says why
+Positions here are as the drive itself counts them; `services.joint.drivers.wired_drive` says why
 a motor at q = 0 is told a mark and not 0. The functions take a `Drive` that is not wrapped:
 behind the mark an armed drive that has lost its zero would only look unzeroed.
 """
@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from services.joint.differential import joint_from_motor, motor_from_joint
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus
-from services.joint.drivers.zeroed import from_zero
+from services.joint.drivers.wired_drive import MotorFrame
 from shared.cansimple import AxisError
 from shared.clock import NS_PER_S, now_ns
 from shared.config import RobotConfig
@@ -93,7 +93,7 @@ def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
         rates = joint_from_motor(reading.vel_turns, gear_ratio)
         speed = max(speed, *map(abs, rates))
         moved = max(moved, _apart(reading, first, gear_ratio))
-    counted = from_zero(newest, mark_turns)
+    counted = MotorFrame(mark_turns).from_drive(newest)
     return DriveLook(
         newest.status,
         counted.status is not DriveStatus.UNZEROED,

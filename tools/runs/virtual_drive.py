@@ -5,8 +5,7 @@ from __future__ import annotations
 from services.joint.drive_manager import DriveAction, DriveCommand
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import LOST_MS
-from services.joint.drivers.signed import Signs, signed_reading, signed_target
-from services.joint.drivers.zeroed import from_zero, to_drive
+from services.joint.drivers.wired_drive import MotorFrame, Signs
 from services.simulator.axis_bank import AxisBank
 from shared.cansimple import AxisState, ControlMode, InputMode
 from shared.clock import NS_PER_S
@@ -25,8 +24,7 @@ class VirtualDrive:
         self._axes = (2 * index, 2 * index + 1)
         self._module = slice(2 * index, 2 * index + 2)
         self._drive = drive
-        self._signs = signs
-        self._zero = drive.zero_mark_turns
+        self._frame = MotorFrame(drive.zero_mark_turns, signs)
         self._lost_after_ns = round((drive.watchdog_timeout or LOST_MS * 1e-3) * NS_PER_S)
         self._sampled_ns = now_ns
         self._written = True
@@ -62,7 +60,7 @@ class VirtualDrive:
             int(errors),
             None if self._written else (float(bank.torque[a]), float(bank.torque[b])),
         )
-        return from_zero(signed_reading(reading, self._signs), self._zero)
+        return self._frame.from_drive(reading)
 
     def carry_out(self, step: DriveAction, *, onboard: bool) -> None:
         """Do what a cycle asks for, if the drive can hear it; any word feeds its watchdog."""
@@ -71,10 +69,9 @@ class VirtualDrive:
             return
         self._written = True
         if step.target is not None:
-            self._aim(signed_target(to_drive(step.target, self._zero), self._signs))
+            self._aim(self._frame.target(step.target))
         elif step.order is DriveCommand.TORQUE:
-            (a_torque, b_torque), (a_sign, b_sign) = step.torque, self._signs
-            bank.input_torque[self._module] = (a_torque * a_sign, b_torque * b_sign)
+            bank.input_torque[self._module] = self._frame.torque(step.torque)
         elif step.order is DriveCommand.ARM:
             self._arm(onboard=onboard)
         elif step.order is DriveCommand.FORGET_ZERO:

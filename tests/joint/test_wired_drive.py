@@ -7,9 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.readonly import ReadOnly
-from services.joint.drivers.signed import Signed
-from services.joint.drivers.zeroed import Zeroed
+from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from shared.messages import Pair
 
 MARK = 64.0
@@ -55,7 +53,7 @@ def inner() -> Recorder:
 
 
 def test_positions_are_counted_from_the_mark_both_ways(inner: Recorder) -> None:
-    drive: Drive = Zeroed(inner, MARK)
+    drive: Drive = WiredDrive(inner, MotorFrame(MARK))
     inner.reading = at((MARK + 3.0, MARK - 4.0))
     reading = drive.read(0.0)
     assert reading == DriveReading(7, (3.0, -4.0), (0.5, -0.5), DriveStatus.ARMED, 0x40, (0.1, 0.2))
@@ -75,29 +73,29 @@ def test_a_drive_that_counts_far_from_the_mark_is_unzeroed(
     inner: Recorder, pos: Pair, status: DriveStatus
 ) -> None:
     inner.reading = at(pos, status)
-    reading = Zeroed(inner, MARK).read(0.0)
+    reading = WiredDrive(inner, MotorFrame(MARK)).read(0.0)
     assert reading is not None
     assert reading.status is DriveStatus.UNZEROED
 
 
 def test_a_lost_drive_is_lost_wherever_it_was(inner: Recorder) -> None:
     inner.reading = at((0.0, 0.0), DriveStatus.LOST)
-    reading = Zeroed(inner, MARK).read(0.0)
+    reading = WiredDrive(inner, MotorFrame(MARK)).read(0.0)
     assert reading is not None
     assert reading.status is DriveStatus.LOST
 
 
 def test_silence_stays_silence(inner: Recorder) -> None:
-    assert Zeroed(inner, MARK).read(0.0) is None
+    assert WiredDrive(inner, MotorFrame(MARK)).read(0.0) is None
 
 
 def test_without_a_mark_any_drive_is_taken_for_zeroed(inner: Recorder) -> None:
     inner.reading = at((0.0, 500.0))
-    assert Zeroed(inner, 0.0).read(0.0) == inner.reading
+    assert WiredDrive(inner, MotorFrame(0.0)).read(0.0) == inner.reading
 
 
 def test_everything_else_goes_through(inner: Recorder) -> None:
-    drive = Zeroed(inner, MARK)
+    drive = WiredDrive(inner, MotorFrame(MARK))
     drive.write_torque((0.1, 0.2))
     drive.arm(onboard=True)
     drive.idle()
@@ -106,7 +104,7 @@ def test_everything_else_goes_through(inner: Recorder) -> None:
 
 
 def test_a_read_only_drive_is_sent_nothing_at_all(inner: Recorder) -> None:
-    drive: Drive = ReadOnly(inner)
+    drive: Drive = WiredDrive(inner, MotorFrame(), read_only=True)
     drive.write_torque((0.1, 0.2))
     drive.write(TARGET)
     drive.arm(onboard=True)
@@ -122,7 +120,7 @@ def test_a_read_only_drive_tells_all_but_that_somebody_armed_it(
     inner: Recorder, status: DriveStatus
 ) -> None:
     inner.reading = at((1.0, 2.0), status)
-    reading = ReadOnly(inner).read(0.0)
+    reading = WiredDrive(inner, MotorFrame(), read_only=True).read(0.0)
     assert reading is not None
     assert (reading.pos_turns, reading.vel_turns, reading.error) == ((1.0, 2.0), (0.5, -0.5), 0x40)
     armed = status is DriveStatus.ARMED
@@ -136,7 +134,7 @@ def test_a_read_only_drive_tells_all_but_that_somebody_armed_it(
 def test_a_motor_that_counts_down_is_the_same_joint(pos: Pair, signs: tuple[int, int]) -> None:
     """What is told, armed and written through the signs comes back through them."""
     inner = Recorder()
-    drive: Drive = Zeroed(Signed(inner, signs), MARK)
+    drive: Drive = WiredDrive(inner, MotorFrame(MARK, signs))
     drive.set_position(pos)
     told = inner.sent.pop()
     assert told == (signs[0] * (pos[0] + MARK), signs[1] * (pos[1] + MARK))
@@ -164,6 +162,6 @@ def test_a_motor_that_counts_down_is_the_same_joint(pos: Pair, signs: tuple[int,
 def test_a_drive_with_signs_that_lost_power_is_unzeroed(signs: tuple[int, int]) -> None:
     inner = Recorder()
     inner.reading = at((0.97, 0.5))
-    reading = Zeroed(Signed(inner, signs), MARK).read(0.0)
+    reading = WiredDrive(inner, MotorFrame(MARK, signs)).read(0.0)
     assert reading is not None
     assert reading.status is DriveStatus.UNZEROED

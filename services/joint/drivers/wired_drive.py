@@ -1,0 +1,121 @@
+"""A module's drive as the joint sees it: zero, motor signs, and read-only access.
+
+The encoders sit on the motors and count turns; a power cycle loses what a count means at the
+joint. So `xrl zero` writes the joint's position plus `mark_turns` to the drive: a motor at q = 0
+reads `mark_turns`. After a power cycle the drive reads near 0 instead, so a lost zero is detected
+within one cycle: the drive is `UNZEROED`, it is never armed, and a drive that was armed faults. A
+failed encoder goes on reporting its last position; the drive's error shows that one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
+from shared.messages import Pair
+
+Signs = tuple[int, int]
+"""Of axis0 and axis1, 1 or -1; -1: the motor counts down where the differential counts up."""
+
+
+class MotorFrame(NamedTuple):
+    """Conversion between the drive's counts and motor turns from the joint's zero."""
+
+    mark_turns: float = 0.0
+    """Reading of a motor at q = 0; 0: any drive counts as zeroed."""
+    signs: Signs = (1, 1)
+
+    def from_drive(self, reading: DriveReading) -> DriveReading:
+        """Return a reading in turns from the joint's zero; UNZEROED if the position is invalid."""
+        mark, torque = self.mark_turns, reading.torque
+        a, b = self._signed(reading.pos_turns)
+        a, b = a - mark, b - mark
+        status, half = reading.status, 0.5 * mark
+        zeroed = mark == 0.0 or (-half < a < half and -half < b < half)
+        if not zeroed and status is not DriveStatus.LOST:
+            status = DriveStatus.UNZEROED
+        return DriveReading(
+            reading.t_ns,
+            (a, b),
+            self._signed(reading.vel_turns),
+            status,
+            reading.error,
+            None if torque is None else self._signed(torque),
+        )
+
+    def target(self, target: MotorTarget) -> MotorTarget:
+        """Return a target as the drive counts it."""
+        return MotorTarget(
+            self.position(target.pos_turns),
+            self._signed(target.vel_turns),
+            self._signed(target.torque),
+            target.pos_gain,
+            target.vel_gain,
+        )
+
+    def position(self, turns: Pair) -> Pair:
+        """Return motor turns from the joint's zero as the drive counts them."""
+        return self._signed((turns[0] + self.mark_turns, turns[1] + self.mark_turns))
+
+    def torque(self, torque: Pair) -> Pair:
+        """Return motor torques, N m, as the drive counts them."""
+        return self._signed(torque)
+
+    def _signed(self, pair: Pair) -> Pair:
+        return (pair[0] * self.signs[0], pair[1] * self.signs[1])
+
+
+class WiredDrive:
+    """A drive behind its motor frame; implements `Drive`.
+
+    Read-only, for bring-up and beside another controller, it sends nothing to the drive. An armed
+    drive then belongs to somebody else and reads as IDLE, so the service stays DISARMED: it
+    publishes the joint's position and the drive's errors, and takes no command.
+    """
+
+    def __init__(self, drive: Drive, frame: MotorFrame, *, read_only: bool = False) -> None:
+        """Wrap a drive."""
+        self._drive = drive
+        self._frame = frame
+        self._read_only = read_only
+
+    def read(self, timeout_s: float) -> DriveReading | None:
+        """See `Drive.read`."""
+        raw = self._drive.read(timeout_s)
+        if raw is None:
+            return None
+        reading = self._frame.from_drive(raw)
+        if not self._read_only or reading.status is not DriveStatus.ARMED:
+            return reading
+        return DriveReading(
+            reading.t_ns, reading.pos_turns, reading.vel_turns, DriveStatus.IDLE, reading.error
+        )
+
+    def write_torque(self, torque: Pair) -> None:
+        """See `Drive.write_torque`."""
+        if not self._read_only:
+            self._drive.write_torque(self._frame.torque(torque))
+
+    def write(self, target: MotorTarget) -> None:
+        """See `Drive.write`."""
+        if not self._read_only:
+            self._drive.write(self._frame.target(target))
+
+    def arm(self, *, onboard: bool) -> None:
+        """See `Drive.arm`."""
+        if not self._read_only:
+            self._drive.arm(onboard=onboard)
+
+    def idle(self) -> None:
+        """See `Drive.idle`."""
+        if not self._read_only:
+            self._drive.idle()
+
+    def set_position(self, turns: Pair) -> None:
+        """Write both motors' turns from the joint's zero: this zeroes them."""
+        if not self._read_only:
+            self._drive.set_position(self._frame.position(turns))
+
+    def close(self) -> None:
+        """See `Drive.close`."""
+        self._drive.close()
