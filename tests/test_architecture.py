@@ -86,6 +86,7 @@ LAWS = [
     "services/joint/drivers/axes_status.py",
     "services/joint/drivers/firmware.py",
     "services/joint/drivers/wired_drive.py",
+    "services/joint/setpoint_law.py",
     "shared/can_load.py",
     "shared/fault_table.py",
     "tools/bringup/jogging.py",

@@ -8,6 +8,7 @@ import pytest
 from services.joint.controller import JointController, row_of
 from services.joint.neighbours import NeighbourRow, NeighbourView
 from services.joint.sinking import SinkingState
+from services.joint.snapshots import ControllerSnapshot
 from services.joint.torque_limiter import limits_of
 from services.joint.trips import JointTrips
 from shared.config import RobotConfig
@@ -23,14 +24,14 @@ def bench(robot: RobotConfig) -> Bench:
     return Bench(robot)
 
 
-def test_a_controller_goes_on_from_its_memory_and_shares_nothing_with_it(
+def test_a_controller_restored_from_a_snapshot_shares_nothing_with_it(
     bench: Bench, robot: RobotConfig
 ) -> None:
     bench.to_track(tau_coupled=COUPLED)
     sinking = SinkingState(-2.2, 0.1, -0.3, 0.4, caught=True, doubt_ns=7)
-    memory = msgspec.structs.replace(
-        bench.controller.snapshot(),
-        changed_ns=11,
+    taken = bench.controller.snapshot()
+    state = msgspec.structs.replace(
+        taken.state,
         last_cycle_ns=12,
         initial_torque=(1.0, 2.0),
         cause=3,
@@ -41,16 +42,24 @@ def test_a_controller_goes_on_from_its_memory_and_shares_nothing_with_it(
         states=9,
         takeover_offset=(0.1, 0.2),
         resumed_ns=10,
-        stiffened_ns=13,
         trips=JointTrips(slow=(1.0, 2.0), mean=(3.0, 4.0), at_limit_ns=5, fast_ns=6),
-        sinking=sinking,
     )
-    before = msgspec.msgpack.encode(memory)
+    law = msgspec.structs.replace(taken.law, changed_ns=11, stiffened_ns=13, sinking=sinking)
+    snapshot = ControllerSnapshot(state=state, law=law)
+    before = msgspec.msgpack.encode(snapshot)
     other = JointController(believing(robot), "knee_right")
-    other.restore(memory)
-    assert other.snapshot() == memory
+    other.restore(snapshot)
+    assert other.snapshot() == snapshot
     other.step(bench.now_ns, None, bench.fresh(), True)
-    assert msgspec.msgpack.encode(memory) == before
+    assert msgspec.msgpack.encode(snapshot) == before
+
+
+def test_a_snapshot_shares_nothing_with_the_controller_that_it_was_taken_from(bench: Bench) -> None:
+    bench.to_track(tau_coupled=COUPLED)
+    snapshot = bench.controller.snapshot()
+    before = msgspec.msgpack.encode(snapshot)
+    bench.run(3, fresh=True)
+    assert msgspec.msgpack.encode(snapshot) == before
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -99,9 +108,10 @@ def test_cycles_are_counted_one_by_one_and_before_any_change_there_is_no_cause(
 
 
 def test_one_that_holds_with_all_it_has_says_so_from_the_first_instant(bench: Bench) -> None:
-    memory = bench.controller.snapshot()
+    taken = bench.controller.snapshot()
     for stiffened_ns, stiffened in ((0, False), (1, True)):
-        bench.controller.restore(msgspec.structs.replace(memory, stiffened_ns=stiffened_ns))
+        law = msgspec.structs.replace(taken.law, stiffened_ns=stiffened_ns)
+        bench.controller.restore(msgspec.structs.replace(taken, law=law))
         assert bench.controller.state(bench.now_ns).stiffened is stiffened
 
 

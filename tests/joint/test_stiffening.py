@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from services.joint.controller import JointController
 from services.joint.neighbours import NeighbourView
-from services.joint.snapshots import ControllerState
+from services.joint.snapshots import ControllerSnapshot
 from shared.clock import NS_PER_MS
 from shared.config import RobotConfig
 from shared.joints import MODULES, kind_of
@@ -159,7 +159,7 @@ def test_a_controller_that_is_restored_stays_stiff(robot: RobotConfig) -> None:
     bench.run(20, fresh=True, hold=True, stiffen=True)
     text = msgspec.json.encode(bench.controller.snapshot())
     twin = JointController(robot, "hip_right")
-    twin.restore(msgspec.json.decode(text, type=ControllerState))
+    twin.restore(msgspec.json.decode(text, type=ControllerSnapshot))
     for _ in range(200):
         bench.cycle()
         twin.step(bench.now_ns, bench.reading(), None, estop=False)

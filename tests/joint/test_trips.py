@@ -154,11 +154,13 @@ def test_in_hold_nothing_trips(robot: RobotConfig) -> None:
     assert bench.controller.failsafe.mode is Mode.HOLD
 
 
-def test_what_was_seen_is_remembered(tracking: Bench, robot: RobotConfig) -> None:
+def test_a_restored_controller_knows_the_torques_of_its_trips(
+    tracking: Bench, robot: RobotConfig
+) -> None:
     tracking.v = (0.6, -0.3)
     tracking.run(3, fresh=True)
-    memory = tracking.controller.snapshot()
+    snapshot = tracking.controller.snapshot()
     other = Bench(robot).controller
-    other.restore(memory)
-    assert other.snapshot() == memory
-    assert memory.trips.mean != (0.0, 0.0)
+    other.restore(snapshot)
+    assert other.snapshot() == snapshot
+    assert snapshot.state.trips.mean != (0.0, 0.0)

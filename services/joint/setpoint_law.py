@@ -1,0 +1,152 @@
+"""The setpoint of each instant: TRACK follows the planner, HOLD freezes, DAMP sinks. Pure.
+
+A change of mode freezes the setpoint in force; the new mode starts from it, so that no change makes
+a torque step.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from services.joint import pd_law
+from services.joint.failsafe import Failsafe
+from services.joint.neighbours import UNKNOWN, NeighbourView
+from services.joint.pd_law import Setpoint
+from services.joint.sinking import Sinking, SinkingState
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import RobotConfig
+from shared.messages import JointCommand, Mode, Pair
+
+
+class SetpointState(msgspec.Struct, frozen=True, kw_only=True):
+    """State of `SetpointLaw`."""
+
+    frozen: Setpoint
+    current: Setpoint
+    changed_ns: int
+    stiffened_ns: int
+    sinking: SinkingState
+
+
+class SetpointLaw:
+    """Chooses and blends a module's setpoints."""
+
+    def __init__(self, config: RobotConfig, module: str) -> None:
+        """Take the module's gains and times; start at the stand gains."""
+        service, stand = config.joint_service, config.stand_gains(module)
+        self.stand_k_p, self.stand_k_d = stand.k_p, stand.k_d
+        self._support_k_p, self._support_k_d = config.support_gains(module)
+        self._hold_k_p, self._hold_k_d = config.hold_gains(module)
+        self._hold_torque = config.envelope.hold_torque
+        self._aging_max_s = service.command_aging_max_ms / 1e3
+        self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
+        self._blend_ns = service.blend_ms * NS_PER_MS
+        self.sinking = Sinking(config, module)
+        self._frozen = pd_law.stand(pd_law.ZERO, self.stand_k_p, self.stand_k_d)
+        """The setpoint at the last change of mode: HOLD keeps it, TRACK blends from it."""
+        self.current: Setpoint = self._frozen
+        self._changed_ns = 0
+        self._stiffened_ns = 0
+        """When it began to stiffen because another module may be limp; 0: it does not."""
+
+    @property
+    def stiffened(self) -> bool:
+        """True while it holds with all of its support gains."""
+        return self._stiffened_ns > 0
+
+    def age_s(self, command: JointCommand, now_ns: int) -> float:
+        """Return a command's age, s, as far as it is extrapolated."""
+        return min(self._aging_max_s, (now_ns - command.echo_t_ns) / NS_PER_S)
+
+    def is_settled(self, now_ns: int) -> bool:
+        """Return True if the blend after the last change of mode is over."""
+        return now_ns - self._changed_ns >= self._blend_ns
+
+    def start(self, mode: Mode, now_ns: int, setpoint: Setpoint) -> None:
+        """Start a mode from a given setpoint: until now the module was DISARMED."""
+        self._note_change(mode, now_ns)
+        self._frozen = setpoint
+
+    def change(self, mode: Mode, now_ns: int, q: Pair) -> None:
+        """Freeze the setpoint in force for a new mode.
+
+        Args:
+            mode: the new mode.
+            now_ns: this module's monotonic clock.
+            q: joint angles (phi, theta), rad.
+        """
+        self._note_change(mode, now_ns)
+        if mode is Mode.DAMP:
+            self._frozen = self.sinking.begin(self.current, q)
+        elif mode is Mode.HOLD:
+            self._frozen = pd_law.limit_stiffening(
+                self.current, q, self._hold_k_p, self._hold_torque
+            )
+        else:
+            self._frozen = self.current
+
+    def evaluate(
+        self, now_ns: int, failsafe: Failsafe, q: Pair, near: NeighbourView = UNKNOWN
+    ) -> Setpoint:
+        """Return the setpoint of this instant.
+
+        Args:
+            now_ns: this module's monotonic clock.
+            failsafe: mode and newest command.
+            q: joint angles (phi, theta), rad.
+            near: what is known of the other modules on this host.
+        """
+        mode = failsafe.mode
+        limp = near.stiffen and mode in (Mode.HOLD, Mode.DAMP)
+        if not self._stiffened_ns and (limp or failsafe.asks_to_stiffen):
+            self._stiffened_ns = now_ns
+        since_ns = now_ns - self._changed_ns
+        if mode is Mode.TRACK:
+            self.current = self._tracked(now_ns, failsafe.command, since_ns)
+        elif mode is Mode.DAMP:
+            near = near._replace(stiffen=self._stiffened_ns > 0)
+            self.current = self.sinking.law(self._frozen, since_ns, q, near)
+        else:
+            self.current = self._held(since_ns)
+            if self._stiffened_ns:
+                risen = min(1.0, (now_ns - self._stiffened_ns) / self._blend_ns)
+                self.current = pd_law.raise_gains(
+                    self.current, self._support_k_p, self._support_k_d, risen
+                )
+        return self.current
+
+    def snapshot(self) -> SetpointState:
+        """Return the state; `restore` continues from it."""
+        return SetpointState(
+            frozen=self._frozen,
+            current=self.current,
+            changed_ns=self._changed_ns,
+            stiffened_ns=self._stiffened_ns,
+            sinking=self.sinking.snapshot(),
+        )
+
+    def restore(self, state: SetpointState) -> None:
+        """Continue from a state."""
+        self._frozen, self.current = state.frozen, state.current
+        self._changed_ns, self._stiffened_ns = state.changed_ns, state.stiffened_ns
+        self.sinking.restore(state.sinking)
+
+    def _note_change(self, mode: Mode, now_ns: int) -> None:
+        self._changed_ns = now_ns
+        if mode is not Mode.DAMP:
+            self._stiffened_ns = 0
+
+    def _tracked(self, now_ns: int, command: JointCommand | None, since_ns: int) -> Setpoint:
+        """Return the planner's setpoint now, blended in from HOLD's."""
+        assert command is not None  # noqa: S101 - TRACK is entered on fresh commands only
+        fresh = pd_law.extrapolate(command, self.age_s(command, now_ns))
+        if since_ns >= self._blend_ns:
+            return fresh
+        return pd_law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
+
+    def _held(self, since_ns: int) -> Setpoint:
+        """Return HOLD's setpoint: frozen, and some gains rise to the stand gains."""
+        moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
+        risen = min(1.0, since_ns / self._blend_ns)
+        frozen = pd_law.freeze(self._frozen, moving)
+        return pd_law.raise_gains(frozen, self._hold_k_p, self._hold_k_d, risen)
