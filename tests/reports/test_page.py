@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import re
 from pathlib import Path
 
@@ -15,8 +16,8 @@ from tests.reports.runs import Made
 from tools.reports import page as page_module
 from tools.reports.page import render
 from tools.reports.run_data import RunData
-from tools.reports.timeline import happenings
-from tools.reports.torques import origins
+from tools.reports.timeline import timeline_events
+from tools.reports.torques import torque_terms
 from tools.runs.run_log import RunLog, read_run
 
 PLOTS = {
@@ -84,8 +85,9 @@ def test_the_plots_show_what_the_log_holds(page: str, log: RunLog) -> None:
 def test_a_page_asks_no_network_for_anything(page: str) -> None:
     outside = r"""(?i)(src|href|action|data)\s*=\s*["']?\s*(https?:)?//|url\(|@import|fetch\("""
     assert not re.findall(outside, page.partition('<section id="made-from"')[0])
-    code = page[page.rindex("<script>") :]
-    assert not re.findall(r"(?i)https?://|XMLHttpRequest|WebSocket|import\(|fetch\(", code)
+    code = page[page.index('<script id="uplot">') :]
+    banned = r"(?i)https?://\S*|XMLHttpRequest|WebSocket|import\(|fetch\("
+    assert re.findall(banned, code) == ["https://github.com/leeoniya/uPlot"], "its header"
     assert "default-src 'none'" in page
     assert re.findall(r"<(?:link|img|iframe|object|embed)\b|<script src", page) == []
 
@@ -143,7 +145,7 @@ def test_a_log_of_another_robot_file_has_a_page_without_origins(
     foreign = runs.rewritten(log, tmp_path, attachments={"robot.toml": b'name = "old"\n'})
     data = pages.data_of(render(foreign))
     choice = pages.panel(data, "Torque of one joint, by origin")
-    assert "Without origins: " in choice["note"]
+    assert "Without torque_terms: " in choice["note"]
     assert str(tmp_path) not in choice["note"]
     assert {line["label"] for line in choice["choices"][0]["lines"]} == {
         "total, after the gate",
@@ -182,18 +184,18 @@ def test_text_from_a_log_is_text_in_the_page(log: RunLog, tmp_path: Path) -> Non
 
     page = render(runs.rewritten(log, tmp_path, payload=hostile))
     assert "<script>alert" not in page
-    assert page.count("</script>") == 2
+    assert page.count("</script>") == 3
     assert any("<script>alert" in mark[2] for mark in pages.data_of(page)["marks"])
 
 
 def test_the_origins_of_a_torque_add_up_to_it(log: RunLog) -> None:
     """But for what the gate cuts off."""
-    source = RunData(log)
-    assert source.robot is not None
-    most = source.robot.joint.tau_module_max
+    run = RunData(log)
+    assert run.robot is not None
+    most = run.robot.joint.tau_module_max
     for module in MODULES:
         states: list[JointState] = log.messages(topics.JOINT_STATE, module)
-        found = origins(source, source.robot, module)
+        found = torque_terms(run, run.robot, module)
         total = found.feedforward + found.coupled + found.local
         known = np.isfinite(total[:, 0])
         tracking = np.array([state.mode == Mode.TRACK for state in states])
@@ -207,7 +209,7 @@ def test_the_origins_of_a_torque_add_up_to_it(log: RunLog) -> None:
 
 
 def test_the_timeline_tells_kill_hold_and_what_came_after(log: RunLog) -> None:
-    rows = happenings(RunData(log))
+    rows = timeline_events(RunData(log))
     assert [row.t for row in rows] == sorted(row.t for row in rows)
     texts = [row.text for row in rows]
     kill = next(row for row in rows if row.kind == "kill")
@@ -280,6 +282,20 @@ def test_the_page_shows_what_the_run_was_made_from(page: str, log: RunLog) -> No
     assert str(log.path.parent) not in page, "a page is given to others"
 
 
-def test_the_parts_of_the_page_lie_beside_its_code() -> None:
-    for name in (page_module.STYLE, *page_module.SCRIPTS):
-        assert (page_module.HERE / name).stat().st_size > 1000
+def test_the_page_embeds_the_library_unchanged_and_all_scripts(page: str) -> None:
+    files = (*page_module.STYLES, page_module.LIBRARY, *page_module.SCRIPTS)
+    assert all(path.read_text(encoding="utf-8") in page for path in files)
+    unused = set(page_module.HERE.glob("*.js")) - set(page_module.SCRIPTS)
+    assert unused == set()
+
+
+def test_the_library_is_the_release_that_its_note_names() -> None:
+    note = (page_module.VENDOR / "VERSION").read_text(encoding="utf-8")
+    noted = {name: digest for digest, name in re.findall(r"(?m)^([0-9a-f]{64})  (\S+)$", note)}
+    files = {path.name: path.read_bytes() for path in page_module.VENDOR.iterdir()}
+    del files["VERSION"]
+    assert noted == {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    (version,) = re.findall(r"^uPlot (\S+),", note)
+    header = files["uPlot.iife.min.js"].splitlines()[0].decode()
+    assert f"(v{version})" in header
+    assert b"MIT License" in files["LICENSE"]

@@ -30,7 +30,7 @@ from tests.reports import runs
 from tests.reports.runs import Made
 from tools import cli
 from tools.reports import scene
-from tools.reports.foxglove import UPRIGHT, Arrow, Entity, Placed, Solid
+from tools.reports.foxglove import UPRIGHT, Arrow, Entity, FrameTransform, Solid
 from tools.reports.scene import RobotPose
 from tools.runs.run_log import RunLog, read_run
 
@@ -56,7 +56,7 @@ def matrix(turn: tuple[float, float, float, float]) -> Array:
     return out.reshape(3, 3)
 
 
-def in_world(frames: list[Placed]) -> dict[str, tuple[Array, Array]]:
+def in_world(frames: list[FrameTransform]) -> dict[str, tuple[Array, Array]]:
     """Return (position, rotation) of each frame, chained from the world on."""
     found = {"world": (np.zeros(3), np.eye(3))}
     for row in frames:
@@ -243,7 +243,7 @@ def test_another_reader_of_protobuf_finds_all_frames_and_bodies_of_the_scene(
     assert len(found["links"]) == pytest.approx((poses[-1].t_ns - poses[0].t_ns) / 1e9, abs=1)
     for pose in poses:
         assert scene.frames(robot, pose) == [
-            Placed(
+            FrameTransform(
                 row.parent_frame_id, row.child_frame_id,
                 numbers(row.translation, "xyz"), numbers(row.rotation, "xyzw"),
             )

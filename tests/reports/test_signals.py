@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.reports.pages import unpacked
-from tools.reports.signals import BINS, Span, packed, seconds, segments
+from tests.reports.pages import decode_signal
+from tools.reports.signals import BINS, Span, encode_signal, seconds, segments
 
 VALUES = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=300)
 
@@ -15,10 +15,10 @@ VALUES = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=300)
 def test_every_signal_keeps_its_extremes_and_its_order(values: list[float], step: float) -> None:
     t = np.arange(len(values)) * step
     span = Span(0.0, max(float(t[-1]), 1.0))
-    found = packed(t, np.array(values), span)
+    found = encode_signal(t, np.array(values), span)
     assert found is not None
     assert (found["lo"], found["hi"]) == (min(values), max(values))
-    seen_t, seen = unpacked(found)
+    seen_t, seen = decode_signal(found, span.grid)
     resolution = found["step"] + 1e-9
     assert abs(seen.min() - min(values)) <= resolution
     assert abs(seen.max() - max(values)) <= resolution
@@ -32,9 +32,10 @@ def test_one_sample_in_a_long_run_is_not_lost() -> None:
     t = np.arange(0.0, 600.0, 0.004)
     values = np.sin(t)
     values[77_777] = 40.0
-    found = packed(t, values, Span(0.0, 600.0))
+    span = Span(0.0, 600.0)
+    found = encode_signal(t, values, span)
     assert found is not None
-    where, seen = unpacked(found)
+    where, seen = decode_signal(found, span.grid)
     assert len(seen) <= 2 * BINS
     assert abs(seen.max() - 40.0) < 1e-3
     assert abs(where[seen.argmax()] - t[77_777]) <= 600.0 / BINS
@@ -43,18 +44,20 @@ def test_one_sample_in_a_long_run_is_not_lost() -> None:
 def test_silence_breaks_a_line_and_a_missing_sample_does_not() -> None:
     t = np.concatenate((np.arange(0.0, 1.0, 0.004), np.arange(1.5, 2.0, 0.004)))
     t = np.delete(t, [50, 51])
-    found = packed(t, np.ones(len(t)), Span(0.0, 2.0))
+    span = Span(0.0, 2.0)
+    found = encode_signal(t, np.ones(len(t)), span)
     assert found is not None
-    where, seen = unpacked(found)
-    gone = where[np.isnan(seen)]
-    assert len(gone)
-    assert ((gone > 0.99) & (gone < 1.5)).all()
+    where, seen = decode_signal(found, span.grid)
+    gap = where[np.isnan(seen)]
+    assert gap[0] == pytest.approx(1.0, abs=0.005)
+    assert gap[-1] == pytest.approx(1.5, abs=0.005)
+    assert np.diff(gap).max() < 0.0011, "the cursor finds no value anywhere in the gap"
 
 
 def test_numbers_that_are_none_are_left_out() -> None:
-    assert packed(np.array([0.0, 1.0]), np.array([np.nan, np.inf]), Span(0.0, 1.0)) is None
-    assert packed(np.zeros(0), np.zeros(0), Span(0.0, 1.0)) is None
-    found = packed(np.array([0.0, 1.0]), np.array([np.nan, 3.0]), Span(0.0, 1.0))
+    assert encode_signal(np.array([0.0, 1.0]), np.array([np.nan, np.inf]), Span(0.0, 1.0)) is None
+    assert encode_signal(np.zeros(0), np.zeros(0), Span(0.0, 1.0)) is None
+    found = encode_signal(np.array([0.0, 1.0]), np.array([np.nan, 3.0]), Span(0.0, 1.0))
     assert found is not None
     assert (found["lo"], found["hi"], found["step"]) == (3.0, 3.0, 0.0)
 
@@ -77,9 +80,9 @@ def test_a_sample_alone_in_its_bin_is_one_point_in_its_own_half() -> None:
     """Two places for one sample would draw every slow signal as stairs."""
     t = np.array([0.0, 0.101, 0.305, 0.507, 0.999])
     span = Span(0.0, 1.0)
-    found = packed(t, np.arange(5.0), span)
+    found = encode_signal(t, np.arange(5.0), span)
     assert found is not None
-    where, seen = unpacked(found)
+    where, seen = decode_signal(found, span.grid)
     assert len(seen) == len(t)
     assert np.abs(where - t).max() <= span.bin_s / 2
 

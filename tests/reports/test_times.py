@@ -17,7 +17,7 @@ from tests.reports import pages, runs
 from tools.reports.network import ImpairedLink
 from tools.reports.page import render
 from tools.reports.run_data import RunData
-from tools.reports.timeline import happenings
+from tools.reports.timeline import timeline_events
 from tools.runs.run_log import RunLog
 
 
@@ -30,15 +30,15 @@ def test_the_cycles_of_a_service_come_at_its_rate(page: str) -> None:
 def test_late_cycles_are_counted_from_the_arming_on_and_across_a_restart(
     log: RunLog, tmp_path: Path
 ) -> None:
-    source = RunData(log)
-    begin_ns = source.zero_ns + round(source.armed_s() * 1e9)
+    run = RunData(log)
+    begin_ns = run.zero_ns + round(run.armed_s() * 1e9)
 
     def late(name: str, body: bytes) -> bytes:
         """40 while it starts up; then one in 0.1 s; restarted at 2 s, it counts from 0."""
         if name != "joint/hip_right/state":
             return body
         state = msgspec.json.decode(body)
-        t = (state["t_ns"] - source.zero_ns) / 1e9
+        t = (state["t_ns"] - run.zero_ns) / 1e9
         since = (state["t_ns"] - begin_ns) / 1e9
         state["late"] = 40 + int(10.0 * max(0.0, since)) if t < 2.0 else int(10.0 * (t - 2.0))
         return msgspec.json.encode(state)
@@ -46,7 +46,7 @@ def test_late_cycles_are_counted_from_the_arming_on_and_across_a_restart(
     page = render(runs.rewritten(log, tmp_path, payload=late))
     _, counted = pages.line(pages.data_of(page), "Control cycles that came late", "hip_right")
     assert counted[0] == 0.0
-    assert counted[-1] == pytest.approx(10.0 * (4.0 - source.armed_s()), abs=3.0)
+    assert counted[-1] == pytest.approx(10.0 * (4.0 - run.armed_s()), abs=3.0)
     assert (np.diff(counted[np.isfinite(counted)]) >= 0.0).all()
 
 
@@ -73,20 +73,20 @@ def test_a_machine_too_slow_is_said_beside_the_verdict(log: RunLog, tmp_path: Pa
 def test_drives_that_come_up_together_are_one_line_and_no_alarm(
     log: RunLog, tmp_path: Path
 ) -> None:
-    source = RunData(log)
+    run = RunData(log)
 
     def coming_up(name: str, body: bytes) -> bytes:
         if not name.endswith("/state") or not name.startswith("joint/"):
             return body
         state = msgspec.json.decode(body)
-        t = (state["t_ns"] - source.zero_ns) / 1e9
+        t = (state["t_ns"] - run.zero_ns) / 1e9
         if t < -2.0:
             state["drive"] = int(DriveStatus.LOST if t < -2.1 else DriveStatus.IDLE)
         if 3.0 <= t < 3.1 and name == "joint/knee_left/state":
             state["drive"] = int(DriveStatus.IDLE)
         return msgspec.json.encode(state)
 
-    rows = happenings(RunData(runs.rewritten(log, tmp_path, payload=coming_up)))
+    rows = timeline_events(RunData(runs.rewritten(log, tmp_path, payload=coming_up)))
     told = {row.text: row.kind for row in rows if "drive" in row.text}
     assert told["all six: drive LOST to IDLE"] == "note"
     assert told["all six: drive IDLE to ARMED"] == "note"
@@ -105,12 +105,12 @@ def impairment(number: int, link: str, t_ns: int, *, begins: bool, cut: bool) ->
 def test_what_was_injected_into_the_network_is_a_panel_marks_and_lines(
     log: RunLog, tmp_path: Path
 ) -> None:
-    source = RunData(log)
+    run = RunData(log)
     more: list[tuple[int, str, bytes]] = []
     for number, cut, begin, end in ((1, False, 0.5, 2.0), (2, True, 1.0, 1.5)):
         for t, begins in ((begin, True), (end, False)):
             for module in ("ankle_left", "knee_left", "hip_left"):
-                t_ns = source.zero_ns + round(t * 1e9)
+                t_ns = run.zero_ns + round(t * 1e9)
                 event = impairment(number, f"planner->{module}", t_ns, begins=begins, cut=cut)
                 more.append((t_ns, topics.LINK_EVENT.name, msgspec.json.encode(event)))
     data, rows = panel_and_rows(runs.rewritten(log, tmp_path, more=more))
@@ -171,14 +171,14 @@ def test_a_planner_that_waits_after_drop_outs_is_in_the_timeline(
         status["wait_s"] = 3.5 - t_s if 2.5 <= t_s < 3.5 else 0.0
         return msgspec.json.encode(status)
 
-    found = happenings(RunData(runs.rewritten(log, tmp_path, payload=waits)))
+    found = timeline_events(RunData(runs.rewritten(log, tmp_path, payload=waits)))
     (row,) = [row for row in found if "leads again" in row.text]
     assert row.t == pytest.approx(2.5, abs=0.01)
     assert row.text.startswith("planner: leads again in 1.0 s at the earliest")
 
 
 def panel_and_rows(log: RunLog) -> tuple[dict[str, Any], list[str]]:
-    return pages.data_of(render(log)), [row.text for row in happenings(RunData(log))]
+    return pages.data_of(render(log)), [row.text for row in timeline_events(RunData(log))]
 
 
 def test_a_log_with_nothing_injected_says_so(page: str) -> None:

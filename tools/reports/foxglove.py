@@ -27,7 +27,7 @@ ORIGIN: Final[Vector3] = (0.0, 0.0, 0.0)
 UPRIGHT: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 
 
-class Placed(NamedTuple):
+class FrameTransform(NamedTuple):
     """A frame in its parent."""
 
     parent: str
@@ -69,7 +69,7 @@ class Entity(NamedTuple):
     arrows: tuple[Arrow, ...] = ()
 
 
-def transforms(ns: int, rows: Iterable[Placed]) -> bytes:
+def transforms(ns: int, rows: Iterable[FrameTransform]) -> bytes:
     """Encode where frames are at a time of ns since 1970."""
     when = _time(ns)
     return well_known.FrameTransforms(

@@ -39,7 +39,7 @@ WORLD: Final = (
 while it does not); no limit: not told."""
 
 
-class Crossing(NamedTuple):
+class Violation(NamedTuple):
     """A stretch of time that began beyond a limit."""
 
     who: str
@@ -49,19 +49,19 @@ class Crossing(NamedTuple):
     """Time beyond it, all together."""
 
 
-def crossings(source: RunData) -> Iterator[TimelineEvent]:
+def limit_violations(run: RunData) -> Iterator[TimelineEvent]:
     """Yield when each figure first went beyond its limit, not in the order of time.
 
     The limits are the verdict's (docs/results.md#targets) for the world, and the robot file's for
     torques, joints and margins.
     """
-    yield from _world(source)
-    yield from _torques(source)
-    yield from _stops(source)
-    yield from _margins(source)
+    yield from _world(run)
+    yield from _torques(run)
+    yield from _stops(run)
+    yield from _margins(run)
 
 
-def first_beyond(who: str, t: Array, beyond: NDArray[np.bool_]) -> Crossing | None:
+def first_violation(who: str, t: Array, beyond: NDArray[np.bool_]) -> Violation | None:
     """Return when something first was beyond a limit, and for how long in all; None if never.
 
     Args:
@@ -74,17 +74,17 @@ def first_beyond(who: str, t: Array, beyond: NDArray[np.bool_]) -> Crossing | No
     steps = np.append(np.diff(t), 0.0)
     usual = float(np.median(steps[:-1])) if len(steps) > 1 else 0.0
     lasts = float(np.minimum(steps, 5.0 * usual)[beyond].sum())
-    return Crossing(who, float(t[int(np.argmax(beyond))]), lasts)
+    return Violation(who, float(t[int(np.argmax(beyond))]), lasts)
 
 
-def _world(source: RunData) -> Iterator[TimelineEvent]:
+def _world(run: RunData) -> Iterator[TimelineEvent]:
     """Tell what the verdict judges, with its limits, over the time that it judges."""
-    if source.course is None:
+    if run.course is None:
         return
-    t = source.course.t
-    is_led = leading(source.log, np.round(t * NS_PER_S).astype(np.int64) + source.zero_ns)
+    t = run.course.t
+    is_led = leading(run.log, np.round(t * NS_PER_S).astype(np.int64) + run.zero_ns)
     for what, field, place, scale, led, held in WORLD:
-        rows = np.array([getattr(row, field) for row in source.course.rows], dtype=np.float64)
+        rows = np.array([getattr(row, field) for row in run.course.rows], dtype=np.float64)
         values = np.abs(rows if rows.ndim == 1 else rows[:, place]) * scale
         for key, when, while_ in (
             (led, is_led, "while led"),
@@ -93,71 +93,71 @@ def _world(source: RunData) -> Iterator[TimelineEvent]:
             if not key:
                 continue
             most, unit = ALLOWED[key]
-            found = first_beyond(what, t, (values > most) & when)
+            found = first_violation(what, t, (values > most) & when)
             if found is not None:
                 yield _told([found], f"over {most:g} {unit}, the limit {while_}")
 
 
-def _torques(source: RunData) -> Iterator[TimelineEvent]:
-    if source.robot is None:
+def _torques(run: RunData) -> Iterator[TimelineEvent]:
+    if run.robot is None:
         return
-    most = source.robot.joint.tau_module_max
+    most = run.robot.joint.tau_module_max
     found = []
     for module in MODULES:
-        (tau,) = source.columns(topics.JOINT_STATE, module, "tau")
+        (tau,) = run.columns(topics.JOINT_STATE, module, "tau")
         if not len(tau):
             continue
-        t = source.times(topics.JOINT_STATE, module)
-        at_limit = first_beyond(module, t, np.abs(tau).sum(axis=1) >= AT_LIMIT * most)
+        t = run.times(topics.JOINT_STATE, module)
+        at_limit = first_violation(module, t, np.abs(tau).sum(axis=1) >= AT_LIMIT * most)
         if at_limit is not None and at_limit.lasts_s >= LASTING_S:
             found.append(at_limit)
     for group in _together(found):
         yield _told(group, f"torque at its limit of {most:g} N m")
 
 
-def _stops(source: RunData) -> Iterator[TimelineEvent]:
-    if source.robot is None:
+def _stops(run: RunData) -> Iterator[TimelineEvent]:
+    if run.robot is None:
         return
     found = []
-    limits = source.robot.joint_limits()
-    armed_s = source.armed_s()
+    limits = run.robot.joint_limits()
+    armed_s = run.armed_s()
     for number, joint in enumerate(JOINTS):
         module = MODULES[number // 2]
-        (q,) = source.columns(topics.JOINT_STATE, module, "q")
+        (q,) = run.columns(topics.JOINT_STATE, module, "q")
         if not len(q):
             continue
         low, high = limits[number]
         angle = q[:, number % 2]
-        t = source.times(topics.JOINT_STATE, module)
+        t = run.times(topics.JOINT_STATE, module)
         outside = (angle < low) | (angle > high)
-        at_stop = first_beyond(joint, t, outside & (t >= armed_s))
+        at_stop = first_violation(joint, t, outside & (t >= armed_s))
         if at_stop is not None:
             found.append(at_stop)
     for group in _together(found):
         yield _told(group, "beyond a soft stop")
 
 
-def _margins(source: RunData) -> Iterator[TimelineEvent]:
-    if source.robot is None:
+def _margins(run: RunData) -> Iterator[TimelineEvent]:
+    if run.robot is None:
         return
-    asked = source.robot.certificate
-    mode, service, onboard = source.columns(
+    asked = run.robot.certificate
+    mode, service, onboard = run.columns(
         topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
     )
-    t = source.times(topics.PLANNER_STATUS)
+    t = run.times(topics.PLANNER_STATUS)
     for who, values, least in (
         ("margin of the joint services alone", service, asked.margin_min),
         ("margin of the drives alone", onboard, asked.onboard_margin_min),
     ):
         told = (values < least) & ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED))
-        found = first_beyond(who, t, told)
+        found = first_violation(who, t, told)
         if found is not None:
             yield _told([found], f"under {least:g}, down to {values[told].min():.3g}")
 
 
-def _together(found: Sequence[Crossing]) -> list[list[Crossing]]:
+def _together(found: Sequence[Violation]) -> list[list[Violation]]:
     """Return what began at about the same time, together."""
-    groups: list[list[Crossing]] = []
+    groups: list[list[Violation]] = []
     for one in sorted(found, key=lambda crossing: crossing.t):
         if groups and one.t - groups[-1][0].t <= TOGETHER_S:
             groups[-1].append(one)
@@ -166,7 +166,7 @@ def _together(found: Sequence[Crossing]) -> list[list[Crossing]]:
     return groups
 
 
-def _told(group: Sequence[Crossing], what: str) -> TimelineEvent:
+def _told(group: Sequence[Violation], what: str) -> TimelineEvent:
     who = ", ".join(one.who for one in group)
     longest = max(one.lasts_s for one in group)
     text = f"{who}: {what}, for the first time; {longest:.2f} s in all"

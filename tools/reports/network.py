@@ -13,7 +13,7 @@ from shared import topics
 from shared.clock import NS_PER_S
 from shared.links import GROUPS
 from shared.traces import LinkEvent
-from tools.reports.page_model import BarRow, Sheet
+from tools.reports.page_model import BarRow, PageModel
 from tools.reports.run_data import RunData
 from tools.reports.signals import GAP_S
 
@@ -37,15 +37,15 @@ COLOURS: Final[dict[int, str]] = {
 History = tuple[tuple[float, ImpairedLink], ...]
 
 
-def add_network(source: RunData, sheet: Sheet) -> None:
+def add_network(run: RunData, model: PageModel) -> None:
     """Add the directions that were impaired; those that fared alike in one row."""
     alike: dict[History, list[str]] = defaultdict(list)
-    events: list[LinkEvent] = source.log.messages(topics.LINK_EVENT)
-    for name, history in histories(events, source.zero_ns).items():
+    events: list[LinkEvent] = run.log.messages(topics.LINK_EVENT)
+    for name, history in histories(events, run.zero_ns).items():
         alike[history].append(name)
-    rows = [_row(source, label, history) for history, names in alike.items()
+    rows = [_row(run, label, history) for history, names in alike.items()
             for label in _labels(names)]  # fmt: skip
-    sheet.bars("Network, as injected", rows, ImpairedLink, COLOURS, otherwise=NOTHING_DONE)
+    model.bars("Network, as injected", rows, ImpairedLink, COLOURS, if_empty=NOTHING_DONE)
 
 
 def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
@@ -79,9 +79,9 @@ def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
     return {name: tuple(history) for name, history in found.items()}
 
 
-def _row(source: RunData, label: str, history: History) -> BarRow:
+def _row(run: RunData, label: str, history: History) -> BarRow:
     """Return a history as samples that are close enough to be one bar."""
-    begin, end = source.span
+    begin, end = run.span
     changes = np.array([t for t, _ in history])
     codes = np.array([ImpairedLink.CLEAR, *(code for _, code in history)])
     t = np.union1d(np.arange(begin, end, GAP_S / 2), changes)

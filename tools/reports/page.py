@@ -9,15 +9,19 @@ from pathlib import Path
 from typing import Final
 
 from tools.reports import network, panels, summary, timeline, times, torques
-from tools.reports.page_model import Sheet, TimelineEvent
+from tools.reports.page_model import PageModel, TimelineEvent
 from tools.reports.run_data import RunData
 from tools.reports.summary import RunVerdict
 from tools.runs import verdict_table
 from tools.runs.run_log import RunLog
 
 HERE: Final = Path(__file__).parent
-STYLE: Final = "page.css"
-SCRIPTS: Final = ("draw.js", "plot.js", "legend.js", "view.js", "page.js")
+VENDOR: Final = HERE / "vendor" / "uplot"
+STYLES: Final = (VENDOR / "uPlot.min.css", HERE / "page.css")
+LIBRARY: Final = VENDOR / "uPlot.iife.min.js"
+SCRIPTS: Final = tuple(
+    HERE / f"{name}.js" for name in ("signals", "format", "overlay", "panel", "view", "page")
+)
 
 BEFORE_FALL_S: Final = 3.0
 """A click on a fall shows so much before it."""
@@ -47,42 +51,43 @@ def render(log: RunLog) -> str:
     Raises:
         RunError: a message is not of this version.
     """
-    source = RunData(log)
-    sheet = fill(source)
-    events = timeline.happenings(source)
-    judged = summary.judge(source)
+    run = RunData(log)
+    model = fill(run)
+    events = timeline.timeline_events(run)
+    judged = summary.judge(run)
     name = log.metadata["run"].get("scenario") or log.path.name
     fell_s = next((row.t for row in events if row.kind == "fall"), None)
     parts = (
-        _head(source, judged, name),
-        _tools(source, fell_s),
+        _head(run, judged, name),
+        _tools(run, fell_s),
         f'<div class="work">{_timeline(events)}<main id="panels"></main></div>',
-        _left_out(sheet),
-        _lost(source),
-        _folded(source),
+        _left_out(model),
+        _lost(run),
+        _folded(run),
     )
-    data = json.dumps(sheet.as_data(events), separators=(",", ":"), allow_nan=False)
+    data = json.dumps(model.as_data(events), separators=(",", ":"), allow_nan=False)
     said = "" if judged.good is None else f"{judged.sentence}: "
     return _document(f"{said}{name}, {log.robot}", "\n".join(parts), data)
 
 
-def fill(source: RunData) -> Sheet:
+def fill(run: RunData) -> PageModel:
     """Return all panels of a run, in the order of the page."""
-    sheet = Sheet(source.span)
-    panels.add_body(source, sheet)
-    panels.add_states(source, sheet)
-    network.add_network(source, sheet)
-    times.add_ages(source, sheet)
-    panels.add_certificate(source, sheet)
-    torques.add_joints(source, sheet)
-    panels.add_harness(source, sheet)
-    times.add_times(source, sheet)
-    return sheet
+    model = PageModel(run.span)
+    panels.add_body(run, model)
+    panels.add_states(run, model)
+    network.add_network(run, model)
+    times.add_ages(run, model)
+    panels.add_certificate(run, model)
+    torques.add_joints(run, model)
+    panels.add_harness(run, model)
+    times.add_times(run, model)
+    return model
 
 
 def _document(title: str, body: str, data: str) -> str:
-    style = (HERE / STYLE).read_text(encoding="utf-8")
-    script = "\n".join((HERE / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    style = "\n".join(path.read_text(encoding="utf-8") for path in STYLES)
+    library = LIBRARY.read_text(encoding="utf-8")
+    script = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     safe = data.replace("<", "\\u003c")  # no end tag within
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -98,6 +103,7 @@ def _document(title: str, body: str, data: str) -> str:
 <body>
 {body}
 <script type="application/json" id="data">{safe}</script>
+<script id="uplot">{library}</script>
 <script>
 {script}</script>
 </body>
@@ -105,11 +111,11 @@ def _document(title: str, body: str, data: str) -> str:
 """
 
 
-def _head(source: RunData, judged: RunVerdict, name: str) -> str:
+def _head(run: RunData, judged: RunVerdict, name: str) -> str:
     word = {True: "good", False: "bad", None: "none"}[judged.good]
     rows = "".join(
         f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>"
-        for key, value in summary.head(source)
+        for key, value in summary.head(run)
     )
     caution = f'<p class="caution">{escape(judged.caution)}</p>' if judged.caution else ""
     table = ""
@@ -120,14 +126,14 @@ def _head(source: RunData, judged: RunVerdict, name: str) -> str:
         cells = _table(names, judged.rows, numbers=(1, 2))
         table = _details(f"Figures against their limits: {count}", cells, opened=True)
     return (
-        f"<header><h1>{escape(source.log.robot)}: {escape(name)}</h1>"
+        f"<header><h1>{escape(run.log.robot)}: {escape(name)}</h1>"
         f'<p class="verdict {word}" id="verdict">{escape(judged.sentence)}</p>{caution}'
         f'<div class="head">{table}<dl>{rows}</dl></div></header>'
     )
 
 
-def _tools(source: RunData, fell_s: float | None) -> str:
-    begin, end = source.span
+def _tools(run: RunData, fell_s: float | None) -> str:
+    begin, end = run.span
     buttons = "".join(
         f'<button type="button" data-do="{do}" title="{title}" aria-label="{title}">{text}</button>'
         for do, text, title in (
@@ -150,17 +156,17 @@ def _tools(source: RunData, fell_s: float | None) -> str:
     return (
         f'<nav class="tools" aria-label="time shown"><span class="buttons">{buttons}</span>{fields}'
         f'<output id="cursor"></output></nav>'
-        f'<details class="hint"><summary>{escape(source.axis[0].upper() + source.axis[1:])}. '
+        f'<details class="hint"><summary>{escape(run.axis[0].upper() + run.axis[1:])}. '
         f"How to read and zoom</summary><ul>{HELP}</ul></details>"
         "<noscript><p>The plots need JavaScript; verdict, timeline and tables do not.</p>"
         "</noscript>"
     )
 
 
-def _left_out(sheet: Sheet) -> str:
-    if not sheet.left_out:
+def _left_out(model: PageModel) -> str:
+    if not model.left_out:
         return ""
-    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in sheet.left_out)
+    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in model.left_out)
     return f'<section id="left-out"><h2>Left out</h2><ul>{rows}</ul></section>'
 
 
@@ -184,8 +190,8 @@ def _before(row: TimelineEvent) -> str:
     return f' data-before="{BEFORE_FALL_S:g}"' if row.kind == "fall" else ""
 
 
-def _lost(source: RunData) -> str:
-    rows = summary.lost(source)
+def _lost(run: RunData) -> str:
+    rows = summary.lost(run)
     missing = sum(row.lost for row in rows)
     cells = [
         (
@@ -197,14 +203,14 @@ def _lost(source: RunData) -> str:
     ]  # fmt: skip
     title = f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
     names = ("topic", "messages", "Hz", "of Hz", "lost", "gaps", "restarts")
-    damage = "".join(f"<li>{escape(line)}</li>" for line in summary.damage(source))
+    damage = "".join(f"<li>{escape(line)}</li>" for line in summary.damage(run))
     body = (f"<ul>{damage}</ul>" if damage else "") + _table(names, cells, numbers=range(1, 7))
     return f'<section id="lost">{_details(title, body, opened=bool(missing or damage))}</section>'
 
 
-def _folded(source: RunData) -> str:
-    parts = [_details(name, f"<pre>{escape(text)}</pre>") for name, text in summary.files(source)]
-    installed = summary.packages(source)
+def _folded(run: RunData) -> str:
+    parts = [_details(name, f"<pre>{escape(text)}</pre>") for name, text in summary.files(run)]
+    installed = summary.packages(run)
     if installed:
         table = _table(("package", "version"), installed, numbers=())
         parts.append(_details(f"{len(installed)} packages", table))

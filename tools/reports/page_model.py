@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tools.reports.signals import Array, Span, packed, segments
+from tools.reports.signals import Array, Span, encode_signal, segments
 
 
 class Line(NamedTuple):
@@ -52,7 +52,7 @@ class TimelineEvent(NamedTuple):
     """What the mark says; empty: no mark."""
 
 
-class Sheet:
+class PageModel:
     """Panels in the order in which they are added."""
 
     def __init__(self, span: Span) -> None:
@@ -72,7 +72,7 @@ class Sheet:
         limits: Sequence[LevelLine] = (),
         reach: float | None = None,
         note: str = "",
-        otherwise: str = "",
+        if_empty: str = "",
     ) -> None:
         """Add a panel; without data it is left out.
 
@@ -83,11 +83,11 @@ class Sheet:
             limits: levels.
             reach: the axis goes no higher; a line may.
             note: a sentence for those who do not know the panel.
-            otherwise: why it is left out, if it has no data.
+            if_empty: why it is left out, if it has no data.
         """
         found = self._lines(lines)
         if not found:
-            self.left_out.append((title, otherwise))
+            self.left_out.append((title, if_empty))
             return
         self.panels.append(
             _panel("plot", title, note, unit=unit, lines=found, limits=_levels(limits), reach=reach)
@@ -102,7 +102,7 @@ class Sheet:
         *,
         initial: str,
         note: str = "",
-        otherwise: str = "",
+        if_empty: str = "",
     ) -> None:
         """Add a panel of which one of several sets of lines is shown at a time.
 
@@ -113,7 +113,7 @@ class Sheet:
             choices: lines and levels by name.
             initial: which is shown first.
             note: a sentence for those who do not know the panel.
-            otherwise: why it is left out, if it has no data.
+            if_empty: why it is left out, if it has no data.
         """
         found = [
             {"label": label, "lines": self._lines(lines), "limits": _levels(limits)}
@@ -121,7 +121,7 @@ class Sheet:
         ]
         found = [choice for choice in found if choice["lines"]]
         if not found:
-            self.left_out.append((title, otherwise))
+            self.left_out.append((title, if_empty))
             return
         labels = [choice["label"] for choice in found]
         index = labels.index(initial) if initial in labels else 0
@@ -136,7 +136,7 @@ class Sheet:
         names: type[IntEnum],
         colours: Mapping[int, str],
         *,
-        otherwise: str = "",
+        if_empty: str = "",
     ) -> None:
         """Add a panel of coloured bars; rows without data are left out.
 
@@ -145,7 +145,7 @@ class Sheet:
             rows: from top to bottom.
             names: of the codes.
             colours: name of the colour of each code.
-            otherwise: why it is left out, if it has no data.
+            if_empty: why it is left out, if it has no data.
         """
         found: list[dict[str, Any]] = []
         for row in rows:
@@ -154,7 +154,7 @@ class Sheet:
             if spans:
                 found.append({"label": row.label, "spans": spans})
         if not found:
-            self.left_out.append((title, otherwise))
+            self.left_out.append((title, if_empty))
             return
         used = sorted({int(span[2]) for row in found for span in row["spans"]})
         codes = {
@@ -162,19 +162,20 @@ class Sheet:
         }  # an unknown code is of another version
         self.panels.append(_panel("bars", title, "", rows=found, codes=codes))
 
-    def as_data(self, happenings: Sequence[TimelineEvent]) -> dict[str, Any]:
+    def as_data(self, timeline_events: Sequence[TimelineEvent]) -> dict[str, Any]:
         """Return all that the page's plots are made from."""
         return {
             "span": [self.span.begin, self.span.end],
+            "grid": self.span.grid,
             "signals": self.signals,
             "panels": self.panels,
-            "marks": [[row.t, row.kind, row.mark] for row in happenings if row.mark],
+            "marks": [[row.t, row.kind, row.mark] for row in timeline_events if row.mark],
         }
 
     def _lines(self, lines: Sequence[Line]) -> list[dict[str, Any]]:
         found = []
         for line in lines:
-            signal = packed(line.t, line.values, self.span)
+            signal = encode_signal(line.t, line.values, self.span)
             if signal is not None:
                 found.append(
                     {

@@ -10,7 +10,7 @@ import numpy as np
 from shared import topics
 from shared.joints import MODULES
 from shared.messages import DriveStatus, Mode, PlannerMode, SplitSource
-from tools.reports.page_model import BarRow, LevelLine, Line, Sheet
+from tools.reports.page_model import BarRow, LevelLine, Line, PageModel
 from tools.reports.run_data import RunData
 from tools.reports.signals import Array
 from tools.runs.verdict_limits import LIMITS
@@ -56,11 +56,11 @@ SENSE_COLOURS: Final[dict[int, str]] = {
 }  # fmt: skip
 
 
-def add_body(source: RunData, sheet: Sheet) -> None:
+def add_body(run: RunData, model: PageModel) -> None:
     """Add the paper's Fig. 7: COM, height, torso angles, and the operator's hand."""
-    com, torso, angles = _truth(source, "com", "torso", "angles")
-    p, p_ref = _planner(source)
-    t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
+    com, torso, angles = _truth(run, "com", "torso", "angles")
+    p, p_ref = _planner(run)
+    t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
     real = bool(len(t))
 
     def both(label: str, truth: Array, seen: Array, colour: int) -> list[Line]:
@@ -70,36 +70,36 @@ def add_body(source: RunData, sheet: Sheet) -> None:
         return [*lines, Line(view, t_p, seen, colour, hidden=real, dashed=real)]
 
     neither = f"{NO_WORLD}, and {NO_PLANNER}"
-    sheet.plot(
+    model.plot(
         "COM", "mm",
         [*both("x", com[:, 0] * 1e3, p[:, 0] * 1e3, 0),
          *both("y", com[:, 1] * 1e3, p[:, 1] * 1e3, 1)],
         limits=[*_led("alive_com_x_max_mm", "x, while led"),
                 *_led("alive_com_y_max_mm", "y, while led")],
         note="World axes: x forward, y left; 0 is midway between the ankles.",
-        otherwise=neither,
+        if_empty=neither,
     )  # fmt: skip
-    sheet.plot(
+    model.plot(
         "Height", "m",
         [Line("torso", t, torso[:, 2], 0), *both("COM", com[:, 2], p[:, 2], 1),
          Line("COM asked for", t_p, p_ref[:, 2], 2, hidden=True, dashed=True)],
-        note="Above the ankles.", otherwise=neither,
+        note="Above the ankles.", if_empty=neither,
     )  # fmt: skip
-    sheet.plot(
+    model.plot(
         "Torso angles", "rad",
         [*(line for number, name in enumerate(("roll", "pitch", "yaw"))
            for line in both(name, angles[:, number], p[:, 3 + number], number)),
          Line("pitch asked for", t_p, p_ref[:, 4], 4, hidden=True, dashed=True)],
-        limits=_led("alive_roll_max_rad", "roll and yaw, while led"), otherwise=neither,
+        limits=_led("alive_roll_max_rad", "roll and yaw, while led"), if_empty=neither,
     )  # fmt: skip
-    _add_hand(source, sheet)
-    _add_feet(source, sheet)
+    _add_hand(run, model)
+    _add_feet(run, model)
 
 
-def _add_hand(source: RunData, sheet: Sheet) -> None:
-    hand, load, given, push = _truth(source, "operator_force", "load_n", "harness_force_z", "push")
-    t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
-    wanted, assist = source.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
+def _add_hand(run: RunData, model: PageModel) -> None:
+    hand, load, given, push = _truth(run, "operator_force", "load_n", "harness_force_z", "push")
+    t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
+    wanted, assist = run.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
     lines = [Line("hand, z", t, hand[:, 2], 0)]
     if load.any():
         lines += [Line("weight on the harness", t, load, 1), Line("carried", t, given, 2)]
@@ -113,44 +113,44 @@ def _add_hand(source: RunData, sheet: Sheet) -> None:
         for number, axis in enumerate("xyz")
         if push[:, number].any()
     ]
-    sheet.plot(
+    model.plot(
         "Operator's force", "N", lines if len(t) else [],
         limits=_led("operator_peak_n", "hand, while led"),
-        note="World axes, on the torso.", otherwise=NO_WORLD,
+        note="World axes, on the torso.", if_empty=NO_WORLD,
     )  # fmt: skip
 
 
-def _add_feet(source: RunData, sheet: Sheet) -> None:
+def _add_feet(run: RunData, model: PageModel) -> None:
     """Add whether the soles lie flat, stay where they are, and agree about the torso."""
-    right, left, slip = _truth(source, "foot_right_tilt", "foot_left_tilt", "feet_slip")
-    t, t_p = source.times(topics.SIM_TRUTH), source.times(topics.PLANNER_STATUS)
-    sheet.plot(
+    right, left, slip = _truth(run, "foot_right_tilt", "foot_left_tilt", "feet_slip")
+    t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
+    model.plot(
         "Tilt of the soles", "rad", [Line("right", t, right, 0), Line("left", t, left, 1)],
         limits=_led("alive_sole_tilt_max_rad", "while led")[:1],
         note="Angle between sole and floor: a foot that tips stands on an edge.",
-        otherwise=NO_WORLD,
+        if_empty=NO_WORLD,
     )  # fmt: skip
-    sheet.plot(
+    model.plot(
         "Slip of the feet", "mm", [Line("the further ankle", t, slip * 1e3, 0)],
-        note="Distance of an ankle from where it stood at the start.", otherwise=NO_WORLD,
+        note="Distance of an ankle from where it stood at the start.", if_empty=NO_WORLD,
     )  # fmt: skip
-    mode, closure = source.columns(topics.PLANNER_STATUS, "", "mode", "closure")
+    mode, closure = run.columns(topics.PLANNER_STATUS, "", "mode", "closure")
     closure = _wide(closure, 6)
-    closure[(mode == PlannerMode.WAITING) | (t_p < source.armed_s())] = np.nan
+    closure[(mode == PlannerMode.WAITING) | (t_p < run.armed_s())] = np.nan
     note = (
         "Left minus right leg's estimate of where the torso is: the planner's own sign of a "
         "foot that slips or tips."
     )
-    sheet.plot(
+    model.plot(
         "The legs' disagreement, position", "mm",
         [Line(axis, t_p, closure[:, number] * 1e3, number) for number, axis in enumerate("xyz")],
-        note=note, otherwise=NO_PLANNER,
+        note=note, if_empty=NO_PLANNER,
     )  # fmt: skip
-    sheet.plot(
+    model.plot(
         "The legs' disagreement, angle", "rad",
         [Line(axis, t_p, closure[:, 3 + number], number)
          for number, axis in enumerate(("roll", "pitch", "yaw"))],
-        otherwise=NO_PLANNER,
+        if_empty=NO_PLANNER,
     )  # fmt: skip
 
 
@@ -160,78 +160,78 @@ def _led(key: str, label: str) -> list[LevelLine]:
     return [LevelLine(most, label, shown=False), LevelLine(-most, label, shown=False)]
 
 
-def add_states(source: RunData, sheet: Sheet) -> None:
+def add_states(run: RunData, model: PageModel) -> None:
     """Add the bars: services, drives, planner, gains, harness."""
     modes, drives = [], []
     for module in MODULES:
-        t = source.times(topics.JOINT_STATE, module)
-        mode, drive = source.columns(topics.JOINT_STATE, module, "mode", "drive")
+        t = run.times(topics.JOINT_STATE, module)
+        mode, drive = run.columns(topics.JOINT_STATE, module, "mode", "drive")
         modes.append(BarRow(module, t, mode))
         drives.append(BarRow(module, t, drive))
-    sheet.bars("Modes of the six services", modes, Mode, MODE_COLOURS, otherwise=NO_STATES)
-    sheet.bars("Drives", drives, DriveStatus, DRIVE_COLOURS, otherwise=NO_STATES)
-    t = source.times(topics.PLANNER_STATUS)
-    mode, split = source.columns(topics.PLANNER_STATUS, "", "mode", "split")
-    sheet.bars(
-        "Planner", [BarRow("planner", t, mode)], PlannerMode, PLANNER_COLOURS, otherwise=NO_PLANNER
+    model.bars("Modes of the six services", modes, Mode, MODE_COLOURS, if_empty=NO_STATES)
+    model.bars("Drives", drives, DriveStatus, DRIVE_COLOURS, if_empty=NO_STATES)
+    t = run.times(topics.PLANNER_STATUS)
+    mode, split = run.columns(topics.PLANNER_STATUS, "", "mode", "split")
+    model.bars(
+        "Planner", [BarRow("planner", t, mode)], PlannerMode, PLANNER_COLOURS, if_empty=NO_PLANNER
     )
-    sheet.bars(
+    model.bars(
         "Where the local gains come from", [BarRow("gains", t, split)], SplitSource, SPLIT_COLOURS,
-        otherwise=NO_PLANNER,
+        if_empty=NO_PLANNER,
     )  # fmt: skip
-    valid, saturated = source.columns(topics.WRENCH, "", "valid", "saturated")
+    valid, saturated = run.columns(topics.WRENCH, "", "valid", "saturated")
     sense = np.where(saturated > 0.0, Sense.SATURATED, np.where(valid > 0.0, 0.0, 1.0))
-    row = BarRow("harness", source.times(topics.WRENCH), sense)
-    sheet.bars("Harness sensor", [row], Sense, SENSE_COLOURS, otherwise=NO_HARNESS)
+    row = BarRow("harness", run.times(topics.WRENCH), sense)
+    model.bars("Harness sensor", [row], Sense, SENSE_COLOURS, if_empty=NO_HARNESS)
 
 
-def add_harness(source: RunData, sheet: Sheet) -> None:
+def add_harness(run: RunData, model: PageModel) -> None:
     """Add the operator's wrench on the torso, as measured."""
-    t = source.times(topics.WRENCH)
-    force, moment = source.columns(topics.WRENCH, "", "force", "moment")
+    t = run.times(topics.WRENCH)
+    force, moment = run.columns(topics.WRENCH, "", "force", "moment")
     force, moment = _wide(force, 3), _wide(moment, 3)
     for title, unit, values in (("force", "N", force), ("moment", "N m", moment)):
         lines = [Line(axis, t, values[:, number], number) for number, axis in enumerate("xyz")]
         note = "Operator on torso, at the harness point, torso axes."
-        sheet.plot(f"Harness {title}", unit, lines, note=note, otherwise=NO_HARNESS)
+        model.plot(f"Harness {title}", unit, lines, note=note, if_empty=NO_HARNESS)
 
 
-def add_certificate(source: RunData, sheet: Sheet) -> None:
+def add_certificate(run: RunData, model: PageModel) -> None:
     """Add the margins of the gains in force, the least allowed, and what is coupled beside them."""
-    t = source.times(topics.PLANNER_STATUS)
-    mode, service, onboard = source.columns(
+    t = run.times(topics.PLANNER_STATUS)
+    mode, service, onboard = run.columns(
         topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
     )
     for values in (service, onboard):
         values[mode == PlannerMode.WAITING] = np.nan
     limits = [LevelLine(0.0, "a fall")]
-    if source.robot is not None:
-        asked = source.robot.certificate
+    if run.robot is not None:
+        asked = run.robot.certificate
         limits += [
             LevelLine(asked.margin_min, "least, services"),
             LevelLine(asked.onboard_margin_min, "least, drives"),
         ]
-    sheet.plot(
+    model.plot(
         "Certificate margin", "",
         [Line("joint services alone", t, service, 0), Line("drives alone", t, onboard, 1)],
         limits=limits,
         note="What stands if the planner is gone: 1 is the stiffness required, 0 is a fall.",
-        otherwise=NO_PLANNER,
+        if_empty=NO_PLANNER,
     )  # fmt: skip
 
 
-def _truth(source: RunData, *names: str) -> list[Array]:
+def _truth(run: RunData, *names: str) -> list[Array]:
     widths = {"com": 3, "torso": 3, "angles": 3, "operator_force": 3, "push": 3}
-    found = source.columns(topics.SIM_TRUTH, "", *names)
+    found = run.columns(topics.SIM_TRUTH, "", *names)
     return [
         _wide(values, widths[name]) if name in widths else values
         for name, values in zip(names, found, strict=True)
     ]
 
 
-def _planner(source: RunData) -> tuple[Array, Array]:
+def _planner(run: RunData) -> tuple[Array, Array]:
     """Return p and p_ref as the planner had them; NaN while it waited."""
-    mode, p, p_ref = source.columns(topics.PLANNER_STATUS, "", "mode", "p", "p_ref")
+    mode, p, p_ref = run.columns(topics.PLANNER_STATUS, "", "mode", "p", "p_ref")
     p, p_ref = _wide(p, 6), _wide(p_ref, 6)
     for values in (p, p_ref):
         values[mode == PlannerMode.WAITING] = np.nan

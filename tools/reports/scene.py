@@ -24,7 +24,16 @@ from shared.joints import MODULES, SIDES
 from shared.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
 from shared.robot_model import MODULE_RADIUS, side_sign
 from tools.reports import foxglove, urdf
-from tools.reports.foxglove import ORIGIN, UPRIGHT, Arrow, Colour, Entity, Placed, Quaternion, Solid
+from tools.reports.foxglove import (
+    ORIGIN,
+    UPRIGHT,
+    Arrow,
+    Colour,
+    Entity,
+    FrameTransform,
+    Quaternion,
+    Solid,
+)
 from tools.runs.run_log import RunLog
 
 RATE_HZ: Final = 30.0
@@ -187,13 +196,13 @@ def _thinned(rows: list[Any], first_ns: int) -> Iterator[Any]:
             yield row
 
 
-def frames(robot: RobotConfig, pose: RobotPose) -> list[Placed]:
+def frames(robot: RobotConfig, pose: RobotPose) -> list[FrameTransform]:
     """Return every frame at a moment."""
     geometry = robot.geometry
     found = [
-        Placed("world", "torso", pose.torso, torso_turn(pose.angles)),
-        Placed("world", "com", pose.com, UPRIGHT),
-        Placed("torso", "harness", geometry.harness_point, UPRIGHT),
+        FrameTransform("world", "torso", pose.torso, torso_rotation(pose.angles)),
+        FrameTransform("world", "com", pose.com, UPRIGHT),
+        FrameTransform("torso", "harness", geometry.harness_point, UPRIGHT),
     ]
     for side in SIDES:
         sign = side_sign(side)
@@ -206,18 +215,18 @@ def frames(robot: RobotConfig, pose: RobotPose) -> list[Placed]:
             module = f"{kind}_{side}"
             number = 2 * MODULES.index(module)
             phi, theta = pose.q[number], pose.q[number + 1]
-            found.append(Placed(parent, module, at, module_turn(phi, theta)))
+            found.append(FrameTransform(parent, module, at, module_rotation(phi, theta)))
             parent = module
     return found
 
 
-def torso_turn(angles: Vector3) -> Quaternion:
+def torso_rotation(angles: Vector3) -> Quaternion:
     """Return Rz(yaw) Rx(roll) Ry(pitch)."""
     roll, pitch, yaw = angles
     return product(product(_about(2, yaw), _about(0, roll)), _about(1, pitch))
 
 
-def module_turn(phi: float, theta: float) -> Quaternion:
+def module_rotation(phi: float, theta: float) -> Quaternion:
     """Return how what hangs below a module is turned in what is above it.
 
     From the foot up a module is Rx(phi) Ry(theta); from the torso down, its inverse.

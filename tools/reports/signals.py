@@ -44,6 +44,12 @@ class Span(NamedTuple):
         """Width of a bin."""
         return max((self.end - self.begin) / BINS, BIN_MIN_S)
 
+    @property
+    def grid(self) -> dict[str, float]:
+        """Grid of times of all signals: half a bin apart, each in the middle of its half."""
+        count = 2 * (int((self.end - self.begin) / self.bin_s) + 1)
+        return {"begin": self.begin, "step": self.bin_s / 2, "count": count}
+
 
 def seconds(stamps_ns: list[int], zero_ns: int, heard_ns: list[int] | None = None) -> Array:
     """Return times in s that rise.
@@ -80,7 +86,7 @@ def seconds(stamps_ns: list[int], zero_ns: int, heard_ns: list[int] | None = Non
     return np.asarray(np.minimum(t + later, np.where(within > 0, latest, t)), dtype=np.float64)
 
 
-def packed(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
+def encode_signal(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
     """Return a signal as it goes into the page, or None if it has no finite value.
 
     Args:
@@ -93,8 +99,8 @@ def packed(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
     if not len(t):
         return None
     width = span.bin_s
-    places = (t - span.begin) / width
-    bins = places.astype(np.int64)
+    position = (t - span.begin) / width
+    bins = position.astype(np.int64)
     starts = np.flatnonzero(np.concatenate(([True], np.diff(bins) > 0)))
     first, second = _extremes(values, starts)
     lo, hi = float(values.min()), float(values.max())
@@ -105,15 +111,15 @@ def packed(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
         coded = np.clip(scaled, 0, STEPS).astype(np.int64) + FIRST
         codes[bins[starts] - bins[0], column] = coded
     alone = starts[np.diff(np.append(starts, len(t))) == 1]
-    late = (places[alone] - bins[alone] >= 0.5).astype(np.int64)
+    late = (position[alone] - bins[alone] >= 0.5).astype(np.int64)
     codes[bins[alone] - bins[0], 1 - late] = SKIP  # one sample is one point, in its own half
-    silent = np.flatnonzero(np.diff(t) > _gap(t))
-    after = bins[silent] - bins[0] + 1
-    after = after[after < bins[silent + 1] - bins[0]]
-    codes[after] = BREAK
+    places = codes.reshape(-1)
+    used = np.flatnonzero(places != SKIP)
+    for gap in np.flatnonzero(np.diff(t) > _gap(t)):
+        last, following = np.searchsorted(used, 2 * (bins[[gap, gap + 1]] - bins[0] + [1, 0]))
+        places[used[last - 1] + 1 : used[following]] = BREAK
     return {
-        "t0": round(span.begin + float(bins[0]) * width, 6),
-        "h": width / 2,
+        "first": 2 * int(bins[0]),
         "lo": lo,
         "hi": hi,
         "step": step,

@@ -52,13 +52,13 @@ class Lost(NamedTuple):
     restarts: int
 
 
-def judge(source: RunData) -> RunVerdict:
+def judge(run: RunData) -> RunVerdict:
     """Return the verdict as the verbs that made the run print it."""
-    log = source.log
-    if source.course is None:
-        return RunVerdict(f"No verdict: {source.without_course}", None, [])
+    log = run.log
+    if run.course is None:
+        return RunVerdict(f"No verdict: {run.without_course}", None, [])
     try:
-        summary = verdict.summarise(log, _duration_s(source))
+        summary = verdict.summarise(log, _duration_s(run))
     except XrlError as error:
         return RunVerdict(f"No verdict: {error}", None, [])
     if log.metadata["run"].get("lockstep"):
@@ -68,14 +68,14 @@ def judge(source: RunData) -> RunVerdict:
     return RunVerdict(said[-1], bool(summary["stood"]), _rows(summary), caution)
 
 
-def _duration_s(source: RunData) -> float:
+def _duration_s(run: RunData) -> float:
     """Return how long the scenario was to be; without one, as long as it was."""
-    raw = source.log.attachments.get("scenario.toml", b"")
+    raw = run.log.attachments.get("scenario.toml", b"")
     try:
         return float(tomllib.loads(raw.decode())["duration"])
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
-        assert source.course is not None  # noqa: S101 - asked for with a course only
-        return float(source.course.t[-1])
+        assert run.course is not None  # noqa: S101 - asked for with a course only
+        return float(run.course.t[-1])
 
 
 def _said(summary: Summary) -> list[str]:
@@ -99,12 +99,12 @@ def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def head(source: RunData) -> list[tuple[str, str]]:
+def head(run: RunData) -> list[tuple[str, str]]:
     """Return (name, value) of what a reader needs to know first."""
-    log, about = source.log, source.log.metadata["run"]
-    begin, end = source.span
+    log, about = run.log, run.log.metadata["run"]
+    begin, end = run.span
     rows = [
-        ("scenario", _scenario(source)),
+        ("scenario", _scenario(run)),
         ("started", _moment(about.get("started", ""))),
         ("virtual time", about.get("lockstep", "")),
         ("length", f"{end - begin:.1f} s"),
@@ -130,16 +130,16 @@ def _threads(raw: str) -> str:
 
 
 def _moment(started: str) -> str:
-    """Return a time as people write it; as it is, if it is written otherwise."""
+    """Return a time as people write it; as it is, if it is written if_empty."""
     try:
         return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
     except ValueError:
         return started
 
 
-def _scenario(source: RunData) -> str:
-    name = source.log.metadata["run"].get("scenario", "")
-    raw = source.log.attachments.get("scenario.toml", b"")
+def _scenario(run: RunData) -> str:
+    name = run.log.metadata["run"].get("scenario", "")
+    raw = run.log.attachments.get("scenario.toml", b"")
     try:
         about = str(tomllib.loads(raw.decode()).get("about", ""))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError):
@@ -152,9 +152,9 @@ def _commit(about: dict[str, str]) -> str:
     return f"{commit} with changes" if about.get("git_dirty") == "true" else commit
 
 
-def lost(source: RunData) -> list[Lost]:
+def lost(run: RunData) -> list[Lost]:
     """Return what was recorded of each key, and what is missing, by sequence numbers."""
-    log, rows = source.log, []
+    log, rows = run.log, []
     known = topics.all_keys(log.robot)
     for key, count in sorted(log.gaps().items()):
         received = [row[0] for row in log.raw(key)]
@@ -168,18 +168,18 @@ def lost(source: RunData) -> list[Lost]:
     return rows
 
 
-def damage(source: RunData) -> list[str]:
+def damage(run: RunData) -> list[str]:
     """Return what of the file cannot be read, a line for each place."""
-    log = source.log
+    log = run.log
     if log.complete and not log.damage:
         return []
     return describe_lost(log.cut, log.damage, finished=log.complete)
 
 
-def files(source: RunData) -> list[tuple[str, str]]:
+def files(run: RunData) -> list[tuple[str, str]]:
     """Return (name, text) of the files that the run was made from, as they are in its log."""
     found = []
-    for name, raw in sorted(source.log.attachments.items(), key=lambda row: _order(row[0])):
+    for name, raw in sorted(run.log.attachments.items(), key=lambda row: _order(row[0])):
         if name.endswith((".toml", ".json")):
             found.append((name, raw.decode(errors="replace")))
     return found
@@ -190,7 +190,7 @@ def _order(name: str) -> tuple[bool, str]:
     return not name.endswith(".toml"), name
 
 
-def packages(source: RunData) -> list[tuple[str, str]]:
+def packages(run: RunData) -> list[tuple[str, str]]:
     """Return (name, version) of all packages that were installed."""
-    found: dict[str, Any] = source.log.metadata.get("packages", {})
+    found: dict[str, Any] = run.log.metadata.get("packages", {})
     return sorted(found.items(), key=lambda row: row[0].lower())

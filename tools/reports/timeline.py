@@ -24,7 +24,7 @@ from shared.messages import (
     Tare,
     Wrench,
 )
-from tools.reports.limit_violations import crossings
+from tools.reports.limit_violations import limit_violations
 from tools.reports.page_model import TimelineEvent
 from tools.reports.run_data import RunData
 from tools.reports.signals import GAP_S, seconds
@@ -51,26 +51,24 @@ KINDS: Final = {
 _USUAL: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
 
 
-def happenings(source: RunData) -> list[TimelineEvent]:
+def timeline_events(run: RunData) -> list[TimelineEvent]:
     """Return what happened, in the order of time."""
     found = [
-        *_from_outside(source),
-        *_changes_of_mode(source),
-        *_drives(source),
-        *_planner(source),
-        *_harness(source),
-        *_world(source),
-        *_silences(source),
-        *crossings(source),
-        *_network(source),
+        *_from_outside(run),
+        *_changes_of_mode(run),
+        *_drives(run),
+        *_planner(run),
+        *_harness(run),
+        *_world(run),
+        *_silences(run),
+        *limit_violations(run),
+        *_network(run),
     ]
     found.sort(key=lambda row: row.t)
     if len(found) > LINES_MAX:
         left = len(found) - LINES_MAX
         found = sorted([row for row in found if row.mark] + _spread(found), key=lambda row: row.t)
-        found.append(
-            TimelineEvent(source.span.end, "note", f"about {left} more lines are left out")
-        )
+        found.append(TimelineEvent(run.span.end, "note", f"about {left} more lines are left out"))
     return found
 
 
@@ -80,12 +78,12 @@ def _spread(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
     return quiet[: max(0, LINES_MAX - (len(found) - len(quiet)))]
 
 
-def _at(source: RunData, t_ns: int) -> float:
-    return (t_ns - source.zero_ns) / NS_PER_S
+def _at(run: RunData, t_ns: int) -> float:
+    return (t_ns - run.zero_ns) / NS_PER_S
 
 
-def _from_outside(source: RunData) -> Iterator[TimelineEvent]:
-    events: list[RunEvent] = source.log.messages(topics.RUN_EVENT)
+def _from_outside(run: RunData) -> Iterator[TimelineEvent]:
+    events: list[RunEvent] = run.log.messages(topics.RUN_EVENT)
     for event in events:
         kind = KINDS.get(_known(RunEventKind, event.kind), "note")
         text = _said(event)
@@ -95,28 +93,26 @@ def _from_outside(source: RunData) -> Iterator[TimelineEvent]:
             mark = mark or f"{event.subject} back"
         if kind == "push":
             mark = f"push {event.detail.partition(' for ')[0]}"
-        yield TimelineEvent(_at(source, event.t_ns), kind, text, mark)
+        yield TimelineEvent(_at(run, event.t_ns), kind, text, mark)
     last = None
-    for stop in source.log.messages(topics.ESTOP):
-        t = _at(source, stop.t_ns)
+    for stop in run.log.messages(topics.ESTOP):
+        t = _at(run, stop.t_ns)
         if last is None or t - last > 1.0:  # it is said again and again
             yield TimelineEvent(t, "estop", f"emergency stop by {stop.source}", "e-stop")
         last = t
-    for request in source.log.messages(topics.HARNESS_TARE):
-        yield TimelineEvent(
-            _at(source, request.t_ns), "note", f"tare asked for by {request.source}"
-        )
+    for request in run.log.messages(topics.HARNESS_TARE):
+        yield TimelineEvent(_at(run, request.t_ns), "note", f"tare asked for by {request.source}")
 
 
-def _network(source: RunData) -> Iterator[TimelineEvent]:
+def _network(run: RunData) -> Iterator[TimelineEvent]:
     """Tell when each impairment begins and ends; all its directions at once."""
-    for row in impairments(source.log.messages(topics.LINK_EVENT)):
-        begin_s, end_s = row.begin_s(source.zero_ns), row.end_s(source.zero_ns)
+    for row in impairments(run.log.messages(topics.LINK_EVENT)):
+        begin_s, end_s = row.begin_s(run.zero_ns), row.end_s(run.zero_ns)
         yield TimelineEvent(begin_s, "network", f"network, {row.title}", row.title)
         if end_s is None:
             continue
         text = f"network, {row.title} ends; {row.counts()}"
-        mark = f"{row.link} ends" if end_s < source.span.end - END_S else ""
+        mark = f"{row.link} ends" if end_s < run.span.end - END_S else ""
         yield TimelineEvent(end_s, "network" if mark else "note", text, mark)
 
 
@@ -133,11 +129,11 @@ def _said(event: RunEvent) -> str:
     return words.get(_known(RunEventKind, event.kind), other.strip())
 
 
-def _changes_of_mode(source: RunData) -> Iterator[TimelineEvent]:
+def _changes_of_mode(run: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointEvent]] = sorted(
-        (_at(source, event.t_ns), module, event)
+        (_at(run, event.t_ns), module, event)
         for module in MODULES
-        for event in source.log.messages(topics.JOINT_EVENT, module)
+        for event in run.log.messages(topics.JOINT_EVENT, module)
     )
     for alike in _together(
         changes, lambda row: (row[2].mode_before, row[2].mode_after, row[2].cause)
@@ -189,11 +185,11 @@ def _describe_change(alike: Sequence[tuple[float, str, JointEvent]]) -> str:
     return f"{text}; torque step {step:.2f} N m"
 
 
-def _drives(source: RunData) -> Iterator[TimelineEvent]:
+def _drives(run: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointState, JointState]] = []
     for module in MODULES:
-        states: list[JointState] = source.log.messages(topics.JOINT_STATE, module)
-        t = source.times(topics.JOINT_STATE, module)
+        states: list[JointState] = run.log.messages(topics.JOINT_STATE, module)
+        t = run.times(topics.JOINT_STATE, module)
         changes += [
             (float(t[index]), module, states[index - 1], states[index])
             for index in _changes([(state.drive, state.drive_error) for state in states])
@@ -219,9 +215,9 @@ def _what_of_drive(row: tuple[float, str, JointState, JointState]) -> str:
     return ", ".join(parts)
 
 
-def _planner(source: RunData) -> Iterator[TimelineEvent]:
-    rows: list[PlannerStatus] = source.log.messages(topics.PLANNER_STATUS)
-    t = source.times(topics.PLANNER_STATUS)
+def _planner(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[PlannerStatus] = run.log.messages(topics.PLANNER_STATUS)
+    t = run.times(topics.PLANNER_STATUS)
     for index in _changes([(row.mode, row.session) for row in rows]):
         before, after = rows[index - 1], rows[index]
         fresh = " in a new session" if before.session != after.session else ""
@@ -234,9 +230,9 @@ def _planner(source: RunData) -> Iterator[TimelineEvent]:
             yield TimelineEvent(float(t[index]), "note", f"{text} have dropped out")
 
 
-def _harness(source: RunData) -> Iterator[TimelineEvent]:
-    rows: list[Wrench] = source.log.messages(topics.WRENCH)
-    t = source.times(topics.WRENCH)
+def _harness(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[Wrench] = run.log.messages(topics.WRENCH)
+    t = run.times(topics.WRENCH)
     for index in _changes([(row.valid, row.saturated, row.tare) for row in rows]):
         row = rows[index]
         word = "valid" if row.valid else "saturated" if row.saturated else "not valid"
@@ -245,23 +241,23 @@ def _harness(source: RunData) -> Iterator[TimelineEvent]:
         yield TimelineEvent(float(t[index]), kind, f"harness sensor {word}{tare}")
 
 
-def _world(source: RunData) -> Iterator[TimelineEvent]:
-    rows: list[SimTruth] = source.log.messages(topics.SIM_TRUTH)
+def _world(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[SimTruth] = run.log.messages(topics.SIM_TRUTH)
     for row in rows:
         if row.fallen:
-            yield TimelineEvent(_at(source, row.t_ns), "fall", "the robot fell", "fell")
+            yield TimelineEvent(_at(run, row.t_ns), "fall", "the robot fell", "fell")
             return
 
 
-def _silences(source: RunData) -> Iterator[TimelineEvent]:
+def _silences(run: RunData) -> Iterator[TimelineEvent]:
     """Tell where topics with a rate said nothing for long, as the recorder heard them."""
     found: list[tuple[float, str, float]] = []
-    for key, topic in topics.all_keys(source.log.robot).items():
+    for key, topic in topics.all_keys(run.log.robot).items():
         if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
             continue
-        t = seconds([row[0] for row in source.log.raw(key)], source.zero_ns)
+        t = seconds([row[0] for row in run.log.raw(key)], run.zero_ns)
         steps = np.diff(t)
-        name = key.removeprefix(f"xrl/{source.log.robot}/")
+        name = key.removeprefix(f"xrl/{run.log.robot}/")
         found += [
             (float(t[index]), name, float(steps[index]))
             for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from shared import topics
 from shared.traces import LinkEvent
 from tests.reports import runs
-from tools.reports.limit_violations import crossings, first_beyond
+from tools.reports.limit_violations import first_violation, limit_violations
 from tools.reports.page_model import TimelineEvent
 from tools.reports.run_data import RunData
 from tools.runs.run_log import RunLog
@@ -27,7 +27,7 @@ T_S = 2.5
 def changed(
     log: RunLog, directory: Path, name: str, change: Callable[[float, dict[str, Any]], object]
 ) -> list[TimelineEvent]:
-    """Return the crossings of a log of which one key's messages are changed."""
+    """Return the limit_violations of a log of which one key's messages are changed."""
     zero_ns = RunData(log).zero_ns
 
     def payload(key: str, body: bytes) -> bytes:
@@ -37,11 +37,11 @@ def changed(
         change((message["t_ns"] - zero_ns) / 1e9, message)
         return msgspec.json.encode(message)
 
-    return list(crossings(RunData(runs.rewritten(log, directory, payload=payload))))
+    return list(limit_violations(RunData(runs.rewritten(log, directory, payload=payload))))
 
 
 def test_a_run_within_its_limits_has_none(log: RunLog) -> None:
-    assert list(crossings(RunData(log))) == []
+    assert list(limit_violations(RunData(log))) == []
 
 
 def test_a_sole_that_tips_is_told_with_its_first_time_and_how_long(
@@ -118,7 +118,7 @@ def test_a_margin_under_the_least_is_told_with_how_far_it_fell(log: RunLog, tmp_
 def test_hold_is_not_led_only_where_the_network_was_impaired_on_purpose(
     log: RunLog, tmp_path: Path, on_purpose: bool
 ) -> None:
-    """The verdict's rule: a module that drops out otherwise is no excuse."""
+    """The verdict's rule: a module that drops out if_empty is no excuse."""
     zero_ns = RunData(log).zero_ns
     link = "planner->ankle_right"
     event = LinkEvent(
@@ -138,14 +138,14 @@ def test_hold_is_not_led_only_where_the_network_was_impaired_on_purpose(
         return msgspec.json.encode(message)
 
     again = runs.rewritten(log, tmp_path, payload=unplugged, more=more if on_purpose else ())
-    told = " ".join(row.text for row in crossings(RunData(again)))
+    told = " ".join(row.text for row in limit_violations(RunData(again)))
     assert ("operator's force: over 40 N" in told) is not on_purpose
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=50))
 def test_the_time_beyond_a_limit_is_that_of_the_samples_beyond_it(beyond: list[bool]) -> None:
     t = np.arange(len(beyond)) * 0.01
-    found = first_beyond("x", t, np.array(beyond))
+    found = first_violation("x", t, np.array(beyond))
     if not any(beyond):
         assert found is None
         return
