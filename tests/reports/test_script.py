@@ -48,7 +48,7 @@ def test_every_panel_draws_narrow_and_wide_light_and_dark(
     assert len(panels) >= 17
     for panel in panels:
         kinds = {op[0] for op in panel["ops"]}
-        bars = panel["title"].startswith(("Modes", "Drives", "Planner", "Where", "Harness s"))
+        bars = panel["title"].startswith(("Modes", "Drives", "Planner", "Source", "Harness s"))
         assert {"path", "text"} <= kinds, panel["title"]
         assert ("rect" in kinds) == bars
         for op in panel["ops"]:
@@ -253,7 +253,7 @@ def test_limits_are_named_in_the_plot_whose_lines_come_close(page_file: Path) ->
     )
     assert "limit" in torque
     assert "HOLD" in command
-    assert "while led" not in tilt, "a limit far off does not flatten the line"
+    assert "planner leading" not in tilt, "a limit far off does not flatten the line"
 
 
 def test_numbers_of_an_axis_have_room_on_a_narrow_screen(page_file: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a page shows, as plain values: panels with lines, bars, a timeline. Pure."""
+"""Contents of a page as plain values: panels with lines, bars and a timeline. Pure."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ class Line(NamedTuple):
     values: Array
     colour: int
     hidden: bool = False
-    """Off until it is switched on in the legend."""
+    """True: not shown until the user switches it on in the legend."""
     dashed: bool = False
 
 
 class LevelLine(NamedTuple):
-    """A level to hold the lines against."""
+    """A horizontal line: a limit or another level to compare the lines with."""
 
     value: float
     label: str
     shown: bool = True
-    """False: only if the lines come near; the axis does not reach out for it."""
+    """False: the value axis does not extend to include it."""
 
 
 class BarRow(NamedTuple):
-    """One row of a panel of bars."""
+    """One row of a bar panel."""
 
     label: str
     t: Array
@@ -41,27 +41,27 @@ class BarRow(NamedTuple):
 
 
 class TimelineEvent(NamedTuple):
-    """One line of the timeline."""
+    """One row of the timeline."""
 
     t: float
     kind: str
-    """`kill`, `restart`, `push`, `fault`, `network`, `estop`, `fall`: also a mark in the plots;
-    `limit`, `bad` and `note` are not."""
+    """`kill`, `restart`, `push`, `fault`, `network`, `estop`, `fall`: also marked in the plots;
+    `limit`, `bad`, `note`: only in the timeline."""
     text: str
     mark: str = ""
-    """What the mark says; empty: no mark."""
+    """Label of the mark in the plots; empty: no mark."""
 
 
 class PageModel:
-    """Panels in the order in which they are added."""
+    """Panels of a page, in the order in which they are added."""
 
     def __init__(self, span: Span) -> None:
         self.span = span
         self.signals: list[dict[str, Any]] = []
         self.panels: list[dict[str, Any]] = []
-        self._places: dict[tuple[Any, ...], int] = {}
+        self._indices: dict[tuple[Any, ...], int] = {}
         self.left_out: list[tuple[str, str]] = []
-        """(panel, why) of what the log has no data for."""
+        """(title, reason) of each panel for which the log has no data."""
 
     def plot(
         self,
@@ -74,16 +74,16 @@ class PageModel:
         note: str = "",
         if_empty: str = "",
     ) -> None:
-        """Add a panel; without data it is left out.
+        """Add a panel of lines; a panel without data is left out.
 
         Args:
-            title: of the panel.
-            unit: of the axis.
-            lines: those without data are left out.
+            title: title of the panel.
+            unit: unit of the value axis.
+            lines: lines; those without data are left out.
             limits: levels.
-            reach: the axis goes no higher; a line may.
-            note: a sentence for those who do not know the panel.
-            if_empty: why it is left out, if it has no data.
+            reach: upper end of the value axis; lines may go beyond it.
+            note: an explanation for readers who do not know the panel.
+            if_empty: reason to state if the panel has no data.
         """
         found = self._lines(lines)
         if not found:
@@ -104,16 +104,16 @@ class PageModel:
         note: str = "",
         if_empty: str = "",
     ) -> None:
-        """Add a panel of which one of several sets of lines is shown at a time.
+        """Add a panel that shows one of several sets of lines at a time.
 
         Args:
-            title: of the panel.
-            unit: of the axis.
+            title: title of the panel.
+            unit: unit of the value axis.
             group: panels of one group show the same choice.
             choices: lines and levels by name.
-            initial: which is shown first.
-            note: a sentence for those who do not know the panel.
-            if_empty: why it is left out, if it has no data.
+            initial: name of the set that is shown first.
+            note: an explanation for readers who do not know the panel.
+            if_empty: reason to state if the panel has no data.
         """
         found = [
             {"label": label, "lines": self._lines(lines), "limits": _levels(limits)}
@@ -141,16 +141,16 @@ class PageModel:
         """Add a panel of coloured bars; rows without data are left out.
 
         Args:
-            title: of the panel.
-            rows: from top to bottom.
-            names: of the codes.
+            title: title of the panel.
+            rows: rows from top to bottom.
+            names: names of the codes.
             colours: name of the colour of each code.
-            if_empty: why it is left out, if it has no data.
+            if_empty: reason to state if the panel has no data.
         """
         found: list[dict[str, Any]] = []
         for row in rows:
-            there = (row.t >= self.span.begin) & (row.t <= self.span.end)
-            spans = segments(row.t[there], np.asarray(row.codes[there], dtype=np.int64))
+            inside = (row.t >= self.span.begin) & (row.t <= self.span.end)
+            spans = segments(row.t[inside], np.asarray(row.codes[inside], dtype=np.int64))
             if spans:
                 found.append({"label": row.label, "spans": spans})
         if not found:
@@ -159,17 +159,17 @@ class PageModel:
         used = sorted({int(span[2]) for row in found for span in row["spans"]})
         codes = {
             str(code): [_name(names, code), colours.get(code, "idle")] for code in used
-        }  # an unknown code is of another version
+        }  # an unknown code comes from another version
         self.panels.append(_panel("bars", title, "", rows=found, codes=codes))
 
-    def as_data(self, timeline_events: Sequence[TimelineEvent]) -> dict[str, Any]:
-        """Return all that the page's plots are made from."""
+    def as_data(self, events: Sequence[TimelineEvent]) -> dict[str, Any]:
+        """Return the data of the page's plots."""
         return {
             "span": [self.span.begin, self.span.end],
             "grid": self.span.grid,
             "signals": self.signals,
             "panels": self.panels,
-            "marks": [[row.t, row.kind, row.mark] for row in timeline_events if row.mark],
+            "marks": [[row.t, row.kind, row.mark] for row in events if row.mark],
         }
 
     def _lines(self, lines: Sequence[Line]) -> list[dict[str, Any]]:
@@ -180,7 +180,7 @@ class PageModel:
                 found.append(
                     {
                         "label": line.label,
-                        "signal": self._place(signal),
+                        "signal": self._index(signal),
                         "colour": line.colour,
                         "hidden": line.hidden,
                         "dashed": line.dashed,
@@ -188,12 +188,12 @@ class PageModel:
                 )
         return found
 
-    def _place(self, signal: dict[str, Any]) -> int:
-        """Return where a signal is among all; one that is there already is not kept twice."""
-        place = self._places.setdefault(tuple(signal.values()), len(self.signals))
-        if place == len(self.signals):
+    def _index(self, signal: dict[str, Any]) -> int:
+        """Return the index of a signal; equal signals are stored once."""
+        index = self._indices.setdefault(tuple(signal.values()), len(self.signals))
+        if index == len(self.signals):
             self.signals.append(signal)
-        return place
+        return index
 
 
 def _levels(limits: Sequence[LevelLine]) -> list[dict[str, Any]]:

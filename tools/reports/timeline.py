@@ -1,4 +1,4 @@
-"""What happened in a run, from all that its log says, in order."""
+"""Timeline of a run: its events, mode changes, silences and limit violations, in order."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from shared.messages import (
 from tools.reports.limit_violations import limit_violations
 from tools.reports.page_model import TimelineEvent
 from tools.reports.run_data import RunData
-from tools.reports.signals import GAP_S, seconds
+from tools.reports.signals import GAP_S, message_times
 from tools.runs.impairment_intervals import impairments
 
 TOGETHER_S: Final = 0.1
-"""The same change of several modules within this time is told in one line."""
-LINES_MAX: Final = 500
-WAIT_S: Final = 0.5
-"""A planner that waits for so long after drop-outs says it in the timeline."""
+"""Equal changes of several modules within this time share one row."""
+ROWS_MAX: Final = 500
+BACKOFF_MIN_S: Final = 0.5
+"""Shortest back-off of the planner after drop-outs that has a row."""
 END_S: Final = 0.1
-"""What ends so close to the end of the log has no mark: the run ends with it."""
+"""An impairment that ends this close to the end of the log has no mark for its end."""
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
 
@@ -48,14 +48,14 @@ KINDS: Final = {
     RunEventKind.STARTED: "note",
     RunEventKind.FINISHED: "note",
 }
-_USUAL: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
+_NORMAL_MODES: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
 
 
 def timeline_events(run: RunData) -> list[TimelineEvent]:
-    """Return what happened, in the order of time."""
+    """Return all events of a run in the order of time."""
     found = [
-        *_from_outside(run),
-        *_changes_of_mode(run),
+        *_run_events(run),
+        *_mode_changes(run),
         *_drives(run),
         *_planner(run),
         *_harness(run),
@@ -65,28 +65,29 @@ def timeline_events(run: RunData) -> list[TimelineEvent]:
         *_network(run),
     ]
     found.sort(key=lambda row: row.t)
-    if len(found) > LINES_MAX:
-        left = len(found) - LINES_MAX
-        found = sorted([row for row in found if row.mark] + _spread(found), key=lambda row: row.t)
-        found.append(TimelineEvent(run.span.end, "note", f"about {left} more lines are left out"))
+    if len(found) > ROWS_MAX:
+        left = len(found) - ROWS_MAX
+        kept = [row for row in found if row.mark] + _first_unmarked(found)
+        found = sorted(kept, key=lambda row: row.t)
+        found.append(TimelineEvent(run.span.end, "note", f"about {left} more rows are left out"))
     return found
 
 
-def _spread(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
-    """Return what marks nothing, but not more of it than a page can hold."""
-    quiet = [row for row in found if not row.mark]
-    return quiet[: max(0, LINES_MAX - (len(found) - len(quiet)))]
+def _first_unmarked(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
+    """Return the first rows without a mark, as many as the page has room for."""
+    unmarked = [row for row in found if not row.mark]
+    return unmarked[: max(0, ROWS_MAX - (len(found) - len(unmarked)))]
 
 
 def _at(run: RunData, t_ns: int) -> float:
     return (t_ns - run.zero_ns) / NS_PER_S
 
 
-def _from_outside(run: RunData) -> Iterator[TimelineEvent]:
+def _run_events(run: RunData) -> Iterator[TimelineEvent]:
     events: list[RunEvent] = run.log.messages(topics.RUN_EVENT)
     for event in events:
-        kind = KINDS.get(_known(RunEventKind, event.kind), "note")
-        text = _said(event)
+        kind = KINDS.get(_member(RunEventKind, event.kind), "note")
+        text = _describe_run_event(event)
         mark = ""
         if kind != "note":
             mark = f"{event.subject} {event.detail}".strip() if kind != "restart" else ""
@@ -97,15 +98,15 @@ def _from_outside(run: RunData) -> Iterator[TimelineEvent]:
     last = None
     for stop in run.log.messages(topics.ESTOP):
         t = _at(run, stop.t_ns)
-        if last is None or t - last > 1.0:  # it is said again and again
+        if last is None or t - last > 1.0:  # a stop is published repeatedly
             yield TimelineEvent(t, "estop", f"emergency stop by {stop.source}", "e-stop")
         last = t
     for request in run.log.messages(topics.HARNESS_TARE):
-        yield TimelineEvent(_at(run, request.t_ns), "note", f"tare asked for by {request.source}")
+        yield TimelineEvent(_at(run, request.t_ns), "note", f"tare requested by {request.source}")
 
 
 def _network(run: RunData) -> Iterator[TimelineEvent]:
-    """Tell when each impairment begins and ends; all its directions at once."""
+    """Yield the begin and the end of each impairment, of all its directions together."""
     for row in impairments(run.log.messages(topics.LINK_EVENT)):
         begin_s, end_s = row.begin_s(run.zero_ns), row.end_s(run.zero_ns)
         yield TimelineEvent(begin_s, "network", f"network, {row.title}", row.title)
@@ -116,46 +117,46 @@ def _network(run: RunData) -> Iterator[TimelineEvent]:
         yield TimelineEvent(end_s, "network" if mark else "note", text, mark)
 
 
-def _said(event: RunEvent) -> str:
-    words = {
+def _describe_run_event(event: RunEvent) -> str:
+    texts = {
         RunEventKind.STARTED: f"{event.subject} starts",
         RunEventKind.KILLED: f"{event.subject} gets SIG{event.detail}",
-        RunEventKind.RESTARTED: f"{event.subject} is started again",
+        RunEventKind.RESTARTED: f"{event.subject} restarts",
         RunEventKind.PUSHED: f"push {event.detail}",
         RunEventKind.FINISHED: f"{event.subject} ends {event.detail}".strip(),
         RunEventKind.FAULTED: f"{event.subject}: fault {event.detail} begins",
     }
-    other = f"{event.subject} {_word(RunEventKind, event.kind)} {event.detail}"
-    return words.get(_known(RunEventKind, event.kind), other.strip())
+    other = f"{event.subject} {_name(RunEventKind, event.kind)} {event.detail}"
+    return texts.get(_member(RunEventKind, event.kind), other.strip())
 
 
-def _changes_of_mode(run: RunData) -> Iterator[TimelineEvent]:
+def _mode_changes(run: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointEvent]] = sorted(
         (_at(run, event.t_ns), module, event)
         for module in MODULES
         for event in run.log.messages(topics.JOINT_EVENT, module)
     )
-    for alike in _together(
+    for group in _together(
         changes, lambda row: (row[2].mode_before, row[2].mode_after, row[2].cause)
     ):
-        t, _, first = alike[0]
-        yield TimelineEvent(t, _severity(first), _describe_change(alike))
+        t, _, first = group[0]
+        yield TimelineEvent(t, _severity(first), _describe_mode_change(group))
 
 
-def _together(changes: Sequence[Row], what: Callable[[Row], Any]) -> list[list[Row]]:
-    """Return rows, which begin with their time, in groups: the same, at about the same time."""
+def _together(changes: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
+    """Group rows with equal keys at about the same time. The first field of a row is its time."""
     groups: list[list[Row]] = []
     open_: dict[Any, list[Row]] = {}
     for row in changes:
-        group = open_.get(what(row))
+        group = open_.get(key(row))
         if group is None or row[0] - group[0][0] > TOGETHER_S:
-            group = open_[what(row)] = []
+            group = open_[key(row)] = []
             groups.append(group)
         group.append(row)
     return groups
 
 
-def _who(found: Iterable[str]) -> str:
+def _modules(found: Iterable[str]) -> str:
     modules = sorted(set(found), key=MODULES.index)
     return "all six" if len(modules) == len(MODULES) else ", ".join(modules)
 
@@ -164,22 +165,22 @@ def _severity(event: JointEvent) -> str:
     return "bad" if event.mode_after in (Mode.FAULT, Mode.DAMP) else "note"
 
 
-def _describe_change(alike: Sequence[tuple[float, str, JointEvent]]) -> str:
-    first = alike[0][2]
-    who = _who(module for _, module, _ in alike)
+def _describe_mode_change(group: Sequence[tuple[float, str, JointEvent]]) -> str:
+    first = group[0][2]
+    modules = _modules(module for _, module, _ in group)
     step = max(
         abs(b - a)
-        for _, _, event in alike
+        for _, _, event in group
         for a, b in zip(event.tau_before, event.tau_after, strict=True)
     )
-    within_ms = (alike[-1][0] - alike[0][0]) * 1e3
+    within_ms = (group[-1][0] - group[0][0]) * 1e3
     text = (
-        f"{who}: {_word(Mode, first.mode_before)} to {_word(Mode, first.mode_after)}, "
-        f"{_word(Cause, first.cause)}"
+        f"{modules}: {_name(Mode, first.mode_before)} to {_name(Mode, first.mode_after)}, "
+        f"{_name(Cause, first.cause)}"
     )
-    if len(alike) > 1 and within_ms > 0.0:
+    if len(group) > 1 and within_ms > 0.0:
         text += f", within {within_ms:.1f} ms"
-    ages = [event.age_ns for _, _, event in alike if event.age_ns >= 0]
+    ages = [event.age_ns for _, _, event in group if event.age_ns >= 0]
     if ages:
         text += f"; command {max(ages) / NS_PER_MS:.1f} ms old"
     return f"{text}; torque step {step:.2f} N m"
@@ -195,20 +196,21 @@ def _drives(run: RunData) -> Iterator[TimelineEvent]:
             for index in _changes([(state.drive, state.drive_error) for state in states])
         ]
     changes.sort(key=lambda row: row[0])
-    for alike in _together(changes, _what_of_drive):
-        t_s, _, before, after = alike[0]
+    for group in _together(changes, _describe_drive_change):
+        t_s, _, before, after = group[0]
         worse = after.drive != DriveStatus.ARMED and before.drive == DriveStatus.ARMED
         bad = worse or after.drive == DriveStatus.ERROR or after.drive_error != 0
-        who = _who(module for _, module, _, _ in alike)
-        yield TimelineEvent(t_s, "bad" if bad else "note", f"{who}: {_what_of_drive(alike[0])}")
+        modules = _modules(module for _, module, _, _ in group)
+        text = f"{modules}: {_describe_drive_change(group[0])}"
+        yield TimelineEvent(t_s, "bad" if bad else "note", text)
 
 
-def _what_of_drive(row: tuple[float, str, JointState, JointState]) -> str:
+def _describe_drive_change(row: tuple[float, str, JointState, JointState]) -> str:
     _, _, before, after = row
     parts = []
     if before.drive != after.drive:
         parts.append(
-            f"drive {_word(DriveStatus, before.drive)} to {_word(DriveStatus, after.drive)}"
+            f"drive {_name(DriveStatus, before.drive)} to {_name(DriveStatus, after.drive)}"
         )
     if before.drive_error != after.drive_error:
         parts.append(f"error bits {after.drive_error:#x}")
@@ -221,13 +223,13 @@ def _planner(run: RunData) -> Iterator[TimelineEvent]:
     for index in _changes([(row.mode, row.session) for row in rows]):
         before, after = rows[index - 1], rows[index]
         fresh = " in a new session" if before.session != after.session else ""
-        text = f"planner: {_word(PlannerMode, before.mode)} to {_word(PlannerMode, after.mode)}"
-        bad = after.mode not in _USUAL
+        text = f"planner: {_name(PlannerMode, before.mode)} to {_name(PlannerMode, after.mode)}"
+        bad = after.mode not in _NORMAL_MODES
         yield TimelineEvent(float(t[index]), "bad" if bad else "note", text + fresh)
     for index in _changes([row.wait_s > 0.0 for row in rows]):
-        if rows[index].wait_s >= WAIT_S:
-            text = f"planner: leads again in {rows[index].wait_s:.1f} s at the earliest, for links"
-            yield TimelineEvent(float(t[index]), "note", f"{text} have dropped out")
+        if rows[index].wait_s >= BACKOFF_MIN_S:
+            text = f"planner: backs off for {rows[index].wait_s:.1f} s or more, after drop-outs"
+            yield TimelineEvent(float(t[index]), "note", text)
 
 
 def _harness(run: RunData) -> Iterator[TimelineEvent]:
@@ -235,10 +237,10 @@ def _harness(run: RunData) -> Iterator[TimelineEvent]:
     t = run.times(topics.WRENCH)
     for index in _changes([(row.valid, row.saturated, row.tare) for row in rows]):
         row = rows[index]
-        word = "valid" if row.valid else "saturated" if row.saturated else "not valid"
-        tare = "" if row.tare == Tare.DONE else f", tare {_word(Tare, row.tare)}"
+        state = "valid" if row.valid else "saturated" if row.saturated else "not valid"
+        tare = "" if row.tare == Tare.DONE else f", tare {_name(Tare, row.tare)}"
         kind = "note" if row.valid else "bad"
-        yield TimelineEvent(float(t[index]), kind, f"harness sensor {word}{tare}")
+        yield TimelineEvent(float(t[index]), kind, f"harness sensor {state}{tare}")
 
 
 def _world(run: RunData) -> Iterator[TimelineEvent]:
@@ -250,27 +252,28 @@ def _world(run: RunData) -> Iterator[TimelineEvent]:
 
 
 def _silences(run: RunData) -> Iterator[TimelineEvent]:
-    """Tell where topics with a rate said nothing for long, as the recorder heard them."""
+    """Yield the gaps in periodic topics, by the recorder's clock."""
     found: list[tuple[float, str, float]] = []
     for key, topic in topics.all_keys(run.log.robot).items():
         if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
             continue
-        t = seconds([row[0] for row in run.log.raw(key)], run.zero_ns)
+        t = message_times([row[0] for row in run.log.raw(key)], run.zero_ns)
         steps = np.diff(t)
         name = key.removeprefix(f"xrl/{run.log.robot}/")
         found += [
             (float(t[index]), name, float(steps[index]))
             for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz))
         ]
-    for alike in _together(sorted(found), lambda _: None):
-        names = _folded([name for _, name, _ in alike])
-        longest = max(length for *_, length in alike)
-        word = "silent for up to" if len(alike) > 1 else "silent for"
-        yield TimelineEvent(alike[0][0], "note", f"{', '.join(names)} {word} {longest:.2f} s")
+    for group in _together(sorted(found), lambda _: None):
+        names = ", ".join(_merged([name for _, name, _ in group]))
+        longest = max(length for *_, length in group)
+        most = "up to " if len(group) > 1 else ""
+        text = f"{names} silent for {most}{longest:.2f} s"
+        yield TimelineEvent(group[0][0], "note", text)
 
 
-def _folded(names: Sequence[str]) -> list[str]:
-    """Return names; those of all six modules as one."""
+def _merged(names: Sequence[str]) -> list[str]:
+    """Return names of topics; the six of one topic as one name."""
     left = list(dict.fromkeys(names))
     for topic in topics.TOPICS:
         six = [topic.name.replace("*", module) for module in MODULES]
@@ -283,10 +286,10 @@ def _changes(values: Sequence[Any]) -> list[int]:
     return [index for index in range(1, len(values)) if values[index] != values[index - 1]]
 
 
-def _word(enumeration: Any, code: int) -> str:
-    found = _known(enumeration, code)
+def _name(enumeration: Any, code: int) -> str:
+    found = _member(enumeration, code)
     return str(found.name) if found is not None else f"unknown ({code})"
 
 
-def _known(enumeration: Any, code: int) -> Any:
+def _member(enumeration: Any, code: int) -> Any:
     return next((member for member in enumeration if member == code), None)

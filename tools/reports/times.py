@@ -1,4 +1,4 @@
-"""The panels of a page about time: ages, rates, the planner's tick, and what came late."""
+"""Timing panels: ages, rates, late cycles, refused commands, the planner's tick."""
 
 from __future__ import annotations
 
@@ -12,27 +12,31 @@ from shared.joints import MODULES
 from shared.topics import Topic
 from tools.reports.page_model import LevelLine, Line, PageModel
 from tools.reports.run_data import RunData, module_of
-from tools.reports.signals import Array, seconds
+from tools.reports.signals import Array, message_times
 
 RATE_WINDOW_S: Final = 0.25
 AGE_REACH: Final = 4.0
-"""Times the greatest usable age: ages of seconds, in HOLD, would flatten all others."""
+"""Upper end of an age axis, as a multiple of the largest usable age. In HOLD ages reach seconds,
+which would flatten all others."""
 NO_REAL_TIME: Final = "no real time in this log"
 NO_PLANNER: Final = "no planner/status in this log"
-LATE_NOTE: Final = "More than two periods after the one before; since all six drives were armed."
+LATE_NOTE: Final = (
+    "Cycles more than two periods after the previous one, since all six drives were armed."
+)
 REFUSED_NOTE: Final = (
-    "Too old, of another session, out of order or out of limits; since all six drives were armed."
+    "Commands too old, of another session, out of order or out of limits, since all six drives "
+    "were armed."
 )
 
 
 def add_ages(run: RunData, model: PageModel) -> None:
-    """Add ages both ways, to be read beside what was done to the network."""
+    """Add the ages of commands and states, to be compared with the network impairments."""
     _add_command_ages(run, model)
     _add_state_ages(run, model)
 
 
 def add_times(run: RunData, model: PageModel) -> None:
-    """Add rates, late cycles, refused commands, the planner's tick."""
+    """Add rates, late cycles, refused commands and the planner's tick."""
     _add_rates(run, model)
     _add_cycles(run, model)
     _add_tick(run, model)
@@ -45,19 +49,19 @@ def _add_command_ages(run: RunData, model: PageModel) -> None:
         age[age < 0.0] = np.nan
         lines.append(Line(module, run.times(topics.JOINT_STATE, module), age / NS_PER_MS, number))
     limits, reach = [], None
-    note = "Age of the newest command in use, by each joint service's own clock."
+    note = "Age of the command in use, by each joint service's own clock."
     if run.robot is not None:
         most_ms = run.robot.joint_service.max_command_age_ms
         limits, reach = [LevelLine(most_ms, "HOLD")], AGE_REACH * most_ms
         note += f" The axis ends at {reach:g} ms."
     model.plot(
         "Command age", "ms", lines, limits=limits, reach=reach, note=note,
-        if_empty="no command was ever in use",
+        if_empty="no service ever used a command",
     )  # fmt: skip
 
 
 def _add_state_ages(run: RunData, model: PageModel) -> None:
-    """Add what the planner's inputs were worth when it used them."""
+    """Add the ages of the planner's inputs when it used them."""
     (ages,) = run.columns(topics.PLANNER_STATUS, "", "state_age_ns")
     (sample,) = run.columns(topics.WRENCH, "", "age_ns")
     if not ages.any() and not (sample > 0.0).any():
@@ -72,11 +76,11 @@ def _add_state_ages(run: RunData, model: PageModel) -> None:
         if len(ages)
     ]
     wrench_t = run.times(topics.WRENCH)
-    lines.append(Line("sample of the harness sensor", wrench_t, sample / NS_PER_MS, 6, hidden=True))
+    lines.append(Line("harness sensor sample", wrench_t, sample / NS_PER_MS, 6, hidden=True))
     limits, reach = [], None
     note = (
-        "Counted from when each module's newest state arrived, by the planner's clock: what it was "
-        "late by then is not in it."
+        "Time since each module's newest state arrived, by the planner's clock. The delay before "
+        "the arrival is not included."
     )
     if run.robot is not None:
         most_ms = run.robot.planner.state_stale_ms
@@ -103,7 +107,7 @@ def _add_rates(run: RunData, model: PageModel) -> None:
 
 
 def _add_cycles(run: RunData, model: PageModel) -> None:
-    """Add the control loops: how fast they ran, what came late, what they refused."""
+    """Add the rates of the control loops, their late cycles and the commands they refused."""
     armed_s = run.armed_s()
     rates: list[Line] = []
     late: list[Line] = []
@@ -115,22 +119,22 @@ def _add_cycles(run: RunData, model: PageModel) -> None:
         cycles, *counts = run.columns(topics.JOINT_STATE, module, "cycle", "late", "refused")
         rates.append(Line(module, *_cycle_rate(t, cycles), number))
         for lines, count in zip((late, refused), counts, strict=True):
-            lines.append(Line(module, t[t >= armed_s], _grown(count[t >= armed_s]), number))
+            lines.append(Line(module, t[t >= armed_s], _increase(count[t >= armed_s]), number))
     model.plot(
         "Control cycles of each service", "Hz", rates,
         note=f"Mean over {RATE_WINDOW_S:g} s, by each service's clock.",
         if_empty="no joint/*/state in this log",
     )  # fmt: skip
     for title, lines, note, none in (
-        ("Control cycles that came late", late, LATE_NOTE, "none came late"),
-        ("Commands refused", refused, REFUSED_NOTE, "none was refused"),
+        ("Late control cycles", late, LATE_NOTE, "no cycle was late"),
+        ("Refused commands", refused, REFUSED_NOTE, "no command was refused"),
     ):
-        some = any(line.values.any() for line in lines)
-        model.plot(title, "count", lines if some else [], note=note, if_empty=none)
+        counted = any(line.values.any() for line in lines)
+        model.plot(title, "count", lines if counted else [], note=note, if_empty=none)
 
 
 def _cycle_rate(t: Array, cycles: Array) -> tuple[Array, Array]:
-    """Return cycles per second over windows; a service that restarts counts anew."""
+    """Return cycles per second over windows; a restarted service counts from 0."""
     edges = np.arange(t[0], t[-1], RATE_WINDOW_S)
     places = np.unique(np.minimum(np.searchsorted(t, edges), len(t) - 1))
     t, cycles = t[places], cycles[places]
@@ -139,8 +143,8 @@ def _cycle_rate(t: Array, cycles: Array) -> tuple[Array, Array]:
     return t[:-1] + steps / 2, rate
 
 
-def _grown(count: Array) -> Array:
-    """Return how much a counter grew since its first value; after a restart it counts from 0."""
+def _increase(count: Array) -> Array:
+    """Return the growth of a counter since its first value; a restart resets the counter to 0."""
     steps = np.diff(count, prepend=count[:1])
     return np.asarray(np.cumsum(np.where(steps >= 0.0, steps, count)))
 
@@ -153,12 +157,12 @@ def _add_tick(run: RunData, model: PageModel) -> None:
         return
     model.plot(
         "Planner tick", "\u00b5s", [Line("tick", t, tick, 0)],
-        note="From reading the inputs to the last command put.",
+        note="Time from reading the inputs to publishing the last command.",
     )  # fmt: skip
 
 
 def _rate(run: RunData, topic: Topic) -> tuple[Array, Array]:
-    """Return messages per second in windows; of the slowest module that is there."""
+    """Return messages per second over windows, of the slowest recorded module."""
     begin, end = run.span
     edges = np.arange(begin, end, RATE_WINDOW_S)
     if len(edges) < 2:
@@ -167,7 +171,7 @@ def _rate(run: RunData, topic: Topic) -> tuple[Array, Array]:
     for key in topics.keys(topic, run.log.robot):
         received = run.log.received_ns(topic, module_of(topic, key))
         if received:
-            t = seconds(received, run.zero_ns)
+            t = message_times(received, run.zero_ns)
             counts.append(np.histogram(t, edges)[0])
     if not counts:
         return np.zeros(0), np.zeros(0)

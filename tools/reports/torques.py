@@ -1,4 +1,4 @@
-"""The panels of the joints: torques against their limit and by origin, angles."""
+"""Joint panels: torques against their limit and by origin, angles, rates."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from tools.reports.run_data import RunData
 from tools.reports.signals import Array
 
 Sets: TypeAlias = dict[str, tuple[list[Line], list[LevelLine]]]
-"""Lines and levels of each joint."""
+"""Lines and levels by joint."""
 
 NO_STATES: Final = "no joint/*/state in this log"
 
 
 class TorqueTerms(msgspec.Struct):
-    """Torques of one module by where they come from, (n, 2): phi, theta; N m."""
+    """Torques of one module by origin, (n, 2): phi, theta; N m."""
 
     feedforward: Array
     coupled: Array
-    """What was used of it."""
+    """Coupled torque after scaling."""
     local: Array
-    """k_p (q_ref - q) + k_d (v_ref - v), the gains as stiff as they then were."""
-    taken_off: Array
-    """What the service sent less these: what the gate cut off, and what is left of a step that
-    a service that was frozen did not make."""
+    """k_p (q_ref - q) + k_d (v_ref - v), with the gains active at that time."""
+    removed: Array
+    """Torque that the service sent minus the three others: the part cut by the torque limiter,
+    and the part of a step that remains after a service stopped for a while."""
 
 
 def add_joints(run: RunData, model: PageModel) -> None:
-    """Add the joints' panels."""
+    """Add the panels of the joints."""
     robot = run.robot
     most = robot.joint.tau_module_max if robot is not None else None
     sums: list[Line] = []
@@ -68,15 +68,15 @@ def add_joints(run: RunData, model: PageModel) -> None:
     model.plot(
         "Torque of each module against its limit", "N m", sums,
         limits=[LevelLine(most, "limit")] if most is not None else [],
-        note="|tau_phi| + |tau_theta|: both motors of a module add up along one axis.",
+        note="|tau_phi| + |tau_theta|: both motors of a module act along one axis.",
         if_empty=NO_STATES,
     )  # fmt: skip
     note = (
-        "The torque_terms are those of the command in use, while the service tracks it. In HOLD the "
-        "service goes on with what it froze, and only the total is in the log."
+        "The origins belong to the command in use, while the service is in TRACK. In HOLD the "
+        "service repeats a frozen command, and the log holds only the total."
     )
     if robot is None:
-        note = f"Without torque_terms: {run.without_robot}."
+        note = f"Origins unknown: {run.without_robot}."
     hardest = max(peaks, key=lambda joint: peaks[joint], default="")
     model.choice("Torque of one joint, by origin", "N m", "joint", torques, initial=hardest,
                  note=note, if_empty=NO_STATES)  # fmt: skip
@@ -85,10 +85,10 @@ def add_joints(run: RunData, model: PageModel) -> None:
 
 
 def torque_terms(run: RunData, robot: RobotConfig, module: str) -> TorqueTerms:
-    """Return the law's terms at each state of a module; NaN where the log does not tell.
+    """Return the terms of the PD law at each state of a module; NaN where they are unknown.
 
-    They are those of the command that the state names, aged as the service ages it, and
-    only while it tracks, once it has blended over to the commands.
+    They are known in TRACK, after the blend to the commands. They belong to the command that the
+    state names, extrapolated by its age as the service does.
     """
     states: list[JointState] = run.log.messages(topics.JOINT_STATE, module)
     commands: list[JointCommand] = run.log.messages(topics.JOINT_COMMAND, module)
@@ -114,18 +114,18 @@ def torque_terms(run: RunData, robot: RobotConfig, module: str) -> TorqueTerms:
         found.local[index] = pd_law.torque(used, state.q, state.v)
     sent = np.array([state.tau for state in states]).reshape(shape)
     found.local -= found.feedforward + found.coupled
-    found.taken_off = sent - found.feedforward - found.coupled - found.local
+    found.removed = sent - found.feedforward - found.coupled - found.local
     return found
 
 
 def _torques(t: Array, tau: Array, found: TorqueTerms | None, axis: int) -> list[Line]:
-    lines = [Line("total, after the gate", t, tau[:, axis], 0)]
+    lines = [Line("total, after the torque limiter", t, tau[:, axis], 0)]
     if found is not None:
         lines += [
             Line("tau_ff", t, found.feedforward[:, axis], 1),
             Line("tau_coupled", t, found.coupled[:, axis], 2),
             Line("local PD", t, found.local[:, axis], 3),
-            Line("taken off by the service", t, found.taken_off[:, axis], 5, hidden=True),
+            Line("removed by the service", t, found.removed[:, axis], 5, hidden=True),
         ]
     sibling = f"total of {AXES[1 - axis]}"
     return [*lines, Line(sibling, t, tau[:, 1 - axis], 4, hidden=True, dashed=True)]

@@ -57,15 +57,15 @@ class View {
     this.point(at);
   }
 
-  // uPlot says where the cursor is; null: it is in no plot.
+  // uPlot reports the time at the cursor; null: it is in no plot.
   read(t) {
     this.cursor = t;
     this.describeSoon();
   }
 
-  // Pin the cursor. A second time at the same place, or with null, remove the pin.
-  pinAt(t, near) {
-    const again = this.pin !== null && t !== null && Math.abs(t - this.pin) <= (near || 0);
+  // Pin the cursor. A second pin at the same time, or null, removes the pin.
+  pinAt(t, tolerance) {
+    const again = this.pin !== null && t !== null && Math.abs(t - this.pin) <= (tolerance || 0);
     this.pin = t === null || again ? null : this.within(t);
     this.panels.forEach((panel) => panel.placePin());
     this.describeSoon();
@@ -108,8 +108,8 @@ class View {
     const parts = [`t = ${t.toFixed(3)} s`];
     const by = this.pin === null ? 0 : t - this.pin;
     if (Math.abs(by) >= 0.0005) parts.push(`\u0394t = ${by < 0 ? "\u2212" : "+"}${Math.abs(by).toFixed(3)} s`);
-    const near = (this.to - this.from) / 150;
-    const mark = this.marks.find(([at]) => Math.abs(at - t) <= near);
+    const tolerance = (this.to - this.from) / 150;
+    const mark = this.marks.find(([at]) => Math.abs(at - t) <= tolerance);
     if (mark) parts.push(mark[2]);
     return parts.join(" \u00b7 ");
   }
