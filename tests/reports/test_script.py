@@ -53,7 +53,8 @@ def test_every_panel_draws_narrow_and_wide_light_and_dark(
         assert ("rect" in kinds) == bars
         for op in panel["ops"]:
             if op[0] == "text":
-                assert -1 <= op[2] <= width + 1, (panel["title"], op[1])
+                half = 3 * len(op[1]) if op[4] == "center" else 0
+                assert -1 <= op[2] - half <= op[2] + half <= width + 1, (panel["title"], op[1])
                 assert -1 <= op[3] <= panel["height"] + 1, (panel["title"], op[1])
 
 
@@ -269,6 +270,16 @@ def test_a_screen_reader_gets_the_range_of_every_line(page_file: Path) -> None:
     assert lines.startswith("Torso angles: roll from ")
     assert "; pitch from " in lines
     assert "ankle_right, " in bars
+
+
+def test_no_time_is_cut_off_at_the_edge(page_file: Path) -> None:
+    """The time shown ends with a round number, which has no room on a narrow screen."""
+    _, _, (panel, *_) = do(
+        page_file, ["type", "from", "1"], ["type", "to", "2"], ["all"], width=380
+    )
+    times = [op for op in panel["ops"] if op[0] == "text" and op[1].endswith(" s")]
+    assert len(times) > 2
+    assert all(op[2] + 3 * len(op[1]) <= 380 for op in times)
 
 
 def test_a_print_draws_every_panel_with_the_pin(page_file: Path) -> None:

@@ -97,7 +97,10 @@ class Panel {
     };
     const time = {
       ...common, size: 18, gap: 4, space: 64,
-      values: (_, splits, axis, space, step) => axisTexts(splits, step).map((text) => `${text} s`),
+      values: (plot, splits, axis, space, step) => axisTexts(splits, step).map((text, i) => {
+        const right = this.left + plot.valToPos(splits[i], "x") + 3.5 * text.length + 5;
+        return right < plot.width ? `${text} s` : null;  // no half label at the edge
+      }),
     };
     const value = {
       ...common, show: !this.bars, size: () => this.left, space: 28,
