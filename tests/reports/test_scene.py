@@ -293,7 +293,7 @@ def test_an_impossible_export_prints_one_line(
         ([bare, "--scene", "-o", out], "holds no robot.toml"),
     ):
         assert cli.main(["export", *map(str, arguments)]) == 2
-        said = capsys.readouterr().err
-        assert words in said
-        assert said.count("\n") == 1
+        printed = capsys.readouterr().err
+        assert words in printed
+        assert printed.count("\n") == 1
     assert not Path(out).exists()

@@ -24,8 +24,8 @@ def test_every_signal_keeps_its_extremes_and_its_order(values: list[float], step
     assert abs(seen.max() - max(values)) <= resolution
     assert (np.diff(seen_t) > 0.0).all()
     for where, value in zip(seen_t, seen, strict=True):  # each is a sample of its own bin
-        near = np.abs(t - where) <= span.bin_s
-        assert np.abs(np.array(values)[near] - value).min() <= resolution
+        close = np.abs(t - where) <= span.bin_s
+        assert np.abs(np.array(values)[close] - value).min() <= resolution
 
 
 def test_a_peak_of_one_sample_in_a_long_run_is_kept() -> None:
