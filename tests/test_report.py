@@ -18,7 +18,9 @@ def report(*arguments: object) -> int:
     return cli.main(["report", *map(str, arguments)])
 
 
-def test_the_page_goes_beside_the_record(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_page_is_written_beside_the_log(
+    record: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert report(record) == 0
     page = record.with_suffix(".html")
     assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
@@ -26,7 +28,7 @@ def test_the_page_goes_beside_the_record(record: Path, capsys: pytest.CaptureFix
     assert SCHEMA_VERSION in page.read_text(encoding="utf-8")
 
 
-def test_a_page_is_replaced_and_nothing_is_left_behind(record: Path, tmp_path: Path) -> None:
+def test_an_old_page_is_replaced_and_no_other_file_remains(record: Path, tmp_path: Path) -> None:
     out = tmp_path / "report.html"
     out.write_text("old", encoding="utf-8")
     assert report(record, "-o", out, "--open", "no") == 0
@@ -34,15 +36,15 @@ def test_a_page_is_replaced_and_nothing_is_left_behind(record: Path, tmp_path: P
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "run.mcap"]
 
 
-def test_the_record_is_never_written_over(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_log_is_never_overwritten(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = record.read_bytes()
     assert report(record, "-o", record) == 2
     assert record.read_bytes() == before
-    assert "is the record itself" in capsys.readouterr().err
+    assert "is the log itself" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("out", ["", "absent/report.html"])
-def test_an_output_that_cannot_be_is_one_line(
+def test_an_impossible_output_prints_one_line(
     record: Path, tmp_path: Path, out: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert report(record, "-o", tmp_path / out) == 2
@@ -50,7 +52,7 @@ def test_an_output_that_cannot_be_is_one_line(
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no record", bytes(200)])
-def test_what_is_no_record_is_one_line(
+def test_a_file_that_is_no_log_prints_one_line(
     tmp_path: Path, content: bytes | None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "x.mcap"
@@ -61,7 +63,7 @@ def test_what_is_no_record_is_one_line(
     assert not path.with_suffix(".html").exists()
 
 
-def test_a_browser_is_opened_when_asked_for(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_browser_opens_on_request(record: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", opened.append)
     assert report(record, "--open", "no") == 0

@@ -1,4 +1,4 @@
-"""`xrl report`: a run as one page that opens in any browser, without a network."""
+"""`xrl report`: writes a run as one page that opens in any browser without a network."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def add_parser(subparsers: Subparsers) -> None:
         "--out",
         type=Path,
         metavar="OUT",
-        help="where the page goes (default: NAME.html beside the record); replaced if it exists",
+        help="path of the page (default: NAME.html beside the log); an old page is replaced",
     )
     parser.add_argument(
         "--open",
         choices=("yes", "no", "auto"),
         default="auto",
-        help="show it in a browser; auto (default): at a terminal with a screen",
+        help="open the page in a browser; auto (default): if run in a terminal with a display",
     )
 
 
@@ -53,23 +53,23 @@ def run(args: argparse.Namespace) -> int:
     log = read_run(path)
     out: Path = args.out or log.files[0].with_suffix(".html")
     if out.is_dir():
-        raise RunError(f"{out}: is a directory; give a file's name with -o")
+        raise RunError(f"{out}: is a directory; give a file with -o")
     if out.exists() and path.exists() and out.samefile(path):
-        raise RunError(f"{out}: is the record itself, which stays as it is; give another -o")
+        raise RunError(f"{out}: is the log itself; give another file with -o")
     page = render(log).encode()
     write(out, page)
     name = escape(str(out))
     Console().print(f"[bold]{name}[/]: {len(page) / MIB:.2f} MiB, one file", soft_wrap=True)
-    if args.open == "yes" or (args.open == "auto" and _at_a_screen()):
+    if args.open == "yes" or (args.open == "auto" and _has_display()):
         webbrowser.open(out.resolve().as_uri())
     return 0
 
 
 def write(out: Path, content: bytes) -> None:
-    """Write a file whole, or not at all.
+    """Write a file atomically.
 
     Raises:
-        RunError: it cannot be written.
+        RunError: the file cannot be written.
     """
     part = out.with_name(f".{out.name}.part")
     try:
@@ -81,6 +81,6 @@ def write(out: Path, content: bytes) -> None:
         raise RunError(f"{out}: cannot be written: {error.strerror}; give another -o") from None
 
 
-def _at_a_screen() -> bool:
-    screen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-    return sys.stdout.isatty() and screen
+def _has_display() -> bool:
+    display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.stdout.isatty() and display

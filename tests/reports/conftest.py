@@ -10,7 +10,7 @@ from tools.runs.run_log import RunLog, read_run
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """A short squat in virtual time: planner killed and back, a push, a cable out."""
+    """A short squat in virtual time: planner killed and restarted, a push, a lost link."""
     return runs.make(tmp_path_factory.mktemp("report") / "run")
 
 

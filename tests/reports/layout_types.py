@@ -1,11 +1,11 @@
-"""What a layout may hold: the types of the viewers' own sources, key by key.
+"""Types of a layout file, key by key, from the sources of the viewers.
 
 From Lichtblick (`packages/suite-base/src`: `context/CurrentLayoutContext/actions.ts`,
 `panels/Plot/utils/config.ts`, `panels/StateTransitions/types.ts`, `panels/RawMessages/types.ts`,
 `panels/ThreeDeeRender/IRenderer.ts`, `camera.ts`, `settings.ts`, `renderables/Grids.ts`,
 `packages/message-path/src/grammar.ne`) and Foxglove Studio 1.48, the last open one, from which
-Lichtblick comes. A key that either does not know would be dropped without a word. A panel's own
-title is the one key that they name differently; each ignores the other's.
+Lichtblick comes. Each viewer silently drops a key that it does not know. The title of a panel is
+the only key that they name differently; each ignores the key of the other.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ TimestampMethod = Literal["receiveTime", "headerStamp"]
 
 TOPIC: Final = r"[A-Za-z0-9_-]+(?:/[A-Za-z0-9_-]*)*"
 FIELD: Final = r"\.[A-Za-z0-9_-]+(?:\[\d+\])?"
-"""Of a message path: `id` with slashes, then names with an index each. What has other characters
-stands in quotes, and a leading slash is a part of the name."""
+"""Parts of a message path: `id` with slashes, then names with one index each. Names with other
+characters stand in quotes, and a leading slash is part of the name."""
 
 
 class Known(msgspec.Struct, forbid_unknown_fields=True, rename="camel"):
-    """Base of all: a key that is not here is an error."""
+    """Base class: an unknown key is an error."""
 
 
 class Titled(Known):
@@ -171,7 +171,7 @@ class PlaybackConfig(Known):
 
 
 class Layout(Known):
-    """The file; each panel's config is of the type that its id begins with."""
+    """Layout file; the start of a panel's id names the type of its configuration."""
 
     config_by_id: dict[str, dict[str, Any]]
     layout: Split | str
@@ -187,4 +187,4 @@ PANELS: Final[dict[str, type[Known]]] = {
     "RawMessages": RawMessages,
     "Tab": Tab,
 }
-"""Of the panels that the viewers have, those that this layout uses."""
+"""Panel types that this layout uses."""

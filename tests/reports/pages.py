@@ -1,4 +1,4 @@
-"""Reads a page back: its data, its signals."""
+"""Readers of a page: its data and its signals."""
 
 from __future__ import annotations
 
@@ -23,16 +23,18 @@ def panel(data: dict[str, Any], title: str) -> dict[str, Any]:
     return next(panel for panel in data["panels"] if panel["title"] == title)
 
 
-def unpacked(signal: dict[str, Any]) -> tuple[Array, Array]:
-    """Return times and values as the page's script sees them; NaN where the line breaks."""
+def decode_signal(signal: dict[str, Any], grid: dict[str, float]) -> tuple[Array, Array]:
+    """Return times and values as the page's script decodes them; NaN where the line breaks."""
     codes = np.frombuffer(base64.b64decode(signal["d"]), "<i2").astype(np.int64)
-    t = signal["t0"] + (np.arange(len(codes)) + 0.5) * signal["h"]
+    assert signal["first"] + len(codes) <= grid["count"]
+    t = grid["begin"] + (signal["first"] + np.arange(len(codes)) + 0.5) * grid["step"]
     values = signal["lo"] + (codes + 32766) * signal["step"]
     values[codes == -32767] = np.nan
-    there = codes != -32768
-    return t[there], values[there]
+    present = codes != -32768
+    return t[present], values[present]
 
 
 def line(data: dict[str, Any], title: str, label: str) -> tuple[Array, Array]:
     lines = panel(data, title)["lines"]
-    return unpacked(data["signals"][next(x for x in lines if x["label"] == label)["signal"]])
+    index = next(line for line in lines if line["label"] == label)["signal"]
+    return decode_signal(data["signals"][index], data["grid"])

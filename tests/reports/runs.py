@@ -1,4 +1,4 @@
-"""Logs for the tests of the report: one run in virtual time, and what is made of it."""
+"""Logs for the tests of the report: one run in virtual time, and changed copies of it."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ SIM = (
     "--fault hip_left:link_lost@3.2:0.4"
 )
 FROM_RECORDER = ("clock", "split", "counts")
-"""Metadata that the recorder writes itself."""
+"""Metadata written by the recorder itself."""
 
 
 class Made(NamedTuple):
-    """A run, and what the verb that made it printed."""
+    """A run, and the output of the command that made it."""
 
     path: Path
     printed: str
@@ -50,9 +50,9 @@ def rewritten(
     more: Sequence[tuple[int, str, bytes]] = (),
     repeats: int = 1,
 ) -> RunLog:
-    """Write a log again with some topics, attachments or payloads changed, and read it.
+    """Write a copy of a log with other topics, attachments or payloads, and read it.
 
-    `more` are further messages: time, name of the key below the robot, payload.
+    `more` holds further messages: time, name of the key below the robot, payload.
     """
     known = {key: topic for key, topic in topics.all_keys(log.robot).items() if topic.recorded}
     prefix = f"xrl/{log.robot}/"

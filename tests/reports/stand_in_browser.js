@@ -1,135 +1,202 @@
 "use strict";
-// Runs a report's script without a browser: just enough of a document to click in, and a
-// canvas that notes what is drawn. Usage: node stand_in_browser.js PAGE WIDTH STEPS, where
-// STEPS is JSON: [[what, ...arguments], ...]. Prints JSON: one answer for each step.
+// A document for the page's script in node: elements, events, and canvases that record what is drawn.
+// Usage: node stand_in_browser.js PAGE WIDTH STEPS THEME; STEPS is JSON: [[step, ...arguments], ...].
+// Prints JSON: one answer for each step.
 const fs = require("fs"), vm = require("vm");
 
-const [page, width, stepsText] = [process.argv[2], Number(process.argv[3]), process.argv[4]];
-const html = fs.readFileSync(page, "utf8");
+const [page, widthText, stepsText, theme] = process.argv.slice(2);
+const html = fs.readFileSync(page, "utf8"), width = Number(widthText);
 const style = /<style>([\s\S]*?)<\/style>/.exec(html)[1];
-const dark = process.argv[5] === "dark";
-const lists = [...style.matchAll(/:root[^{]*\{([^}]*)\}/g)].map((found) => found[1]);
 const variables = {};
-for (const list of lists.slice(0, dark ? 2 : 1)) {
+for (const [, list] of [...style.matchAll(/:root[^{]*\{([^}]*)\}/g)].slice(0, theme === "dark" ? 2 : 1)) {
   for (const [, name, value] of list.matchAll(/(--[\w-]+):\s*([^;]+);/g)) variables[name] = value;
 }
-const frames = [];
+const queue = [];  // microtasks and frames
 
-class Context {
-  constructor() { this.ops = []; this.dash = []; this.saved = []; this.wiped = 0; }
-  note(...op) { this.ops.push([...op, this.strokeStyle, this.fillStyle, this.lineWidth, this.dash]); }
-  setTransform() { this.ops = []; }
-  clearRect() { this.ops = []; this.wiped += 1; }
-  measureText(text) { return { width: 6 * text.length }; }
-  setLineDash(dash) { this.dash = dash; }
-  save() { this.saved.push(this.clipped); }
-  restore() { this.clipped = this.saved.pop(); }
-  rect(...box) { this.box = box; }
-  clip() { this.clipped = this.box; }
-  beginPath() { this.path = []; }
-  moveTo(x, y) { this.path.push(["M", x, y]); }
-  lineTo(x, y) { this.path.push(["L", x, y]); }
-  stroke() {
-    if (!this.path.every(([, x, y]) => Number.isFinite(x) && Number.isFinite(y))) throw new Error("not finite");
-    this.note("path", this.path, this.clipped || null);
+function flush() { while (queue.length) queue.shift()(); }
+
+class Path {
+  constructor(points) {
+    if (points && !(points instanceof Path)) throw new Error("unknown argument");
+    this.points = points ? [...points.points] : [];
   }
-  fillRect(...box) { this.note("rect", box); }
-  strokeText() {}  // the halo of what fillText says next
-  fillText(text, x, y) { this.note("text", text, x, y, this.textAlign, this.textBaseline); }
+  moveTo(x, y) { this.add("M", x, y); }
+  lineTo(x, y) { this.add("L", x, y); }
+  arc(x, y) { this.add("O", x, y); }
+  rect() {}
+  add(kind, x, y) {
+    if (!Number.isFinite(x) || !Number.isFinite(y)) throw new Error("not finite");
+    this.points.push([kind, x, y]);
+  }
 }
 
-class Node {
+class Context extends Path {
+  constructor(canvas) {
+    super();
+    Object.assign(this, { canvas, ops: [], cleared: 0 });
+  }
+  clearRect() { this.ops = []; this.cleared += 1; }
+  measureText(text) { return { width: 6 * String(text).length }; }
+  beginPath() { this.points = []; }
+  stroke(path = this) { if (path.points.length) this.ops.push(["path", path.points, this.strokeStyle]); }
+  fill(path) { if (path.points.length) this.ops.push(["points", path.points, this.fillStyle]); }
+  fillRect(...box) { this.ops.push(["rect", box, this.fillStyle]); }
+  fillText(text, x, y) { this.ops.push(["text", String(text), x, y, this.textAlign]); }
+}
+for (const name of ["save", "restore", "scale", "translate", "clip", "setLineDash", "strokeText"]) {
+  Context.prototype[name] = () => {};
+}
+
+class Element {
   constructor(tag) {
-    Object.assign(this, { tag, children: [], listeners: {}, attributes: {}, style: {}, dataset: {}, textContent: "" });
-    this.classList = { add() {}, remove() {} };
+    Object.assign(this, { tag, childNodes: [], listeners: [], attributes: {}, style: {}, dataset: {}, className: "" });
+    this.classList = {
+      contains: (name) => this.className.split(" ").includes(name),
+      add: (name) => { this.className = `${this.className} ${name}`.trim(); },
+      remove: (name) => { this.className = this.className.split(" ").filter((one) => one !== name).join(" "); },
+    };
   }
   get clientWidth() { return width; }
-  append(...nodes) { this.children.push(...nodes); }
-  replaceChildren(...nodes) { this.children = nodes; }
+  get firstChild() { return this.childNodes[0]; }
+  get children() { return this.childNodes.filter((node) => node instanceof Element); }
+  get all() { return this.children.flatMap((node) => [node, ...node.all]); }
+  get textContent() {
+    return this.childNodes.map((node) => (node instanceof Element ? node.textContent : node.nodeValue)).join("");
+  }
+  set textContent(text) { this.childNodes = [{ nodeValue: text }]; }
+  append(...nodes) { nodes.forEach((node) => this.insertBefore(node)); }
+  appendChild(node) { this.insertBefore(node); }
+  insertBefore(node, next) {
+    const child = node instanceof Element ? node : { nodeValue: node };
+    child.parent = this;
+    this.childNodes.splice(next ? this.childNodes.indexOf(next) : this.childNodes.length, 0, child);
+  }
+  remove() { if (this.parent) this.parent.childNodes = this.parent.childNodes.filter((node) => node !== this); }
   setAttribute(name, value) { this.attributes[name] = value; }
   getAttribute(name) { return this.attributes[name]; }
-  addEventListener(name, listener) { (this.listeners[name] ||= []).push(listener); }
-  getBoundingClientRect() { return { left: 0, top: 0, bottom: 100 }; }
-  getContext() { return (this.context ||= new Context()); }
-  setPointerCapture() {}
-  scrollIntoView() { this.shown = true; }
-  say(name, event = {}) {
-    const all = { preventDefault() { this.prevented = true; }, button: 0, pointerId: 1, key: "", deltaY: 0, ...event };
-    for (const listener of this.listeners[name] || []) listener.call(this, all);
+  getContext() { return (this.context ||= new Context(this)); }
+  scrollIntoView() { this.scrolledTo = true; }
+  getBoundingClientRect() { return { left: parseFloat(this.style.left) || 0, top: 0, bottom: 100 }; }
+  querySelectorAll(selector) {
+    const [parent, tag] = selector.split(" ");
+    return this.all.filter((node) => node.tag === tag && node.parent.classList.contains(parent.slice(1)));
+  }
+  one(name) { return this.all.find((node) => node.classList.contains(name) || node.tag === name); }
+  addEventListener(name, listener, options) {
+    this.listeners.push({ name, listener, capture: Boolean(options && options.capture) });
+  }
+  removeEventListener(name, listener) {
+    this.listeners = this.listeners.filter((one) => one.name !== name || one.listener !== listener);
+  }
+  dispatchEvent(event) {
+    event.target = this;
+    const path = [];
+    for (let node = this; node; node = node.parent) path.push(node);
+    path.push(documentNode, windowNode);
+    const run = (nodes, capture) => nodes.forEach((node) => node.listeners
+      .filter((one) => one.name === event.type && (node === this || one.capture === capture))
+      .forEach((one) => one.listener.call(node, event)));
+    run(path.slice(1).reverse(), true);
+    run([this], false);
+    run(path.slice(1), false);
+  }
+  click() { this.send("click"); }
+  send(type, more = {}) {
+    const event = new Event(type, { clientY: 20, ...more });
+    this.dispatchEvent(event);
     flush();
-    return all;
+    return event;
   }
 }
 
-function flush() { while (frames.length) frames.shift()(); }
+class Event {
+  constructor(type, more) { Object.assign(this, { type, button: 0, movementX: 1, key: "", deltaY: 0, ctrlKey: false, metaKey: false }, more); }
+  preventDefault() { this.prevented = true; }
+  stopPropagation() {}
+  stopImmediatePropagation() {}
+}
 
-const ids = {};
-for (const [, id] of html.matchAll(/ id="([\w-]+)"/g)) ids[id] = new Node(id);
+const documentNode = new Element("document"), windowNode = new Element("window"), ids = {};
+for (const [, id] of html.matchAll(/ id="([\w-]+)"/g)) ids[id] = new Element(id);
 ids.data.textContent = /id="data">([\s\S]*?)<\/script>/.exec(html)[1];
 const buttons = { "[data-do]": [], "[data-t]": [] };
-const written = /<button type="button" data-(do|t)="([^"]+)"(?: data-before="([^"]+)")?/g;
-for (const [, name, value, before] of html.matchAll(written)) {
-  const node = new Node("button");
-  node.dataset[name] = value;
-  if (before) node.dataset.before = before;
-  buttons[`[data-${name}]`].push(node);
+for (const [, name, value, before] of html.matchAll(/<button type="button" data-(do|t)="([^"]+)"(?: data-before="([^"]+)")?/g)) {
+  const button = new Element("button");
+  button.dataset[name] = value;
+  if (before) button.dataset.before = before;
+  buttons[`[data-${name}]`].push(button);
 }
-const windowNode = new Node("window");
-const root = new Node("html");
 const sandbox = {
-  document: {
-    createElement: (tag) => new Node(tag), getElementById: (id) => ids[id],
-    querySelectorAll: (query) => buttons[query], documentElement: root, activeElement: null,
-  },
-  window: Object.assign(windowNode, { devicePixelRatio: 1, innerHeight: 800, matchMedia: () => new Node("media") }),
+  document: Object.assign(documentNode, {
+    createElement: (tag) => new Element(tag), getElementById: (id) => ids[id], activeElement: null,
+    querySelectorAll: (selector) => buttons[selector], documentElement: new Element("html"),
+  }),
+  window: Object.assign(windowNode, { innerHeight: 800 }),
+  matchMedia: () => new Element("media"), devicePixelRatio: 1, navigator: { language: "en" },
   getComputedStyle: () => ({ getPropertyValue: (name) => variables[name] || (() => { throw new Error(name); })() }),
-  requestAnimationFrame: (frame) => frames.push(frame), setTimeout: () => {}, atob, console,
+  requestAnimationFrame: (frame) => queue.push(frame), queueMicrotask: (task) => queue.push(task),
+  HTMLElement: Element, Path2D: Path, CustomEvent: Event, MouseEvent: Event, atob, console,
 };
-sandbox.globalThis = sandbox;
-const source = html.slice(html.lastIndexOf("<script>") + 8, html.lastIndexOf("</script>"));
-vm.runInNewContext(source, sandbox, { filename: "report" });
+windowNode.matchMedia = sandbox.matchMedia;
+for (const [, script] of html.matchAll(/<script(?: id="uplot")?>([\s\S]*?)<\/script>/g)) {
+  vm.runInNewContext(script, vm.isContext(sandbox) ? sandbox : vm.createContext(sandbox), { filename: "report" });
+}
 flush();
 
-function everyNode(node) { return [node, ...node.children.filter((part) => part instanceof Node).flatMap(everyNode)]; }
-const panels = ids.panels.children.map((section) => {
-  const nodes = everyNode(section), found = (name) => nodes.find((node) => node.className === name);
-  const [canvas, over] = nodes.filter((node) => node.tag === "canvas");
-  return {
-    section, title: nodes.find((node) => node.tag === "h3").textContent,
-    select: nodes.find((node) => node.tag === "select"),
-    canvas, over, stage: found("stage"), legend: found("legend"), read: found("read"),
-  };
-});
-const panel = (title) => panels.find((one) => one.title.startsWith(title));
+const panels = ids.panels.children;
+const title = (panel) => panel.one("h3").textContent;
+const panel = (name) => panels.find((one) => title(one).startsWith(name));
+const over = (name) => panel(name).one("u-over");
+const context = (one) => one.one("canvas").getContext();
+const ops = (name, kind) => context(panel(name)).ops.filter((op) => op[0] === kind);
 const shown = () => [ids.from.value, ids.to.value].map(Number);
-const steps = {
-  titles: () => panels.map((one) => one.title),
-  shown,
-  click: (name, value) => { buttons[`[data-${name}]`].find((one) => one.dataset[name] === value).say("click"); return shown(); },
-  drag: (title, a, b) => {
-    const { canvas } = panel(title);
-    canvas.say("pointerdown", { clientX: a });
-    canvas.say("pointermove", { clientX: b });
-    canvas.say("pointerup", { clientX: b });
-    return shown();
-  },
-  hover: (title, x) => { panel(title).canvas.say("pointermove", { clientX: x }); return ids.cursor.textContent; },
-  event: (title, name, event) => { const said = panel(title).canvas.say(name, event); return [shown(), Boolean(said.prevented)]; },
-  toggle: (title, index) => { const button = panel(title).legend.children[index]; button.say("click"); return button.attributes["aria-pressed"]; },
-  choose: (title, index) => { const { select } = panel(title); select.selectedIndex = index; select.say("change"); return panels.filter((one) => one.select).map((one) => one.select.selectedIndex); },
-  legend: (title) => panel(title).legend.children.map((node) => [node.children.filter((part) => typeof part === "string").join(""), (node.children[2] || {}).textContent]),
-  read: (title) => panel(title).read.textContent,
-  label: (title) => panel(title).canvas.attributes["aria-label"],
-  strokes: (title) => panel(title).canvas.getContext().ops.filter((op) => op[0] === "path" && op[2]).map((op) => [op[3], op[1]]),
-  rects: (title) => panel(title).canvas.getContext().ops.filter((op) => op[0] === "rect").map((op) => [op[3], op[1]]),
-  times: () => ids.cursor.textContent,
-  levels: (title) => [...panel(title).over.getContext().ops].map((op) => [op[0], op[0] === "path" ? op[1][0][1] : op[1]]),
-  texts: (title) => panel(title).canvas.getContext().ops.filter((op) => op[0] === "text").map((op) => op[1]),
-  type: (id, value) => { ids[id].value = value; ids[id].say("change"); return shown(); },
-  print: () => { windowNode.say("beforeprint"); const ops = panels.map((one) => one.canvas.getContext().ops.length); windowNode.say("afterprint"); return ops; },
-  all: () => panels.map((one) => ({ title: one.title, height: parseFloat(one.stage.style.height), ops: one.canvas.getContext().ops })),
-  drawings: () => panels.map((one) => one.canvas.getContext().wiped),
-  goto: (index) => { ids.goto.selectedIndex = index; ids.goto.say("change"); return panels.find((one) => one.section.shown).title; },
+const left = (name) => parseFloat(over(name).style.left);
+const drag = (target, names, a, b, more) => {
+  target.send(`${names}down`, { clientX: a, ...more });
+  target.send(`${names}move`, { clientX: b, ...more });
+  target.send(`${names}up`, { clientX: b, ...more });
 };
-const answers = JSON.parse(stepsText).map(([name, ...rest]) => steps[name](...rest));
-process.stdout.write(JSON.stringify(answers));
+const steps = {
+  titles: () => panels.map(title),
+  shown,
+  press: (name, value) => { buttons[`[data-${name}]`].find((one) => one.dataset[name] === value).click(); return shown(); },
+  drag: (name, a, b) => { drag(over(name), "mouse", a, b); over(name).send("click", { clientX: b }); return shown(); },
+  swipe: (name, a, b) => { drag(over(name), "pointer", a, b, { pointerType: "touch" }); return shown(); },
+  click: (name, x) => { drag(over(name), "mouse", x, x); over(name).send("click", { clientX: x }); return ids.cursor.textContent; },
+  hover: (name, x) => { over(name).send("mousemove", { clientX: x }); return ids.cursor.textContent; },
+  event: (name, type, event) => { const { prevented } = over(name).send(type, event); return [shown(), Boolean(prevented)]; },
+  toggle: (name, index, key) => {
+    const th = panel(name).querySelectorAll(".u-series th")[index + 1];
+    if (key) th.send("keydown", { key });
+    else th.click();
+    return th.attributes["aria-pressed"];
+  },
+  choose: (name, index) => {
+    const select = panel(name).one("select");
+    select.selectedIndex = index;
+    select.send("change");
+    return panels.map((one) => one.one("select")).filter(Boolean).map((one) => one.selectedIndex);
+  },
+  legend: (name) => panel(name).all.filter((node) => node.classList.contains("u-series")).slice(1)
+    .map((row) => [row.one("u-label").textContent, row.one("u-value").textContent]),
+  description: (name) => over(name).attributes["aria-label"],
+  lines: (name) => ops(name, "path").map(([, points, colour]) => [colour, points]),
+  points: (name) => ops(name, "points").map(([, points, colour]) => [colour, points]),
+  texts: (name) => ops(name, "text").map((op) => op[1]),
+  times: () => ids.cursor.textContent,
+  cursors: (name) => ["pin", "u-cursor-x"].map((one) => panel(name).one(one)).map((node) => {
+    if (node.hidden || node.classList.contains("u-off")) return null;
+    return left(name) + parseFloat(node.style.left || /\((-?[\d.]+)/.exec(node.style.transform)[1]);
+  }),
+  type: (id, value) => { ids[id].value = value; ids[id].send("change"); return shown(); },
+  print: () => {
+    windowNode.send("beforeprint");
+    const drawn = panels.map((one) => [context(one).ops.length, !one.one("pin").hidden]);
+    windowNode.send("afterprint");
+    return drawn;
+  },
+  all: () => panels.map((one) => ({ title: title(one), height: parseFloat(one.one("u-wrap").style.height), ops: context(one).ops })),
+  drawings: () => panels.map((one) => context(one).cleared),
+  goto: (index) => { ids.goto.selectedIndex = index; ids.goto.send("change"); return title(panels.find((one) => one.scrolledTo)); },
+};
+process.stdout.write(JSON.stringify(JSON.parse(stepsText).map(([name, ...rest]) => steps[name](...rest))));

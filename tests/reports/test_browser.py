@@ -1,4 +1,4 @@
-"""The page in a real browser, if there is one: widths, errors, what is drawn."""
+"""The page in a real browser, if one is installed: errors, drawing, narrow screens."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ addEventListener("load", () => setTimeout(() => {
   const root = document.documentElement, width = root.clientWidth;
   const scroller = ".wide, pre, #timeline ol";
   const boxes = [...document.querySelectorAll("body *")].filter((node) => !node.closest(scroller));
-  const beyond = boxes.filter((node) => {
+  const wider = boxes.filter((node) => {
     const { left, right, width: wide } = node.getBoundingClientRect();
     return wide > 0 && (right > width + 0.5 || left < -0.5);
   }).map((node) => `${node.tagName} ${node.className}`);
   const cut = [...document.querySelectorAll("button, h1, h3, summary, dd, td, input")]
     .filter((node) => node.scrollWidth > node.clientWidth + 1 && node.clientWidth > 0)
     .map((node) => `${node.tagName} ${node.textContent || node.value}`);
-  const empty = [...document.querySelectorAll("canvas:not(.cursor)")].filter((canvas) => {
+  const empty = [...document.querySelectorAll("canvas")].filter((canvas) => {
     const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
     return !data.some((value) => value > 0);
   }).length;
   parent.postMessage(JSON.stringify({
-    frame: window.innerWidth, width, page: root.scrollWidth, errors, beyond, cut, empty,
+    frame: window.innerWidth, width, page: root.scrollWidth, errors, wider, cut, empty,
     panels: document.querySelectorAll(".panel").length,
     shown: document.getElementById("to").value,
   }), "*");
@@ -54,7 +54,7 @@ pytestmark = pytest.mark.skipif(BROWSER is None, reason="needs a Chromium")
 
 @pytest.fixture(scope="module")
 def seen(page: str, tmp_path_factory: pytest.TempPathFactory) -> dict[int, dict[str, Any]]:
-    """What the page is at each width: one browser, one frame for each."""
+    """Properties of the page at each width: one browser, one frame for each width."""
     directory = tmp_path_factory.mktemp("browser")
     opened = page.replace("<details>", "<details open>").replace("<head>", f"<head>{LOOK}")
     (directory / "page.html").write_text(opened, encoding="utf-8")
@@ -90,11 +90,11 @@ def test_the_page_has_no_errors_and_every_panel_is_drawn(
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_nothing_is_beyond_the_edge_of_a_narrow_screen(
+def test_no_element_exceeds_the_width_of_the_screen(
     seen: dict[int, dict[str, Any]], width: int
 ) -> None:
-    """All details are open: tables and files scroll inside themselves."""
+    """With all details open; tables and files scroll inside their own area."""
     row = seen[width]
     assert row["page"] == row["width"] <= width
-    assert row["beyond"] == []
+    assert row["wider"] == []
     assert row["cut"] == []

@@ -1,4 +1,4 @@
-"""deploy/foxglove/xrl.json: panels, keys and paths that the viewers and our logs know."""
+"""deploy/foxglove/xrl.json: its panels, keys and paths exist in the viewers and in our logs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def layout() -> Layout:
 
 @pytest.fixture(scope="module")
 def panels(layout: Layout) -> dict[str, Any]:
-    """Every panel's config, by id, as the viewers type it."""
+    """Configuration of every panel by id, in the types of the viewers."""
     return {
         name: msgspec.convert(config, PANELS[name.partition("!")[0]])
         for name, config in layout.config_by_id.items()
@@ -54,9 +54,7 @@ def levels_of(panel: Plot) -> dict[str, float]:
     return {row.label: float(row.value) for row in panel.paths if NUMBER.fullmatch(row.value)}
 
 
-def test_every_panel_and_every_key_is_one_that_the_viewers_know(
-    layout: Layout, panels: dict[str, Any]
-) -> None:
+def test_the_viewers_know_every_panel_and_every_key(layout: Layout, panels: dict[str, Any]) -> None:
     assert len(panels) == len(layout.config_by_id) > 10
 
 
@@ -69,7 +67,7 @@ def test_every_panel_and_every_key_is_one_that_the_viewers_know(
         ("StateTransitions!modes", {"isSynced": "yes"}),
     ],
 )
-def test_a_key_or_a_value_that_they_do_not_know_is_found(
+def test_an_unknown_key_or_value_is_an_error(
     layout: Layout, panel: str, change: dict[str, Any]
 ) -> None:
     config = layout.config_by_id[panel] | change
@@ -103,7 +101,7 @@ def test_every_path_is_a_number_of_a_message(panels: dict[str, Any]) -> None:
         assert node["type"] in ("number", "integer") or not match[2], path
 
 
-def test_every_path_is_in_a_log_and_every_message_answers_it(
+def test_every_path_is_in_a_log_and_in_its_messages(
     made: Made, tmp_path: Path, panels: dict[str, Any]
 ) -> None:
     shown = tmp_path / "shown.mcap"
@@ -113,7 +111,7 @@ def test_every_path_is_in_a_log_and_every_message_answers_it(
         if not NUMBER.fullmatch(path):
             topic, _, field = path.partition(".")
             wanted.setdefault(topic, []).append(field)
-    answered = set()
+    seen = set()
     with shown.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
@@ -122,18 +120,18 @@ def test_every_path_is_in_a_log_and_every_message_answers_it(
         assert set(wanted) <= channels
         assert set(panels["3D!scene"].topics) <= channels
         for _, channel, message in reader.iter_messages(topics=list(wanted)):
-            if channel.topic in answered:
+            if channel.topic in seen:
                 continue
-            answered.add(channel.topic)
+            seen.add(channel.topic)
             body = json.loads(message.data)
             for field in filter(None, wanted[channel.topic]):
                 name, _, index = field.partition("[")
                 value = body[name][int(index.rstrip("]"))] if index else body[name]
                 assert isinstance(value, int | float), field
-    assert set(wanted) - answered == {"xrl/xrl/link/event"}, "nothing was done to this network"
+    assert set(wanted) - seen == {"xrl/xrl/link/event"}, "this network had no impairment"
 
 
-def test_the_scene_is_shown_in_frames_that_it_has(panels: dict[str, Any]) -> None:
+def test_the_3d_panel_uses_frames_of_the_scene(panels: dict[str, Any]) -> None:
     view = panels["3D!scene"]
     assert set(view.topics) <= {channel.topic for channel in scene.channels("xrl")}
     assert view.follow_tf == "world"
@@ -148,18 +146,18 @@ def test_the_levels_are_those_of_the_robot_file(robot: RobotConfig, panels: dict
     assert panels["Plot!ages"].max_y_value > most_ns
 
 
-def test_the_numbers_of_modes_are_told_where_they_are_shown(panels: dict[str, Any]) -> None:
-    """The viewers know no names of a JSON enumeration."""
+def test_panels_of_modes_list_the_names_of_their_numbers(panels: dict[str, Any]) -> None:
+    """The viewers know no names for the values of a JSON enumeration."""
 
-    def words(enumeration: Any) -> str:
+    def names(enumeration: Any) -> str:
         return ", ".join(f"{member.value} {member.name.lower()}" for member in enumeration)
 
     modes, drives = panels["StateTransitions!modes"], panels["StateTransitions!drives"]
-    assert modes.foxglove_panel_title == words(Mode)
-    assert drives.foxglove_panel_title == words(DriveStatus)
+    assert modes.foxglove_panel_title == names(Mode)
+    assert drives.foxglove_panel_title == names(DriveStatus)
     labels = [row.label for row in modes.paths]
-    assert f"planner: {words(PlannerMode)}" in labels
-    assert f"gains: {words(SplitSource)}" in labels
+    assert f"planner: {names(PlannerMode)}" in labels
+    assert f"gains: {names(SplitSource)}" in labels
     for panel in panels.values():
         if not isinstance(panel, Tab):
             assert panel.foxglove_panel_title == panel.lichtblick_panel_title

@@ -1,4 +1,4 @@
-"""The network's panel shows what was in force, by the rule that the links themselves have."""
+"""The network panel shows the active impairments, by the rule of the links themselves."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tools.reports.network import ImpairedLink, histories
 
 
 @given(st.lists(st.tuples(st.booleans(), st.integers(1, 6), st.integers(1, 9)), max_size=8))
-def test_cut_is_shown_when_nothing_passes_and_only_then(
-    asked: list[tuple[bool, int, int]],
+def test_the_state_is_cut_exactly_when_no_message_passes(
+    requested: list[tuple[bool, int, int]],
 ) -> None:
     directions = {name: Direction(name, 0) for name in DIRECTIONS}
-    told: list[LinkEvent] = []
-    impairments = ImpairmentSchedule(directions, told.append)
-    for cut, begins, lasts in asked:
+    events: list[LinkEvent] = []
+    impairments = ImpairmentSchedule(directions, events.append)
+    for cut, begin_s, duration_s in requested:
         what = Impairment(delay_ms=0.0 if cut else 5.0, partition=cut)
-        impairments.plan(WRENCHES, what, float(begins), float(begins + lasts))
+        impairments.plan(WRENCHES, what, float(begin_s), float(begin_s + duration_s))
     for s in range(20):
         impairments.advance(float(s), s * NS_PER_S)
-        rows = histories(told, 0).get(WRENCHES, ())
+        rows = histories(events, 0).get(WRENCHES, ())
         shown = rows[-1][1] if rows else ImpairedLink.CLEAR
         now_ns = s * NS_PER_S
         passed = directions[WRENCHES].passes(now_ns, 0)

@@ -1,8 +1,8 @@
-"""What the exported copy has for Rerun: transforms in protobuf, and bodies as URDF.
+"""Exported log in Rerun: transforms in protobuf, and bodies as URDF.
 
-Rerun takes transforms from `foxglove.FrameTransforms` in protobuf alone, and URDF from a
-`std_msgs/msg/String` whose topic ends in `robot_description` (tried with rerun-sdk 0.41).
-The model is read here by Pinocchio's own reader of URDF.
+Rerun reads transforms only from `foxglove.FrameTransforms` in protobuf, and URDF from a
+`std_msgs/msg/String` whose topic ends in `robot_description` (tested with rerun-sdk 0.41).
+The tests read the model with Pinocchio's URDF reader.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def model(robot: RobotConfig, first: RobotPose) -> str:
     return scene.model("lab", robot, first)
 
 
-def test_the_model_comes_once_before_the_first_transforms_under_the_name_rerun_knows(
+def test_the_model_comes_once_before_the_transforms_on_the_topic_for_rerun(
     shown: Path, log: RunLog, robot: RobotConfig, first: RobotPose
 ) -> None:
     with shown.open("rb") as file:
@@ -65,7 +65,7 @@ def test_the_model_comes_once_before_the_first_transforms_under_the_name_rerun_k
     assert message.data == b"\x00\x01\x00\x00" + len(text).to_bytes(4, "little") + text
 
 
-def test_the_links_hang_together_as_the_frames_do(
+def test_the_links_form_the_tree_of_the_frames(
     model: str, robot: RobotConfig, first: RobotPose
 ) -> None:
     tree = pin.buildModelFromXML(model)
@@ -92,8 +92,8 @@ def test_the_bodies_of_the_model_are_those_of_the_scene(
             body = bodies.pop(f"{entity.frame}_{count[entity.frame]}")
             count[entity.frame] += 1
             assert tree.frames[body.parentFrame].name == entity.frame
-            assert SIZES[solid.form](body) == pytest.approx(solid.size)
-            assert body.placement.translation == pytest.approx(np.array(solid.at))
+            assert SIZES[solid.shape](body) == pytest.approx(solid.size)
+            assert body.placement.translation == pytest.approx(np.array(solid.position))
             assert body.placement.rotation == pytest.approx(np.eye(3))
             colour = scene.UNKNOWN if entity.name.startswith("module_") else solid.colour
             assert body.meshColor == pytest.approx(np.array(colour))
@@ -101,7 +101,7 @@ def test_the_bodies_of_the_model_are_those_of_the_scene(
     assert count.total() == 14
 
 
-def test_names_with_marks_of_xml_stay_what_they_are(robot: RobotConfig, first: RobotPose) -> None:
+def test_names_with_xml_characters_are_kept(robot: RobotConfig, first: RobotPose) -> None:
     name = 'a<b>&"c'
     solid = Solid("sphere", (0.1, 0.1, 0.1), (1.0, 0.0, 0.0, 1.0))
     text = urdf.urdf(name, scene.frames(robot, first), [Entity("torso", name, (solid,))])

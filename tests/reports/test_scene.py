@@ -1,4 +1,4 @@
-"""`xrl export`: the 3-D scene, held against the models and the schemas."""
+"""`xrl export`: the 3-D scene, compared with the models and the schemas."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.reports import runs
 from tests.reports.runs import Made
 from tools import cli
 from tools.reports import scene
-from tools.reports.foxglove import UPRIGHT, Arrow, Entity, Placed, Solid
+from tools.reports.foxglove import UPRIGHT, Arrow, Entity, FrameTransform, Solid
 from tools.reports.scene import RobotPose
 from tools.runs.run_log import RunLog, read_run
 
@@ -56,17 +56,17 @@ def matrix(turn: tuple[float, float, float, float]) -> Array:
     return out.reshape(3, 3)
 
 
-def in_world(frames: list[Placed]) -> dict[str, tuple[Array, Array]]:
-    """Return (position, rotation) of each frame, chained from the world on."""
+def in_world(frames: list[FrameTransform]) -> dict[str, tuple[Array, Array]]:
+    """Return (position, rotation) of each frame in the world."""
     found = {"world": (np.zeros(3), np.eye(3))}
     for row in frames:
         r, R = found[row.parent]
-        found[row.child] = (r + R @ np.array(row.at), R @ matrix(row.turn))
+        found[row.child] = (r + R @ np.array(row.position), R @ matrix(row.rotation))
     return found
 
 
 def bodies(robot: RobotConfig, torso: Any, angles: Any, q: Any) -> dict[str, tuple[Array, Array]]:
-    """Return where MuJoCo has each frame."""
+    """Return the position and rotation of each frame in MuJoCo."""
     model = mujoco.MjModel.from_xml_string(mjcf(robot))
     data = mujoco.MjData(model)
     roll, pitch, yaw = angles
@@ -89,7 +89,7 @@ def bodies(robot: RobotConfig, torso: Any, angles: Any, q: Any) -> dict[str, tup
     return found
 
 
-def apart(found: Any, right: Any) -> float:
+def deviation(found: Any, right: Any) -> float:
     return max(
         np.abs(a - b).max() for name in right for a, b in zip(found[name], right[name], strict=True)
     )
@@ -111,7 +111,7 @@ def test_the_frames_are_those_of_the_model_at_random_times(
         ]
         right = bodies(robot, truth.torso, truth.angles, q)
         found = in_world(scene.frames(robot, pose))
-        assert apart(found, right) < 1e-9
+        assert deviation(found, right) < 1e-9
         assert found["com"][0].tolist() == list(truth.com)
         assert set(found) == {"world", "torso", "com", "harness", *MODULES}
 
@@ -123,7 +123,7 @@ def test_the_frames_are_those_of_the_model_in_any_pose(
     torso, angles, q = tuple(numbers[:3]), tuple(numbers[3:6]), tuple(numbers[6:])
     nothing = (0.0, 0.0, 0.0)
     pose = RobotPose(0, torso, angles, nothing, q, (0,) * 6, nothing, nothing)
-    assert apart(in_world(scene.frames(robot, pose)), bodies(robot, torso, angles, q)) < 1e-9
+    assert deviation(in_world(scene.frames(robot, pose)), bodies(robot, torso, angles, q)) < 1e-9
 
 
 def test_the_bodies_are_those_of_the_model(robot: RobotConfig) -> None:
@@ -133,9 +133,9 @@ def test_the_bodies_are_those_of_the_model(robot: RobotConfig) -> None:
         (solid,) = found[name].solids
         geom = model.geom(name)
         half = geom.size if form == "cube" else [geom.size[0], geom.size[0], geom.size[1]]
-        assert solid.form == form
+        assert solid.shape == form
         assert solid.size == pytest.approx(2 * np.array(half))
-        assert solid.at == pytest.approx(geom.pos)
+        assert solid.position == pytest.approx(geom.pos)
 
 
 def test_the_scene_comes_at_30_hz_and_shows_modes_and_forces(poses: list[RobotPose]) -> None:
@@ -155,11 +155,11 @@ def test_the_scene_comes_at_30_hz_and_shows_modes_and_forces(poses: list[RobotPo
 
 @given(st.tuples(*[st.floats(-10.0, 10.0)] * 3).filter(lambda v: math.hypot(*v) > 1e-3))
 def test_an_arrow_points_along_its_force(force: tuple[float, float, float]) -> None:
-    R = matrix(scene.along(force))
+    R = matrix(scene.rotation_to(force))
     assert np.abs(R[:, 0] - np.array(force) / math.hypot(*force)).max() < 1e-7
 
 
-def test_a_log_without_a_world_has_its_robot_stand_on_its_feet(
+def test_without_a_simulated_world_the_robot_stands_on_its_feet(
     log: RunLog, robot: RobotConfig, tmp_path: Path
 ) -> None:
     real = runs.rewritten(log, tmp_path, keep=lambda name: not name.startswith("sim/"))
@@ -177,7 +177,7 @@ def test_a_log_without_a_world_has_its_robot_stand_on_its_feet(
 def test_every_payload_of_every_channel_fits_its_schema(shown: Path) -> None:
     """PlotJuggler and Foxglove read a channel by its schema alone.
 
-    What the scene's hold, another reader decodes in the test after this one.
+    The next test decodes the channels of the scene with another reader.
     """
     foreign = {
         known.name: ("protobuf", "protobuf", known.data)
@@ -230,7 +230,7 @@ def arrows(entity: Any) -> tuple[Arrow, ...]:
 def test_another_reader_of_protobuf_finds_all_frames_and_bodies_of_the_scene(
     shown: Path, poses: list[RobotPose], log: RunLog, robot: RobotConfig
 ) -> None:
-    """It knows nothing but the schemas in the file."""
+    """The reader uses only the schemas in the file."""
     found: dict[str, dict[int, Any]] = {}
     names = {f"xrl/xrl/scene/{name}": name for name in ("frames", "links", "state")}
     with shown.open("rb") as file:
@@ -243,7 +243,7 @@ def test_another_reader_of_protobuf_finds_all_frames_and_bodies_of_the_scene(
     assert len(found["links"]) == pytest.approx((poses[-1].t_ns - poses[0].t_ns) / 1e9, abs=1)
     for pose in poses:
         assert scene.frames(robot, pose) == [
-            Placed(
+            FrameTransform(
                 row.parent_frame_id, row.child_frame_id,
                 numbers(row.translation, "xyz"), numbers(row.rotation, "xyzw"),
             )
@@ -259,14 +259,14 @@ def test_another_reader_of_protobuf_finds_all_frames_and_bodies_of_the_scene(
                 ]
 
 
-def test_the_exported_log_opens_as_before(shown: Path, log: RunLog) -> None:
+def test_the_exported_log_holds_all_messages_of_the_original(shown: Path, log: RunLog) -> None:
     again = read_run(shown)
     assert again.complete
     for key in log.keys():  # noqa: SIM118 - not a dict
         assert again.raw(key) == log.raw(key)
 
 
-def test_foxgloves_own_library_takes_every_schema(tmp_path: Path) -> None:
+def test_foxgloves_own_library_accepts_every_schema(tmp_path: Path) -> None:
     context = Context()
     path = tmp_path / "theirs.mcap"
     with open_mcap(path, context=context):
@@ -278,7 +278,7 @@ def test_foxgloves_own_library_takes_every_schema(tmp_path: Path) -> None:
         assert make_reader(file).get_summary() is not None
 
 
-def test_what_cannot_be_exported_is_one_line(
+def test_an_impossible_export_prints_one_line(
     made: Made, shown: Path, log: RunLog, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     half = runs.rewritten(log, tmp_path / "half", keep=lambda name: "hip_left" not in name).path
@@ -293,7 +293,7 @@ def test_what_cannot_be_exported_is_one_line(
         ([bare, "--scene", "-o", out], "holds no robot.toml"),
     ):
         assert cli.main(["export", *map(str, arguments)]) == 2
-        said = capsys.readouterr().err
-        assert words in said
-        assert said.count("\n") == 1
+        printed = capsys.readouterr().err
+        assert words in printed
+        assert printed.count("\n") == 1
     assert not Path(out).exists()

@@ -1,4 +1,4 @@
-"""Ages, rates, late cycles; what the timeline says together; the network's impairments."""
+"""Timing panels, grouped rows of the timeline, network impairments."""
 
 from __future__ import annotations
 
@@ -17,48 +17,50 @@ from tests.reports import pages, runs
 from tools.reports.network import ImpairedLink
 from tools.reports.page import render
 from tools.reports.run_data import RunData
-from tools.reports.timeline import happenings
+from tools.reports.timeline import timeline_events
 from tools.runs.run_log import RunLog
 
 
-def test_the_cycles_of_a_service_come_at_its_rate(page: str) -> None:
+def test_the_rate_of_control_cycles_is_that_of_the_service(page: str) -> None:
     for module in MODULES:
         _, rate = pages.line(pages.data_of(page), "Control cycles of each service", module)
         assert np.abs(rate - 500.0).max() < 10.0
 
 
-def test_late_cycles_are_counted_from_the_arming_on_and_across_a_restart(
+def test_late_cycles_are_counted_from_arming_and_across_a_restart(
     log: RunLog, tmp_path: Path
 ) -> None:
-    source = RunData(log)
-    begin_ns = source.zero_ns + round(source.armed_s() * 1e9)
+    run = RunData(log)
+    begin_ns = run.zero_ns + round(run.armed_s() * 1e9)
 
     def late(name: str, body: bytes) -> bytes:
-        """40 while it starts up; then one in 0.1 s; restarted at 2 s, it counts from 0."""
+        """40 late cycles at the start, then one in 0.1 s; a restart at 2 s resets the count."""
         if name != "joint/hip_right/state":
             return body
         state = msgspec.json.decode(body)
-        t = (state["t_ns"] - source.zero_ns) / 1e9
+        t = (state["t_ns"] - run.zero_ns) / 1e9
         since = (state["t_ns"] - begin_ns) / 1e9
         state["late"] = 40 + int(10.0 * max(0.0, since)) if t < 2.0 else int(10.0 * (t - 2.0))
         return msgspec.json.encode(state)
 
     page = render(runs.rewritten(log, tmp_path, payload=late))
-    _, counted = pages.line(pages.data_of(page), "Control cycles that came late", "hip_right")
+    _, counted = pages.line(pages.data_of(page), "Late control cycles", "hip_right")
     assert counted[0] == 0.0
-    assert counted[-1] == pytest.approx(10.0 * (4.0 - source.armed_s()), abs=3.0)
+    assert counted[-1] == pytest.approx(10.0 * (4.0 - run.armed_s()), abs=3.0)
     assert (np.diff(counted[np.isfinite(counted)]) >= 0.0).all()
 
 
-def test_what_virtual_time_cannot_tell_is_left_out(page: str) -> None:
+def test_panels_of_real_time_are_left_out_in_virtual_time(page: str) -> None:
     for line in (
-        "Control cycles that came late: none came late",
+        "Late control cycles: no cycle was late",
         "Planner tick: no real time in this log",
     ):
         assert f"<li>{line}</li>" in page
 
 
-def test_a_machine_too_slow_is_said_beside_the_verdict(log: RunLog, tmp_path: Path) -> None:
+def test_a_machine_too_slow_for_real_time_is_named_with_the_verdict(
+    log: RunLog, tmp_path: Path
+) -> None:
     def slow(name: str, body: bytes) -> bytes:
         return body.replace(b'"late_s":0.0', b'"late_s":1.5') if name == "sim/truth" else body
 
@@ -70,27 +72,27 @@ def test_a_machine_too_slow_is_said_beside_the_verdict(log: RunLog, tmp_path: Pa
     assert 'class="caution">' not in render(log), "virtual time is never too slow"
 
 
-def test_drives_that_come_up_together_are_one_line_and_no_alarm(
+def test_drives_that_start_together_share_one_row_and_are_no_alarm(
     log: RunLog, tmp_path: Path
 ) -> None:
-    source = RunData(log)
+    run = RunData(log)
 
     def coming_up(name: str, body: bytes) -> bytes:
         if not name.endswith("/state") or not name.startswith("joint/"):
             return body
         state = msgspec.json.decode(body)
-        t = (state["t_ns"] - source.zero_ns) / 1e9
+        t = (state["t_ns"] - run.zero_ns) / 1e9
         if t < -2.0:
             state["drive"] = int(DriveStatus.LOST if t < -2.1 else DriveStatus.IDLE)
         if 3.0 <= t < 3.1 and name == "joint/knee_left/state":
             state["drive"] = int(DriveStatus.IDLE)
         return msgspec.json.encode(state)
 
-    rows = happenings(RunData(runs.rewritten(log, tmp_path, payload=coming_up)))
-    told = {row.text: row.kind for row in rows if "drive" in row.text}
-    assert told["all six: drive LOST to IDLE"] == "note"
-    assert told["all six: drive IDLE to ARMED"] == "note"
-    assert told["knee_left: drive ARMED to IDLE"] == "bad"
+    rows = timeline_events(RunData(runs.rewritten(log, tmp_path, payload=coming_up)))
+    kinds = {row.text: row.kind for row in rows if "drive" in row.text}
+    assert kinds["all six: drive LOST to IDLE"] == "note"
+    assert kinds["all six: drive IDLE to ARMED"] == "note"
+    assert kinds["knee_left: drive ARMED to IDLE"] == "bad"
 
 
 def impairment(number: int, link: str, t_ns: int, *, begins: bool, cut: bool) -> LinkEvent:
@@ -102,19 +104,17 @@ def impairment(number: int, link: str, t_ns: int, *, begins: bool, cut: bool) ->
     )  # fmt: skip
 
 
-def test_what_was_injected_into_the_network_is_a_panel_marks_and_lines(
-    log: RunLog, tmp_path: Path
-) -> None:
-    source = RunData(log)
+def test_network_impairments_have_a_panel_marks_and_rows(log: RunLog, tmp_path: Path) -> None:
+    run = RunData(log)
     more: list[tuple[int, str, bytes]] = []
     for number, cut, begin, end in ((1, False, 0.5, 2.0), (2, True, 1.0, 1.5)):
         for t, begins in ((begin, True), (end, False)):
             for module in ("ankle_left", "knee_left", "hip_left"):
-                t_ns = source.zero_ns + round(t * 1e9)
+                t_ns = run.zero_ns + round(t * 1e9)
                 event = impairment(number, f"planner->{module}", t_ns, begins=begins, cut=cut)
                 more.append((t_ns, topics.LINK_EVENT.name, msgspec.json.encode(event)))
     data, rows = panel_and_rows(runs.rewritten(log, tmp_path, more=more))
-    (row,) = pages.panel(data, "Network, as injected")["rows"]
+    (row,) = pages.panel(data, "Injected network impairments")["rows"]
     assert row["label"] == "to left"
     starts, _, codes = zip(*row["spans"][1:], strict=True)
     assert starts == pytest.approx((0.5, 1.0, 1.5, 2.0), abs=1e-3)
@@ -131,20 +131,18 @@ def test_what_was_injected_into_the_network_is_a_panel_marks_and_lines(
     assert "network, planner->left partition ends; 60 messages passed, 21 lost" in rows
 
 
-def test_ages_stand_beside_what_was_done_to_the_network(log: RunLog, tmp_path: Path) -> None:
+def test_the_ages_follow_the_panel_of_network_impairments(log: RunLog, tmp_path: Path) -> None:
     t_ns = RunData(log).zero_ns + 10**9
     event = msgspec.json.encode(impairment(1, "planner->knee_left", t_ns, begins=True, cut=True))
     data = pages.data_of(
         render(runs.rewritten(log, tmp_path, more=[(t_ns, topics.LINK_EVENT.name, event)]))
     )
     titles = [panel["title"] for panel in data["panels"]]
-    place = titles.index("Network, as injected")
+    place = titles.index("Injected network impairments")
     assert titles[place + 1] == "Command age"
 
 
-def test_inputs_of_seconds_do_not_flatten_the_ages_of_milliseconds(
-    log: RunLog, tmp_path: Path
-) -> None:
+def test_ages_of_seconds_do_not_flatten_ages_of_milliseconds(log: RunLog, tmp_path: Path) -> None:
     def cut_off(name: str, body: bytes) -> bytes:
         if name != "planner/status":
             return body
@@ -155,12 +153,10 @@ def test_inputs_of_seconds_do_not_flatten_the_ages_of_milliseconds(
     page = render(runs.rewritten(log, tmp_path, payload=cut_off))
     panel = pages.panel(pages.data_of(page), "Age of the planner's inputs")
     assert panel["reach"] == pytest.approx(200.0)
-    assert "what it was late by then is not in it" in panel["note"]
+    assert "The delay before the arrival is not included" in panel["note"]
 
 
-def test_a_planner_that_waits_after_drop_outs_is_in_the_timeline(
-    log: RunLog, tmp_path: Path
-) -> None:
+def test_the_back_off_of_the_planner_is_in_the_timeline(log: RunLog, tmp_path: Path) -> None:
     zero_ns = RunData(log).zero_ns
 
     def waits(name: str, body: bytes) -> bytes:
@@ -171,15 +167,15 @@ def test_a_planner_that_waits_after_drop_outs_is_in_the_timeline(
         status["wait_s"] = 3.5 - t_s if 2.5 <= t_s < 3.5 else 0.0
         return msgspec.json.encode(status)
 
-    found = happenings(RunData(runs.rewritten(log, tmp_path, payload=waits)))
-    (row,) = [row for row in found if "leads again" in row.text]
+    found = timeline_events(RunData(runs.rewritten(log, tmp_path, payload=waits)))
+    (row,) = [row for row in found if "backs off" in row.text]
     assert row.t == pytest.approx(2.5, abs=0.01)
-    assert row.text.startswith("planner: leads again in 1.0 s at the earliest")
+    assert row.text.startswith("planner: backs off for 1.0 s or more")
 
 
 def panel_and_rows(log: RunLog) -> tuple[dict[str, Any], list[str]]:
-    return pages.data_of(render(log)), [row.text for row in happenings(RunData(log))]
+    return pages.data_of(render(log)), [row.text for row in timeline_events(RunData(log))]
 
 
-def test_a_log_with_nothing_injected_says_so(page: str) -> None:
-    assert "<li>Network, as injected: nothing was injected into the network" in page
+def test_a_log_without_impairments_says_so(page: str) -> None:
+    assert "<li>Injected network impairments: no impairment in this log" in page

@@ -1,8 +1,8 @@
-"""Foxglove's well-known messages for 3-D, encoded and described by its own library. Pure.
+"""Foxglove's well-known 3-D messages, encoded by its own library. Pure.
 
-`foxglove.FrameTransforms` and `foxglove.SceneUpdate`, in protobuf: viewers know them by name,
-and Rerun takes transforms in no other form. Lengths and positions in m; turns as quaternions
-(x, y, z, w); colours as (r, g, b, a) from 0 to 1.
+`foxglove.FrameTransforms` and `foxglove.SceneUpdate` in protobuf: viewers know them by name, and
+Rerun accepts transforms in no other form. Lengths and positions are in m, rotations are
+quaternions (x, y, z, w), colours are (r, g, b, a) from 0 to 1.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 Colour: TypeAlias = tuple[float, float, float, float]
 
 ENCODING: Final = "protobuf"
-"""Of the messages."""
+"""Encoding of the messages."""
 TRANSFORMS: Final = well_known.FrameTransforms.get_schema()
 SCENE: Final = well_known.SceneUpdate.get_schema()
 
@@ -27,41 +27,41 @@ ORIGIN: Final[Vector3] = (0.0, 0.0, 0.0)
 UPRIGHT: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 
 
-class Placed(NamedTuple):
-    """A frame in its parent."""
+class FrameTransform(NamedTuple):
+    """Pose of a frame in its parent."""
 
     parent: str
     child: str
-    at: Vector3
-    turn: Quaternion
+    position: Vector3
+    rotation: Quaternion
 
 
 class Solid(NamedTuple):
-    """A body in its frame, not turned; a cylinder stands along z."""
+    """Body with the axes of its frame; a cylinder stands along z."""
 
-    form: Literal["cube", "cylinder", "sphere"]
+    shape: Literal["cube", "cylinder", "sphere"]
     size: Vector3
-    """Along x, y and z: the diameter, where it is round."""
+    """Size along x, y and z; the diameter where the body is round."""
     colour: Colour
-    at: Vector3 = ORIGIN
-    """Of its middle."""
+    position: Vector3 = ORIGIN
+    """Position of its centre."""
 
 
 class Arrow(NamedTuple):
-    """An arrow in its frame."""
+    """Arrow in its frame."""
 
-    at: Vector3
-    """Of its tail."""
-    turn: Quaternion
-    """From x to where it points."""
+    position: Vector3
+    """Position of its tail."""
+    rotation: Quaternion
+    """Rotation from the x axis to the arrow's direction."""
     length: float
     width: float
-    """Of the shaft."""
+    """Diameter of the shaft."""
     colour: Colour
 
 
 class Entity(NamedTuple):
-    """What moves with a frame, until it is replaced by an entity of its name."""
+    """Bodies and arrows fixed to a frame; a later entity of the same name replaces it."""
 
     frame: str
     name: str
@@ -69,17 +69,17 @@ class Entity(NamedTuple):
     arrows: tuple[Arrow, ...] = ()
 
 
-def transforms(ns: int, rows: Iterable[Placed]) -> bytes:
-    """Encode where frames are at a time of ns since 1970."""
-    when = _time(ns)
+def transforms(ns: int, rows: Iterable[FrameTransform]) -> bytes:
+    """Encode the poses of frames at a time, ns since 1970."""
+    timestamp = _time(ns)
     return well_known.FrameTransforms(
         transforms=[
             well_known.FrameTransform(
-                timestamp=when,
+                timestamp=timestamp,
                 parent_frame_id=row.parent,
                 child_frame_id=row.child,
-                translation=_vector(row.at),
-                rotation=_turn(row.turn),
+                translation=_vector(row.position),
+                rotation=_quaternion(row.rotation),
             )
             for row in rows
         ]
@@ -87,43 +87,43 @@ def transforms(ns: int, rows: Iterable[Placed]) -> bytes:
 
 
 def scene(ns: int, entities: Iterable[Entity]) -> bytes:
-    """Encode entities, each in place of the one of its name, at a time of ns since 1970."""
-    when = _time(ns)
-    return well_known.SceneUpdate(entities=[_entity(when, row) for row in entities]).encode()
+    """Encode entities at a time, ns since 1970."""
+    timestamp = _time(ns)
+    return well_known.SceneUpdate(entities=[_entity(timestamp, row) for row in entities]).encode()
 
 
-def _entity(when: well_known.Timestamp, row: Entity) -> well_known.SceneEntity:
+def _entity(timestamp: well_known.Timestamp, row: Entity) -> well_known.SceneEntity:
     return well_known.SceneEntity(
-        timestamp=when,
+        timestamp=timestamp,
         frame_id=row.frame,
         id=row.name,
-        lifetime=well_known.Duration(0),  # it stays
+        lifetime=well_known.Duration(0),  # no end
         frame_locked=True,
         arrows=[_arrow(arrow) for arrow in row.arrows],
         cubes=[
             well_known.CubePrimitive(
-                pose=_pose(solid.at), size=_vector(solid.size), color=_colour(solid.colour)
+                pose=_pose(solid.position), size=_vector(solid.size), color=_colour(solid.colour)
             )
             for solid in row.solids
-            if solid.form == "cube"
+            if solid.shape == "cube"
         ],
         spheres=[
             well_known.SpherePrimitive(
-                pose=_pose(solid.at), size=_vector(solid.size), color=_colour(solid.colour)
+                pose=_pose(solid.position), size=_vector(solid.size), color=_colour(solid.colour)
             )
             for solid in row.solids
-            if solid.form == "sphere"
+            if solid.shape == "sphere"
         ],
         cylinders=[
             well_known.CylinderPrimitive(
-                pose=_pose(solid.at),
+                pose=_pose(solid.position),
                 size=_vector(solid.size),
                 bottom_scale=1.0,
                 top_scale=1.0,
                 color=_colour(solid.colour),
             )
             for solid in row.solids
-            if solid.form == "cylinder"
+            if solid.shape == "cylinder"
         ],
     )
 
@@ -131,7 +131,7 @@ def _entity(when: well_known.Timestamp, row: Entity) -> well_known.SceneEntity:
 def _arrow(arrow: Arrow) -> well_known.ArrowPrimitive:
     head = min(arrow.length, 3.0 * arrow.width)
     return well_known.ArrowPrimitive(
-        pose=_pose(arrow.at, arrow.turn),
+        pose=_pose(arrow.position, arrow.rotation),
         shaft_length=arrow.length - head,
         shaft_diameter=arrow.width,
         head_length=head,
@@ -144,8 +144,8 @@ def _time(ns: int) -> well_known.Timestamp:
     return well_known.Timestamp(*divmod(ns, NS_PER_S))
 
 
-def _pose(at: Vector3, turn: Quaternion = UPRIGHT) -> well_known.Pose:
-    return well_known.Pose(position=_vector(at), orientation=_turn(turn))
+def _pose(position: Vector3, rotation: Quaternion = UPRIGHT) -> well_known.Pose:
+    return well_known.Pose(position=_vector(position), orientation=_quaternion(rotation))
 
 
 def _vector(values: Vector3) -> well_known.Vector3:
@@ -153,7 +153,7 @@ def _vector(values: Vector3) -> well_known.Vector3:
     return well_known.Vector3(x=x, y=y, z=z)
 
 
-def _turn(values: Quaternion) -> well_known.Quaternion:
+def _quaternion(values: Quaternion) -> well_known.Quaternion:
     x, y, z, w = values
     return well_known.Quaternion(x=x, y=y, z=z, w=w)
 

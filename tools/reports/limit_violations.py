@@ -1,4 +1,7 @@
-"""When a figure first went beyond its limit: where a search for a cause begins. Pure."""
+"""First time at which each figure exceeds its limit, for the timeline. Pure.
+
+The search for the cause of a fall begins at the earliest violation.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +22,11 @@ from tools.runs.verdict import leading
 from tools.runs.verdict_limits import LIMITS
 
 TOGETHER_S: Final = 0.1
-"""The same of several modules or joints within this time is told in one line."""
-LASTING_S: Final = 0.02
-"""Torques at their limit for less, all together, are not told."""
+"""Equal violations of several modules or joints within this time share one row."""
+TORQUE_DURATION_MIN_S: Final = 0.02
+"""Shorter times at the torque limit, in total, are not reported."""
 AT_LIMIT: Final = 0.999
-"""Share of a module's torque limit at which the gate is taken to hold it back."""
+"""Fraction of a module's torque limit from which the torque counts as limited."""
 
 ALLOWED: Final = {row.key: (row.limit, row.unit) for row in LIMITS}
 WORLD: Final = (
@@ -35,130 +38,131 @@ WORLD: Final = (
     ("left sole's tilt", "foot_left_tilt", 0, 1.0, "alive_sole_tilt_max_rad", ""),
     ("operator's force", "operator_force", 2, 1.0, "operator_peak_n", ""),
 )
-"""(what, field of `SimTruth`, its place, scale, the verdict's limit while the planner leads, and
-while it does not); no limit: not told."""
+"""(name, field of `SimTruth`, index in the field, scale, key of the verdict's limit while the
+planner leads, key while it does not lead); an empty key: no limit."""
 
 
-class Crossing(NamedTuple):
-    """A stretch of time that began beyond a limit."""
+class Violation(NamedTuple):
+    """Time that one figure spent beyond its limit."""
 
-    who: str
+    name: str
     t: float
-    """First time beyond it, s."""
-    lasts_s: float
-    """Time beyond it, all together."""
+    """First time beyond the limit, s."""
+    duration_s: float
+    """Total time beyond the limit."""
 
 
-def crossings(source: RunData) -> Iterator[TimelineEvent]:
-    """Yield when each figure first went beyond its limit, not in the order of time.
+def limit_violations(run: RunData) -> Iterator[TimelineEvent]:
+    """Yield the first violation of each limit, in no order.
 
-    The limits are the verdict's (docs/results.md#targets) for the world, and the robot file's for
-    torques, joints and margins.
+    The simulated world has the limits of the verdict (docs/results.md#targets); torques, joints
+    and margins have those of the robot file.
     """
-    yield from _world(source)
-    yield from _torques(source)
-    yield from _stops(source)
-    yield from _margins(source)
+    yield from _world(run)
+    yield from _torques(run)
+    yield from _stops(run)
+    yield from _margins(run)
 
 
-def first_beyond(who: str, t: Array, beyond: NDArray[np.bool_]) -> Crossing | None:
-    """Return when something first was beyond a limit, and for how long in all; None if never.
+def first_violation(name: str, t: Array, beyond: NDArray[np.bool_]) -> Violation | None:
+    """Return the first time beyond a limit and the total duration; None if there is none.
 
     Args:
-        who: what or whose it is.
+        name: the figure, module or joint.
         t: times, s, not falling.
-        beyond: True where it is, one for each time.
+        beyond: True where the limit is exceeded; one for each time.
     """
     if not beyond.any():
         return None
     steps = np.append(np.diff(t), 0.0)
     usual = float(np.median(steps[:-1])) if len(steps) > 1 else 0.0
-    lasts = float(np.minimum(steps, 5.0 * usual)[beyond].sum())
-    return Crossing(who, float(t[int(np.argmax(beyond))]), lasts)
+    duration = float(np.minimum(steps, 5.0 * usual)[beyond].sum())
+    return Violation(name, float(t[int(np.argmax(beyond))]), duration)
 
 
-def _world(source: RunData) -> Iterator[TimelineEvent]:
-    """Tell what the verdict judges, with its limits, over the time that it judges."""
-    if source.course is None:
+def _world(run: RunData) -> Iterator[TimelineEvent]:
+    """Yield violations of the verdict's limits, over the time that the verdict judges."""
+    if run.course is None:
         return
-    t = source.course.t
-    is_led = leading(source.log, np.round(t * NS_PER_S).astype(np.int64) + source.zero_ns)
-    for what, field, place, scale, led, held in WORLD:
-        rows = np.array([getattr(row, field) for row in source.course.rows], dtype=np.float64)
-        values = np.abs(rows if rows.ndim == 1 else rows[:, place]) * scale
-        for key, when, while_ in (
-            (led, is_led, "while led"),
-            (held, ~is_led, "while not led"),
+    t = run.course.t
+    leads = leading(run.log, np.round(t * NS_PER_S).astype(np.int64) + run.zero_ns)
+    for name, field, index, scale, leading_key, other_key in WORLD:
+        rows = np.array([getattr(row, field) for row in run.course.rows], dtype=np.float64)
+        values = np.abs(rows if rows.ndim == 1 else rows[:, index]) * scale
+        for key, mask, condition in (
+            (leading_key, leads, "while the planner leads"),
+            (other_key, ~leads, "while the planner does not lead"),
         ):
             if not key:
                 continue
             most, unit = ALLOWED[key]
-            found = first_beyond(what, t, (values > most) & when)
+            found = first_violation(name, t, (values > most) & mask)
             if found is not None:
-                yield _told([found], f"over {most:g} {unit}, the limit {while_}")
+                yield _event([found], f"over {most:g} {unit}, the limit {condition}")
 
 
-def _torques(source: RunData) -> Iterator[TimelineEvent]:
-    if source.robot is None:
+def _torques(run: RunData) -> Iterator[TimelineEvent]:
+    if run.robot is None:
         return
-    most = source.robot.joint.tau_module_max
+    most = run.robot.joint.tau_module_max
     found = []
     for module in MODULES:
-        (tau,) = source.columns(topics.JOINT_STATE, module, "tau")
+        (tau,) = run.columns(topics.JOINT_STATE, module, "tau")
         if not len(tau):
             continue
-        t = source.times(topics.JOINT_STATE, module)
-        at_limit = first_beyond(module, t, np.abs(tau).sum(axis=1) >= AT_LIMIT * most)
-        if at_limit is not None and at_limit.lasts_s >= LASTING_S:
+        t = run.times(topics.JOINT_STATE, module)
+        at_limit = first_violation(module, t, np.abs(tau).sum(axis=1) >= AT_LIMIT * most)
+        if at_limit is not None and at_limit.duration_s >= TORQUE_DURATION_MIN_S:
             found.append(at_limit)
     for group in _together(found):
-        yield _told(group, f"torque at its limit of {most:g} N m")
+        yield _event(group, f"torque at its limit of {most:g} N m")
 
 
-def _stops(source: RunData) -> Iterator[TimelineEvent]:
-    if source.robot is None:
+def _stops(run: RunData) -> Iterator[TimelineEvent]:
+    if run.robot is None:
         return
     found = []
-    limits = source.robot.joint_limits()
-    armed_s = source.armed_s()
+    limits = run.robot.joint_limits()
+    armed_s = run.armed_s()
     for number, joint in enumerate(JOINTS):
         module = MODULES[number // 2]
-        (q,) = source.columns(topics.JOINT_STATE, module, "q")
+        (q,) = run.columns(topics.JOINT_STATE, module, "q")
         if not len(q):
             continue
         low, high = limits[number]
         angle = q[:, number % 2]
-        t = source.times(topics.JOINT_STATE, module)
+        t = run.times(topics.JOINT_STATE, module)
         outside = (angle < low) | (angle > high)
-        at_stop = first_beyond(joint, t, outside & (t >= armed_s))
+        at_stop = first_violation(joint, t, outside & (t >= armed_s))
         if at_stop is not None:
             found.append(at_stop)
     for group in _together(found):
-        yield _told(group, "beyond a soft stop")
+        yield _event(group, "beyond a soft stop")
 
 
-def _margins(source: RunData) -> Iterator[TimelineEvent]:
-    if source.robot is None:
+def _margins(run: RunData) -> Iterator[TimelineEvent]:
+    if run.robot is None:
         return
-    asked = source.robot.certificate
-    mode, service, onboard = source.columns(
+    certificate = run.robot.certificate
+    mode, service, onboard = run.columns(
         topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
     )
-    t = source.times(topics.PLANNER_STATUS)
-    for who, values, least in (
-        ("margin of the joint services alone", service, asked.margin_min),
-        ("margin of the drives alone", onboard, asked.onboard_margin_min),
+    t = run.times(topics.PLANNER_STATUS)
+    has_margin = ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED))
+    for name, values, least in (
+        ("margin of the joint services alone", service, certificate.margin_min),
+        ("margin of the drives alone", onboard, certificate.onboard_margin_min),
     ):
-        told = (values < least) & ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED))
-        found = first_beyond(who, t, told)
+        below = (values < least) & has_margin
+        found = first_violation(name, t, below)
         if found is not None:
-            yield _told([found], f"under {least:g}, down to {values[told].min():.3g}")
+            yield _event([found], f"under {least:g}, down to {values[below].min():.3g}")
 
 
-def _together(found: Sequence[Crossing]) -> list[list[Crossing]]:
-    """Return what began at about the same time, together."""
-    groups: list[list[Crossing]] = []
-    for one in sorted(found, key=lambda crossing: crossing.t):
+def _together(found: Sequence[Violation]) -> list[list[Violation]]:
+    """Group violations that began at about the same time."""
+    groups: list[list[Violation]] = []
+    for one in sorted(found, key=lambda violation: violation.t):
         if groups and one.t - groups[-1][0].t <= TOGETHER_S:
             groups[-1].append(one)
         else:
@@ -166,8 +170,8 @@ def _together(found: Sequence[Crossing]) -> list[list[Crossing]]:
     return groups
 
 
-def _told(group: Sequence[Crossing], what: str) -> TimelineEvent:
-    who = ", ".join(one.who for one in group)
-    longest = max(one.lasts_s for one in group)
-    text = f"{who}: {what}, for the first time; {longest:.2f} s in all"
+def _event(group: Sequence[Violation], what: str) -> TimelineEvent:
+    names = ", ".join(one.name for one in group)
+    longest = max(one.duration_s for one in group)
+    text = f"{names}: {what}, for the first time; {longest:.2f} s in total"
     return TimelineEvent(group[0].t, "limit", text)

@@ -1,4 +1,4 @@
-"""What was done to the network on purpose: a panel of bars."""
+"""Bar panel of the injected network impairments."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from shared import topics
 from shared.clock import NS_PER_S
 from shared.links import GROUPS
 from shared.traces import LinkEvent
-from tools.reports.page_model import BarRow, Sheet
+from tools.reports.page_model import BarRow, PageModel
 from tools.reports.run_data import RunData
 from tools.reports.signals import GAP_S
 
-NOTHING_DONE: Final = "nothing was injected into the network, as far as this log says"
+NO_IMPAIRMENTS: Final = "no impairment in this log"
 
 
 class ImpairedLink(IntEnum):
-    """What is done to one direction of a link."""
+    """State of one direction of a link."""
 
     CLEAR = 0
     IMPAIRED = 1
@@ -37,51 +37,48 @@ COLOURS: Final[dict[int, str]] = {
 History = tuple[tuple[float, ImpairedLink], ...]
 
 
-def add_network(source: RunData, sheet: Sheet) -> None:
-    """Add the directions that were impaired; those that fared alike in one row."""
-    alike: dict[History, list[str]] = defaultdict(list)
-    events: list[LinkEvent] = source.log.messages(topics.LINK_EVENT)
-    for name, history in histories(events, source.zero_ns).items():
-        alike[history].append(name)
-    rows = [_row(source, label, history) for history, names in alike.items()
+def add_network(run: RunData, model: PageModel) -> None:
+    """Add the impaired directions; directions with equal histories share a row."""
+    names_by_history: dict[History, list[str]] = defaultdict(list)
+    events: list[LinkEvent] = run.log.messages(topics.LINK_EVENT)
+    for name, history in histories(events, run.zero_ns).items():
+        names_by_history[history].append(name)
+    rows = [_row(run, label, history) for history, names in names_by_history.items()
             for label in _labels(names)]  # fmt: skip
-    sheet.bars("Network, as injected", rows, ImpairedLink, COLOURS, otherwise=NOTHING_DONE)
+    model.bars("Injected network impairments", rows, ImpairedLink, COLOURS, if_empty=NO_IMPAIRMENTS)
 
 
 def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
-    """Return (time, what is in force from then on) of each direction that was ever impaired.
+    """Return (time in s, state from then on) of each direction that was ever impaired.
 
-    Of several a partition counts before all others (`shared.impairment.Direction`).
+    A partition outweighs all other impairments (`shared.impairment.Direction`).
 
     Args:
-        events: as they were told.
+        events: begin and end of impairments, in order.
         zero_ns: stamp of time 0.
-
-    Returns:
-        Times in s.
     """
     found: dict[str, list[tuple[float, ImpairedLink]]] = defaultdict(list)
-    asked: dict[str, dict[int, bool]] = defaultdict(dict)
+    active: dict[str, dict[int, bool]] = defaultdict(dict)
     for event in events:
-        cuts = asked[event.link]
+        cuts = active[event.link]
         if event.active:
             cuts[event.number] = event.partition
         else:
             cuts.pop(event.number, None)
-        now = (
+        state = (
             ImpairedLink.CUT
             if any(cuts.values())
             else ImpairedLink.IMPAIRED
             if cuts
             else ImpairedLink.CLEAR
         )
-        found[event.link].append(((event.t_ns - zero_ns) / NS_PER_S, now))
+        found[event.link].append(((event.t_ns - zero_ns) / NS_PER_S, state))
     return {name: tuple(history) for name, history in found.items()}
 
 
-def _row(source: RunData, label: str, history: History) -> BarRow:
-    """Return a history as samples that are close enough to be one bar."""
-    begin, end = source.span
+def _row(run: RunData, label: str, history: History) -> BarRow:
+    """Return a history as samples that are close enough to form one bar."""
+    begin, end = run.span
     changes = np.array([t for t, _ in history])
     codes = np.array([ImpairedLink.CLEAR, *(code for _, code in history)])
     t = np.union1d(np.arange(begin, end, GAP_S / 2), changes)
@@ -89,7 +86,7 @@ def _row(source: RunData, label: str, history: History) -> BarRow:
 
 
 def _labels(names: Iterable[str]) -> list[str]:
-    """Return directions in few words: the greatest groups that they make up, then the rest."""
+    """Return short labels: the largest groups that the directions cover, then the rest."""
     left, found = set(names), []
     for group, members in sorted(GROUPS.items(), key=lambda item: -len(item[1])):
         if set(members) <= left:

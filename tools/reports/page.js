@@ -1,38 +1,30 @@
-// The page: what the hand, the keyboard, the printer and the window do to the shared time.
+// The page: what mouse, finger, keyboard, printer and window do to the shared time.
 
-function listen(panel, view) {
-  const canvas = panel.canvas;
-  const at = (event) => panel.timeAt(event.clientX - canvas.getBoundingClientRect().left);
-  const pixels = (n) => n * (view.to - view.from) / Math.max(1, panel.box.right - panel.box.left);
-  let start = null;
-  canvas.addEventListener("pointerdown", (event) => {
-    if (event.button !== 0) return;
-    start = event.clientX;
-    view.drag = [at(event), at(event)];
-    canvas.setPointerCapture(event.pointerId);
+// uPlot handles the hover, the drag and the legend. The rest is here.
+function listenToPlot({ plot, view }) {
+  const { over } = plot, at = (event) => plot.posToVal(event.clientX - over.getBoundingClientRect().left, "x");
+  let down = null;
+  over.addEventListener("mousedown", (event) => { down = event.clientX; });
+  over.addEventListener("click", (event) => {
+    if (down === null || Math.abs(event.clientX - down) >= 4) return;  // the end of a drag
+    view.pinAt(at(event), plot.posToVal(4, "x") - plot.posToVal(0, "x"));
   });
-  canvas.addEventListener("pointermove", (event) => {
-    if (start !== null) view.drag[1] = at(event);
-    view.point(at(event));
-  });
-  canvas.addEventListener("pointerup", (event) => {
-    if (start === null) return;
-    const [a, b] = view.drag, far = Math.abs(event.clientX - start) > 4;
-    start = view.drag = null;
-    if (far && a !== b) view.show(Math.min(a, b), Math.max(a, b));
-    else view.pinAt(at(event), pixels(4));
-  });
-  canvas.addEventListener("pointercancel", () => { start = view.drag = null; view.point(null); });
-  canvas.addEventListener("pointerleave", () => { if (start === null) view.point(null); });
-  canvas.addEventListener("dblclick", () => view.all());
-  canvas.addEventListener("wheel", (event) => turn(event, view, at(event)), { passive: false });
-  canvas.addEventListener("keydown", (event) => press(event, view));
+  over.addEventListener("wheel", (event) => onWheel(event, view, at(event)), { passive: false });
+  over.addEventListener("keydown", (event) => onKey(event, view));
+  // uPlot listens to the mouse alone, so a finger acts as one; vertical moves scroll the page
+  for (const name of ["down", "move", "up"]) {
+    over.addEventListener(`pointer${name}`, (event) => {
+      if (event.pointerType !== "touch") return;
+      const { clientX, clientY } = event;
+      over.dispatchEvent(new MouseEvent(`mouse${name}`, { clientX, clientY, movementX: 1, bubbles: true }));
+    });
+  }
 }
 
-// With Ctrl zoom, with Shift or sideways move the time; else the page is scrolled.
-function turn(event, view, t) {
-  const lines = event.deltaMode === 1 ? 33 : 1;
-  const [dx, dy] = [(event.deltaX || 0) * lines, (event.deltaY || 0) * lines];
+// With Ctrl zoom; with Shift or sideways move the time; else the page scrolls.
+function onWheel(event, view, t) {
+  const pixels = event.deltaMode === 1 ? 33 : 1;
+  const [dx, dy] = [(event.deltaX || 0) * pixels, (event.deltaY || 0) * pixels];
   const clipped = (d) => Math.max(-100, Math.min(100, d));
   if (event.ctrlKey || event.metaKey) {
     event.preventDefault();
@@ -43,12 +35,12 @@ function turn(event, view, t) {
   }
 }
 
-function press(event, view) {
+function onKey(event, view) {
   const step = (view.to - view.from) / 100, middle = (view.from + view.to) / 2;
   const from = view.reading === null ? middle : view.reading;
   const keys = {
-    ArrowLeft: () => (event.shiftKey ? view.pan(-0.2) : view.point(from - step)),
-    ArrowRight: () => (event.shiftKey ? view.pan(0.2) : view.point(from + step)),
+    ArrowLeft: () => (event.shiftKey ? view.pan(-0.2) : view.moveTo(from - step)),
+    ArrowRight: () => (event.shiftKey ? view.pan(0.2) : view.moveTo(from + step)),
     Enter: () => view.pinAt(from, step / 2),
     "+": () => view.zoom(0.5, view.reading), "=": () => view.zoom(0.5, view.reading),
     "-": () => view.zoom(2, view.reading), "0": () => view.all(),
@@ -59,7 +51,7 @@ function press(event, view) {
   keys[event.key]();
 }
 
-// The bar over the plots: moving, zooming, the time in numbers, going to a panel.
+// The bar over the plots: move, zoom, times as numbers, go to a panel.
 function listenToBar(view) {
   const moves = {
     left: () => view.pan(-0.5), right: () => view.pan(0.5), all: () => view.all(),
@@ -84,68 +76,42 @@ function listenToBar(view) {
   });
 }
 
-// A line of what happened shows its moment, in the plots that are in sight.
+// A click on a line of the timeline shows and pins its time.
 function listenToTimeline(view, main) {
   const buttons = [...document.querySelectorAll("[data-t]")];
   buttons.forEach((button) => {
     button.addEventListener("click", () => {
       const t = parseFloat(button.dataset.t), before = parseFloat(button.dataset.before || "0.5");
       view.show(t - before, t - before + Math.max(2, before + 0.5));
-      view.pin = t;
+      view.pinAt(null);
+      view.pinAt(t);
       buttons.forEach((other) => other.setAttribute("aria-current", String(other === button)));
       const { top, bottom } = main.getBoundingClientRect();
       if (top > window.innerHeight / 2 || bottom < window.innerHeight / 2) main.scrollIntoView({ block: "start" });
-      view.redraw();
     });
   });
 }
 
 function listenToWindow(view) {
-  const root = document.documentElement, again = () => { view.readTheme(); view.redraw(); };
-  window.addEventListener("scroll", () => view.redraw(), { passive: true });
-  window.addEventListener("resize", () => {
-    view.panels.forEach((panel) => panel.layout());
-    view.redraw();
-  });
-  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
-  window.addEventListener("beforeprint", () => {
-    root.classList.add("print");
-    view.printing = true;
-    view.readTheme();
-    view.draw(true);
-  });
-  window.addEventListener("afterprint", () => {
-    root.classList.remove("print");
-    view.printing = false;
-    view.panels.forEach((panel) => panel.layout());
-    again();
-  });
+  const root = document.documentElement;
+  const redraw = () => { view.readTheme(); view.update(); };
+  window.addEventListener("resize", redraw);
+  window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  window.addEventListener("beforeprint", () => { root.classList.add("print"); redraw(); });
+  window.addEventListener("afterprint", () => { root.classList.remove("print"); redraw(); });
 }
 
 function start() {
   const data = JSON.parse(document.getElementById("data").textContent);
   const view = new View(data), main = document.getElementById("panels");
-  view.readTheme();
-  data.panels.forEach((spec, index) => {
-    const panel = new Panel(spec, data, view, index === 0);
-    view.panels.push(panel);
-    main.append(panel.element);
-    listen(panel, view);
-  });
-  for (const panel of view.panels) if (panel.spec.choices) panel.choose(panel.spec.initial);
+  data.times = gridTimes(data.grid);
+  view.panels = data.panels.map((spec, index) => new Panel(spec, data, view, index === 0));
+  main.append(...view.panels.map((panel) => panel.element));
+  view.panels.forEach((panel) => panel.build());
   listenToBar(view);
   listenToTimeline(view, main);
   listenToWindow(view);
-  view.panels.forEach((panel) => panel.layout());  // each has its height, before any is drawn
-  view.draw(false);
-  const rest = [...view.panels];
-  const next = () => {  // the others while nothing else is to be done, so that none is empty
-    const panel = rest.shift();
-    if (!panel) return;
-    panel.draw(view.theme);
-    setTimeout(next);
-  };
-  setTimeout(next);
+  view.describe();
 }
 
 start();

@@ -1,4 +1,4 @@
-"""The page: one HTML file with everything in it, that asks no network for anything."""
+"""Report page: one HTML file that contains all it needs and makes no network request."""
 
 from __future__ import annotations
 
@@ -9,81 +9,86 @@ from pathlib import Path
 from typing import Final
 
 from tools.reports import network, panels, summary, timeline, times, torques
-from tools.reports.page_model import Sheet, TimelineEvent
+from tools.reports.page_model import PageModel, TimelineEvent
 from tools.reports.run_data import RunData
 from tools.reports.summary import RunVerdict
 from tools.runs import verdict_table
 from tools.runs.run_log import RunLog
 
 HERE: Final = Path(__file__).parent
-STYLE: Final = "page.css"
-SCRIPTS: Final = ("draw.js", "plot.js", "legend.js", "view.js", "page.js")
+VENDOR: Final = HERE / "vendor" / "uplot"
+STYLES: Final = (VENDOR / "uPlot.min.css", HERE / "page.css")
+LIBRARY: Final = VENDOR / "uPlot.iife.min.js"
+SCRIPTS: Final = tuple(
+    HERE / f"{name}.js" for name in ("signals", "format", "overlay", "panel", "view", "page")
+)
 
 BEFORE_FALL_S: Final = 3.0
-"""A click on a fall shows so much before it."""
+"""A click on a fall shows this time before it."""
 
 HELP: Final = "".join(
     f"<li>{line}</li>"
     for line in (
-        "Drag in a plot to zoom, in all of them; double-click for the whole run.",
+        "Drag in a plot to zoom all plots; double-click to show the whole run.",
         "Ctrl and wheel zoom at the cursor; Shift and wheel move the time shown.",
-        "The legends tell the values at the cursor; dotted red lines are limits.",
-        "A click pins the cursor, and the time from there is told; Escape takes the pin away.",
-        "A click on a name in a legend hides its line or shows it.",
+        "The legends show the values at the cursor. Dotted red lines are limits.",
+        "Click in a plot to pin the cursor and to see time differences; Escape removes the pin.",
+        "Click a name in a legend to hide or show its line; with Ctrl, to show it alone.",
         "Keys in a plot: arrows move the cursor, with Shift the time shown; Enter pins.",
-        "Keys in a plot: + and &minus; zoom, 0 shows the whole run.",
+        "Keys in a plot: + and &minus; zoom; 0 shows the whole run.",
     )
 )
 
 POLICY: Final = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
-"""The browser itself refuses whatever would leave the page."""
+"""Makes the browser refuse every request to another place."""
 
 
 def render(log: RunLog) -> str:
     """Return the page of a run.
 
     Raises:
-        RunError: a message is not of this version.
+        RunError: a message has another version.
     """
-    source = RunData(log)
-    sheet = fill(source)
-    events = timeline.happenings(source)
-    judged = summary.judge(source)
+    run = RunData(log)
+    model = page_model(run)
+    events = timeline.timeline_events(run)
+    verdict = summary.judge(run)
     name = log.metadata["run"].get("scenario") or log.path.name
     fell_s = next((row.t for row in events if row.kind == "fall"), None)
     parts = (
-        _head(source, judged, name),
-        _tools(source, fell_s),
+        _head(run, verdict, name),
+        _tools(run, fell_s),
         f'<div class="work">{_timeline(events)}<main id="panels"></main></div>',
-        _left_out(sheet),
-        _lost(source),
-        _folded(source),
+        _left_out(model),
+        _losses(run),
+        _inputs(run),
     )
-    data = json.dumps(sheet.as_data(events), separators=(",", ":"), allow_nan=False)
-    said = "" if judged.good is None else f"{judged.sentence}: "
-    return _document(f"{said}{name}, {log.robot}", "\n".join(parts), data)
+    data = json.dumps(model.as_data(events), separators=(",", ":"), allow_nan=False)
+    prefix = "" if verdict.good is None else f"{verdict.sentence}: "
+    return _document(f"{prefix}{name}, {log.robot}", "\n".join(parts), data)
 
 
-def fill(source: RunData) -> Sheet:
+def page_model(run: RunData) -> PageModel:
     """Return all panels of a run, in the order of the page."""
-    sheet = Sheet(source.span)
-    panels.add_body(source, sheet)
-    panels.add_states(source, sheet)
-    network.add_network(source, sheet)
-    times.add_ages(source, sheet)
-    panels.add_certificate(source, sheet)
-    torques.add_joints(source, sheet)
-    panels.add_harness(source, sheet)
-    times.add_times(source, sheet)
-    return sheet
+    model = PageModel(run.span)
+    panels.add_body(run, model)
+    panels.add_states(run, model)
+    network.add_network(run, model)
+    times.add_ages(run, model)
+    panels.add_certificate(run, model)
+    torques.add_joints(run, model)
+    panels.add_harness(run, model)
+    times.add_times(run, model)
+    return model
 
 
 def _document(title: str, body: str, data: str) -> str:
-    style = (HERE / STYLE).read_text(encoding="utf-8")
-    script = "\n".join((HERE / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    safe = data.replace("<", "\\u003c")  # no end tag within
+    style = "\n".join(path.read_text(encoding="utf-8") for path in STYLES)
+    library = LIBRARY.read_text(encoding="utf-8")
+    script = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
+    safe = data.replace("<", "\\u003c")  # so the data hold no end tag
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -98,6 +103,7 @@ def _document(title: str, body: str, data: str) -> str:
 <body>
 {body}
 <script type="application/json" id="data">{safe}</script>
+<script id="uplot">{library}</script>
 <script>
 {script}</script>
 </body>
@@ -105,29 +111,29 @@ def _document(title: str, body: str, data: str) -> str:
 """
 
 
-def _head(source: RunData, judged: RunVerdict, name: str) -> str:
-    word = {True: "good", False: "bad", None: "none"}[judged.good]
+def _head(run: RunData, verdict: RunVerdict, name: str) -> str:
+    word = {True: "good", False: "bad", None: "none"}[verdict.good]
     rows = "".join(
         f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>"
-        for key, value in summary.head(source)
+        for key, value in summary.head(run)
     )
-    caution = f'<p class="caution">{escape(judged.caution)}</p>' if judged.caution else ""
+    caution = f'<p class="caution">{escape(verdict.caution)}</p>' if verdict.caution else ""
     table = ""
-    if judged.rows:
-        over = sum(mark.startswith(verdict_table.OVER) for *_, mark in judged.rows)
-        count = f"{over} of {len(judged.rows)} over" if over else f"all {len(judged.rows)} ok"
-        names = ("what", "measured", "limit", "")
-        cells = _table(names, judged.rows, numbers=(1, 2))
-        table = _details(f"Figures against their limits: {count}", cells, opened=True)
+    if verdict.rows:
+        over = sum(mark.startswith(verdict_table.OVER) for *_, mark in verdict.rows)
+        count = f"{over} of {len(verdict.rows)} over" if over else f"all {len(verdict.rows)} ok"
+        names = ("figure", "measured", "limit", "")
+        cells = _table(names, verdict.rows, numbers=(1, 2))
+        table = _details(f"Figures against their limits: {count}", cells, is_open=True)
     return (
-        f"<header><h1>{escape(source.log.robot)}: {escape(name)}</h1>"
-        f'<p class="verdict {word}" id="verdict">{escape(judged.sentence)}</p>{caution}'
+        f"<header><h1>{escape(run.log.robot)}: {escape(name)}</h1>"
+        f'<p class="verdict {word}" id="verdict">{escape(verdict.sentence)}</p>{caution}'
         f'<div class="head">{table}<dl>{rows}</dl></div></header>'
     )
 
 
-def _tools(source: RunData, fell_s: float | None) -> str:
-    begin, end = source.span
+def _tools(run: RunData, fell_s: float | None) -> str:
+    begin, end = run.span
     buttons = "".join(
         f'<button type="button" data-do="{do}" title="{title}" aria-label="{title}">{text}</button>'
         for do, text, title in (
@@ -150,18 +156,18 @@ def _tools(source: RunData, fell_s: float | None) -> str:
     return (
         f'<nav class="tools" aria-label="time shown"><span class="buttons">{buttons}</span>{fields}'
         f'<output id="cursor"></output></nav>'
-        f'<details class="hint"><summary>{escape(source.axis[0].upper() + source.axis[1:])}. '
+        f'<details class="hint"><summary>{escape(run.axis[0].upper() + run.axis[1:])}. '
         f"How to read and zoom</summary><ul>{HELP}</ul></details>"
         "<noscript><p>The plots need JavaScript; verdict, timeline and tables do not.</p>"
         "</noscript>"
     )
 
 
-def _left_out(sheet: Sheet) -> str:
-    if not sheet.left_out:
+def _left_out(model: PageModel) -> str:
+    if not model.left_out:
         return ""
-    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in sheet.left_out)
-    return f'<section id="left-out"><h2>Left out</h2><ul>{rows}</ul></section>'
+    rows = "".join(f"<li>{escape(title)}: {escape(why)}</li>" for title, why in model.left_out)
+    return f'<section id="left-out"><h2>Panels without data</h2><ul>{rows}</ul></section>'
 
 
 def _timeline(events: Sequence[TimelineEvent]) -> str:
@@ -171,21 +177,21 @@ def _timeline(events: Sequence[TimelineEvent]) -> str:
         f"<time>{row.t:.3f} s</time> <span>{escape(row.text)}</span></button></li>"
         for row in events
     )
-    rows = rows or "<li>nothing</li>"
+    rows = rows or "<li>no events</li>"
     return (
-        '<section id="timeline"><h2>What happened</h2>'
-        f'<p class="hint">A click shows that moment in the plots.</p><ol tabindex="0" '
-        f'aria-label="what happened">{rows}</ol></section>'
+        '<section id="timeline"><h2>Timeline</h2>'
+        f'<p class="hint">Click a row to show its time in the plots.</p><ol tabindex="0" '
+        f'aria-label="timeline">{rows}</ol></section>'
     )
 
 
 def _before(row: TimelineEvent) -> str:
-    """A fall is looked at from before it; all else from a little before to what came of it."""
+    """Return the time to show before an event, if it is a fall; other events have the default."""
     return f' data-before="{BEFORE_FALL_S:g}"' if row.kind == "fall" else ""
 
 
-def _lost(source: RunData) -> str:
-    rows = summary.lost(source)
+def _losses(run: RunData) -> str:
+    rows = summary.message_losses(run)
     missing = sum(row.lost for row in rows)
     cells = [
         (
@@ -196,23 +202,23 @@ def _lost(source: RunData) -> str:
         for row in rows
     ]  # fmt: skip
     title = f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
-    names = ("topic", "messages", "Hz", "of Hz", "lost", "gaps", "restarts")
-    damage = "".join(f"<li>{escape(line)}</li>" for line in summary.damage(source))
+    names = ("topic", "messages", "Hz", "nominal Hz", "lost", "gaps", "restarts")
+    damage = "".join(f"<li>{escape(line)}</li>" for line in summary.damage(run))
     body = (f"<ul>{damage}</ul>" if damage else "") + _table(names, cells, numbers=range(1, 7))
-    return f'<section id="lost">{_details(title, body, opened=bool(missing or damage))}</section>'
+    return f'<section id="lost">{_details(title, body, is_open=bool(missing or damage))}</section>'
 
 
-def _folded(source: RunData) -> str:
-    parts = [_details(name, f"<pre>{escape(text)}</pre>") for name, text in summary.files(source)]
-    installed = summary.packages(source)
+def _inputs(run: RunData) -> str:
+    parts = [_details(name, f"<pre>{escape(text)}</pre>") for name, text in summary.files(run)]
+    installed = summary.packages(run)
     if installed:
         table = _table(("package", "version"), installed, numbers=())
         parts.append(_details(f"{len(installed)} packages", table))
-    return f'<section id="made-from"><h2>Made from</h2>{"".join(parts)}</section>'
+    return f'<section id="inputs"><h2>Inputs of the run</h2>{"".join(parts)}</section>'
 
 
-def _details(title: str, body: str, *, opened: bool = False) -> str:
-    flag = " open" if opened else ""
+def _details(title: str, body: str, *, is_open: bool = False) -> str:
+    flag = " open" if is_open else ""
     return f"<details{flag}><summary>{escape(title)}</summary>{body}</details>"
 
 

@@ -1,4 +1,4 @@
-"""What a page shows, as plain values: panels with lines, bars, a timeline. Pure."""
+"""Contents of a page as plain values: panels with lines, bars and a timeline. Pure."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tools.reports.signals import Array, Span, packed, segments
+from tools.reports.signals import Array, Span, encode_signal, segments
 
 
 class Line(NamedTuple):
@@ -19,21 +19,21 @@ class Line(NamedTuple):
     values: Array
     colour: int
     hidden: bool = False
-    """Off until it is switched on in the legend."""
+    """True: not shown until the user switches it on in the legend."""
     dashed: bool = False
 
 
 class LevelLine(NamedTuple):
-    """A level to hold the lines against."""
+    """A horizontal line: a limit or another level to compare the lines with."""
 
     value: float
     label: str
     shown: bool = True
-    """False: only if the lines come near; the axis does not reach out for it."""
+    """False: the value axis does not extend to include it."""
 
 
 class BarRow(NamedTuple):
-    """One row of a panel of bars."""
+    """One row of a bar panel."""
 
     label: str
     t: Array
@@ -41,27 +41,27 @@ class BarRow(NamedTuple):
 
 
 class TimelineEvent(NamedTuple):
-    """One line of the timeline."""
+    """One row of the timeline."""
 
     t: float
     kind: str
-    """`kill`, `restart`, `push`, `fault`, `network`, `estop`, `fall`: also a mark in the plots;
-    `limit`, `bad` and `note` are not."""
+    """`kill`, `restart`, `push`, `fault`, `network`, `estop`, `fall`: also marked in the plots;
+    `limit`, `bad`, `note`: only in the timeline."""
     text: str
     mark: str = ""
-    """What the mark says; empty: no mark."""
+    """Label of the mark in the plots; empty: no mark."""
 
 
-class Sheet:
-    """Panels in the order in which they are added."""
+class PageModel:
+    """Panels of a page, in the order in which they are added."""
 
     def __init__(self, span: Span) -> None:
         self.span = span
         self.signals: list[dict[str, Any]] = []
         self.panels: list[dict[str, Any]] = []
-        self._places: dict[tuple[Any, ...], int] = {}
+        self._indices: dict[tuple[Any, ...], int] = {}
         self.left_out: list[tuple[str, str]] = []
-        """(panel, why) of what the log has no data for."""
+        """(title, reason) of each panel for which the log has no data."""
 
     def plot(
         self,
@@ -72,22 +72,22 @@ class Sheet:
         limits: Sequence[LevelLine] = (),
         reach: float | None = None,
         note: str = "",
-        otherwise: str = "",
+        if_empty: str = "",
     ) -> None:
-        """Add a panel; without data it is left out.
+        """Add a panel of lines; a panel without data is left out.
 
         Args:
-            title: of the panel.
-            unit: of the axis.
-            lines: those without data are left out.
+            title: title of the panel.
+            unit: unit of the value axis.
+            lines: lines; those without data are left out.
             limits: levels.
-            reach: the axis goes no higher; a line may.
-            note: a sentence for those who do not know the panel.
-            otherwise: why it is left out, if it has no data.
+            reach: upper end of the value axis; lines may go beyond it.
+            note: an explanation for readers who do not know the panel.
+            if_empty: reason to state if the panel has no data.
         """
         found = self._lines(lines)
         if not found:
-            self.left_out.append((title, otherwise))
+            self.left_out.append((title, if_empty))
             return
         self.panels.append(
             _panel("plot", title, note, unit=unit, lines=found, limits=_levels(limits), reach=reach)
@@ -102,18 +102,18 @@ class Sheet:
         *,
         initial: str,
         note: str = "",
-        otherwise: str = "",
+        if_empty: str = "",
     ) -> None:
-        """Add a panel of which one of several sets of lines is shown at a time.
+        """Add a panel that shows one of several sets of lines at a time.
 
         Args:
-            title: of the panel.
-            unit: of the axis.
+            title: title of the panel.
+            unit: unit of the value axis.
             group: panels of one group show the same choice.
             choices: lines and levels by name.
-            initial: which is shown first.
-            note: a sentence for those who do not know the panel.
-            otherwise: why it is left out, if it has no data.
+            initial: name of the set that is shown first.
+            note: an explanation for readers who do not know the panel.
+            if_empty: reason to state if the panel has no data.
         """
         found = [
             {"label": label, "lines": self._lines(lines), "limits": _levels(limits)}
@@ -121,7 +121,7 @@ class Sheet:
         ]
         found = [choice for choice in found if choice["lines"]]
         if not found:
-            self.left_out.append((title, otherwise))
+            self.left_out.append((title, if_empty))
             return
         labels = [choice["label"] for choice in found]
         index = labels.index(initial) if initial in labels else 0
@@ -136,50 +136,51 @@ class Sheet:
         names: type[IntEnum],
         colours: Mapping[int, str],
         *,
-        otherwise: str = "",
+        if_empty: str = "",
     ) -> None:
         """Add a panel of coloured bars; rows without data are left out.
 
         Args:
-            title: of the panel.
-            rows: from top to bottom.
-            names: of the codes.
+            title: title of the panel.
+            rows: rows from top to bottom.
+            names: names of the codes.
             colours: name of the colour of each code.
-            otherwise: why it is left out, if it has no data.
+            if_empty: reason to state if the panel has no data.
         """
         found: list[dict[str, Any]] = []
         for row in rows:
-            there = (row.t >= self.span.begin) & (row.t <= self.span.end)
-            spans = segments(row.t[there], np.asarray(row.codes[there], dtype=np.int64))
+            inside = (row.t >= self.span.begin) & (row.t <= self.span.end)
+            spans = segments(row.t[inside], np.asarray(row.codes[inside], dtype=np.int64))
             if spans:
                 found.append({"label": row.label, "spans": spans})
         if not found:
-            self.left_out.append((title, otherwise))
+            self.left_out.append((title, if_empty))
             return
         used = sorted({int(span[2]) for row in found for span in row["spans"]})
         codes = {
             str(code): [_name(names, code), colours.get(code, "idle")] for code in used
-        }  # an unknown code is of another version
+        }  # an unknown code comes from another version
         self.panels.append(_panel("bars", title, "", rows=found, codes=codes))
 
-    def as_data(self, happenings: Sequence[TimelineEvent]) -> dict[str, Any]:
-        """Return all that the page's plots are made from."""
+    def as_data(self, events: Sequence[TimelineEvent]) -> dict[str, Any]:
+        """Return the data of the page's plots."""
         return {
             "span": [self.span.begin, self.span.end],
+            "grid": self.span.grid,
             "signals": self.signals,
             "panels": self.panels,
-            "marks": [[row.t, row.kind, row.mark] for row in happenings if row.mark],
+            "marks": [[row.t, row.kind, row.mark] for row in events if row.mark],
         }
 
     def _lines(self, lines: Sequence[Line]) -> list[dict[str, Any]]:
         found = []
         for line in lines:
-            signal = packed(line.t, line.values, self.span)
+            signal = encode_signal(line.t, line.values, self.span)
             if signal is not None:
                 found.append(
                     {
                         "label": line.label,
-                        "signal": self._place(signal),
+                        "signal": self._index(signal),
                         "colour": line.colour,
                         "hidden": line.hidden,
                         "dashed": line.dashed,
@@ -187,12 +188,12 @@ class Sheet:
                 )
         return found
 
-    def _place(self, signal: dict[str, Any]) -> int:
-        """Return where a signal is among all; one that is there already is not kept twice."""
-        place = self._places.setdefault(tuple(signal.values()), len(self.signals))
-        if place == len(self.signals):
+    def _index(self, signal: dict[str, Any]) -> int:
+        """Return the index of a signal; equal signals are stored once."""
+        index = self._indices.setdefault(tuple(signal.values()), len(self.signals))
+        if index == len(self.signals):
             self.signals.append(signal)
-        return place
+        return index
 
 
 def _levels(limits: Sequence[LevelLine]) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""A run's log as arrays over one time axis."""
+"""Log of a run as arrays over one time axis."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shared.exceptions import XrlError
 from shared.joints import MODULES
 from shared.messages import DriveStatus
 from shared.topics import Topic
-from tools.reports.signals import Array, Span, seconds
+from tools.reports.signals import Array, Span, message_times
 from tools.runs import verdict
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog
@@ -26,18 +26,18 @@ class RunData:
     def __init__(self, log: RunLog) -> None:
         self.log = log
         self.course: Course | None = None
-        """The simulated world; None in a log without one, or whose scenario never began."""
+        """Trajectory of the simulated world; None if the log has none or its scenario never
+        began."""
         self.without_course = ""
-        """Why there is none."""
+        """Reason why `course` is None."""
         try:
             self.course = verdict.course(log)
         except XrlError as error:
             self.without_course = _reason(log, error)
         self.robot: RobotConfig | None = None
-        """The robot that the log was made with; None if the log does not say, in a way that
-        this version understands."""
+        """Configuration of the robot; None if the log holds none that this version can read."""
         self.without_robot = ""
-        """Why there is none."""
+        """Reason why `robot` is None."""
         try:
             self.robot = robot_of(log)
         except XrlError as error:
@@ -48,18 +48,18 @@ class RunData:
 
     @property
     def axis(self) -> str:
-        """What the time axis is."""
+        """Description of the time axis."""
         if self.course is None:
             return "time since the log begins, s"
         if self.course.began:
             return "scenario time, s"
-        return "time since the hoist let go, s"
+        return "time since the hoist released the robot, s"
 
     def times(self, topic: Topic, module: str = "") -> Array:
         """Return the time of each message, s.
 
-        A stamp from before the log was never set (a joint service that has not heard its
-        drive yet): such a message is placed where the recorder heard it.
+        A joint service that has no sample from its drive yet publishes a stamp of 0. A message
+        with a stamp from before the log is placed at its time of reception.
         """
         found = self._times.get((topic.name, module))
         if found is None:
@@ -67,15 +67,15 @@ class RunData:
             received = self.log.received_ns(topic, module)
             earliest_ns = self.log.began_ns() - NS_PER_S // 5
             stamps = [
-                message.t_ns if message.t_ns >= earliest_ns else heard_ns
-                for message, heard_ns in zip(messages, received, strict=True)
+                message.t_ns if message.t_ns >= earliest_ns else received_ns
+                for message, received_ns in zip(messages, received, strict=True)
             ]
-            found = seconds(stamps, self.zero_ns, received)
+            found = message_times(stamps, self.zero_ns, received)
             self._times[topic.name, module] = found
         return found
 
     def columns(self, topic: Topic, module: str, *names: str) -> list[Array]:
-        """Return one array for each field: (n,), or (n, k) of a field of k numbers."""
+        """Return one array for each field: (n,), or (n, k) for a field of k numbers."""
         messages: list[Any] = self.log.messages(topic, module)
         return [
             np.array([getattr(message, name) for message in messages], dtype=np.float64)
@@ -85,7 +85,7 @@ class RunData:
     def armed_s(self) -> float:
         """Return when all six drives were armed for the first time, s; if never, the begin.
 
-        What is told before then is about a robot that does not stand yet.
+        Earlier figures describe a robot that does not stand yet.
         """
         found = []
         for module in MODULES:
@@ -113,10 +113,10 @@ class RunData:
 
 
 def module_of(topic: Topic, key: str) -> str:
-    """Return the module that a full key is about; empty if it is of none."""
+    """Return the module of a full key; empty if its topic has no modules."""
     return key.split("/")[-2] if topic.per_module else ""
 
 
 def _reason(log: RunLog, error: XrlError) -> str:
-    """Return an error's text without the file's path: a page is given to others."""
+    """Return an error's text without the path of the file, since pages are shared."""
     return str(error).replace(f"{log.path}: ", "").replace(str(log.path), log.path.name)

@@ -1,8 +1,8 @@
-"""The robot as a 3-D scene: a frame for each module, a body for each link, COM and forces.
+"""3-D scene of the robot: a frame for each module, a body for each link, COM and forces.
 
-Frames (docs/law.md#the-robot): `world`; `torso`; from it down each leg `hip_*` (it carries the
-thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso; `com` with the
-world's axes. The links are those of `shared.robot_model`.
+Frames (docs/law.md#the-robot): `world`; `torso`; below it on each leg `hip_*` (carries the
+thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso; `com` with the axes
+of the world. The links are those of `shared.robot_model`.
 """
 
 from __future__ import annotations
@@ -24,15 +24,24 @@ from shared.joints import MODULES, SIDES
 from shared.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
 from shared.robot_model import MODULE_RADIUS, side_sign
 from tools.reports import foxglove, urdf
-from tools.reports.foxglove import ORIGIN, UPRIGHT, Arrow, Colour, Entity, Placed, Quaternion, Solid
+from tools.reports.foxglove import (
+    ORIGIN,
+    UPRIGHT,
+    Arrow,
+    Colour,
+    Entity,
+    FrameTransform,
+    Quaternion,
+    Solid,
+)
 from tools.runs.run_log import RunLog
 
 RATE_HZ: Final = 30.0
-LINKS_EVERY_S: Final = 1.0
-"""The links stay; they are said again for a viewer that begins in the middle."""
+LINKS_PERIOD_S: Final = 1.0
+"""Links do not change; they are repeated for a viewer that starts in the middle."""
 METRES_PER_NEWTON: Final = 0.005
 FORCE_MIN_N: Final = 2.0
-"""Smaller forces have no arrow: the sensor's noise would make it jump about."""
+"""Smaller forces have no arrow, since it would show the sensor's noise."""
 
 FRAMES, LINKS, STATE, MODEL = range(4)
 LINK: Final[Colour] = (0.62, 0.66, 0.70, 1.0)
@@ -52,30 +61,30 @@ MODES: Final[dict[int, Colour]] = {
 
 
 class RobotPose(NamedTuple):
-    """The robot at one moment."""
+    """Pose, modes and forces of the robot at one time."""
 
     t_ns: int
-    """Monotonic."""
+    """Monotonic clock."""
     torso: Vector3
-    """Origin, m, world."""
+    """Origin of the torso frame, m, world axes."""
     angles: Vector3
     """Roll, pitch, yaw (3-1-2), rad."""
     com: Vector3
-    """m, world."""
+    """m, world axes."""
     q: tuple[float, ...]
     """Joint angles (12,), rad."""
     modes: tuple[int, ...]
     force: Vector3
-    """Operator on torso, N, torso axes."""
+    """Force of the operator on the torso, N, torso axes."""
     push: Vector3
-    """N, world."""
+    """N, world axes."""
 
 
 def channels(robot: str) -> list[NewChannel]:
-    """Return the channels of a scene: `FRAMES`, `LINKS`, `STATE`, and for Rerun the `MODEL`."""
+    """Return the channels of a scene: `FRAMES`, `LINKS`, `STATE` and, for Rerun, `MODEL`."""
     rows = (
-        ("frames", foxglove.TRANSFORMS, f"{RATE_HZ:g}", "where each module is"),
-        ("links", foxglove.SCENE, f"{1.0 / LINKS_EVERY_S:g}", "the robot's bodies"),
+        ("frames", foxglove.TRANSFORMS, f"{RATE_HZ:g}", "pose of each module"),
+        ("links", foxglove.SCENE, f"{1.0 / LINKS_PERIOD_S:g}", "bodies of the robot"),
         ("state", foxglove.SCENE, f"{RATE_HZ:g}", "modes by colour, COM, forces"),
     )
     found = [
@@ -90,18 +99,18 @@ def channels(robot: str) -> list[NewChannel]:
         for name, schema, rate, why in rows
     ]
     model = NewChannel(
-        f"xrl/{robot}/robot_description",  # the name by which Rerun knows it
+        f"xrl/{robot}/robot_description",  # the name that Rerun expects
         urdf.SCHEMA_NAME,
         urdf.SCHEMA_ENCODING,
         urdf.SCHEMA,
         urdf.ENCODING,
-        {"why": "the robot's bodies as URDF, once"},
+        {"why": "bodies of the robot as URDF, once"},
     )
     return [*found, model]
 
 
 def messages(log: RunLog, robot: RobotConfig) -> Iterator[NewMessage]:
-    """Yield the messages of a run's scene, in the order of time.
+    """Yield the messages of a run's scene in the order of time.
 
     Raises:
         RunError: the log does not hold the states of all six modules.
@@ -112,23 +121,23 @@ def messages(log: RunLog, robot: RobotConfig) -> Iterator[NewMessage]:
         if links_ns is None:
             yield NewMessage(MODEL, ns, urdf.message(model(log.robot, robot, pose)))
         yield NewMessage(FRAMES, ns, foxglove.transforms(ns, frames(robot, pose)))
-        if links_ns is None or ns - links_ns >= LINKS_EVERY_S * NS_PER_S:
+        if links_ns is None or ns - links_ns >= LINKS_PERIOD_S * NS_PER_S:
             links_ns = ns
             yield NewMessage(LINKS, ns, foxglove.scene(ns, links(robot)))
         yield NewMessage(STATE, ns, foxglove.scene(ns, state(pose)))
 
 
 def model(name: str, robot: RobotConfig, pose: RobotPose) -> str:
-    """Return all bodies of a robot of some name as URDF; the modules in no mode's colour."""
+    """Return all bodies of a robot as URDF; the modules have the colour of no mode."""
     still = pose._replace(modes=(NO_MODE,) * len(MODULES))
     return urdf.urdf(name, frames(robot, pose), [*links(robot), *state(still)])
 
 
 def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
-    """Yield the robot at the scene's rate, each time as it was known then.
+    """Yield the poses of the robot at the scene's rate, from the newest messages at each time.
 
-    The torso is where the simulated world says; in a log without one, where the legs say,
-    the feet standing as the planner took them.
+    The pose of the torso comes from the simulated world. In a log without one it comes from the
+    legs' kinematics, with the planner's stance.
 
     Raises:
         RunError: the log does not hold the states of all six modules.
@@ -136,7 +145,7 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
     states: list[list[JointState]] = [log.messages(topics.JOINT_STATE, name) for name in MODULES]
     if not all(states):
         missing = ", ".join(name for name, rows in zip(MODULES, states, strict=True) if not rows)
-        raise RunError(f"{log.path}: no states of {missing}; a scene needs those of all six")
+        raise RunError(f"{log.path}: no states of {missing}; a scene needs the states of all six")
     truth: list[SimTruth] = log.messages(topics.SIM_TRUTH)
     wrenches: list[Wrench] = log.messages(topics.WRENCH)
     newest = [NewestAt(rows) for rows in states]
@@ -144,14 +153,14 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
     status = NewestAt(statuses)
     kinematics = None if truth else Kinematics(robot)
-    # a service that has not heard its drive yet says 0
+    # a service without a sample from its drive yet publishes a stamp of 0
     first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
-    for row in _thinned(truth or states[0], first_ns):
-        now = [one.at(row.t_ns) for one in newest]
-        q = tuple(angle for state_now in now for angle in state_now.q)
-        felt = wrench.at(row.t_ns) if wrenches and wrenches[0].t_ns <= row.t_ns else None
-        force = felt.force if felt is not None and felt.valid else (0.0, 0.0, 0.0)
-        modes = tuple(state_now.mode for state_now in now)
+    for row in _thin(truth or states[0], first_ns):
+        states_now = [one.at(row.t_ns) for one in newest]
+        q = tuple(angle for state_now in states_now for angle in state_now.q)
+        sensed = wrench.at(row.t_ns) if wrenches and wrenches[0].t_ns <= row.t_ns else None
+        force = sensed.force if sensed is not None and sensed.valid else (0.0, 0.0, 0.0)
+        modes = tuple(state_now.mode for state_now in states_now)
         if kinematics is None:
             yield RobotPose(row.t_ns, row.torso, row.angles, row.com, q, modes, force, row.push)
             continue
@@ -166,7 +175,7 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
 
 
 class NewestAt:
-    """The newest message of a key at a time."""
+    """Finds the newest message of a key at a time."""
 
     def __init__(self, rows: list[Any]) -> None:
         self._rows = rows
@@ -177,8 +186,8 @@ class NewestAt:
         return self._rows[bisect.bisect_right(self._stamps, t_ns) - 1]
 
 
-def _thinned(rows: list[Any], first_ns: int) -> Iterator[Any]:
-    """Yield rows at the scene's rate, at stamps that they really have."""
+def _thin(rows: list[Any], first_ns: int) -> Iterator[Any]:
+    """Yield rows at about the scene's rate, without changing their stamps."""
     period_ns = round(NS_PER_S / RATE_HZ)
     due_ns = first_ns
     for row in rows:
@@ -187,18 +196,18 @@ def _thinned(rows: list[Any], first_ns: int) -> Iterator[Any]:
             yield row
 
 
-def frames(robot: RobotConfig, pose: RobotPose) -> list[Placed]:
-    """Return every frame at a moment."""
+def frames(robot: RobotConfig, pose: RobotPose) -> list[FrameTransform]:
+    """Return all frames of a pose."""
     geometry = robot.geometry
     found = [
-        Placed("world", "torso", pose.torso, torso_turn(pose.angles)),
-        Placed("world", "com", pose.com, UPRIGHT),
-        Placed("torso", "harness", geometry.harness_point, UPRIGHT),
+        FrameTransform("world", "torso", pose.torso, torso_rotation(pose.angles)),
+        FrameTransform("world", "com", pose.com, UPRIGHT),
+        FrameTransform("torso", "harness", geometry.harness_point, UPRIGHT),
     ]
     for side in SIDES:
         sign = side_sign(side)
         parent = "torso"
-        for kind, at in (
+        for kind, position in (
             ("hip", (0.0, sign * geometry.w_hip / 2, 0.0)),
             ("knee", (0.0, 0.0, -geometry.l1)),
             ("ankle", (0.0, 0.0, -geometry.l2)),
@@ -206,33 +215,33 @@ def frames(robot: RobotConfig, pose: RobotPose) -> list[Placed]:
             module = f"{kind}_{side}"
             number = 2 * MODULES.index(module)
             phi, theta = pose.q[number], pose.q[number + 1]
-            found.append(Placed(parent, module, at, module_turn(phi, theta)))
+            found.append(FrameTransform(parent, module, position, module_rotation(phi, theta)))
             parent = module
     return found
 
 
-def torso_turn(angles: Vector3) -> Quaternion:
+def torso_rotation(angles: Vector3) -> Quaternion:
     """Return Rz(yaw) Rx(roll) Ry(pitch)."""
     roll, pitch, yaw = angles
-    return product(product(_about(2, yaw), _about(0, roll)), _about(1, pitch))
+    return product(product(_rotation(2, yaw), _rotation(0, roll)), _rotation(1, pitch))
 
 
-def module_turn(phi: float, theta: float) -> Quaternion:
-    """Return how what hangs below a module is turned in what is above it.
+def module_rotation(phi: float, theta: float) -> Quaternion:
+    """Return the rotation of the part below a module in the part above it.
 
-    From the foot up a module is Rx(phi) Ry(theta); from the torso down, its inverse.
+    From the foot up a module is Rx(phi) Ry(theta); from the torso down it is the inverse.
     """
-    return product(_about(1, -theta), _about(0, -phi))
+    return product(_rotation(1, -theta), _rotation(0, -phi))
 
 
-def _about(axis: int, angle: float) -> Quaternion:
+def _rotation(axis: int, angle: float) -> Quaternion:
     values = [0.0, 0.0, 0.0, math.cos(angle / 2)]
     values[axis] = math.sin(angle / 2)
     return values[0], values[1], values[2], values[3]
 
 
 def product(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return the turn b followed by the turn a."""
+    """Return the rotation b followed by the rotation a."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -243,11 +252,11 @@ def product(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-def along(direction: Vector3) -> Quaternion:
-    """Return the turn that takes x to a direction, which is not zero."""
+def rotation_to(direction: Vector3) -> Quaternion:
+    """Return the rotation that takes the x axis to a direction, which is not zero."""
     x, y, z = (part / math.hypot(*direction) for part in direction)
     across = y * y + z * z
-    beyond = across / (1.0 - x) if x < 0.0 else 1.0 + x  # 1 + x, also where that is all but 0
+    beyond = across / (1.0 - x) if x < 0.0 else 1.0 + x  # 1 + x, precise near 0
     if beyond < 1e-24:
         return 0.0, 0.0, 1.0, 0.0
     w = math.sqrt(beyond / 2)
@@ -255,7 +264,7 @@ def along(direction: Vector3) -> Quaternion:
 
 
 def links(robot: RobotConfig) -> list[Entity]:
-    """Return the bodies, each in its module's frame."""
+    """Return the bodies, each in the frame of its module."""
     geometry = robot.geometry
     found = [Entity("torso", "torso", (Solid("cube", geometry.torso_size, BODY),))]
     for side in SIDES:
@@ -269,7 +278,7 @@ def links(robot: RobotConfig) -> list[Entity]:
 
 
 def state(pose: RobotPose) -> list[Entity]:
-    """Return what changes: the modules in their modes' colours, the COM, the forces."""
+    """Return the changing parts: the modules in the colours of their modes, the COM, the forces."""
     size = (MODULE_RADIUS,) * 3
     found = []
     for module, mode in zip(MODULES, pose.modes, strict=True):
@@ -282,11 +291,11 @@ def state(pose: RobotPose) -> list[Entity]:
     return found
 
 
-def _arrows(force: Vector3, colour: Colour, at: Vector3 = ORIGIN) -> tuple[Arrow, ...]:
+def _arrows(force: Vector3, colour: Colour, position: Vector3 = ORIGIN) -> tuple[Arrow, ...]:
     size = math.hypot(*force)
     if size < FORCE_MIN_N:
         return ()
-    return (Arrow(at, along(force), METRES_PER_NEWTON * size, 0.02, colour),)
+    return (Arrow(position, rotation_to(force), METRES_PER_NEWTON * size, 0.02, colour),)
 
 
 def _vector(values: Any) -> Vector3:

@@ -1,8 +1,8 @@
-"""Signals for the plots of a page: on an even grid, with every extreme kept. Pure.
+"""Signals for the plots of a page: downsampled to an even grid with every extreme kept. Pure.
 
-A signal is cut into bins of one width. Of each bin its least and its greatest value are
-kept, in the order in which they came: zoomed in or out, a plot shows what was there, and
-a page's size does not grow with the length of the run.
+A signal is divided into bins of equal width. Each bin keeps its least and its greatest value, in
+the order in which they came. So a plot shows every extreme at each zoom, and the size of a page
+does not grow with the length of the run.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from shared.clock import NS_PER_S
 Array = NDArray[np.float64]
 
 BINS: Final = 4500
-"""Of each signal, over the whole run: 13 ms in a run of a minute. A bin has two places: two
-extremes, or one sample in that half of the bin in which it was taken."""
+"""Bins over the whole run: 13 ms each in a run of a minute. A bin has two places: for two
+extremes, or for one sample in the half of the bin in which it was taken."""
 BIN_MIN_S: Final = 0.002
 GAP_S: Final = 0.1
-"""A signal that is silent for longer is interrupted in the plot."""
+"""A plot interrupts its line where a signal has no sample for longer than this."""
 
 SKIP: Final = -32768
-"""Code of a bin without a sample: the line goes on."""
+"""Code of a place without a sample: the line passes."""
 BREAK: Final = -32767
-"""Code of a bin without a sample: the line is interrupted."""
+"""Code of a place without a sample: the line is interrupted."""
 FIRST: Final = -32766
-"""Code of the least value."""
+"""Code of the signal's least value."""
 STEPS: Final = 32767 - FIRST
 
 
 class Span(NamedTuple):
-    """The time that a page shows, s."""
+    """Time that a page shows, s."""
 
     begin: float
     end: float
@@ -44,20 +44,28 @@ class Span(NamedTuple):
         """Width of a bin."""
         return max((self.end - self.begin) / BINS, BIN_MIN_S)
 
+    @property
+    def grid(self) -> dict[str, float]:
+        """Times of all signals: one in the middle of each half bin."""
+        count = 2 * (int((self.end - self.begin) / self.bin_s) + 1)
+        return {"begin": self.begin, "step": self.bin_s / 2, "count": count}
 
-def seconds(stamps_ns: list[int], zero_ns: int, heard_ns: list[int] | None = None) -> Array:
-    """Return times in s that rise.
 
-    A joint service whose drive is silent goes on saying when its last sample came: messages
-    with the same stamp come as far after the first as they were heard after it, but before
-    the next stamp. Those that were heard at once (in virtual time, all) are spread until then,
-    at half the usual rate or faster.
+def message_times(
+    stamps_ns: list[int], zero_ns: int, received_ns: list[int] | None = None
+) -> Array:
+    """Return the times of messages in s, which never fall.
+
+    A joint service whose drive is silent repeats the stamp of its last sample. Messages with
+    equal stamps are placed after the first by their delay of reception, but before the next
+    stamp. Messages received at the same time (all, in virtual time) are spread until the next
+    stamp, at half the usual rate or faster.
 
     Args:
-        stamps_ns: of messages, in the order in which they came.
-        zero_ns: time zero.
-        heard_ns: when each message was heard, by another clock perhaps; None: the stamps are
-            these times.
+        stamps_ns: stamps of the messages, in the order of reception.
+        zero_ns: stamp of time 0.
+        received_ns: time of reception of each message, possibly by another clock; None: the
+            stamps are the times of reception.
     """
     stamps = np.maximum.accumulate(np.array(stamps_ns, dtype=np.int64))
     t = (stamps - zero_ns) / NS_PER_S
@@ -71,30 +79,30 @@ def seconds(stamps_ns: list[int], zero_ns: int, heard_ns: list[int] | None = Non
     usual = float(np.median(steps[steps > 0.0])) if steps.any() else 0.0
     until = np.repeat(np.append(t[starts[1:]], np.inf), counts)
     later = within * usual * np.where(np.isfinite(until), 2.0, 1.0)
-    if heard_ns is not None:
-        heard = np.maximum.accumulate(np.array(heard_ns, dtype=np.int64))
-        after = (heard - np.repeat(heard[starts], counts)) / NS_PER_S
-        told = np.repeat(np.maximum.reduceat(after, starts) > 0.0, counts)
-        later = np.where(told, after, later)
+    if received_ns is not None:
+        received = np.maximum.accumulate(np.array(received_ns, dtype=np.int64))
+        delay = (received - np.repeat(received[starts], counts)) / NS_PER_S
+        is_known = np.repeat(np.maximum.reduceat(delay, starts) > 0.0, counts)
+        later = np.where(is_known, delay, later)
     latest = t + (until - t) * (within + 1) / (room + 1)
     return np.asarray(np.minimum(t + later, np.where(within > 0, latest, t)), dtype=np.float64)
 
 
-def packed(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
-    """Return a signal as it goes into the page, or None if it has no finite value.
+def encode_signal(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
+    """Return a signal as the page stores it, or None if it has no finite value.
 
     Args:
         t: times, s, not falling.
-        values: one for each time; NaN where there is none.
-        span: what the page shows.
+        values: one value for each time; NaN where there is none.
+        span: time that the page shows.
     """
-    good = np.isfinite(values) & (t >= span.begin) & (t <= span.end)
-    t, values = t[good], values[good]
+    usable = np.isfinite(values) & (t >= span.begin) & (t <= span.end)
+    t, values = t[usable], values[usable]
     if not len(t):
         return None
     width = span.bin_s
-    places = (t - span.begin) / width
-    bins = places.astype(np.int64)
+    position = (t - span.begin) / width
+    bins = position.astype(np.int64)
     starts = np.flatnonzero(np.concatenate(([True], np.diff(bins) > 0)))
     first, second = _extremes(values, starts)
     lo, hi = float(values.min()), float(values.max())
@@ -105,15 +113,15 @@ def packed(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
         coded = np.clip(scaled, 0, STEPS).astype(np.int64) + FIRST
         codes[bins[starts] - bins[0], column] = coded
     alone = starts[np.diff(np.append(starts, len(t))) == 1]
-    late = (places[alone] - bins[alone] >= 0.5).astype(np.int64)
-    codes[bins[alone] - bins[0], 1 - late] = SKIP  # one sample is one point, in its own half
-    silent = np.flatnonzero(np.diff(t) > _gap(t))
-    after = bins[silent] - bins[0] + 1
-    after = after[after < bins[silent + 1] - bins[0]]
-    codes[after] = BREAK
+    second_half = (position[alone] - bins[alone] >= 0.5).astype(np.int64)
+    codes[bins[alone] - bins[0], 1 - second_half] = SKIP  # one sample is one point
+    places = codes.reshape(-1)
+    used = np.flatnonzero(places != SKIP)
+    for gap in np.flatnonzero(np.diff(t) > _gap(t)):
+        last, following = np.searchsorted(used, 2 * (bins[[gap, gap + 1]] - bins[0] + [1, 0]))
+        places[used[last - 1] + 1 : used[following]] = BREAK
     return {
-        "t0": round(span.begin + float(bins[0]) * width, 6),
-        "h": width / 2,
+        "first": 2 * int(bins[0]),
         "lo": lo,
         "hi": hi,
         "step": step,
@@ -127,7 +135,7 @@ def _gap(t: Array) -> float:
 
 
 def _extremes(values: Array, starts: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return the two extremes of each bin, that which came first before the other."""
+    """Return the two extremes of each bin in the order in which they came."""
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     counts = np.diff(np.append(starts, len(values)))
     places = np.arange(len(values))
@@ -139,7 +147,7 @@ def _extremes(values: Array, starts: NDArray[np.int64]) -> tuple[Array, Array]:
 
 
 def segments(t: Array, codes: NDArray[np.int64], gap_s: float = GAP_S) -> list[list[float]]:
-    """Return [begin, end, code] of every stretch with one code; silence ends a stretch."""
+    """Return [begin, end, code] of every interval with one code; a gap ends an interval."""
     if not len(t):
         return []
     changed = (np.diff(codes) != 0) | (np.diff(t) > gap_s)

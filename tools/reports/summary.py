@@ -1,4 +1,4 @@
-"""The head and the foot of a page: verdict, where the run comes from, what was lost."""
+"""Head and foot of a page: verdict, facts about the run, lost messages, input files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tools.runs.verdict import Summary
 from tools.runs.verdict_limits import LIMITS
 
 REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
-"""Figures that mean nothing in virtual time."""
+"""Figures without a meaning in virtual time."""
 
 MACHINE: Final = {
     "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
@@ -28,58 +28,58 @@ MACHINE: Final = {
 
 
 class RunVerdict(NamedTuple):
-    """What a run was worth."""
+    """Verdict on a run."""
 
     sentence: str
     good: bool | None
-    """None: there is nothing to judge."""
+    """None: no verdict."""
     rows: list[tuple[str, str, str, str]]
-    """(what, measured, limit, `ok`, or `over` and perhaps why)."""
+    """(figure, measured, limit, `ok` or `over`, the latter possibly with the reason)."""
     caution: str = ""
-    """Why the figures are not to be trusted."""
+    """Reason not to trust the figures."""
 
 
-class Lost(NamedTuple):
-    """One topic, as the recorder heard it."""
+class TopicLoss(NamedTuple):
+    """Recorded and lost messages of one topic."""
 
     name: str
     messages: int
     rate_hz: float | None
-    """Mean from the first to the last message."""
+    """Mean rate from the first to the last message."""
     nominal_hz: float
     lost: int
     gaps: int
     restarts: int
 
 
-def judge(source: RunData) -> RunVerdict:
-    """Return the verdict as the verbs that made the run print it."""
-    log = source.log
-    if source.course is None:
-        return RunVerdict(f"No verdict: {source.without_course}", None, [])
+def judge(run: RunData) -> RunVerdict:
+    """Return the verdict in the words of the command that made the run."""
+    log = run.log
+    if run.course is None:
+        return RunVerdict(f"No verdict: {run.without_course}", None, [])
     try:
-        summary = verdict.summarise(log, _duration_s(source))
+        summary = verdict.summarise(log, _duration_s(run))
     except XrlError as error:
         return RunVerdict(f"No verdict: {error}", None, [])
     if log.metadata["run"].get("lockstep"):
         summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
-    said = _said(summary)
-    caution = "" if summary["in_real_time"] else said[-2]
-    return RunVerdict(said[-1], bool(summary["stood"]), _rows(summary), caution)
+    lines = _verdict_lines(summary)
+    caution = "" if summary["in_real_time"] else lines[-2]
+    return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)
 
 
-def _duration_s(source: RunData) -> float:
-    """Return how long the scenario was to be; without one, as long as it was."""
-    raw = source.log.attachments.get("scenario.toml", b"")
+def _duration_s(run: RunData) -> float:
+    """Return the planned duration of the scenario; without one, the duration of the run."""
+    raw = run.log.attachments.get("scenario.toml", b"")
     try:
         return float(tomllib.loads(raw.decode())["duration"])
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
-        assert source.course is not None  # noqa: S101 - asked for with a course only
-        return float(source.course.t[-1])
+        assert run.course is not None  # noqa: S101 - called with a course only
+        return float(run.course.t[-1])
 
 
-def _said(summary: Summary) -> list[str]:
-    """Return the lines of the verdict as the other verbs print it; the last is the verdict."""
+def _verdict_lines(summary: Summary) -> list[str]:
+    """Return the printed lines of the verdict; the last line is the verdict itself."""
     text = io.StringIO()
     console = Console(file=text, width=200, color_system=None, soft_wrap=True)
     verdict_table.show(summary, console)
@@ -99,17 +99,20 @@ def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def head(source: RunData) -> list[tuple[str, str]]:
-    """Return (name, value) of what a reader needs to know first."""
-    log, about = source.log, source.log.metadata["run"]
-    begin, end = source.span
+def head(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, value) of the facts that a reader needs first."""
+    log, about = run.log, run.log.metadata["run"]
+    begin, end = run.span
     rows = [
-        ("scenario", _scenario(source)),
-        ("started", _moment(about.get("started", ""))),
+        ("scenario", _scenario(run)),
+        ("started", _date(about.get("started", ""))),
         ("virtual time", about.get("lockstep", "")),
         ("length", f"{end - begin:.1f} s"),
         ("file", log.path.name),
-        ("recording", "finished" if log.complete else "not finished: the recorder did not end it"),
+        (
+            "recording",
+            "complete" if log.complete else "incomplete: the recorder did not close the file",
+        ),
         ("git commit", _commit(about)),
         ("robot", log.robot),
         ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
@@ -121,7 +124,7 @@ def head(source: RunData) -> list[tuple[str, str]]:
 
 
 def _threads(raw: str) -> str:
-    """Return the environment that limits threads in words; as it is, if it is not JSON."""
+    """Return the environment variables that limit threads; the raw text if it is not JSON."""
     try:
         found = json.loads(raw or "{}")
         return ", ".join(f"{name}={value}" for name, value in sorted(found.items()))
@@ -129,17 +132,17 @@ def _threads(raw: str) -> str:
         return raw
 
 
-def _moment(started: str) -> str:
-    """Return a time as people write it; as it is, if it is written otherwise."""
+def _date(started: str) -> str:
+    """Return a readable date; the raw text if it is not in ISO format."""
     try:
         return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
     except ValueError:
         return started
 
 
-def _scenario(source: RunData) -> str:
-    name = source.log.metadata["run"].get("scenario", "")
-    raw = source.log.attachments.get("scenario.toml", b"")
+def _scenario(run: RunData) -> str:
+    name = run.log.metadata["run"].get("scenario", "")
+    raw = run.log.attachments.get("scenario.toml", b"")
     try:
         about = str(tomllib.loads(raw.decode()).get("about", ""))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError):
@@ -152,9 +155,9 @@ def _commit(about: dict[str, str]) -> str:
     return f"{commit} with changes" if about.get("git_dirty") == "true" else commit
 
 
-def lost(source: RunData) -> list[Lost]:
-    """Return what was recorded of each key, and what is missing, by sequence numbers."""
-    log, rows = source.log, []
+def message_losses(run: RunData) -> list[TopicLoss]:
+    """Return recorded and lost messages of each topic, by sequence numbers."""
+    log, rows = run.log, []
     known = topics.all_keys(log.robot)
     for key, count in sorted(log.gaps().items()):
         received = [row[0] for row in log.raw(key)]
@@ -163,34 +166,36 @@ def lost(source: RunData) -> list[Lost]:
         rate = (len(received) - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
         name = key.removeprefix(f"xrl/{log.robot}/")
         rows.append(
-            Lost(name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts)
+            TopicLoss(
+                name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts
+            )
         )
     return rows
 
 
-def damage(source: RunData) -> list[str]:
-    """Return what of the file cannot be read, a line for each place."""
-    log = source.log
+def damage(run: RunData) -> list[str]:
+    """Return the unreadable parts of the file, one line each."""
+    log = run.log
     if log.complete and not log.damage:
         return []
     return describe_lost(log.cut, log.damage, finished=log.complete)
 
 
-def files(source: RunData) -> list[tuple[str, str]]:
-    """Return (name, text) of the files that the run was made from, as they are in its log."""
+def files(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, text) of the input files of the run, from its log."""
     found = []
-    for name, raw in sorted(source.log.attachments.items(), key=lambda row: _order(row[0])):
+    for name, raw in sorted(run.log.attachments.items(), key=lambda row: _order(row[0])):
         if name.endswith((".toml", ".json")):
             found.append((name, raw.decode(errors="replace")))
     return found
 
 
 def _order(name: str) -> tuple[bool, str]:
-    """What people wrote goes before what was computed from it."""
+    """Sort files written by people before computed ones."""
     return not name.endswith(".toml"), name
 
 
-def packages(source: RunData) -> list[tuple[str, str]]:
-    """Return (name, version) of all packages that were installed."""
-    found: dict[str, Any] = source.log.metadata.get("packages", {})
+def packages(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, version) of all installed packages."""
+    found: dict[str, Any] = run.log.metadata.get("packages", {})
     return sorted(found.items(), key=lambda row: row[0].lower())

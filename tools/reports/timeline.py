@@ -1,4 +1,4 @@
-"""What happened in a run, from all that its log says, in order."""
+"""Timeline of a run: its events, mode changes, silences and limit violations, in order."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from shared.messages import (
     Tare,
     Wrench,
 )
-from tools.reports.limit_violations import crossings
+from tools.reports.limit_violations import limit_violations
 from tools.reports.page_model import TimelineEvent
 from tools.reports.run_data import RunData
-from tools.reports.signals import GAP_S, seconds
+from tools.reports.signals import GAP_S, message_times
 from tools.runs.impairment_intervals import impairments
 
 TOGETHER_S: Final = 0.1
-"""The same change of several modules within this time is told in one line."""
-LINES_MAX: Final = 500
-WAIT_S: Final = 0.5
-"""A planner that waits for so long after drop-outs says it in the timeline."""
+"""Equal changes of several modules within this time share one row."""
+ROWS_MAX: Final = 500
+BACKOFF_MIN_S: Final = 0.5
+"""Shortest back-off of the planner after drop-outs that has a row."""
 END_S: Final = 0.1
-"""What ends so close to the end of the log has no mark: the run ends with it."""
+"""An impairment that ends this close to the end of the log has no mark for its end."""
 
 Row = TypeVar("Row", bound=tuple[Any, ...])
 
@@ -48,118 +48,115 @@ KINDS: Final = {
     RunEventKind.STARTED: "note",
     RunEventKind.FINISHED: "note",
 }
-_USUAL: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
+_NORMAL_MODES: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
 
 
-def happenings(source: RunData) -> list[TimelineEvent]:
-    """Return what happened, in the order of time."""
+def timeline_events(run: RunData) -> list[TimelineEvent]:
+    """Return all events of a run in the order of time."""
     found = [
-        *_from_outside(source),
-        *_changes_of_mode(source),
-        *_drives(source),
-        *_planner(source),
-        *_harness(source),
-        *_world(source),
-        *_silences(source),
-        *crossings(source),
-        *_network(source),
+        *_run_events(run),
+        *_mode_changes(run),
+        *_drives(run),
+        *_planner(run),
+        *_harness(run),
+        *_world(run),
+        *_silences(run),
+        *limit_violations(run),
+        *_network(run),
     ]
     found.sort(key=lambda row: row.t)
-    if len(found) > LINES_MAX:
-        left = len(found) - LINES_MAX
-        found = sorted([row for row in found if row.mark] + _spread(found), key=lambda row: row.t)
-        found.append(
-            TimelineEvent(source.span.end, "note", f"about {left} more lines are left out")
-        )
+    if len(found) > ROWS_MAX:
+        left = len(found) - ROWS_MAX
+        kept = [row for row in found if row.mark] + _first_unmarked(found)
+        found = sorted(kept, key=lambda row: row.t)
+        found.append(TimelineEvent(run.span.end, "note", f"about {left} more rows are left out"))
     return found
 
 
-def _spread(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
-    """Return what marks nothing, but not more of it than a page can hold."""
-    quiet = [row for row in found if not row.mark]
-    return quiet[: max(0, LINES_MAX - (len(found) - len(quiet)))]
+def _first_unmarked(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
+    """Return the first rows without a mark, as many as the page has room for."""
+    unmarked = [row for row in found if not row.mark]
+    return unmarked[: max(0, ROWS_MAX - (len(found) - len(unmarked)))]
 
 
-def _at(source: RunData, t_ns: int) -> float:
-    return (t_ns - source.zero_ns) / NS_PER_S
+def _at(run: RunData, t_ns: int) -> float:
+    return (t_ns - run.zero_ns) / NS_PER_S
 
 
-def _from_outside(source: RunData) -> Iterator[TimelineEvent]:
-    events: list[RunEvent] = source.log.messages(topics.RUN_EVENT)
+def _run_events(run: RunData) -> Iterator[TimelineEvent]:
+    events: list[RunEvent] = run.log.messages(topics.RUN_EVENT)
     for event in events:
-        kind = KINDS.get(_known(RunEventKind, event.kind), "note")
-        text = _said(event)
+        kind = KINDS.get(_member(RunEventKind, event.kind), "note")
+        text = _describe_run_event(event)
         mark = ""
         if kind != "note":
             mark = f"{event.subject} {event.detail}".strip() if kind != "restart" else ""
             mark = mark or f"{event.subject} back"
         if kind == "push":
             mark = f"push {event.detail.partition(' for ')[0]}"
-        yield TimelineEvent(_at(source, event.t_ns), kind, text, mark)
+        yield TimelineEvent(_at(run, event.t_ns), kind, text, mark)
     last = None
-    for stop in source.log.messages(topics.ESTOP):
-        t = _at(source, stop.t_ns)
-        if last is None or t - last > 1.0:  # it is said again and again
+    for stop in run.log.messages(topics.ESTOP):
+        t = _at(run, stop.t_ns)
+        if last is None or t - last > 1.0:  # a stop is published repeatedly
             yield TimelineEvent(t, "estop", f"emergency stop by {stop.source}", "e-stop")
         last = t
-    for request in source.log.messages(topics.HARNESS_TARE):
-        yield TimelineEvent(
-            _at(source, request.t_ns), "note", f"tare asked for by {request.source}"
-        )
+    for request in run.log.messages(topics.HARNESS_TARE):
+        yield TimelineEvent(_at(run, request.t_ns), "note", f"tare requested by {request.source}")
 
 
-def _network(source: RunData) -> Iterator[TimelineEvent]:
-    """Tell when each impairment begins and ends; all its directions at once."""
-    for row in impairments(source.log.messages(topics.LINK_EVENT)):
-        begin_s, end_s = row.begin_s(source.zero_ns), row.end_s(source.zero_ns)
+def _network(run: RunData) -> Iterator[TimelineEvent]:
+    """Yield the begin and the end of each impairment, of all its directions together."""
+    for row in impairments(run.log.messages(topics.LINK_EVENT)):
+        begin_s, end_s = row.begin_s(run.zero_ns), row.end_s(run.zero_ns)
         yield TimelineEvent(begin_s, "network", f"network, {row.title}", row.title)
         if end_s is None:
             continue
         text = f"network, {row.title} ends; {row.counts()}"
-        mark = f"{row.link} ends" if end_s < source.span.end - END_S else ""
+        mark = f"{row.link} ends" if end_s < run.span.end - END_S else ""
         yield TimelineEvent(end_s, "network" if mark else "note", text, mark)
 
 
-def _said(event: RunEvent) -> str:
-    words = {
+def _describe_run_event(event: RunEvent) -> str:
+    texts = {
         RunEventKind.STARTED: f"{event.subject} starts",
         RunEventKind.KILLED: f"{event.subject} gets SIG{event.detail}",
-        RunEventKind.RESTARTED: f"{event.subject} is started again",
+        RunEventKind.RESTARTED: f"{event.subject} restarts",
         RunEventKind.PUSHED: f"push {event.detail}",
         RunEventKind.FINISHED: f"{event.subject} ends {event.detail}".strip(),
         RunEventKind.FAULTED: f"{event.subject}: fault {event.detail} begins",
     }
-    other = f"{event.subject} {_word(RunEventKind, event.kind)} {event.detail}"
-    return words.get(_known(RunEventKind, event.kind), other.strip())
+    other = f"{event.subject} {_name(RunEventKind, event.kind)} {event.detail}"
+    return texts.get(_member(RunEventKind, event.kind), other.strip())
 
 
-def _changes_of_mode(source: RunData) -> Iterator[TimelineEvent]:
+def _mode_changes(run: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointEvent]] = sorted(
-        (_at(source, event.t_ns), module, event)
+        (_at(run, event.t_ns), module, event)
         for module in MODULES
-        for event in source.log.messages(topics.JOINT_EVENT, module)
+        for event in run.log.messages(topics.JOINT_EVENT, module)
     )
-    for alike in _together(
+    for group in _together(
         changes, lambda row: (row[2].mode_before, row[2].mode_after, row[2].cause)
     ):
-        t, _, first = alike[0]
-        yield TimelineEvent(t, _severity(first), _describe_change(alike))
+        t, _, first = group[0]
+        yield TimelineEvent(t, _severity(first), _describe_mode_change(group))
 
 
-def _together(changes: Sequence[Row], what: Callable[[Row], Any]) -> list[list[Row]]:
-    """Return rows, which begin with their time, in groups: the same, at about the same time."""
+def _together(changes: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
+    """Group rows with equal keys at about the same time. The first field of a row is its time."""
     groups: list[list[Row]] = []
     open_: dict[Any, list[Row]] = {}
     for row in changes:
-        group = open_.get(what(row))
+        group = open_.get(key(row))
         if group is None or row[0] - group[0][0] > TOGETHER_S:
-            group = open_[what(row)] = []
+            group = open_[key(row)] = []
             groups.append(group)
         group.append(row)
     return groups
 
 
-def _who(found: Iterable[str]) -> str:
+def _modules(found: Iterable[str]) -> str:
     modules = sorted(set(found), key=MODULES.index)
     return "all six" if len(modules) == len(MODULES) else ", ".join(modules)
 
@@ -168,113 +165,115 @@ def _severity(event: JointEvent) -> str:
     return "bad" if event.mode_after in (Mode.FAULT, Mode.DAMP) else "note"
 
 
-def _describe_change(alike: Sequence[tuple[float, str, JointEvent]]) -> str:
-    first = alike[0][2]
-    who = _who(module for _, module, _ in alike)
+def _describe_mode_change(group: Sequence[tuple[float, str, JointEvent]]) -> str:
+    first = group[0][2]
+    modules = _modules(module for _, module, _ in group)
     step = max(
         abs(b - a)
-        for _, _, event in alike
+        for _, _, event in group
         for a, b in zip(event.tau_before, event.tau_after, strict=True)
     )
-    within_ms = (alike[-1][0] - alike[0][0]) * 1e3
+    within_ms = (group[-1][0] - group[0][0]) * 1e3
     text = (
-        f"{who}: {_word(Mode, first.mode_before)} to {_word(Mode, first.mode_after)}, "
-        f"{_word(Cause, first.cause)}"
+        f"{modules}: {_name(Mode, first.mode_before)} to {_name(Mode, first.mode_after)}, "
+        f"{_name(Cause, first.cause)}"
     )
-    if len(alike) > 1 and within_ms > 0.0:
+    if len(group) > 1 and within_ms > 0.0:
         text += f", within {within_ms:.1f} ms"
-    ages = [event.age_ns for _, _, event in alike if event.age_ns >= 0]
+    ages = [event.age_ns for _, _, event in group if event.age_ns >= 0]
     if ages:
         text += f"; command {max(ages) / NS_PER_MS:.1f} ms old"
     return f"{text}; torque step {step:.2f} N m"
 
 
-def _drives(source: RunData) -> Iterator[TimelineEvent]:
+def _drives(run: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointState, JointState]] = []
     for module in MODULES:
-        states: list[JointState] = source.log.messages(topics.JOINT_STATE, module)
-        t = source.times(topics.JOINT_STATE, module)
+        states: list[JointState] = run.log.messages(topics.JOINT_STATE, module)
+        t = run.times(topics.JOINT_STATE, module)
         changes += [
             (float(t[index]), module, states[index - 1], states[index])
             for index in _changes([(state.drive, state.drive_error) for state in states])
         ]
     changes.sort(key=lambda row: row[0])
-    for alike in _together(changes, _what_of_drive):
-        t_s, _, before, after = alike[0]
+    for group in _together(changes, _describe_drive_change):
+        t_s, _, before, after = group[0]
         worse = after.drive != DriveStatus.ARMED and before.drive == DriveStatus.ARMED
         bad = worse or after.drive == DriveStatus.ERROR or after.drive_error != 0
-        who = _who(module for _, module, _, _ in alike)
-        yield TimelineEvent(t_s, "bad" if bad else "note", f"{who}: {_what_of_drive(alike[0])}")
+        modules = _modules(module for _, module, _, _ in group)
+        text = f"{modules}: {_describe_drive_change(group[0])}"
+        yield TimelineEvent(t_s, "bad" if bad else "note", text)
 
 
-def _what_of_drive(row: tuple[float, str, JointState, JointState]) -> str:
+def _describe_drive_change(row: tuple[float, str, JointState, JointState]) -> str:
     _, _, before, after = row
     parts = []
     if before.drive != after.drive:
         parts.append(
-            f"drive {_word(DriveStatus, before.drive)} to {_word(DriveStatus, after.drive)}"
+            f"drive {_name(DriveStatus, before.drive)} to {_name(DriveStatus, after.drive)}"
         )
     if before.drive_error != after.drive_error:
         parts.append(f"error bits {after.drive_error:#x}")
     return ", ".join(parts)
 
 
-def _planner(source: RunData) -> Iterator[TimelineEvent]:
-    rows: list[PlannerStatus] = source.log.messages(topics.PLANNER_STATUS)
-    t = source.times(topics.PLANNER_STATUS)
+def _planner(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[PlannerStatus] = run.log.messages(topics.PLANNER_STATUS)
+    t = run.times(topics.PLANNER_STATUS)
     for index in _changes([(row.mode, row.session) for row in rows]):
         before, after = rows[index - 1], rows[index]
         fresh = " in a new session" if before.session != after.session else ""
-        text = f"planner: {_word(PlannerMode, before.mode)} to {_word(PlannerMode, after.mode)}"
-        bad = after.mode not in _USUAL
+        text = f"planner: {_name(PlannerMode, before.mode)} to {_name(PlannerMode, after.mode)}"
+        bad = after.mode not in _NORMAL_MODES
         yield TimelineEvent(float(t[index]), "bad" if bad else "note", text + fresh)
     for index in _changes([row.wait_s > 0.0 for row in rows]):
-        if rows[index].wait_s >= WAIT_S:
-            text = f"planner: leads again in {rows[index].wait_s:.1f} s at the earliest, for links"
-            yield TimelineEvent(float(t[index]), "note", f"{text} have dropped out")
+        if rows[index].wait_s >= BACKOFF_MIN_S:
+            text = f"planner: backs off for {rows[index].wait_s:.1f} s or more, after drop-outs"
+            yield TimelineEvent(float(t[index]), "note", text)
 
 
-def _harness(source: RunData) -> Iterator[TimelineEvent]:
-    rows: list[Wrench] = source.log.messages(topics.WRENCH)
-    t = source.times(topics.WRENCH)
+def _harness(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[Wrench] = run.log.messages(topics.WRENCH)
+    t = run.times(topics.WRENCH)
     for index in _changes([(row.valid, row.saturated, row.tare) for row in rows]):
         row = rows[index]
-        word = "valid" if row.valid else "saturated" if row.saturated else "not valid"
-        tare = "" if row.tare == Tare.DONE else f", tare {_word(Tare, row.tare)}"
+        state = "valid" if row.valid else "saturated" if row.saturated else "not valid"
+        tare = "" if row.tare == Tare.DONE else f", tare {_name(Tare, row.tare)}"
         kind = "note" if row.valid else "bad"
-        yield TimelineEvent(float(t[index]), kind, f"harness sensor {word}{tare}")
+        yield TimelineEvent(float(t[index]), kind, f"harness sensor {state}{tare}")
 
 
-def _world(source: RunData) -> Iterator[TimelineEvent]:
-    rows: list[SimTruth] = source.log.messages(topics.SIM_TRUTH)
+def _world(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[SimTruth] = run.log.messages(topics.SIM_TRUTH)
     for row in rows:
         if row.fallen:
-            yield TimelineEvent(_at(source, row.t_ns), "fall", "the robot fell", "fell")
+            yield TimelineEvent(_at(run, row.t_ns), "fall", "the robot fell", "fell")
             return
 
 
-def _silences(source: RunData) -> Iterator[TimelineEvent]:
-    """Tell where topics with a rate said nothing for long, as the recorder heard them."""
+def _silences(run: RunData) -> Iterator[TimelineEvent]:
+    """Yield the gaps in periodic topics, by the recorder's clock."""
     found: list[tuple[float, str, float]] = []
-    for key, topic in topics.all_keys(source.log.robot).items():
+    for key, topic in topics.all_keys(run.log.robot).items():
         if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
             continue
-        t = seconds([row[0] for row in source.log.raw(key)], source.zero_ns)
+        t = message_times([row[0] for row in run.log.raw(key)], run.zero_ns)
         steps = np.diff(t)
-        name = key.removeprefix(f"xrl/{source.log.robot}/")
+        name = key.removeprefix(f"xrl/{run.log.robot}/")
         found += [
             (float(t[index]), name, float(steps[index]))
             for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz))
         ]
-    for alike in _together(sorted(found), lambda _: None):
-        names = _folded([name for _, name, _ in alike])
-        longest = max(length for *_, length in alike)
-        word = "silent for up to" if len(alike) > 1 else "silent for"
-        yield TimelineEvent(alike[0][0], "note", f"{', '.join(names)} {word} {longest:.2f} s")
+    for group in _together(sorted(found), lambda _: None):
+        names = ", ".join(_merged([name for _, name, _ in group]))
+        longest = max(length for *_, length in group)
+        most = "up to " if len(group) > 1 else ""
+        text = f"{names} silent for {most}{longest:.2f} s"
+        yield TimelineEvent(group[0][0], "note", text)
 
 
-def _folded(names: Sequence[str]) -> list[str]:
-    """Return names; those of all six modules as one."""
+def _merged(names: Sequence[str]) -> list[str]:
+    """Return names of topics; the six of one topic as one name."""
     left = list(dict.fromkeys(names))
     for topic in topics.TOPICS:
         six = [topic.name.replace("*", module) for module in MODULES]
@@ -287,10 +286,10 @@ def _changes(values: Sequence[Any]) -> list[int]:
     return [index for index in range(1, len(values)) if values[index] != values[index - 1]]
 
 
-def _word(enumeration: Any, code: int) -> str:
-    found = _known(enumeration, code)
+def _name(enumeration: Any, code: int) -> str:
+    found = _member(enumeration, code)
     return str(found.name) if found is not None else f"unknown ({code})"
 
 
-def _known(enumeration: Any, code: int) -> Any:
+def _member(enumeration: Any, code: int) -> Any:
     return next((member for member in enumeration if member == code), None)

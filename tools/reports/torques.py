@@ -1,4 +1,4 @@
-"""The panels of the joints: torques against their limit and by origin, angles."""
+"""Joint panels: torques against their limit and by origin, angles, rates."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import RobotConfig
 from shared.joints import AXES, MODULES
 from shared.messages import JointCommand, JointState, Mode
-from tools.reports.page_model import LevelLine, Line, Sheet
+from tools.reports.page_model import LevelLine, Line, PageModel
 from tools.reports.run_data import RunData
 from tools.reports.signals import Array
 
 Sets: TypeAlias = dict[str, tuple[list[Line], list[LevelLine]]]
-"""Lines and levels of each joint."""
+"""Lines and levels by joint."""
 
 NO_STATES: Final = "no joint/*/state in this log"
 
 
-class Origins(msgspec.Struct):
-    """Torques of one module by where they come from, (n, 2): phi, theta; N m."""
+class TorqueTerms(msgspec.Struct):
+    """Torques of one module by origin, (n, 2): phi, theta; N m."""
 
     feedforward: Array
     coupled: Array
-    """What was used of it."""
+    """Coupled torque after scaling."""
     local: Array
-    """k_p (q_ref - q) + k_d (v_ref - v), the gains as stiff as they then were."""
-    taken_off: Array
-    """What the service sent less these: what the gate cut off, and what is left of a step that
-    a service that was frozen did not make."""
+    """k_p (q_ref - q) + k_d (v_ref - v), with the gains active at that time."""
+    removed: Array
+    """Torque that the service sent minus the three others: the part cut by the torque limiter,
+    and the part of a step that remains after a service stopped for a while."""
 
 
-def add_joints(source: RunData, sheet: Sheet) -> None:
-    """Add the joints' panels."""
-    robot = source.robot
+def add_joints(run: RunData, model: PageModel) -> None:
+    """Add the panels of the joints."""
+    robot = run.robot
     most = robot.joint.tau_module_max if robot is not None else None
     sums: list[Line] = []
     torques: Sets = {}
@@ -46,55 +46,55 @@ def add_joints(source: RunData, sheet: Sheet) -> None:
     rates: Sets = {}
     peaks: dict[str, float] = {}
     for number, module in enumerate(MODULES):
-        t = source.times(topics.JOINT_STATE, module)
+        t = run.times(topics.JOINT_STATE, module)
         if not len(t):
             continue
-        tau, q, v = source.columns(topics.JOINT_STATE, module, "tau", "q", "v")
+        tau, q, v = run.columns(topics.JOINT_STATE, module, "tau", "q", "v")
         sums.append(Line(module, t, np.abs(tau).sum(axis=1), number))
-        found = origins(source, robot, module) if robot is not None else None
-        t_ref, q_ref, v_ref = _references(source, module)
+        found = torque_terms(run, robot, module) if robot is not None else None
+        t_ref, q_ref, v_ref = _references(run, module)
         for axis, name in enumerate(AXES):
             joint = f"{module}_{name}"
             peaks[joint] = float(np.abs(tau[:, axis]).max())
             torques[joint] = (_torques(t, tau, found, axis), _torque_limits(most))
             angles[joint] = (
                 [Line("q", t, q[:, axis], 0), Line("q_ref", t_ref, q_ref[:, axis], 1)],
-                _stops(source, module, axis),
+                _stops(run, module, axis),
             )
             rates[joint] = (
                 [Line("v", t, v[:, axis], 0), Line("v_ref", t_ref, v_ref[:, axis], 1)],
                 [],
             )
-    sheet.plot(
+    model.plot(
         "Torque of each module against its limit", "N m", sums,
         limits=[LevelLine(most, "limit")] if most is not None else [],
-        note="|tau_phi| + |tau_theta|: both motors of a module add up along one axis.",
-        otherwise=NO_STATES,
+        note="|tau_phi| + |tau_theta|: both motors of a module act along one axis.",
+        if_empty=NO_STATES,
     )  # fmt: skip
     note = (
-        "The origins are those of the command in use, while the service tracks it. In HOLD the "
-        "service goes on with what it froze, and only the total is in the log."
+        "The origins belong to the command in use, while the service is in TRACK. In HOLD the "
+        "service repeats a frozen command, and the log holds only the total."
     )
     if robot is None:
-        note = f"Without origins: {source.without_robot}."
+        note = f"Origins unknown: {run.without_robot}."
     hardest = max(peaks, key=lambda joint: peaks[joint], default="")
-    sheet.choice("Torque of one joint, by origin", "N m", "joint", torques, initial=hardest,
-                 note=note, otherwise=NO_STATES)  # fmt: skip
-    sheet.choice("Angle of one joint", "rad", "joint", angles, initial=hardest, otherwise=NO_STATES)
-    sheet.choice("Rate of one joint", "rad/s", "joint", rates, initial=hardest, otherwise=NO_STATES)
+    model.choice("Torque of one joint, by origin", "N m", "joint", torques, initial=hardest,
+                 note=note, if_empty=NO_STATES)  # fmt: skip
+    model.choice("Angle of one joint", "rad", "joint", angles, initial=hardest, if_empty=NO_STATES)
+    model.choice("Rate of one joint", "rad/s", "joint", rates, initial=hardest, if_empty=NO_STATES)
 
 
-def origins(source: RunData, robot: RobotConfig, module: str) -> Origins:
-    """Return the law's terms at each state of a module; NaN where the log does not tell.
+def torque_terms(run: RunData, robot: RobotConfig, module: str) -> TorqueTerms:
+    """Return the terms of the PD law at each state of a module; NaN where they are unknown.
 
-    They are those of the command that the state names, aged as the service ages it, and
-    only while it tracks, once it has blended over to the commands.
+    They are known in TRACK, after the blend to the commands. They belong to the command that the
+    state names, extrapolated by its age as the service does.
     """
-    states: list[JointState] = source.log.messages(topics.JOINT_STATE, module)
-    commands: list[JointCommand] = source.log.messages(topics.JOINT_COMMAND, module)
+    states: list[JointState] = run.log.messages(topics.JOINT_STATE, module)
+    commands: list[JointCommand] = run.log.messages(topics.JOINT_COMMAND, module)
     known = {(command.session, command.seq): command for command in commands}
     shape = (len(states), 2)
-    found = Origins(*(np.full(shape, np.nan) for _ in range(4)))
+    found = TorqueTerms(*(np.full(shape, np.nan) for _ in range(4)))
     blend_ns = robot.joint_service.blend_ms * NS_PER_MS
     aging_max_s = robot.joint_service.command_aging_max_ms / 1e3
     tracking_since_ns: int | None = None
@@ -114,18 +114,18 @@ def origins(source: RunData, robot: RobotConfig, module: str) -> Origins:
         found.local[index] = pd_law.torque(used, state.q, state.v)
     sent = np.array([state.tau for state in states]).reshape(shape)
     found.local -= found.feedforward + found.coupled
-    found.taken_off = sent - found.feedforward - found.coupled - found.local
+    found.removed = sent - found.feedforward - found.coupled - found.local
     return found
 
 
-def _torques(t: Array, tau: Array, found: Origins | None, axis: int) -> list[Line]:
-    lines = [Line("total, after the gate", t, tau[:, axis], 0)]
+def _torques(t: Array, tau: Array, found: TorqueTerms | None, axis: int) -> list[Line]:
+    lines = [Line("total, after the torque limiter", t, tau[:, axis], 0)]
     if found is not None:
         lines += [
             Line("tau_ff", t, found.feedforward[:, axis], 1),
             Line("tau_coupled", t, found.coupled[:, axis], 2),
             Line("local PD", t, found.local[:, axis], 3),
-            Line("taken off by the service", t, found.taken_off[:, axis], 5, hidden=True),
+            Line("removed by the service", t, found.removed[:, axis], 5, hidden=True),
         ]
     sibling = f"total of {AXES[1 - axis]}"
     return [*lines, Line(sibling, t, tau[:, 1 - axis], 4, hidden=True, dashed=True)]
@@ -137,16 +137,16 @@ def _torque_limits(most: float | None) -> list[LevelLine]:
     return [LevelLine(most, "limit", shown=False), LevelLine(-most, "limit", shown=False)]
 
 
-def _references(source: RunData, module: str) -> tuple[Array, Array, Array]:
-    t = source.times(topics.JOINT_COMMAND, module)
-    q_ref, v_ref = source.columns(topics.JOINT_COMMAND, module, "q_ref", "v_ref")
+def _references(run: RunData, module: str) -> tuple[Array, Array, Array]:
+    t = run.times(topics.JOINT_COMMAND, module)
+    q_ref, v_ref = run.columns(topics.JOINT_COMMAND, module, "q_ref", "v_ref")
     if q_ref.ndim != 2:
         q_ref = v_ref = np.zeros((0, 2))
     return t, q_ref, v_ref
 
 
-def _stops(source: RunData, module: str, axis: int) -> list[LevelLine]:
-    if source.robot is None:
+def _stops(run: RunData, module: str, axis: int) -> list[LevelLine]:
+    if run.robot is None:
         return []
-    low, high = source.robot.joint_limits()[2 * MODULES.index(module) + axis]
+    low, high = run.robot.joint_limits()[2 * MODULES.index(module) + axis]
     return [LevelLine(low, "soft stop", shown=False), LevelLine(high, "soft stop", shown=False)]

@@ -1,7 +1,7 @@
-"""The robot's bodies as URDF, in a message as ROS 2 has it: Rerun draws bodies from nothing else.
+"""Bodies of the robot as URDF in a ROS 2 message, the only form from which Rerun draws bodies.
 
-Links are the frames of `tools.reports.scene`. The joints are left free: where the frames are is
-said by the transforms.
+The links are the frames of `tools.reports.scene`. All joints are floating, since the transforms
+give the poses of the frames.
 """
 
 from __future__ import annotations
@@ -11,29 +11,29 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from tools.reports.foxglove import Entity, Placed, Solid
+from tools.reports.foxglove import Entity, FrameTransform, Solid
 
 SCHEMA_NAME: Final = "std_msgs/msg/String"
 SCHEMA: Final = b"string data\n"
 SCHEMA_ENCODING: Final = "ros2msg"
 ENCODING: Final = "cdr"
-"""Of the message."""
+"""Encoding of the message."""
 _LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
 
 
 def message(text: str) -> bytes:
-    """Return a `std_msgs/msg/String`, in CDR."""
+    """Return a `std_msgs/msg/String` in CDR."""
     data = text.encode() + b"\0"
     return _LITTLE_ENDIAN + struct.pack("<I", len(data)) + data
 
 
-def urdf(robot: str, frames: Sequence[Placed], entities: Iterable[Entity]) -> str:
+def urdf(robot: str, frames: Sequence[FrameTransform], entities: Iterable[Entity]) -> str:
     """Return the model: a link for each frame and its parents, a visual for each solid.
 
     Args:
-        robot: its name.
-        frames: as one tree; only who hangs on whom counts.
-        entities: the bodies, each in one of these frames; arrows are left out.
+        robot: name of the robot.
+        frames: frames that form one tree; only parents and children matter.
+        entities: bodies, each in one of these frames; arrows are ignored.
     """
     root = ET.Element("robot", name=robot)
     names = dict.fromkeys(name for row in frames for name in (row.parent, row.child))
@@ -51,12 +51,12 @@ def urdf(robot: str, frames: Sequence[Placed], entities: Iterable[Entity]) -> st
 
 def _add_visual(link: ET.Element, name: str, solid: Solid) -> None:
     visual = ET.SubElement(link, "visual", name=name)
-    ET.SubElement(visual, "origin", xyz=_listed(solid.at))
+    ET.SubElement(visual, "origin", xyz=_listed(solid.position))
     geometry = ET.SubElement(visual, "geometry")
     x, _, z = solid.size
-    if solid.form == "cube":
+    if solid.shape == "cube":
         ET.SubElement(geometry, "box", size=_listed(solid.size))
-    elif solid.form == "cylinder":
+    elif solid.shape == "cylinder":
         ET.SubElement(geometry, "cylinder", radius=str(x / 2), length=str(z))
     else:
         ET.SubElement(geometry, "sphere", radius=str(x / 2))

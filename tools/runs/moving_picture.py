@@ -101,8 +101,8 @@ def world_frames(robot: RobotConfig, pose: RobotPose) -> dict[str, tuple[Array, 
     for frame in scene.frames(robot, pose):
         origin, rotation = placed[frame.parent]
         placed[frame.child] = (
-            origin + rotation @ np.array(frame.at),
-            rotation @ _matrix(frame.turn),
+            origin + rotation @ np.array(frame.position),
+            rotation @ _matrix(frame.rotation),
         )
     return placed
 

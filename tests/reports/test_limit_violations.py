@@ -1,4 +1,4 @@
-"""When a figure first went beyond its limit: the lines of the timeline that say so."""
+"""Rows of the timeline for the first violation of each limit."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from hypothesis import strategies as st
 from shared import topics
 from shared.traces import LinkEvent
 from tests.reports import runs
-from tools.reports.limit_violations import crossings, first_beyond
+from tools.reports.limit_violations import first_violation, limit_violations
 from tools.reports.page_model import TimelineEvent
 from tools.reports.run_data import RunData
 from tools.runs.run_log import RunLog
 
 T_S = 2.5
-"""When something happens in these logs; the scenario's time."""
+"""Time of the changes in these logs, scenario time."""
 
 
 def changed(
     log: RunLog, directory: Path, name: str, change: Callable[[float, dict[str, Any]], object]
 ) -> list[TimelineEvent]:
-    """Return the crossings of a log of which one key's messages are changed."""
+    """Return the violations in a log after a change of one key's messages."""
     zero_ns = RunData(log).zero_ns
 
     def payload(key: str, body: bytes) -> bytes:
@@ -37,35 +37,35 @@ def changed(
         change((message["t_ns"] - zero_ns) / 1e9, message)
         return msgspec.json.encode(message)
 
-    return list(crossings(RunData(runs.rewritten(log, directory, payload=payload))))
+    return list(limit_violations(RunData(runs.rewritten(log, directory, payload=payload))))
 
 
-def test_a_run_within_its_limits_has_none(log: RunLog) -> None:
-    assert list(crossings(RunData(log))) == []
+def test_a_run_within_its_limits_has_no_violation(log: RunLog) -> None:
+    assert list(limit_violations(RunData(log))) == []
 
 
-def test_a_sole_that_tips_is_told_with_its_first_time_and_how_long(
-    log: RunLog, tmp_path: Path
-) -> None:
+def test_a_tilted_sole_has_a_row_with_first_time_and_duration(log: RunLog, tmp_path: Path) -> None:
     def tip(t: float, truth: dict[str, Any]) -> None:
         if T_S <= t < T_S + 0.2 or T_S + 0.5 <= t < T_S + 0.6:
             truth["foot_left_tilt"] = 0.05
 
-    # the planner was killed at 1 s: a tilt has no limit any more after that
+    # the planner is killed at 1 s: from then on a tilt has no limit
     assert changed(log, tmp_path / "after", "sim/truth", tip) == []
-    begins = T_S - 2.0
+    begin_s = T_S - 2.0
 
     def tip_early(t: float, truth: dict[str, Any]) -> None:
         tip(t + 2.0, truth)
 
     (found,) = changed(log, tmp_path / "before", "sim/truth", tip_early)
     assert (found.kind, found.mark) == ("limit", "")
-    assert found.t == pytest.approx(begins, abs=0.011)
-    assert found.text.startswith("left sole's tilt: over 0.02 rad, the limit while led")
-    assert "0.20 s in all" in found.text, "the second stretch is after the kill"
+    assert found.t == pytest.approx(begin_s, abs=0.011)
+    assert found.text.startswith(
+        "left sole's tilt: over 0.02 rad, the limit while the planner leads"
+    )
+    assert "0.20 s in total" in found.text, "the second interval is after the kill"
 
 
-def test_after_the_kill_the_com_has_the_limit_of_a_robot_that_is_not_led(
+def test_after_the_kill_the_com_has_the_limit_without_a_leading_planner(
     log: RunLog, tmp_path: Path
 ) -> None:
     def lean(t: float, truth: dict[str, Any]) -> None:
@@ -74,24 +74,24 @@ def test_after_the_kill_the_com_has_the_limit_of_a_robot_that_is_not_led(
 
     (found,) = changed(log, tmp_path, "sim/truth", lean)
     assert found.t == pytest.approx(T_S + 0.5, abs=0.011)
-    assert "COM x: over 80 mm, the limit while not led" in found.text
+    assert "COM x: over 80 mm, the limit while the planner does not lead" in found.text
 
 
-@pytest.mark.parametrize(("lasts_s", "told"), [(0.012, False), (0.1, True)])
-def test_a_torque_at_its_limit_is_told_unless_it_was_a_moment(
-    log: RunLog, tmp_path: Path, lasts_s: float, told: bool
+@pytest.mark.parametrize(("duration_s", "reported"), [(0.012, False), (0.1, True)])
+def test_a_torque_at_its_limit_has_a_row_unless_it_was_short(
+    log: RunLog, tmp_path: Path, duration_s: float, reported: bool
 ) -> None:
     def push(t: float, state: dict[str, Any]) -> None:
-        if T_S <= t < T_S + lasts_s:
+        if T_S <= t < T_S + duration_s:
             state["tau"] = [-100.0, 15.6]
 
     found = changed(log, tmp_path, "joint/knee_left/state", push)
-    assert bool(found) is told
-    if told:
+    assert bool(found) is reported
+    if reported:
         assert found[0].text.startswith("knee_left: torque at its limit of 115.6 N m")
 
 
-def test_a_joint_beyond_its_stop_is_told_once_the_drives_are_armed(
+def test_a_joint_beyond_its_stop_has_a_row_once_the_drives_are_armed(
     log: RunLog, tmp_path: Path
 ) -> None:
     armed_s = RunData(log).armed_s()
@@ -105,7 +105,7 @@ def test_a_joint_beyond_its_stop_is_told_once_the_drives_are_armed(
     assert found.text.startswith("knee_right_theta: beyond a soft stop")
 
 
-def test_a_margin_under_the_least_is_told_with_how_far_it_fell(log: RunLog, tmp_path: Path) -> None:
+def test_a_margin_below_the_least_has_a_row_with_its_minimum(log: RunLog, tmp_path: Path) -> None:
     def soften(t: float, status: dict[str, Any]) -> None:
         if T_S <= t < T_S + 0.1:
             status["margin"] = -0.25
@@ -115,10 +115,10 @@ def test_a_margin_under_the_least_is_told_with_how_far_it_fell(log: RunLog, tmp_
 
 
 @pytest.mark.parametrize("on_purpose", [True, False])
-def test_hold_is_not_led_only_where_the_network_was_impaired_on_purpose(
+def test_hold_has_the_other_limits_only_if_the_network_was_impaired_on_purpose(
     log: RunLog, tmp_path: Path, on_purpose: bool
 ) -> None:
-    """The verdict's rule: a module that drops out otherwise is no excuse."""
+    """Rule of the verdict: a module that drops out for another reason changes no limit."""
     zero_ns = RunData(log).zero_ns
     link = "planner->ankle_right"
     event = LinkEvent(
@@ -128,7 +128,7 @@ def test_hold_is_not_led_only_where_the_network_was_impaired_on_purpose(
     more = [(zero_ns, topics.LINK_EVENT.name, msgspec.json.encode(event))]
 
     def unplugged(name: str, body: bytes) -> bytes:
-        """As if none had been killed; hip_left's drive is lost at 3.2 s, and then all six hold."""
+        """No service is killed; hip_left's drive is lost at 3.2 s, and then all six hold."""
         message = msgspec.json.decode(body)
         if name == "run/event":
             message["scenario_s"], message["t_ns"] = 9.0, zero_ns + 9_000_000_000
@@ -138,17 +138,17 @@ def test_hold_is_not_led_only_where_the_network_was_impaired_on_purpose(
         return msgspec.json.encode(message)
 
     again = runs.rewritten(log, tmp_path, payload=unplugged, more=more if on_purpose else ())
-    told = " ".join(row.text for row in crossings(RunData(again)))
-    assert ("operator's force: over 40 N" in told) is not on_purpose
+    texts = " ".join(row.text for row in limit_violations(RunData(again)))
+    assert ("operator's force: over 40 N" in texts) is not on_purpose
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=50))
-def test_the_time_beyond_a_limit_is_that_of_the_samples_beyond_it(beyond: list[bool]) -> None:
+def test_the_duration_of_a_violation_is_that_of_its_samples(beyond: list[bool]) -> None:
     t = np.arange(len(beyond)) * 0.01
-    found = first_beyond("x", t, np.array(beyond))
+    found = first_violation("x", t, np.array(beyond))
     if not any(beyond):
         assert found is None
         return
     assert found is not None
     assert found.t == pytest.approx(0.01 * beyond.index(True))
-    assert found.lasts_s == pytest.approx(0.01 * sum(beyond[:-1]))
+    assert found.duration_s == pytest.approx(0.01 * sum(beyond[:-1]))
