@@ -25,69 +25,94 @@ Modules = tuple[int, int, int, int, int, int]
 
 
 class Mode(IntEnum):
-    """State of a joint service (docs/architecture.md#age-rule)."""
+    """Mode of a joint service (docs/architecture.md#modes)."""
 
     DISARMED = 0
+    """No torque; the drive is not armed."""
     HOLD = 1
+    """References frozen; stands on local gains."""
     TRACK = 2
+    """Follows the planner's commands."""
     DAMP = 3
+    """After an emergency stop: sinks slowly."""
     FAULT = 4
+    """The drive, or its position, is lost; left by a restart only."""
 
 
 class Cause(IntEnum):
-    """Why a joint service changed its state."""
+    """Cause of the last change of mode."""
 
     NONE = 0
+    """No change so far."""
     DRIVE_ARMED = 1
+    """The drive is armed."""
     COMMANDS_FRESH = 2
+    """Commands were fresh for long enough."""
     COMMAND_STALE = 3
+    """The newest command is too old."""
     HOLD_ALL = 4
+    """The planner asks all six modules to hold."""
     ESTOP = 5
+    """Emergency stop."""
     DRIVE_LOST = 6
+    """No frames from the drive."""
     DRIVE_DISARMED = 7
+    """The drive left closed loop by itself."""
     POSITION_LOST = 8
-    """The drive does not know where its joint is: unzeroed, or its samples jump."""
+    """The joint's position is unknown: the drive is unzeroed, or its samples jump."""
     SHAKING = 9
-    """It tripped by itself (`shared.trip_table`), as by the two that follow."""
+    """A trip of this module (`shared.trip_table`)."""
     TORQUE_LIMIT = 10
+    """A trip of this module."""
     TOO_FAST = 11
+    """A trip of this module."""
 
 
 class Trip(IntEnum):
-    """What the planner does not lead for (`shared.trip_table`)."""
+    """Trip of the planner: why it does not lead (`shared.trip_table`)."""
 
     NONE = 0
     LEGS = 1
+    """The legs disagree about the torso's pose."""
     REACH = 2
+    """The reference pose is out of reach."""
     TRACKING = 3
+    """A joint is far from its reference."""
     UNLOADED = 4
+    """A leg carries hardly any load."""
     SINKING = 5
+    """The torso sinks or rises too fast."""
     TURNING = 6
+    """The torso turns too fast."""
     HARNESS = 7
+    """The harness force is far from the requested assist."""
     SAGGING = 8
+    """The person sinks with weight on the harness."""
     UNATTENDED = 9
+    """The robot drifts and nobody holds it."""
 
 
 class Outside(IntEnum):
-    """Which number of a command a joint service does not believe (`services.joint.envelope`)."""
+    """Part of a command that lies outside the envelope (`services.joint.envelope`)."""
 
     NOTHING = 0
+    """The command is inside."""
     K_P = 1
     K_D = 2
     TAU_FF = 3
     DTAU_FF = 4
     TAU_COUPLED = 5
     Q_REF = 6
-    """Too far from where the joint is."""
+    """Too far from the joint's position."""
     V_REF = 7
     TORQUE_STEP = 8
-    """It would change the torque faster than the law does."""
+    """The torque would change faster than the law changes it."""
     MARGIN = 9
-    """It tells a margin that no gains may leave with."""
+    """The margin is below the least that the planner may publish."""
 
 
 class DriveStatus(IntEnum):
-    """What a module's two axes are, together."""
+    """Status of a module's two axes together."""
 
     LOST = 0
     """No frames, or the link is down."""
@@ -98,65 +123,70 @@ class DriveStatus(IntEnum):
     ERROR = 3
     """At least one axis reports an error or left closed loop by itself."""
     UNZEROED = 4
-    """Both axes answer, but have not been told where they are since they got power."""
+    """Both axes answer, but the zero was lost with the power."""
     HOLDING = 5
-    """Both axes are in closed loop by a service that is no more, and wait to be taken over."""
+    """Both axes are in closed loop by an earlier service and wait for the take-over."""
 
 
 class PlannerMode(IntEnum):
-    """What the planner asks of the six modules."""
+    """Mode of the planner: what it asks of the six modules."""
 
     WAITING = 0
-    """Not every module's state is fresh: nothing but `hold` can be said."""
+    """Some module's state is stale: all hold."""
     ALIGNING = 1
     """All six states are fresh; commands start from the measured pose, still with `hold`."""
     LEADING = 2
     """All six track."""
     OVERLOADED = 3
-    """The harness carries more than it may: `hold` until it has been let go for a while."""
+    """The harness is overloaded: all hold until it has been released for a while."""
     UNCERTIFIED = 4
-    """No local gains stand alone in this pose: `hold`."""
+    """No local gains stand alone in this pose: all hold."""
     MISPLACED = 5
-    """The feet stand farther from where the robot file has them than `law.stance_max`, or have just
-    been moved: `hold`."""
+    """The feet are farther from their place than `law.stance_max`, or were just moved: all hold."""
     TRIPPED = 6
-    """Something was beyond its limit (`PlannerStatus.trip`): `hold` until all has been calm."""
+    """A limit was exceeded (`PlannerStatus.trip`): all hold until all values are calm."""
     MISLOADED = 7
-    """Its load is farther from the robot file than `law.load_correction`, or not known yet because
-    it hung on a hoist: `hold`."""
+    """The load is farther from the robot file than `law.load_correction`, or not yet weighed after
+    hanging on a hoist: all hold."""
 
 
 class SplitSource(IntEnum):
-    """Where the local gains of a tick come from (docs/law.md#gain-split)."""
+    """Source of a tick's local gains (docs/law.md#gain-split)."""
 
     DIAGONAL = 0
-    """diag(K_q), as configured."""
+    """The paper's split, diag(K_q)."""
     SCHEDULE = 1
     """The certified schedule."""
     STIFFENED = 2
-    """The certificate was not met by these: stiffer ones that meet it."""
+    """Stiffer gains, because the schedule's did not meet the certificate."""
     UNCERTIFIED = 3
-    """None met it; `hold`."""
+    """None met the certificate: all hold."""
 
 
 class Tare(IntEnum):
-    """Whether the harness sensor knows its zero."""
+    """Zero of the harness sensor."""
 
     RUNNING = 0
     """The zero is being averaged; the harness must be unloaded and still."""
     UNSTEADY = 1
-    """So it is, but the forces moved too much for a zero so far: it began anew."""
+    """As RUNNING, but the forces moved too much: averaging started over."""
     DONE = 2
+    """The zero is known."""
 
 
 class RunEventKind(IntEnum):
-    """What happened to a run from outside."""
+    """Kind of an event of a run."""
 
     STARTED = 0
+    """The scenario started."""
     KILLED = 1
+    """A service got a signal."""
     RESTARTED = 2
+    """A service was started or continued."""
     PUSHED = 3
+    """A push began."""
     FINISHED = 4
+    """The scenario ended."""
     FAULTED = 5
     """A drive's fault began; the subject is the module, the detail the kind."""
 
@@ -165,9 +195,9 @@ class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True,
     """Base of all messages: the sender's monotonic time and a sequence number."""
 
     t_ns: int
-    """Sender's monotonic clock when the content was true."""
+    """Sender's monotonic time at which the content was true."""
     seq: int
-    """Counts up by one for each message of this sender on this key."""
+    """Sequence number: one more for each message of this sender on this key."""
 
 
 class JointState(Message, frozen=True):
@@ -177,17 +207,17 @@ class JointState(Message, frozen=True):
     """
 
     q: Pair
-    """Joint angles in rad."""
+    """Joint angles (phi, theta), rad."""
     v: Pair
-    """Joint rates in rad/s."""
+    """Joint rates, rad/s."""
     tau: Pair
-    """Joint torques sent to the drive in this cycle, in N m, after the gate."""
+    """Joint torques sent to the drive in this cycle, N m, after the limiter."""
     mode: int
-    """`Mode`."""
+    """Mode of the service."""
     cause: int
-    """`Cause` of the last change of mode; 0 before the first."""
+    """Cause of the last change of mode; 0 before the first."""
     ready: bool
-    """True if fresh commands have come for long enough to track, were `hold` lifted."""
+    """True if commands have been fresh for long enough to track as soon as `hold` is lifted."""
     age_ns: int
     """Age of the newest command in use (docs/architecture.md#age-rule); -1 if there is none."""
     session: int
@@ -199,61 +229,64 @@ class JointState(Message, frozen=True):
     late: int
     """Cycles that came later than twice the period after the one before."""
     dropouts: int
-    """Drop-outs remembered by the re-engagement hysteresis."""
+    """Recent drop-outs that lengthen the wait before TRACK."""
     refused: int
     """Commands refused since the start: old, foreign, out of order or out of limits."""
     drive: int
-    """`DriveStatus`."""
+    """Status of the drive."""
     drive_error: int
-    """The drives' error bits, both axes or-ed; 0 if none."""
+    """Error bits of both axes, or-ed; 0 if none."""
     stiffened: bool = False
-    """True while this module holds with all of its stand gains, for another may be limp."""
+    """True while this module holds with all of its stand gains because another may be limp."""
     outside: int = 0
-    """`Outside`: why the newest command was not believed; 0 if it was."""
+    """Part of the newest command that lies outside the envelope; 0 if none."""
 
 
 class JointCommand(Message, frozen=True):
     """References, local gains and torques for one module (docs/law.md#references-and-age)."""
 
     session: int
-    """Drawn at random when the planner starts."""
+    """Random number of this planner's life."""
     echo_t_ns: int
-    """The `t_ns` of this module's own newest state: age is told on one clock."""
+    """The `t_ns` of this module's newest state: the age is measured on the module's clock."""
     hold: bool
-    """True asks for HOLD (`hold_all`): no leg is to work against the other."""
+    """True asks for HOLD, so that no leg works against the other."""
     q_ref: Pair
-    """rad"""
+    """Joint reference, rad."""
     v_ref: Pair
-    """rad/s"""
+    """Rate of the reference, rad/s."""
     tau_ff: Pair
-    """N m"""
+    """Feedforward torque, N m."""
     dtau_ff: Pair
-    """N m/s"""
+    """Rate of the feedforward torque, N m/s."""
     tau_coupled: Pair
-    """What the local gains lack of the body's stiffness and damping, low-passed, and the eased
-    lead, in N m; dropped in HOLD."""
+    """Coupled torque, N m: stiffness and damping of the body beyond the local gains, low-passed,
+    plus the eased lead; dropped in HOLD."""
     k_p: Pair
-    """Local stiffness D in N m/rad."""
+    """Local stiffness D, N m/rad."""
     k_d: Pair
-    """Local damping in N m s/rad."""
+    """Local damping D_B, N m s/rad."""
     margin: float
-    """Failsafe certificate of these gains, all six modules (docs/law.md#certificate): 1 is the
-    stiffness required, 0 is a fall."""
+    """Margin of the failsafe certificate for all six modules' gains: 1 is the stiffness required, 0
+    is a fall (docs/law.md#certificate)."""
     margin_onboard: float
-    """The same with the joint services gone and the drives' own loops left."""
+    """The same with the drives' own loops only."""
     stiffen: bool = False
-    """True while another may be limp: this module in HOLD is to rise to all its stand gains."""
+    """True while another module may be limp: in HOLD this one raises its gains to the stand
+    gains."""
 
 
 class JointEvent(Message, frozen=True):
-    """A change of state of a joint service."""
+    """A change of mode of a joint service."""
 
     mode_before: int
+    """Mode before the change."""
     mode_after: int
+    """Mode after the change."""
     cause: int
-    """`Cause`."""
+    """Cause of the change."""
     age_ns: int
-    """Command age at the change; -1 if there was no command."""
+    """Age of the newest command at the change; -1 if there was none."""
     tau_before: Pair
     """Torque of the last cycle before the change, N m."""
     tau_after: Pair
@@ -261,121 +294,128 @@ class JointEvent(Message, frozen=True):
 
 
 class Wrench(Message, frozen=True):
-    """What the operator does to the torso at the harness point.
+    """Wrench of the operator on the torso, at the harness point.
 
-    In torso axes, for the sensor is fixed to the torso. The robot's assist on the
-    operator is the opposite.
+    Torso axes, because the sensor is fixed to the torso. The assist on the operator is the
+    opposite.
     """
 
     force: Vector3
-    """N, torso axes."""
+    """Force, N, torso axes."""
     moment: Vector3
-    """N m, torso axes, about the harness point."""
+    """Moment about the harness point, N m, torso axes."""
     valid: bool
-    """False while the sensor is stale, saturated or without a zero: the numbers are then
-    the last good ones."""
+    """False while the sensor is stale, saturated or without a zero: the numbers are the last good
+    ones."""
     saturated: bool
+    """True while a leg of the sensor is at its limit."""
     tare: int
-    """`Tare`."""
+    """Zero of the sensor."""
     age_ns: int
-    """Age of the sensor sample, by the harness service's clock."""
+    """Age of the sensor's sample on the harness service's clock."""
 
 
 class Attitude(Message, frozen=True):
-    """Which way is up, as the IMU on the torso has it."""
+    """Direction of up, from the IMU on the torso."""
 
     up: Vector3
     """Unit vector against gravity, torso axes."""
     rate: Vector3
     """Angular velocity of the torso, rad/s, torso axes."""
     valid: bool
-    """False while the sensor is silent or says that it does not know: the numbers are then the
-    last good ones."""
+    """False while the sensor is silent or reports no fix: the numbers are the last good ones."""
     age_ns: int
-    """Age of the sensor's sample, by the IMU service's clock; -1 before the first."""
+    """Age of the sensor's sample on the IMU service's clock; -1 before the first."""
 
 
 class TareRequest(Message, frozen=True):
-    """Asks the harness service for a new zero: what acts now is to read as nothing."""
+    """Asks the harness service for a new zero: the present wrench shall read as nothing."""
 
     source: str
-    """Who asks, in words."""
+    """Name of the sender."""
 
 
 class PlannerStatus(Message, frozen=True):
-    """What the planner saw and decided in one tick."""
+    """Inputs and decisions of one planner tick."""
 
     session: int
+    """Random number of this planner's life."""
     mode: int
-    """`PlannerMode`."""
+    """Mode of the planner."""
     hold: bool
+    """True if the commands of this tick ask for HOLD."""
     p: Vector6
-    """Measured [COM x y z in m; torso roll, pitch, yaw in rad], world."""
+    """Measured pose: COM x y z, m; torso roll, pitch, yaw, rad; world."""
     pdot: Vector6
+    """Rate of the pose."""
     p_ref: Vector6
+    """Reference of the pose."""
     closure: Vector6
-    """Left minus right leg's estimate of the torso pose: m and rad, world."""
+    """Left minus right leg's estimate of the torso's pose, m and rad, world."""
     assist_n: float
     """Assist force in the feedforward, N."""
     margin: float
-    """Failsafe certificate, as in the commands; 0 before the first tick."""
+    """Margin of the failsafe certificate, as in the commands; 0 before the first tick."""
     margin_onboard: float
+    """The same with the drives' own loops only."""
     split: int
-    """`SplitSource`."""
+    """Source of the local gains."""
     ik_iterations: int
+    """Steps of the inverse kinematics."""
     ik_residual: float
+    """Largest residual of the inverse kinematics, m or rad."""
     tick_us: float
-    """Time this tick took: from reading the inputs to the last command put."""
+    """Duration of this tick, from reading the inputs to the last command put."""
     state_seq: Modules
     """Sequence number of the state consumed from each module."""
     wrench_seq: int
+    """Sequence number of the wrench consumed; -1: none yet."""
     assist_requested_n: float
-    """Assist that the operator asked for, N, as this tick took it."""
+    """Assist requested by the operator, N."""
     state_age_ns: Modules
-    """Time since each module's newest state arrived, by the planner's clock; -1 if none yet."""
+    """Time since each module's newest state arrived, on the planner's clock; -1 if none yet."""
     wait_s: float = 0.0
-    """Until it may lead again after drop-outs, s; 0 if nothing is waited for."""
+    """Time until it may lead again after drop-outs, s; 0 if it does not wait."""
     attitude_seq: int = -1
-    """Sequence number of the attitude that this tick knew; -1: none yet."""
+    """Sequence number of the attitude consumed; -1: none yet."""
     slope: Pair = (0.0, 0.0)
-    """Rise of the floor along x and y that the law reckons with, rad."""
+    """Rise of the floor along x and y in the law, rad."""
     shift_requested: Vector4 = STRAIGHT
-    """What the operator asked for, as this tick took it: x, y, m, roll, yaw, rad."""
+    """Shift requested by the operator: x, y, m; roll, yaw, rad."""
     stance: Vector6 = AS_CONFIGURED
-    """The right foot against the left as the law takes them, beyond the robot file: x, y, z in m
-    and a rotation vector in rad, world axes."""
+    """Place of the right foot relative to the left, as deviation from the robot file: x, y, z, m,
+    and a rotation vector, rad, world axes."""
     why: str = ""
-    """Why it does not lead, in words, where the mode does not say it all."""
+    """Reason for not leading, in words, where the mode does not say it all."""
     trip: int = 0
-    """`Trip`: what it does not lead for."""
+    """Trip for which it does not lead."""
     load: Vector3 = (0.0, 0.0, 0.0)
-    """What it carries beyond the robot file: kg, and its moments a and b about pitch, N m
+    """Load beyond the robot file: kg, and moments a and b about pitch, N m
     (`services.planner.load`)."""
     requested_by: str = ""
-    """`OperatorIntent.source` of the intent that is given now; "": none, or it has gone stale."""
+    """Source of the intent in use; empty: none, or it is stale."""
 
 
 class OperatorIntent(Message, frozen=True):
-    """What the person asks for beyond leading by hand."""
+    """Requests of the person beyond leading by hand."""
 
     assist_n: float
-    """Upward force wanted at the harness, N."""
+    """Requested upward force at the harness, N."""
     shift: Vector4 = STRAIGHT
-    """Where the closed directions are wanted, off a straight stand: COM x and y, m, the torso's
-    roll and yaw, rad."""
+    """Requested offset from a straight stand: COM x and y, m; torso's roll and yaw, rad."""
     source: str = ""
-    """Who asks, in words."""
+    """Name of the sender."""
 
 
 class Estop(Message, frozen=True):
-    """The emergency stop: every module goes to DAMP, and leaves it by a restart only."""
+    """Emergency stop: every module goes to DAMP; only a restart leaves it."""
 
     source: str
-    """Who stopped, in words."""
+    """Name of the sender."""
 
 
 class SimTruth(Message, frozen=True):
-    """The simulated world as it really is; no controller reads it."""
+    """True state of the simulated world; no controller reads it."""
 
     scenario_s: float
     """Scenario time; negative until the scenario starts."""
@@ -386,29 +426,31 @@ class SimTruth(Message, frozen=True):
     angles: Vector3
     """Torso roll, pitch, yaw (3-1-2), rad."""
     operator_force: Vector3
-    """Spring-damper force of the operator's hand on the torso, N, world."""
+    """Force of the operator's hand on the torso, N, world."""
     operator_moment: Vector3
-    """N m"""
+    """Moment of the operator's hand on the torso, N m."""
     load_n: float
-    """Weight the operator rests on the harness, N."""
+    """Weight that the operator rests on the harness, N."""
     harness_force_z: float
-    """Upward force the robot gives the operator: the load less what the hand lifts, N."""
+    """Upward force of the robot on the operator: the load minus the hand's lift, N."""
     push: Vector3
     """Push on the torso, N, world."""
     foot_right_tilt: float
     """Angle between the right sole and the floor, rad."""
     foot_left_tilt: float
+    """Angle between the left sole and the floor, rad."""
     feet_slip: float
     """Largest distance of an ankle from where it stood at the start, m."""
     hoist: float
-    """Share of the hoist's support: 1 hanging, 0 free."""
+    """Fraction of the hoist's support: 1 hanging, 0 free."""
     fallen: bool
+    """True once the robot has fallen."""
     real_time_factor: float
     """Simulated time over wall time since the scenario started."""
     late_s: float
     """World time lost so far because the machine was too slow, s."""
     lean: Pair = (0.0, 0.0)
-    """How far up leans against the floor's normal along x and y, m/m: on a slope not zero."""
+    """Lean of up against the floor's normal along x and y, m/m; not zero on a slope."""
 
     @property
     def over(self) -> Pair:
@@ -418,19 +460,20 @@ class SimTruth(Message, frozen=True):
 
 
 class SimControl(Message, frozen=True):
-    """A word from a tool to the simulated world."""
+    """Command of a tool to the simulated world."""
 
     start: bool
     """Start the scenario: its time becomes zero."""
 
 
 class RunEvent(Message, frozen=True):
-    """Something a tool did to the run, for the log and the verdict."""
+    """An action of a tool on the run, for the log and the verdict."""
 
     kind: int
-    """`RunEventKind`."""
+    """Kind of the event."""
     subject: str
-    """The service, or the push."""
+    """Service or push."""
     detail: str
-    """The signal, or the push in words."""
+    """Signal, or push in words."""
     scenario_s: float
+    """Scenario time, s."""

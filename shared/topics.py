@@ -71,7 +71,7 @@ JOINT_TRACE: Final = Topic(
     rate_hz=50.0,
     priority=Priority.BACKGROUND,
     recorded=True,
-    why="every cycle's inputs: a joint service is executed again from them, bit for bit",
+    why="every cycle's inputs: a joint service can be re-executed from them, bit for bit",
 )
 PLANNER_CHECKPOINT: Final = Topic(
     name="planner/checkpoint",
@@ -79,7 +79,7 @@ PLANNER_CHECKPOINT: Final = Topic(
     rate_hz=1.0,
     priority=Priority.BACKGROUND,
     recorded=True,
-    why="where the planner can be executed again from",
+    why="the planner's state: re-execution can start here",
 )
 WRENCH: Final = Topic(
     name="harness/wrench",
@@ -87,7 +87,7 @@ WRENCH: Final = Topic(
     rate_hz=250.0,
     priority=Priority.DATA,
     recorded=True,
-    why="what the operator does to the torso",
+    why="wrench of the operator on the torso",
 )
 ATTITUDE: Final = Topic(
     name="imu/attitude",
@@ -95,7 +95,7 @@ ATTITUDE: Final = Topic(
     rate_hz=100.0,
     priority=Priority.DATA,
     recorded=True,
-    why="which way is up, where an IMU is fitted",
+    why="direction of up, where an IMU is fitted",
 )
 HARNESS_TARE: Final = Topic(
     name="harness/tare",
@@ -103,7 +103,7 @@ HARNESS_TARE: Final = Topic(
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,
-    why="asks for a new zero of the harness sensor",
+    why="request for a new zero of the harness sensor",
 )
 PLANNER_STATUS: Final = Topic(
     name="planner/status",
@@ -111,7 +111,7 @@ PLANNER_STATUS: Final = Topic(
     rate_hz=250.0,
     priority=Priority.DATA,
     recorded=True,
-    why="what the law saw and decided",
+    why="inputs and decisions of the law",
 )
 OPERATOR_INTENT: Final = Topic(
     name="operator/intent",
@@ -119,7 +119,7 @@ OPERATOR_INTENT: Final = Topic(
     rate_hz=50.0,
     priority=Priority.DATA,
     recorded=True,
-    why="the assist that the person asks for, and where the robot is to lean or turn",
+    why="assist and shift that the person requests",
 )
 ESTOP: Final = Topic(
     name="estop",
@@ -127,7 +127,7 @@ ESTOP: Final = Topic(
     rate_hz=0.0,
     priority=Priority.REAL_TIME,
     recorded=True,
-    why="every module to DAMP",
+    why="emergency stop: every module to DAMP",
 )
 SIM_TRUTH: Final = Topic(
     name="sim/truth",
@@ -135,7 +135,7 @@ SIM_TRUTH: Final = Topic(
     rate_hz=100.0,
     priority=Priority.BACKGROUND,
     recorded=True,
-    why="the verdict is judged on it; no controller reads it",
+    why="true state of the world, for the verdict; no controller reads it",
 )
 SIM_STATE: Final = Topic(
     name="sim/state",
@@ -143,7 +143,7 @@ SIM_STATE: Final = Topic(
     rate_hz=10.0,
     priority=Priority.BACKGROUND,
     recorded=True,
-    why="the simulated world, complete: `xrl whatif` goes on from it",
+    why="complete simulated world: `xrl whatif` continues from it",
 )
 SIM_CONTROL: Final = Topic(
     name="sim/control",
@@ -159,7 +159,7 @@ RUN_EVENT: Final = Topic(
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,
-    why="kills, restarts and pushes, for the verdict",
+    why="kills, restarts, faults and pushes, for the verdict",
 )
 LINK_EVENT: Final = Topic(
     name="link/event",
@@ -167,7 +167,7 @@ LINK_EVENT: Final = Topic(
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,
-    why="what is done to the network on purpose: an experiment without it is no evidence",
+    why="impairments of the network on purpose: a log without them is no evidence",
 )
 
 TOPICS: Final = (

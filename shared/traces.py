@@ -1,7 +1,6 @@
-"""Messages for the log: what a service was given, and what was done to the network.
+"""Messages for the log: inputs of the services, and impairments of the network.
 
-From the first each cycle is executed again. On the bus like all others; nobody but the
-recorder listens.
+Re-execution reads them. They are on the bus like all others; only the recorder subscribes.
 """
 
 from __future__ import annotations
@@ -12,108 +11,117 @@ from shared.messages import Message, Pair
 
 
 class CycleTrace(msgspec.Struct, gc=False, frozen=True):
-    """All that one cycle of a joint service was given, and what it decided."""
+    """Inputs and decision of one cycle of a joint service."""
 
     now_ns: int
+    """The cycle's time."""
     sampled_ns: int
-    """When the drive's sample came; -1: none came, and the next six fields say nothing."""
+    """Arrival of the drive's sample; -1: none came, and the next six fields are void."""
     pos: Pair
     """Motor positions from the joint's zero, turns."""
     vel: Pair
-    """turn/s"""
+    """Motor rates, turn/s."""
     status: int
-    """`DriveStatus`."""
+    """Status of the drive."""
     error: int
+    """Error bits of the drive."""
     carried: Pair
-    """Motor torques that a drive told which was found armed, N m,"""
+    """Motor torques of a drive that was found armed, N m; valid if `carries`."""
     carries: bool
-    """if this says so."""
+    """True if `carried` is valid."""
     session: int
-    """Of the command that came in this cycle,"""
+    """Session of the command that came in this cycle; see `command_seq`."""
     command_seq: int
-    """and its number; -1: none came."""
+    """Sequence number of the command that came in this cycle; -1: none came."""
     estop: bool
+    """True while the emergency stop is engaged."""
     drive_command: int
-    """What the drive was told: 0 nothing, 1 torques, 2 a target, 3 idle, 4 to arm, 5 no zero."""
+    """Command to the drive: 0 nothing, 1 torques, 2 a target, 3 idle, 4 arm, 5 forget the zero."""
     tau: Pair
-    """Joint torques of this cycle, N m, after the gate."""
+    """Joint torques of this cycle, N m, after the limiter."""
     below: Pair = (0.0, 0.0)
-    """Theta and rate of ankle and knee together, as a hip knew them, rad, rad/s,"""
+    """For a hip: theta and rate of ankle and knee together, rad, rad/s; valid if `knows_below`."""
     knows_below: bool = False
-    """if this says so."""
+    """True if `below` is valid."""
     sinks: bool = True
-    """For a knee: it knew of no reason not to sink."""
+    """For a knee: it saw no reason not to sink."""
     stiffen: bool = False
-    """It knew of a limp module that it stiffens for."""
+    """It saw a limp module that it stiffens for."""
 
 
 class JointTrace(Message, frozen=True):
-    """Cycles of a joint service, one after the other: from these it is executed again."""
+    """Consecutive cycles of a joint service: enough to execute them again."""
 
     snapshot: str
-    """Once in a while, what the service knew before the first of these cycles, as JSON; else
-    empty."""
+    """Once in a while the service's state before the first of these cycles, as JSON; else empty."""
     cycles: tuple[CycleTrace, ...]
+    """The cycles, oldest first."""
 
 
 class PlannerCheckpoint(Message, frozen=True):
-    """What the planner knew before a tick: from here it is executed again."""
+    """State of the planner before a tick: execution can start here."""
 
     session: int
+    """Random number of this planner's life."""
     snapshot: str
-    """JSON."""
+    """State, as JSON."""
 
 
 class SimState(Message, frozen=True):
-    """The simulated world and its drives, complete: a run can be gone on with from here."""
+    """Complete state of the simulated world and its drives: a run can continue from here."""
 
     scenario_s: float
     """Scenario time; negative until the scenario starts."""
     qpos: tuple[float, ...]
-    """MuJoCo's position, m, quaternion, rad."""
+    """MuJoCo's positions, m, quaternion, rad."""
     qvel: tuple[float, ...]
-    """m/s, rad/s"""
+    """MuJoCo's velocities, m/s, rad/s."""
     warmstart: tuple[float, ...]
     """MuJoCo's qacc_warmstart."""
     hoist: float
-    """Share of the hoist's support: 1 hanging, 0 free."""
+    """Fraction of the hoist's support: 1 hanging, 0 free."""
     armed: tuple[int, ...]
-    """1 for each axis in closed loop; 12 of each from here on."""
+    """1 for each axis in closed loop; 12 values, as in all that follow."""
     input_pos: tuple[float, ...]
-    """Turns, as the drive counts them."""
+    """Position targets, turns as the drive counts them."""
     input_vel: tuple[float, ...]
-    """turn/s"""
+    """Velocity targets, turn/s."""
     input_torque: tuple[float, ...]
-    """N m"""
+    """Feedforward torques, N m."""
     pos_gain: tuple[float, ...]
-    """1/s"""
+    """Position gains, 1/s."""
     vel_gain: tuple[float, ...]
-    """N m s/turn"""
+    """Velocity gains, N m s/turn."""
     counts_from: tuple[float, ...]
-    """What each encoder counts at the true zero."""
+    """Count of each encoder at the true zero."""
     hidden: tuple[float, ...]
-    """Of the plant: the person, the rotors and torques on their way, as `World.hidden`."""
+    """Hidden state of the plant: the person, the rotors and torques on their way, as
+    `World.hidden`."""
 
 
 class LinkEvent(Message, frozen=True):
-    """What is done to one direction of a link has changed."""
+    """A change of the impairment of one direction of a link."""
 
     link: str
-    """One direction, of `shared.links`."""
+    """One direction, as named in `shared.links`."""
     requested: str
-    """As it was asked for: that direction, or a group of them."""
+    """The link as requested: this direction, or a group of directions."""
     number: int
-    """The same for all directions of one impairment, and for its beginning and its end."""
+    """Number of the impairment: the same for all its directions, and for its begin and end."""
     active: bool
-    """True: from now on, unless a partition or what begins later hides it; False: it is over."""
+    """True from the begin on, unless a partition or a later impairment hides it; False at its
+    end."""
     delay_ms: float
+    """Delay."""
     jitter_ms: float
+    """Jitter."""
     loss: float
+    """Fraction of lost messages."""
     partition: bool
+    """True if nothing passes."""
     detail: str
-    """All of it in words, as `--inject` takes it."""
+    """The impairment in the words of `--inject`."""
     passed: int
-    """Messages (live: batches of Zenoh's) that went through while it was in force; 0 when it
-    begins."""
+    """Messages (live: Zenoh batches) that passed while it was active; 0 at the begin."""
     lost: int
-    """Messages that it took away."""
+    """Messages lost to it."""
