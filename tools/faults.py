@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     console.print(
         "[bold]A drive's fault.[/] Its module goes to FAULT, and the planner has the other five "
         "HOLD. An axis that disarms floats; its sibling keeps its torque until the service idles "
-        "it, at once. Nothing takes hold again unasked: mend it, then restart the module's "
+        "it, at once. Nothing is re-armed automatically: mend it, then restart the module's "
         "service (`xrl kill MODULE`).\n"
     )
     for kind, row in DRIVE_FAULTS.items():
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"[bold]{name}[/]")
         _say(console, "module", loss.module)
         _say(console, "others", loss.others)
-        _say(console, "you see", loss.told)
+        _say(console, "you see", loss.visible)
         _say(console, "it ends", loss.recovery)
     console.print(
         "\n[bold]What trips.[/] Noticed while the robot is led, by each module or by the planner: "
