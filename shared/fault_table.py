@@ -120,9 +120,9 @@ LOSSES: Final[dict[str, LossRow]] = {
         "its drive's own loop holds, with the coupled torque frozen",
         "HOLD: the planner asks for it when the module's state is stale",
         "`xrl status`: no states, restarts; planner/status: hold",
-        "automatic: the supervisor restarts it; it takes the drive over when a planner is there and "
-        "all track again. A hung service: `xrl kill`. If the drive lost torque meanwhile: hang the "
-        "robot, then `xrl kill`",
+        "automatic: the supervisor restarts it; it takes the drive over once a planner is there, "
+        "and all track again. A hung service: `xrl kill`. If the drive lost torque meanwhile: hang "
+        "the robot, then `xrl kill`",
     ),
     "planner killed or hung": LossRow(
         "HOLD within max_command_age: local gains, references frozen",

@@ -101,25 +101,25 @@ class DriveManager:
         self._gear_ratio = config.joint.gear_ratio
         self._estop = last_state is LastState.DAMP
         self._holding = False
-        """The drive was found armed, and has not been taken over."""
+        """True while a drive that was found armed has not been taken over."""
         self._arm_at_ns = 0
         self._idle_at_ns = 0
         self._tries = 0
         self._forgets = config.drive.zero_mark_turns > 0.0
         self._target: MotorTarget | None = None
-        """The last that the drive was told."""
+        """The last target sent to the drive."""
         self._last_cycle_ns = 0
         self._listen_until_ns = 0
-        """Listening after a gap; 0: not."""
+        """End of flushing the link after a gap; 0: no gap."""
 
     @property
     def needs_neighbours(self) -> bool:
-        """True while it matters what the neighbours do: in HOLD and DAMP."""
+        """True while the neighbours' states are used: in HOLD and DAMP."""
         return self.controller.failsafe.mode in (Mode.HOLD, Mode.DAMP)
 
     @property
     def leaves_holding(self) -> bool:
-        """True if the drive holds the robot by its own loop should the service end now."""
+        """True if the drive goes on holding by its own loop when the service ends now."""
         mode, lost = self.controller.failsafe.mode, self.controller.cause is Cause.DRIVE_LOST
         holds = mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP) or (mode is Mode.FAULT and lost)
         return self.onboard and (holds or self._holding)
@@ -132,7 +132,7 @@ class DriveManager:
         estop: bool,
         near: NeighbourView = UNKNOWN,
     ) -> DriveAction:
-        """Run one cycle; arguments as for `JointController.step`, and `estop` is remembered."""
+        """Run one cycle; arguments as for `JointController.step`; `estop` latches."""
         self._estop = self._estop or estop
         if self._tries == 0 and reading is not None and reading.status is DriveStatus.ARMED:
             reading = self._found_armed(now_ns, reading)
@@ -176,7 +176,7 @@ class DriveManager:
         return DriveAction(result.event, order, torque, target, ArmingInhibit.NONE)
 
     def snapshot(self) -> DriveManagerState:
-        """Return the state; it shares what still changes, so use it at once."""
+        """Return the state; `restore` continues from it."""
         return DriveManagerState(
             controller=self.controller.snapshot(),
             gains=self._law.gains,
@@ -205,7 +205,7 @@ class DriveManager:
         self.last_state, self._holding = m.last_state, m.holding
 
     def _resumed(self, now_ns: int, result: CycleResult, tau_before: Pair) -> CycleResult:
-        """Return the cycle's result with the torque that the drive, left alone, carries."""
+        """Return the cycle's result with the torque that the drive carried without commands."""
         samples, carried = self.controller.samples, tau_before
         if self._target is not None:
             carried = self._law.carried(self._target, samples.pos, samples.vel)
@@ -216,12 +216,12 @@ class DriveManager:
         return CycleResult(tau, event)
 
     def _in_fault(self, now_ns: int) -> DriveCommand:
-        """Return what the drive of a module in FAULT is to be told.
+        """Return the command to the drive of a module in FAULT.
 
-        A lost one that holds by its own loop is left alone: should the link come back, it
-        holds still, unless it has let go in the meantime, and be it one axis. Any other is to
-        be idle, and one that has lost its position is to know no zero: an encoder that comes
-        back may have missed turns.
+        A lost drive that may hold by its own loop gets no command: when the link comes back it
+        still holds, unless one of its axes lost torque meanwhile. Any other drive goes idle. A
+        drive that lost its position also forgets its zero: a failed encoder that comes back may
+        have missed turns.
         """
         samples, cause = self.controller.samples, self.controller.cause
         if cause is Cause.DRIVE_LOST and self.onboard and samples.status in _MAY_HOLD:
@@ -236,13 +236,13 @@ class DriveManager:
         return DriveCommand.NOTHING
 
     def _found_armed(self, now_ns: int, reading: DriveReading) -> DriveReading:
-        """Return the reading of a drive that somebody else has armed.
+        """Return the reading of a drive that was found armed.
 
-        One that holds the robot by its own loop, after the service before this one died, is
-        taken over as it is, once it has told its torques, and with the gains that the planner has
-        the other five hold on. Until one is heard it is left alone: a knee taken over with its
-        stand gains beside one that holds on soft ones rolled the torso, and the robot tipped
-        while the hand led on. Any other drive is not armed by us.
+        A drive that holds by its own loop after its service died is taken over as it is: once its
+        torques are known, and with the gains on which the other five hold. Until a planner sends
+        those it gets no command: a knee taken over with stand gains, beside one that holds on soft
+        gains, rolled the torso, and the robot tipped while the hand led on. Without the onboard
+        loop an armed drive is not ours.
         """
         if not self.onboard:
             return msgspec.structs.replace(reading, status=DriveStatus.IDLE)
@@ -255,22 +255,22 @@ class DriveManager:
         return reading
 
     def _is_to_be_taken_over(self, reading: DriveReading | None) -> bool:
-        """Return True if the drive may hold the module by its own loop: first it is taken over.
+        """Return True if the drive may hold by its own loop: it is taken over before a stop.
 
-        An emergency stop of a module whose drive is not known would make a law of nothing.
+        An emergency stop needs the drive's torque to start from.
         """
         if not self.onboard or self.controller.failsafe.mode is not Mode.DISARMED:
             return False
         return reading is None or reading.status in _MAY_HOLD
 
     def _new_last_state(self, mode: Mode) -> LastState:
-        """Return what a service that dies now leaves to the next."""
+        """Return the last state for the next service, in case this one dies now."""
         if mode is Mode.DISARMED:
             return self.last_state
         return LastState.DAMP if mode is Mode.DAMP or self._estop else LastState.HELD
 
     def _obstacle(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
-        """Return what keeps the drive from being armed now; None: nothing is known of it."""
+        """Return what inhibits arming now; None if the drive is silent."""
         if reading is None or reading.status is DriveStatus.LOST:
             return None
         self._arm_at_ns = now_ns + ARM_EVERY_NS
@@ -278,7 +278,7 @@ class DriveManager:
             return ArmingInhibit.WAITING if reading.torque is not None else None
         self._holding = False
         if reading.status is DriveStatus.UNZEROED:
-            self.last_state = LastState.NOTHING  # whoever zeroes it asks for it
+            self.last_state = LastState.NOTHING  # zeroing it is a request to arm it
             return ArmingInhibit.UNZEROED
         if self.last_state is not LastState.NOTHING:
             return ArmingInhibit.LET_GO

@@ -1,7 +1,7 @@
-"""States of a joint service and what makes a command usable (docs/architecture.md#age-rule).
+"""Modes of a joint service and the age rule (docs/architecture.md#age-rule).
 
-Pure: state, now, inputs -> state. The transitions are one table; `tests/safety` sweeps
-every state against every event.
+Pure: state, now, inputs -> state. The transitions are one table; `tests/safety` sweeps every mode
+against every event.
 
     DISARMED -> HOLD <-> TRACK;  any of them -> DAMP (e-stop);  any armed -> FAULT (drive or
     its position lost)
@@ -21,7 +21,7 @@ from shared.messages import Cause, JointCommand, Mode, Outside
 
 
 class Event(IntEnum):
-    """What a cycle can bring, the gravest first: one event a cycle is acted on."""
+    """Events of a cycle, the gravest first; each cycle acts on one."""
 
     ESTOP = 0
     DRIVE_LOST = 1
@@ -38,7 +38,7 @@ class Event(IntEnum):
 
 
 TRIPS: Final = (Event.SHAKING, Event.TORQUE_LIMIT, Event.TOO_FAST)
-"""What a module sees of itself while it tracks (`services.joint.trips`)."""
+"""Trips that a module detects by itself while it tracks (`services.joint.trips`)."""
 
 
 TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
@@ -71,19 +71,19 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
     },
     Mode.FAULT: {},
 }
-"""What is not listed stays where it is. DAMP and FAULT are left by a restart only: a robot
-under load never stiffens again by itself."""
+"""(mode, event) -> (next mode, cause); an event that is not listed changes nothing. Only a restart
+leaves DAMP and FAULT: a robot under load never stiffens again by itself."""
 
 
 class Timing(msgspec.Struct, frozen=True):
-    """The failsafe's times and limits, in ns where not said otherwise."""
+    """Times, ns, and limits of the failsafe, SI."""
 
     max_command_age_ns: int
     engage_after_ns: int
     engage_after_max_ns: int
     dropout_forget_ns: int
     dropouts_max: int
-    """As many double the wait to its maximum; more would only be slower to forget."""
+    """Drop-outs that double the wait up to its maximum; more would only take longer to forget."""
     k_p_max: float
     k_d_max: float
     v_max: float
@@ -107,7 +107,7 @@ def timing_of(config: RobotConfig) -> Timing:
 
 
 class Refusal(IntEnum):
-    """Why a command is not taken; the one rule of docs/architecture.md#age-rule."""
+    """Reason to refuse a command (docs/architecture.md#age-rule)."""
 
     NONE = 0
     TOO_OLD = 1
@@ -126,22 +126,22 @@ class Failsafe(msgspec.Struct):
 
     mode: Mode = Mode.DISARMED
     command: JointCommand | None = None
-    """The newest command taken."""
+    """The newest accepted command."""
     session: int = 0
-    """Session of the commands that are taken; 0 before the first."""
+    """Session of the accepted commands; 0 before the first."""
     retired: tuple[int, ...] = ()
-    """Sessions that were current once: they never become so again."""
+    """Earlier sessions; their commands are refused for good."""
     fresh_since_ns: int = -1
-    """Since when commands have been usable without a break; -1 if they are not."""
+    """Start of the unbroken time with usable commands; -1 if there is none."""
     dropouts: int = 0
-    """Drop-outs not yet forgotten: each doubles the wait before TRACK."""
+    """Recent drop-outs; each doubles the wait before TRACK."""
     steady_since_ns: int = 0
-    """Since when nothing has dropped out or been forgotten."""
+    """Time of the last drop-out, or of the last one forgotten."""
     refused: int = 0
     outside: Outside = Outside.NOTHING
-    """Why the newest command that could have been taken was not believed."""
+    """Part of the newest usable command that lies outside the envelope."""
     judged_ns: int = 0
-    """When that was: what is old is told no more."""
+    """Time of that judgement; an old one is no longer reported."""
 
     def offer(
         self,
@@ -150,13 +150,13 @@ class Failsafe(msgspec.Struct):
         timing: Timing,
         outside: Outside = Outside.NOTHING,
     ) -> Refusal:
-        """Take a command if it is usable; count it if not.
+        """Accept a command if it is usable; count it as refused if not.
 
         Args:
-            command: what came.
-            now_ns: this module's clock.
+            command: the received command.
+            now_ns: this module's monotonic clock.
             timing: times and limits.
-            outside: what `services.joint.envelope` says of it.
+            outside: judgement of `services.joint.envelope`.
         """
         refusal = self._judge(command, now_ns, timing)
         if refusal in (Refusal.NONE, Refusal.OUT_OF_LIMITS):
@@ -176,31 +176,31 @@ class Failsafe(msgspec.Struct):
 
     @property
     def asks_to_stiffen(self) -> bool:
-        """True in HOLD if the newest command taken says that another module may be limp."""
+        """True in HOLD if the newest accepted command says that another module may be limp."""
         return self.mode is Mode.HOLD and self.command is not None and self.command.stiffen
 
     def age_ns(self, now_ns: int) -> int:
-        """Return the age of the newest command taken, by this module's clock; -1 if none."""
+        """Return the age of the newest accepted command on this module's clock; -1 if none."""
         return now_ns - self.command.echo_t_ns if self.command is not None else -1
 
     def disbelieves(self, now_ns: int, timing: Timing) -> Outside:
-        """Return why the newest command was not believed, if it came within the age rule."""
+        """Return the part of the newest command outside the envelope, while that is recent."""
         old = now_ns - self.judged_ns > timing.max_command_age_ns
         return Outside.NOTHING if old else self.outside
 
     def usable(self, now_ns: int, timing: Timing) -> bool:
-        """Return True if the newest command taken is still young enough."""
+        """Return True if the newest accepted command is within the age limit."""
         return (
             self.command is not None
             and now_ns - self.command.echo_t_ns <= timing.max_command_age_ns
         )
 
     def engage_after_ns(self, timing: Timing) -> int:
-        """Return how long commands must be fresh before TRACK: doubled by each drop-out."""
+        """Return the time of fresh commands before TRACK, ns; each drop-out doubles it."""
         return min(timing.engage_after_ns << self.dropouts, timing.engage_after_max_ns)
 
     def ready(self, now_ns: int, timing: Timing) -> bool:
-        """Return True if this module can track, and fresh commands are believed for long enough."""
+        """Return True if this module can track and accepted commands for long enough."""
         return (
             self.mode in (Mode.HOLD, Mode.TRACK)
             and self.outside is Outside.NOTHING
@@ -216,7 +216,7 @@ class Failsafe(msgspec.Struct):
         estop: bool,
         trip: Event = Event.NONE,
     ) -> Cause | None:
-        """Go one cycle on; return the cause if the mode changed.
+        """Advance by one cycle; return the cause if the mode changed.
 
         Args:
             now_ns: this module's clock.
@@ -226,17 +226,17 @@ class Failsafe(msgspec.Struct):
             trip: one of `TRIPS`, or NONE.
         """
         fresh = self.usable(now_ns, timing)
-        # a new session took over from a current one that went stale in this very cycle
+        # a new session replaced a current one that went stale in this cycle
         broken = self.mode is Mode.TRACK and self.fresh_since_ns < 0
         if not fresh or self.mode is Mode.DISARMED:
-            self.fresh_since_ns = -1  # what came before the drive was armed does not count
+            self.fresh_since_ns = -1  # commands from before arming do not count
         elif self.fresh_since_ns < 0:
             self.fresh_since_ns = now_ns
         gone = estop or drive not in (Event.NONE, Event.DRIVE_ARMED)
         event = self._event(now_ns, timing, drive, estop, fresh and not broken)
         if trip is not Event.NONE and self.mode is Mode.TRACK and not gone:
             event = trip
-            self.fresh_since_ns = now_ns  # what tripped waits, as after a drop-out
+            self.fresh_since_ns = now_ns  # after a trip it waits as after a drop-out
         row = TRANSITIONS[self.mode].get(event)
         self._count_dropouts(now_ns, timing, event)
         if row is None:
@@ -276,7 +276,7 @@ class Failsafe(msgspec.Struct):
         if age > timing.max_command_age_ns:
             return Refusal.TOO_OLD
         if command.session != self.session:
-            # a foreign session takes over only where nothing current is left to lose
+            # another session takes over only when no usable command of the present one is left
             if command.session in self.retired or self.usable(now_ns, timing):
                 return Refusal.FOREIGN_SESSION
         elif self.command is not None and command.seq <= self.command.seq:

@@ -32,7 +32,7 @@ from shared.traces import JointTrace
 READ_TIMEOUT_S: Final = 0.005
 """A cycle without an encoder sample runs all the same: ages and the failsafe go on."""
 
-TELL_EVERY_NS: Final = 10 * NS_PER_S
+REPORT_EVERY_NS: Final = 10 * NS_PER_S
 """What keeps a drive from being armed is said so often."""
 
 _WHY_NOT: Final = {
@@ -43,7 +43,7 @@ _WHY_NOT: Final = {
     ArmingInhibit.LET_GO: "the drive held the robot and lost torque while no service ran: drive "
     "error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
     ArmingInhibit.WAITING: "the drive holds by its own loop; it is taken over once a planner is "
-    "heard",
+    "there",
     ArmingInhibit.WILL_NOT: f"asked for {ARM_TRIES} times: drive error 0x{{error:x}}",
 }
 
@@ -59,7 +59,7 @@ class JointPorts(msgspec.Struct, frozen=True):
 
 
 class JointLoop:
-    """Read, decide, write, publish: once for each encoder sample."""
+    """One cycle for each encoder sample: read, decide, write, publish."""
 
     def __init__(
         self,
@@ -70,15 +70,15 @@ class JointLoop:
         last_state: RearmGuard | None = None,
         neighbours: Neighbours | None = None,
     ) -> None:
-        """Take the module's parts.
+        """Take the parts of the service.
 
         Args:
             config: the robot.
-            module: what it does in a cycle.
-            drive: its drive.
-            ports: its ends of the bus.
-            last_state: where it leaves what its successor has to know, and hears of a stop.
-            neighbours: what it shares with the other five on this host.
+            module: decisions of a cycle.
+            drive: the module's drive.
+            ports: publishers and subscribers.
+            last_state: shared memory for the next service of this module, and for a local stop.
+            neighbours: shared memory of the six services on this host.
         """
         service = config.joint_service
         self._last_state, self._neighbours = last_state, neighbours
@@ -87,17 +87,17 @@ class JointLoop:
         self._drive = drive
         self._ports = ports
         self._tracer = Tracer(module)
-        self._told = ArmingInhibit.NONE
-        self._tell_at_ns = 0
+        self._reported = ArmingInhibit.NONE
+        self._report_at_ns = 0
         self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._nowhere = (-config.drive.zero_mark_turns,) * 2
 
     def run(self, stop: StopFlag) -> None:
-        """Run until told to stop.
+        """Run until a signal stops it.
 
-        Told alone (SIGTERM), the service leaves a drive that holds by its own loop holding:
-        the robot stands on it, and the next service takes it over. When the fleet goes down
-        (SIGINT) the drive is left idle.
+        On SIGTERM the service ends alone: a drive that holds by its own loop goes on holding, the
+        robot stands on it, and the next service takes it over. On SIGINT the fleet goes down: the
+        drive is left idle.
         """
         while not stop:
             self.cycle()
@@ -134,17 +134,17 @@ class JointLoop:
         if trace is not None:
             ports.traces.put(trace)
         if step.event is not None or step.obstacle is not ArmingInhibit.NONE:
-            self._tell(now, step)
+            self._report(now, step)
 
     def _is_stopped_here(self, now: int) -> bool:
-        """Return True if this host says so: someone on it, or a pendant that is silent."""
+        """Return True if a local emergency stop is set, or the pendant is silent."""
         last_state = self._last_state
         if last_state is None:
             return False
         return self._pendant.is_lost(now, last_state.beats) or last_state.stop_asked
 
     def _write(self, step: DriveAction) -> None:
-        """Carry out the order of this cycle."""
+        """Send this cycle's command to the drive."""
         drive, order = self._drive, step.order
         if step.target is not None:
             drive.write(step.target)
@@ -155,11 +155,11 @@ class JointLoop:
         elif order is DriveCommand.IDLE:
             drive.idle()
         elif order is DriveCommand.FORGET_ZERO:
-            with suppress(DriveError):  # it is gone: no zero is left to be forgotten
+            with suppress(DriveError):  # the drive is gone, and its zero with it
                 drive.set_position(self._nowhere)
 
-    def _tell(self, now: int, step: DriveAction) -> None:
-        """Log what a person has to know; nothing is controlled then, and a line does no harm."""
+    def _report(self, now: int, step: DriveAction) -> None:
+        """Log what a person must know; the module is not controlled then, so a log line is safe."""
         samples = self._module.controller.samples
         if step.event is not None and step.event.cause == Cause.ESTOP and self._pendant.lost:
             log.get("xrl").error("emergency stop: the pendant is silent")
@@ -169,8 +169,8 @@ class JointLoop:
                 Cause(step.event.cause).name,
                 samples.error,
             )
-        told = step.obstacle is self._told and now < self._tell_at_ns
-        if step.obstacle is not ArmingInhibit.NONE and not told:
-            self._told, self._tell_at_ns = step.obstacle, now + TELL_EVERY_NS
+        reported = step.obstacle is self._reported and now < self._report_at_ns
+        if step.obstacle is not ArmingInhibit.NONE and not reported:
+            self._reported, self._report_at_ns = step.obstacle, now + REPORT_EVERY_NS
             why = _WHY_NOT[step.obstacle].format(q=samples.q, error=samples.error)
             log.get("xrl").error("not armed: %s", why)
