@@ -9,7 +9,7 @@ from __future__ import annotations
 from own_drive import BenchDrive
 
 from services.joint.drive_manager import DriveCommand, DriveManager
-from shared.config_file import load
+from shared.config.files import load
 from shared.process import DEFAULT_CONFIG
 
 

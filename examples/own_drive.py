@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
-from shared.messages import Pair
 
 GEAR_RATIO = 17.5
 INERTIA = 0.5  # kg m^2 at the joint

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 from services.simulator.operator import HandForce, Operator
-from shared.config_file import load
+from shared.config.files import load
+from shared.config.scenarios import Keyframe, Lead, Scenario
 from shared.process import DEFAULT_CONFIG
-from shared.scenarios import Keyframe, Lead, Scenario
 from tools.runs.lockstep import Lockstep
 
 LIMIT = 12.0  # N

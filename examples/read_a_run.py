@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shared import topics
+from shared.bus import topics
 from tools.runs.run_log import read_run
 
 

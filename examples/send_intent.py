@@ -9,11 +9,11 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from shared import topics
-from shared.bus import open_session
+from shared.bus import topics
+from shared.bus.messages import OperatorIntent, PlannerStatus
+from shared.bus.session import open_session
 from shared.clock import now_ns
-from shared.config_file import load
-from shared.messages import OperatorIntent, PlannerStatus
+from shared.config.files import load
 from shared.process import default_run_dir
 from tools.supervision.supervise import SupervisedFleet
 

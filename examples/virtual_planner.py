@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from shared.config_file import load
-from shared.messages import Mode
+from shared.bus.messages import Mode
+from shared.config.files import load
+from shared.config.scenarios import Keyframe, Kill, Restart, Scenario
 from shared.process import DEFAULT_CONFIG
-from shared.scenarios import Keyframe, Kill, Restart, Scenario
 from tools.runs.lockstep import Lockstep
 
 SQUAT = Scenario(

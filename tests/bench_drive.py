@@ -6,9 +6,9 @@ import math
 
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Pair
+from shared.config.robot_config import RobotConfig
 
 START: Pair = (0.03, -1.0)
 STEP_NS = NS_PER_S // 1000

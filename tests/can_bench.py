@@ -14,7 +14,7 @@ from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.can_link import BUS_OFF
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
-from shared.cansimple import (
+from shared.can.cansimple import (
     AxisState,
     Command,
     Heartbeat,
@@ -23,7 +23,7 @@ from shared.cansimple import (
     pack_two_floats,
     split_id,
 )
-from shared.config_sections import CanConfig
+from shared.config.sections import CanConfig
 from tests.test_odrive_can import DRIVE, NODES
 
 TARGET = MotorTarget((0.25, -0.5), (1.0, -2.0), (0.5, -0.25), (30.0, 40.0), (0.05, 0.06))

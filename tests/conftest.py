@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from hypothesis import Phase, settings
 
-from shared import config_file
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 
 # A busy machine is no failed claim: no time limit for one example.
 settings.register_profile("no_deadline", deadline=None)

@@ -48,25 +48,25 @@ SOURCES = {
 IMPORTS = {file: imports_in(source) for file, source in SOURCES.items()}
 
 VENDORS = {
-    "zenoh": ["shared/bus.py"],
+    "zenoh": ["shared/bus/session.py"],
     "mujoco": ["services/simulator/world.py", "services/simulator/body.py"],
     "pinocchio": ["services/planner/model.py"],
     "cvxpy": ["services/planner/split_program.py"],
     "casadi": [
         "services/planner/symbolic.py",
         "services/simulator/drivetrain.py",
-        "shared/compiled_graph.py",
+        "shared/robot/compiled_graph.py",
     ],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
     "mcap": ["services/recorder/mcap_log.py", "tools/reexecution/rewritten.py"],
     "foxglove": ["tools/reports/foxglove.py"],
     "supervisor": ["tools/supervision/*.py"],
     "can": [
-        "shared/unix_can.py",
+        "shared/can/unix_can.py",
         "services/joint/drivers/odrive_can.py",
         "services/joint/drivers/odrive_frames.py",
         "services/joint/drivers/can_link.py",
-        "shared/can_sensor.py",
+        "shared/can/can_sensor.py",
         "tools/bringup/can_monitor.py",
     ],
 }
@@ -87,8 +87,8 @@ LAWS = [
     "services/joint/drivers/firmware.py",
     "services/joint/drivers/wired_drive.py",
     "services/joint/setpoint_law.py",
-    "shared/can_load.py",
-    "shared/fault_table.py",
+    "shared/can/can_load.py",
+    "shared/robot/fault_table.py",
     "tools/bringup/jogging.py",
     "services/planner/assist.py",
     "services/planner/torque_breakdown.py",
@@ -139,7 +139,7 @@ LAWS = [
 IMPURE = {
     "asyncio", "can", "datetime", "logging", "multiprocessing", "odrive", "os", "queue", "random",
     "secrets", "select", "signal", "socket", "subprocess", "sys", "threading", "time", "zenoh",
-    "shared.bus", "shared.log", "shared.process", "shared.unix_can",
+    "shared.bus.session", "shared.log", "shared.process", "shared.can.unix_can",
 }  # fmt: skip
 
 LINES_MAX = 600

@@ -9,10 +9,10 @@ import pytest
 from rich.text import Text
 
 from services.planner.planner import Planner
-from shared.config import RobotConfig
+from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
-from shared.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
-from shared.scenarios import SCENARIO
 from tools import assist
 
 WISH = OperatorIntent(t_ns=1, seq=0, assist_n=80.0, shift=(0.02, 0.0, 0.0, 0.0), source="me")

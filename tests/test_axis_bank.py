@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.simulator.axis_bank import AXIS_NAMES, FAULTS, AxisBank, AxisErrors
-from shared.cansimple import AxisError, AxisState, ControllerError, ControlMode, InputMode
+from shared.can.cansimple import AxisError, AxisState, ControllerError, ControlMode, InputMode
 from shared.exceptions import DriveError
 from tests.simulator.banks import CPR, DRIVE, DT, ZERO, make_bank
 

@@ -13,14 +13,15 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared import config_file, topics
-from shared.bus import Latest, Publisher, Session, open_session, peers_of
-from shared.config import SERVICES
+from shared.bus import topics
+from shared.bus.messages import Estop, JointCommand, JointEvent, Wrench
+from shared.bus.session import Latest, Publisher, Session, open_session, peers_of
+from shared.bus.topics import Topic
+from shared.config import files as config_file
+from shared.config.robot_config import SERVICES
 from shared.exceptions import BusError
-from shared.joints import MODULES
-from shared.messages import Estop, JointCommand, JointEvent, Wrench
 from shared.process import DEFAULT_CONFIG
-from shared.topics import Topic
+from shared.robot.joints import MODULES
 
 ROOT = Path(__file__).resolve().parent.parent
 ROBOT = config_file.load(DEFAULT_CONFIG)
@@ -29,9 +30,10 @@ TOOL = "test"
 PRELUDE = """
 import os, sys, time
 from pathlib import Path
-from shared import config_file, topics
-from shared.bus import open_session
-from shared.messages import Estop, JointCommand, JointEvent
+from shared.config import files as config_file
+from shared.bus import topics
+from shared.bus.session import open_session
+from shared.bus.messages import Estop, JointCommand, JointEvent
 from shared.process import DEFAULT_CONFIG
 robot, run_dir = config_file.load(DEFAULT_CONFIG), Path(sys.argv[1])
 """

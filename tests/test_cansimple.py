@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared import cansimple
-from shared.cansimple import AxisError, AxisState, Command, Heartbeat
+from shared.can import cansimple
+from shared.can.cansimple import AxisError, AxisState, Command, Heartbeat
 
 float32 = st.floats(width=32, allow_nan=False)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from shared import cansimple_06
-from shared.cansimple import AxisState
-from shared.cansimple_06 import (
+from shared.can import cansimple_06
+from shared.can.cansimple import AxisState
+from shared.can.cansimple_06 import (
     Command06,
     DriveError06,
     Heartbeat06,

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.codec import Decoder, encode
+from shared.bus.codec import Decoder, encode
+from shared.bus.messages import JointCommand, Message
+from shared.bus.topics import JOINT_STATE, TOPICS, WRENCH, Topic, all_keys, keys
 from shared.exceptions import NonFiniteError
-from shared.joints import MODULES
-from shared.messages import JointCommand, Message
-from shared.topics import JOINT_STATE, TOPICS, WRENCH, Topic, all_keys, keys
+from shared.robot.joints import MODULES
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 NOT_FINITE = (math.nan, math.inf, -math.inf)

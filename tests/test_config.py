@@ -14,13 +14,13 @@ import msgspec
 import pytest
 import tomli_w
 
-from shared import config_file
-from shared.config import RobotConfig, expand
-from shared.config_check import INTERFACES
+from shared.config import files as config_file
+from shared.config.checks import INTERFACES
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.scenarios import Fault, Scenario
+from shared.config.toml_file import Range
 from shared.exceptions import ConfigError
-from shared.joints import MODULES
-from shared.scenarios import Fault, Scenario
-from shared.toml_file import Range
+from shared.robot.joints import MODULES
 from tests.conftest import ROBOT_FILE
 
 Table = dict[str, Any]

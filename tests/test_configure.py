@@ -18,11 +18,11 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from shared.config import RobotConfig, expand
-from shared.config_sections import CanConfig
-from shared.drive_settings import of_module
+from shared.can.drive_settings import of_module
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.sections import CanConfig
 from shared.exceptions import DriveError, FleetError
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 from tests.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools import cli, configure
 from tools.bringup import backup, changes, reach

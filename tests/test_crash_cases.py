@@ -6,10 +6,10 @@ import re
 
 import pytest
 
-from shared import scenarios
-from shared.config import OPTIONAL, SERVICES
-from shared.joints import MODULES
-from shared.scenarios import FAULT_KINDS, Fault, FaultKind, Kill
+from shared.config import scenarios
+from shared.config.robot_config import OPTIONAL, SERVICES
+from shared.config.scenarios import FAULT_KINDS, Fault, FaultKind, Kill
+from shared.robot.joints import MODULES
 from tools import crashtest
 from tools.crash.cases import (
     BACK_S,

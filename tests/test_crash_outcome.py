@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import msgspec
 import pytest
 
-from shared import scenarios
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
+from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tools.crash.cases import (
     BACK_S,
     CASES,

@@ -11,11 +11,11 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from shared.config import RobotConfig
+from shared.bus.messages import Mode, RunEvent, RunEventKind
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Kill
 from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.messages import Mode, RunEvent, RunEventKind
-from shared.scenarios import Kill
+from shared.robot.joints import MODULES
 from tests.test_cli import assert_one_line_error, xrl
 from tools import crashtest
 from tools.crash import report, runner

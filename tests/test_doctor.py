@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from shared import cansimple
-from shared.cansimple import Command
-from shared.cansimple_06 import Command06
+from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.can.cansimple_06 import Command06
 from shared.process import DEFAULT_CONFIG
 from tools import cli
 from tools.supervision import procfs
@@ -74,7 +74,7 @@ def test_nothing_is_wrong_with_the_emulated_robot_as_shipped(run_dir: Path) -> N
 
 RECORDED = """
 import contextlib, json, sys
-from shared import unix_can
+from shared.can import unix_can
 from tools import cli
 from tools.bringup import reach
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from shared.config.scenarios import FAULT_KINDS, Fault
 from shared.exceptions import ConfigError
-from shared.gain_schedule import path_beside
 from shared.process import DEFAULT_CONFIG
-from shared.scenarios import FAULT_KINDS, Fault
+from shared.robot.gain_schedule import path_beside
 from tools.runs import experiment
 
 

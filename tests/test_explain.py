@@ -9,11 +9,11 @@ import pytest
 
 from services.planner.kinematics import Kinematics
 from services.planner.torque_breakdown import torque_breakdown
-from shared import topics
-from shared.config import RobotConfig
-from shared.joints import JOINTS, MODULES, N_JOINTS
-from shared.messages import PlannerStatus
-from shared.robot_model import stand_pose
+from shared.bus import topics
+from shared.bus.messages import PlannerStatus
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import JOINTS, MODULES, N_JOINTS
+from shared.robot.robot_model import stand_pose
 from tools import cli, explain
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run

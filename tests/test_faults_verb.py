@@ -7,9 +7,9 @@ from argparse import Namespace
 
 import pytest
 
-from shared.fault_table import DRIVE_FAULTS, LOSSES
 from shared.process import DEFAULT_CONFIG
-from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
+from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools import faults
 
 

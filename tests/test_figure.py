@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from matplotlib.figure import Figure
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tools import cli
 from tools.runs import figure, verdict
 from tools.runs.run_log import RunLog, read_run

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from shared.config import SERVICES
-from shared.config_file import load
+from shared.bus.links import PAIRS
+from shared.config.files import load
+from shared.config.robot_config import SERVICES
 from shared.exceptions import ConfigError, FleetError
-from shared.joints import MODULES
-from shared.links import PAIRS
 from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
 from tools.supervision import fleet
 from tools.supervision.run_dir import RunDir, supervisor_config
 

@@ -15,11 +15,12 @@ import msgspec
 import pytest
 import tomli_w
 
-from shared import config_file, gain_schedule
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.gain_schedule import digest_of, inputs_of
-from shared.gain_table import GainSchedule
+from shared.robot import gain_schedule
+from shared.robot.gain_schedule import digest_of, inputs_of
+from shared.robot.gain_table import GainSchedule
 from tests.conftest import ROBOT_FILE
 
 INPUTS = inputs_of(config_file.load(ROBOT_FILE))

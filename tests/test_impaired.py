@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from shared.bus.links import DIRECTIONS, directions_of
+from shared.bus.messages import PlannerMode, PlannerStatus, SimTruth
+from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_S
-from shared.impairment import Direction, Impairment
-from shared.impairment_schedule import ImpairmentSchedule
-from shared.links import DIRECTIONS, directions_of
-from shared.messages import PlannerMode, PlannerStatus, SimTruth
-from shared.scenarios import Inject
-from shared.traces import LinkEvent
+from shared.config.scenarios import Inject
+from shared.network.impairment import Direction, Impairment
+from shared.network.impairment_schedule import ImpairmentSchedule
 from tests.recorder.runs import sample
 from tools.runs import verdict_table
 from tools.runs.impairment_intervals import impairments, touches

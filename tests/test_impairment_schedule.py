@@ -6,12 +6,12 @@ import math
 
 import pytest
 
+from shared.bus.links import COMMANDS, DIRECTIONS, WRENCHES
+from shared.bus.traces import LinkEvent
 from shared.exceptions import ConfigError
-from shared.impairment import Direction, Impairment
-from shared.impairment_schedule import ImpairmentSchedule
-from shared.links import COMMANDS, DIRECTIONS, WRENCHES
-from shared.proxy_protocol import RequestedImpairment
-from shared.traces import LinkEvent
+from shared.network.impairment import Direction, Impairment
+from shared.network.impairment_schedule import ImpairmentSchedule
+from shared.network.proxy_protocol import RequestedImpairment
 
 CUT = Impairment(partition=True)
 LATE = Impairment(delay_ms=5.0)

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from shared import codec, topics
-from shared.messages import JointState, Wrench
-from shared.traces import LinkEvent
+from shared.bus import codec, topics
+from shared.bus.messages import JointState, Wrench
+from shared.bus.traces import LinkEvent
 from tests.recorder import runs
 from tests.recorder.runs import OFFSET_NS, ROBOT, STATE_KEY, Queue
 from tools import cli

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from shared.links import COMMANDS
-from shared.proxy_protocol import RequestedImpairment
-from shared.scenarios import Inject
+from shared.bus.links import COMMANDS
+from shared.config.scenarios import Inject
+from shared.network.proxy_protocol import RequestedImpairment
 from tools import cli, inject
 
 BEGUN = RequestedImpairment(1, "planner->joints", "delay=30ms", None, 10, 0, hidden=COMMANDS[:3])

@@ -11,13 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from shared import scenarios, topics
-from shared.config import RobotConfig
+from shared.bus import topics
+from shared.bus.links import DIRECTIONS
+from shared.bus.messages import Mode
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject
 from shared.exceptions import ConfigError
-from shared.impairment import Impairment
-from shared.links import DIRECTIONS
-from shared.messages import Mode
-from shared.scenarios import Inject
+from shared.network.impairment import Impairment
 from tests.lockstep.runs import still
 from tools import sim
 from tools.runs import describe_inject, experiment, verdict

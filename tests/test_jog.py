@@ -14,10 +14,10 @@ from services.joint.differential import (
     joint_torque,
 )
 from services.joint.drivers.base import DriveReading, DriveStatus
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.messages import Pair
 from tests.bench_drive import START, BenchDrive
 from tools.bringup import jog_drive
 from tools.bringup.jogging import (

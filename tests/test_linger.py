@@ -9,8 +9,9 @@ from pathlib import Path
 
 import msgspec
 
-from shared import config_file, socket_linger
-from shared.bus import open_session
+from shared.bus import socket_linger
+from shared.bus.session import open_session
+from shared.config import files as config_file
 from shared.process import DEFAULT_CONFIG
 
 ON_FOR_10_S = struct.pack("ii", 1, 10)

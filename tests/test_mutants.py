@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from shared.toml_file import read_toml
+from shared.config.toml_file import read_toml
 from tools import mutants
 from tools.mutants import FILE, ROOT, Group, GroupResult, MutantsFile, Mutation, Reason, change_of
 

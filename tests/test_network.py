@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shared.bus.messages import SimControl
+from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.impairment import Impairment
-from shared.messages import SimControl
-from shared.scenarios import Inject
-from shared.traces import LinkEvent
+from shared.config.scenarios import Inject
+from shared.network.impairment import Impairment
 from tools.runs.network import BASE, VirtualLink
 from tools.runs.virtual_network import VirtualNetwork
 

@@ -6,9 +6,9 @@ import pytest
 
 from services.joint.drivers.base import DriveReading
 from services.joint.drivers.odrive_can import REBOOT_MS, RETRY_MS, OdriveCan
-from shared.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
-from shared.config_sections import CanConfig
-from shared.messages import Pair
+from shared.bus.messages import Pair
+from shared.can.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
+from shared.config.sections import CanConfig
 from tests.can_bench import Bench, bench, frame
 from tests.test_odrive_can import DRIVE, NODES
 from tests.test_odrive_can_link import receiving_fails

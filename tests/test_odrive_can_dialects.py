@@ -13,8 +13,8 @@ import pytest
 from services.joint.drivers.base import DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, REBOOT_MS, RETRY_MS, OdriveCan
 from services.simulator.cansimple_dialects import DialectName
-from shared.cansimple import AxisError, AxisState
-from shared.config_sections import CanConfig
+from shared.can.cansimple import AxisError, AxisState
+from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
 from tests.test_odrive_can import AXES, DRIVE, MS, NODES, Rig, connected, make_driver, path
 

@@ -12,7 +12,7 @@ import pytest
 from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.can_link import receiver
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, INSIST_MS, REBOOT_MS
-from shared.cansimple import AxisState, Command, Heartbeat, pack_heartbeat, pack_two_floats
+from shared.can.cansimple import AxisState, Command, Heartbeat, pack_heartbeat, pack_two_floats
 from tests.can_bench import Bench, FakeBus, bench, frame
 from tests.test_odrive_can import NODES
 

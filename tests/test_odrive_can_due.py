@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.resend_policy import DRIFT_MS, GAINS_MS, SETTLE_MS
-from shared.cansimple import Command, split_id
+from shared.can.cansimple import Command, split_id
 from tests.can_bench import TARGET, Bench, bench
 from tests.test_odrive_can import NODES
 

@@ -15,9 +15,9 @@ from services.joint.drivers.firmware import (
     judged,
 )
 from services.simulator.cansimple_dialects import VERSION_06
-from shared import cansimple, cansimple_06
-from shared.cansimple import AxisError, AxisState, Heartbeat
-from shared.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult
+from shared.can import cansimple, cansimple_06
+from shared.can.cansimple import AxisError, AxisState, Heartbeat
+from shared.can.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult
 
 CLOSED, IDLE = AxisState.CLOSED_LOOP_CONTROL, AxisState.IDLE
 VERSION = cansimple_06.pack_version(VERSION_06)

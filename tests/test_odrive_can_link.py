@@ -11,8 +11,8 @@ import pytest
 from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.can_link import FRAMES_PER_READ, RETRY_MS, receiver
 from services.joint.drivers.odrive_can import ARM_GRACE_MS
-from shared.cansimple import AxisState, Command, arbitration_id, pack_two_floats
-from shared.cansimple_06 import Command06
+from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
+from shared.can.cansimple_06 import Command06
 from shared.clock import NS_PER_MS
 from tests.can_bench import TARGET, Bench, bench, error_frame, error_on_the_wire, frame
 from tests.test_odrive_can import DRIVE, NODES

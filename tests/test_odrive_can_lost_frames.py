@@ -18,10 +18,10 @@ import pytest
 
 from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveStatus, MotorTarget
-from shared.cansimple import AxisState
+from shared.can.cansimple import AxisState
+from shared.can.unix_can import Frame
+from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import NS_PER_MS
-from shared.unix_can import Frame
-from shared.unix_can_hub import UnixCanHub
 from tests.test_odrive_can import AXES, Rig, make_driver
 
 HERE = (0.1, -0.2)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from shared import config_file
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tests.recorder import runs
 from tests.recorder.runs import item, write

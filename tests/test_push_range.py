@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tools import cli
 from tools.sweeps.push_range import PushRange
 from tools.sweeps.push_trial import PushTrial, limits_of

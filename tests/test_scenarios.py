@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import tomli_w
 
-from shared import scenarios
-from shared.config import RobotConfig
-from shared.exceptions import ConfigError
-from shared.scenarios import (
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import (
     FAULT_KINDS,
     Fault,
     FaultKind,
@@ -24,6 +23,7 @@ from shared.scenarios import (
     lead,
     push_at,
 )
+from shared.exceptions import ConfigError
 from tests.conftest import ROBOT_FILE
 
 SHIPPED = sorted((ROBOT_FILE.parent / "scenarios").glob("*.toml"))

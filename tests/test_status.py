@@ -7,8 +7,8 @@ from itertools import product
 import msgspec
 import pytest
 
-from shared.messages import Cause, DriveStatus, JointState, Mode, Outside
-from shared.trip_table import JOINT_TRIPS
+from shared.bus.messages import Cause, DriveStatus, JointState, Mode, Outside
+from shared.robot.trip_table import JOINT_TRIPS
 from tools.runs.fleet_status import LeadStatus, lead_status, module_status
 from tools.status import describe_lead
 

@@ -17,9 +17,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared import gain_schedule
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.robot import gain_schedule
 from tools import cli
 from tools.sweeps import cases, pool
 from tools.sweeps.prepare import prepare

@@ -14,12 +14,12 @@ from services.planner.kinematics import Kinematics
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL
 from services.simulator.world import World
-from shared import scenarios
+from shared.bus.messages import SimTruth
 from shared.clock import NS_PER_S
-from shared.config import GRAVITY, RobotConfig
-from shared.messages import SimTruth
-from shared.robot_model import stand_pose
-from shared.scenarios import Keyframe, Push, Scenario, lead
+from shared.config import scenarios
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.scenarios import Keyframe, Push, Scenario, lead
+from shared.robot.robot_model import stand_pose
 from tools.runs import lockstep
 from tools.runs.lockstep import Lockstep
 from tools.runs.standing import is_tipping

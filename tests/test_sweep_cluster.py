@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools import cli
 from tools.sweeps import cluster, latency

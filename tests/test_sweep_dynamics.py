@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tools import cli
 from tools.sweeps import dynamics, dynamics_trial
 from tools.sweeps.dynamics_trial import UNREADY, DynamicsResult, delay_s, draw, drawn, run_trial

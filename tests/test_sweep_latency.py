@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from shared import scenarios
-from shared.config import RobotConfig
-from shared.links import DIRECTIONS
-from shared.messages import JointEvent, Mode
+from shared.bus.links import DIRECTIONS
+from shared.bus.messages import JointEvent, Mode
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
 from tools import cli
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import kill, latency, latency_picture

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from services.simulator.plant import PlantConfig
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools import cli
 from tools.sweeps import push, push_trial

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tools import cli
 from tools.sweeps import plants, robust
 from tools.sweeps.figures import Ending

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.sweeps import study
 from tools.sweeps.table import CaseTable, code_of

@@ -8,10 +8,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared.config import RobotConfig
-from shared.messages import Cause, Trip
+from shared.bus.messages import Cause, Trip
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
-from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools import cli
 from tools.sweeps.trips import wrong_with
 from tools.sweeps.trips_trial import PLANTS, TROUBLES, TripResult, run_trial

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
+from shared.bus.messages import Tare, TareRequest, Wrench
 from shared.exceptions import FleetError
-from shared.messages import Tare, TareRequest, Wrench
 from tools import tare
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import can
 import pytest
 
+from shared.can.unix_can import REMOTE_FLAG, UnixCanBus, pack_frames, unpack_frames
+from shared.can.unix_can_hub import UnixCanHub
 from shared.exceptions import FleetError
-from shared.unix_can import REMOTE_FLAG, UnixCanBus, pack_frames, unpack_frames
-from shared.unix_can_hub import UnixCanHub
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from rich.console import Console
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL
 from services.simulator.world import World
-from shared.config import RobotConfig
-from shared.messages import SimTruth
-from shared.scenarios import Push
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Push
 from tests.lockstep.runs import still
 from tools import cli
 from tools.runs import verdict, verdict_table

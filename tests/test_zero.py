@@ -15,11 +15,11 @@ from rich.console import Console
 
 from services.joint.differential import joint_from_motor, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from shared.cansimple import AxisError
+from shared.bus.messages import Pair
+from shared.can.cansimple import AxisError
 from shared.clock import now_ns
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError, XrlError
-from shared.messages import Pair
 from tools import zero as verb
 from tools.bringup import bench, zeroing
 from tools.bringup.standing import standing

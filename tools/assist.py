@@ -14,15 +14,15 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from shared import topics
-from shared.bus import open_session
+from shared.bus import topics
+from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
+from shared.bus.session import open_session
 from shared.clock import now_ns
-from shared.config import RobotConfig
-from shared.config_file import load
+from shared.config.files import load
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
-from shared.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
 from shared.process import StopFlag
-from shared.scenarios import SCENARIO
 from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 

@@ -21,13 +21,16 @@ from rich.progress import track
 from rich.table import Table
 
 from services.planner.planner import Planner
-from shared import config_file, gain_schedule, scenarios, topics
-from shared.config import RobotConfig
+from shared.bus import topics
+from shared.bus.messages import JointState, Message, Tare, Wrench
+from shared.bus.topics import Topic
+from shared.config import files as config_file
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.messages import JointState, Message, Tare, Wrench
-from shared.scenarios import Scenario
-from shared.topics import Topic
+from shared.robot import gain_schedule
+from shared.robot.joints import MODULES
 from tools.runs.experiment import scenario_file
 from tools.runs.lockstep import Lockstep
 from tools.verbs import Subparsers, add_config, add_verb
@@ -36,7 +39,7 @@ TICK_US: Final = 500.0
 SPEED: Final = 3.0
 """Targets of docs/results.md#targets: planner tick, median; lockstep, in times of real time."""
 TICKS: Final = 750
-"""Of a recorded squat: 3 s at 250 Hz, on the way down and up."""
+"""Ticks of a recorded squat: 3 s at 250 Hz, on the way down and up."""
 YARDSTICK_CALLS: Final = 20
 
 

@@ -13,10 +13,11 @@ from typing import Final
 from rich.console import Console
 from rich.markup import escape
 
-from shared import config_file, drive_settings
-from shared.config import RobotConfig
+from shared.can import drive_settings
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, FleetError
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 from tools.bringup import backup, bench, changes
 from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
 from tools.bringup.changes import ChangeResult, SettingChange

@@ -9,11 +9,11 @@ from pathlib import Path
 from rich.console import Console
 
 from services.simulator.plant import plant_from
-from shared import topics
-from shared.bus import Session
-from shared.config import RobotConfig
-from shared.messages import PlannerStatus
-from shared.scenarios import Scenario
+from shared.bus import topics
+from shared.bus.messages import PlannerStatus
+from shared.bus.session import Session
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
 from tools.runs import experiment, figure, verdict, verdict_table
 from tools.runs.live import run_live
 from tools.runs.live_view import LiveView

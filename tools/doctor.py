@@ -7,7 +7,7 @@ import argparse
 import msgspec
 from rich.console import Console
 
-from shared import config_file
+from shared.config import files as config_file
 from tools.bringup import bench
 from tools.bringup.reach import add_plant, check_plants
 from tools.bringup.report import report_of, show

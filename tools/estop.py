@@ -12,14 +12,14 @@ from rich.console import Console
 
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import ask_stop
-from shared import topics
-from shared.bus import open_session
+from shared.bus import topics
+from shared.bus.messages import Estop, JointState, Mode
+from shared.bus.session import open_session
 from shared.clock import now_ns
-from shared.config import RobotConfig
-from shared.config_file import load
+from shared.config.files import load
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, XrlError
-from shared.joints import MODULES
-from shared.messages import Estop, JointState, Mode
+from shared.robot.joints import MODULES
 from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 

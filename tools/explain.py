@@ -19,13 +19,15 @@ from services.planner.inverse_kinematics import describe as in_words_of_reach
 from services.planner.kinematics import Kinematics
 from services.planner.push_limit import PushLimits
 from services.planner.torque_breakdown import TorqueBreakdown, torque_breakdown
-from shared import config_file, gain_schedule, topics
+from shared.bus import topics
+from shared.bus.messages import JointCommand, JointState, PlannerMode, PlannerStatus, SplitSource
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import JOINTS, MODULES, N_JOINTS
-from shared.messages import JointCommand, JointState, PlannerMode, PlannerStatus, SplitSource
-from shared.robot_model import stand_pose
+from shared.robot import gain_schedule
+from shared.robot.joints import JOINTS, MODULES, N_JOINTS
+from shared.robot.robot_model import stand_pose
 from tools.runs import snapshot_text, verdict
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run

@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from services.recorder.files import SUFFIX
 from services.recorder.scene import extended
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
 from tools.report import write

@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from shared.config_file import load
-from shared.config_sections import TripLimit
-from shared.fault_table import DRIVE_FAULTS, LOSSES
-from shared.scenarios import FAULT_KINDS
-from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
+from shared.config.files import load
+from shared.config.scenarios import FAULT_KINDS
+from shared.config.sections import TripLimit
+from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
+from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
 from tools.verbs import Subparsers, add_config, add_verb
 
 _LABEL_WIDTH = 12

@@ -12,14 +12,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from services.planner.push_limit import DIRECTIONS, slope_pulling
-from shared import config_file, gain_schedule
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.gain_table import GainSchedule
+from shared.robot import gain_schedule
+from shared.robot.gain_table import GainSchedule
 from tools.verbs import Subparsers, add_config, add_verb
 
 ROOM_EVERY = 5
-"""Of the poses, for the printed margins."""
+"""Every n-th pose gets its printed margins."""
 RIGID_FROM = 1e6
 """N m/rad"""
 PUSH_HEIGHTS = 4

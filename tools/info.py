@@ -16,7 +16,7 @@ from rich.text import Text
 from services.recorder.mcap_log import SCHEMA_VERSION
 from services.recorder.reader import LostBytes
 from services.recorder.recover import clock_time, describe_lost
-from shared import topics
+from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from tools.logs.files import files_of_run
@@ -27,7 +27,7 @@ from tools.runs.run_log import RunLog, read_run
 from tools.verbs import Subparsers, add_verb
 
 SLOW: Final = 0.9
-"""Of a topic's rate in the table of topics: less is marked."""
+"""Fraction of a topic's nominal rate below which it is marked."""
 MIB: Final = 1 << 20
 INJECTED_MAX: Final = 12
 """Impairments with a line of their own."""

@@ -10,10 +10,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from shared.bus.links import GROUPS
+from shared.config.scenarios import Inject
 from shared.exceptions import ConfigError, RunError
-from shared.links import GROUPS
-from shared.proxy_protocol import RequestedImpairment
-from shared.scenarios import Inject
+from shared.network.proxy_protocol import RequestedImpairment
 from tools.runs.describe_inject import (
     DISTRIBUTION,
     NUMBERS,

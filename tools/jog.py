@@ -13,10 +13,10 @@ from rich.table import Table
 
 from services.joint.__main__ import open_drive
 from services.joint.differential import joint_from_motor
-from shared import config_file
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, FleetError, XrlError
-from shared.joints import AXES, MODULES
+from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, limits
 from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_words, jog_drive
 from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see

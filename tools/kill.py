@@ -6,7 +6,7 @@ import argparse
 import signal
 from typing import Final
 
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 

@@ -23,8 +23,8 @@ import msgspec
 import tomli_w
 from rich.console import Console
 
+from shared.config.toml_file import Section, read_toml
 from shared.exceptions import RunError, XrlError
-from shared.toml_file import Section, read_toml
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 FILE: Final = ROOT / "tests" / "mutants.toml"

@@ -12,8 +12,8 @@ from rich.console import Console
 
 from services.joint.rearm_guard import Pendant
 from shared.exceptions import FleetError
-from shared.joints import MODULES
 from shared.process import StopFlag
+from shared.robot.joints import MODULES
 from tools.estop import GIVE_UP_S, ask_here, wait_here
 from tools.verbs import Subparsers, add_run_dir, add_verb
 

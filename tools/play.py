@@ -14,10 +14,10 @@ from typing import Final, NamedTuple
 from rich.console import Console
 from rich.markup import escape
 
-from shared import config_file
-from shared.bus import RawPublisher, Session, open_session
+from shared.bus.session import RawPublisher, Session, open_session
 from shared.clock import NS_PER_S, now_ns
-from shared.config import RobotConfig, expand
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import ConfigError, FleetError, RunError
 from shared.process import DEFAULT_CONFIG
 from tools.cli import INTERRUPTED

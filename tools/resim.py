@@ -13,11 +13,11 @@ from rich.progress import Progress
 from rich.table import Table
 
 from services.recorder.provenance import machine
-from shared import topics
-from shared.config import RobotConfig
+from shared.bus import topics
+from shared.bus.messages import JointEvent, JointState, Message, PlannerStatus
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.messages import JointEvent, JointState, Message, PlannerStatus
+from shared.robot.joints import MODULES
 from tools.reexecution import rewritten
 from tools.reexecution.compare import size
 from tools.reexecution.joint import JointExecution

@@ -15,15 +15,15 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from services.recorder import provenance
 from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
 from services.simulator.plant import PlantConfig, plant_from
-from shared import topics
-from shared.codec import encode
-from shared.config import RobotConfig
+from shared.bus import topics
+from shared.bus.codec import encode
+from shared.bus.messages import Message
+from shared.bus.topics import Topic
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
-from shared.impairment import Impairment
-from shared.messages import Message
-from shared.robot_model import mjcf
-from shared.scenarios import Scenario
-from shared.topics import Topic
+from shared.network.impairment import Impairment
+from shared.robot.robot_model import mjcf
 from tools.centralised.fleet import CONTROLS, SHIPPED
 from tools.runs import experiment, figure, verdict, verdict_table
 from tools.runs.run_log import read_run

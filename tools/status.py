@@ -13,9 +13,9 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
-from shared.bus import open_session
-from shared.config_file import load
-from shared.messages import DriveStatus
+from shared.bus.messages import DriveStatus
+from shared.bus.session import open_session
+from shared.config.files import load
 from tools.runs.fleet_status import (
     SILENT_PROXY,
     FleetStatus,

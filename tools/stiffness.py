@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from services.planner.body_stiffness import BodyStiffness, for_robot
-from shared import config_file
+from shared.config import files as config_file
 from tools.verbs import Subparsers, add_config, add_verb
 
 ROWS = (

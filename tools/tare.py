@@ -11,12 +11,12 @@ from typing import Final, Protocol
 
 from rich.console import Console
 
-from shared import topics
-from shared.bus import open_session
+from shared.bus import topics
+from shared.bus.messages import Tare, TareRequest, Wrench
+from shared.bus.session import open_session
 from shared.clock import now_ns
-from shared.config_file import load
+from shared.config.files import load
 from shared.exceptions import FleetError
-from shared.messages import Tare, TareRequest, Wrench
 from tools.supervision.supervise import SupervisedFleet
 from tools.verbs import Subparsers, add_run_dir, add_verb
 

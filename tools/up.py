@@ -7,9 +7,10 @@ import time
 from pathlib import Path
 
 from services.simulator.plant import plant_from
-from shared import config_file, gain_schedule
+from shared.config import files as config_file
 from shared.exceptions import FleetError
-from shared.joints import MODULES
+from shared.robot import gain_schedule
+from shared.robot.joints import MODULES
 from tools.runs.experiment import add_plant, make_out, scenario_file
 from tools.supervision.fleet import check_known, load_table
 from tools.supervision.pace import add_pace

@@ -12,11 +12,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from services.simulator.plant import PlantConfig
-from shared import scenarios
+from shared.config import scenarios
+from shared.config.scenarios import Scenario
+from shared.config.toml_file import parse_toml
 from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.scenarios import Scenario
-from shared.toml_file import parse_toml
+from shared.robot.joints import MODULES
 from tools.counterfactual import picture
 from tools.counterfactual.moments import moments_of
 from tools.counterfactual.run import Counterfactual, Task, counterfactual_of

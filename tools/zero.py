@@ -19,12 +19,13 @@ from rich.table import Table
 
 from services.joint.__main__ import open_drive
 from services.joint.drivers.base import Drive
-from shared import config_file, topics
-from shared.bus import open_session
-from shared.config import RobotConfig
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, Pair
+from shared.bus.session import open_session
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, FleetError
-from shared.joints import MODULES
-from shared.messages import JointState, Mode, Pair
+from shared.robot.joints import MODULES
 from tools.bringup import bench
 from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, zero
 from tools.supervision.supervise import SupervisedFleet

@@ -22,11 +22,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from shared.bus.messages import Tare
+from shared.can.loadcell_can import LegSample, as_sent
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config_sections import HarnessConfig
-from shared.loadcell_can import LegSample, as_sent
-from shared.messages import Tare
-from shared.stewart import N_LEGS, geometry_matrix
+from shared.config.sections import HarnessConfig
+from shared.robot.stewart import N_LEGS, geometry_matrix
 
 Array = npt.NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import Protocol
 from services.harness import filter as wrench_filter
 from services.harness.filter import FilterState, WrenchFilter
 from services.harness.sensor import HarnessSensor
-from shared.messages import TareRequest, Wrench
+from shared.bus.messages import TareRequest, Wrench
 
 
 class WrenchPublisher(Protocol):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from shared.can_sensor import CanSensor
-from shared.loadcell_can import LegSample, SampleAssembler
-from shared.messages import Vector6
+from shared.bus.messages import Vector6
+from shared.can.can_sensor import CanSensor
+from shared.can.loadcell_can import LegSample, SampleAssembler
 
 
 class HarnessSensor(Protocol):

@@ -6,14 +6,16 @@ from pathlib import Path
 
 from services.imu.attitude import AttitudeLaw
 from services.imu.loop import ImuLoop
-from shared import bus, log, process, topics
-from shared.can_sensor import CanSensor, pause_ns
-from shared.config import RobotConfig, expand
-from shared.config_file import load
-from shared.imu_can import ImuAssembler, ImuSample
-from shared.messages import Attitude
+from shared import log, process
+from shared.bus import session as bus
+from shared.bus import topics
+from shared.bus.messages import Attitude
+from shared.can.can_sensor import CanSensor, pause_ns
+from shared.can.imu_can import ImuAssembler, ImuSample
+from shared.can.sensor_loop import run
+from shared.config.files import load
+from shared.config.robot_config import RobotConfig, expand
 from shared.priority import raise_priority
-from shared.sensor_loop import run
 
 FIFO_PRIORITY = 10
 """Below the joint services and the planner: both stand and lead without it."""

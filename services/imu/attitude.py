@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+from shared.bus.messages import Vector3, Vector4
+from shared.can.imu_can import ImuSample
 from shared.clock import NS_PER_MS
-from shared.config_sections import ImuConfig
-from shared.imu_can import ImuSample
-from shared.messages import Vector3, Vector4
+from shared.config.sections import ImuConfig
 
 UNIT_TOLERANCE: Final = 0.02
 """How far a quaternion's length may be from 1; rounding to 2^-15 makes 6e-5."""

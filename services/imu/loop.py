@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Protocol
 
 from services.imu.attitude import AttitudeLaw
-from shared.imu_can import ImuSample
-from shared.messages import Attitude
+from shared.bus.messages import Attitude
+from shared.can.imu_can import ImuSample
 
 
 class ImuSensor(Protocol):

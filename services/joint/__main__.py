@@ -11,12 +11,14 @@ from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import LastState, RearmGuard
-from shared import config_file, log, topics
-from shared.bus import open_session
-from shared.config import RobotConfig, expand
-from shared.config_sections import CanConfig
-from shared.joints import MODULES
-from shared.messages import Estop, JointCommand, JointEvent, JointState
+from shared import log
+from shared.bus import topics
+from shared.bus.messages import Estop, JointCommand, JointEvent, JointState
+from shared.bus.session import open_session
+from shared.bus.traces import JointTrace
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.sections import CanConfig
 from shared.priority import raise_priority
 from shared.process import (
     StopFlag,
@@ -24,7 +26,7 @@ from shared.process import (
     run_service,
     service_parser,
 )
-from shared.traces import JointTrace
+from shared.robot.joints import MODULES
 
 FIFO_PRIORITY = 20
 """Above the planner: this tier stands when the others do not get the processor."""

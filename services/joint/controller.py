@@ -20,9 +20,9 @@ from services.joint.setpoint_law import SetpointLaw
 from services.joint.snapshots import ControllerSnapshot, ControllerState
 from services.joint.torque_limiter import limit_differential, limit_torque, limits_of
 from services.joint.trips import limits_of as trip_limits_of
+from shared.bus.messages import Cause, JointCommand, JointEvent, JointState, Mode, Outside, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Cause, JointCommand, JointEvent, JointState, Mode, Outside, Pair
+from shared.config.robot_config import RobotConfig
 
 
 class CycleResult(NamedTuple):

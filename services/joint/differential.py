@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from shared.messages import Pair
+from shared.bus.messages import Pair
 
 
 def joint_from_motor(motor_turns: Pair, gear_ratio: float) -> Pair:

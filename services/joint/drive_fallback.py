@@ -6,9 +6,9 @@ from typing import Final
 
 from services.joint import pd_law
 from services.joint.pd_law import Setpoint
-from shared.config import RobotConfig
-from shared.joints import kind_of
-from shared.messages import Mode
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import kind_of
 
 HOLD_SHARE: Final = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
 """How far a drive's gains rise to HOLD's while its service leads.

@@ -20,10 +20,10 @@ from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.rearm_guard import LastState
 from services.joint.snapshots import DriveManagerState
-from shared.cansimple import AxisError
+from shared.bus.messages import Cause, JointCommand, JointEvent, Mode, Pair
+from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.messages import Cause, JointCommand, JointEvent, Mode, Pair
+from shared.config.robot_config import RobotConfig
 
 ARM_EVERY_NS: Final = 500 * NS_PER_MS
 """Arming is asked for again after this long, while DISARMED."""
@@ -69,7 +69,7 @@ class DriveAction(NamedTuple):
     torque: Pair
     """Motor torques of `DriveCommand.TORQUE`, N m."""
     target: MotorTarget | None
-    """Of `DriveCommand.TARGET`."""
+    """Target of `DriveCommand.TARGET`."""
     obstacle: ArmingInhibit
 
 

@@ -19,8 +19,8 @@ from typing import Final
 from services.joint.differential import joint_torque, motor_from_joint, motor_torque
 from services.joint.drivers.base import MotorTarget
 from services.joint.pd_law import Setpoint
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
-from shared.messages import Pair
 
 GAIN_CHANGE: Final = 0.02
 """Gains that have changed by less than this share are left as they are on the drive: what is
@@ -31,9 +31,9 @@ modules on one CAN bus were 15 to 20 ms behind by its end; what is missing goes 
 POS_GAIN_MAX: Final = 400.0
 """1/s; a stiffness with hardly a damping is given the damping that this asks for."""
 INPUT_TORQUE_SHARE: Final = 0.75
-"""Of what current_lim gives, as much goes in as input_torque: the firmware clamps that by itself.
-A hip held with (900, 26) N m/rad has 463 on both motors, and from 0.25 rad off its reference the
-rest is more than the clamp lets through: its theta was 463 stiff instead of 26."""
+"""Fraction of current_lim's torque that may go in as input_torque: the firmware clamps that by
+itself. A hip held with (900, 26) N m/rad has 463 on both motors, and from 0.25 rad off its
+reference the rest is more than the clamp lets through: its theta was 463 stiff instead of 26."""
 
 
 class DriveSetpointLaw:

@@ -12,10 +12,10 @@ ready to track (`Failsafe.ready`), so no planner leads by such numbers.
 from __future__ import annotations
 
 from services.joint import pd_law
-from shared.config import RobotConfig
-from shared.gain_table import Bounds, ModuleBounds
-from shared.joints import kind_of
-from shared.messages import JointCommand, Outside, Pair
+from shared.bus.messages import JointCommand, Outside, Pair
+from shared.config.robot_config import RobotConfig
+from shared.robot.gain_table import Bounds, ModuleBounds
+from shared.robot.joints import kind_of
 
 ROUNDING = 0.02
 """Share of a gain that is allowed beyond: the schedule interpolates between rounded nodes."""

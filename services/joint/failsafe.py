@@ -15,9 +15,9 @@ from typing import Final
 
 import msgspec
 
+from shared.bus.messages import Cause, JointCommand, Mode, Outside
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Cause, JointCommand, Mode, Outside
+from shared.config.robot_config import RobotConfig
 
 
 class Event(IntEnum):

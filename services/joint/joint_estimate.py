@@ -16,8 +16,8 @@ import msgspec
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
-from shared.messages import Pair
 
 JUMP_TURNS: Final = 0.1
 """At the motor, beyond what the last velocity explains: 0.02 rad at the joint."""
@@ -46,7 +46,7 @@ class JointEstimate(msgspec.Struct):
     v: Pair = (0.0, 0.0)
     """rad/s"""
     pos: Pair = (0.0, 0.0)
-    """Of the motors, turns."""
+    """Motor positions, turns."""
     vel: Pair = (0.0, 0.0)
     """turn/s"""
     t_ns: int = 0

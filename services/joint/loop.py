@@ -21,13 +21,13 @@ from services.joint.pendant import PendantWatch
 from services.joint.rearm_guard import LastState, RearmGuard
 from services.joint.tracer import Tracer
 from shared import log
-from shared.bus import Latest, Publisher
+from shared.bus.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode
+from shared.bus.session import Latest, Publisher
+from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S, now_ns
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode
 from shared.process import StopFlag
-from shared.traces import JointTrace
 
 READ_TIMEOUT_S: Final = 0.005
 """A cycle without an encoder sample runs all the same: ages and the failsafe go on."""

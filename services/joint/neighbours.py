@@ -5,8 +5,8 @@ thighs: it turned back by 1.5 rad, and with its COM 5 cm back and 10 cm up it th
 A hip that knows how its ankle and its knee have turned holds the torso as it stood. And a knee that
 sinks beside one whose service is dead tips the robot sideways: it was down in 4 s. It has to know
 that the other one does not sink. A limp module makes the others stiffen, in HOLD and in DAMP
-(`shared.limp_leg_support`): without that the robot fell within 1.3 s of a knee that went limp with
-the planner dead, and within 2 s of a stop beside a limp knee.
+(`shared.robot.limp_leg_support`). Without that the robot fell within 1.3 s of a knee that went
+limp with the planner dead, and within 2 s of a stop beside a limp knee.
 
 All this with planner and bus dead: so each service writes down where it is in a file that all six
 have mapped, by a store to memory in each cycle, which the control path may do. What runs on another
@@ -21,10 +21,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS
-from shared.joints import MODULES, N_MODULES, kind_of
-from shared.limp_leg_support import SUPPORT_FOR, Support
-from shared.messages import Mode, Pair
+from shared.robot.joints import MODULES, N_MODULES, kind_of
+from shared.robot.limp_leg_support import SUPPORT_FOR, Support
 
 STALE_NS: Final = 20 * NS_PER_MS
 """An older angle says nothing of where the joint is now."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import msgspec
 
-from shared.messages import JointCommand, Pair
+from shared.bus.messages import JointCommand, Pair
 
 ZERO: Pair = (0.0, 0.0)
 

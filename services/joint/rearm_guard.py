@@ -2,7 +2,7 @@
 
 The first is what a service that dies leaves to its successor.
 
-What has let go of the robot never takes hold of it again by itself (`shared.fault_table`). A
+What has let go of the robot never takes hold of it again by itself (`shared.robot.fault_table`). A
 service that crashes is started again by the supervisor, and a drive may have disarmed in the
 meantime, or an emergency stop be in force: the new service would arm it, and stiffen, unasked.
 So each writes down what it last was, and a person who asks for the module (`xrl kill`, `xrl start`,

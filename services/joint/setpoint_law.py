@@ -13,9 +13,9 @@ from services.joint.failsafe import Failsafe
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.pd_law import Setpoint
 from services.joint.sinking import Sinking, SinkingState
+from shared.bus.messages import JointCommand, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import JointCommand, Mode, Pair
+from shared.config.robot_config import RobotConfig
 
 
 class SetpointState(msgspec.Struct, frozen=True, kw_only=True):

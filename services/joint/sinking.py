@@ -20,10 +20,10 @@ import msgspec
 from services.joint import pd_law
 from services.joint.neighbours import NeighbourView
 from services.joint.pd_law import Setpoint
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import kind_of
-from shared.messages import Pair
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import kind_of
 
 DOUBT_NS: Final = 100 * NS_PER_MS
 """A stop does not reach all six in the same cycle, and services pause: a module that holds for the

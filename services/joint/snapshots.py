@@ -10,7 +10,7 @@ from services.joint.joint_estimate import JointEstimate
 from services.joint.rearm_guard import LastState
 from services.joint.setpoint_law import SetpointState
 from services.joint.trips import JointTrips
-from shared.messages import Pair
+from shared.bus.messages import Pair
 
 
 class ControllerState(msgspec.Struct, kw_only=True):

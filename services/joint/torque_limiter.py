@@ -10,9 +10,9 @@ import math
 
 import msgspec
 
-from shared.config import RobotConfig
-from shared.joints import kind_of
-from shared.messages import Pair
+from shared.bus.messages import Pair
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import kind_of
 
 
 class GateLimits(msgspec.Struct, frozen=True):

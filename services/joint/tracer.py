@@ -13,8 +13,8 @@ import msgspec
 from services.joint.drive_manager import DriveAction, DriveManager
 from services.joint.drivers.base import DriveReading
 from services.joint.neighbours import UNKNOWN, NeighbourView
-from shared.messages import JointCommand
-from shared.traces import CycleTrace, JointTrace
+from shared.bus.messages import JointCommand
+from shared.bus.traces import CycleTrace, JointTrace
 
 CYCLES: Final = 10
 """In a message; so much is lost with a killed service."""

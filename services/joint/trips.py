@@ -2,7 +2,7 @@
 
 A robot whose gains do not suit its drivetrain shakes within a tenth of a second of being led, and
 nobody but the six services sees it at 500 Hz. Each looks at its own torque and speed while it
-tracks (`shared.trip_table`; limits: [trips] of the robot file):
+tracks (`shared.robot.trip_table`; limits: [trips] of the robot file):
 
     shaking   torque above `SHAKE_ABOVE_HZ`, as the root of its mean square over `SHAKE_S`
     torque    a motor at the limit of the torque diamond, for long
@@ -21,10 +21,10 @@ from typing import Final
 import msgspec
 
 from services.joint.failsafe import Event
-from shared import trip_table
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.messages import Pair
+from shared.config.robot_config import RobotConfig
+from shared.robot import trip_table
 
 SHAKE_ABOVE_HZ: Final = 8.0
 SHAKE_S: Final = 0.1

@@ -14,16 +14,18 @@ from services.network_proxy.listener import SocketListener
 from services.network_proxy.loop import run
 from services.network_proxy.proxy_endpoint import Place, address_of
 from services.network_proxy.relay import Relay
-from shared import bus, log, process, topics
+from shared import log, process
+from shared.bus import session as bus
+from shared.bus import topics
+from shared.bus.links import DIRECTIONS, PAIRS, Pair, endpoint_through
+from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_MS, now_ns
-from shared.config import RobotConfig, expand
-from shared.config_file import load
-from shared.impairment import Direction
-from shared.impairment_schedule import ImpairmentSchedule
-from shared.links import DIRECTIONS, PAIRS, Pair, endpoint_through
+from shared.config.files import load
+from shared.config.robot_config import RobotConfig, expand
+from shared.network.impairment import Direction
+from shared.network.impairment_schedule import ImpairmentSchedule
+from shared.network.proxy_protocol import SOCKET
 from shared.priority import raise_priority
-from shared.proxy_protocol import SOCKET
-from shared.traces import LinkEvent
 
 FIFO_PRIORITY = 15
 """With those whose messages it passes on: what it delays by itself is not asked for."""

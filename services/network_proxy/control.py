@@ -12,7 +12,7 @@ import msgspec
 
 from services.network_proxy.event_loop import READ, WRITE, SocketWatch
 from services.network_proxy.listener import SocketListener
-from shared.proxy_protocol import LINE_MAX, Reply, Request
+from shared.network.proxy_protocol import LINE_MAX, Reply, Request
 
 ASKERS_MAX: Final = 16
 """Who asks at once; one more, and the one that came first has to go."""

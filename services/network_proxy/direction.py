@@ -7,7 +7,7 @@ from collections import deque
 from typing import Final, NamedTuple
 
 from services.network_proxy.wire import Splitter, carries_messages
-from shared.impairment import HELD, Direction, Impairer
+from shared.network.impairment import HELD, Direction, Impairer
 
 PENDING_MAX: Final = 262_144
 """Bytes that are due and wait for a receiver that takes none: then the sender is read no

@@ -8,7 +8,7 @@ from services.network_proxy.commands import Orders
 from services.network_proxy.event_loop import SocketWatch
 from services.network_proxy.relay import Relay
 from shared.clock import NS_PER_S, machine_s, now_ns
-from shared.impairment_schedule import ImpairmentSchedule
+from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.process import StopFlag
 
 LOOK_S: Final = 0.02

@@ -8,8 +8,8 @@ import socket
 from typing import Any, NamedTuple
 
 from services.network_proxy.listener import SocketListener
+from shared.bus.links import Pair
 from shared.exceptions import BusError
-from shared.links import Pair
 
 
 class Address(NamedTuple):

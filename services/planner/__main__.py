@@ -6,10 +6,9 @@ import secrets
 
 from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner
-from shared import config_file, gain_schedule, log, topics
-from shared.bus import open_session
-from shared.joints import MODULES
-from shared.messages import (
+from shared import log
+from shared.bus import topics
+from shared.bus.messages import (
     Attitude,
     JointCommand,
     JointState,
@@ -17,6 +16,9 @@ from shared.messages import (
     PlannerStatus,
     Wrench,
 )
+from shared.bus.session import open_session
+from shared.bus.traces import PlannerCheckpoint
+from shared.config import files as config_file
 from shared.priority import raise_priority
 from shared.process import (
     StopFlag,
@@ -25,7 +27,8 @@ from shared.process import (
     run_service,
     service_parser,
 )
-from shared.traces import PlannerCheckpoint
+from shared.robot import gain_schedule
+from shared.robot.joints import MODULES
 
 FIFO_PRIORITY = 15
 """Below the joint services, because the failsafe has priority over the law."""

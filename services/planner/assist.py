@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.snapshots import AssistState, EasingState, OverloadState
+from shared.bus.messages import Vector3, Wrench
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config_sections import HarnessConfig
-from shared.messages import Vector3, Wrench
+from shared.config.sections import HarnessConfig
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ LEAD_MAX: Final = (150.0, 60.0)
 LEAD_FADE_S: Final = 0.1
 """The easing goes out over this time when the wrench is lost."""
 RELEASE_SHARE: Final = 0.8
-"""Of an overload's limits: below them the harness counts as let go."""
+"""Fraction of the overload limits; below it the harness counts as released."""
 _W_RAD_S: Final = tuple(10.0 ** (exponent / 1000.0) for exponent in range(-1000, 3000))
 """0.1 to 1000 rad/s: a person's slowest lead, and far beyond what a joint service follows."""
 
@@ -287,7 +287,7 @@ class Coupling(msgspec.Struct, frozen=True, kw_only=True):
     delay_s: float
     """From wrench to torque: once each way over the bus, and the periods between."""
     low_pass_hz: float
-    """Of the harness filter."""
+    """Bandwidth of the harness filter, Hz."""
 
     def force_by_force(self, s: complex) -> complex:
         """Return G: what the hand feels of a force of the robot, delayed and filtered.

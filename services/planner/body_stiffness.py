@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from shared.config import GRAVITY, RobotConfig
+from shared.config.robot_config import GRAVITY, RobotConfig
 
 
 class BodyStiffness(NamedTuple):

@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import RobotConfig
-from shared.joints import N_JOINTS
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 

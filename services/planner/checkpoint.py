@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from services.planner.planner import Planner
-from shared.traces import PlannerCheckpoint
+from shared.bus.traces import PlannerCheckpoint
 
 
 class Checkpoints:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
 from services.planner.poses import PoseNode
-from shared.config import GRAVITY, RobotConfig
-from shared.gain_table import Bounds, ModuleBounds
-from shared.joints import MODULES, N_LEG, kind_of
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.robot.gain_table import Bounds, ModuleBounds
+from shared.robot.joints import MODULES, N_LEG, kind_of
 
 Array = NDArray[np.float64]
 

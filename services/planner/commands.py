@@ -9,9 +9,9 @@ import numpy as np
 
 from services.planner.certificate import Margins
 from services.planner.hocca import LawOutput
-from shared.joints import MODULES, N_MODULES
-from shared.limp_leg_support import Support
-from shared.messages import JointCommand, JointState, Pair
+from shared.bus.messages import JointCommand, JointState, Pair
+from shared.robot.joints import MODULES, N_MODULES
+from shared.robot.limp_leg_support import Support
 
 
 class CommandHeader(NamedTuple):

@@ -21,13 +21,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.joints import N_JOINTS
+from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 
 
 LEAST = 1e-9
-"""Of a body's gain: a smaller one is none."""
+"""Smallest gain of the body that counts, N/m or N m/rad."""
 
 
 class UncoupledGains:

@@ -19,7 +19,7 @@ import numpy as np
 
 from services.planner.dynamic_certificate import Design, DynamicCertificate, StiffnessNode
 from services.planner.split import CouplingGains
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 
 Progress = Callable[[str], None]
@@ -29,7 +29,8 @@ STEP: Final = 1.25
 ROUNDS: Final = 3
 START: Final = Design((40.0, 30.0, 40.0, 8.0, 40.0, 6.0), CouplingGains(3.0, 1.7))
 LEAD_HZ: Final = 0.3
-"""Of the squat's effort: between its 0.2 Hz and what a quick person does."""
+"""Frequency at which the hand's effort is judged: between the squat's 0.2 Hz and a quick
+person's."""
 LEAD_M_S: Final = 0.15
 """Speed of the hand in the reference squat."""
 NOMINAL_STIFFNESS: Final = 8000.0

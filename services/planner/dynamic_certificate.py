@@ -35,8 +35,8 @@ from services.planner.sampled_loop import (
     halves,
 )
 from services.planner.split import CouplingGains
-from shared.config import RobotConfig
-from shared.joints import MODULES
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 
 Array = NDArray[np.float64]
 

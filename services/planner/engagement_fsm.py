@@ -17,8 +17,8 @@ from typing import Final
 
 import msgspec
 
+from shared.bus.messages import Mode, PlannerMode
 from shared.clock import NS_PER_S
-from shared.messages import Mode, PlannerMode
 
 GRACE_NS = 150_000_000
 """ns; after `hold` is lifted, modules may take this long to report TRACK."""

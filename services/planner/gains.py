@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
-from shared.config import RobotConfig
-from shared.joints import N_JOINTS
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 

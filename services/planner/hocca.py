@@ -35,8 +35,8 @@ from services.planner.shift import ShiftReference
 from services.planner.snapshots import LawState
 from services.planner.split import GainSplit, LocalGains
 from services.planner.stance import FOLLOW_S, Stance
-from shared.config import GRAVITY, RobotConfig
-from shared.messages import STRAIGHT, Pair, Vector3, Vector4, Wrench
+from shared.bus.messages import STRAIGHT, Pair, Vector3, Vector4, Wrench
+from shared.config.robot_config import GRAVITY, RobotConfig
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config_sections import AssistConfig
-from shared.messages import STRAIGHT, OperatorIntent, Vector4
+from shared.config.sections import AssistConfig
 
 
 class Wish(NamedTuple):

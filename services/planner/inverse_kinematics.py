@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
-from shared.joints import JOINTS, N_JOINTS, N_LEG
+from shared.robot.joints import JOINTS, N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
 
@@ -34,18 +34,19 @@ STEP_MAX = 0.2
 """rad; a longer step leaves the region where the linearisation is good."""
 
 GAIN_AT_LIMIT = 0.01
-"""Of the sum of squares: for less, out of reach, the legs would creep into a twist."""
+"""Least relative gain of the sum of squares: below it, out of reach, the legs would creep into a
+twist."""
 
 COLD_STEP_MAX = 0.5
 """rad; longer than `STEP_MAX`, for here a step that does not pay is taken back."""
 EVALUATIONS_MAX = 60
-"""Of the kinematics, for one start; from a bent stand the median is 8."""
+"""Most evaluations of the kinematics for one start; from a bent stand the median is 8."""
 CLOSURE_WEIGHT = 10.0
-"""Of the closure against p, where not all can be had; what it leaves, the shift takes."""
+"""Weight of the closure against p where not both can be met; `shift` takes up the rest."""
 CLOSING_ROUNDS = 5
 """Each makes what is left of the closure about a hundred times smaller."""
 STATIONARY = 1e-3
-"""Of the error: joint gradients below this share of it move nothing any more."""
+"""Relative size of joint gradients below which nothing moves any more."""
 EQUAL_SHARES: Array = 0.5 * np.eye(6)
 """Load sharing (6, 6) for a cold start: the same at every q, so that J is what p changes by."""
 POSE_ROWS = (
@@ -91,7 +92,7 @@ class Reach(NamedTuple):
     stopped: tuple[int, ...]
     """For each of the 12 joints: +1 pressed against its upper limit, -1 its lower, else 0."""
     evaluations: int
-    """Of the kinematics, since the last solve began."""
+    """Evaluations of the kinematics since the last solve began."""
 
     @property
     def converged(self) -> bool:

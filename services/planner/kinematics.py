@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from services.planner import symbolic
 from services.planner.model import leg_geometry
-from shared.compiled_graph import CompiledGraph
-from shared.config import RobotConfig
-from shared.config_sections import GeometryConfig, LawConfig, MassConfig
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import GeometryConfig, LawConfig, MassConfig
+from shared.robot.compiled_graph import CompiledGraph
 
 Array = NDArray[np.float64]
 
@@ -27,8 +27,8 @@ _GRAPHS: Final[dict[tuple[MassConfig, GeometryConfig, LawConfig], symbolic.Graph
 """A process builds the graphs of a robot once: that takes a tenth of a second."""
 _GRAPHS_KEPT: Final = 16
 DETERMINANT_MIN: Final = 0.05
-"""Of a leg's Jacobian, m^3: straighter or more folded legs (outside 0.79 to 1.27 m) tell no wrench,
-for a N m of friction would be more than 10 N."""
+"""Least determinant of a leg's Jacobian, m^3. Straighter or more folded legs (outside 0.79 to 1.27
+m) give no wrench: a N m of friction would be more than 10 N."""
 
 
 class Kinematics:

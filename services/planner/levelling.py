@@ -27,7 +27,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.messages import Pair, Vector3
+from shared.bus.messages import Pair, Vector3
 
 Array = NDArray[np.float64]
 

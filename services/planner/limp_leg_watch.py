@@ -11,10 +11,10 @@ from typing import Final
 
 import msgspec
 
+from shared.bus.messages import DriveStatus, JointState, Mode
 from shared.clock import NS_PER_MS
-from shared.joints import N_MODULES
-from shared.limp_leg_support import SUPPORT_FOR, Support
-from shared.messages import DriveStatus, JointState, Mode
+from shared.robot.joints import N_MODULES
+from shared.robot.limp_leg_support import SUPPORT_FOR, Support
 
 DISARMED_NS: Final = 200 * NS_PER_MS
 """A module that is DISARMED for so long is not about to take its drive over."""

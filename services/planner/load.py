@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.snapshots import LoadState
-from shared.config import GRAVITY
-from shared.messages import Pair
+from shared.bus.messages import Pair
+from shared.config.robot_config import GRAVITY
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ HIDDEN: Final = (8.0, 1.5)
 WEIGHING_S: Final = 1.0
 """After it hung the load is within the limits for so long before it is led: four time constants."""
 AGAIN_SHARE: Final = 0.8
-"""Of the limits: what was refused is led again within so much of them."""
+"""Fraction of the limits within which a refused load is led again."""
 BORNE_SHARE: Final = 0.25
 """Share of the file's weight: with less on the feet of a robot that is led it falls, or hangs."""
 HANGS_SHARE: Final = 0.5

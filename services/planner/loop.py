@@ -9,10 +9,7 @@ import msgspec
 from services.planner.checkpoint import Checkpoints
 from services.planner.intents import Intents
 from services.planner.planner import Planner
-from shared.bus import Latest, Publisher
-from shared.clock import NS_PER_S, NS_PER_US, now_ns, sleep_until
-from shared.config import RobotConfig
-from shared.messages import (
+from shared.bus.messages import (
     Attitude,
     JointCommand,
     JointState,
@@ -20,8 +17,11 @@ from shared.messages import (
     PlannerStatus,
     Wrench,
 )
+from shared.bus.session import Latest, Publisher
+from shared.bus.traces import PlannerCheckpoint
+from shared.clock import NS_PER_S, NS_PER_US, now_ns, sleep_until
+from shared.config.robot_config import RobotConfig
 from shared.process import StopFlag
-from shared.traces import PlannerCheckpoint
 
 
 class PlannerPorts(msgspec.Struct, frozen=True):

@@ -1,7 +1,7 @@
 """Loads the robot model into Pinocchio and extracts each leg's screw axes, foot upwards.
 
-Pinocchio reads the MJCF that `shared.robot_model` generates, the only model source. Its root is the
-torso. The law needs each leg from the foot upwards, because the feet stand still. It needs the six
+Pinocchio reads the MJCF that `shared.robot.robot_model` generates, the only model source. Its root
+is the torso. The law needs each leg from the foot upwards, because the feet stand still: the six
 screw axes of a leg in the foot's frame, and the torso's position at q = 0. The product of
 exponentials is T_torso(q) = exp(s_1 q_1) ... exp(s_6 q_6) T_torso(0).
 """
@@ -16,9 +16,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from shared.config import RobotConfig
-from shared.joints import SIDES
-from shared.robot_model import ankle_positions, mjcf
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import SIDES
+from shared.robot.robot_model import ankle_positions, mjcf
 
 Array = NDArray[np.float64]
 

@@ -22,11 +22,7 @@ from services.planner.plausible import Plausible
 from services.planner.snapshots import TickState
 from services.planner.trips import PlannerTrips, values_of
 from services.planner.unattended import Unattended
-from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import N_JOINTS, N_MODULES
-from shared.limp_leg_support import Support
-from shared.messages import (
+from shared.bus.messages import (
     Attitude,
     JointCommand,
     JointState,
@@ -38,13 +34,17 @@ from shared.messages import (
     Vector6,
     Wrench,
 )
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import N_JOINTS, N_MODULES
+from shared.robot.limp_leg_support import Support
 
 Array = NDArray[np.float64]
 
 EARLY_SHARE = 0.5
-"""Of a period: states that come sooner after a tick belong to that tick still."""
+"""Fraction of a period: states that arrive sooner after a tick still belong to that tick."""
 LATE_SHARE = 1.25
-"""Of a period: after so long the planner ticks with what it has."""
+"""Multiple of the period after which the planner ticks with the states it has."""
 TICK_GAP_MAX_S = 0.02
 """A longer gap between ticks (a stopped process) is not integrated over."""
 

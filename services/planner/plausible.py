@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from shared.config import RobotConfig
-from shared.joints import N_MODULES
-from shared.messages import JointState
+from shared.bus.messages import JointState
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import N_MODULES
 
 BEYOND_RAD: Final = 0.5
 """Largest angle beyond a soft stop, from the joint's elasticity or an error of its zero."""

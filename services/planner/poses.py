@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from services.planner.gains import GainLaw
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
-from shared.config import GRAVITY, RobotConfig
-from shared.joints import N_JOINTS, N_LEG
-from shared.robot_model import stand_pose
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.robot.joints import N_JOINTS, N_LEG
+from shared.robot.robot_model import stand_pose
 
 Array = NDArray[np.float64]
 

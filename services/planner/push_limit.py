@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from services.planner.certificate import motor_mean
 from services.planner.coupling import UncoupledGains
 from services.planner.kinematics import Kinematics
-from shared.config import GRAVITY, RobotConfig
-from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
-from shared.robot_model import ankle_positions
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.robot.joints import MODULES, N_JOINTS, N_LEG, SIDES
+from shared.robot.robot_model import ankle_positions
 
 Array = NDArray[np.float64]
 

@@ -30,7 +30,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from shared.joints import N_JOINTS, N_LEG
+from shared.robot.joints import N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class DrivetrainModel(NamedTuple):
     joint_damping: float = 0.2
     """N m s/rad"""
     lag_s: float = 1e-3
-    """Of the drive's torque."""
+    """Lag of the drive's torque, s."""
     encoder_bandwidth: float = 1000.0
     """w, rad/s."""
 
@@ -73,7 +73,7 @@ class LoopTiming(NamedTuple):
     delay: float
     """From a state's sample to the first joint cycle that uses its command."""
     drive_step: float = 125e-6
-    """Of the drive's own loop."""
+    """Period of the drive's own loop, s."""
     write_delay: float = 1e-3
     """From a joint cycle to the drive's acting on it; a multiple of `drive_step`."""
 
@@ -88,10 +88,10 @@ class Feedback(NamedTuple):
     C_v: Array
     """Coupled damping, N m s/rad."""
     bandwidth_hz: float
-    """Of the two poles of tau_coupled."""
+    """Bandwidth of the two poles of tau_coupled, Hz."""
     lead_easing: float = 0.0
     easing_bandwidth_hz: float = 40.0
-    """Of one pole on what the hand is felt to do."""
+    """Bandwidth of the pole on the measured hand force, Hz."""
 
 
 class Gains(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.snapshots import ShiftState
-from shared.messages import Vector4
+from shared.bus.messages import Vector4
 
 Array = NDArray[np.float64]
 

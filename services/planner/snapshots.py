@@ -7,8 +7,7 @@ import msgspec
 from services.planner.engagement_fsm import Engagement
 from services.planner.intents import Wish
 from services.planner.limp_leg_watch import LimpLegWatch
-from shared.joints import N_JOINTS
-from shared.messages import (
+from shared.bus.messages import (
     AS_CONFIGURED,
     STRAIGHT,
     Attitude,
@@ -20,11 +19,12 @@ from shared.messages import (
     Vector6,
     Wrench,
 )
-from shared.trip_table import PLANNER_TRIPS
+from shared.robot.joints import N_JOINTS
+from shared.robot.trip_table import PLANNER_TRIPS
 
 
 class AssistState(msgspec.Struct, frozen=True):
-    """Of `AssistLaw`."""
+    """State of `AssistLaw`."""
 
     ramp: float | None
     wanted: float
@@ -33,14 +33,14 @@ class AssistState(msgspec.Struct, frozen=True):
 
 
 class EasingState(msgspec.Struct, frozen=True):
-    """Of `LeadEasing`."""
+    """State of `LeadEasing`."""
 
     lead: Pair
     left: float
 
 
 class OverloadState(msgspec.Struct, frozen=True):
-    """Of `Overload`."""
+    """State of `Overload`."""
 
     beyond_since_ns: int | None
     below_since_ns: int | None
@@ -70,7 +70,7 @@ class TripsState(msgspec.Struct, frozen=True):
 
 
 class UnattendedState(msgspec.Struct, frozen=True):
-    """Of `Unattended`."""
+    """State of `Unattended`."""
 
     felt_ns: int = 0
     """When a hand was felt last."""
@@ -79,7 +79,7 @@ class UnattendedState(msgspec.Struct, frozen=True):
 
 
 class LoadState(msgspec.Struct, frozen=True):
-    """Of `Load`."""
+    """State of `Load`."""
 
     kg: float = 0.0
     a: float = 0.0
@@ -91,7 +91,7 @@ class LoadState(msgspec.Struct, frozen=True):
 
 
 class LawState(msgspec.Struct, frozen=True):
-    """Of `Hocca`."""
+    """State of `Hocca`."""
 
     p_C0: tuple[float, ...]
     since_align_s: float
@@ -102,7 +102,7 @@ class LawState(msgspec.Struct, frozen=True):
     easing: EasingState
     has_led: bool = False
     coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS)
-    """Of `CouplingFilter`, N m."""
+    """State of `CouplingFilter`, N m."""
     levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
     """Whether a slope is known, and the slope, rad: the memory of `Levelling`."""
     shift: ShiftState = ShiftState()
@@ -112,7 +112,7 @@ class LawState(msgspec.Struct, frozen=True):
 
 
 class TickState(msgspec.Struct, frozen=True):
-    """Of `Planner`, before a tick."""
+    """State of `Planner` before a tick."""
 
     states: tuple[JointState | None, ...]
     arrived_ns: tuple[int, ...]

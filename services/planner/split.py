@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from services.planner.certificate import Certificate, Margins
 from services.planner.gains import JointGains
-from shared import gain_schedule
-from shared.config import RobotConfig
+from shared.bus.messages import SplitSource
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.gain_table import GainSchedule
-from shared.joints import MODULES
-from shared.messages import SplitSource
+from shared.robot import gain_schedule
+from shared.robot.gain_table import GainSchedule
+from shared.robot.joints import MODULES
 
 Array = NDArray[np.float64]
 

@@ -31,11 +31,11 @@ from services.planner.dynamic_certificate import StiffnessNode as DynamicNode
 from services.planner.poses import PoseNode, Poses
 from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import CouplingGains, ScheduledGains
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.gain_schedule import VERSION, digest_of, inputs_of
-from shared.gain_table import GainSchedule, LegGains
-from shared.joints import N_LEG
+from shared.robot.gain_schedule import VERSION, digest_of, inputs_of
+from shared.robot.gain_table import GainSchedule, LegGains
+from shared.robot.joints import N_LEG
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]

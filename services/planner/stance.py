@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.messages import Vector6
+from shared.bus.messages import Vector6
 
 Array = NDArray[np.float64]
 

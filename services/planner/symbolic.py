@@ -14,8 +14,8 @@ import casadi as ca
 import numpy as np
 
 from services.planner.model import LegGeometry
-from shared.config import RobotConfig
-from shared.joints import N_JOINTS, N_LEG
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import N_JOINTS, N_LEG
 
 
 class Graphs(NamedTuple):

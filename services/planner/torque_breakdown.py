@@ -18,8 +18,8 @@ from services.planner.kinematics import Kinematics
 from services.planner.levelling import up_of
 from services.planner.push_limit import PushLimits, limits_at
 from services.planner.split import GainSplit, LocalGains
-from shared.config import GRAVITY, RobotConfig
-from shared.messages import AS_CONFIGURED, Pair, Vector6
+from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
+from shared.config.robot_config import GRAVITY, RobotConfig
 
 Array = NDArray[np.float64]
 

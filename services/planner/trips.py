@@ -1,6 +1,7 @@
 """What the planner trips on: it asks all six modules to hold. Pure.
 
-What no joint service can see by itself (`shared.trip_table`; limits: [trips] of the robot file):
+Each trip watches what no joint service can see by itself (`shared.robot.trip_table`; its limits are
+[trips] of the robot file):
 
     legs       the two legs' estimates of the torso's place differ: a sole tips, or a zero is wrong
     reach      the inverse kinematics does not reach the reference pose
@@ -29,10 +30,10 @@ from numpy.typing import NDArray
 
 from services.planner.hocca import LawOutput
 from services.planner.snapshots import TripsState
+from shared.bus.messages import Trip
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Trip
-from shared.trip_table import PLANNER_TRIPS, limits_of
+from shared.config.robot_config import RobotConfig
+from shared.robot.trip_table import PLANNER_TRIPS, limits_of
 
 Array = NDArray[np.float64]
 

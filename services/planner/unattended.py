@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import Final
 
 from services.planner.snapshots import UnattendedState
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
-from shared.messages import Pair
 
 FELT: Final = (3.0, 1.0)
 """N and N m: noise and a zero that is off are less, a hand that leads is more

@@ -25,14 +25,16 @@ from services.recorder.files import FIRST
 from services.recorder.mcap_log import SCHEMA_VERSION, MessageSource, RunWriter
 from services.recorder.recording import CAPACITY, Recorder, free_bytes_at, summary
 from services.recorder.snapshot import SnapshotRing
-from shared import gain_schedule, log, topics
-from shared.bus import open_session
+from shared import log
+from shared.bus import topics
+from shared.bus.session import open_session
 from shared.clock import keep_pace, now_ns, pace
-from shared.config_file import load
-from shared.config_sections import RecorderConfig
+from shared.config.files import load
+from shared.config.sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
 from shared.priority import raise_priority
 from shared.process import StopFlag, run_service, service_parser
+from shared.robot import gain_schedule
 
 FIFO_PRIORITY: Final = 5
 """Below every control service, above what has no such priority: a starved recorder's

@@ -13,11 +13,11 @@ from typing import Final
 MIB: Final = 1 << 20
 
 WARN: Final = 2.0
-"""Of the least free space: below, a warning."""
+"""Multiple of the least free space below which it warns."""
 RESUME: Final = 1.5
-"""Of the least free space: above, recording goes on."""
+"""Multiple of the least free space above which recording resumes."""
 CALM: Final = 2.5
-"""Of the least free space: above, the next warning is news again."""
+"""Multiple of the least free space above which the next warning is new."""
 
 
 class DiskChange(Enum):

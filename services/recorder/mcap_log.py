@@ -35,11 +35,11 @@ from mcap.writer import CompressionType, Writer
 from services.recorder import files, schema
 from services.recorder.fsync_thread import Syncer
 from services.recorder.sequence_stats import KeyCount
+from shared.bus.topics import Topic
 from shared.exceptions import RunError
-from shared.topics import Topic
 
 SCHEMA_VERSION: Final = "5"
-"""Of the layout above and of the messages in `shared/messages.py`."""
+"""Version of the layout above and of the messages in `shared/bus/messages.py`."""
 
 FILE_NAME: Final = files.FIRST
 PROFILE: Final = "xrl"
@@ -106,7 +106,7 @@ class RunWriter:
         self.begun = 0
         """Files begun so far."""
         self.counts: dict[str, KeyCount] = {key: KeyCount() for key in topics}
-        """Of the whole run."""
+        """Counts of the whole run."""
         self.unknown: dict[str, int] = {}
         """Messages on keys that have no row in the table of topics; not written."""
         self.malformed: dict[str, int] = {}

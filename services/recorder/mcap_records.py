@@ -85,9 +85,9 @@ class Chunk(NamedTuple):
     first_ns: int
     last_ns: int
     size: int
-    """Of the content before compression."""
+    """Size of the content before compression, bytes."""
     crc: int
-    """Of the content before compression; 0 if there is none."""
+    """CRC of the content before compression; 0 if there is none."""
     compression: str
     content: bytes
 

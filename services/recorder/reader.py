@@ -35,7 +35,7 @@ class Piece(NamedTuple):
 
     opcode: int
     start: int
-    """Of the record in the file."""
+    """Offset of the record in the file."""
     end: int
     body: bytes
     """Content of the record; of a chunk, its decompressed content."""

@@ -36,7 +36,7 @@ class NewChannel(NamedTuple):
     schema_encoding: str
     schema: bytes
     encoding: str
-    """Of the messages."""
+    """Encoding of the messages."""
     about: dict[str, str]
 
 

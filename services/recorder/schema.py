@@ -14,9 +14,9 @@ from typing import Any, Final
 import msgspec
 from msgspec import inspect
 
-from shared import messages
+from shared.bus import messages
+from shared.bus.messages import Message
 from shared.exceptions import RunError
-from shared.messages import Message
 
 ENCODING: Final = "jsonschema"
 """MCAP's name for this kind of schema."""

@@ -15,10 +15,10 @@ from typing import Final
 import msgspec
 
 from services.recorder.mcap_log import MessageSource
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import Mode
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
-from shared.messages import Mode
-from shared.topics import Topic
 
 FAULTS: Final = frozenset((Mode.FAULT, Mode.DAMP))
 """Modes of a joint service that are worth a file."""

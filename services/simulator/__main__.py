@@ -18,11 +18,15 @@ from services.simulator.loop import SimulatorLoop, SimulatorPorts
 from services.simulator.plant import plant_from
 from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
-from shared import config_file, log, scenarios, topics
-from shared.bus import open_session
-from shared.config import RobotConfig, expand
-from shared.joints import MODULE_INDEX, N_JOINTS
-from shared.messages import OperatorIntent, SimControl, SimTruth
+from shared import log
+from shared.bus import topics
+from shared.bus.messages import OperatorIntent, SimControl, SimTruth
+from shared.bus.session import open_session
+from shared.bus.traces import SimState
+from shared.can.unix_can_hub import UnixCanHub
+from shared.config import files as config_file
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig, expand
 from shared.priority import raise_priority
 from shared.process import (
     DEFAULT_CONFIG,
@@ -31,8 +35,7 @@ from shared.process import (
     run_service,
     service_parser,
 )
-from shared.traces import SimState
-from shared.unix_can_hub import UnixCanHub
+from shared.robot.joints import MODULE_INDEX, N_JOINTS
 
 FIFO_PRIORITY = 25
 """The world waits for nobody."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from services.simulator.body import Body
 from services.simulator.drivetrain import FlexibleDrivetrain
 from services.simulator.plant import RIGID
-from shared.joints import N_JOINTS
+from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 

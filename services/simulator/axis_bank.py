@@ -30,16 +30,16 @@ from services.simulator.axis_faults import (
 )
 from services.simulator.axis_settings import Settings, configured
 from services.simulator.dc_bus import DEAD_VOLTAGE, DcBus
-from shared.cansimple import (
+from shared.can.cansimple import (
     AxisError,
     AxisState,
     ControllerError,
     Heartbeat,
     InputMode,
 )
-from shared.config_sections import DriveConfig
+from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
-from shared.joints import N_JOINTS
+from shared.robot.joints import N_JOINTS
 
 __all__ = ["AXIS_NAMES", "FAULTS", "AxisBank", "AxisErrors"]
 

@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 
 from services.simulator.axis_faults import AxisErrors
 from services.simulator.axis_settings import Settings
-from shared.cansimple import AxisError, AxisState, EncoderError
-from shared.joints import N_JOINTS
+from shared.can.cansimple import AxisError, AxisState, EncoderError
+from shared.robot.joints import N_JOINTS
 
 SLIP: Final = 0.05
 """turn; a shaft that moves further by itself fails the encoder's calibration."""

@@ -12,7 +12,7 @@ from typing import Final
 from services.simulator.axis_control import AxisControl
 from services.simulator.axis_faults import FAULTS, AxisErrors
 from services.simulator.axis_settings import N_DRIVES, Settings
-from shared.joints import N_JOINTS
+from shared.robot.joints import N_JOINTS
 
 BOOT_S: Final = 1.5
 """s from power to the first frame; the firmware waits so long before it starts its axes."""

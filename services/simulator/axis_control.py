@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.axis_settings import Settings
-from shared.cansimple import ControlMode
-from shared.joints import N_JOINTS
+from shared.can.cansimple import ControlMode
+from shared.robot.joints import N_JOINTS
 
 Vector = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from shared.cansimple import (
+from shared.can.cansimple import (
     AxisError,
     ControllerError,
     EncoderError,
     MotorError,
     OdriveError,
 )
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 
 AXIS_NAMES: Final = tuple(f"{module}.axis{index}" for module in MODULES for index in (0, 1))
 """The 12 axes by name, in order."""

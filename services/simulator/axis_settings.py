@@ -1,7 +1,7 @@
 """Settings of the emulated drives by the firmware's names: a plain table {name: value}.
 
 What ODrive ships with firmware 0.5.6; what this robot wants instead is in
-`shared.drive_settings`. One column for each name, for all drives at once: the emulation reads
+`shared.can.drive_settings`. One column for each name, for all drives at once: the emulation reads
 its limits from the columns, a front reads and writes single values by name.
 
 Source: the configuration structs of firmware 0.5.6 (odriverobotics/ODrive). The over-voltage
@@ -22,11 +22,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shared import drive_settings
-from shared.config_sections import DriveConfig
-from shared.drive_settings import Need, Value
+from shared.can import drive_settings
+from shared.can.drive_settings import Need, Value
+from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
-from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
+from shared.robot.joints import MODULE_INDEX, MODULES, N_JOINTS
 
 __all__ = [
     "AXIS_SETTINGS", "DRIVE_SETTINGS", "NAMES", "N_DRIVES", "PHASE_RESISTANCE", "Settings", "Value",
@@ -73,7 +73,7 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "encoder.config.direction": 0,
     "encoder.config.pre_calibrated": False,
 }
-"""Of each axis, below `axis0.` and `axis1.`: the default, whose type is the setting's."""
+"""Settings of each axis, below `axis0.` and `axis1.`: the default, whose type is the setting's."""
 
 DRIVE_SETTINGS: Final[Mapping[str, Value]] = {
     "config.dc_bus_undervoltage_trip_level": 8.0,
@@ -85,7 +85,7 @@ DRIVE_SETTINGS: Final[Mapping[str, Value]] = {
     "config.brake_resistance": 2.0,
     "can.config.baud_rate": 250_000,
 }
-"""Of the whole ODrive."""
+"""Settings of the whole ODrive."""
 
 NAMES: Final = (
     *DRIVE_SETTINGS,

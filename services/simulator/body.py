@@ -1,7 +1,7 @@
 """The true robot: what the robot file says, with the plant's errors laid over it.
 
 The world steps this and nothing else: it holds no robot file, so what a controller believes and
-what is true can differ in every number. The one generated model (`shared.robot_model`) is the
+what is true can differ in every number. The one generated model (`shared.robot.robot_model`) is the
 nominal one; masses, friction, floor and feet are changed on it here.
 """
 
@@ -22,11 +22,11 @@ from services.simulator.plant import (
     Person,
     PlantConfig,
 )
-from shared.config import GRAVITY, RobotConfig
-from shared.config_sections import OperatorConfig
-from shared.joints import JOINTS, MODULES, SIDES
-from shared.messages import Vector3
-from shared.robot_model import ankle_positions, mjcf, stand_pose
+from shared.bus.messages import Vector3
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.sections import OperatorConfig
+from shared.robot.joints import JOINTS, MODULES, SIDES
+from shared.robot.robot_model import ankle_positions, mjcf, stand_pose
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class Body(NamedTuple):
 
     model: mujoco.MjModel
     timestep: float
-    """Of one call of `World.step`, s; the model's own is a `steps`th of it."""
+    """Duration of one call of `World.step`, s; the model's own is a `steps`th of it."""
     steps: int
     weight: float
     """N"""
@@ -65,7 +65,7 @@ class Body(NamedTuple):
     motor_from_joint: Array
     """(12, 12) turns/rad, with the motors' signs."""
     counts_per_turn: int
-    """Of the encoders."""
+    """Counts of an encoder per turn."""
     drivetrain: Drivetrain
     drive: DriveErrors
     encoder: EncoderErrors

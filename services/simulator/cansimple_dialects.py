@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_faults import AxisErrors
 from services.simulator.axis_settings import AXIS_SETTINGS, DRIVE_SETTINGS, Value
-from shared import cansimple, cansimple_06
-from shared.cansimple import (
+from shared.can import cansimple, cansimple_06
+from shared.can.cansimple import (
     AxisError,
     AxisState,
     Command,
@@ -29,7 +29,7 @@ from shared.cansimple import (
     MotorError,
     OdriveError,
 )
-from shared.cansimple_06 import (
+from shared.can.cansimple_06 import (
     Command06,
     DriveError06,
     Heartbeat06,

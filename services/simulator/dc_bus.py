@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.axis_settings import N_DRIVES, Settings
-from shared.joints import N_JOINTS
+from shared.robot.joints import N_JOINTS
 
 Vector = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.plant import Drivetrain
-from shared.compiled_graph import CompiledGraph
-from shared.joints import N_JOINTS
+from shared.robot.compiled_graph import CompiledGraph
+from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_conditions import OVER_TEMP_MARGIN, ROOM_TEMPERATURE
 from services.simulator.axis_faults import AXIS_NAMES
 from services.simulator.dc_bus import SUPPLY_VOLTAGE
-from shared.joints import MODULE_INDEX
-from shared.scenarios import Fault
+from shared.config.scenarios import Fault
+from shared.robot.joints import MODULE_INDEX
 
 _AT_ONCE: Final = {"watchdog": "WATCHDOG", "disarmed": "DISARM", "overspeed": "OVERSPEED"}
 """Kinds that are of a moment, and the fault of the bank that each is."""

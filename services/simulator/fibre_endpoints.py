@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_settings import AXIS_SETTINGS, DRIVE_SETTINGS, Value
-from shared.cansimple import AxisState, InputMode
+from shared.can.cansimple import AxisState, InputMode
 
 AXES: Final = (0, 1)
 HARDWARE: Final = (3, 6, 56)
@@ -90,7 +90,7 @@ class Function(NamedTuple):
 
     name: str
     call: Callable[..., None]
-    """Of the board and the arguments."""
+    """Function of the board and the arguments."""
     arguments: tuple[Argument, ...] = ()
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from services.simulator.frame_hub import FrameHub
-from shared import loadcell_can, stewart
-from shared.config import RobotConfig
+from shared.can import loadcell_can
+from shared.config.robot_config import RobotConfig
+from shared.robot import stewart
 
 BIAS_MAX: Final = 20.0
 """Zero offset of a load cell: uniform within +- this, N; constant, so that tare matters."""

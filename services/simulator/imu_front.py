@@ -10,8 +10,8 @@ import numpy as np
 from services.simulator.frame_hub import FrameHub
 from services.simulator.plant import ImuErrors
 from services.simulator.world import World
-from shared import imu_can
-from shared.config_sections import ImuConfig
+from shared.can import imu_can
+from shared.config.sections import ImuConfig
 
 
 class ImuFront:

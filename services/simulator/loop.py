@@ -14,15 +14,15 @@ from services.simulator.harness_front import HarnessFront
 from services.simulator.imu_front import ImuFront
 from services.simulator.state import taken
 from services.simulator.world import World
-from shared.bus import Latest, Publisher
-from shared.cansimple import AxisState
+from shared.bus.messages import OperatorIntent, SimControl, SimTruth
+from shared.bus.session import Latest, Publisher
+from shared.bus.topics import SIM_STATE
+from shared.bus.traces import SimState
+from shared.can.cansimple import AxisState
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns, sleep_until
-from shared.config import RobotConfig
-from shared.messages import OperatorIntent, SimControl, SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO
 from shared.process import StopFlag
-from shared.scenarios import SCENARIO
-from shared.topics import SIM_STATE
-from shared.traces import SimState
 
 INTENT_RATE_HZ = 50.0
 SILENT_INTENTS = 250

@@ -10,9 +10,9 @@ import math
 from typing import Final, NamedTuple
 
 from services.simulator.plant import Person
-from shared.config_sections import OperatorConfig
-from shared.messages import Vector3
-from shared.scenarios import Lead
+from shared.bus.messages import Vector3
+from shared.config.scenarios import Lead
+from shared.config.sections import OperatorConfig
 
 
 class HandForce(NamedTuple):

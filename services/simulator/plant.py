@@ -19,9 +19,9 @@ from typing import Annotated, Any, Final
 import msgspec
 import tomli_w
 
+from shared.config.toml_file import Range, Section, parse_toml, read_toml
 from shared.exceptions import ConfigError
-from shared.joints import N_JOINTS
-from shared.toml_file import Range, Section, parse_toml, read_toml
+from shared.robot.joints import N_JOINTS
 
 Angle = Annotated[float, Range(-0.5, 0.5, "rad")]
 Shift = Annotated[float, Range(-0.3, 0.3, "m")]
@@ -35,8 +35,9 @@ class Drivetrain(Section, frozen=True):
     """Between motor and joint, each of the 12 axes alike; the encoder is at the motor."""
 
     stiffness: Annotated[float, Range(500.0, math.inf, "N m/rad")] = 8000.0
-    """Of gear and chain, seen at the joint; inf: rigid. Harmonic drives of this torque class have
-    10 000 to 30 000 N m/rad by their catalogues, a chain stage after it a half to a fifth."""
+    """Stiffness of gear and chain, seen at the joint; inf: rigid. Harmonic drives of this torque
+    class have 10 000 to 30 000 N m/rad by their catalogues, a chain stage after it a half to a
+    fifth."""
     damping_s: Annotated[float, Range(0.0, 0.02, "s")] = 0.002
     """Damping as a time: N m s/rad per N m/rad. Steel in grease has a loss factor of 1 to 5 %; at
     the drivetrain's 37 Hz (8000 N m/rad on the rotor) 0.002 s is a damping ratio of 0.23 against
@@ -92,9 +93,9 @@ class BodyErrors(Section, frozen=True):
 
     payload_scale: Annotated[float, Range(0.0, 3.0, "1")] = 1.0
     mass_scale: Scale = 1.0
-    """Of every body."""
+    """Factor on every body's mass."""
     com_offset: tuple[Shift, Shift, Shift] = (0.0, 0.0, 0.0)
-    """Of the torso's centre of mass, m, torso axes."""
+    """Offset of the torso's centre of mass, m, torso axes."""
 
 
 class Floor(Section, frozen=True):
@@ -127,7 +128,8 @@ class Person(Section, frozen=True):
     mass: Annotated[float, Range(0.0, 200.0, "kg")] = 80.0
     """0: the hand follows the path exactly, whatever it meets."""
     leg_frequency_hz: Annotated[float, Range(0.5, 20.0, "Hz")] = 2.5
-    """Of the mass on its legs: a standing person bounces at 2 to 3 Hz (whole-body vibration)."""
+    """Frequency of the person's mass on its legs: a standing person bounces at 2 to 3 Hz
+    (whole-body vibration)."""
     leg_damping_ratio: Annotated[float, Range(0.0, 2.0, "1")] = 0.4
     load_scale: Annotated[float, Range(0.0, 3.0, "1")] = 0.9
     """What the person rests on the harness, of the assist that was asked for."""
@@ -147,9 +149,9 @@ class PlantConfig(Section, frozen=True):
     feet: Feet = Feet()
     person: Person = Person()
     steps: Annotated[int, Range(1, 64, "1")] = 1
-    """Of world and drivetrain in a `simulation.timestep`: more show whether one will do."""
+    """Steps of world and drivetrain in a `simulation.timestep`: more show whether one is enough."""
     seed: Annotated[int, Range(0, 1 << 31, "1")] = 0
-    """Of the encoders' noise."""
+    """Seed of the encoders' noise."""
 
 
 IDEAL: Final = PlantConfig(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.world import World
-from shared.cansimple import AxisState
-from shared.joints import N_JOINTS
-from shared.traces import SimState
+from shared.bus.traces import SimState
+from shared.can.cansimple import AxisState
+from shared.robot.joints import N_JOINTS
 
 
 def taken(world: World, bank: AxisBank, t_ns: int, seq: int) -> SimState:

@@ -23,7 +23,7 @@ SOURCE: Final = Path(__file__).with_name("libusb_standin.c")
 SONAME: Final = "libusb-1.0.so.0"
 """As libodrive asks for it."""
 FOLDER: Final = "usb"
-"""Of the plugs, in the run directory; a plug's file name is the drive's serial number."""
+"""Folder of the plugs in the run directory; a plug's file name is the drive's serial number."""
 VARIABLE: Final = "XRL_USB"
 """Environment variable in which the stand-in looks for the folder of the plugs."""
 

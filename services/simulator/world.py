@@ -18,9 +18,9 @@ from services.simulator.actuation import Actuation
 from services.simulator.body import Body
 from services.simulator.hoist import Hoist
 from services.simulator.operator import HandForce, Operator, Wearer
-from shared.joints import JOINTS, N_LEG, SIDES
-from shared.messages import SimTruth, Vector3, Vector4
-from shared.scenarios import Lead, Scenario, lead, push_at
+from shared.bus.messages import SimTruth, Vector3, Vector4
+from shared.config.scenarios import Lead, Scenario, lead, push_at
+from shared.robot.joints import JOINTS, N_LEG, SIDES
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from shared.config_file import load_without_schedule
-from shared.drive_settings import AXES, of_module
+from shared.can.drive_settings import AXES, of_module
+from shared.config.files import load_without_schedule
 from tests.conftest import ROBOT_FILE
 from tools.bringup.boards import Value
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from shared.config import RobotConfig
-from shared.config_sections import CanConfig
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import CanConfig
 
 
 @pytest.fixture

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from shared import cansimple, imu_can, loadcell_can
-from shared.cansimple import AxisState, Command, Heartbeat, arbitration_id
-from shared.cansimple_06 import Command06, Version, pack_version
-from shared.config_sections import CanConfig
-from shared.unix_can import REMOTE_FLAG
-from shared.unix_can_hub import UnixCanHub
+from shared.can import cansimple, imu_can, loadcell_can
+from shared.can.cansimple import AxisState, Command, Heartbeat, arbitration_id
+from shared.can.cansimple_06 import Command06, Version, pack_version
+from shared.can.unix_can import REMOTE_FLAG
+from shared.can.unix_can_hub import UnixCanHub
+from shared.config.sections import CanConfig
 from tools.bringup.can_monitor import listen
 
 NODE = 8

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from shared.cansimple import AxisState
-from shared.config import RobotConfig
-from shared.drive_settings import WantedSetting, of_module
+from shared.can.cansimple import AxisState
+from shared.can.drive_settings import WantedSetting, of_module
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools.bringup import backup, changes

@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from shared.cansimple import AxisError, AxisState, MotorError
-from shared.config import RobotConfig
-from shared.drive_settings import of_module
+from shared.can.cansimple import AxisError, AxisState, MotorError
+from shared.can.drive_settings import of_module
+from shared.config.robot_config import RobotConfig
 from tests.bringup.board_in_memory import as_wanted, healthy
 from tools.bringup import check_board
 from tools.bringup.boards import Value

@@ -8,11 +8,11 @@ import os
 import msgspec
 import pytest
 
-from shared.cansimple import AxisState, Heartbeat
-from shared.cansimple_06 import Version
-from shared.config import RobotConfig
-from shared.config_sections import CanConfig
-from shared.imu_can import ImuSample
+from shared.can.cansimple import AxisState, Heartbeat
+from shared.can.cansimple_06 import Version
+from shared.can.imu_can import ImuSample
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import CanConfig
 from tests.imu.robots import with_imu
 from tools.bringup import check_can
 from tools.bringup.can_monitor import BusHeard, NodeHeard, long_enough, period_ms

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from shared import priority
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.bringup import check_machine
 from tools.bringup.rows import Finding, FindingKind

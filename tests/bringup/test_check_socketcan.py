@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tools.bringup import check_socketcan
 from tools.bringup.check_socketcan import socketcan_rows
 from tools.bringup.rows import Finding, FindingKind

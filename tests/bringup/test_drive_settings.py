@@ -15,10 +15,17 @@ from services.simulator.axis_settings import (
     configured,
     plant,
 )
-from shared.config import RobotConfig
-from shared.drive_settings import AXIS_TABLE, DRIVE_TABLE, Compare, WantedSetting, of_module, same
+from shared.can.drive_settings import (
+    AXIS_TABLE,
+    DRIVE_TABLE,
+    Compare,
+    WantedSetting,
+    of_module,
+    same,
+)
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 
 TRAPS = (
     "controller.config.vel_limit",

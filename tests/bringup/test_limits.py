@@ -10,9 +10,9 @@ import can
 import msgspec
 import pytest
 
-from shared import cansimple
-from shared.cansimple import Command
-from shared.config import RobotConfig
+from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.bringup.board_in_memory import BoardInMemory, as_wanted
 from tools.bringup import limits

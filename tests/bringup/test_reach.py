@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared.config import RobotConfig
-from shared.config_sections import CanConfig
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import CanConfig
 from shared.exceptions import FleetError
 from tools.bringup import reach
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from shared.cansimple import AxisState
-from shared.config import RobotConfig
+from shared.can.cansimple import AxisState
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.usb.standin import MODULE, UsbRobot, eventually, serial_number
 from tools.bringup import usb_board

@@ -12,15 +12,16 @@ import numpy.typing as npt
 
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
-from shared import config_file, loadcell_can
+from shared.bus.codec import encode
+from shared.bus.messages import TareRequest, Vector6, Wrench
+from shared.can import loadcell_can
+from shared.can.loadcell_can import LegSample
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.codec import encode
-from shared.config import RobotConfig
-from shared.config_sections import HarnessConfig
-from shared.loadcell_can import LegSample
-from shared.messages import TareRequest, Vector6, Wrench
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import HarnessConfig
 from shared.process import DEFAULT_CONFIG
-from shared.stewart import geometry_matrix
+from shared.robot.stewart import geometry_matrix
 
 ROBOT = config_file.load(DEFAULT_CONFIG)
 HARNESS = ROBOT.harness

@@ -15,9 +15,9 @@ from services.harness.filter import (
     initial_state,
     start_tare,
 )
+from shared.bus.messages import Tare
+from shared.can.loadcell_can import as_sent
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.loadcell_can import as_sent
-from shared.messages import Tare
 from tests.harness.helpers import HARNESS, PERIOD_NS, T0, ZERO, G, harness_with, legs, sample
 
 Array = npt.NDArray[np.float64]

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.loadcell_can import FRAME_IDS, SampleAssembler, as_sent, pack
+from shared.can.loadcell_can import FRAME_IDS, SampleAssembler, as_sent, pack
 
 float32 = st.floats(width=32, allow_nan=False)
 ONE = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from services.simulator.harness_front import HarnessFront
-from shared import topics
-from shared.bus import open_session
+from shared.bus import topics
+from shared.bus.messages import Tare, TareRequest, Wrench
+from shared.bus.session import open_session
+from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import now_ns
-from shared.messages import Tare, TareRequest, Wrench
-from shared.unix_can_hub import UnixCanHub
 from tests.harness.helpers import ROBOT
 
 pytestmark = pytest.mark.system

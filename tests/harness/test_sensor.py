@@ -9,11 +9,11 @@ import can
 import pytest
 
 from services.harness.sensor import CanHarnessSensor
-from shared import loadcell_can
-from shared.can_sensor import DRAIN_MAX, RETRY_NS
+from shared.can import loadcell_can
+from shared.can.can_sensor import DRAIN_MAX, RETRY_NS
+from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import ConfigError
-from shared.unix_can_hub import UnixCanHub
 from tests.harness.helpers import PERIOD_NS, CanHub
 
 PAUSE_NS = 20 * NS_PER_MS

@@ -9,7 +9,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from shared.exceptions import ConfigError
-from shared.stewart import CONDITION_MAX, condition_number, geometry_matrix, leg_points
+from shared.robot.stewart import CONDITION_MAX, condition_number, geometry_matrix, leg_points
 from tests.harness.helpers import HARNESS, G
 
 Array = npt.NDArray[np.float64]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.harness.filter import TARE_DEVIATION_MAX, WrenchFilter, initial_state
-from shared.messages import Tare
+from shared.bus.messages import Tare
 from tests.harness.helpers import (
     HARNESS,
     PERIOD_NS,

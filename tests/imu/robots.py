@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 
 
 def with_imu(robot: RobotConfig, **changes: object) -> RobotConfig:

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from services.imu.attitude import AttitudeLaw, rotation, up_in_sensor
 from services.imu.loop import ImuLoop
+from shared.bus.messages import Attitude, Vector4
+from shared.can.imu_can import ImuSample
 from shared.clock import NS_PER_MS
-from shared.config_sections import ImuConfig
-from shared.imu_can import ImuSample
-from shared.messages import Attitude, Vector4
+from shared.config.sections import ImuConfig
 
 ROBOT_IMU = ImuConfig(fitted=True, stale_ms=100.0)
 STALE_NS = round(100.0 * NS_PER_MS)

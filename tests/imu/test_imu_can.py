@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.imu_can import IDS, ImuAssembler, ImuSample, pack
+from shared.can.imu_can import IDS, ImuAssembler, ImuSample, pack
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 STILL = (0.0, 0.0, 0.0)

@@ -8,9 +8,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from shared import config_file
-from shared.config import RobotConfig
-from shared.gain_schedule import believing
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.robot.gain_schedule import believing
 from tests.conftest import ROBOT_FILE
 
 

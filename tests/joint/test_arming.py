@@ -20,9 +20,9 @@ from services.joint.drivers.base import DriveStatus
 from services.joint.neighbours import NeighbourView
 from services.joint.rearm_guard import LastState
 from services.joint.sinking import DOUBT_NS
+from shared.bus.messages import Mode
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Mode
+from shared.config.robot_config import RobotConfig
 from tests.joint.test_drive_manager import MOVED, Bench
 from tests.joint.test_rearm_guard import CARRIED, Successor
 

@@ -6,7 +6,7 @@ import pytest
 
 from services.joint.drivers.axes_status import AxesStatus
 from services.joint.drivers.base import DriveStatus
-from shared.cansimple import AxisError, AxisState
+from shared.can.cansimple import AxisError, AxisState
 
 IDLE, CLOSED = AxisState.IDLE, AxisState.CLOSED_LOOP_CONTROL
 NONE = (0,) * 8

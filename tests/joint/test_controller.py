@@ -9,9 +9,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from services.joint.drivers.base import DriveReading, DriveStatus
+from shared.bus.messages import Cause, JointCommand, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Cause, JointCommand, Mode, Pair
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, Bench, command, with_service
 
 K_P_STAND, K_D_STAND = (900.0, 1500.0), (30.0, 30.0)

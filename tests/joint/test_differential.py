@@ -13,7 +13,7 @@ from services.joint.differential import (
     motor_from_joint,
     motor_torque,
 )
-from shared.messages import Pair
+from shared.bus.messages import Pair
 
 gear_ratios = st.floats(1.0, 200.0)
 pairs = st.tuples(st.floats(-300.0, 300.0), st.floats(-300.0, 300.0))

@@ -9,8 +9,8 @@ import pytest
 
 from services.joint.drive_manager import IDLE_EVERY_NS, DriveCommand
 from services.joint.drivers.base import DriveStatus
-from shared.config import RobotConfig
-from shared.messages import Mode, Pair
+from shared.bus.messages import Mode, Pair
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import command
 from tests.joint.test_drive_manager import Bench
 

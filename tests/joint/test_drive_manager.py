@@ -19,9 +19,9 @@ from services.joint.drive_manager import (
     DriveManagerState,
 )
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from shared.bus.messages import JointCommand, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import JointCommand, Mode, Pair
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import T0, command, with_service
 
 LoopName = Literal["onboard", "service"]

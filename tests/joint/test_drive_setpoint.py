@@ -21,8 +21,8 @@ from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.resend_policy import DRIFT_MS
 from services.joint.pd_law import ZERO, Setpoint
 from services.joint.pd_law import torque as law_torque
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
-from shared.messages import Pair
 
 N = 17.5
 VEL_LIMIT = 60.0

@@ -13,12 +13,12 @@ from services.joint import pd_law
 from services.joint.controller import JointController
 from services.joint.envelope import ROUNDING, Envelope
 from services.joint.failsafe import Event, Failsafe, Refusal, timing_of
-from shared import config_file
-from shared.config import RobotConfig
-from shared.gain_schedule import believing
-from shared.gain_table import Bounds, ModuleBounds
-from shared.joints import MODULES, kind_of
-from shared.messages import JointCommand, Mode, Outside, Pair
+from shared.bus.messages import JointCommand, Mode, Outside, Pair
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.robot.gain_schedule import believing
+from shared.robot.gain_table import Bounds, ModuleBounds
+from shared.robot.joints import MODULES, kind_of
 from tests.conftest import ROBOT_FILE
 from tests.joint.helpers import SESSION, T0, command
 

@@ -10,8 +10,8 @@ from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
 from services.joint.joint_estimate import JUMP_SPEED, JUMP_TURNS, ODD_MAX, JointEstimate
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.messages import Pair
 
 N = 17.5
 T0 = NS_PER_S

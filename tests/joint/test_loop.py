@@ -13,9 +13,9 @@ from services.joint.drive_manager import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS,
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.rearm_guard import LastState, RearmGuard
-from shared.config import RobotConfig
-from shared.messages import Estop, JointEvent, JointState, Mode, Pair
-from shared.traces import JointTrace
+from shared.bus.messages import Estop, JointEvent, JointState, Mode, Pair
+from shared.bus.traces import JointTrace
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import T0, command, with_service
 
 M = TypeVar("M")

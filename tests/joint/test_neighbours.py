@@ -20,8 +20,8 @@ from services.joint.neighbours import (
     path_of,
     view_of,
 )
-from shared.joints import MODULES, kind_of
-from shared.messages import Mode
+from shared.bus.messages import Mode
+from shared.robot.joints import MODULES, kind_of
 from tests.joint.helpers import T0
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from services.joint import pd_law
 from services.joint.pd_law import Setpoint
-from shared.messages import Pair
+from shared.bus.messages import Pair
 from tests.joint.helpers import command
 
 shares = st.floats(0.0, 1.0)

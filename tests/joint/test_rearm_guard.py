@@ -20,10 +20,10 @@ from services.joint.drive_manager import (
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.loop import JointLoop
 from services.joint.rearm_guard import LastState, Pendant, RearmGuard
+from shared.bus.messages import JointCommand, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import JointCommand, Mode, Pair
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tests.joint.helpers import T0, command
 from tests.joint.test_loop import Rig, Stop
 

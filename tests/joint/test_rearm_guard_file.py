@@ -10,7 +10,7 @@ import pytest
 
 from services.joint import neighbours
 from services.joint.rearm_guard import LastState, Pendant, RearmGuard, ask_stop, clear, path_of
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 from tools import kill
 from tools.supervision import fleet as fleets
 from tools.supervision import procfs, supervise

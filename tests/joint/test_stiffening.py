@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from services.joint.controller import JointController
 from services.joint.neighbours import NeighbourView
 from services.joint.snapshots import ControllerSnapshot
+from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.joints import MODULES, kind_of
-from shared.messages import Mode, Pair
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES, kind_of
 from tests.joint.helpers import Bench
 
 SOFT_P: Pair = (500.0, 12.0)

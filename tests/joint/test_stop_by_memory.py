@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from services.joint.rearm_guard import RearmGuard, ask_stop, clear
-from shared.config import RobotConfig
-from shared.messages import Mode
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
 from tests.joint.test_loop import Rig
 
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.torque_limiter import GateLimits, limit_differential, limit_torque, limits_of
-from shared.config import RobotConfig
-from shared.messages import Pair
+from shared.bus.messages import Pair
+from shared.config.robot_config import RobotConfig
 
 MAX = 115.6
 STEP = 40.0

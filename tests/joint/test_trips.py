@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from services.joint.failsafe import TRIPS, Event
 from services.joint.trips import JointTrips, limits_of
+from shared.bus.messages import Cause, Mode, Pair
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.config_sections import TripLimit
-from shared.messages import Cause, Mode, Pair
-from shared.trip_table import JOINT_TRIPS
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import TripLimit
+from shared.robot.trip_table import JOINT_TRIPS
 from tests.joint.helpers import T0, Bench
 
 CYCLE_NS = 2 * NS_PER_MS

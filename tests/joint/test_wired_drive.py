@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
-from shared.messages import Pair
+from shared.bus.messages import Pair
 
 MARK = 64.0
 TARGET = MotorTarget((0.5, -1.5), (1.0, 2.0), (0.1, 0.2), (20.0, 20.0), (0.3, 0.3))

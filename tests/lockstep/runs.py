@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from services.simulator.plant import PlantConfig
 from services.simulator.plant import to_toml as plant_to_toml
 from services.simulator.state import taken
-from shared import scenarios
-from shared.config import RobotConfig
-from shared.config_file import to_toml
-from shared.impairment import Impairment
-from shared.joints import MODULES
-from shared.messages import SimTruth
-from shared.scenarios import Keyframe, Kill, Push, Restart, Scenario
+from shared.bus.messages import SimTruth
+from shared.config import scenarios
+from shared.config.files import to_toml
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
+from shared.network.impairment import Impairment
+from shared.robot.joints import MODULES
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
 from tools.runs.partial import PartialStart

@@ -9,9 +9,9 @@ import pytest
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL
 from services.simulator.world import World
-from shared.config import RobotConfig
-from shared.messages import Cause, Mode, SimTruth
-from shared.scenarios import Keyframe, Scenario
+from shared.bus.messages import Cause, Mode, SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Scenario
 from tests.lockstep.runs import run, variant
 from tools.runs.lockstep import Lockstep
 

@@ -14,12 +14,12 @@ from services.joint.drive_manager import DriveAction, DriveCommand
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.planner.planner import Planner
 from services.simulator.plant import IDEAL, PlantConfig
+from shared.bus.messages import JointState, Mode, Pair, PlannerMode, SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.messages import JointState, Mode, Pair, PlannerMode, SimTruth
-from shared.robot_model import stand_pose
-from shared.scenarios import Inject, Scenario
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject, Scenario
+from shared.network.impairment import Impairment
+from shared.robot.robot_model import stand_pose
 from tests.joint.helpers import command
 from tests.lockstep.runs import push, variant
 from tests.planner.conftest import standing_torque

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.config import RobotConfig
-from shared.messages import SimTruth
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tools.sweeps import certificate_study as study
 from tools.sweeps.certificate_study import CertificateCase, CertificateCases, CertificateResult

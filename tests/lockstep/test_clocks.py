@@ -15,11 +15,11 @@ import msgspec
 import pytest
 
 from services.planner.engagement_fsm import WAITS_NS
+from shared.bus.messages import Cause, JointCommand, Message, Mode, PlannerStatus, SimTruth
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import Cause, JointCommand, Message, Mode, PlannerStatus, SimTruth
-from shared.topics import Topic
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tools.runs import partial
 from tools.runs.host_clock import HostClock
 from tools.runs.lockstep import Lockstep

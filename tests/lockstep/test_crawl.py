@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.config import RobotConfig
-from shared.messages import Mode
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import Run, kill, run, variant
 
 

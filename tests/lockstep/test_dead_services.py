@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import Mode
-from shared.scenarios import Kill, Push, Restart
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Kill, Push, Restart
+from shared.robot.joints import MODULES
 from tests.lockstep.runs import push, run, variant
 from tools.sweeps.figures import Ending, ending_of
 

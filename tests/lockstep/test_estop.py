@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from services.simulator.plant import PlantConfig, changed
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import Mode
-from shared.scenarios import Fault, Keyframe, Kill, Restart
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Fault, Keyframe, Kill, Restart
+from shared.robot.joints import MODULES
 from tests.lockstep.runs import still
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants

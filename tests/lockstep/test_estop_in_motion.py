@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
-from shared.config import RobotConfig
-from shared.messages import Mode
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import variant
 from tools.runs.lockstep import Lockstep
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.cansimple import AxisState
-from shared.config import RobotConfig
-from shared.fault_table import DRIVE_FAULTS
-from shared.joints import MODULE_INDEX
-from shared.messages import Cause, DriveStatus, Mode
-from shared.scenarios import FAULT_KINDS, Fault, FaultKind, Kill, Restart
+from shared.bus.messages import Cause, DriveStatus, Mode
+from shared.can.cansimple import AxisState
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import FAULT_KINDS, Fault, FaultKind, Kill, Restart
+from shared.robot.fault_table import DRIVE_FAULTS
+from shared.robot.joints import MODULE_INDEX
 from tests.lockstep.runs import Run, run, still
 
 MODULE = "hip_left"

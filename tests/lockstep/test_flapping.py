@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.planner.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
+from shared.bus.messages import Cause, Mode, PlannerMode, SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Cause, Mode, PlannerMode, SimTruth
-from shared.scenarios import Inject, Keyframe, Scenario
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject, Keyframe, Scenario
 from tests.joint.helpers import T0
 from tools.runs.lockstep import Lockstep
 

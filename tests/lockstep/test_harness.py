@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared import topics
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.messages import Message, PlannerStatus, SimTruth, Tare, TareRequest, Wrench
-from shared.scenarios import Keyframe, Scenario
-from shared.topics import Topic
+from shared.bus import topics
+from shared.bus.messages import Message, PlannerStatus, SimTruth, Tare, TareRequest, Wrench
+from shared.bus.topics import Topic
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Scenario
+from shared.network.impairment import Impairment
 from tests.lockstep.runs import still, variant
 from tools.runs.lockstep import Lockstep
 

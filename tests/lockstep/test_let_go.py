@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from services.simulator.plant import PlantConfig, changed
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.messages import PlannerMode, PlannerStatus, Trip
-from shared.scenarios import Keyframe
+from shared.bus.messages import PlannerMode, PlannerStatus, Trip
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe
+from shared.network.impairment import Impairment
 from tests.lockstep.runs import variant
 from tools.runs.lockstep import Lockstep
 

@@ -7,10 +7,10 @@ import random
 
 import pytest
 
-from shared.config import RobotConfig
-from shared.joints import MODULE_INDEX, MODULES
-from shared.messages import Mode
-from shared.scenarios import Fault, FaultKind, Kill
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Fault, FaultKind, Kill
+from shared.robot.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import Run, kill, push, run, variant
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants

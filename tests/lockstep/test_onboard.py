@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared.config import RobotConfig
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Kill, Restart
 from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.messages import Mode
-from shared.scenarios import Kill, Restart
+from shared.robot.joints import MODULES
 from tests.lockstep.runs import push, run, variant
 from tools.runs.lockstep import Lockstep
 

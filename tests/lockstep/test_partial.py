@@ -17,11 +17,11 @@ import random
 import pytest
 
 from services.planner.engagement_fsm import GRACE_NS, WAITS_NS
+from shared.bus.links import ATTITUDES, DIRECTIONS, WRENCHES, directions_of
+from shared.bus.messages import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import MODULES, SIDES
-from shared.links import ATTITUDES, DIRECTIONS, WRENCHES, directions_of
-from shared.messages import SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES, SIDES
 from tests.recorder.runs import sample as sample_of
 from tools.runs import partial
 from tools.runs.partial import KINDS, SUBSETS, PartialCase, PartialStart, run_case

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 
 from services.simulator.plant import PlantConfig, changed
-from shared.config import RobotConfig
-from shared.messages import Mode, SimTruth
+from shared.bus.messages import Mode, SimTruth
+from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import push, run, still
 from tools.runs.lockstep import Lockstep
 

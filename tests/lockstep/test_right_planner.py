@@ -13,11 +13,11 @@ from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
 from services.planner.trips import PlannerTrips
 from services.simulator.plant import PlantConfig, changed
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.messages import Cause, Outside, PlannerMode
-from shared.scenarios import Inject, Keyframe, Push, Scenario
-from shared.trip_table import JOINT_TRIPS
+from shared.bus.messages import Cause, Outside, PlannerMode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject, Keyframe, Push, Scenario
+from shared.network.impairment import Impairment
+from shared.robot.trip_table import JOINT_TRIPS
 from tests.lockstep.runs import kill, push, restart, variant
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.config import RobotConfig
-from shared.messages import Vector4
-from shared.scenarios import Keyframe
+from shared.bus.messages import Vector4
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe
 from tests.lockstep.runs import kill, push, restart, run, variant
 from tools.sweeps import plants
 

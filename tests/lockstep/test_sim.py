@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from shared import topics
-from shared.messages import PlannerStatus
+from shared.bus import topics
+from shared.bus.messages import PlannerStatus
 from tools import cli
 from tools.runs.run_log import read_run
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from services.simulator.plant import PlantConfig, changed
-from shared.config import RobotConfig
-from shared.scenarios import Inject, Keyframe, Kill
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject, Keyframe, Kill
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import Run, push, run, variant
 

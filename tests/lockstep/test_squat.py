@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared.config import RobotConfig
-from shared.messages import Cause, Mode
+from shared.bus.messages import Cause, Mode
+from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import Run, kill, push, restart, run, still, variant
 
 

@@ -6,10 +6,10 @@ import msgspec
 import pytest
 
 from services.simulator.plant import PlantConfig
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.messages import PlannerMode
-from shared.scenarios import Keyframe
+from shared.bus.messages import PlannerMode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe
+from shared.network.impairment import Impairment
 from tests.lockstep.runs import kill, push, restart, run, variant
 from tools.runs.lockstep import Lockstep
 from tools.sweeps import plants

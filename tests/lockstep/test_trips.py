@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 
 from services.simulator.plant import PlantConfig, changed
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
-from shared.scenarios import Keyframe, Push, Scenario
-from shared.trip_table import JOINT_TRIPS, untripped
+from shared.bus.messages import Cause, Mode, PlannerMode, PlannerStatus, Trip
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Push, Scenario
+from shared.network.impairment import Impairment
+from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tests.lockstep.runs import still, variant
 from tools.runs.lockstep import Lockstep, Record, forget
 from tools.sweeps.trips_trial import PLANTS, unfiltered

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.signal import find_peaks
 
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.messages import Mode
-from shared.scenarios import Inject, Keyframe, Push, Scenario
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject, Keyframe, Push, Scenario
+from shared.network.impairment import Impairment
 from tests.lockstep.runs import Run, push, run, still, variant
 from tools.runs.lockstep import Lockstep
 

@@ -19,11 +19,11 @@ import pytest
 from services.joint.snapshots import DriveManagerState
 from services.planner.snapshots import TickState
 from services.simulator.state import taken
-from shared.config import RobotConfig
-from shared.gain_schedule import believing
-from shared.joints import MODULES
-from shared.messages import Mode, Outside
-from shared.traces import SimState
+from shared.bus.messages import Mode, Outside
+from shared.bus.traces import SimState
+from shared.config.robot_config import RobotConfig
+from shared.robot.gain_schedule import believing
+from shared.robot.joints import MODULES
 from tests.lockstep.runs import push, variant
 from tests.lockstep.wrong_planners import faults, wrong
 from tools.runs.lockstep import Lockstep

@@ -11,8 +11,8 @@ from typing import Final
 import msgspec
 
 from services.planner.planner import Planner
-from shared.joints import MODULES, N_MODULES
-from shared.messages import JointCommand, Pair
+from shared.bus.messages import JointCommand, Pair
+from shared.robot.joints import MODULES, N_MODULES
 
 Commands = list[JointCommand]
 Fault = Callable[[Commands, int], Commands]

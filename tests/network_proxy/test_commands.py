@@ -15,13 +15,13 @@ import pytest
 from services.network_proxy.commands import ASKED_MAX, Orders
 from services.network_proxy.control import ASKERS_MAX, ControlSocket
 from services.network_proxy.event_loop import SocketWatch
+from shared.bus.links import COMMANDS, DIRECTIONS
+from shared.bus.traces import LinkEvent
+from shared.config.scenarios import Inject
 from shared.exceptions import FleetError
-from shared.impairment import Direction
-from shared.impairment_schedule import ImpairmentSchedule
-from shared.links import COMMANDS, DIRECTIONS
-from shared.proxy_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
-from shared.scenarios import Inject
-from shared.traces import LinkEvent
+from shared.network.impairment import Direction
+from shared.network.impairment_schedule import ImpairmentSchedule
+from shared.network.proxy_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
 from tools.runs.proxy_client import ProxyClient
 
 DELAY = Inject(link="planner->joints", at=0.0, delay_ms=30.0)

@@ -11,9 +11,9 @@ import pytest
 
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
-from shared import config_file
-from shared.config import GRAVITY, RobotConfig
-from shared.robot_model import stand_pose
+from shared.config import files as config_file
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.robot.robot_model import stand_pose
 from tests.conftest import ROBOT_FILE
 from tests.planner import oracle
 from tests.planner.oracle import Array

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 
 Array = NDArray[np.float64]
 

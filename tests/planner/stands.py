@@ -8,7 +8,7 @@ from services.planner.certificate import Certificate
 from services.planner.gains import GainLaw, JointGains
 from services.planner.kinematics import Kinematics
 from services.planner.split import GainSplit, LocalGains
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.oracle import Array
 

@@ -23,8 +23,8 @@ from services.planner.assist import (
     force_up,
     is_still,
 )
+from shared.bus.messages import Tare, Vector3, Wrench
 from shared.clock import NS_PER_MS
-from shared.messages import Tare, Vector3, Wrench
 from tests.planner import oracle
 
 DT = 0.004

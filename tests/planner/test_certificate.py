@@ -14,8 +14,8 @@ from services.joint.differential import motor_from_joint
 from services.planner.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
 from services.planner.gains import GainLaw
 from services.planner.inverse_kinematics import InverseKinematics
-from shared.config import RobotConfig
-from shared.robot_model import stand_pose
+from shared.config.robot_config import RobotConfig
+from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed, at_pose, p_at
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand

@@ -7,9 +7,9 @@ import pytest
 
 from services.joint.envelope import Envelope
 from services.planner.hocca import Hocca
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import JointCommand, Outside
+from shared.bus.messages import JointCommand, Outside
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tests.planner.conftest import Closed
 
 

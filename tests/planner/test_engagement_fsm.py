@@ -6,10 +6,10 @@ import pytest
 
 from services.joint.drivers.base import DriveStatus
 from services.planner.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
+from shared.bus.messages import JointCommand, Mode, PlannerMode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import JointCommand, Mode, PlannerMode
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tests.joint.helpers import Bench
 
 T = TypeVar("T")

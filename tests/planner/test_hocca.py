@@ -10,7 +10,7 @@ from services.planner.hocca import Hocca, LawOutput
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
 from services.planner.split import LocalGains
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed, at_pose
 from tests.planner.oracle import LEFT, RIGHT, Array

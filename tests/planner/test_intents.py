@@ -7,9 +7,9 @@ import math
 import pytest
 
 from services.planner.intents import Intents, Wish
+from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.messages import STRAIGHT, OperatorIntent, Vector4
+from shared.config.robot_config import RobotConfig
 
 T0 = 5_000_000_000
 

@@ -9,8 +9,8 @@ import pytest
 
 from services.planner.inverse_kinematics import TOLERANCE, IkEnding, InverseKinematics, describe
 from services.planner.kinematics import Kinematics
-from shared.config import RobotConfig
-from shared.robot_model import stand_pose
+from shared.config.robot_config import RobotConfig
+from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.conftest import Closed, com_height, p_at
 from tests.planner.oracle import Array

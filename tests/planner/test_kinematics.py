@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.planner.kinematics import Kinematics
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import SQUAT, Closed
 from tests.planner.oracle import LEFT, RIGHT, Array

@@ -10,11 +10,11 @@ import pytest
 from services.planner.limp_leg_watch import DISARMED_NS, LimpLegWatch
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
+from shared.bus.messages import DriveStatus, JointState, Mode
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
-from shared.limp_leg_support import Support
-from shared.messages import DriveStatus, JointState, Mode
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
+from shared.robot.limp_leg_support import Support
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state

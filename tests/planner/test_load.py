@@ -13,8 +13,8 @@ from services.planner.hocca import Hocca
 from services.planner.kinematics import Kinematics
 from services.planner.load import AGAIN_SHARE, HIDDEN, WEIGHING_S, Load
 from services.planner.snapshots import LoadState
-from shared.config import GRAVITY, RobotConfig
-from shared.messages import Pair, Tare, Wrench
+from shared.bus.messages import Pair, Tare, Wrench
+from shared.config.robot_config import GRAVITY, RobotConfig
 from tests.planner.conftest import Closed
 
 LARGEST = (8.0, 20.0)

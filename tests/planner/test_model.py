@@ -9,9 +9,9 @@ import pinocchio as pin
 import pytest
 
 from services.planner.model import leg_geometry, load_pinocchio, q_tree
-from shared.config import RobotConfig
-from shared.joints import JOINTS, SIDES
-from shared.robot_model import mjcf
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import JOINTS, SIDES
+from shared.robot.robot_model import mjcf
 from tests.planner import oracle
 from tests.planner.oracle import Array
 

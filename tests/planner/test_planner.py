@@ -9,11 +9,7 @@ import pytest
 from services.planner.certificate import Margins
 from services.planner.intents import Wish
 from services.planner.planner import EARLY_SHARE, LATE_SHARE, TICK_GAP_MAX_S, Planner
-from shared import gain_schedule
-from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import N_MODULES
-from shared.messages import (
+from shared.bus.messages import (
     DriveStatus,
     JointCommand,
     JointState,
@@ -23,6 +19,10 @@ from shared.messages import (
     Tare,
     Wrench,
 )
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.robot import gain_schedule
+from shared.robot.joints import N_MODULES
 from tests.planner.conftest import Closed, standing_torque
 from tests.planner.oracle import Array
 

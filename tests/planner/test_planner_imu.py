@@ -7,9 +7,9 @@ import math
 import pytest
 
 from services.planner.planner import Planner
+from shared.bus.messages import Attitude
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.messages import Attitude
+from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
 from tests.planner.conftest import Closed
 from tests.planner.test_planner import SESSION, START_NS, receive_all

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from services.planner.planner import Planner
 from services.planner.plausible import BEYOND_RAD, SPEED_MAX, Plausible
+from shared.bus.messages import PlannerMode
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.joints import N_JOINTS, N_MODULES
-from shared.messages import PlannerMode
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import N_JOINTS, N_MODULES
 from tests.planner.conftest import Closed
 from tests.planner.test_planner import SESSION, START_NS, lead, receive_all, state
 

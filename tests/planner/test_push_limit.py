@@ -16,9 +16,9 @@ from services.planner.push_limit import DIRECTIONS, LoadedStand, slope_pulling
 from services.simulator.body import body_of
 from services.simulator.plant import NAMED, changed
 from services.simulator.world import World
-from shared.config import GRAVITY, RobotConfig
-from shared.joints import N_JOINTS, N_LEG
-from shared.scenarios import Keyframe, Push, Scenario
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.scenarios import Keyframe, Push, Scenario
+from shared.robot.joints import N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
 

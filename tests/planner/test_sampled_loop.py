@@ -33,7 +33,7 @@ from services.planner.stability_room import room_of
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
 from services.simulator.world import World
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import still
 from tests.planner import loop_oracle
 from tools.runs.lockstep import Lockstep

@@ -12,8 +12,8 @@ from services.planner.intents import Wish
 from services.planner.planner import Planner
 from services.planner.shift import ROWS, SHIFT_S, ShiftReference
 from services.planner.snapshots import ShiftState
-from shared.config import RobotConfig
-from shared.messages import STRAIGHT, Vector4
+from shared.bus.messages import STRAIGHT, Vector4
+from shared.config.robot_config import RobotConfig
 
 LARGEST = (0.03, 0.04, 0.06, 0.12)
 DT = 0.004

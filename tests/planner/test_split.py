@@ -15,12 +15,12 @@ from services.planner.gains import JointGains
 from services.planner.inverse_kinematics import InverseKinematics
 from services.planner.kinematics import Kinematics
 from services.planner.split import GainSplit, ScheduledGains
-from shared.config import GRAVITY, RobotConfig
+from shared.bus.messages import SplitSource
+from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.exceptions import ConfigError
-from shared.gain_schedule import digest_of, inputs_of
-from shared.gain_table import GainSchedule
-from shared.messages import SplitSource
-from shared.robot_model import stand_pose
+from shared.robot.gain_schedule import digest_of, inputs_of
+from shared.robot.gain_table import GainSchedule
+from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand

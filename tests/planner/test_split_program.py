@@ -10,11 +10,11 @@ from services.planner import design_program, split_program
 from services.planner.certificate import Margins
 from services.planner.dynamic_certificate import DynamicCertificate
 from services.planner.inverse_kinematics import InverseKinematics
-from shared import gain_schedule
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.gain_table import GainSchedule
-from shared.robot_model import stand_pose
+from shared.robot import gain_schedule
+from shared.robot.gain_table import GainSchedule
+from shared.robot.robot_model import stand_pose
 from tests.planner.conftest import at_pose, com_height
 from tests.planner.oracle import Array
 from tests.planner.stands import Stand

@@ -13,8 +13,8 @@ from services.planner.planner import Planner
 from services.planner.poses import Poses
 from services.planner.push_limit import LoadedStand
 from services.planner.stance import FOLLOW_S, Stance
-from shared.config import RobotConfig
-from shared.messages import PlannerMode
+from shared.bus.messages import PlannerMode
+from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
 from tests.planner.oracle import LEFT, RIGHT, Array

@@ -11,7 +11,7 @@ import pytest
 from services.planner import inverse_kinematics
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.inverse_kinematics import InverseKinematics
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed, at_pose, p_at
 from tests.planner.oracle import LEFT, RIGHT, Array

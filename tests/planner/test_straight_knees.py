@@ -18,7 +18,7 @@ from services.planner.gains import GainLaw
 from services.planner.inverse_kinematics import TOLERANCE, InverseKinematics
 from services.planner.kinematics import Kinematics
 from services.planner.split import GainSplit
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
 from tests.planner.oracle import Array

@@ -10,10 +10,10 @@ import pytest
 from services.planner.hocca import LawOutput
 from services.planner.kinematics import Kinematics, leg_loads
 from services.planner.trips import CALM_NS, PlannerTrips, values_of
+from shared.bus.messages import Trip
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.messages import Trip
-from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from shared.config.robot_config import RobotConfig
+from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tests.planner.conftest import Closed
 
 T0 = 5_000_000_000

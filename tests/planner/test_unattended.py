@@ -7,7 +7,7 @@ import math
 import pytest
 
 from services.planner.unattended import ARM, FELT, LET_GO_NS, Unattended
-from shared.messages import Pair
+from shared.bus.messages import Pair
 
 T0 = 5_000_000_000
 HERE: Pair = (0.8, 0.1)

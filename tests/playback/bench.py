@@ -15,9 +15,10 @@ from typing import NamedTuple
 
 import pytest
 
-from shared import codec, config_file, topics
-from shared.bus import Session, open_session
-from shared.messages import Estop, JointCommand, JointState, Message, SimTruth, Wrench
+from shared.bus import codec, topics
+from shared.bus.messages import Estop, JointCommand, JointState, Message, SimTruth, Wrench
+from shared.bus.session import Session, open_session
+from shared.config import files as config_file
 from shared.process import DEFAULT_CONFIG
 from tests.recorder import runs
 from tests.recorder.runs import Queue, sample

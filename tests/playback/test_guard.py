@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from shared import topics
+from shared.bus import topics
 from shared.exceptions import FleetError
 from tests.test_bus import TALK, TOOL
 from tools.playback import guard, selection

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shared import codec, topics
+from shared.bus import codec, topics
 from shared.exceptions import RunError
 from tests.recorder import runs
 from tests.recorder.runs import STATE_KEY, Queue, item, killed_file, write, writer

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared import topics
+from shared.bus import topics
 from shared.exceptions import RunError
 from tools.playback.selection import check_prefix, choose, clock_key, short, targets
 

@@ -12,7 +12,7 @@ from mcap.writer import Writer
 
 from services.recorder import recover
 from services.recorder.mcap_log import RunWriter
-from shared import codec, topics
+from shared.bus import codec, topics
 from shared.clock import NS_PER_S
 from tests.recorder import runs
 from tests.recorder.runs import Queue, sample

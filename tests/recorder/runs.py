@@ -12,9 +12,9 @@ import msgspec
 from msgspec import inspect
 
 from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
-from shared import codec, topics
-from shared.messages import JointState, Message
-from shared.topics import Topic
+from shared.bus import codec, topics
+from shared.bus.messages import JointState, Message
+from shared.bus.topics import Topic
 
 ROBOT = "lab"
 OFFSET_NS = 1_700_000_000_000_000_000

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from services.recorder import recover
-from shared import topics
+from shared.bus import topics
 from shared.exceptions import RunError
 from tests.recorder import runs
 from tests.recorder.runs import STATE_KEY, Killed

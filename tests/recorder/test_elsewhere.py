@@ -19,8 +19,8 @@ import msgspec
 import pytest
 
 from services.recorder import schema
-from shared import topics
-from shared.joints import MODULES
+from shared.bus import topics
+from shared.robot.joints import MODULES
 from tests.recorder import elsewhere_files, runs
 from tests.recorder.elsewhere import LAST, Opened, Refused, opened_by_3, opened_by_4
 from tests.recorder.elsewhere_files import write_one

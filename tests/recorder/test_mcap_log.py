@@ -10,7 +10,7 @@ from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
 from services.recorder import mcap_log
-from shared import codec
+from shared.bus import codec
 from shared.exceptions import RunError
 from tests.recorder import runs
 from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, Queue, item

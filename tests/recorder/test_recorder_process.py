@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from shared import topics
-from shared.bus import Publisher, open_session
-from shared.config_file import load
+from shared.bus import topics
+from shared.bus.messages import JointState
+from shared.bus.session import Publisher, open_session
+from shared.config.files import load
 from shared.exceptions import RunError
-from shared.messages import JointState
 from shared.process import DEFAULT_CONFIG
 from tests.recorder import runs
 from tools import cli

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from services.recorder import auto_recover, recover
 from services.recorder.recover import Interrupted
-from shared import topics
+from shared.bus import topics
 from shared.exceptions import RunError
 from tests.recorder import runs
 from tests.recorder.runs import ATTACHMENTS, STATE_KEY, Queue, item

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from services.recorder.mcap_log import SCHEMA_VERSION
-from shared import codec, topics
+from shared.bus import codec, topics
+from shared.bus.messages import Wrench
 from shared.exceptions import RunError
-from shared.messages import Wrench
 from tests.recorder import runs
 from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Queue, item
 from tools.runs.run_log import read_run

@@ -7,9 +7,9 @@ import msgspec
 import pytest
 
 from services.recorder import schema
-from shared import codec, messages, topics
+from shared.bus import codec, messages, topics
+from shared.bus.topics import Topic
 from shared.exceptions import RunError
-from shared.topics import Topic
 from tests.recorder.runs import sample
 
 RECORDED = [topic for topic in topics.TOPICS if topic.recorded]

@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 
 from services.recorder.snapshot import OVERHEAD, SnapshotRing
-from shared import codec, topics
+from shared.bus import codec, topics
+from shared.bus.messages import Estop, JointEvent, Mode
 from shared.clock import NS_PER_S
-from shared.messages import Estop, JointEvent, Mode
 from tests.recorder import runs
 from tests.recorder.runs import ROBOT, STATE_KEY, Queue
 

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from shared import topics
+from shared.bus import topics
 from shared.clock import NS_PER_S
 from tools.reexecution import rewritten
 from tools.runs.run_log import RunLog, read_run

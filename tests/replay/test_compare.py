@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.messages import JointEvent
-from shared.traces import PlannerCheckpoint
+from shared.bus.messages import JointEvent
+from shared.bus.traces import PlannerCheckpoint
 from tools.reexecution.compare import Comparison, ulp
 
 finite = st.floats(allow_nan=False, allow_infinity=False)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from shared import topics
-from shared.joints import MODULES
+from shared.bus import topics
+from shared.robot.joints import MODULES
 from tests.replay.make_golden import TRACED
 from tools import resim
 from tools.reexecution.outcome import ReexecutionResult

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from shared import gain_schedule
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
+from shared.robot import gain_schedule
 from tools.reexecution.params import with_params
 
 

@@ -11,11 +11,11 @@ import pytest
 from rich.console import Console
 
 from services.simulator.plant import PlantConfig, changed
-from shared import topics
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.joints import MODULES
-from shared.scenarios import Fault, Kill, Restart
+from shared.bus import topics
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Fault, Kill, Restart
+from shared.network.impairment import Impairment
+from shared.robot.joints import MODULES
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tools import resim, sim

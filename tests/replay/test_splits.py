@@ -8,11 +8,11 @@ import pytest
 from rich.console import Console
 
 from services.recorder.mcap_log import RunWriter
-from shared import topics
-from shared.config import RobotConfig
+from shared.bus import topics
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Kill, Restart
 from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.scenarios import Kill, Restart
+from shared.robot.joints import MODULES
 from tests.lockstep.runs import still
 from tests.recorder.runs import Queue
 from tools import cli, resim, sim

@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from services.simulator.plant import PlantConfig
-from shared import topics
-from shared.config import RobotConfig
+from shared.bus import topics
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
-from shared.messages import SimTruth
-from shared.scenarios import Scenario
 from tests.lockstep.runs import kill, push, run, still
 from tools import sim, whatif
 from tools.counterfactual.moments import Moment, moments_of

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import msgspec
 
 from services.recorder.mcap_log import RunWriter
-from shared import topics
+from shared.bus import topics
 from shared.clock import NS_PER_S
 from tests.recorder.runs import Queue
 from tools import cli

@@ -13,9 +13,9 @@ import pytest
 from mcap.reader import make_reader
 
 from services.recorder import schema
-from shared import topics
-from shared.config import RobotConfig
-from shared.messages import DriveStatus, Mode, PlannerMode, SplitSource
+from shared.bus import topics
+from shared.bus.messages import DriveStatus, Mode, PlannerMode, SplitSource
+from shared.config.robot_config import RobotConfig
 from tests.reports.layout_types import FIELD, PANELS, TOPIC, Layout, Plot, Split, Tab
 from tests.reports.runs import Made
 from tools import cli

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared import topics
-from shared.traces import LinkEvent
+from shared.bus import topics
+from shared.bus.traces import LinkEvent
 from tests.reports import runs
 from tools.reports.limit_violations import first_violation, limit_violations
 from tools.reports.page_model import TimelineEvent

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from shared.config import RobotConfig
-from shared.joints import SIDES
-from shared.messages import Mode
-from shared.robot_model import ankle_positions
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import SIDES
+from shared.robot.robot_model import ankle_positions
 from tests.reports.runs import Made
 from tools import cli
 from tools.reports import scene

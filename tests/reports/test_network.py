@@ -5,11 +5,11 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shared.bus.links import DIRECTIONS, WRENCHES
+from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_S
-from shared.impairment import Direction, Impairment
-from shared.impairment_schedule import ImpairmentSchedule
-from shared.links import DIRECTIONS, WRENCHES
-from shared.traces import LinkEvent
+from shared.network.impairment import Direction, Impairment
+from shared.network.impairment_schedule import ImpairmentSchedule
 from tools.reports.network import ImpairedLink, histories
 
 

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared import topics
-from shared.joints import JOINTS, MODULES
-from shared.messages import JointState, Mode, RunEvent
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, RunEvent
+from shared.robot.joints import JOINTS, MODULES
 from tests.reports import pages, runs
 from tests.reports.runs import Made
 from tools.reports import page as page_module

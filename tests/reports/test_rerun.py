@@ -16,7 +16,7 @@ import pinocchio as pin
 import pytest
 from mcap.reader import make_reader
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.reports.runs import Made
 from tools import cli
 from tools.reports import scene, urdf

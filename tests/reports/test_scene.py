@@ -20,10 +20,10 @@ from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from services.recorder import schema
-from shared import codec, topics
-from shared.config import RobotConfig
-from shared.joints import JOINTS, MODULES, SIDES
-from shared.robot_model import ankle_positions, mjcf
+from shared.bus import codec, topics
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import JOINTS, MODULES, SIDES
+from shared.robot.robot_model import ankle_positions, mjcf
 from tests.recorder.runs import sample
 from tests.recorder.test_schema import fits
 from tests.reports import runs

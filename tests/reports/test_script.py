@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from shared import topics
-from shared.joints import MODULES
+from shared.bus import topics
+from shared.robot.joints import MODULES
 from tests.reports import runs
 from tools.reports.page import render
 from tools.reports.run_data import RunData

@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared import topics
-from shared.joints import MODULES
-from shared.messages import DriveStatus
-from shared.traces import LinkEvent
+from shared.bus import topics
+from shared.bus.messages import DriveStatus
+from shared.bus.traces import LinkEvent
+from shared.robot.joints import MODULES
 from tests.reports import pages, runs
 from tools.reports.network import ImpairedLink
 from tools.reports.page import render

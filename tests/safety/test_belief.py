@@ -8,9 +8,9 @@ import msgspec
 import pytest
 
 from services.joint.controller import JointController
+from shared.bus.messages import Mode, Outside
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.messages import Mode, Outside
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import Bench
 from tests.joint.test_envelope import MODULE, Q, bounds_of, middle
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import pytest
 
 from services.joint.failsafe import timing_of
+from shared.bus.messages import Mode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Mode
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, Bench
 
 ROOT = Path(__file__).resolve().parents[2]

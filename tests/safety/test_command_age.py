@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.joint.failsafe import Event, Failsafe, Refusal, Timing, timing_of
+from shared.bus.messages import Mode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Mode
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, command
 
 OTHER = 8

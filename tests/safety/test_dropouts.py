@@ -8,9 +8,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from services.joint.failsafe import Event, Failsafe, Timing, timing_of
+from shared.bus.messages import Cause, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Cause, Mode
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import T0, command
 
 CYCLE_NS = 2 * NS_PER_MS

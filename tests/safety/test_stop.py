@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from services.joint.drivers.base import DriveStatus
+from shared.bus.messages import Cause, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import kind_of
-from shared.messages import Cause, Mode
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import kind_of
 from tests.joint.helpers import Bench
 
 

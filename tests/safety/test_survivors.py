@@ -17,12 +17,12 @@ from services.joint.failsafe import (
 )
 from services.planner.engagement_fsm import GRACE_NS, Engagement
 from services.planner.planner import Planner
+from shared.bus.messages import Cause, Mode, PlannerMode, Wrench
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.gain_schedule import believing
-from shared.joints import MODULES, kind_of
-from shared.messages import Cause, Mode, PlannerMode, Wrench
-from shared.robot_model import stand_pose
+from shared.config.robot_config import RobotConfig
+from shared.robot.gain_schedule import believing
+from shared.robot.joints import MODULES, kind_of
+from shared.robot.robot_model import stand_pose
 from tests.joint.helpers import SESSION, T0, Bench, command
 from tests.planner.test_planner import START_NS, lead, receive_all
 

@@ -8,9 +8,9 @@ from itertools import product
 import pytest
 
 from services.joint.torque_limiter import GateLimits, limit_differential, limit_torque, limits_of
-from shared.config import RobotConfig
-from shared.joints import KINDS
-from shared.messages import Pair
+from shared.bus.messages import Pair
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import KINDS
 
 ROUNDING = 1e-9
 HUGE = 1.7e308

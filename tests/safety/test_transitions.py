@@ -8,8 +8,8 @@ from typing import NamedTuple
 import pytest
 
 from services.joint.failsafe import TRANSITIONS, TRIPS, Event, Failsafe, Timing, timing_of
-from shared.config import RobotConfig
-from shared.messages import Cause, Mode
+from shared.bus.messages import Cause, Mode
+from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, command
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.axis_bank import AxisBank
-from shared.cansimple import AxisState, ControlMode, InputMode
-from shared.config_sections import DriveConfig
+from shared.can.cansimple import AxisState, ControlMode, InputMode
+from shared.config.sections import DriveConfig
 
 DRIVE = DriveConfig(
     encoder_bandwidth=1000.0,  # rad/s: at a step of 1 ms the emulation is exact to a few per cent

@@ -6,7 +6,7 @@ import numpy as np
 
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_calibration import ENCODER_S, MOTOR_S
-from shared.cansimple import AxisError, AxisState, EncoderError
+from shared.can.cansimple import AxisError, AxisState, EncoderError
 from tests.simulator.banks import DT, make_bank, step_for
 
 

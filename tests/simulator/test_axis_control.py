@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.simulator.axis_bank import AxisBank
-from shared.cansimple import AxisState, ControlMode, InputMode
+from shared.can.cansimple import AxisState, ControlMode, InputMode
 from tests.simulator.banks import DRIVE, ZERO, make_bank
 
 GEAR = 17.5

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.simulator.axis_bank import AxisBank
-from shared.cansimple import AxisState, InputMode
+from shared.can.cansimple import AxisState, InputMode
 from tests.simulator.banks import CPR, DRIVE, DT, ZERO
 from tests.simulator.firmware import FirmwareAxis
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from services.simulator.axis_settings import NAMES, Settings, configured
-from shared.cansimple import AxisState
+from shared.can.cansimple import AxisState
 from shared.exceptions import DriveError
 from tests.simulator.banks import CPR, DRIVE, DT, make_bank, step_for
 

@@ -9,7 +9,7 @@ import pytest
 
 from services.simulator.axis_settings import PHASE_RESISTANCE
 from services.simulator.dc_bus import SUPPLY_RESISTANCE, SUPPLY_VOLTAGE
-from shared.cansimple import AxisError, AxisState, MotorError, OdriveError
+from shared.can.cansimple import AxisError, AxisState, MotorError, OdriveError
 from tests.simulator.banks import DT, make_bank, step_for
 
 KT = 0.0827

@@ -9,7 +9,7 @@ from services.simulator.body import body_of
 from services.simulator.drivetrain import FlexibleDrivetrain
 from services.simulator.plant import IDEAL, Drivetrain, PlantConfig, changed
 from services.simulator.world import World
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.lockstep.runs import still
 from tools.runs.lockstep import Lockstep
 

@@ -11,7 +11,7 @@ from services.simulator.axis_bank import AXIS_NAMES, AxisBank
 from services.simulator.axis_conditions import BOOT_S
 from services.simulator.axis_faults import AxisErrors as Registers
 from services.simulator.fault_injector import FaultInjector
-from shared.cansimple import (
+from shared.can.cansimple import (
     AxisError,
     AxisState,
     ControllerError,
@@ -19,8 +19,8 @@ from shared.cansimple import (
     MotorError,
     OdriveError,
 )
-from shared.joints import MODULES
-from shared.scenarios import FAULT_KINDS, Fault
+from shared.config.scenarios import FAULT_KINDS, Fault
+from shared.robot.joints import MODULES
 from tests.simulator.banks import DT, ZERO, make_bank
 
 FAILED = AxisError.MOTOR_FAILED

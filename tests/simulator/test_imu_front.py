@@ -11,9 +11,9 @@ from services.simulator.body import body_of
 from services.simulator.imu_front import ImuFront
 from services.simulator.plant import ImuErrors, PlantConfig, changed
 from services.simulator.world import World
-from shared.config import RobotConfig
-from shared.imu_can import ImuAssembler
-from shared.messages import Vector3
+from shared.bus.messages import Vector3
+from shared.can.imu_can import ImuAssembler
+from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tools.runs.virtual_can import VirtualCan

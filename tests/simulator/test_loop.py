@@ -15,9 +15,9 @@ from services.simulator.harness_front import HarnessFront
 from services.simulator.loop import SimulatorLoop, SimulatorPorts
 from services.simulator.plant import IDEAL
 from services.simulator.world import World
-from shared.cansimple import AxisState, ControlMode, InputMode
-from shared.config import RobotConfig
-from shared.scenarios import Fault, Keyframe, Scenario
+from shared.can.cansimple import AxisState, ControlMode, InputMode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Fault, Keyframe, Scenario
 
 
 class Silent:

@@ -8,8 +8,8 @@ import pytest
 
 from services.simulator.operator import Operator, Wearer
 from services.simulator.plant import IDEAL, Person
-from shared.config import RobotConfig
-from shared.scenarios import Lead
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Lead
 
 LEVEL = Lead(height=1.1, height_rate=0.0, pitch=0.0, pitch_rate=0.0, assist=0.0)
 

@@ -12,7 +12,7 @@ import pytest
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL, PlantConfig, changed, load, plant_from, to_toml
 from services.simulator.world import World
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.lockstep.runs import variant
 from tools.runs.lockstep import Lockstep

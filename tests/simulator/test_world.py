@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL
 from services.simulator.world import World
-from shared.config import GRAVITY, RobotConfig
-from shared.joints import JOINTS, SIDES
-from shared.messages import SimTruth
-from shared.scenarios import Keyframe, Push, Scenario
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.scenarios import Keyframe, Push, Scenario
+from shared.robot.joints import JOINTS, SIDES
 
 Array = NDArray[np.float64]
 

@@ -25,13 +25,13 @@ import msgspec
 import tomli_w
 
 from services.simulator.plant import PlantConfig
-from shared import scenarios
-from shared.bus import open_session
+from shared.bus.session import open_session
 from shared.clock import now_ns
-from shared.config import RobotConfig
-from shared.joints import MODULES
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Push, Scenario
 from shared.process import DEFAULT_CONFIG
-from shared.scenarios import Push, Scenario
+from shared.robot.joints import MODULES
 from tests.system.namespaces import Network
 from tools.runs import experiment
 from tools.runs.scenario_runner import LiveSnapshot, ScenarioRunner

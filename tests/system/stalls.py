@@ -16,10 +16,10 @@ import time
 from pathlib import Path
 from typing import Final
 
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import Mode
 from shared.clock import NS_PER_S
-from shared.joints import MODULES
-from shared.messages import Mode
+from shared.robot.joints import MODULES
 from tests.system.stall_watch import gaps_in
 from tools.runs.run_log import read_run
 

@@ -21,17 +21,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared import config_file, topics
-from shared.bus import Publisher, Session, open_session
+from shared.bus import topics
+from shared.bus.codec import Decoder
+from shared.bus.links import DIRECTIONS
+from shared.bus.messages import JointState
+from shared.bus.session import Publisher, Session, open_session
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
-from shared.codec import Decoder
-from shared.impairment import Impairer, Impairment
-from shared.joints import MODULES
-from shared.links import DIRECTIONS
-from shared.messages import JointState
+from shared.config import files as config_file
+from shared.config.scenarios import Inject
+from shared.network.impairment import Impairer, Impairment
+from shared.network.proxy_protocol import SOCKET
 from shared.process import DEFAULT_CONFIG
-from shared.proxy_protocol import SOCKET
-from shared.scenarios import Inject
+from shared.robot.joints import MODULES
 from tests.recorder.runs import sample
 from tests.system.stalls import has_stalled, stalled_before_it_began
 from tools.runs.proxy_client import ProxyClient

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from shared import topics
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import PlannerStatus, Wrench
+from shared.bus import topics
+from shared.bus.messages import PlannerStatus, Wrench
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tests.system.stalls import stalled_before_it_began
 from tools.runs.run_log import read_run
 from tools.supervision import procfs

@@ -13,12 +13,12 @@ import pytest
 
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import Pendant
-from shared import topics
-from shared.bus import open_session
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import JointState, Mode, SimTruth
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, SimTruth
+from shared.bus.session import open_session
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
 from tools.supervision.supervise import SupervisedFleet
 

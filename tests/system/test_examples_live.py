@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from shared import topics
-from shared.bus import open_session
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import PlannerMode, PlannerStatus
+from shared.bus import topics
+from shared.bus.messages import PlannerMode, PlannerStatus
+from shared.bus.session import open_session
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG, RUN_DIR_VARIABLE
+from shared.robot.joints import MODULES
 from tools.supervision.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]

@@ -17,10 +17,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from shared import config_file
-from shared.config import SERVICES, RobotConfig
-from shared.joints import MODULES
+from shared.config import files as config_file
+from shared.config.robot_config import SERVICES, RobotConfig
 from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
 from tests.system.waiting import wait_for
 from tools import cli
 from tools.supervision import procfs

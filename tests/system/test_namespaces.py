@@ -19,11 +19,8 @@ from typing import NamedTuple
 import msgspec
 import pytest
 
-from shared import codec, topics
-from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import (
+from shared.bus import codec, topics
+from shared.bus.messages import (
     Cause,
     JointCommand,
     JointEvent,
@@ -33,6 +30,9 @@ from shared.messages import (
     PlannerStatus,
     SimTruth,
 )
+from shared.clock import NS_PER_MS
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tests.recorder.runs import ROBOT, sample, write
 from tests.system.multihost import BODY, LEGS, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in

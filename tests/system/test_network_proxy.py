@@ -15,15 +15,16 @@ from pathlib import Path
 
 import pytest
 
-from shared import config_file, topics
-from shared.bus import Publisher, Session, Stream, open_session
+from shared.bus import topics
+from shared.bus.codec import Decoder
+from shared.bus.messages import JointState
+from shared.bus.session import Publisher, Session, Stream, open_session
+from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_MS, now_ns
-from shared.codec import Decoder
-from shared.messages import JointState
+from shared.config import files as config_file
+from shared.config.scenarios import Inject
+from shared.network.proxy_protocol import SOCKET
 from shared.process import DEFAULT_CONFIG
-from shared.proxy_protocol import SOCKET
-from shared.scenarios import Inject
-from shared.traces import LinkEvent
 from tests.recorder.runs import sample
 from tools import cli
 from tools.runs.proxy_client import ProxyClient

@@ -13,8 +13,8 @@ import pytest
 from services.joint.drivers import odrive_usb
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_usb import EXCHANGE_HZ, OdriveUsb
-from shared.cansimple import AxisError, AxisState, ControlMode
-from shared.config import RobotConfig
+from shared.can.cansimple import AxisError, AxisState, ControlMode
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.usb import standin
 from tests.usb.standin import MODULE, Control, UsbRobot, eventually, serial_number

@@ -12,8 +12,8 @@ from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.odrive_usb import OdriveUsb
 from services.simulator import fibre_front
 from services.simulator.fibre_endpoints import endpoints
-from shared.cansimple import AxisState
-from shared.config import RobotConfig
+from shared.can.cansimple import AxisState
+from shared.config.robot_config import RobotConfig
 from tests.usb.standin import MODULE, Control, UsbRobot, eventually, serial_number
 
 pytest_plugins = ["tests.usb.fixtures"]

@@ -10,8 +10,8 @@ import pytest
 from services.joint.drivers import odrive_usb
 from services.joint.drivers.base import DriveStatus, MotorTarget
 from services.joint.drivers.odrive_usb import OdriveUsb
-from shared.cansimple import AxisState
-from shared.config import RobotConfig
+from shared.can.cansimple import AxisState
+from shared.config.robot_config import RobotConfig
 from tests.usb.standin import MODULE, Control, UsbRobot, eventually, serial_number
 
 pytest_plugins = ["tests.usb.fixtures"]

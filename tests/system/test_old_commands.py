@@ -15,13 +15,13 @@ from services.joint.differential import motor_from_joint
 from services.joint.drive_manager import DriveManager
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.loop import JointLoop, JointPorts
-from shared import topics
-from shared.bus import open_session
+from shared.bus import topics
+from shared.bus.messages import Estop, JointCommand, JointEvent, JointState, Mode, Pair
+from shared.bus.session import open_session
+from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
-from shared.gain_schedule import believing
-from shared.messages import Estop, JointCommand, JointEvent, JointState, Mode, Pair
-from shared.traces import JointTrace
+from shared.config.robot_config import RobotConfig
+from shared.robot.gain_schedule import believing
 from tests.joint.helpers import SESSION, command
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(60)]

@@ -73,7 +73,7 @@ def test_nothing_is_lost_to_a_subscriber_when_it_plays_as_fast_as_it_can(
 STANDS_STILL = """
 import os, signal, sys, time
 from pathlib import Path
-from shared.bus import open_session
+from shared.bus.session import open_session
 from tests.playback.bench import LISTEN, ROBOT
 with open_session(ROBOT, "ear", Path(sys.argv[1]), connect=[LISTEN]) as session:
     stream = session.stream(["replay/**"], capacity=1_000_000)

@@ -30,10 +30,10 @@ FAILING = "print('no drive on can0'); raise SystemExit(3)"
 JOINT = """
 import sys, time
 from pathlib import Path
-from shared.bus import open_session
-from shared.config_file import load
-from shared.messages import JointState, Mode
-from shared.topics import JOINT_STATE
+from shared.bus.session import open_session
+from shared.config.files import load
+from shared.bus.messages import JointState, Mode
+from shared.bus.topics import JOINT_STATE
 zero = (0.0, 0.0)
 with open_session(load(Path(sys.argv[1])), "ankle_right", Path(sys.argv[2])) as session:
     publisher = session.publisher(JOINT_STATE, JointState, "ankle_right")

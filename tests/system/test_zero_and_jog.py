@@ -16,13 +16,14 @@ import pytest
 
 from services.joint.__main__ import open_drive
 from services.joint.drivers.base import DriveStatus
-from shared import cansimple, topics
-from shared.bus import open_session
-from shared.cansimple import Command
-from shared.config import RobotConfig, expand
-from shared.joints import MODULES
-from shared.messages import JointState, Mode, SimTruth
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, SimTruth
+from shared.bus.session import open_session
+from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.config.robot_config import RobotConfig, expand
 from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
 from tools.bringup import bench, zeroing
 from tools.bringup.zeroing import DriveLook, look

@@ -18,8 +18,8 @@ from services.simulator.fibre_endpoints import EmulatedBoard
 from services.simulator.fibre_front import FibreFront
 from services.simulator.fibre_port import FibreHub, FibrePort
 from services.simulator.usb_standin import build, load
-from shared.config import RobotConfig
-from shared.joints import MODULES, N_JOINTS
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES, N_JOINTS
 
 __all__ = ["Control", "UsbRobot", "build", "load"]
 

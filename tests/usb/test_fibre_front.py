@@ -16,8 +16,8 @@ from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_settings import NAMES
 from services.simulator.fibre_endpoints import CODECS, EmulatedBoard
 from services.simulator.fibre_front import FibreFront, crc16
-from shared.cansimple import AxisError, AxisState
-from shared.config import RobotConfig
+from shared.can.cansimple import AxisError, AxisState
+from shared.config.robot_config import RobotConfig
 
 MODULE = 1
 SERIAL = 0x365A335A3438

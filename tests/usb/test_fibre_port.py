@@ -14,7 +14,7 @@ from services.simulator.axis_bank import AxisBank
 from services.simulator.fibre_endpoints import EmulatedBoard
 from services.simulator.fibre_front import FibreFront
 from services.simulator.fibre_port import LOOK_EVERY, FibreHub, FibrePort
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 
 VERSION = struct.pack("<HHHIH", 0x81, 0x8000, 4, 0xFFFF_FFFF, 1)

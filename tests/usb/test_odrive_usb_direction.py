@@ -6,7 +6,7 @@ import pytest
 
 from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.odrive_usb import OdriveUsb
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tests.usb.standin import MODULE, Control, UsbRobot, eventually, serial_number
 
 pytest_plugins = ["tests.usb.fixtures"]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from shared import config_file
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.usb import robot_file
 from tools.supervision import fleet

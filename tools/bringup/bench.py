@@ -15,11 +15,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from shared import config_file
-from shared.config import RobotConfig, expand
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import FleetError, XrlError
-from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
 from tools.bringup import reach
 from tools.supervision import fleet, procfs
 from tools.supervision.run_dir import RunDir

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple, Protocol
 
-from shared.drive_settings import AXES
+from shared.can.drive_settings import AXES
 from shared.exceptions import DriveError
 
 Value = bool | int | float | str | None

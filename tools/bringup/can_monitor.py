@@ -16,14 +16,14 @@ from typing import Final
 import can
 import msgspec
 
-from shared import cansimple
-from shared.cansimple import Command, Heartbeat
-from shared.cansimple_06 import Command06, Version, unpack_version
-from shared.config_sections import CanConfig
-from shared.imu_can import IDS as IMU_IDS
-from shared.imu_can import ImuAssembler, ImuSample
-from shared.loadcell_can import FRAME_IDS, SampleAssembler
-from shared.messages import Vector6
+from shared.bus.messages import Vector6
+from shared.can import cansimple
+from shared.can.cansimple import Command, Heartbeat
+from shared.can.cansimple_06 import Command06, Version, unpack_version
+from shared.can.imu_can import IDS as IMU_IDS
+from shared.can.imu_can import ImuAssembler, ImuSample
+from shared.can.loadcell_can import FRAME_IDS, SampleAssembler
+from shared.config.sections import CanConfig
 
 LISTEN_S: Final = 0.5
 LISTEN_MAX_S: Final = 3.0
@@ -63,7 +63,7 @@ class BusHeard(msgspec.Struct):
     nodes: dict[int, NodeHeard] = {}
     """By node id: those that should be there, and whoever else sends heartbeats."""
     samples: list[Vector6] = []
-    """Of the load cells."""
+    """Samples of the load cells."""
     samples_s: list[float] = []
     """When they came."""
     malformed: int = 0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from shared.cansimple import AxisState
-from shared.drive_settings import AXES, WantedSetting, describe_value
+from shared.can.cansimple import AxisState
+from shared.can.drive_settings import AXES, WantedSetting, describe_value
 from shared.exceptions import DriveError
 from tools.bringup.boards import Board, Value, equal
 from tools.bringup.check_board import CALIBRATE

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from statistics import median
 from typing import Final
 
-from shared.drive_settings import AXES, AXIS_TABLE, DRIVE_TABLE, describe_value
+from shared.can.drive_settings import AXES, AXIS_TABLE, DRIVE_TABLE, describe_value
 from tools.bringup.boards import Value
 from tools.bringup.rows import Finding, ok, warning, wrong
 
@@ -24,7 +24,8 @@ BOARDS_MIN: Final = 3
 MEASURED: Final = ("motor.config.phase_resistance", "motor.config.phase_inductance")
 """What a calibration finds; alike for motors of one kind."""
 MEASURED_SHARE: Final = 0.3
-"""Of the median that it may differ by: copper at 100 C has 30 % more than at 20 C."""
+"""Fraction of the median by which a value may differ: copper at 100 C has 30 % more than at 20
+C."""
 VOLTS_APART: Final = 1.0
 """Boards on one supply, at rest, and their tolerance."""
 

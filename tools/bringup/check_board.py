@@ -7,7 +7,7 @@ from enum import IntFlag
 from typing import Final
 
 from services.joint.differential import joint_from_motor
-from shared.cansimple import (
+from shared.can.cansimple import (
     AxisError,
     AxisState,
     ControllerError,
@@ -15,11 +15,11 @@ from shared.cansimple import (
     MotorError,
     OdriveError,
 )
-from shared.config import RobotConfig
-from shared.drive_settings import AXES, WantedSetting, describe_value
+from shared.can.drive_settings import AXES, WantedSetting, describe_value
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.joints import AXES as JOINT_AXES
-from shared.joints import MODULE_INDEX
+from shared.robot.joints import AXES as JOINT_AXES
+from shared.robot.joints import MODULE_INDEX
 from tools.bringup.boards import FIRMWARE, Value, describe_firmware, is_known, number
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 
@@ -34,7 +34,7 @@ REGISTERS: Final[tuple[tuple[str, type[IntFlag]], ...]] = (
 """An axis's error registers, in the order of `boards.AXIS_ERRORS`."""
 
 OVERVOLTAGE_SHARE: Final = 0.95
-"""Of the trip level; a supply nearer to it leaves braking legs no room."""
+"""Fraction of the trip level; a supply closer to it leaves braking legs no room."""
 
 TEMPERATURES: Final = (-10.0, 70.0)
 """C; of an output stage that is idle."""

@@ -7,10 +7,10 @@ import os
 from collections.abc import Mapping
 from typing import Final
 
-from shared.cansimple import AxisError
-from shared.config import RobotConfig
-from shared.config_sections import CanConfig
-from shared.drive_settings import AXES
+from shared.can.cansimple import AxisError
+from shared.can.drive_settings import AXES
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import CanConfig
 from tools.bringup.boards import describe_firmware
 from tools.bringup.can_monitor import BusHeard, NodeHeard, mean_ms, period_ms
 from tools.bringup.check_board import describe_flags, state_row
@@ -21,7 +21,7 @@ from tools.supervision.fleet import SIMULATED_CAN
 PERIOD_SHARE: Final = 0.2
 """A measured period may differ by this much: more is a setting, and not a busy machine."""
 TWICE: Final = 0.65
-"""Of the period that is wanted: two axes that speak under one node id."""
+"""Fraction of the wanted period below which two axes share one node id."""
 RATE_SHARE: Final = 0.2
 
 
@@ -63,7 +63,7 @@ def harness_rows(robot: RobotConfig, heard: BusHeard) -> list[Finding]:
         fix = _how_to_open(robot.can[harness.bus], heard.trouble)
         return [wrong(subject, "CAN bus", heard.trouble, "open", fix)]
     if not heard.samples:
-        fix = "the amplifier's supply and wires; its frames are in shared/loadcell_can.py"
+        fix = "the amplifier's supply and wires; its frames are in shared/can/loadcell_can.py"
         why = "no assist force, no easing, no stop at overload"
         return [wrong(subject, "load cells", f"{heard.frames} other frames", wanted, fix, why)]
     fix = "the amplifier's rate, or `harness.rate_hz`"
@@ -85,7 +85,7 @@ def imu_rows(robot: RobotConfig, heard: BusHeard) -> list[Finding]:
         return [wrong(subject, "CAN bus", heard.trouble, "open", fix)]
     why = "the floor is taken as level"
     if not heard.attitudes:
-        fix = "its supply and wires, its CAN output; its frames are in shared/imu_can.py"
+        fix = "its supply and wires, its CAN output; its frames are in shared/can/imu_can.py"
         found = f"{heard.frames} frames that make none"
         return [wrong(subject, "samples", found, wanted, fix, why)]
     fix = "its output rate, or `imu.rate_hz`"

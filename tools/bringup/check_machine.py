@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from shared import priority
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tools.bringup.check_socketcan import ask_ip, socketcan_rows
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 from tools.supervision.fleet import is_simulated
@@ -25,7 +25,7 @@ CPUS_FOR_1_KHZ: Final = 4
 CLOCKS: Final = ("tsc", "arch_sys_counter", "kvm-clock")
 """Clock sources that are read without a system call."""
 FIFO_PRIORITY: Final = 20
-"""Of the joint services."""
+"""FIFO priority of the joint services."""
 
 ODRIVE_VENDOR: Final = "1209"
 ODRIVE_PRODUCTS: Final = tuple(f"0d3{i}" for i in range(1, 10))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from shared import gain_schedule
-from shared.config import RobotConfig, expand
+from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import FleetError
-from shared.joints import MODULES
+from shared.robot import gain_schedule
+from shared.robot.joints import MODULES
 from tools.bringup.rows import Finding, judged, ok, warning, wrong
 from tools.supervision import fleet
 from tools.supervision.fleet import ListenPoint

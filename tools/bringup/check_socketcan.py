@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from shared.config import RobotConfig
-from shared.drive_settings import CAN_BAUD_RATE
+from shared.can.drive_settings import CAN_BAUD_RATE
+from shared.config.robot_config import RobotConfig
 from tools.bringup.rows import Finding, FindingKind, judged, warning, wrong
 
 Links = Mapping[str, Mapping[str, Any]]

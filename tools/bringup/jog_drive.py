@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_S, now_ns
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.messages import Pair
 from tools.bringup.jogging import STRAYED_MAX, Jog, JogPlan, Sample, duration_s, outside
 
 ANSWER_S: Final = 3.0

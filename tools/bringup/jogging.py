@@ -18,29 +18,29 @@ from services.joint.differential import joint_from_motor
 from services.joint.drive_setpoint import DriveSetpointLaw
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.torque_limiter import GateLimits, limit_torque, limits_of
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from shared.joints import AXES, kind_of
-from shared.messages import Pair
+from shared.robot.joints import AXES, kind_of
 
 SETTLE_S: Final = 0.7
 """Held where it is before it moves, and again afterwards."""
 VEL_LIMIT: Final = 3.0
 """turn/s at the motor, at least; a drive that is faster disarms by itself (OVERSPEED)."""
 VEL_FACTOR: Final = 5.0
-"""Of the fastest that is asked for, where that is more."""
+"""Factor on the fastest requested rate, where that is more."""
 APART_MAX: Final = 0.15
 """rad between reference and joint: no friction explains it."""
 OVER_TORQUE: Final = 0.98
-"""Of the torque limit, in the sum of both axes, is at the limit."""
+"""Fraction of the torque limit, in the sum of both axes, that counts as at the limit."""
 OVER_TORQUE_S: Final = 0.2
 SILENT_S: Final = 0.2
 """Without a sample for so long, nobody knows where the joint is."""
 STRAYED_MAX: Final = 0.05
 """rad that a limp joint may have moved between the look and the arming."""
 TRAVEL_SHARE: Final = 0.25
-"""Of what was asked, the travel may be more or less."""
+"""Fraction of the requested travel by which the travel may differ."""
 LAG_MAX: Final = 0.02
 """rad between reference and joint, beyond what its load bends it at rest."""
 SIBLING_MAX: Final = 0.02
@@ -55,7 +55,7 @@ class JogPlan(NamedTuple):
     by: float
     """rad, there and back."""
     period_s: float
-    """Of one there and back."""
+    """Period of one motion there and back, s."""
     cycles: int
     torque_limit: float
     """N m at the joint: |tau_phi| + |tau_theta|."""

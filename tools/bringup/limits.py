@@ -11,11 +11,11 @@ from typing import Final
 
 from services.joint.drivers.can_link import CanLink
 from services.joint.drivers.odrive_frames import orders
-from shared import cansimple
-from shared.cansimple import Command
-from shared.config import RobotConfig, expand
-from shared.config_sections import CanConfig
-from shared.drive_settings import AXES
+from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.can.drive_settings import AXES
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
 from tools.bringup.boards import Value, equal
 from tools.bringup.reach import boards_on_usb

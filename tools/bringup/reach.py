@@ -18,8 +18,8 @@ from typing import Final
 
 from services.simulator import usb_standin
 from services.simulator.axis_settings import Settings, plant
-from shared.config import RobotConfig, expand
-from shared.config_sections import CanConfig
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.sections import CanConfig
 from shared.exceptions import FleetError
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import listen

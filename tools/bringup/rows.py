@@ -8,8 +8,8 @@ from typing import Final
 
 import msgspec
 
-from shared.drive_settings import AXES
-from shared.joints import MODULES
+from shared.can.drive_settings import AXES
+from shared.robot.joints import MODULES
 
 
 class FindingKind(StrEnum):

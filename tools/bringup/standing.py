@@ -8,16 +8,16 @@ import numpy as np
 
 from services.planner.inverse_kinematics import InverseKinematics, describe
 from services.planner.kinematics import Kinematics
-from shared.config import RobotConfig
+from shared.bus.messages import Pair
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import MODULE_INDEX, MODULES
-from shared.messages import Pair
-from shared.robot_model import stand_pose
+from shared.robot.joints import MODULE_INDEX, MODULES
+from shared.robot.robot_model import stand_pose
 
 HEIGHT_TOLERANCE: Final = 1e-7
 """m of torso height"""
 ROUNDS: Final = 20
-"""Of the search for the COM height that goes with a torso height; three are usual."""
+"""Most rounds of the search for the COM height of a torso height; three are usual."""
 
 
 class Standing(NamedTuple):
@@ -26,7 +26,7 @@ class Standing(NamedTuple):
     q: dict[str, Pair]
     """(phi, theta) of each module, rad."""
     hips_forward: float
-    """Of the ankles, m: where the hips are when the COM is over the ankles."""
+    """Position of the hips ahead of the ankles with the COM over the ankles, m."""
 
 
 def standing(robot: RobotConfig, height: float) -> Standing:

@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from shared import drive_settings
-from shared.config import RobotConfig, expand
-from shared.config_sections import CanConfig
+from shared.can import drive_settings
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.sections import CanConfig
 from shared.exceptions import DriveError, FleetError
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 from tools.bringup import check_alike, check_board, check_can, check_machine, check_robot
 from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, number
 from tools.bringup.can_monitor import BusHeard, listen, long_enough

@@ -23,7 +23,7 @@ from odrive.device_manager import (
 from odrive.libodrive import DeviceType
 from odrive.runtime_device import RuntimeDevice
 
-from shared.drive_settings import AXES
+from shared.can.drive_settings import AXES
 from shared.exceptions import DriveError
 from tools.bringup.boards import Board, FoundBoards, Value, describe_firmware, number
 

@@ -13,11 +13,11 @@ from typing import Final, NamedTuple
 from services.joint.differential import joint_from_motor, motor_from_joint
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus
 from services.joint.drivers.wired_drive import MotorFrame
-from shared.cansimple import AxisError
+from shared.bus.messages import Pair
+from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S, now_ns
-from shared.config import RobotConfig
-from shared.joints import kind_of
-from shared.messages import Pair
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import kind_of
 
 LOOK_S: Final = 0.3
 """A joint is watched for so long before it is taken to be still."""

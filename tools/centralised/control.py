@@ -23,9 +23,9 @@ from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.torque_limiter import limit_differential
 from services.planner.engagement_fsm import Engagement
 from services.planner.planner import Planner
+from shared.bus.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.messages import JointCommand, JointState, Mode, PlannerMode, PlannerStatus
+from shared.config.robot_config import RobotConfig
 
 
 class LeadsOn(Engagement):

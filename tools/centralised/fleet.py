@@ -8,11 +8,11 @@ from typing import Final
 import msgspec
 
 from services.simulator.plant import PlantConfig
-from shared.config import RobotConfig
-from shared.gain_schedule import believing
-from shared.impairment import Impairment
-from shared.scenarios import Scenario
-from shared.trip_table import untripped
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from shared.network.impairment import Impairment
+from shared.robot.gain_schedule import believing
+from shared.robot.trip_table import untripped
 from tools.centralised.control import CentralPlanner, PassThrough
 from tools.runs.lockstep import Lockstep, Record, forget
 

@@ -10,13 +10,13 @@ import msgspec
 
 from services.joint.snapshots import DriveManagerState
 from services.planner.snapshots import TickState
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import PlannerStatus
+from shared.bus.traces import SimState
 from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.messages import PlannerStatus
-from shared.traces import SimState
+from shared.robot.joints import MODULES
 from tools.reexecution.joint import JointExecution
 from tools.reexecution.outcome import ReexecutionResult
 from tools.reexecution.planner import PlannerExecution
@@ -40,7 +40,7 @@ class Moment(msgspec.Struct):
     planner: tuple[int, TickState] | None = None
     """Session, and what the planner knew, if it was alive."""
     margin: float | None = None
-    """Of the failsafe certificate, as last published."""
+    """Margin of the failsafe certificate, as last published."""
 
     @property
     def at_s(self) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from shared import topics
+from shared.bus import topics
 from shared.clock import NS_PER_S
 from tools.counterfactual.run import Counterfactual
 from tools.runs.run_log import RunLog

@@ -7,9 +7,9 @@ from typing import Final
 import msgspec
 
 from services.simulator.plant import PlantConfig
-from shared.config import RobotConfig
-from shared.messages import SimTruth
-from shared.scenarios import Kill, Scenario
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Kill, Scenario
 from tools.counterfactual.moments import Moment
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
@@ -41,7 +41,7 @@ class Counterfactual(msgspec.Struct, frozen=True):
     com_y_max_mm: float
     sole_tilt_max_rad: float
     margin: float | None
-    """Of the failsafe certificate when it was killed; None: nothing was published then."""
+    """Margin of the failsafe certificate at the kill; None: none was published."""
 
 
 def scenario_from(scenario: Scenario, at_s: float, kill: tuple[str, ...], for_s: float) -> Scenario:

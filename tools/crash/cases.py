@@ -12,10 +12,19 @@ from typing import Final
 
 import msgspec
 
-from shared.config import OPTIONAL, SERVICES
-from shared.fault_table import DRIVE_FAULTS
-from shared.joints import MODULES, kind_of
-from shared.scenarios import FAULT_KINDS, Fault, FaultKind, Keyframe, Kill, Push, Restart, Scenario
+from shared.config.robot_config import OPTIONAL, SERVICES
+from shared.config.scenarios import (
+    FAULT_KINDS,
+    Fault,
+    FaultKind,
+    Keyframe,
+    Kill,
+    Push,
+    Restart,
+    Scenario,
+)
+from shared.robot.fault_table import DRIVE_FAULTS
+from shared.robot.joints import MODULES, kind_of
 from tools.runs.scenario_runner import Chase
 
 CRASH_S: Final = 2.4

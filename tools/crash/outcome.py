@@ -10,11 +10,11 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from shared.bus.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.messages import Cause, JointEvent, Mode, RunEvent, RunEventKind, SimTruth
-from shared.scenarios import lead
-from shared.trip_table import JOINT_TRIPS
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import lead
+from shared.robot.trip_table import JOINT_TRIPS
 from tools.crash.cases import CRASH_S, REQUEST_S, CrashCase, CrashVerdict, scenario_of
 from tools.runs.standing import is_tipping
 from tools.runs.verdict import LATE_MAX_S, REAL_TIME_FACTOR_MIN

@@ -11,13 +11,13 @@ from typing import Final
 import msgspec
 
 from services.simulator.plant import PlantConfig
-from shared import topics
-from shared.bus import Session
-from shared.codec import Decoder
-from shared.config import RobotConfig
+from shared.bus import topics
+from shared.bus.codec import Decoder
+from shared.bus.messages import JointEvent, RunEvent, RunEventKind, SimTruth
+from shared.bus.session import Session
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
-from shared.joints import MODULES
-from shared.messages import JointEvent, RunEvent, RunEventKind, SimTruth
+from shared.robot.joints import MODULES
 from tools.crash.cases import CrashCase, CrashVerdict, scenario_of
 from tools.crash.outcome import CrashResult, Heard, as_expected, measure, unjudged
 from tools.runs.live import run_live

@@ -27,7 +27,7 @@ class TopicFacts(msgspec.Struct, kw_only=True):
     nominal_hz: float
     """As the table of topics had it when it was recorded; 0: events, or unknown."""
     bytes: int = 0
-    """Of payload, before compression."""
+    """Size of the payload before compression, bytes."""
     first_ns: int = _NEVER
     last_ns: int = _NEVER
     longest_gap_ns: int = 0

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from shared.bus import RawPublisher
+from shared.bus.session import RawPublisher
 from shared.clock import NS_PER_MS, NS_PER_S
 from tools.logs.files import further_files
 from tools.playback.player import Player

@@ -9,13 +9,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from shared import topics
-from shared.bus import open_session
-from shared.config import RobotConfig, expand
+from shared.bus import topics
+from shared.bus.messages import JointState
+from shared.bus.session import open_session
+from shared.bus.topics import Topic
+from shared.config.robot_config import RobotConfig, expand
 from shared.exceptions import FleetError
-from shared.joints import MODULES
-from shared.messages import JointState
-from shared.topics import Topic
+from shared.robot.joints import MODULES
 from tools.playback.selection import LIVE, short
 from tools.supervision.fleet import is_listening
 from tools.supervision.supervise import SupervisedFleet

@@ -125,7 +125,7 @@ class Schedule:
         self._next = self._first
         self._start_ns = part.start_ns
         self.length_ns = max(0, part.end_ns - part.start_ns)
-        """Of one pass."""
+        """Length of one pass, ns."""
         self._loop = loop and self._end > self._first
         self._period_ns = max(self.length_ns, PASS_MIN_NS)
         self.passes = 0

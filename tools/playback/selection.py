@@ -11,8 +11,8 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from typing import Final
 
+from shared.bus.topics import TOPICS
 from shared.exceptions import RunError
-from shared.topics import TOPICS
 
 LIVE: Final = "xrl"
 """First section of every key that a robot's services use."""

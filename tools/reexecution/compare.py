@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import msgspec
 
-from shared.messages import Message
+from shared.bus.messages import Message
 
 _F64: Final = struct.Struct("<d")
 _I64: Final = struct.Struct("<q")

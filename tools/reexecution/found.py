@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections.abc import Iterable
 from typing import Generic, TypeVar
 
-from shared.messages import Message
+from shared.bus.messages import Message
 
 M = TypeVar("M", bound=Message)
 

@@ -11,10 +11,10 @@ from services.joint.drive_manager import DriveManager
 from services.joint.drivers.base import DriveReading
 from services.joint.neighbours import NeighbourView
 from services.joint.snapshots import DriveManagerState
-from shared import topics
-from shared.config import RobotConfig
-from shared.messages import DriveStatus, JointCommand, JointState, Message
-from shared.traces import CycleTrace, JointTrace
+from shared.bus import topics
+from shared.bus.messages import DriveStatus, JointCommand, JointState, Message
+from shared.bus.traces import CycleTrace, JointTrace
+from shared.config.robot_config import RobotConfig
 from tools.reexecution.compare import Comparison
 from tools.reexecution.outcome import ReexecutionResult
 from tools.runs.run_log import RunLog

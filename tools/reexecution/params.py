@@ -10,10 +10,11 @@ from typing import Any, Final
 import msgspec
 import tomli_w
 
-from shared import config_file, gain_schedule
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from shared.gain_table import GainSchedule
+from shared.robot import gain_schedule
+from shared.robot.gain_table import GainSchedule
 
 DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Names of the six rows of K_p and B_p."""

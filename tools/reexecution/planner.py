@@ -10,11 +10,11 @@ import msgspec
 from services.planner.intents import Wish
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
-from shared import topics
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import JointCommand, Message, PlannerStatus
-from shared.traces import PlannerCheckpoint
+from shared.bus import topics
+from shared.bus.messages import JointCommand, Message, PlannerStatus
+from shared.bus.traces import PlannerCheckpoint
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tools.reexecution.found import BySeq
 from tools.reexecution.outcome import ReexecutionResult
 from tools.runs.run_log import RunLog

@@ -11,9 +11,9 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
 from services.recorder import schema
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import Message
 from shared.exceptions import RunError
-from shared.messages import Message
 from tools.runs.run_log import RunLog
 
 PROFILE: Final = "xrl"

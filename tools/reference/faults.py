@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from shared.config_file import load
-from shared.config_sections import TripLimit, TripsConfig
-from shared.fault_table import DRIVE_FAULTS, LOSSES
+from shared.config.files import load
+from shared.config.scenarios import FAULT_KINDS
+from shared.config.sections import TripLimit, TripsConfig
 from shared.process import DEFAULT_CONFIG
-from shared.scenarios import FAULT_KINDS
-from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
+from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
+from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
 from tools.reference.field_docs import one_line
 
 _INTRODUCTION: Final = """\

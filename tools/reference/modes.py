@@ -6,7 +6,7 @@ from collections import defaultdict
 from typing import Final
 
 from services.joint.failsafe import TRANSITIONS, Event
-from shared.messages import Mode
+from shared.bus.messages import Mode
 from tools.reference.field_docs import field_docs
 
 _INTRODUCTION: Final = """\

@@ -1,4 +1,4 @@
-"""The page of the robot file: every key of `shared.config`, with type, unit, range and default."""
+"""The page of the robot file: every key with type, unit, range and default."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_typ
 
 import msgspec
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
+from shared.config.toml_file import Range
 from shared.process import DEFAULT_CONFIG
-from shared.toml_file import Range
 from tools.reference.field_docs import field_docs, one_line, summary
 
 _INTRODUCTION: Final = """\
@@ -28,7 +28,7 @@ default must be there. *Shipped* is the value in `deploy/robot.toml`.
 _LONGEST: Final = 60
 """Characters of a shipped value that fit a cell."""
 _NOT_IN_THE_FILE: Final = "gain_schedule"
-"""Read from the file beside it (`shared.gain_schedule`)."""
+"""Read from the file beside it (`shared.robot.gain_schedule`)."""
 
 
 def page() -> str:

@@ -1,4 +1,4 @@
-"""The page of topics and messages, from `shared.topics` and the message structs."""
+"""The page of topics and messages, from `shared.bus.topics` and the message structs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Final, get_args, get_origin, get_type_hints
 import msgspec
 
 from services.recorder.schema import ENUMERATIONS
-from shared import messages, topics
-from shared.topics import Topic
+from shared.bus import messages, topics
+from shared.bus.topics import Topic
 from tools.reference.field_docs import field_docs, one_line, summary
 
 ENUMS: Final[tuple[type[IntEnum], ...]] = tuple(

@@ -12,8 +12,8 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 
 from foxglove import messages as well_known
 
+from shared.bus.messages import Vector3
 from shared.clock import NS_PER_S
-from shared.messages import Vector3
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Colour: TypeAlias = tuple[float, float, float, float]

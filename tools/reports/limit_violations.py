@@ -11,10 +11,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import PlannerMode
 from shared.clock import NS_PER_S
-from shared.joints import JOINTS, MODULES
-from shared.messages import PlannerMode
+from shared.robot.joints import JOINTS, MODULES
 from tools.reports.page_model import TimelineEvent
 from tools.reports.run_data import RunData
 from tools.reports.signals import Array

@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from shared import topics
+from shared.bus import topics
+from shared.bus.links import GROUPS
+from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_S
-from shared.links import GROUPS
-from shared.traces import LinkEvent
 from tools.reports.page_model import BarRow, PageModel
 from tools.reports.run_data import RunData
 from tools.reports.signals import GAP_S
@@ -51,7 +51,7 @@ def add_network(run: RunData, model: PageModel) -> None:
 def histories(events: Iterable[LinkEvent], zero_ns: int) -> dict[str, History]:
     """Return (time in s, state from then on) of each direction that was ever impaired.
 
-    A partition outweighs all other impairments (`shared.impairment.Direction`).
+    A partition outweighs all other impairments (`shared.network.impairment.Direction`).
 
     Args:
         events: begin and end of impairments, in order.

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from shared import topics
-from shared.joints import MODULES
-from shared.messages import DriveStatus, Mode, PlannerMode, SplitSource
+from shared.bus import topics
+from shared.bus.messages import DriveStatus, Mode, PlannerMode, SplitSource
+from shared.robot.joints import MODULES
 from tools.reports.page_model import BarRow, LevelLine, Line, PageModel
 from tools.reports.run_data import RunData
 from tools.reports.signals import Array

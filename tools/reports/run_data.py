@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import DriveStatus
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import XrlError
-from shared.joints import MODULES
-from shared.messages import DriveStatus
-from shared.topics import Topic
+from shared.robot.joints import MODULES
 from tools.reports.signals import Array, Span, message_times
 from tools.runs import verdict
 from tools.runs.recorded_robot import robot_of

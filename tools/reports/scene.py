@@ -2,7 +2,7 @@
 
 Frames (docs/law.md#the-robot): `world`; `torso`; below it on each leg `hip_*` (carries the
 thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso; `com` with the axes
-of the world. The links are those of `shared.robot_model`.
+of the world. The links are those of `shared.robot.robot_model`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy as np
 
 from services.planner.kinematics import Kinematics
 from services.recorder.scene import NewChannel, NewMessage
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import MODULES, SIDES
-from shared.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
-from shared.robot_model import MODULE_RADIUS, side_sign
+from shared.robot.joints import MODULES, SIDES
+from shared.robot.robot_model import MODULE_RADIUS, side_sign
 from tools.reports import foxglove, urdf
 from tools.reports.foxglove import (
     ORIGIN,

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 from rich.console import Console
 
 from services.recorder.recover import describe_lost
-from shared import topics
+from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from tools.reports.run_data import RunData

@@ -7,10 +7,8 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from shared import topics
-from shared.clock import NS_PER_MS, NS_PER_S
-from shared.joints import MODULES
-from shared.messages import (
+from shared.bus import topics
+from shared.bus.messages import (
     Cause,
     DriveStatus,
     JointEvent,
@@ -24,6 +22,8 @@ from shared.messages import (
     Tare,
     Wrench,
 )
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.robot.joints import MODULES
 from tools.reports.limit_violations import limit_violations
 from tools.reports.page_model import TimelineEvent
 from tools.reports.run_data import RunData

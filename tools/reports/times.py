@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from shared import topics
+from shared.bus import topics
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
-from shared.joints import MODULES
-from shared.topics import Topic
+from shared.robot.joints import MODULES
 from tools.reports.page_model import LevelLine, Line, PageModel
 from tools.reports.run_data import RunData, module_of
 from tools.reports.signals import Array, message_times

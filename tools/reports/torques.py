@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 
 from services.joint import pd_law
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import JointCommand, JointState, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import AXES, MODULES
-from shared.messages import JointCommand, JointState, Mode
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import AXES, MODULES
 from tools.reports.page_model import LevelLine, Line, PageModel
 from tools.reports.run_data import RunData
 from tools.reports.signals import Array

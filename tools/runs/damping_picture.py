@@ -18,7 +18,7 @@ from services.planner.dynamic_certificate import (
     StiffnessNode,
 )
 from services.planner.sampled_loop import NO_HAND, NOMINAL
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 
 mpl.use("Agg")
 

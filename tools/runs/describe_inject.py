@@ -11,18 +11,18 @@ from typing import Any, Final, NamedTuple, get_args
 
 import msgspec
 
+from shared.bus.links import DIRECTIONS, GROUPS, directions_of
+from shared.config.scenarios import Inject
+from shared.config.toml_file import check_ranges
 from shared.exceptions import ConfigError
-from shared.impairment import Distribution
-from shared.links import DIRECTIONS, GROUPS, directions_of
-from shared.scenarios import Inject
-from shared.toml_file import check_ranges
+from shared.network.impairment import Distribution
 
 
 class Number(NamedTuple):
     """A word that takes a number."""
 
     field: str
-    """Of `Inject`."""
+    """Field of `Inject`."""
     units: Mapping[str, str]
     """What may stand behind the number, and what it is then multiplied by."""
     like: str
@@ -79,7 +79,7 @@ def make(link: str, words: Mapping[str, str], dash: str = "") -> Inject:
     """Return an impairment from its words, checked.
 
     Args:
-        link: of `shared.links`.
+        link: of `shared.bus.links`.
         words: each with its value as written: times with us, ms or s behind them (alone: ms, of
             `at` and `for` s), shares with % (alone: 0 to 1); of a switch it is not looked at.
         dash: what stands before a word where it was written, for errors.

@@ -15,13 +15,25 @@ import msgspec
 
 from services.simulator import plant
 from services.simulator.plant import NAMED, PlantConfig
-from shared import config_check, config_file, gain_schedule, scenarios
-from shared.config import SERVICES, RobotConfig
-from shared.config_sections import LawConfig
+from shared.config import checks as config_check
+from shared.config import files as config_file
+from shared.config import scenarios
+from shared.config.robot_config import SERVICES, RobotConfig
+from shared.config.scenarios import (
+    FAULT_KINDS,
+    SIGNALS,
+    Fault,
+    Inject,
+    Kill,
+    Push,
+    Restart,
+    Scenario,
+)
+from shared.config.sections import LawConfig
 from shared.exceptions import FleetError, RunError
-from shared.joints import MODULES
 from shared.process import DEFAULT_CONFIG
-from shared.scenarios import FAULT_KINDS, SIGNALS, Fault, Inject, Kill, Push, Restart, Scenario
+from shared.robot import gain_schedule
+from shared.robot.joints import MODULES
 from tools.runs.describe_inject import in_words_of, parse_inject
 from tools.verbs import add_config
 

@@ -12,11 +12,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from shared import config_file, topics
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, PlannerMode, RunEvent, RunEventKind
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config import files as config_file
 from shared.exceptions import ConfigError
-from shared.joints import MODULES
-from shared.messages import JointState, Mode, PlannerMode, RunEvent, RunEventKind
+from shared.robot.joints import MODULES
 from tools.runs.impairment_intervals import Impaired, impairments
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary, course

@@ -8,12 +8,7 @@ from typing import Final
 
 import msgspec
 
-from shared.bus import Latest, Session
-from shared.clock import NS_PER_S, now_ns, pace
-from shared.exceptions import FleetError
-from shared.fault_table import recovery_of
-from shared.joints import MODULES
-from shared.messages import (
+from shared.bus.messages import (
     Cause,
     DriveStatus,
     JointState,
@@ -25,8 +20,13 @@ from shared.messages import (
     PlannerStatus,
     Trip,
 )
-from shared.topics import JOINT_STATE, PLANNER_STATUS, TOPICS
-from shared.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from shared.bus.session import Latest, Session
+from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOPICS
+from shared.clock import NS_PER_S, now_ns, pace
+from shared.exceptions import FleetError
+from shared.robot.fault_table import recovery_of
+from shared.robot.joints import MODULES
+from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
 from tools.runs.proxy_client import ProxyClient
 from tools.supervision.supervise import SupervisedFleet
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from shared.messages import Message
+from shared.bus.messages import Message
 from tools.runs.network import VirtualLink
 
 M = TypeVar("M", bound=Message)

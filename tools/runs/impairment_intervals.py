@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_S
-from shared.traces import LinkEvent
 
 LAST_NS: Final = np.iinfo(np.int64).max
 
@@ -22,7 +22,7 @@ class Impaired(NamedTuple):
     words: str
     """What was done, as `--inject` takes it."""
     directions: frozenset[str]
-    """Of `shared.links`."""
+    """Directions, as named in `shared.bus.links`."""
     begin_ns: int
     """Monotonic, as of messages."""
     end_ns: int | None

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from services.simulator.plant import PlantConfig
-from shared.bus import Session, open_session
-from shared.config import RobotConfig
-from shared.robot_model import mjcf
-from shared.scenarios import Scenario
+from shared.bus.session import Session, open_session
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from shared.robot.robot_model import mjcf
 from tools.runs import experiment
 from tools.runs.experiment import PLANT_FILE
 from tools.supervision.pace import PACE_MIN, PACE_VARIABLE, SLOWER, CoresFullError, usual_pace

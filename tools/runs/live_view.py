@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from shared.messages import PlannerStatus
-from shared.scenarios import Inject
+from shared.bus.messages import PlannerStatus
+from shared.config.scenarios import Inject
 from tools.runs.scenario_runner import LiveSnapshot
 
 PERIOD_S = 0.1
@@ -21,7 +21,7 @@ UNHEARD_S = 0.5
 
 
 class PlannerNews(Protocol):
-    """Gives what the planner said last (`shared.bus.Latest`)."""
+    """Gives what the planner said last (`shared.bus.session.Latest`)."""
 
     def take(self) -> PlannerStatus | None:
         """Return the newest message if it was not taken before, else None."""

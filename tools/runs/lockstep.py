@@ -24,13 +24,8 @@ from services.simulator.fault_injector import FaultInjector
 from services.simulator.plant import PlantConfig
 from services.simulator.state import restored, taken
 from services.simulator.world import World
-from shared import topics
-from shared.clock import NS_PER_S
-from shared.config import RobotConfig
-from shared.exceptions import RunError
-from shared.impairment import Impairment
-from shared.joints import MODULE_INDEX, MODULES
-from shared.messages import (
+from shared.bus import topics
+from shared.bus.messages import (
     JointEvent,
     Message,
     Mode,
@@ -39,9 +34,14 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
-from shared.scenarios import SCENARIO, Kill, Push, Restart, Scenario
-from shared.topics import Topic
-from shared.traces import SimState
+from shared.bus.topics import Topic
+from shared.bus.traces import SimState
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO, Kill, Push, Restart, Scenario
+from shared.exceptions import RunError
+from shared.network.impairment import Impairment
+from shared.robot.joints import MODULE_INDEX, MODULES
 from tools.runs.host_clock import HostClock
 from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import Mode, RunEvent, RunEventKind
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import MODULES, SIDES
-from shared.messages import Mode, RunEvent, RunEventKind
+from shared.robot.joints import MODULES, SIDES
 from tools.reports import scene
 from tools.reports.scene import RobotPose
 from tools.runs.run_log import RunLog

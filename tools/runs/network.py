@@ -1,8 +1,8 @@
 """A modelled network link, seeded (docs/architecture.md). Pure.
 
 What a link does by itself, and what is done to it meanwhile (`xrl sim --inject`), are both
-`shared.impairment`: the network proxy of a live fleet decides with the same objects. A link here is
-never given up: there is neither lease nor dialling again, and a stream delivers all that a
+`shared.network.impairment`: the network proxy of a live fleet decides with the same objects. A link
+here is never given up: there is neither lease nor dialling again, and a stream delivers all that a
 partition held back, however long it was.
 """
 
@@ -11,9 +11,9 @@ from __future__ import annotations
 import heapq
 from typing import Final, Generic, TypeVar
 
-from shared.codec import encode
-from shared.impairment import HELD, Direction, Impairer, Impairment
-from shared.messages import Message
+from shared.bus.codec import encode
+from shared.bus.messages import Message
+from shared.network.impairment import HELD, Direction, Impairer, Impairment
 
 M = TypeVar("M", bound=Message)
 
@@ -35,7 +35,7 @@ class VirtualLink(Generic[M]):
 
         Args:
             base: what it does by itself.
-            name: of `shared.links`.
+            name: of `shared.bus.links`.
             seed: of all that is decided here.
         """
         self.direction = Direction(name, seed)

@@ -16,15 +16,15 @@ from services.joint.differential import joint_torque
 from services.joint.snapshots import DriveManagerState
 from services.planner.snapshots import TickState
 from services.simulator.state import taken
+from shared.bus.links import Pair as Link
+from shared.bus.messages import Message, Mode, Pair, PlannerStatus, SimTruth
+from shared.bus.topics import Topic
+from shared.bus.traces import SimState
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject, Keyframe, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
-from shared.joints import MODULE_INDEX, MODULES
-from shared.links import Pair as Link
-from shared.messages import Message, Mode, Pair, PlannerStatus, SimTruth
-from shared.scenarios import Inject, Keyframe, Kill, Push, Restart, Scenario
-from shared.topics import Topic
-from shared.traces import SimState
+from shared.robot.joints import MODULE_INDEX, MODULES
 from tools.runs.lockstep import Lockstep, Record, forget
 from tools.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 

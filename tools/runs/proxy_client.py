@@ -8,9 +8,17 @@ from typing import Final
 
 import msgspec
 
+from shared.config.scenarios import Inject
 from shared.exceptions import FleetError
-from shared.proxy_protocol import SOCKET, Begin, Clear, List, Reply, Request, RequestedImpairment
-from shared.scenarios import Inject
+from shared.network.proxy_protocol import (
+    SOCKET,
+    Begin,
+    Clear,
+    List,
+    Reply,
+    Request,
+    RequestedImpairment,
+)
 from tools.supervision.run_dir import RunDir
 
 _PATIENCE_S: Final = 2.0

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import msgspec
 
-from shared import config_file
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.gain_table import GainSchedule
+from shared.robot.gain_table import GainSchedule
 from tools.runs.run_log import RunLog
 
 

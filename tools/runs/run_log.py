@@ -19,8 +19,8 @@ from services.recorder.mcap_log import SCHEMA_VERSION
 from services.recorder.mcap_records import Malformed
 from services.recorder.reader import LostBytes, Piece, opened
 from services.recorder.sequence_stats import KeyCount
+from shared.bus.topics import Topic
 from shared.exceptions import RunError
-from shared.topics import Topic
 from tools.logs.files import files_in
 
 
@@ -98,7 +98,7 @@ class RunLog:
         """Return the messages of a topic as `topic.type`, in the order of the file.
 
         Args:
-            topic: a row of `shared.topics`.
+            topic: a row of `shared.bus.topics`.
             module: for a topic with one key for each module.
 
         Raises:

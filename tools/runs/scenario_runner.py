@@ -13,12 +13,8 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from shared import topics
-from shared.bus import Latest, Session
-from shared.clock import NS_PER_S, machine_s, now_ns, pace
-from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.messages import (
+from shared.bus import topics
+from shared.bus.messages import (
     JointState,
     Mode,
     PlannerStatus,
@@ -27,7 +23,11 @@ from shared.messages import (
     SimControl,
     SimTruth,
 )
-from shared.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
+from shared.bus.session import Latest, Session
+from shared.clock import NS_PER_S, machine_s, now_ns, pace
+from shared.config.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
+from shared.exceptions import RunError
+from shared.robot.joints import MODULES
 from tools.runs.proxy_client import ProxyClient
 from tools.supervision import procfs
 from tools.supervision.pace import IDLE_LEAST, CoresFullError, IdleMeter

@@ -5,10 +5,10 @@ from __future__ import annotations
 import bisect
 from collections.abc import Sequence
 
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode
 from shared.clock import NS_PER_MS
-from shared.joints import MODULES
-from shared.messages import JointState, Mode
+from shared.robot.joints import MODULES
 from tools.runs.impairment_intervals import impairments
 from tools.runs.run_log import RunLog
 

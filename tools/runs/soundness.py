@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.joint.trips import AT_LIMIT, SHAKE_ABOVE_HZ, SHAKE_S
-from shared import topics
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.joints import MODULES
-from shared.messages import JointState, Mode, SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
 from tools.runs.run_log import RunLog
 from tools.runs.verdict_limits import LIMITS, SOUND
 
 Array = NDArray[np.float64]
 
 BREAK_S: Final = 0.05
-"""Of states: after a longer one nothing is known of what was in between."""
+"""Longest gap between states; within a longer one nothing is known."""
 SINK_OVER_S: Final = 0.1
 """A sole's touch or a blow is faster, and no sinking."""
 _HELD: Final = (Mode.HOLD, Mode.TRACK, Mode.DAMP)

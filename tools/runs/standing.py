@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from shared.config import RobotConfig
-from shared.messages import SimTruth
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
 
 SOLE_TILT_MAX: Final = 0.05
 """rad; a sole tilted more than this does not lie down again by itself."""

@@ -13,12 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.shift import ROWS
-from shared import topics
-from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import RobotConfig
-from shared.exceptions import ConfigError, RunError
-from shared.joints import MODULES
-from shared.messages import (
+from shared.bus import topics
+from shared.bus.messages import (
     JointEvent,
     JointState,
     Mode,
@@ -27,6 +23,10 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import ConfigError, RunError
+from shared.robot.joints import MODULES
 from tools.runs.impairment_intervals import Impaired, impairments, touches
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from shared.can_sensor import Assembler
+from shared.can.can_sensor import Assembler
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 
 S = TypeVar("S")
 

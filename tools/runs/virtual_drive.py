@@ -7,10 +7,10 @@ from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import LOST_MS
 from services.joint.drivers.wired_drive import MotorFrame, Signs
 from services.simulator.axis_bank import AxisBank
-from shared.cansimple import AxisState, ControlMode, InputMode
+from shared.bus.messages import Pair
+from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.clock import NS_PER_S
-from shared.config_sections import DriveConfig
-from shared.messages import Pair
+from shared.config.sections import DriveConfig
 
 
 class VirtualDrive:

@@ -12,10 +12,10 @@ from services.harness.filter import WrenchFilter, tared_state
 from services.harness.loop import HarnessLoop
 from services.simulator.harness_front import HarnessFront
 from services.simulator.world import World
-from shared.config import RobotConfig
-from shared.loadcell_can import LegSample, SampleAssembler
-from shared.messages import Message, TareRequest, Vector6, Wrench
-from shared.topics import WRENCH, Topic
+from shared.bus.messages import Message, TareRequest, Vector6, Wrench
+from shared.bus.topics import WRENCH, Topic
+from shared.can.loadcell_can import LegSample, SampleAssembler
+from shared.config.robot_config import RobotConfig
 from tools.runs.host_clock import HostClock, HostLink
 from tools.runs.network import VirtualLink
 from tools.runs.virtual_can import VirtualCan, whole_steps_ns

@@ -9,10 +9,10 @@ from services.imu.loop import ImuLoop
 from services.simulator.imu_front import ImuFront
 from services.simulator.plant import ImuErrors
 from services.simulator.world import World
-from shared.config import RobotConfig
-from shared.imu_can import ImuAssembler
-from shared.messages import Attitude, Message
-from shared.topics import ATTITUDE, Topic
+from shared.bus.messages import Attitude, Message
+from shared.bus.topics import ATTITUDE, Topic
+from shared.can.imu_can import ImuAssembler
+from shared.config.robot_config import RobotConfig
 from tools.runs.host_clock import HostClock, HostLink
 from tools.runs.network import VirtualLink
 from tools.runs.virtual_can import VirtualCan, whole_steps_ns

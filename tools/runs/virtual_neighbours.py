@@ -7,7 +7,7 @@ from collections.abc import Container, Sequence
 from services.joint.controller import row_of
 from services.joint.drive_manager import DriveManager
 from services.joint.neighbours import UNKNOWN, NeighbourView, view_of
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 from tools.runs.host_clock import HostClock
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from shared.impairment import Impairment
-from shared.impairment_schedule import ImpairmentSchedule
-from shared.joints import MODULES
-from shared.links import ATTITUDES, DIRECTIONS, WRENCHES
-from shared.messages import Attitude, JointCommand, JointState, Wrench
-from shared.scenarios import Inject
-from shared.traces import LinkEvent
+from shared.bus.links import ATTITUDES, DIRECTIONS, WRENCHES
+from shared.bus.messages import Attitude, JointCommand, JointState, Wrench
+from shared.bus.traces import LinkEvent
+from shared.config.scenarios import Inject
+from shared.network.impairment import Impairment
+from shared.network.impairment_schedule import ImpairmentSchedule
+from shared.robot.joints import MODULES
 from tools.runs.network import VirtualLink
 
 

@@ -15,15 +15,15 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 
-from shared.config import RobotConfig, expand
-from shared.config_file import load
+from shared.bus.links import PAIRS, endpoint_through
+from shared.bus.topics import TOPICS
+from shared.config.files import load
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.toml_file import Range, Section, read_toml
 from shared.exceptions import ConfigError, FleetError
-from shared.joints import MODULES
-from shared.links import PAIRS, endpoint_through
+from shared.network.proxy_protocol import SOCKET
 from shared.process import DEFAULT_CONFIG, SOCKET_PATH_MAX
-from shared.proxy_protocol import SOCKET
-from shared.toml_file import Range, Section, read_toml
-from shared.topics import TOPICS
+from shared.robot.joints import MODULES
 
 TABLE = DEFAULT_CONFIG.parent / "processes.toml"
 """The process table of this checkout."""
@@ -59,7 +59,7 @@ class Process(Section, frozen=True):
     """`simulation`: not started where the drives are real; `injected`: only where the network is
     to be impaired; `imu`: only on a robot that has one."""
     topic: str = ""
-    """Topic that it publishes steadily, as in `shared.topics`; empty if there is none."""
+    """Topic that it publishes steadily, as in `shared.bus.topics`; empty if there is none."""
 
 
 class ProcessTable(Section, frozen=True):

@@ -15,7 +15,7 @@ import msgspec
 from services.joint import neighbours, rearm_guard
 from shared.clock import PACE_FILE
 from shared.exceptions import FleetError
-from shared.joints import MODULES
+from shared.robot.joints import MODULES
 from tools.supervision.fleet import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_listening
 
 _NEVER_GIVE_UP = 1_000_000

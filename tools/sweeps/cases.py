@@ -7,10 +7,10 @@ from typing import Final
 
 import msgspec
 
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.robot_model import stand_pose
-from shared.scenarios import Keyframe, Kill, Push, Scenario
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Kill, Push, Scenario
+from shared.network.impairment import Impairment
+from shared.robot.robot_model import stand_pose
 from tools.sweeps.push_range import SHARE, PushRange
 
 PAYLOADS: Final = 5

@@ -10,8 +10,8 @@ from rich.console import Console
 
 from services.planner.certificate import DIRECTIONS
 from services.simulator.plant import IDEAL, PlantConfig
-from shared import config_file
-from shared.config import RobotConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.sweeps import certificate_study, study
 from tools.sweeps.certificate_study import CertificateCases, CertificateResult

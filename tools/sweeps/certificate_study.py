@@ -32,12 +32,12 @@ from services.planner.kinematics import Kinematics
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
 from services.simulator.world import World
-from shared.config import GRAVITY, RobotConfig
+from shared.bus.messages import Pair, SimTruth
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
-from shared.joints import MODULES, N_JOINTS, N_LEG
-from shared.messages import Pair, SimTruth
-from shared.robot_model import stand_pose
-from shared.scenarios import Keyframe, Push, Scenario
+from shared.robot.joints import MODULES, N_JOINTS, N_LEG
+from shared.robot.robot_model import stand_pose
 
 mpl.use("Agg")
 
@@ -50,7 +50,8 @@ PITCHES: Final = (-0.2, 1.2)
 PAYLOADS: Final = (0.0, 6.8, 13.6, 20.4)
 """kg"""
 FACTORS: Final = (0.15, 5.0)
-"""Of diag(K_q): each joint its own, log-uniform, the legs alike. About half do not stand."""
+"""Factors on diag(K_q): each joint its own, log-uniform, the legs alike. About half do not
+stand."""
 DAMPING_S: Final = 0.04
 """s; D_B is so much of D, as in the stand gains, up to the largest of theirs."""
 DAMPING_MAX: Final = 60.0
@@ -68,7 +69,7 @@ SAMPLE_EVERY: Final = 10
 LIMIT_MARGIN: Final = 0.1
 """rad inside the joint limits: a soft stop would hold what the gains do not."""
 TORQUE_SHARE_MAX: Final = 0.8
-"""Of a module's torque, what a posture may need to be carried."""
+"""Fraction of a module's torque that a posture may need to carry itself."""
 DRAWS_MAX: Final = 100
 RIGID_STEPS: Final = 4
 """Time constant of a rigid floor's skin (MuJoCo's is 20 ms), in time steps; 2 is its least."""
@@ -82,7 +83,7 @@ TILT_BOUND: Final = 0.05
 GROWTH_BOUND: Final = 1.2
 """Farthest in the last third of a run over farthest before: beyond, it drifts away."""
 STILL: Final = 0.02
-"""Of the bounds; what moves less does not drift."""
+"""Fraction of the bounds; slower motion is no drift."""
 
 
 class Posture(NamedTuple):

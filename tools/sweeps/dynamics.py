@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from services.planner.dynamic_certificate import HALF_NAMES
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.sweeps import study

@@ -24,13 +24,13 @@ from services.planner.planner import Planner
 from services.planner.sampled_loop import NOMINAL, HandModel
 from services.planner.split_program import design_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
-from shared.config import RobotConfig
-from shared.gain_schedule import believing
-from shared.gain_table import GainSchedule
-from shared.impairment import Impairment
-from shared.joints import N_LEG
-from shared.messages import Mode
-from shared.scenarios import Keyframe, Push, Scenario
+from shared.bus.messages import Mode
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Push, Scenario
+from shared.network.impairment import Impairment
+from shared.robot.gain_schedule import believing
+from shared.robot.gain_table import GainSchedule
+from shared.robot.joints import N_LEG
 from tools.runs.lockstep import Lockstep
 
 HEIGHTS: Final = (0.95, 1.188)

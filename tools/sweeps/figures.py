@@ -9,8 +9,8 @@ from typing import Final, TypeAlias
 
 import msgspec
 
-from shared.config import RobotConfig
-from shared.messages import JointEvent, SimTruth
+from shared.bus.messages import JointEvent, SimTruth
+from shared.config.robot_config import RobotConfig
 from tools.runs.standing import is_tipping
 
 Watch: TypeAlias = Callable[[SimTruth], None]

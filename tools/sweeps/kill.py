@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 import msgspec
 from rich.console import Console
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.sweeps import cases, picture, plants, push_range, report, study

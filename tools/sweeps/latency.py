@@ -12,9 +12,9 @@ from typing import Final, TypeAlias
 import msgspec
 from rich.console import Console
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
+from shared.config.toml_file import check_ranges
 from shared.process import DEFAULT_CONFIG
-from shared.toml_file import check_ranges
 from tools.runs import experiment
 from tools.sweeps import latency_picture, latency_report, plants, study
 from tools.sweeps.figures import ENDINGS, Ending

@@ -49,7 +49,7 @@ class LineStyle(NamedTuple):
     colour: str
     marker: str
     shift: float
-    """Of a delay's place, so that nothing hides another."""
+    """Offset of a delay's place, so that nothing hides another."""
 
 
 LOOKS: Final = {

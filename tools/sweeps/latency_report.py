@@ -32,7 +32,7 @@ class Falls(NamedTuple):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Of the share, 95 %, Wilson; over several losses or jitters, of that mix of them."""
+        """Return the 95 % interval of the share (Wilson), over the mix of losses or jitters."""
         return wilson(self.fallen, self.of)
 
     @property

@@ -17,11 +17,7 @@ import msgspec
 import numpy as np
 
 from services.simulator.plant import PlantConfig
-from shared.clock import NS_PER_S
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.joints import MODULES
-from shared.messages import (
+from shared.bus.messages import (
     JointEvent,
     JointState,
     Message,
@@ -31,8 +27,12 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
-from shared.scenarios import Inject, Keyframe, Scenario
-from shared.topics import Topic
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject, Keyframe, Scenario
+from shared.network.impairment import Impairment
+from shared.robot.joints import MODULES
 from tools.centralised.fleet import CentralisedLockstep
 from tools.runs.lockstep import Lockstep, Record
 from tools.sweeps import plants
@@ -120,14 +120,14 @@ class Draw(msgspec.Struct, frozen=True):
     impaired_from_s: float
     shoves: tuple[Shove, ...]
     fleet_seed: int
-    """Of what is lost, of jitter, and of the harness sensor's noise."""
+    """Seed of losses, jitter and the harness sensor's noise."""
 
 
 class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
     """What is run."""
 
     number: int
-    """Of the row."""
+    """Number of the row."""
     repeat: int
     seed: int
     control: str
@@ -171,8 +171,8 @@ class LatencyResult(Ended, frozen=True, kw_only=True):
     com_max_mm: float | None = None
     """Largest horizontal distance of the COM from the middle of the ankles."""
     hold_share: float | None = None
-    """Of the time: a module held, and so the robot did not follow the hand. Always 0 where
-    every torque is the planner's: there is no HOLD."""
+    """Fraction of the time in which a module held, so that the robot did not follow the hand.
+    Always 0 where every torque is the planner's: there is no HOLD."""
     holds: int | None = None
     """Changes from TRACK to HOLD of the busiest module."""
     torque_step_nm: float | None = None

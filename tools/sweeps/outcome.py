@@ -6,10 +6,7 @@ import numpy as np
 
 from services.simulator.plant import PlantConfig
 from services.simulator.world import World
-from shared.clock import NS_PER_MS
-from shared.config import RobotConfig
-from shared.joints import MODULES, SIDES
-from shared.messages import (
+from shared.bus.messages import (
     JointEvent,
     Message,
     Mode,
@@ -18,7 +15,10 @@ from shared.messages import (
     RunEventKind,
     SimTruth,
 )
-from shared.topics import Topic
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_MS
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES, SIDES
 from tools.runs.lockstep import Lockstep, Record
 from tools.sweeps import plants
 from tools.sweeps.cases import KillCase, network_of, scenario_of
@@ -68,7 +68,7 @@ class KillResult(Ended, frozen=True, kw_only=True):
     yaw_max_rad: float | None = None
     sole_tilt_max_rad: float | None = None
     slip_max_mm: float | None = None
-    """Of an ankle from where it stood."""
+    """Largest distance of an ankle from its first place, mm."""
 
 
 class KillRecorder:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from tools.sweeps.cases import PUSHES_MAX, payloads
 from tools.sweeps.figures import Ending
 from tools.sweeps.table import Row
@@ -23,7 +23,7 @@ mpl.use("Agg")
 
 FALL_COLOUR: Final = "#c0392b"
 COLOURS: Final = mpl.colormaps["viridis"]
-"""Of the payload."""
+"""Colours of the payload."""
 
 
 def draw(rows: Sequence[Row], robot: RobotConfig, title: str, path: Path) -> None:

@@ -13,22 +13,22 @@ from typing import Any, Final, Literal
 import msgspec
 
 from services.simulator.plant import PlantConfig, changed
+from shared.config.toml_file import Section, read_toml
 from shared.exceptions import ConfigError
 from shared.process import DEFAULT_CONFIG
-from shared.toml_file import Section, read_toml
 
 RANGES_FILE: Final = DEFAULT_CONFIG.parent / "plants" / "ranges.toml"
 
 
 LEAST_SHARE: Final = 0.5
-"""Of a range's low end: how far below it a wider draw may go."""
+"""Fraction of a range's low end below which a wider draw does not go."""
 
 
 class ErrorRange(Section, frozen=True):
     """One error of the plant."""
 
     key: str
-    """Of the plant, such as `drivetrain.play`; every number below it is drawn by itself."""
+    """Key of the plant, such as `drivetrain.play`; every number below it is drawn by itself."""
     low: float
     high: float
     scale: Literal["linear", "log"] = "linear"

@@ -10,9 +10,9 @@ from typing import TypeAlias
 
 import msgspec
 
-from shared import gain_schedule
-from shared.config import RobotConfig
-from shared.gain_table import GainSchedule
+from shared.config.robot_config import RobotConfig
+from shared.robot import gain_schedule
+from shared.robot.gain_table import GainSchedule
 from tools.sweeps import pool
 
 Progress = Callable[[int, int], None]

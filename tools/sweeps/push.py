@@ -18,7 +18,7 @@ from rich.table import Table as Printed
 
 from services.simulator import plant as plants
 from services.simulator.plant import PlantConfig, plant_from
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment

@@ -9,9 +9,9 @@ from typing import Final
 
 from services.planner.poses import Poses
 from services.planner.push_limit import LoadedStand
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Push
 from shared.exceptions import RunError
-from shared.scenarios import Push
 
 DIGITS: Final = 3
 REACHED_M: Final = 1e-4

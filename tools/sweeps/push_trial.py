@@ -19,12 +19,12 @@ from services.planner.snapshots import TickState
 from services.planner.split import ScheduledGains
 from services.simulator.plant import PlantConfig
 from services.simulator.state import taken
-from shared.config import RobotConfig
+from shared.bus.messages import SimTruth
+from shared.bus.traces import SimState
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.exceptions import RunError
-from shared.joints import MODULES
-from shared.messages import SimTruth
-from shared.scenarios import Keyframe, Kill, Push, Scenario
-from shared.traces import SimState
+from shared.robot.joints import MODULES
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
 from tools.sweeps.figures import Ending, ending_of

@@ -14,11 +14,11 @@ from rich.console import Console
 from services.recorder import provenance
 from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
 from services.simulator.plant import PlantConfig
-from shared import topics
-from shared.config import RobotConfig
-from shared.messages import SimTruth
-from shared.robot_model import mjcf
-from shared.scenarios import Scenario
+from shared.bus import topics
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from shared.robot.robot_model import mjcf
 from tools.runs import experiment, figure, verdict
 from tools.runs.lockstep import Record
 from tools.runs.run_log import read_run

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table as Printed
 from scipy.stats import spearmanr
 
-from shared.config import RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment

@@ -10,10 +10,10 @@ from typing import Final
 import msgspec
 
 from services.simulator.plant import PlantConfig, changed
-from shared.config import RobotConfig
-from shared.impairment import Impairment
-from shared.messages import SimTruth
-from shared.scenarios import Keyframe, Kill, Push, Scenario
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Kill, Push, Scenario
+from shared.network.impairment import Impairment
 from tools.runs.lockstep import Lockstep, Record, forget
 from tools.sweeps import plants
 from tools.sweeps.figures import (

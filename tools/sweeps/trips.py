@@ -11,9 +11,9 @@ import msgspec
 from rich.console import Console
 from rich.table import Table as Printed
 
-from shared.config import RobotConfig
+from shared.bus.messages import Cause, Trip
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.messages import Cause, Trip
 from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.sweeps import study

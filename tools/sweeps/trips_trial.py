@@ -12,16 +12,16 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from services.simulator.plant import IDEAL, PlantConfig, changed
-from shared import scenarios
+from shared.bus.messages import STRAIGHT, Cause, Message, Mode, PlannerStatus, SimTruth, Trip
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
-from shared.config import RobotConfig
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
-from shared.gain_schedule import believing
-from shared.messages import STRAIGHT, Cause, Message, Mode, PlannerStatus, SimTruth, Trip
 from shared.process import DEFAULT_CONFIG
-from shared.scenarios import Keyframe, Push, Scenario
-from shared.topics import Topic
-from shared.trip_table import JOINT_TRIPS, untripped
+from shared.robot.gain_schedule import believing
+from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tools.runs.lockstep import Lockstep
 
 SMALL_ERRORS: Final[Mapping[str, Any]] = {

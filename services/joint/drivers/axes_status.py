@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from services.joint.drivers.base import DriveStatus
-from shared.cansimple import AxisError, AxisState, Heartbeat
+from shared.can.cansimple import AxisError, AxisState, Heartbeat
 
 
 class AxesStatus:

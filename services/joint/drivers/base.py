@@ -6,7 +6,7 @@ from typing import Protocol
 
 import msgspec
 
-from shared.messages import DriveStatus, Pair
+from shared.bus.messages import DriveStatus, Pair
 
 __all__ = ["Drive", "DriveReading", "DriveStatus", "MotorTarget"]
 

@@ -9,11 +9,11 @@ from typing import Any, Final, TypeAlias
 
 import can
 
-from shared import cansimple
+from shared.can import cansimple
+from shared.can.unix_can import ERROR_FLAG, EXTENDED_FLAG
 from shared.clock import NS_PER_MS, now_ns
-from shared.config_sections import CanConfig
+from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
-from shared.unix_can import ERROR_FLAG, EXTENDED_FLAG
 
 FRAMES_PER_READ: Final = 512
 """More than can wait in a socket; a flooded bus must not hold up the loop."""

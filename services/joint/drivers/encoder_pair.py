@@ -5,11 +5,11 @@ from __future__ import annotations
 from math import isfinite
 from typing import Final
 
-from shared.messages import Pair
+from shared.bus.messages import Pair
 
 PAIR_SHARE: Final = 0.6
-"""Of its axis's period: an estimate that is older when the other axis's comes belongs to the
-sample before, as after a lost frame. More than half, so that axes out of step make pairs too."""
+"""Fraction of the period; an older estimate belongs to the previous sample, as after a lost frame.
+More than half, so that axes out of step still make pairs."""
 
 _BOTH: Final = 0b11
 

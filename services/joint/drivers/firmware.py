@@ -19,9 +19,9 @@ from __future__ import annotations
 from typing import Final, Literal
 
 from services.joint.drivers.base import DriveStatus
-from shared import cansimple, cansimple_06
-from shared.cansimple import AxisError, AxisState
-from shared.cansimple_06 import DriveError06, ProcedureResult
+from shared.can import cansimple, cansimple_06
+from shared.can.cansimple import AxisError, AxisState
+from shared.can.cansimple_06 import DriveError06, ProcedureResult
 
 Dialect = Literal["", "0.5", "0.6"]
 """The firmware's generation; "" while it is not known."""

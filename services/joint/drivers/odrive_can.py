@@ -24,14 +24,14 @@ from services.joint.drivers.firmware import (
 from services.joint.drivers.odrive_frames import Frames
 from services.joint.drivers.replies import NOTHING, Replies
 from services.joint.drivers.resend_policy import GainRow, ResendPolicy
-from shared import cansimple
-from shared.cansimple import AxisState, Command
-from shared.cansimple_06 import Command06
+from shared.bus.messages import Pair
+from shared.can import cansimple
+from shared.can.cansimple import AxisState, Command
+from shared.can.cansimple_06 import Command06
+from shared.can.unix_can import ERROR_FLAG
 from shared.clock import NS_PER_MS, NS_PER_S, machine_s, now_ns
-from shared.config_sections import CanConfig, DriveConfig
+from shared.config.sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
-from shared.messages import Pair
-from shared.unix_can import ERROR_FLAG
 
 __all__ = ["RETRY_MS", "OdriveCan"]
 

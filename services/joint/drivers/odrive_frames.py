@@ -13,11 +13,11 @@ import can
 from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.can_link import message
 from services.joint.drivers.firmware import Dialect
-from shared import cansimple
-from shared.cansimple import AxisState, Command, ControlMode, InputMode
-from shared.config_sections import DriveConfig
+from shared.bus.messages import Pair
+from shared.can import cansimple
+from shared.can.cansimple import AxisState, Command, ControlMode, InputMode
+from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
-from shared.messages import Pair
 
 Nodes = tuple[int, int]
 Order = tuple[Command, bytes]

@@ -29,11 +29,11 @@ from services.joint.drivers.axes_status import AxesStatus
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_v3 import OdriveV3
 from shared import log
-from shared.cansimple import AxisState
+from shared.bus.messages import Pair
+from shared.can.cansimple import AxisState
 from shared.clock import NS_PER_MS, machine_s, now_ns
-from shared.config_sections import DriveConfig
+from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
-from shared.messages import Pair
 
 EXCHANGE_HZ: Final = 200
 """At most; more than a v3 board answers over USB helps nobody (docs/drives.md)."""

@@ -8,9 +8,9 @@ from math import isfinite
 from typing import Any, Final
 
 from services.joint.drivers.base import MotorTarget
-from shared.cansimple import AxisState, ControlMode, InputMode
+from shared.bus.messages import Pair
+from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.exceptions import DriveError
-from shared.messages import Pair
 
 ARM_SETTINGS: Final = (
     "controller.config.control_mode",

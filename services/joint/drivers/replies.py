@@ -10,10 +10,10 @@ from math import isfinite
 from typing import Final
 
 from services.joint.drivers.can_link import request_of
-from shared import cansimple
-from shared.cansimple import Command
-from shared.cansimple_06 import Command06
-from shared.messages import Pair
+from shared.bus.messages import Pair
+from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.can.cansimple_06 import Command06
 
 NOTHING: Final = (0.0, 0.0)
 """The estimate of an axis that has not been in closed loop yet, turns and turn/s."""

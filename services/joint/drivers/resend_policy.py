@@ -10,8 +10,8 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Final
 
+from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
-from shared.messages import Pair
 
 GAINS_MS: Final = 100
 """Gains go to the drive when they change, and this often."""

@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
-from shared.messages import Pair
+from shared.bus.messages import Pair
 
 Signs = tuple[int, int]
-"""Of axis0 and axis1, 1 or -1; -1: the motor counts down where the differential counts up."""
+"""Signs of axis0 and axis1; -1: the motor counts down where the differential counts up."""
 
 
 class MotorFrame(NamedTuple):

@@ -1,0 +1,1 @@
+"""Topics, messages and the Zenoh session."""

@@ -1,0 +1,479 @@
+"""Every message on the bus (docs/networks.md).
+
+Payloads are JSON by msgspec. SI units; times are integers in ns; enumerations are
+integers. No field is optional: a `null` in a payload can then only be a number that
+was not finite, and `shared.bus.codec` refuses it at both ends.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import msgspec
+
+Pair = tuple[float, float]
+"""(phi, theta) of one module."""
+Vector3 = tuple[float, float, float]
+Vector4 = tuple[float, float, float, float]
+Vector6 = tuple[float, float, float, float, float, float]
+STRAIGHT: Vector4 = (0.0, 0.0, 0.0, 0.0)
+"""No shift of x, y, roll and yaw."""
+AS_CONFIGURED: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""A stance with the feet where the robot file has them."""
+Modules = tuple[int, int, int, int, int, int]
+"""One integer for each module, in `shared.robot.joints.MODULES` order."""
+
+
+class Mode(IntEnum):
+    """Mode of a joint service (docs/architecture.md#modes)."""
+
+    DISARMED = 0
+    """No torque; the drive is not armed."""
+    HOLD = 1
+    """References frozen; stands on local gains."""
+    TRACK = 2
+    """Follows the planner's commands."""
+    DAMP = 3
+    """After an emergency stop: sinks slowly."""
+    FAULT = 4
+    """The drive, or its position, is lost; left by a restart only."""
+
+
+class Cause(IntEnum):
+    """Cause of the last change of mode."""
+
+    NONE = 0
+    """No change so far."""
+    DRIVE_ARMED = 1
+    """The drive is armed."""
+    COMMANDS_FRESH = 2
+    """Commands were fresh for long enough."""
+    COMMAND_STALE = 3
+    """The newest command is too old."""
+    HOLD_ALL = 4
+    """The planner asks all six modules to hold."""
+    ESTOP = 5
+    """Emergency stop."""
+    DRIVE_LOST = 6
+    """No frames from the drive."""
+    DRIVE_DISARMED = 7
+    """The drive left closed loop by itself."""
+    POSITION_LOST = 8
+    """The joint's position is unknown: the drive is unzeroed, or its samples jump."""
+    SHAKING = 9
+    """A trip of this module (`shared.robot.trip_table`)."""
+    TORQUE_LIMIT = 10
+    """A trip of this module."""
+    TOO_FAST = 11
+    """A trip of this module."""
+
+
+class Trip(IntEnum):
+    """Trip of the planner: why it does not lead (`shared.robot.trip_table`)."""
+
+    NONE = 0
+    LEGS = 1
+    """The legs disagree about the torso's pose."""
+    REACH = 2
+    """The reference pose is out of reach."""
+    TRACKING = 3
+    """A joint is far from its reference."""
+    UNLOADED = 4
+    """A leg carries hardly any load."""
+    SINKING = 5
+    """The torso sinks or rises too fast."""
+    TURNING = 6
+    """The torso turns too fast."""
+    HARNESS = 7
+    """The harness force is far from the requested assist."""
+    SAGGING = 8
+    """The person sinks with weight on the harness."""
+    UNATTENDED = 9
+    """The robot drifts and nobody holds it."""
+
+
+class Outside(IntEnum):
+    """Part of a command that lies outside the envelope (`services.joint.envelope`)."""
+
+    NOTHING = 0
+    """The command is inside."""
+    K_P = 1
+    K_D = 2
+    TAU_FF = 3
+    DTAU_FF = 4
+    TAU_COUPLED = 5
+    Q_REF = 6
+    """Too far from the joint's position."""
+    V_REF = 7
+    TORQUE_STEP = 8
+    """The torque would change faster than the law changes it."""
+    MARGIN = 9
+    """The margin is below the least that the planner may publish."""
+
+
+class DriveStatus(IntEnum):
+    """Status of a module's two axes together."""
+
+    LOST = 0
+    """No frames, or the link is down."""
+    IDLE = 1
+    """Both axes answer; at least one is not in closed loop, and neither reports an error."""
+    ARMED = 2
+    """Both axes are in closed loop."""
+    ERROR = 3
+    """At least one axis reports an error or left closed loop by itself."""
+    UNZEROED = 4
+    """Both axes answer, but the zero was lost with the power."""
+    HOLDING = 5
+    """Both axes are in closed loop by an earlier service and wait for the take-over."""
+
+
+class PlannerMode(IntEnum):
+    """Mode of the planner: what it asks of the six modules."""
+
+    WAITING = 0
+    """Some module's state is stale: all hold."""
+    ALIGNING = 1
+    """All six states are fresh; commands start from the measured pose, still with `hold`."""
+    LEADING = 2
+    """All six track."""
+    OVERLOADED = 3
+    """The harness is overloaded: all hold until it has been released for a while."""
+    UNCERTIFIED = 4
+    """No local gains stand alone in this pose: all hold."""
+    MISPLACED = 5
+    """The feet are farther from their place than `law.stance_max`, or were just moved: all hold."""
+    TRIPPED = 6
+    """A limit was exceeded (`PlannerStatus.trip`): all hold until all values are calm."""
+    MISLOADED = 7
+    """The load is farther from the robot file than `law.load_correction`, or not yet weighed after
+    hanging on a hoist: all hold."""
+
+
+class SplitSource(IntEnum):
+    """Source of a tick's local gains (docs/law.md#gain-split)."""
+
+    DIAGONAL = 0
+    """The paper's split, diag(K_q)."""
+    SCHEDULE = 1
+    """The certified schedule."""
+    STIFFENED = 2
+    """Stiffer gains, because the schedule's did not meet the certificate."""
+    UNCERTIFIED = 3
+    """None met the certificate: all hold."""
+
+
+class Tare(IntEnum):
+    """Zero of the harness sensor."""
+
+    RUNNING = 0
+    """The zero is being averaged; the harness must be unloaded and still."""
+    UNSTEADY = 1
+    """As RUNNING, but the forces moved too much: averaging started over."""
+    DONE = 2
+    """The zero is known."""
+
+
+class RunEventKind(IntEnum):
+    """Kind of an event of a run."""
+
+    STARTED = 0
+    """The scenario started."""
+    KILLED = 1
+    """A service got a signal."""
+    RESTARTED = 2
+    """A service was started or continued."""
+    PUSHED = 3
+    """A push began."""
+    FINISHED = 4
+    """The scenario ended."""
+    FAULTED = 5
+    """A drive's fault began; the subject is the module, the detail the kind."""
+
+
+class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Base of all messages: the sender's monotonic time and a sequence number."""
+
+    t_ns: int
+    """Sender's monotonic time at which the content was true."""
+    seq: int
+    """Sequence number: one more for each message of this sender on this key."""
+
+
+class JointState(Message, frozen=True):
+    """One module as its joint service sees it. Published at the state rate.
+
+    `t_ns` is the stamp that the planner echoes in `JointCommand.echo_t_ns`.
+    """
+
+    q: Pair
+    """Joint angles (phi, theta), rad."""
+    v: Pair
+    """Joint rates, rad/s."""
+    tau: Pair
+    """Joint torques sent to the drive in this cycle, N m, after the limiter."""
+    mode: int
+    """Mode of the service."""
+    cause: int
+    """Cause of the last change of mode; 0 before the first."""
+    ready: bool
+    """True if commands have been fresh for long enough to track as soon as `hold` is lifted."""
+    age_ns: int
+    """Age of the newest command in use (docs/architecture.md#age-rule); -1 if there is none."""
+    session: int
+    """Session of the newest command in use; 0 if there is none."""
+    command_seq: int
+    """Sequence number of the newest command in use; -1 if there is none."""
+    cycle: int
+    """Control cycles since the start."""
+    late: int
+    """Cycles that came later than twice the period after the one before."""
+    dropouts: int
+    """Recent drop-outs that lengthen the wait before TRACK."""
+    refused: int
+    """Commands refused since the start: old, foreign, out of order or out of limits."""
+    drive: int
+    """Status of the drive."""
+    drive_error: int
+    """Error bits of both axes, or-ed; 0 if none."""
+    stiffened: bool = False
+    """True while this module holds with all of its stand gains because another may be limp."""
+    outside: int = 0
+    """Part of the newest command that lies outside the envelope; 0 if none."""
+
+
+class JointCommand(Message, frozen=True):
+    """References, local gains and torques for one module (docs/law.md#references-and-age)."""
+
+    session: int
+    """Random number of this planner's life."""
+    echo_t_ns: int
+    """The `t_ns` of this module's newest state: the age is measured on the module's clock."""
+    hold: bool
+    """True asks for HOLD, so that no leg works against the other."""
+    q_ref: Pair
+    """Joint reference, rad."""
+    v_ref: Pair
+    """Rate of the reference, rad/s."""
+    tau_ff: Pair
+    """Feedforward torque, N m."""
+    dtau_ff: Pair
+    """Rate of the feedforward torque, N m/s."""
+    tau_coupled: Pair
+    """Coupled torque, N m: stiffness and damping of the body beyond the local gains, low-passed,
+    plus the eased lead; dropped in HOLD."""
+    k_p: Pair
+    """Local stiffness D, N m/rad."""
+    k_d: Pair
+    """Local damping D_B, N m s/rad."""
+    margin: float
+    """Margin of the failsafe certificate for all six modules' gains: 1 is the stiffness required, 0
+    is a fall (docs/law.md#certificate)."""
+    margin_onboard: float
+    """The same with the drives' own loops only."""
+    stiffen: bool = False
+    """True while another module may be limp: in HOLD this one raises its gains to the stand
+    gains."""
+
+
+class JointEvent(Message, frozen=True):
+    """A change of mode of a joint service."""
+
+    mode_before: int
+    """Mode before the change."""
+    mode_after: int
+    """Mode after the change."""
+    cause: int
+    """Cause of the change."""
+    age_ns: int
+    """Age of the newest command at the change; -1 if there was none."""
+    tau_before: Pair
+    """Torque of the last cycle before the change, N m."""
+    tau_after: Pair
+    """Torque of the first cycle after the change, N m."""
+
+
+class Wrench(Message, frozen=True):
+    """Wrench of the operator on the torso, at the harness point.
+
+    Torso axes, because the sensor is fixed to the torso. The assist on the operator is the
+    opposite.
+    """
+
+    force: Vector3
+    """Force, N, torso axes."""
+    moment: Vector3
+    """Moment about the harness point, N m, torso axes."""
+    valid: bool
+    """False while the sensor is stale, saturated or without a zero: the numbers are the last good
+    ones."""
+    saturated: bool
+    """True while a leg of the sensor is at its limit."""
+    tare: int
+    """Zero of the sensor."""
+    age_ns: int
+    """Age of the sensor's sample on the harness service's clock."""
+
+
+class Attitude(Message, frozen=True):
+    """Direction of up, from the IMU on the torso."""
+
+    up: Vector3
+    """Unit vector against gravity, torso axes."""
+    rate: Vector3
+    """Angular velocity of the torso, rad/s, torso axes."""
+    valid: bool
+    """False while the sensor is silent or reports no fix: the numbers are the last good ones."""
+    age_ns: int
+    """Age of the sensor's sample on the IMU service's clock; -1 before the first."""
+
+
+class TareRequest(Message, frozen=True):
+    """Asks the harness service for a new zero: the present wrench shall read as nothing."""
+
+    source: str
+    """Name of the sender."""
+
+
+class PlannerStatus(Message, frozen=True):
+    """Inputs and decisions of one planner tick."""
+
+    session: int
+    """Random number of this planner's life."""
+    mode: int
+    """Mode of the planner."""
+    hold: bool
+    """True if the commands of this tick ask for HOLD."""
+    p: Vector6
+    """Measured pose: COM x y z, m; torso roll, pitch, yaw, rad; world."""
+    pdot: Vector6
+    """Rate of the pose."""
+    p_ref: Vector6
+    """Reference of the pose."""
+    closure: Vector6
+    """Left minus right leg's estimate of the torso's pose, m and rad, world."""
+    assist_n: float
+    """Assist force in the feedforward, N."""
+    margin: float
+    """Margin of the failsafe certificate, as in the commands; 0 before the first tick."""
+    margin_onboard: float
+    """The same with the drives' own loops only."""
+    split: int
+    """Source of the local gains."""
+    ik_iterations: int
+    """Steps of the inverse kinematics."""
+    ik_residual: float
+    """Largest residual of the inverse kinematics, m or rad."""
+    tick_us: float
+    """Duration of this tick, from reading the inputs to the last command put."""
+    state_seq: Modules
+    """Sequence number of the state consumed from each module."""
+    wrench_seq: int
+    """Sequence number of the wrench consumed; -1: none yet."""
+    assist_requested_n: float
+    """Assist requested by the operator, N."""
+    state_age_ns: Modules
+    """Time since each module's newest state arrived, on the planner's clock; -1 if none yet."""
+    wait_s: float = 0.0
+    """Time until it may lead again after drop-outs, s; 0 if it does not wait."""
+    attitude_seq: int = -1
+    """Sequence number of the attitude consumed; -1: none yet."""
+    slope: Pair = (0.0, 0.0)
+    """Rise of the floor along x and y in the law, rad."""
+    shift_requested: Vector4 = STRAIGHT
+    """Shift requested by the operator: x, y, m; roll, yaw, rad."""
+    stance: Vector6 = AS_CONFIGURED
+    """Place of the right foot relative to the left, as deviation from the robot file: x, y, z, m,
+    and a rotation vector, rad, world axes."""
+    why: str = ""
+    """Reason for not leading, in words, where the mode does not say it all."""
+    trip: int = 0
+    """Trip for which it does not lead."""
+    load: Vector3 = (0.0, 0.0, 0.0)
+    """Load beyond the robot file: kg, and moments a and b about pitch, N m
+    (`services.planner.load`)."""
+    requested_by: str = ""
+    """Source of the intent in use; empty: none, or it is stale."""
+
+
+class OperatorIntent(Message, frozen=True):
+    """Requests of the person beyond leading by hand."""
+
+    assist_n: float
+    """Requested upward force at the harness, N."""
+    shift: Vector4 = STRAIGHT
+    """Requested offset from a straight stand: COM x and y, m; torso's roll and yaw, rad."""
+    source: str = ""
+    """Name of the sender."""
+
+
+class Estop(Message, frozen=True):
+    """Emergency stop: every module goes to DAMP; only a restart leaves it."""
+
+    source: str
+    """Name of the sender."""
+
+
+class SimTruth(Message, frozen=True):
+    """True state of the simulated world; no controller reads it."""
+
+    scenario_s: float
+    """Scenario time; negative until the scenario starts."""
+    com: Vector3
+    """COM of the whole robot, m, world."""
+    torso: Vector3
+    """Torso origin, m, world."""
+    angles: Vector3
+    """Torso roll, pitch, yaw (3-1-2), rad."""
+    operator_force: Vector3
+    """Force of the operator's hand on the torso, N, world."""
+    operator_moment: Vector3
+    """Moment of the operator's hand on the torso, N m."""
+    load_n: float
+    """Weight that the operator rests on the harness, N."""
+    harness_force_z: float
+    """Upward force of the robot on the operator: the load minus the hand's lift, N."""
+    push: Vector3
+    """Push on the torso, N, world."""
+    foot_right_tilt: float
+    """Angle between the right sole and the floor, rad."""
+    foot_left_tilt: float
+    """Angle between the left sole and the floor, rad."""
+    feet_slip: float
+    """Largest distance of an ankle from where it stood at the start, m."""
+    hoist: float
+    """Fraction of the hoist's support: 1 hanging, 0 free."""
+    fallen: bool
+    """True once the robot has fallen."""
+    real_time_factor: float
+    """Simulated time over wall time since the scenario started."""
+    late_s: float
+    """World time lost so far because the machine was too slow, s."""
+    lean: Pair = (0.0, 0.0)
+    """Lean of up against the floor's normal along x and y, m/m; not zero on a slope."""
+
+    @property
+    def over(self) -> Pair:
+        """Where the COM is over by gravity, at the ankles' height: x and y, m, world."""
+        x, y, z = self.com
+        return x - self.lean[0] * z, y - self.lean[1] * z
+
+
+class SimControl(Message, frozen=True):
+    """Command of a tool to the simulated world."""
+
+    start: bool
+    """Start the scenario: its time becomes zero."""
+
+
+class RunEvent(Message, frozen=True):
+    """An action of a tool on the run, for the log and the verdict."""
+
+    kind: int
+    """Kind of the event."""
+    subject: str
+    """Service or push."""
+    detail: str
+    """Signal, or push in words."""
+    scenario_s: float
+    """Scenario time, s."""

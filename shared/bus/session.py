@@ -1,0 +1,435 @@
+"""The bus: publishers, subscribers and the links between processes (docs/networks.md).
+
+The only file that knows Zenoh. Every process is a peer with a fixed endpoint; there is
+no router, no scouting and no gossip, and a peer does not pass on what is not for it, so
+each pair of processes that share a key has a link of its own (`peers_of`).
+
+On the control path (`Publisher.put`, `Latest.take`) nothing blocks, logs or raises: a
+message that cannot be sent or understood is counted, and its absence shows in its age.
+Set RUST_LOG=info to hear Zenoh itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Generic, Self, TypeAlias, TypeVar
+
+import zenoh
+
+from shared.bus import socket_linger
+from shared.bus.codec import Decoder, encode
+from shared.bus.links import PAIRS, Pair, endpoint_through
+from shared.bus.messages import Message
+from shared.bus.topics import Priority, Topic
+from shared.clock import keep_pace, now_ns
+from shared.config.robot_config import SERVICES, RobotConfig, expand
+from shared.exceptions import BusError, NonFiniteError
+from shared.process import SOCKET_PATH_MAX
+from shared.robot.joints import MODULES
+
+M = TypeVar("M", bound=Message)
+_Subscriber: TypeAlias = "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
+
+_SETTINGS: Final[dict[str, object]] = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "listen/timeout_ms": 0,
+    "listen/exit_on_failure": True,
+    # -1 with exit_on_failure off dials in the background for ever; 0 would dial once only.
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    # One object: Zenoh knows no key for its parts.
+    "connect/retry": {
+        "period_init_ms": 20,
+        "period_max_ms": 200,
+        "period_increase_factor": 2.0,
+    },
+    # Else open() waits half a second for peers that are not up.
+    "open/return_conditions/connect_scouted": False,
+    "transport/link/tx/keep_alive": 4,
+    # A full queue drops at once: a stopped subscriber costs the publisher nothing.
+    "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+    "transport/shared_memory/enabled": False,
+}
+"""Zenoh settings that are the same for every process; measured in docs/networks.md."""
+
+_ONE_RUNTIME: Final = (
+    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
+    "app:(worker_threads:1))"
+)
+"""ZENOH_RUNTIME: one thread pool in place of five."""
+
+_PRIORITIES: Final = {
+    Priority.REAL_TIME: zenoh.Priority.REAL_TIME,
+    Priority.DATA: zenoh.Priority.DATA,
+    Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
+}
+_UNIX: Final = "unixsock-stream/"
+_TCP: Final = ("tcp/", "tls/")
+_ALIVE_TIMEOUT_S: Final = 0.2
+
+
+def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
+    """Return which of a fleet's services a process dials; it is dialled by all others it talks to.
+
+    Each pair is linked once. Joint services dial nobody: they have nothing to say to one
+    another, and the tier that must outlive the others spends no time on absent ones. The
+    other services dial the joints and those before them in `services`; a tool dials all.
+    """
+    if name in MODULES:
+        return ()
+    if name not in services:
+        return tuple(services)
+    central = [service for service in services if service not in MODULES]
+    return (*MODULES, *central[: central.index(name)])
+
+
+class Publisher(Generic[M]):
+    """Puts the messages of one key on the bus."""
+
+    def __init__(self, publisher: zenoh.Publisher) -> None:
+        self._put = publisher.put
+        self.failed = 0
+        """Messages that were not sent: not finite, or the session is closed."""
+
+    def put(self, message: M) -> bool:
+        """Send a message; return False and count it if it cannot be sent.
+
+        Never blocks and never raises. Where a subscriber's queue is full the message is
+        dropped for that subscriber only, and that is not counted.
+        """
+        try:
+            self._put(encode(message))
+        except (NonFiniteError, zenoh.ZError):
+            self.failed += 1
+            return False
+        return True
+
+
+class RawPublisher:
+    """Puts payloads on one key as they are: for a player of logs, never for a service."""
+
+    def __init__(self, publisher: zenoh.Publisher) -> None:
+        self._publisher = publisher
+        self.failed = 0
+        """Payloads that were not sent: the session is closed."""
+
+    @property
+    def matched(self) -> bool:
+        """True if somebody subscribes to the key; for display."""
+        try:
+            return bool(self._publisher.matching_status.matching)  # type: ignore[attr-defined]  # zenoh's stub
+        except zenoh.ZError:
+            return False
+
+    def put(self, payload: bytes) -> bool:
+        """Send a payload; return False and count it if it cannot be sent; never raises."""
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError:
+            self.failed += 1
+            return False
+        return True
+
+
+class Latest(Generic[M]):
+    """Holds the newest message of one key."""
+
+    def __init__(self, subscriber: _Subscriber, message_type: type[M]) -> None:
+        self._subscriber = subscriber  # dropping it would end the subscription
+        self._try_recv = subscriber.handler.try_recv
+        self._decoder = Decoder(message_type)
+
+    @property
+    def refused(self) -> int:
+        """Payloads that were no message of this type, or held a number that is not finite."""
+        return self._decoder.refused
+
+    def take(self) -> M | None:
+        """Return the newest message if it was not taken before, else None; never blocks.
+
+        A payload that cannot be decoded is counted in `refused` and gives None.
+        """
+        sample = self._try_recv()
+        if sample is None:
+            return None
+        return self._decoder.decode(sample.payload.to_bytes())
+
+
+class Stream:
+    """Every sample of some keys, undecoded: for the recorder and for tools."""
+
+    def __init__(self, subscribers: Sequence[_Subscriber]) -> None:
+        self._subscribers = deque(subscribers)
+
+    def take(self) -> tuple[str, bytes, int] | None:
+        """Return (key, payload, time in monotonic ns) of the oldest sample, or None.
+
+        The time is that of this call, not of the arrival. Order holds within one key
+        expression. Never blocks; when the buffer is full the oldest samples are lost,
+        which the sequence numbers of the messages show.
+        """
+        for _ in range(len(self._subscribers)):
+            self._subscribers.rotate(-1)  # in turns, so that no busy key starves another
+            sample = self._subscribers[0].try_recv()
+            if sample is not None:
+                return str(sample.key_expr), sample.payload.to_bytes(), now_ns()
+        return None
+
+
+class Session:
+    """One process on the bus. Use it in a `with` statement; see `open_session`."""
+
+    def __init__(
+        self, session: zenoh.Session, robot: str, name: str, *, over_tcp: bool = False
+    ) -> None:
+        self.robot = robot
+        self.name = name
+        self._session = session
+        self._alive_prefix = f"xrl/{robot}/alive/"
+        self._token = session.liveliness().declare_token(self._alive_prefix + name)
+        if over_tcp:  # held, or it would end
+            self._links = session.info.declare_link_events_listener(_meet_link, history=True)
+
+    def __enter__(self) -> Self:
+        """Return the session itself."""
+        return self
+
+    def __exit__(
+        self,
+        error_type: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the session."""
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bus: all publishers and subscribers end, the socket file goes away.
+
+        Takes up to one lease if a peer is stopped; never raises.
+        """
+        with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
+            self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
+
+    def publisher(self, topic: Topic, message_type: type[M], module: str = "") -> Publisher[M]:
+        """Declare a publisher; do it at the start, not in a loop.
+
+        Args:
+            topic: a row of `shared.bus.topics`.
+            message_type: its type, for the type checker and checked here.
+            module: the module, for a topic with one key per module.
+
+        Raises:
+            BusError: the type or the module does not fit the topic.
+        """
+        key = self._key(topic, message_type, module)
+        publisher = self._session.declare_publisher(
+            key,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=_PRIORITIES[topic.priority],
+            express=False,
+        )
+        return Publisher(publisher)
+
+    def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
+        """Declare a publisher of ready payloads on any key.
+
+        All of them have one priority: what is put first arrives first, on all keys together.
+
+        Args:
+            key: a full key, without wildcards.
+            patient: `put` waits for a slow subscriber, up to `wait_before_close` (5 s) and then
+                drops the link, in place of dropping the message. Only where nothing waits for
+                the caller.
+
+        Raises:
+            BusError: it is no key.
+        """
+        control = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
+        try:
+            publisher = self._session.declare_publisher(
+                key, congestion_control=control, priority=_PRIORITIES[Priority.DATA], express=False
+            )
+        except zenoh.ZError as error:
+            raise BusError(f"{key}: {_reason(error)}; a key of the bus is right") from None
+        return RawPublisher(publisher)
+
+    def latest(self, topic: Topic, message_type: type[M], module: str = "") -> Latest[M]:
+        """Declare a subscriber that keeps the newest message only; arguments as `publisher`.
+
+        Raises:
+            BusError: the type or the module does not fit the topic.
+        """
+        key = self._key(topic, message_type, module)
+        return Latest(_ring(self._session, key, 1), message_type)
+
+    def stream(self, key_expressions: Sequence[str], capacity: int = 65536) -> Stream:
+        """Declare a subscriber that keeps every sample, up to `capacity` per expression.
+
+        Args:
+            key_expressions: full keys, or with wildcards such as `xrl/lab/joint/*/state`;
+                a key that fits two of them comes twice.
+            capacity: samples that are kept until they are taken.
+
+        Raises:
+            BusError: an expression is not one.
+        """
+        try:
+            return Stream([_ring(self._session, key, capacity) for key in key_expressions])
+        except zenoh.ZError as error:
+            raise BusError(f"{', '.join(key_expressions)}: {_reason(error)}") from None
+
+    def alive(self) -> set[str]:
+        """Return the names of the processes that this one has a link with, and its own.
+
+        For display only: a stopped process counts as alive until its lease is over.
+        Takes up to 0.2 s; not for a control loop.
+        """
+        replies = self._session.liveliness().get(self._alive_prefix + "*", timeout=_ALIVE_TIMEOUT_S)
+        return {
+            str(reply.ok.key_expr).removeprefix(self._alive_prefix)
+            for reply in replies
+            if reply.ok is not None
+        }
+
+    def _key(self, topic: Topic, message_type: type[Message], module: str) -> str:
+        if message_type is not topic.type:
+            right = topic.type.__name__
+            raise BusError(f"{topic.name}: {message_type.__name__} is not its type; use {right}")
+        if topic.per_module and module not in MODULES:
+            right = ", ".join(MODULES)
+            raise BusError(f"{topic.name}: {module!r} is no module; use one of {right}")
+        if module and not topic.per_module:
+            raise BusError(f"{topic.name}: has no key for {module}; leave the module out")
+        return topic.key(self.robot, module)
+
+
+def open_session(
+    config: RobotConfig,
+    name: str,
+    run_dir: Path,
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    injected: bool = False,
+) -> Session:
+    """Join the bus and return without waiting for anybody; links form as peers come up.
+
+    Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the
+    priority of the process before: Zenoh's thread inherits it. From then on the process goes by
+    the clock of the fleet in `run_dir` (`shared.clock.keep_pace`).
+
+    Args:
+        config: the robot; `config.bus` holds the endpoints and the lease.
+        name: a service of `robot_config.SERVICES`, which listens on its endpoint, or any other
+            name (letters, digits, _ and -) for a tool, which listens nowhere.
+        run_dir: replaces `{run}` in endpoints; made if it is not there.
+        listen: further endpoints to listen on: with them a tool serves other tools.
+        connect: further endpoints to dial: those of such a tool.
+        injected: dial through the network proxy where it stands (`shared.bus.links.PAIRS`).
+
+    Raises:
+        BusError: the name cannot be used, or the endpoint is taken, too long or not
+            possible. The socket that a killed process left behind is no obstacle.
+    """
+    keep_pace(run_dir)
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
+    own = [config.bus.endpoints[name]] if name in SERVICES else []
+    peers = [
+        endpoint_through(Pair(name, peer))
+        if injected and Pair(name, peer) in PAIRS
+        else config.bus.endpoints[peer]
+        for peer in peers_of(name, config.services)
+    ]
+    listening = [_endpoint(text, run_dir) for text in (*own, *listen)]
+    dialling = [_endpoint(text, run_dir) for text in (*peers, *connect)]
+    settings = {
+        **_SETTINGS,
+        "transport/link/tx/lease": config.bus.lease_ms,
+        # A stopped process takes a call but never answers; close() waits for that answer.
+        "transport/unicast/open_timeout": config.bus.lease_ms,
+        "transport/unicast/accept_timeout": config.bus.lease_ms,
+        "listen/endpoints": listening,
+        "connect/endpoints": dialling,
+    }
+    os.environ.setdefault("ZENOH_RUNTIME", _ONE_RUNTIME)  # read when the first session opens
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh's stub
+    try:
+        for endpoint in listening:
+            _make_directory(endpoint)
+        zenoh_config = zenoh.Config()
+        for key, value in settings.items():
+            zenoh_config.insert_json5(key, json.dumps(value))
+        over_tcp = any(endpoint.startswith(_TCP) for endpoint in (*listening, *dialling))
+        return Session(zenoh.open(zenoh_config), config.name, name, over_tcp=over_tcp)
+    except (zenoh.ZError, OSError) as error:
+        raise _open_error(name, listening, error) from None
+
+
+def _meet_link(event: zenoh.LinkEvent) -> None:
+    """Have the socket of a new TCP link closed at once when the link is given up.
+
+    Zenoh sets SO_LINGER to 10 s and closes from its only thread: after a cable was cut for
+    longer than the lease, all links of the process stood still for up to 10 s for each link
+    that was lost.
+    """
+    link = event.link
+    if event.kind == zenoh.SampleKind.PUT and link.src.startswith(_TCP):
+        socket_linger.turn_off(_address(link.src), _address(link.dst))
+
+
+def _address(locator: str) -> socket_linger.Address:
+    """Return host and port of tcp/HOST:PORT, as Zenoh tells them of a link: numeric."""
+    address = re.split("[?#]", locator.partition("/")[2])[0]
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
+    """Subscribe without a callback: a full ring drops its oldest and holds up no other key."""
+    return session.declare_subscriber(key, zenoh.handlers.RingChannel(capacity))
+
+
+def _endpoint(text: str, run_dir: Path) -> str:
+    """Return an endpoint with `{run}` filled in, checked for what a UNIX socket can take."""
+    endpoint = expand(text, run_dir)
+    length = len(os.fsencode(endpoint.removeprefix(_UNIX)))
+    if endpoint.startswith(_UNIX) and length > SOCKET_PATH_MAX:
+        raise BusError(
+            f"{endpoint}: a socket path of {length} bytes; "
+            f"at most {SOCKET_PATH_MAX}: take a shorter run directory"
+        )
+    return endpoint
+
+
+def _make_directory(endpoint: str) -> None:
+    """Make the directory of a UNIX socket, for its owner only."""
+    if endpoint.startswith(_UNIX):
+        directory = Path(endpoint.removeprefix(_UNIX)).parent
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+
+def _open_error(name: str, listen: Sequence[str], error: Exception) -> BusError:
+    """Say in one line why a session could not be opened, and what would be right."""
+    where = ", ".join(listen) or "bus"
+    reason = _reason(error)
+    # EAGAIN is the lock that Zenoh holds beside a UNIX socket while it listens there.
+    if "EAGAIN" in reason or "Address already in use" in reason:
+        right = f"stop the {name} that runs already, or take another run directory"
+        return BusError(f"{where}: in use; {right}")
+    return BusError(f"{where}: {name} cannot listen: {reason}; an endpoint it may use is needed")
+
+
+def _reason(error: Exception) -> str:
+    """Return an error's text without the place in Zenoh's source that it ends with."""
+    return str(error).partition(" at /")[0]

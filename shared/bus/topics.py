@@ -1,0 +1,202 @@
+"""The one table of topics: key, type, rate, priority, recorded (docs/networks.md)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+import msgspec
+
+from shared.bus import messages, traces
+from shared.robot.joints import MODULES
+
+
+class Priority(IntEnum):
+    """Bus priority of a topic; control goes first."""
+
+    REAL_TIME = 1
+    DATA = 5
+    BACKGROUND = 7
+
+
+class Topic(msgspec.Struct, frozen=True, kw_only=True):
+    """One row of the table."""
+
+    name: str
+    """Key below `xrl/<robot>/`; `*` stands for a module."""
+    type: type[messages.Message]
+    rate_hz: float
+    """Nominal rate, as `deploy/robot.toml` sets it; 0 for events."""
+    priority: Priority
+    recorded: bool
+    why: str
+
+    def key(self, robot: str, module: str = "") -> str:
+        """Return the full key, for example `xrl/lab/joint/ankle_right/state`."""
+        return f"xrl/{robot}/{self.name.replace('*', module)}"
+
+    @property
+    def per_module(self) -> bool:
+        """True if there is one key for each module."""
+        return "*" in self.name
+
+
+JOINT_STATE: Final = Topic(
+    name="joint/*/state",
+    type=messages.JointState,
+    rate_hz=250.0,
+    priority=Priority.REAL_TIME,
+    recorded=True,
+    why="the planner's input; its stamp is echoed",
+)
+JOINT_COMMAND: Final = Topic(
+    name="joint/*/command",
+    type=messages.JointCommand,
+    rate_hz=250.0,
+    priority=Priority.REAL_TIME,
+    recorded=True,
+    why="references, gains and torques of the law",
+)
+JOINT_EVENT: Final = Topic(
+    name="joint/*/event",
+    type=messages.JointEvent,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="every change of state, with its cause and torque step",
+)
+JOINT_TRACE: Final = Topic(
+    name="joint/*/trace",
+    type=traces.JointTrace,
+    rate_hz=50.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    why="every cycle's inputs: a joint service can be re-executed from them, bit for bit",
+)
+PLANNER_CHECKPOINT: Final = Topic(
+    name="planner/checkpoint",
+    type=traces.PlannerCheckpoint,
+    rate_hz=1.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    why="the planner's state: re-execution can start here",
+)
+WRENCH: Final = Topic(
+    name="harness/wrench",
+    type=messages.Wrench,
+    rate_hz=250.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="wrench of the operator on the torso",
+)
+ATTITUDE: Final = Topic(
+    name="imu/attitude",
+    type=messages.Attitude,
+    rate_hz=100.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="direction of up, where an IMU is fitted",
+)
+HARNESS_TARE: Final = Topic(
+    name="harness/tare",
+    type=messages.TareRequest,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="request for a new zero of the harness sensor",
+)
+PLANNER_STATUS: Final = Topic(
+    name="planner/status",
+    type=messages.PlannerStatus,
+    rate_hz=250.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="inputs and decisions of the law",
+)
+OPERATOR_INTENT: Final = Topic(
+    name="operator/intent",
+    type=messages.OperatorIntent,
+    rate_hz=50.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="assist and shift that the person requests",
+)
+ESTOP: Final = Topic(
+    name="estop",
+    type=messages.Estop,
+    rate_hz=0.0,
+    priority=Priority.REAL_TIME,
+    recorded=True,
+    why="emergency stop: every module to DAMP",
+)
+SIM_TRUTH: Final = Topic(
+    name="sim/truth",
+    type=messages.SimTruth,
+    rate_hz=100.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    why="true state of the world, for the verdict; no controller reads it",
+)
+SIM_STATE: Final = Topic(
+    name="sim/state",
+    type=traces.SimState,
+    rate_hz=10.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    why="complete simulated world: `xrl whatif` continues from it",
+)
+SIM_CONTROL: Final = Topic(
+    name="sim/control",
+    type=messages.SimControl,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="starts the scenario",
+)
+RUN_EVENT: Final = Topic(
+    name="run/event",
+    type=messages.RunEvent,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="kills, restarts, faults and pushes, for the verdict",
+)
+LINK_EVENT: Final = Topic(
+    name="link/event",
+    type=traces.LinkEvent,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    why="impairments of the network on purpose: a log without them is no evidence",
+)
+
+TOPICS: Final = (
+    JOINT_STATE,
+    JOINT_COMMAND,
+    JOINT_EVENT,
+    JOINT_TRACE,
+    WRENCH,
+    ATTITUDE,
+    HARNESS_TARE,
+    PLANNER_STATUS,
+    PLANNER_CHECKPOINT,
+    OPERATOR_INTENT,
+    ESTOP,
+    SIM_TRUTH,
+    SIM_STATE,
+    SIM_CONTROL,
+    RUN_EVENT,
+    LINK_EVENT,
+)
+
+
+def keys(topic: Topic, robot: str) -> tuple[str, ...]:
+    """Return every full key of a topic."""
+    if topic.per_module:
+        return tuple(topic.key(robot, module) for module in MODULES)
+    return (topic.key(robot),)
+
+
+def all_keys(robot: str) -> dict[str, Topic]:
+    """Return the topic of every full key of a robot."""
+    return {key: topic for topic in TOPICS for key in keys(topic, robot)}

@@ -1,0 +1,127 @@
+"""Messages for the log: inputs of the services, and impairments of the network.
+
+Re-execution reads them. They are on the bus like all others; only the recorder subscribes.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from shared.bus.messages import Message, Pair
+
+
+class CycleTrace(msgspec.Struct, gc=False, frozen=True):
+    """Inputs and decision of one cycle of a joint service."""
+
+    now_ns: int
+    """The cycle's time."""
+    sampled_ns: int
+    """Arrival of the drive's sample; -1: none came, and the next six fields are void."""
+    pos: Pair
+    """Motor positions from the joint's zero, turns."""
+    vel: Pair
+    """Motor rates, turn/s."""
+    status: int
+    """Status of the drive."""
+    error: int
+    """Error bits of the drive."""
+    carried: Pair
+    """Motor torques of a drive that was found armed, N m; valid if `carries`."""
+    carries: bool
+    """True if `carried` is valid."""
+    session: int
+    """Session of the command that came in this cycle; see `command_seq`."""
+    command_seq: int
+    """Sequence number of the command that came in this cycle; -1: none came."""
+    estop: bool
+    """True while the emergency stop is engaged."""
+    drive_command: int
+    """Command to the drive: 0 nothing, 1 torques, 2 a target, 3 idle, 4 arm, 5 forget the zero."""
+    tau: Pair
+    """Joint torques of this cycle, N m, after the limiter."""
+    below: Pair = (0.0, 0.0)
+    """For a hip: theta and rate of ankle and knee together, rad, rad/s; valid if `knows_below`."""
+    knows_below: bool = False
+    """True if `below` is valid."""
+    sinks: bool = True
+    """For a knee: it saw no reason not to sink."""
+    stiffen: bool = False
+    """It saw a limp module that it stiffens for."""
+
+
+class JointTrace(Message, frozen=True):
+    """Consecutive cycles of a joint service: enough to execute them again."""
+
+    snapshot: str
+    """Once in a while the service's state before the first of these cycles, as JSON; else empty."""
+    cycles: tuple[CycleTrace, ...]
+    """The cycles, oldest first."""
+
+
+class PlannerCheckpoint(Message, frozen=True):
+    """State of the planner before a tick: execution can start here."""
+
+    session: int
+    """Random number of this planner's life."""
+    snapshot: str
+    """State, as JSON."""
+
+
+class SimState(Message, frozen=True):
+    """Complete state of the simulated world and its drives: a run can continue from here."""
+
+    scenario_s: float
+    """Scenario time; negative until the scenario starts."""
+    qpos: tuple[float, ...]
+    """MuJoCo's positions, m, quaternion, rad."""
+    qvel: tuple[float, ...]
+    """MuJoCo's velocities, m/s, rad/s."""
+    warmstart: tuple[float, ...]
+    """MuJoCo's qacc_warmstart."""
+    hoist: float
+    """Fraction of the hoist's support: 1 hanging, 0 free."""
+    armed: tuple[int, ...]
+    """1 for each axis in closed loop; 12 values, as in all that follow."""
+    input_pos: tuple[float, ...]
+    """Position targets, turns as the drive counts them."""
+    input_vel: tuple[float, ...]
+    """Velocity targets, turn/s."""
+    input_torque: tuple[float, ...]
+    """Feedforward torques, N m."""
+    pos_gain: tuple[float, ...]
+    """Position gains, 1/s."""
+    vel_gain: tuple[float, ...]
+    """Velocity gains, N m s/turn."""
+    counts_from: tuple[float, ...]
+    """Count of each encoder at the true zero."""
+    hidden: tuple[float, ...]
+    """Hidden state of the plant: the person, the rotors and torques on their way, as
+    `World.hidden`."""
+
+
+class LinkEvent(Message, frozen=True):
+    """A change of the impairment of one direction of a link."""
+
+    link: str
+    """One direction, as named in `shared.bus.links`."""
+    requested: str
+    """The link as requested: this direction, or a group of directions."""
+    number: int
+    """Number of the impairment: the same for all its directions, and for its begin and end."""
+    active: bool
+    """True from the begin on, unless a partition or a later impairment hides it; False at its
+    end."""
+    delay_ms: float
+    """Delay."""
+    jitter_ms: float
+    """Jitter."""
+    loss: float
+    """Fraction of lost messages."""
+    partition: bool
+    """True if nothing passes."""
+    detail: str
+    """The impairment in the words of `--inject`."""
+    passed: int
+    """Messages (live: Zenoh batches) that passed while it was active; 0 at the begin."""
+    lost: int
+    """Messages lost to it."""

@@ -1,0 +1,1 @@
+"""CAN frames of drives and sensors, and the emulated bus."""

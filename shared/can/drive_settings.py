@@ -1,0 +1,275 @@
+"""What this robot wants of its ODrives: one table, by the names of firmware 0.5.6.
+
+With factory settings an ODrive disarms, limits or answers in ways that make this robot fall
+(docs/drives.md#traps). The simulator's drives are set by this table, `xrl doctor` compares a drive
+with it and `xrl configure` writes it, so the three cannot disagree.
+
+What the joint services write at arming or in every cycle (modes, gains, limits) stands here
+too where a drive that was armed by somebody else would be wrong without it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import Enum
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from shared.can.cansimple import InputMode
+from shared.config.sections import DriveConfig
+
+if TYPE_CHECKING:
+    from shared.config.robot_config import RobotConfig
+
+Value = bool | int | float
+
+AXES: Final = ("axis0", "axis1")
+"""Both axes of an ODrive, as its settings name them; axis0 is the first of `node_ids`."""
+
+CAN_BAUD_RATE: Final = 1_000_000
+OVERVOLTAGE_MAX: Final = 59.92
+"""V; what the firmware ships on a 56 V board. Above it the output stage is not protected."""
+OVERSPEED_TOLERANCE: Final = 1.2
+"""What the firmware ships; closer to 1, a noisy estimate at vel_limit disarms."""
+CURRENT_RANGE: Final = 60.0
+"""A; `motor.config.requested_current_range` as the firmware ships it: what a drive can measure."""
+SPINOUT_POWER: Final = 100.0
+"""W; 10 as shipped. A motor that brakes with more than this, and takes more than this beyond the
+copper loss of its calibrated resistance, disarms: its encoder has slipped. A winding at 100 C has
+30 % more resistance, at 30 A and 0.1 ohm 40 W, at 40 A 72 W."""
+
+_RELATIVE: Final = 1e-6
+"""A drive keeps single floats."""
+
+
+class Compare(Enum):
+    """How a setting must compare with what is wanted."""
+
+    EQUAL = ""
+    AT_LEAST = ">= "
+    AT_MOST = "<= "
+
+
+class Need(NamedTuple):
+    """What the wanted values are worked out from."""
+
+    drive: DriveConfig
+    encoder_counts_per_turn: int
+    watchdog: bool = True
+    """Whether the drives' watchdogs are to run, if the robot file gives them a timeout."""
+    node_id: int | None = None
+    """CAN node of the axis; None: not known here, and not wanted."""
+
+
+class Setting(NamedTuple):
+    """One row of the table."""
+
+    name: str
+    """Below `axis0.` and `axis1.`, or of the whole drive."""
+    wanted: Callable[[Need], Value | None]
+    """None: nothing is wanted."""
+    why: str
+    """What happens otherwise."""
+    compare: Compare = Compare.EQUAL
+
+
+class WantedSetting(NamedTuple):
+    """A setting of one drive, by its whole name, with its value worked out."""
+
+    name: str
+    value: Value
+    why: str
+    compare: Compare
+
+    def fits(self, found: Value) -> bool:
+        """Return True if a drive that has this value is as wanted."""
+        if self.compare is not Compare.EQUAL and not math.isnan(found):
+            beyond = found > self.value if self.compare is Compare.AT_LEAST else found < self.value
+            return beyond or same(found, self.value)
+        return same(found, self.value)
+
+    def describe(self) -> str:
+        """Return what is wanted: "60", ">= 1.2"."""
+        return f"{self.compare.value}{describe_value(self.value)}"
+
+
+AXIS_TABLE: Final[tuple[Setting, ...]] = (
+    Setting(
+        "config.enable_watchdog",
+        lambda need: need.watchdog and need.drive.watchdog_timeout > 0.0,
+        "a watchdog that fires lets the module go limp: off with the onboard loop, else on",
+    ),
+    Setting(
+        "config.watchdog_timeout",
+        lambda need: need.drive.watchdog_timeout,
+        "a drive left alone stops after this; too short, a hiccup disarms",
+    ),
+    Setting(
+        "config.startup_motor_calibration",
+        lambda _: False,
+        "the motor would move by itself at power-up",
+    ),
+    Setting(
+        "config.startup_encoder_offset_calibration",
+        lambda _: False,
+        "the motor would turn by itself at power-up",
+    ),
+    Setting(
+        "config.startup_closed_loop_control",
+        lambda _: False,
+        "the axis would arm by itself at power-up, before anything looks after it",
+    ),
+    Setting(
+        "config.can.node_id",
+        lambda need: need.node_id,
+        "the services would speak to another axis, or to none",
+    ),
+    Setting(
+        "config.can.heartbeat_rate_ms",
+        lambda need: need.drive.heartbeat_period_ms,
+        "an axis that disarms shows in its next heartbeat only",
+    ),
+    Setting(
+        "config.can.encoder_rate_ms",
+        lambda need: need.drive.encoder_period_ms,
+        "the encoder frames are the joint service's clock; as shipped they come at 100 Hz",
+    ),
+    Setting(
+        "controller.config.input_mode",
+        lambda _: int(InputMode.PASSTHROUGH),
+        "any other mode filters or ignores the targets",
+    ),
+    Setting(
+        "controller.config.vel_integrator_gain",
+        lambda _: 0.0,
+        "an integrator winds up under the robot's weight; the law has none in the drive",
+    ),
+    Setting(
+        "controller.config.vel_limit",
+        lambda need: need.drive.vel_limit,
+        "faster than this times vel_limit_tolerance disarms with OVERSPEED, in torque mode too",
+    ),
+    Setting(
+        "controller.config.vel_limit_tolerance",
+        lambda _: OVERSPEED_TOLERANCE,
+        "OVERSPEED would fire close to vel_limit",
+        Compare.AT_LEAST,
+    ),
+    Setting(
+        "controller.config.enable_overspeed_error",
+        lambda _: True,
+        "a motor that runs away would not be stopped",
+    ),
+    Setting(
+        "controller.config.enable_torque_mode_vel_limit",
+        lambda _: False,
+        "in torque mode it cuts the torque by vel_gain: with that at 0, all of it",
+    ),
+    Setting(
+        "controller.config.spinout_electrical_power_threshold",
+        lambda _: SPINOUT_POWER,
+        "a warm winding that sinks under load disarms with SPINOUT_DETECTED: the leg lets go",
+        Compare.AT_LEAST,
+    ),
+    Setting(
+        "controller.config.spinout_mechanical_power_threshold",
+        lambda _: -SPINOUT_POWER,
+        "a warm winding that sinks under load disarms with SPINOUT_DETECTED: the leg lets go",
+        Compare.AT_MOST,
+    ),
+    Setting(
+        "motor.config.pre_calibrated",
+        lambda _: True,
+        "after each power-up the motor would have to be calibrated before it arms",
+    ),
+    Setting(
+        "motor.config.torque_constant",
+        lambda need: need.drive.torque_constant,
+        "every torque would be wrong by the ratio",
+    ),
+    Setting(
+        "motor.config.current_lim",
+        lambda need: need.drive.current_lim,
+        "less (10 A as shipped) cannot carry the robot, more is not what the robot file checks",
+    ),
+    Setting(
+        "motor.fet_thermistor.config.enabled",
+        lambda _: True,
+        "the output stage would not protect itself",
+    ),
+    Setting(
+        "encoder.config.cpr",
+        lambda need: need.encoder_counts_per_turn,
+        "every angle would be wrong by the ratio",
+    ),
+    Setting(
+        "encoder.config.bandwidth",
+        lambda need: need.drive.encoder_bandwidth,
+        "slower, the drive's damping comes late and shakes the rotors; faster, it is noisy",
+    ),
+    Setting(
+        "encoder.config.pre_calibrated",
+        lambda _: True,
+        "after each power-up the motor would have to turn by itself before it arms",
+    ),
+)
+"""Settings of each axis."""
+
+DRIVE_TABLE: Final[tuple[Setting, ...]] = (
+    Setting(
+        "config.dc_max_negative_current",
+        lambda need: need.drive.dc_max_negative_current,
+        "braking legs push current back; -0.01 A as shipped trips both axes at once",
+    ),
+    Setting(
+        "config.dc_bus_overvoltage_trip_level",
+        lambda _: OVERVOLTAGE_MAX,
+        "what braking legs push back could destroy the output stage",
+        Compare.AT_MOST,
+    ),
+    Setting(
+        "can.config.baud_rate",
+        lambda _: CAN_BAUD_RATE,
+        "the bus carries two axes at the joint services' rate at 1 Mbit/s only",
+    ),
+)
+"""Settings of the whole ODrive."""
+
+
+def of_module(robot: RobotConfig, module: str) -> tuple[WantedSetting, ...]:
+    """Return all that is wanted of a module's ODrive."""
+    counts = robot.joint.encoder_counts_per_turn
+    common = Need(robot.drive, counts)
+    rows = [_worked_out(setting, common, "") for setting in DRIVE_TABLE]
+    for axis, node_id in zip(AXES, robot.module_named(module).node_ids, strict=True):
+        need = Need(robot.drive, counts, node_id=node_id)
+        rows += [_worked_out(setting, need, f"{axis}.") for setting in AXIS_TABLE]
+    return tuple(row for row in rows if row is not None)
+
+
+def of_every_drive(need: Need) -> dict[str, Value]:
+    """Return what is wanted of all drives alike, by the tables' names."""
+    values = {setting.name: setting.wanted(need) for setting in (*DRIVE_TABLE, *AXIS_TABLE)}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def same(one: Value, other: Value) -> bool:
+    """Return True if two values are the same to a drive, which keeps single floats."""
+    if isinstance(one, float) or isinstance(other, float):
+        both_nan = math.isnan(one) and math.isnan(other)
+        return both_nan or math.isclose(one, other, rel_tol=_RELATIVE)
+    return one == other
+
+
+def describe_value(value: object) -> str:
+    """Return a setting's value as a person would write it."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _worked_out(setting: Setting, need: Need, prefix: str) -> WantedSetting | None:
+    value = setting.wanted(need)
+    if value is None:
+        return None
+    return WantedSetting(f"{prefix}{setting.name}", value, setting.why, setting.compare)

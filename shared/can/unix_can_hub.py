@@ -1,0 +1,171 @@
+"""The bus of `shared.can.unix_can` itself: a listening UNIX socket that hands frames on."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import socket
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+
+from shared.can.unix_can import PACKET_BYTES, Frame, pack_frames, unpack_frames
+from shared.exceptions import FleetError
+
+_PATH_BYTES = 107  # sun_path less its closing zero
+_BACKLOG = 16
+_ROUNDS = 64  # a client that floods the bus must not hold up the simulator
+
+
+class UnixCanHub:
+    """A CAN bus: hands each client's frames to its owner and to the other clients.
+
+    Raises:
+        FleetError: the path is in use, too long, or cannot be made.
+
+    Attributes:
+        dropped: packets that were not handed on because a client's socket was full.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.dropped = 0
+        self._clients: dict[int, socket.socket] = {}
+        self._listener = _listen(path)
+        self._inode = path.stat().st_ino
+        self._epoll = select.epoll()
+        self._epoll.register(self._listener, select.EPOLLIN)
+
+    @property
+    def clients(self) -> int:
+        """How many clients are on the bus."""
+        return len(self._clients)
+
+    def poll(self) -> list[Frame]:
+        """Return the frames that clients have sent, in order; admit new clients. Never waits."""
+        frames: list[Frame] = []
+        wait = self._epoll.poll
+        for _ in range(_ROUNDS):
+            ready = wait(0)
+            if not ready:
+                break
+            for descriptor, _event in ready:
+                client = self._clients.get(descriptor)
+                if client is None:
+                    self._admit()
+                else:
+                    frames += self._take(client)
+        return frames
+
+    def broadcast(self, frames: Iterable[Frame]) -> None:
+        """Send frames to every client in one packet."""
+        self.broadcast_packet(pack_frames(frames))
+
+    def broadcast_packet(self, packet: bytes) -> None:
+        """Send a packet made by `pack_frames` or alike to every client."""
+        for client in tuple(self._clients.values()):
+            self._hand(client, packet)
+
+    def close(self) -> None:
+        """Leave all clients and remove the socket file, unless another hub has replaced it."""
+        if self._epoll.closed:
+            return
+        self._epoll.close()
+        for client in self._clients.values():
+            client.close()
+        self._clients.clear()
+        self._listener.close()
+        if self.path.exists() and self.path.stat().st_ino == self._inode:
+            self.path.unlink()
+
+    def __enter__(self) -> UnixCanHub:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def _admit(self) -> None:
+        """Take one client from the queue, if it is still there."""
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return
+        client.setblocking(False)
+        self._clients[client.fileno()] = client
+        self._epoll.register(client, select.EPOLLIN)
+
+    def _take(self, client: socket.socket) -> list[Frame]:
+        """Read one packet of a ready client and hand it on; part with a client that has gone."""
+        try:
+            packet = client.recv(PACKET_BYTES)
+        except BlockingIOError:
+            return []
+        except ConnectionResetError:
+            return []  # it left frames unread, says the kernel, once; what it sent comes next
+        except OSError:
+            packet = b""
+        if not packet:
+            self._part(client)
+            return []
+        if len(self._clients) > 1:
+            for other in tuple(self._clients.values()):
+                if other is not client:
+                    self._hand(other, packet)
+        return unpack_frames(packet)
+
+    def _hand(self, client: socket.socket, packet: bytes) -> None:
+        """Send without waiting; drop what a slow client has no room for.
+
+        A client that has gone is parted with in `_take`, once what it sent has been read.
+        """
+        try:
+            client.send(packet)
+        except BlockingIOError:
+            self.dropped += 1
+        except OSError:
+            pass
+
+    def _part(self, client: socket.socket) -> None:
+        """Close a client's side."""
+        if self._clients.pop(client.fileno(), None) is not None:
+            self._epoll.unregister(client)
+            client.close()
+
+
+def _listen(path: Path) -> socket.socket:
+    """Listen on a path; clear away the file of a hub that is no more."""
+    if len(os.fsencode(path)) > _PATH_BYTES:
+        raise FleetError(
+            f"CAN hub: {path} is longer than the {_PATH_BYTES} bytes of a UNIX socket's path; "
+            "choose a shorter run directory"
+        )
+    _clear_stale(path)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listener.setblocking(False)
+    try:
+        listener.bind(str(path))
+        listener.listen(_BACKLOG)
+    except OSError as error:
+        listener.close()
+        raise FleetError(
+            f"CAN hub: cannot listen on {path}: {error}; its directory must exist and be writable"
+        ) from error
+    return listener
+
+
+def _clear_stale(path: Path) -> None:
+    """Remove a socket file that nobody listens on; refuse one in use or no socket at all."""
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise FleetError(f"CAN hub: {path} is there and is no socket; remove it")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+        probe.setblocking(False)
+        if probe.connect_ex(str(path)) != errno.ECONNREFUSED:
+            raise FleetError(f"CAN hub: {path} is in use; stop the simulator that holds it")
+    path.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""The robot file and scenarios, read and checked."""

@@ -1,0 +1,269 @@
+"""What a robot file must make sense of as a whole; see `shared.config.robot_config`."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterable
+from importlib.metadata import entry_points
+from typing import Any, Final
+
+import msgspec
+
+from shared.can.can_load import check_buses
+from shared.can.drive_settings import CURRENT_RANGE
+from shared.config.robot_config import SERVICES, RobotConfig
+from shared.config.sections import LimitConfig
+from shared.exceptions import ConfigError
+from shared.robot.joints import KINDS, MODULES
+
+INTERFACES: Final = (
+    "canalystii", "cantact", "etas", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi",
+    "nican", "nixnet", "pcan", "robotell", "seeedstudio", "serial", "slcan", "socketcan",
+    "socketcand", "systec", "udp_multicast", "usb2can", "vector", "virtual", "xrl_unix",
+)  # fmt: skip
+"""What python-can brings itself, and this package; other packages may declare more."""
+
+LEADABLE: Final = (2, 4)
+"""Rows of p that a person may lead: height and pitch."""
+_POWER_UP_TURNS: Final = 1.0
+"""An encoder that has just got power knows its motor within a turn."""
+
+
+def check(file: str, config: RobotConfig) -> None:
+    """Check what no single number shows: duplicates, crossings, dangling names.
+
+    Args:
+        file: for the error.
+        config: the robot, each of its values in range.
+
+    Raises:
+        ConfigError: naming the file, the key, what stands there and what would be right.
+    """
+    _check_names(file, config)
+    _check_interfaces(file, config)
+    _check_physics(file, config)
+    _check_drive(file, config)
+    _check_timing(file, config)
+    check_buses(file, config)
+
+
+def _check_names(file: str, config: RobotConfig) -> None:
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", config.name):
+        raise ConfigError(file, "name", f"{config.name!r}", "use letters, digits, _ and - only")
+    names = [module.name for module in config.module]
+    for index, name in enumerate(names):
+        where = f"module[{index}].name"
+        if name in names[:index]:
+            raise ConfigError(file, where, f"{name!r} stands twice", "each module once")
+        if name not in MODULES:
+            raise ConfigError(file, where, f"{name!r} is no module", f"one of {_words(MODULES)}")
+    absent = [name for name in MODULES if name not in names]
+    if absent:
+        raise ConfigError(file, "module", f"no entry for {_words(absent)}", "six modules in all")
+    nodes: dict[tuple[str, int], str] = {}
+    for index, module in enumerate(config.module):
+        if module.bus not in config.can:
+            buses = _words(config.can)
+            raise ConfigError(file, f"module[{index}].bus", f"{module.bus!r}", f"one of {buses}")
+        for node in module.node_ids:
+            other = nodes.setdefault((config.can[module.bus].channel, node), module.name)
+            if other != module.name or len(set(module.node_ids)) < 2:
+                where = f"module[{index}].node_ids"
+                raise ConfigError(file, where, f"node {node} is taken on this bus", "a free node")
+    _check_serial_numbers(file, config)
+    if config.harness.bus not in config.can:
+        buses = _words(config.can)
+        raise ConfigError(file, "harness.bus", f"{config.harness.bus!r}", f"one of {buses}")
+    _check_imu(file, config)
+    _check_endpoints(file, config)
+    table = msgspec.to_builtins(config)
+    for index, key in enumerate(config.assumed):
+        value: Any = table
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if value is None:
+            raise ConfigError(file, f"assumed[{index}]", f"{key!r} is no key", "a dotted key")
+
+
+def _check_imu(file: str, config: RobotConfig) -> None:
+    imu = config.imu
+    if not imu.fitted:
+        return
+    if imu.bus not in config.can:
+        raise ConfigError(file, "imu.bus", f"{imu.bus!r}", f"one of {_words(config.can)}")
+    channel = config.can[imu.bus].channel
+    for module in config.module:
+        if config.can[module.bus].channel == channel:
+            found = f"{imu.bus!r} is {module.name}'s bus too"
+            right = "one without drives: the IMU's frames 0x11, 0x21 and 0x32 are nodes 0 and 1"
+            raise ConfigError(file, "imu.bus", found, right)
+
+
+def _check_serial_numbers(file: str, config: RobotConfig) -> None:
+    """Check what is given, whichever the driver: a drive has USB and CAN at the same time."""
+    wanted = config.joint_service.driver == "odrive_usb"
+    seen: set[str] = set()
+    for index, module in enumerate(config.module):
+        where, serial = f"module[{index}].serial_number", module.serial_number.upper()
+        if not serial and not wanted:
+            continue
+        if not re.fullmatch(r"[0-9A-F]{12}", serial):
+            found = f"{module.serial_number!r} of {module.name}"
+            raise ConfigError(file, where, found, "12 hexadecimal digits, as `odrivetool` shows")
+        if serial in seen:
+            raise ConfigError(file, where, f"{serial} stands twice", "each drive once")
+        seen.add(serial)
+
+
+def _check_endpoints(file: str, config: RobotConfig) -> None:
+    endpoints = config.bus.endpoints
+    for service in config.services:
+        if service not in endpoints:
+            raise ConfigError(file, f"bus.endpoints.{service}", "missing", "one for each service")
+    seen: dict[str, str] = {}
+    for service, endpoint in endpoints.items():
+        where = f"bus.endpoints.{service}"
+        if service not in SERVICES:
+            raise ConfigError(file, where, "no such service", f"one of {_words(SERVICES)}")
+        if not re.match(r"(unixsock-stream|tcp|tls)/.", endpoint):
+            right = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
+            raise ConfigError(file, where, f"{endpoint!r}", right)
+        if endpoint in seen:
+            raise ConfigError(
+                file, where, f"{endpoint!r} is {seen[endpoint]}'s too", "one for each service"
+            )
+        seen[endpoint] = service
+
+
+def _check_physics(file: str, config: RobotConfig) -> None:
+    mass, geometry = config.mass, config.geometry
+    if mass.payload > mass.payload_max:
+        found = f"{mass.payload:g} kg is more than payload_max"
+        raise ConfigError(file, "mass.payload", found, f"at most {mass.payload_max:g} kg")
+    for kind in KINDS:
+        limit: LimitConfig = getattr(config.limits, kind)
+        for axis, (low, high) in (("phi", limit.phi), ("theta", limit.theta)):
+            if low >= high:
+                where = f"limits.{kind}.{axis}"
+                raise ConfigError(file, where, f"[{low:g}, {high:g}] is crossed", "low below high")
+    if config.limits.knee.theta[1] >= 0.0:
+        found = f"{config.limits.knee.theta[1]:g} rad lets the knee straighten"
+        right = "negative: a straight knee (0) is singular"
+        raise ConfigError(file, "limits.knee.theta[1]", found, right)
+    reach = geometry.l1 + geometry.l2
+    if not abs(geometry.l1 - geometry.l2) < config.simulation.stand_height < reach:
+        found = f"{config.simulation.stand_height:g} m"
+        right = f"inside the legs' reach, {abs(geometry.l1 - geometry.l2):.3f} to {reach:.3f} m"
+        raise ConfigError(file, "simulation.stand_height", found, right)
+    if geometry.l1 >= geometry.l2:
+        found = f"{geometry.l1:g} m is not below l2 = {geometry.l2:g} m"
+        raise ConfigError(file, "geometry.l1", found, "a thigh shorter than the shin")
+    for index, selected in enumerate(config.law.S):
+        if selected and index not in LEADABLE:
+            found = "1: nobody would balance this direction"
+            raise ConfigError(file, f"law.S[{index}]", found, "0; only z and pitch can be led")
+        if not selected and config.law.K_p[index] <= 0.0:
+            where = f"law.K_p[{index}]"
+            raise ConfigError(file, where, "0 in a direction the robot balances", "positive")
+
+
+def _check_interfaces(file: str, config: RobotConfig) -> None:
+    """Check that python-can knows the interface of every bus."""
+    known = set(INTERFACES)
+    for name, bus in config.can.items():
+        if bus.interface not in known:
+            known |= {entry.name for entry in entry_points(group="can.interface")}
+        if bus.interface not in known:
+            found = f"{bus.interface!r} is no interface of python-can"
+            near = difflib.get_close_matches(bus.interface, known, n=1)
+            right = f"did you mean {near[0]!r}?" if near else f"one of {_words(sorted(known))}"
+            raise ConfigError(file, f"can.{name}.interface", found, right)
+
+
+def _check_drive(file: str, config: RobotConfig) -> None:
+    """Check what the drives are told against what the joints need of them."""
+    drive, turns_per_rad = config.drive, config.joint.gear_ratio / (2 * math.pi)
+    tau_per_ampere = 2 * config.joint.gear_ratio * drive.torque_constant
+    if tau_per_ampere * drive.current_lim < config.joint.tau_module_max:
+        found = f"{drive.current_lim:g} A gives less than tau_module_max"
+        right = f"at least {config.joint.tau_module_max / tau_per_ampere:.1f} A"
+        raise ConfigError(file, "drive.current_lim", found, right)
+    if drive.current_lim > CURRENT_RANGE:
+        found = f"{drive.current_lim:g} A is more than an ODrive v3 measures"
+        right = f"at most {CURRENT_RANGE:g} A, its requested_current_range"
+        raise ConfigError(file, "drive.current_lim", found, right)
+    # Up to vel_limit_tolerance times vel_limit are left for what the other axis adds.
+    speed = config.joint_service.v_max * turns_per_rad
+    if drive.vel_limit < speed:
+        found = f"{drive.vel_limit:g} turn/s is slower than joint_service.v_max"
+        right = f"at least {speed:.1f} turn/s, v_max at the motor; beyond vel_limit a drive disarms"
+        raise ConfigError(file, "drive.vel_limit", found, right)
+    if drive.zero_mark_turns > 0.0:
+        kind, turns = max(((kind, _turns(config, kind)) for kind in KINDS), key=lambda row: row[1])
+        least = 2 * (turns + _POWER_UP_TURNS)
+        if drive.zero_mark_turns < least:
+            found = f"{drive.zero_mark_turns:g} turns: the {kind} comes to half of it"
+            right = f"at least {math.ceil(least)} turns, twice a joint's range; 0: no such check"
+            raise ConfigError(file, "drive.zero_mark_turns", found, right)
+
+
+def _turns(config: RobotConfig, kind: str) -> float:
+    """Return how far from q = 0, or from where it got power, a joint's motors can be, turns.
+
+    A motor turns by gear_ratio (theta +- phi).
+    """
+    limit: LimitConfig = getattr(config.limits, kind)
+    pairs = (limit.phi, limit.theta)
+    span = sum(high - low for low, high in pairs)
+    farthest = sum(max(abs(low), abs(high)) for low, high in pairs)
+    return config.joint.gear_ratio * max(span, farthest) / (2 * math.pi)
+
+
+def _check_timing(file: str, config: RobotConfig) -> None:
+    service = config.joint_service
+    pairs = (
+        ("joint_service.state_rate_hz", service.state_rate_hz, service.rate_hz),
+        ("planner.rate_hz", config.planner.rate_hz, service.state_rate_hz),
+        ("joint_service.command_aging_max_ms", service.command_aging_max_ms,
+         service.max_command_age_ms),
+        ("joint_service.engage_after_ms", service.engage_after_ms, service.engage_after_max_ms),
+    )  # fmt: skip
+    for key, value, limit in pairs:
+        if value > limit:
+            raise ConfigError(file, key, f"{value:g} is too large", f"at most {limit:g}")
+    period_ms = 1e3 / service.rate_hz
+    if abs(config.simulation.encoder_rate_hz - service.rate_hz) > 1e-6:
+        found = f"{config.simulation.encoder_rate_hz:g} Hz is not joint_service.rate_hz"
+        raise ConfigError(
+            file, "simulation.encoder_rate_hz", found, f"{service.rate_hz:g} Hz: they are its clock"
+        )
+    if abs(config.drive.encoder_period_ms - period_ms) > 1e-6:
+        found = f"{config.drive.encoder_period_ms} ms is not the period of joint_service.rate_hz"
+        raise ConfigError(file, "drive.encoder_period_ms", found, f"{period_ms:g} ms")
+    if (
+        abs(
+            round(service.rate_hz / service.state_rate_hz) * service.state_rate_hz - service.rate_hz
+        )
+        > 1e-6
+    ):
+        found = f"{service.state_rate_hz:g} Hz does not divide joint_service.rate_hz"
+        right = f"{service.rate_hz:g} Hz divided by a whole number"
+        raise ConfigError(file, "joint_service.state_rate_hz", found, right)
+    if service.loop == "onboard" and config.drive.watchdog_timeout > 0.0:
+        found = f"{config.drive.watchdog_timeout:g} s disarms what the onboard loop is to hold"
+        raise ConfigError(file, "drive.watchdog_timeout", found, "0 s: off")
+    if service.loop == "service" and config.drive.watchdog_timeout < 10e-3 * period_ms:
+        found = f"{config.drive.watchdog_timeout:g} s is under ten control periods"
+        right = f"at least {10e-3 * period_ms:g} s, or a hiccup disarms the drive"
+        raise ConfigError(file, "drive.watchdog_timeout", found, right)
+    command_period_ms = 1e3 / config.planner.rate_hz
+    if service.max_command_age_ms < 3 * command_period_ms:
+        found = f"{service.max_command_age_ms:g} ms is under three planner periods"
+        right = f"at least {3 * command_period_ms:g} ms, or every hiccup is a drop-out"
+        raise ConfigError(file, "joint_service.max_command_age_ms", found, right)
+
+
+def _words(names: Iterable[str]) -> str:
+    return ", ".join(names)

@@ -1,0 +1,62 @@
+"""Reads and writes a robot file, `deploy/robot.toml`, with the gain schedule beside it.
+
+Unknown keys, wrong sizes and impossible values are refused with the file, the key,
+the value and what would be right (`shared.exceptions.ConfigError`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import tomli_w
+
+from shared.config import checks as config_check
+from shared.config.robot_config import RobotConfig
+from shared.config.toml_file import parse_toml, read_toml
+from shared.exceptions import ConfigError
+from shared.robot import gain_schedule
+
+
+def load(path: Path) -> RobotConfig:
+    """Read and check a robot file, and the gain schedule beside it if there is one.
+
+    Raises:
+        ConfigError: a file cannot be read, or a key or value is not as it should be.
+    """
+    config = load_without_schedule(path)
+    schedule = gain_schedule.read(gain_schedule.path_beside(path))
+    return msgspec.structs.replace(config, gain_schedule=schedule)
+
+
+def load_without_schedule(path: Path) -> RobotConfig:
+    """Read and check a robot file alone.
+
+    Raises:
+        ConfigError: the file cannot be read, or a key or value is not as it should be.
+    """
+    return _checked(read_toml(path, RobotConfig), str(path))
+
+
+def parse(text: str, file: str) -> RobotConfig:
+    """Return the robot that a TOML text describes, without a gain schedule.
+
+    Raises:
+        ConfigError: a key or value is not as it should be; `file` names the text.
+    """
+    return _checked(parse_toml(text, file, RobotConfig), file)
+
+
+def _checked(config: RobotConfig, file: str) -> RobotConfig:
+    if config.gain_schedule is not None:
+        right = "remove it: the schedule is a file of its own, made by `xrl gains`"
+        raise ConfigError(file, "gain_schedule", "unknown key", right)
+    config_check.check(file, config)
+    return config
+
+
+def to_toml(config: RobotConfig) -> str:
+    """Return the robot as TOML that `load` reads back; comments are not kept."""
+    table = msgspec.to_builtins(config)
+    del table["gain_schedule"]
+    return tomli_w.dumps(table)

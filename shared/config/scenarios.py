@@ -1,0 +1,290 @@
+"""What happens in a run: the operator's hand, pushes, kills, restarts and drives' faults.
+
+A scenario is a TOML file (`deploy/scenarios/`); `xrl demo` adds to it from its flags.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Final, Literal, NamedTuple
+
+import msgspec
+import tomli_w
+
+from shared.bus.links import directions_of
+from shared.bus.messages import STRAIGHT, Vector4
+from shared.config.robot_config import SERVICES
+from shared.config.toml_file import Range, Section, check_ranges, read_toml
+from shared.exceptions import ConfigError
+from shared.network.impairment import Impairment
+from shared.robot.joints import MODULES
+
+Time = Annotated[float, Range(0.0, 86_400.0, "s")]
+Force = Annotated[float, Range(-2000.0, 2000.0, "N")]
+
+ShiftLength = Annotated[float, Range(-0.1, 0.1, "m")]
+ShiftAngle = Annotated[float, Range(-0.3, 0.3, "rad")]
+
+SIGNALS = ("KILL", "STOP", "TERM", "INT")
+"""What a kill can send; STOP freezes the process instead."""
+
+
+class Keyframe(Section, frozen=True):
+    """Where the operator's hand leads at a moment; cosine-eased to the next keyframe."""
+
+    at: Time
+    height: Annotated[float, Range(0.3, 2.0, "m")]
+    pitch: Annotated[float, Range(-1.5, 1.5, "rad")] = 0.0
+    assist: Annotated[float, Range(0.0, 500.0, "N")] = 0.0
+    """Weight that the operator rests on the harness and asks the robot to carry, N."""
+    shift: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = STRAIGHT
+    """Where the operator asks COM x and y, m, and the torso's roll and yaw, rad, to be."""
+
+
+class Push(Section, frozen=True):
+    """A force on the torso for a while, world axes."""
+
+    at: Time
+    duration: Annotated[float, Range(0.001, 60.0, "s")]
+    force: tuple[Force, Force, Force]
+
+
+class Kill(Section, frozen=True):
+    """A signal to a service. It stays down until a `Restart` names it."""
+
+    service: str
+    at: Time
+    signal: Literal["KILL", "STOP", "TERM", "INT"] = "KILL"
+
+
+class Restart(Section, frozen=True):
+    """Starts a killed service again, or continues a stopped one."""
+
+    service: str
+    at: Time
+
+
+FaultKind = Literal[
+    "over_temperature",
+    "over_voltage",
+    "encoder",
+    "watchdog",
+    "link_lost",
+    "disarmed",
+    "overspeed",
+    "brown_out",
+]
+
+
+class FaultTraits(NamedTuple):
+    """What a kind of fault is like."""
+
+    about: str
+    duration: float | None
+    """s if the scenario gives none; None: it is of a moment."""
+    whole: bool
+    """It is of the whole ODrive, and not of one of its axes."""
+
+
+FAULT_KINDS: Final[Mapping[str, FaultTraits]] = {
+    "over_temperature": FaultTraits("an output stage too hot", 5.0, whole=False),
+    "over_voltage": FaultTraits("the supply too high", 0.1, whole=True),
+    "encoder": FaultTraits("an encoder lost, it repeats its last", 5.0, whole=False),
+    "watchdog": FaultTraits("an axis's watchdog fires", None, whole=False),
+    "link_lost": FaultTraits("the cable out: nothing sent, nothing heard", 0.5, whole=True),
+    "disarmed": FaultTraits("an axis goes idle without an error", None, whole=False),
+    "overspeed": FaultTraits("an axis disarms for its speed", None, whole=False),
+    "brown_out": FaultTraits("no power, then a restart", 0.2, whole=True),
+}
+"""Faults by name. An axis that disarms floats; its sibling keeps its torque."""
+
+
+class Fault(Section, frozen=True):
+    """Something goes wrong in a module's ODrive."""
+
+    module: str
+    kind: FaultKind
+    at: Time
+    axis: int | None = None
+    """Which of its two axes; by default 0. Not for what is of the whole ODrive."""
+    duration: float | None = None
+    """s; by default `FAULT_KINDS`'s. Not for what is of a moment."""
+
+    @property
+    def lasts_s(self) -> float:
+        """How long it lasts, s; 0 for what is of a moment."""
+        return self.duration or FAULT_KINDS[self.kind].duration or 0.0
+
+
+class Inject(Impairment, frozen=True, kw_only=True):
+    """The network does something to a link for a while."""
+
+    link: str
+    """One or several directions (`shared.bus.links`), such as `planner->joints`."""
+    at: Time
+    duration: Annotated[float, Range(0.001, 86_400.0, "s")] | None = None
+    """s; None: to the end of the run."""
+
+    @property
+    def until(self) -> float:
+        """When it ends, s; infinite if it does not."""
+        return math.inf if self.duration is None else self.at + self.duration
+
+
+class Scenario(Section, frozen=True):
+    """The whole file."""
+
+    name: str
+    about: str
+    duration: Annotated[float, Range(0.1, 86_400.0, "s")]
+    keyframe: tuple[Keyframe, ...]
+    hand: bool = True
+    """False: the operator lets go; nothing leads."""
+    push: tuple[Push, ...] = ()
+    kill: tuple[Kill, ...] = ()
+    restart: tuple[Restart, ...] = ()
+    fault: tuple[Fault, ...] = ()
+    inject: tuple[Inject, ...] = ()
+
+
+SCENARIO: Final = "the scenario"
+"""Source of the intents that a scenario asks for."""
+
+
+class Lead(NamedTuple):
+    """What the operator wants at a moment."""
+
+    height: float
+    """m, torso origin above the ankles."""
+    height_rate: float
+    pitch: float
+    pitch_rate: float
+    assist: float
+    """N"""
+    shift: Vector4 = STRAIGHT
+    """x, y, m; roll, yaw, rad."""
+
+
+def lead(scenario: Scenario, t: float) -> Lead:
+    """Return where the hand leads at scenario time t (s); before 0, the first keyframe."""
+    frames = scenario.keyframe
+    if t <= frames[0].at:
+        first = frames[0]
+        return Lead(first.height, 0.0, first.pitch, 0.0, first.assist, first.shift)
+    for a, b in pairwise(frames):
+        if t < b.at:
+            span = b.at - a.at
+            phase = math.pi * (t - a.at) / span
+            s = 0.5 - 0.5 * math.cos(phase)
+            s_rate = 0.5 * math.pi / span * math.sin(phase)
+            return Lead(
+                a.height + (b.height - a.height) * s,
+                (b.height - a.height) * s_rate,
+                a.pitch + (b.pitch - a.pitch) * s,
+                (b.pitch - a.pitch) * s_rate,
+                a.assist + (b.assist - a.assist) * s,
+                _eased(a.shift, b.shift, s),
+            )
+    last = frames[-1]
+    return Lead(last.height, 0.0, last.pitch, 0.0, last.assist, last.shift)
+
+
+def _eased(a: Vector4, b: Vector4, s: float) -> Vector4:
+    if a == b:
+        return a
+    x, y, roll, yaw = (start + (end - start) * s for start, end in zip(a, b, strict=True))
+    return x, y, roll, yaw
+
+
+def push_at(scenario: Scenario, t: float) -> tuple[float, float, float]:
+    """Return the sum of the pushes acting at scenario time t, N, world."""
+    x = y = z = 0.0
+    for push in scenario.push:
+        if push.at <= t < push.at + push.duration:
+            x, y, z = x + push.force[0], y + push.force[1], z + push.force[2]
+    return x, y, z
+
+
+def load(path: Path) -> Scenario:
+    """Read and check a scenario file.
+
+    Raises:
+        ConfigError: naming the file, the key, what stands there and what would be right.
+    """
+    scenario = read_toml(path, Scenario)
+    check(str(path), scenario)
+    return scenario
+
+
+def check(file: str, scenario: Scenario) -> None:
+    """Check what no single value shows: order, services, times inside the run."""
+    check_ranges(file, scenario)
+    if not scenario.keyframe:
+        raise ConfigError(file, "keyframe", "none", "at least one [[keyframe]]")
+    times = [frame.at for frame in scenario.keyframe]
+    for index, (a, b) in enumerate(pairwise(times)):
+        if b <= a:
+            found = f"at {b:g} s does not follow {a:g} s"
+            raise ConfigError(file, f"keyframe[{index + 1}].at", found, "times must rise")
+    tables: tuple[tuple[str, Sequence[Kill | Restart]], ...] = (
+        ("kill", scenario.kill),
+        ("restart", scenario.restart),
+    )
+    for kind, rows in tables:
+        for index, row in enumerate(rows):
+            where = f"{kind}[{index}]"
+            if row.service not in SERVICES:
+                right = f"one of {', '.join(SERVICES)}"
+                raise ConfigError(file, f"{where}.service", f"{row.service!r}", right)
+            _check_inside(file, f"{where}.at", row.at, scenario.duration)
+    for index, push in enumerate(scenario.push):
+        _check_inside(file, f"push[{index}].at", push.at, scenario.duration)
+    for index, fault in enumerate(scenario.fault):
+        _check_fault(file, f"fault[{index}]", fault)
+        _check_inside(file, f"fault[{index}].at", fault.at, scenario.duration)
+    for index, inject in enumerate(scenario.inject):
+        directions_of(inject.link, file, f"inject[{index}].link")
+        if amiss := inject.fault():
+            found, _, right = amiss.partition("; ")
+            raise ConfigError(file, f"inject[{index}]", found, right)
+        _check_inside(file, f"inject[{index}].at", inject.at, scenario.duration)
+    for index, restart in enumerate(scenario.restart):
+        if not any(k.service == restart.service and k.at < restart.at for k in scenario.kill):
+            found = f"{restart.service} is not killed before {restart.at:g} s"
+            raise ConfigError(file, f"restart[{index}]", found, "kill it first")
+
+
+def _check_fault(file: str, where: str, fault: Fault) -> None:
+    if fault.module not in MODULES:
+        right = f"one of {', '.join(MODULES)}"
+        raise ConfigError(file, f"{where}.module", f"{fault.module!r}", right)
+    traits = FAULT_KINDS[fault.kind]
+    if fault.axis not in (None, 0, 1):
+        raise ConfigError(file, f"{where}.axis", f"{fault.axis}", "0 or 1")
+    if fault.axis is not None and traits.whole:
+        found = f"{fault.axis}, but {fault.kind} is of the whole ODrive"
+        raise ConfigError(file, f"{where}.axis", found, "leave it out")
+    if fault.duration is not None and traits.duration is None:
+        found = f"{fault.duration:g} s, but {fault.kind} is of a moment"
+        raise ConfigError(file, f"{where}.duration", found, "leave it out")
+    if fault.duration is not None and not 0.001 <= fault.duration <= 600.0:
+        found = f"{fault.duration!r} is out of range"
+        raise ConfigError(file, f"{where}.duration", found, "must be from 0.001 to 600 s")
+
+
+def _check_inside(file: str, key: str, at: float, duration: float) -> None:
+    if at >= duration:
+        found = f"{at:g} s is not inside the run of {duration:g} s"
+        raise ConfigError(file, key, found, "an earlier time, or a longer duration")
+
+
+def to_toml(scenario: Scenario) -> str:
+    """Return the scenario as TOML that `load` reads back."""
+    table = msgspec.to_builtins(scenario)
+    for row in (*table["fault"], *table["inject"]):
+        for key in [key for key, value in row.items() if value is None]:
+            del row[key]  # TOML has no null
+    return tomli_w.dumps(table)

@@ -1,0 +1,395 @@
+"""The tables of `deploy/robot.toml` as typed structs; `robot_config` puts them together."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from shared.config.toml_file import Range, Section
+
+Mass = Annotated[float, Range(0.0, 200.0, "kg")]
+Length = Annotated[float, Range(0.005, 2.0, "m")]
+Share = Annotated[float, Range(0.0, 1.0, "1")]
+Rate = Annotated[float, Range(1.0, 8000.0, "Hz")]
+Milliseconds = Annotated[float, Range(0.1, 10_000.0, "ms")]
+Seconds = Annotated[float, Range(0.001, 60.0, "s")]
+Angle = Annotated[float, Range(-2 * math.pi, 2 * math.pi, "rad")]
+
+
+class MassConfig(Section, frozen=True):
+    """Masses, paper Table I."""
+
+    module: Annotated[float, Range(0.1, 50.0, "kg")]
+    battery: Mass
+    payload: Mass
+    payload_max: Mass
+
+
+class GeometryConfig(Section, frozen=True):
+    """Lengths, paper Table I."""
+
+    l1: Length
+    l2: Length
+    w_hip: Length
+    w_base: Length
+    l_foot: Length
+    w_foot: Length
+    foot_height: Length
+    harness_point: tuple[
+        Annotated[float, Range(-1.0, 1.0, "m")],
+        Annotated[float, Range(-1.0, 1.0, "m")],
+        Annotated[float, Range(-1.0, 1.0, "m")],
+    ]
+    torso_size: tuple[Length, Length, Length]
+
+
+class JointConfig(Section, frozen=True):
+    """The 2-DOF module: motors, gear and differential."""
+
+    gear_ratio: Annotated[float, Range(1.0, 200.0, "1")]
+    armature: Annotated[float, Range(0.001, 5.0, "kg m^2")]
+    encoder_counts_per_turn: Annotated[int, Range(64, 1 << 24, "counts")]
+    tau_module_max: Annotated[float, Range(1.0, 1000.0, "N m")]
+
+
+class LimitConfig(Section, frozen=True):
+    """Joint range of one kind of module, and why it is so."""
+
+    phi: tuple[Angle, Angle]
+    theta: tuple[Angle, Angle]
+    why: str
+
+
+class LimitsConfig(Section, frozen=True):
+    """Joint ranges by kind."""
+
+    ankle: LimitConfig
+    knee: LimitConfig
+    hip: LimitConfig
+
+
+class ModuleConfig(Section, frozen=True):
+    """One module: which bus and which two CAN nodes, or which ODrive on USB."""
+
+    name: str
+    bus: str
+    node_ids: tuple[Annotated[int, Range(0, 62, "1")], Annotated[int, Range(0, 62, "1")]]
+    motor_signs: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, 1)
+    """-1: that motor counts down where the differential's equations have it count up."""
+    serial_number: str = ""
+    """12 hexadecimal digits, as USB shows them; for `joint_service.driver = "odrive_usb"`."""
+
+
+Stiffness6 = tuple[
+    Annotated[float, Range(0.0, 1e5, "N/m")],
+    Annotated[float, Range(0.0, 1e5, "N/m")],
+    Annotated[float, Range(0.0, 1e5, "N/m")],
+    Annotated[float, Range(0.0, 1e5, "N m/rad")],
+    Annotated[float, Range(0.0, 1e5, "N m/rad")],
+    Annotated[float, Range(0.0, 1e5, "N m/rad")],
+]
+Selection = Literal[0, 1]
+
+
+ShiftLength = Annotated[float, Range(0.0, 0.1, "m")]
+ShiftAngle = Annotated[float, Range(0.0, 0.3, "rad")]
+
+
+StanceLength = Annotated[float, Range(0.0, 0.3, "m")]
+StanceAngle = Annotated[float, Range(0.0, 0.8, "rad")]
+Stance6 = tuple[StanceLength, StanceLength, StanceLength, StanceAngle, StanceAngle, StanceAngle]
+
+
+class LawConfig(Section, frozen=True):
+    """Gains and choices of the law (docs/law.md)."""
+
+    K_p: Stiffness6
+    B_p: Stiffness6
+    K_0: Annotated[float, Range(0.0, 1e4, "N m/rad")]
+    B_0: Annotated[float, Range(0.0, 1e3, "N m s/rad")]
+    S: tuple[Selection, Selection, Selection, Selection, Selection, Selection]
+    damping_lambda: Annotated[float, Range(1e-6, 0.5, "m")]
+    jacobian: Literal["load_sharing", "average"]
+    split: Literal["certified", "diagonal"]
+    local_damping_fraction: Annotated[float, Range(0.0, 1.0, "1")]
+    load_sharing_moment_arms: tuple[Share, Share, Annotated[float, Range(0.001, 0.5, "m")]]
+    recentre_s: Seconds
+    lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
+    shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
+    stance_max: Stance6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    load_correction: tuple[
+        Annotated[float, Range(0.0, 50.0, "kg")], Annotated[float, Range(0.0, 100.0, "N m")]
+    ] = (0.0, 0.0)
+
+
+RequiredStiffness6 = tuple[
+    Annotated[float, Range(1.0, 1e5, "N/m")],
+    Annotated[float, Range(1.0, 1e5, "N/m")],
+    Annotated[float, Range(1.0, 1e5, "N/m")],
+    Annotated[float, Range(1.0, 1e5, "N m/rad")],
+    Annotated[float, Range(1.0, 1e5, "N m/rad")],
+    Annotated[float, Range(1.0, 1e5, "N m/rad")],
+]
+
+
+class CertificateConfig(Section, frozen=True):
+    """What local gains must hold alone (docs/law.md#gain-split and docs/law.md#certificate)."""
+
+    K_required: RequiredStiffness6
+    onboard_fraction: Share
+    k_q_fraction_max: Annotated[float, Range(0.1, 10.0, "1")]
+    margin_min: Share
+    onboard_margin_min: Share
+
+
+class RobustnessConfig(Section, frozen=True):
+    """What the loop must be stable with (the dynamic certificate)."""
+
+    stiffness: tuple[Annotated[float, Range(500.0, 1e6, "N m/rad")], ...]
+    """Stiffnesses of the drivetrain between motor and joint that the loop must be stable with; 1e6
+    is rigid."""
+    damping_s: Annotated[float, Range(0.0, 0.1, "s")]
+    """Damping of the drivetrain, N m s/rad per N m/rad."""
+    torque_lag_ms: Annotated[float, Range(0.05, 20.0, "ms")]
+    """First-order lag of the drives' torque."""
+    delay_ms: Annotated[float, Range(1.0, 100.0, "ms")]
+    """From a state's sample to the first use of its command."""
+    delay_margin: Annotated[float, Range(1.0, 10.0, "1")]
+    gain_margin: Annotated[float, Range(1.0, 10.0, "1")]
+    drift_max: Annotated[float, Range(0.0, 10.0, "1/s")]
+    """A motion without oscillation along a led direction may grow at this rate: with the encoder
+    at the motor, the weight's feedforward follows the motor and not the joint."""
+    hands: tuple[
+        tuple[
+            Annotated[float, Range(0.0, 1e5, "N/m")],
+            Annotated[float, Range(0.0, 1e4, "N s/m")],
+            Annotated[float, Range(0.0, 1e4, "N m/rad")],
+            Annotated[float, Range(0.0, 1e3, "N m s/rad")],
+        ],
+        ...,
+    ]
+    """(k_z, b_z, k_pitch, b_pitch) of hands at the harness, the lightest first."""
+
+
+class AssistConfig(Section, frozen=True):
+    """Assist force on the operator."""
+
+    force_max: Annotated[float, Range(0.0, 500.0, "N")]
+    rate_max: Annotated[float, Range(1.0, 5000.0, "N/s")]
+    integral_max: Annotated[float, Range(0.0, 100.0, "N")]
+    integral_s: Annotated[float, Range(0.5, 60.0, "s")]
+    stale_ms: Annotated[float, Range(50.0, 10000.0, "ms")] = 500.0
+    fade_s: Annotated[float, Range(0.5, 60.0, "s")] = 5.0
+
+
+LocalStiffness = Annotated[float, Range(0.0, 1e4, "N m/rad")]
+LocalDamping = Annotated[float, Range(0.0, 1e3, "N m s/rad")]
+
+
+class StandGains(Section, frozen=True):
+    """Local gains of HOLD at power-up, (phi, theta)."""
+
+    k_p: tuple[LocalStiffness, LocalStiffness]
+    k_d: tuple[LocalDamping, LocalDamping]
+
+
+class StandConfig(Section, frozen=True):
+    """Stand gains by kind."""
+
+    ankle: StandGains
+    knee: StandGains
+    hip: StandGains
+
+
+class AxisGains(Section, frozen=True):
+    """Local gains of one axis."""
+
+    k_p: LocalStiffness
+    k_d: LocalDamping
+
+
+class JointServiceConfig(Section, frozen=True):
+    """Timing and limits of the joint service (docs/architecture.md#age-rule)."""
+
+    driver: Literal["odrive_can", "odrive_usb"]
+    loop: Literal["onboard", "service"]
+    rate_hz: Rate
+    state_rate_hz: Rate
+    max_command_age_ms: Milliseconds
+    command_aging_max_ms: Milliseconds
+    coupled_ramp_ms: Milliseconds
+    engage_after_ms: Milliseconds
+    engage_after_max_ms: Milliseconds
+    dropout_forget_s: Seconds
+    blend_ms: Milliseconds
+    damp_fade_s: Seconds
+    damp_k_d: LocalDamping
+    damp_knee_stop: Angle
+    hold_stiffens_theta: tuple[Literal["ankle", "knee", "hip"], ...]
+    damp_sinks: tuple[Literal["ankle", "knee", "hip"], ...]
+    torque_rate_max: Annotated[float, Range(100.0, 1e6, "N m/s")]
+    soft_stop_k_p: LocalStiffness
+    k_p_max: LocalStiffness
+    k_d_max: LocalDamping
+    v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
+    pendant_ms: Annotated[float, Range(20.0, 10_000.0, "ms")] = 500.0
+    """A pendant that was heard and is silent for so long: emergency stop."""
+    limp_leg_hip_theta: AxisGains = AxisGains(k_p=2700.0, k_d=42.0)
+    """Gains of each hip's theta while a knee is limp: its leg stands as a strut on them."""
+
+
+class EnvelopeConfig(Section, frozen=True):
+    """What a joint service believes of its planner, beyond `GainSchedule.bounds`."""
+
+    tau_ff_margin: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
+    """Beyond the bounds of straight stands: leans, slopes, and feet that stand otherwise."""
+    q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
+    spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 40.0
+    """k_p times the distance."""
+    hold_torque: Annotated[float, Range(1.0, 1e4, "N m")] = 300.0
+    """What HOLD's stiffening may add: an axis so far from its reference holds where it is."""
+    tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
+    dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
+    v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0
+    """Where the bound of a pose is more: straight knees turn ever faster."""
+    torque_step: Annotated[float, Range(0.0, 100.0, "N m")] = 1.0
+    """From one command to the next, at once, and ..."""
+    torque_rate: Annotated[float, Range(1.0, 1e5, "N m/s")] = 1000.0
+    """... for each second between them."""
+
+
+class TripLimit(Section, frozen=True):
+    """When something trips."""
+
+    limit: Annotated[float, Range(0.0, 1e4, "the trip's own unit")]
+    after_ms: Annotated[float, Range(0.0, 1e4, "ms")] = 0.0
+    """Beyond it for so long, without a break."""
+
+
+class TripsConfig(Section, frozen=True):
+    """What takes the robot out of being led (`shared.robot.trip_table`)."""
+
+    shaking: TripLimit = TripLimit(limit=15.0)
+    torque_limit: TripLimit = TripLimit(limit=1.0, after_ms=1000.0)
+    speed: TripLimit = TripLimit(limit=8.0, after_ms=20.0)
+    legs: TripLimit = TripLimit(limit=0.1, after_ms=50.0)
+    reach: TripLimit = TripLimit(limit=0.02, after_ms=50.0)
+    tracking: TripLimit = TripLimit(limit=0.15, after_ms=50.0)
+    unloaded: TripLimit = TripLimit(limit=20.0, after_ms=60.0)
+    sinking: TripLimit = TripLimit(limit=0.8, after_ms=100.0)
+    turning: TripLimit = TripLimit(limit=2.5, after_ms=100.0)
+    harness: TripLimit = TripLimit(limit=150.0, after_ms=200.0)
+    sagging: TripLimit = TripLimit(limit=10.0, after_ms=10.0)
+    unattended: TripLimit = TripLimit(limit=0.03, after_ms=20.0)
+
+
+class PlannerConfig(Section, frozen=True):
+    """Planner timing."""
+
+    rate_hz: Rate
+    state_stale_ms: Milliseconds
+
+
+class HarnessConfig(Section, frozen=True):
+    """Six-axis harness sensor: a Stewart platform of six load cells."""
+
+    bus: str
+    rate_hz: Rate
+    base_radius: Length
+    platform_radius: Length
+    height: Length
+    leg_force_max: Annotated[float, Range(1.0, 1e5, "N")]
+    low_pass_hz: Annotated[float, Range(0.1, 500.0, "Hz")]
+    stale_ms: Milliseconds
+    tare_s: Seconds
+    overload_force: Annotated[float, Range(10.0, 1e4, "N")]
+    overload_moment: Annotated[float, Range(1.0, 1e3, "N m")]
+    overload_after_ms: Milliseconds
+    overload_release_s: Seconds
+
+
+class ImuConfig(Section, frozen=True):
+    """The IMU on the torso, which tells the planner how the floor slopes."""
+
+    fitted: bool = False
+    """False: the robot has none, its service is not started, and the floor is taken as level."""
+    bus: str = "imu"
+    rate_hz: Rate = 100.0
+    """Rate of the sensor's samples and of the service's cycles."""
+    mounting: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    """Roll, pitch and yaw of the sensor on the torso, rad: R = Rz(yaw) Rx(roll) Ry(pitch)."""
+    stale_ms: Milliseconds = 100.0
+    """An older sample says nothing; the slope stays as it was."""
+    levelling_s: Annotated[float, Range(0.05, 60.0, "s")] = 1.0
+    """Time constant with which the slope is followed."""
+
+
+class DriveConfig(Section, frozen=True):
+    """ODrive settings that the joint service relies on (docs/drives.md)."""
+
+    torque_constant: Annotated[float, Range(0.001, 5.0, "N m/A")]
+    current_lim: Annotated[float, Range(1.0, 200.0, "A")]
+    vel_limit: Annotated[float, Range(0.1, 500.0, "turn/s")]
+    dc_max_negative_current: Annotated[float, Range(-200.0, -0.001, "A")]
+    watchdog_timeout: Annotated[float, Range(0.0, 10.0, "s")]
+    encoder_period_ms: Annotated[int, Range(1, 100, "ms")]
+    heartbeat_period_ms: Annotated[int, Range(1, 10_000, "ms")]
+    zero_mark_turns: Annotated[float, Range(0.0, 4096.0, "turns")]
+    encoder_bandwidth: Annotated[float, Range(100.0, 8000.0, "rad/s")] = 2000.0
+    """Bandwidth of the drives' estimate of position and velocity."""
+
+
+class CanConfig(Section, frozen=True):
+    """A CAN bus as python-can takes it."""
+
+    interface: str
+    channel: str
+
+
+class BusConfig(Section, frozen=True):
+    """The Zenoh bus: fixed endpoints, no scouting."""
+
+    lease_ms: Annotated[int, Range(100, 60_000, "ms")]
+    endpoints: dict[str, str]
+
+
+class RecorderConfig(Section, frozen=True):
+    """MCAP file parameters (docs/logs.md)."""
+
+    chunk_kib: Annotated[int, Range(1, 65_536, "KiB")]
+    flush_ms: Milliseconds
+    fsync_s: Seconds
+    split_s: Annotated[float, Range(0.0, 86_400.0, "s")] = 0.0
+    """The next file begins after so long; 0: never."""
+    split_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 1024
+    """The next file begins at this size; 0: never."""
+    free_min_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 256
+    """Recording stops while less of the disk is free; 0: only when it is full."""
+    snapshot_mib: Annotated[int, Range(1, 1 << 16, "MiB")] = 256
+    """Memory of `--snapshot`; 3 MiB hold a second of the fleet."""
+
+
+class OperatorConfig(Section, frozen=True):
+    """The simulated operator's hand: a clipped spring-damper (docs/simulator.md)."""
+
+    k_z: Annotated[float, Range(0.0, 1e5, "N/m")]
+    b_z: Annotated[float, Range(0.0, 1e4, "N s/m")]
+    force_max: Annotated[float, Range(0.0, 1e4, "N")]
+    k_pitch: Annotated[float, Range(0.0, 1e5, "N m/rad")]
+    b_pitch: Annotated[float, Range(0.0, 1e4, "N m s/rad")]
+    moment_max: Annotated[float, Range(0.0, 1e4, "N m")]
+
+
+class SimulationConfig(Section, frozen=True):
+    """The simulated world."""
+
+    timestep: Annotated[float, Range(1e-5, 0.005, "s")]
+    stand_height: Length
+    hoist_s: Seconds
+    encoder_rate_hz: Rate
+    truth_rate_hz: Rate
+    harness_noise: Annotated[float, Range(0.0, 100.0, "N")]
+    late_slip_ms: Milliseconds
+    operator: OperatorConfig
+    can_dialect: Literal["0.5", "0.6"] = "0.5"
+    """Firmware whose CANSimple the emulated drives speak; the services find out by themselves."""

@@ -1,0 +1,1 @@
+"""Impairments of a network, in lockstep and on the wire."""

@@ -1,0 +1,179 @@
+"""What is done to links at the moment, and until when; told as events. Pure.
+
+Lockstep and the network proxy both keep it so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from shared.bus.links import directions_of
+from shared.bus.traces import LinkEvent
+from shared.network.impairment import Direction, Impairer, Impairment
+
+
+class PendingImpairment(NamedTuple):
+    """One impairment that is not over, begun or not."""
+
+    begins: float
+    """On the owner's clock; minus infinite: it began when it was asked for."""
+    until: float
+    """On the owner's clock; infinite: it does not end by itself."""
+    link: str
+    """A direction or a group of them."""
+    what: Impairment
+
+
+class ImpairmentSchedule:
+    """All of them, by number."""
+
+    def __init__(
+        self, directions: Mapping[str, Direction], tell: Callable[[LinkEvent], object]
+    ) -> None:
+        """Begin with none.
+
+        Args:
+            directions: every one, by name.
+            tell: takes an event for each direction whenever something begins or ends.
+        """
+        self.requested: dict[int, PendingImpairment] = {}
+        self.next_due = math.inf
+        """When the first of them begins or ends, on the owner's clock."""
+        self._directions = directions
+        self._tell = tell
+        self._coming: list[int] = []
+        """Those that have not begun, as they were asked for."""
+        self._count = self._told = 0
+
+    def begin(self, link: str, what: Impairment, until: float, now_ns: int) -> int:
+        """Begin an impairment now; return its number.
+
+        Args:
+            link: of `shared.bus.links`.
+            what: is done.
+            until: when it ends, on the owner's clock.
+            now_ns: stamp of the events.
+
+        Raises:
+            ConfigError: there is no such link.
+        """
+        number = self.plan(link, what, -math.inf, until)
+        self._begin(number, now_ns)
+        self._find_next()
+        return number
+
+    def plan(self, link: str, what: Impairment, begins: float, until: float) -> int:
+        """Take an impairment in that `advance` begins when it is due; return its number.
+
+        Args:
+            link: of `shared.bus.links`.
+            what: will be done.
+            begins: when, on the owner's clock.
+            until: when it ends, on the same.
+
+        Raises:
+            ConfigError: there is no such link.
+        """
+        directions_of(link)
+        self._count += 1
+        self.requested[self._count] = PendingImpairment(begins, until, link, what)
+        self._coming.append(self._count)
+        self._find_next()
+        return self._count
+
+    def end(self, number: int, now_ns: int) -> None:
+        """End one, or keep it from beginning; nothing if it is over already."""
+        requested = self.requested.pop(number, None)
+        if requested is None:
+            return
+        if number in self._coming:
+            self._coming.remove(number)
+        for name in directions_of(requested.link):
+            impairer = self._directions[name].end(number)
+            if impairer is not None:
+                self._say(name, number, requested, now_ns, impairer)
+        self._find_next()
+
+    def advance(self, clock: float, now_ns: int) -> bool:
+        """End and begin what is due by the owner's clock; return whether there was anything.
+
+        What would be over before it has begun never begins.
+        """
+        if clock < self.next_due:
+            return False
+        for number in [n for n, requested in self.requested.items() if requested.until <= clock]:
+            self.end(number, now_ns)
+        due = [number for number in self._coming if self.requested[number].begins <= clock]
+        for number in sorted(due, key=lambda number: self.requested[number].begins):
+            self._begin(number, now_ns)
+        self._find_next()
+        return True
+
+    def clear(self, link: str, now_ns: int) -> int:
+        """End all that touches a link, wholly, begun or not; return how many.
+
+        Raises:
+            ConfigError: there is no such link.
+        """
+        names = set(directions_of(link))
+        found = [n for n, row in self.requested.items() if names & set(directions_of(row.link))]
+        for number in found:
+            self.end(number, now_ns)
+        return len(found)
+
+    def counts(self, number: int) -> tuple[int, int]:
+        """Return the messages that have passed, and that were lost, while it was in force."""
+        found = [direction.requested(number) for direction in self._directions.values()]
+        counted = [impairer for impairer in found if impairer is not None]
+        return sum(one.passed for one in counted), sum(one.lost for one in counted)
+
+    def hidden(self, number: int) -> tuple[str, ...]:
+        """Return the directions on which another one is in force, though this one has begun."""
+        found = []
+        for name, direction in self._directions.items():
+            impairer = direction.requested(number)
+            if impairer is not None and impairer is not direction.active:
+                found.append(name)
+        return tuple(found)
+
+    def _begin(self, number: int, now_ns: int) -> None:
+        self._coming.remove(number)
+        requested = self.requested[number]
+        for name in directions_of(requested.link):
+            self._directions[name].begin(number, requested.what)
+            self._say(name, number, requested, now_ns, None)
+
+    def _find_next(self) -> None:
+        times = [requested.until for requested in self.requested.values()]
+        times += [self.requested[number].begins for number in self._coming]
+        self.next_due = min(times, default=math.inf)
+
+    def _say(
+        self,
+        name: str,
+        number: int,
+        requested: PendingImpairment,
+        now_ns: int,
+        ended: Impairer | None,
+    ) -> None:
+        self._told += 1
+        what = requested.what
+        self._tell(
+            LinkEvent(
+                t_ns=now_ns,
+                seq=self._told,
+                link=name,
+                requested=requested.link,
+                number=number,
+                active=ended is None,
+                delay_ms=what.delay_ms,
+                jitter_ms=what.jitter_ms,
+                loss=what.loss,
+                partition=what.partition,
+                detail=what.describe(),
+                passed=0 if ended is None else ended.passed,
+                lost=0 if ended is None else ended.lost,
+            )
+        )

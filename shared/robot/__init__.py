@@ -1,0 +1,1 @@
+"""Geometry, gains, and the tables of faults and trips."""

@@ -1,0 +1,199 @@
+"""Faults, and what then happens: one table (docs/reference/faults.md).
+
+Each row is a claim. `tests/lockstep/test_faults.py` brings about every fault of a drive and
+compares module, neighbours and drive with the row; `xrl crashtest` does so live, with processes and
+recovery. `xrl faults` prints the table.
+
+The rule behind the last column: a module that lost torque is never re-armed automatically. A person
+asks for it by restarting the module's service; a service that crashed and was started by the
+supervisor knows the difference (`services.joint.rearm_guard`).
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from shared.bus.messages import Cause
+from shared.config.scenarios import FaultKind
+
+
+class DriveFault(NamedTuple):
+    """A fault of a module's ODrive.
+
+    The module goes to FAULT, and the planner holds the other five, so that no leg works against
+    the other. If a knee may be limp the other five stiffen: its leg then stands as a strut between
+    a stiff ankle and a stiff hip. If an ankle may be limp the knees stiffen
+    (`shared.robot.limp_leg_support`).
+    """
+
+    drive: str
+    """Reaction of the drive by itself."""
+    limp: bool
+    """True if the module gives no torque; False if the drive goes on holding it."""
+    cause: Cause
+    """Cause of FAULT, as `xrl status` and the service's log show it."""
+    zero_lost: bool
+    """True if the joint must be zeroed (`xrl zero`) before it can be armed again."""
+    recovery: str
+    """Action of a person before the service is restarted."""
+
+
+_LIMP: Final = "that axis floats"
+_BOTH_LIMP: Final = "both axes float"
+_HANG: Final = "hang the robot"
+
+DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
+    "over_temperature": DriveFault(
+        f"less current near the limit, beyond it {_LIMP}",
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; let the drive cool, check its airflow and current_lim",
+    ),
+    "over_voltage": DriveFault(
+        _BOTH_LIMP,
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; make the supply absorb the current of braking legs",
+    ),
+    "encoder": DriveFault(
+        f"it goes on reporting the last position; {_LIMP}",
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=True,
+        recovery=f"{_HANG}; repair the encoder or its cable, then `xrl zero`",
+    ),
+    "watchdog": DriveFault(
+        _LIMP,
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; switch the watchdog off for the onboard loop: `xrl doctor`",
+    ),
+    "link_lost": DriveFault(
+        "its own loop holds the last target",
+        limp=False,
+        cause=Cause.DRIVE_LOST,
+        zero_lost=False,
+        recovery="mend the cable; the restarted service takes the drive over without a torque step",
+    ),
+    "disarmed": DriveFault(
+        _LIMP,
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; find out what requested idle",
+    ),
+    "overspeed": DriveFault(
+        _LIMP,
+        limp=True,
+        cause=Cause.DRIVE_DISARMED,
+        zero_lost=False,
+        recovery=f"{_HANG}; check vel_limit by `xrl doctor`, and what moved so fast",
+    ),
+    "brown_out": DriveFault(
+        "no power: both axes float; it restarts without a zero",
+        limp=True,
+        cause=Cause.DRIVE_LOST,
+        zero_lost=True,
+        recovery=f"{_HANG}; mend the supply, then `xrl zero`",
+    ),
+}
+"""By the name that scenarios and `--fault` use."""
+
+
+class LossRow(NamedTuple):
+    """A lost process or link, or the emergency stop."""
+
+    module: str
+    """Reaction of the affected module, or of all six."""
+    others: str
+    """Reaction of the rest."""
+    visible: str
+    """What the operator sees."""
+    recovery: str
+
+
+LOSSES: Final[dict[str, LossRow]] = {
+    "joint service killed or hung": LossRow(
+        "its drive's own loop holds, with the coupled torque frozen",
+        "HOLD: the planner asks for it when the module's state is stale",
+        "`xrl status`: no states, restarts; planner/status: hold",
+        "automatic: the supervisor restarts it; it takes the drive over once a planner is there, "
+        "and all track again. A hung service: `xrl kill`. If the drive lost torque meanwhile: hang "
+        "the robot, then `xrl kill`",
+    ),
+    "planner killed or hung": LossRow(
+        "HOLD within max_command_age: local gains, references frozen",
+        "the same",
+        "`xrl status`: HOLD because COMMAND_STALE",
+        "automatic: a new planner starts from the measured pose and leads after a blend",
+    ),
+    "bus slow, lossy or cut": LossRow(
+        "HOLD when its commands are too old",
+        "HOLD: the planner asks for it",
+        "`xrl status`: HOLD, ages, drop-outs",
+        "automatic, after a wait that each drop-out doubles",
+    ),
+    "harness lost": LossRow(
+        "nothing",
+        "the planner leads on without closed assist force and without easing the lead",
+        "harness/wrench: not valid",
+        "automatic",
+    ),
+    "IMU lost, where one is fitted": LossRow(
+        "nothing",
+        "the planner leads on with the last slope; a new planner takes the floor as level",
+        "imu/attitude: not valid",
+        "automatic",
+    ),
+    "recorder lost": LossRow(
+        "nothing",
+        "nothing",
+        "`xrl status`: restarts",
+        "automatic: a new file; the old one is readable as far as it was flushed",
+    ),
+    "emergency stop": LossRow(
+        "DAMP: knees sink slowly, hips keep the torso's attitude, ankles and frontal axes hold; "
+        "beside a dead or limp knee or a limp ankle all hold where they are",
+        "the same",
+        "`xrl status`: DAMP because ESTOP",
+        "restart the joint services",
+    ),
+    "feet away from their place before the planner leads": LossRow(
+        "HOLD",
+        "HOLD",
+        "planner/status: MISPLACED; `xrl status` says which way",
+        "automatic, when the feet stand within `law.stance_max` of their place",
+    ),
+    "a load far from the robot file's": LossRow(
+        "HOLD",
+        "HOLD",
+        "planner/status: MISLOADED; `xrl status` says by how much",
+        "automatic, when the load is within `law.load_correction`; or set mass.payload, then "
+        "`xrl gains`",
+    ),
+    "a trip": LossRow(
+        "HOLD: the module trips by itself on shaking, torque or speed",
+        "HOLD, on the planner's request; the planner's own trips hold all six",
+        "`xrl status`: because SHAKING, TORQUE_LIMIT, TOO_FAST; planner/status: TRIPPED, and why",
+        "automatic, after a wait that each trip lengthens",
+    ),
+    "overload at the harness": LossRow(
+        "HOLD",
+        "HOLD",
+        "planner/status: OVERLOADED",
+        "automatic, after the harness has been released for a while",
+    ),
+}
+"""By what is lost."""
+
+
+def recovery_of(cause: Cause) -> str:
+    """Return a person's action for a module in FAULT for this cause, in short."""
+    if cause is Cause.DRIVE_LOST:
+        return "mend power or cable (after a loss of power: xrl zero)"
+    if cause is Cause.POSITION_LOST:
+        return "hang the robot, mend the encoder, xrl zero"
+    return "hang the robot, find out why it disarmed"

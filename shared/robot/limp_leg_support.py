@@ -1,0 +1,43 @@
+"""Which modules stiffen when another one is limp. Planner and joint services share this table.
+
+HOLD leaves the theta of hips and knees as soft as the planner had them, because the hand leads on
+(`RobotConfig.hold_gains`). On these gains a leg with a limp knee folds: it fell at every phase of
+the squat. With every gain at its stand gain the thigh is fixed to the torso and the leg stands as a
+strut: none fell (`tests/lockstep/test_limp.py`), nor through pushes of 30 N. In the crawl, under
+the hand's 60 N m of pitch, it stands, with little left for a push forwards: 20 N stood, 30 N fell.
+The hips then have gains of their own (`joint_service.limp_leg_hip_theta`): on their stand gains the
+torso turned by up to 0.9 rad once the hand let go, and straight legs fell.
+
+A limp ankle leaves one sole to stand on. Stiff hips would hand it the hand's 60 N m of pitch; stiff
+knees alone keep the legs from giving. Fell, of 12 each with and without pushes of 30 N:
+
+    stiff               none  knees  all
+    squat, ankle limp      4      2    0
+    crawl, ankle limp     12      6   12
+
+A limp hip needs nothing: the other one carries the torso.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+from shared.robot.joints import MODULES, kind_of
+
+
+class Support(IntEnum):
+    """Which modules stiffen."""
+
+    NONE = 0
+    KNEES = 1
+    ALL = 2
+
+    def includes(self, module: str) -> bool:
+        """Return True if this module stiffens."""
+        return self is Support.ALL or (self is Support.KNEES and kind_of(module) == "knee")
+
+
+_BY_KIND: Final = {"ankle": Support.KNEES, "knee": Support.ALL, "hip": Support.NONE}
+SUPPORT_FOR: Final = tuple(_BY_KIND[kind_of(name)] for name in MODULES)
+"""Which modules stiffen if this one is limp, in the order of `MODULES`."""

@@ -1,0 +1,107 @@
+"""What trips the robot out of being led, and what then happens: one table.
+
+A trip asks nobody: the module, or all six by the planner's word, goes to HOLD, which needs no one.
+The limits and times stand in [trips] of the robot file. `xrl faults` prints the table.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import msgspec
+
+from shared.bus.messages import Cause, Trip
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import TripLimit, TripsConfig
+
+
+class TripRow(NamedTuple):
+    """One trip."""
+
+    key: str
+    """In [trips] of the robot file."""
+    measured: str
+    unit: str
+    recovery: str
+    """What a person does about it."""
+    least: bool = False
+    """Trips below its limit, not above."""
+
+
+_GAINS: Final = (
+    "the drivetrain is softer, or later, than [robustness] of the robot file says: compare, then "
+    "`xrl gains`"
+)
+
+JOINT_TRIPS: Final[dict[Cause, TripRow]] = {
+    Cause.SHAKING: TripRow(
+        "shaking", "its own torque above the law's band, root mean square", "N m", _GAINS
+    ),
+    Cause.TORQUE_LIMIT: TripRow(
+        "torque_limit", "its torque at the limit of its motors", "of tau_module_max",
+        "take load off; is a leg caught, or does it stand on an edge?",
+    ),
+    Cause.TOO_FAST: TripRow(
+        "speed", "its joint's speed", "rad/s", "lead more slowly; is its encoder sound?"
+    ),
+}  # fmt: skip
+"""By a joint service, while it tracks; the others follow by the planner's word. After its wait,
+which each doubles, it may be led again."""
+
+PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
+    Trip.LEGS: TripRow(
+        "legs", "the legs disagree about the torso", "m",
+        "stand both soles flat; if it lasts: `xrl zero`",
+    ),
+    Trip.REACH: TripRow(
+        "reach", "the reference pose is out of reach", "m", "lead back to where the legs reach"
+    ),
+    Trip.TRACKING: TripRow(
+        "tracking", "a joint is far from its reference", "rad",
+        "let it move freely; is a joint caught, or its zero wrong?",
+    ),
+    Trip.UNLOADED: TripRow(
+        "unloaded", "a leg carries hardly anything", "N", "stand on both feet", least=True
+    ),
+    Trip.SINKING: TripRow("sinking", "it sinks or rises fast", "m/s", "lead more slowly"),
+    Trip.TURNING: TripRow("turning", "the torso turns fast", "rad/s", "lead more slowly"),
+    Trip.HARNESS: TripRow(
+        "harness", "the person is carried otherwise than asked", "N",
+        "take weight off the harness, or ask for more assist",
+    ),
+    Trip.SAGGING: TripRow(
+        "sagging", "the person sinks with weight on the harness", "W",
+        "let the person stand up; ask for more assist, or lead down more slowly",
+    ),
+    Trip.UNATTENDED: TripRow(
+        "unattended", "it drifts with nobody's hand on it", "m",
+        "take hold of it: it leads again a second later",
+    ),
+}  # fmt: skip
+"""By the planner, while it leads. It leads again once all is within its limits for a second."""
+
+
+def limits_of(config: RobotConfig) -> TripsConfig:
+    """Return the robot's limits; with gains that no schedule certifies nothing trips.
+
+    The paper's split is there to be compared with: 20 ms late it shakes, and that is to be seen.
+    """
+    return config.trips if config.law.split == "certified" else _NEVER
+
+
+def untripped(config: RobotConfig) -> RobotConfig:
+    """Return the robot on which nothing trips: what a comparison is made with, and no robot.
+
+    Nor is a load looked for: what shakes is taken for one, and not led.
+    """
+    law = msgspec.structs.replace(config.law, load_correction=(0.0, 0.0))
+    return msgspec.structs.replace(config, trips=_NEVER, law=law)
+
+
+_NEVER: Final = TripsConfig(
+    **{
+        row.key: TripLimit(limit=-math.inf if row.least else math.inf)
+        for row in (*JOINT_TRIPS.values(), *PLANNER_TRIPS.values())
+    }
+)
