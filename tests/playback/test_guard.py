@@ -8,7 +8,7 @@ import pytest
 
 from shared.bus import topics
 from shared.exceptions import FleetError
-from tests.test_bus import TALK, TOOL
+from tests.shared.test_bus import TALK, TOOL
 from tools.playback import guard, selection
 from tools.playback.guard import ACTED_ON, IN_THE_LOOP, allowed, describe, those_of
 

@@ -29,7 +29,7 @@ from tools.sweeps.latency_trial import (
     robot_of,
 )
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[3]
 GOOD = Network(0.0, 0.0, 0.0)
 SOON_DOWN = (
     "--control", "centralised", "--delay", "200", "--loss", "0", "--trials", "1", "--workers", "1",

@@ -14,8 +14,15 @@ from services.joint.drivers.odrive_can import ARM_GRACE_MS
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.can.cansimple_06 import Command06
 from shared.clock import NS_PER_MS
-from tests.can_bench import TARGET, Bench, bench, error_frame, error_on_the_wire, frame
-from tests.test_odrive_can import DRIVE, NODES
+from tests.joint.drivers.can_bench import (
+    TARGET,
+    Bench,
+    bench,
+    error_frame,
+    error_on_the_wire,
+    frame,
+)
+from tests.joint.drivers.test_odrive_can import DRIVE, NODES
 
 __all__ = ["bench"]  # fixtures
 

@@ -17,7 +17,7 @@ from shared.can.cansimple import AxisState, ControlMode
 from shared.can.unix_can import Frame
 from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import NS_PER_MS
-from tests.test_odrive_can import AXES, DRIVE, MS, Rig, make_driver, path
+from tests.joint.drivers.test_odrive_can import AXES, DRIVE, MS, Rig, make_driver, path
 
 __all__ = ["path"]  # fixtures
 

@@ -15,7 +15,7 @@ from shared.can.can_load import BLEND_HZ, BLEND_MAX, LOAD_MAX, BusLoad, bus_load
 from shared.can.cansimple import Command, arbitration_id, pack_input_pos, pack_two_floats
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
-from tests.test_config import Table, load_changed, setting
+from tests.shared.test_config import Table, load_changed, setting
 
 
 def bits_on_the_wire(can_id: int, data: bytes) -> int:

@@ -19,7 +19,7 @@ from shared.bus.messages import Mode
 from shared.robot.joints import MODULES
 from tools import cli
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PATIENCE_S = 30.0
 
 

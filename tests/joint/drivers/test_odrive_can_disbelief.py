@@ -13,8 +13,8 @@ from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.can_link import receiver
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, INSIST_MS, REBOOT_MS
 from shared.can.cansimple import AxisState, Command, Heartbeat, pack_heartbeat, pack_two_floats
-from tests.can_bench import Bench, FakeBus, bench, frame
-from tests.test_odrive_can import NODES
+from tests.joint.drivers.can_bench import Bench, FakeBus, bench, frame
+from tests.joint.drivers.test_odrive_can import NODES
 
 __all__ = ["bench"]  # fixtures
 

@@ -24,7 +24,7 @@ from shared.can.cansimple import (
     split_id,
 )
 from shared.config.sections import CanConfig
-from tests.test_odrive_can import DRIVE, NODES
+from tests.joint.drivers.test_odrive_can import DRIVE, NODES
 
 TARGET = MotorTarget((0.25, -0.5), (1.0, -2.0), (0.5, -0.25), (30.0, 40.0), (0.05, 0.06))
 FULL = can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)

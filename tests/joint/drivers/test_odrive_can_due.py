@@ -5,8 +5,8 @@ from __future__ import annotations
 from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.resend_policy import DRIFT_MS, GAINS_MS, SETTLE_MS
 from shared.can.cansimple import Command, split_id
-from tests.can_bench import TARGET, Bench, bench
-from tests.test_odrive_can import NODES
+from tests.joint.drivers.can_bench import TARGET, Bench, bench
+from tests.joint.drivers.test_odrive_can import NODES
 
 __all__ = ["bench"]  # fixtures
 

@@ -18,7 +18,7 @@ from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from tests.bench_drive import START, BenchDrive
+from tests.tools.bench_drive import START, BenchDrive
 from tools.bringup import jog_drive
 from tools.bringup.jogging import (
     APART_MAX,

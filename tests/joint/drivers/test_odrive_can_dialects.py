@@ -16,7 +16,16 @@ from services.simulator.cansimple_dialects import DialectName
 from shared.can.cansimple import AxisError, AxisState
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
-from tests.test_odrive_can import AXES, DRIVE, MS, NODES, Rig, connected, make_driver, path
+from tests.joint.drivers.test_odrive_can import (
+    AXES,
+    DRIVE,
+    MS,
+    NODES,
+    Rig,
+    connected,
+    make_driver,
+    path,
+)
 
 __all__ = ["path"]  # fixtures
 

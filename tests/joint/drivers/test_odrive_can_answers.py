@@ -9,9 +9,9 @@ from services.joint.drivers.odrive_can import REBOOT_MS, RETRY_MS, OdriveCan
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, Command, pack_two_floats, pack_two_ints
 from shared.config.sections import CanConfig
-from tests.can_bench import Bench, bench, frame
-from tests.test_odrive_can import DRIVE, NODES
-from tests.test_odrive_can_link import receiving_fails
+from tests.joint.drivers.can_bench import Bench, bench, frame
+from tests.joint.drivers.test_odrive_can import DRIVE, NODES
+from tests.joint.drivers.test_odrive_can_link import receiving_fails
 
 __all__ = ["bench"]  # fixtures
 

@@ -15,7 +15,17 @@ from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
 from services.joint.drivers.resend_policy import DRIFT_MS, GAINS_MS
 from services.joint.pd_law import Setpoint
 from shared.can.cansimple import ControlMode
-from tests.test_odrive_can import AXES, DRIVE, MS, Rig, connected, driver, make_driver, path, rig
+from tests.joint.drivers.test_odrive_can import (
+    AXES,
+    DRIVE,
+    MS,
+    Rig,
+    connected,
+    driver,
+    make_driver,
+    path,
+    rig,
+)
 
 __all__ = ["driver", "path", "rig"]  # fixtures
 

@@ -16,7 +16,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES
-from tests.test_cli import assert_one_line_error, xrl
+from tests.tools.test_cli import assert_one_line_error, xrl
 from tools import crashtest
 from tools.crash import report, runner
 from tools.crash.cases import CASES, CrashCase, CrashVerdict, scenario_of

@@ -12,8 +12,8 @@ from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.can_link import ORDERS_MS, RETRY_MS
 from services.joint.drivers.resend_policy import GAINS_MS, SETTLE_MS
 from shared.can.cansimple import AxisState, Command, arbitration_id, split_id
-from tests.can_bench import TARGET, Bench, bench
-from tests.test_odrive_can import NODES
+from tests.joint.drivers.can_bench import TARGET, Bench, bench
+from tests.joint.drivers.test_odrive_can import NODES
 
 __all__ = ["bench"]  # fixtures
 

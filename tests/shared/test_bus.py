@@ -23,7 +23,7 @@ from shared.exceptions import BusError
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 ROBOT = config_file.load(DEFAULT_CONFIG)
 TOOL = "test"
 
