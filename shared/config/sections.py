@@ -233,41 +233,47 @@ class JointServiceConfig(Section, frozen=True):
     k_d_max: LocalDamping
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
     pendant_ms: Annotated[float, Range(20.0, 10_000.0, "ms")] = 500.0
-    """A pendant that was heard and is silent for so long: emergency stop."""
+    """Silence of a pendant that is an emergency stop, once the pendant was there."""
     limp_leg_hip_theta: AxisGains = AxisGains(k_p=2700.0, k_d=42.0)
     """Gains of each hip's theta while a knee is limp: its leg stands as a strut on them."""
 
 
 class EnvelopeConfig(Section, frozen=True):
-    """What a joint service believes of its planner, beyond `GainSchedule.bounds`."""
+    """Envelope of accepted commands, beyond `GainSchedule.bounds`."""
 
     tau_ff_margin: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
-    """Beyond the bounds of straight stands: leans, slopes, and feet that stand otherwise."""
+    """Feedforward beyond the bounds of straight stands: leans, slopes and other stances."""
     q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
+    """Largest distance of the reference from the joint."""
     spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 40.0
-    """k_p times the distance."""
+    """Largest k_p times that distance."""
     hold_torque: Annotated[float, Range(1.0, 1e4, "N m")] = 300.0
-    """What HOLD's stiffening may add: an axis so far from its reference holds where it is."""
+    """Most torque that HOLD's stiffening adds; an axis farther from its reference holds its
+    position."""
     tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
+    """Largest coupled torque."""
     dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
+    """Largest rate of the feedforward."""
     v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0
-    """Where the bound of a pose is more: straight knees turn ever faster."""
+    """Largest rate of the reference where a pose's own bound is larger: straight knees turn ever
+    faster."""
     torque_step: Annotated[float, Range(0.0, 100.0, "N m")] = 1.0
-    """From one command to the next, at once, and ..."""
+    """Torque step from one command to the next, plus `torque_rate` times the time between them."""
     torque_rate: Annotated[float, Range(1.0, 1e5, "N m/s")] = 1000.0
-    """... for each second between them."""
+    """Rate of the torque between two commands; see `torque_step`."""
 
 
 class TripLimit(Section, frozen=True):
-    """When something trips."""
+    """Limit of one trip."""
 
     limit: Annotated[float, Range(0.0, 1e4, "the trip's own unit")]
+    """Value beyond which it trips."""
     after_ms: Annotated[float, Range(0.0, 1e4, "ms")] = 0.0
-    """Beyond it for so long, without a break."""
+    """Time beyond the limit, without a break, before it trips."""
 
 
 class TripsConfig(Section, frozen=True):
-    """What takes the robot out of being led (`shared.robot.trip_table`)."""
+    """Trips: limits that take the robot out of being led (docs/reference/faults.md)."""
 
     shaking: TripLimit = TripLimit(limit=15.0)
     torque_limit: TripLimit = TripLimit(limit=1.0, after_ms=1000.0)
@@ -309,19 +315,19 @@ class HarnessConfig(Section, frozen=True):
 
 
 class ImuConfig(Section, frozen=True):
-    """The IMU on the torso, which tells the planner how the floor slopes."""
+    """IMU on the torso, for floors that slope (docs/law.md#slopes)."""
 
     fitted: bool = False
-    """False: the robot has none, its service is not started, and the floor is taken as level."""
+    """True if the robot has one; without it the floor is taken as level."""
     bus: str = "imu"
     rate_hz: Rate = 100.0
     """Rate of the sensor's samples and of the service's cycles."""
     mounting: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
     """Roll, pitch and yaw of the sensor on the torso, rad: R = Rz(yaw) Rx(roll) Ry(pitch)."""
     stale_ms: Milliseconds = 100.0
-    """An older sample says nothing; the slope stays as it was."""
+    """Age beyond which a sample is ignored; the slope stays."""
     levelling_s: Annotated[float, Range(0.05, 60.0, "s")] = 1.0
-    """Time constant with which the slope is followed."""
+    """Time constant of the slope."""
 
 
 class DriveConfig(Section, frozen=True):
@@ -360,9 +366,9 @@ class RecorderConfig(Section, frozen=True):
     flush_ms: Milliseconds
     fsync_s: Seconds
     split_s: Annotated[float, Range(0.0, 86_400.0, "s")] = 0.0
-    """The next file begins after so long; 0: never."""
+    """Time after which the next file begins; 0: never."""
     split_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 1024
-    """The next file begins at this size; 0: never."""
+    """Size at which the next file begins; 0: never."""
     free_min_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 256
     """Recording stops while less of the disk is free; 0: only when it is full."""
     snapshot_mib: Annotated[int, Range(1, 1 << 16, "MiB")] = 256
