@@ -244,7 +244,7 @@ class JointController:
         return Event.NONE
 
     def _enter(self, now_ns: int, before: Mode) -> None:
-        """Start a mode from the setpoint in force, or from what the drive carries."""
+        """Start a mode from the present setpoint, or from the torque of an armed drive."""
         s, law = self._state, self._law
         q, v = s.estimate.q, s.estimate.v
         if before is not Mode.DISARMED:

@@ -1,8 +1,8 @@
-"""What one module's service does in a cycle, without any I/O: the controller, and its drive's care.
+"""One cycle of a module's service without any I/O: the controller and the care of its drive.
 
-Arming, taking over what a service before this one left holding, idling what has disarmed, and
-whether torques or the onboard loop's targets go out. The loop carries the orders out on a real
-drive, lockstep on an emulated one. Pure.
+It arms the drive, takes over a drive that holds from an earlier service, idles a drive that
+disarmed, and chooses between torques and targets of the onboard loop. The loop sends its command to
+a real drive, lockstep to an emulated one. Pure.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 
 ARM_EVERY_NS: Final = 500 * NS_PER_MS
-"""Arming is asked for again after this long, while DISARMED."""
+"""Time between two attempts to arm while DISARMED, ns."""
 IDLE_EVERY_NS: Final = 500 * NS_PER_MS
-"""A drive one of whose axes has disarmed is told to go idle this often: its sibling goes on."""
+"""Time between two idle commands to a drive of which one axis disarmed: its sibling keeps its
+torque."""
 GAP_NS: Final = 20 * NS_PER_MS
-"""A service that ran no cycle for so long was frozen: its drive has gone on by itself."""
+"""Time without a cycle after which the service counts as frozen: its drive ran without commands."""
 LISTEN_NS: Final = 10 * NS_PER_MS
-"""Then it listens for so long before it speaks: what waits in the link's buffer is old."""
+"""Time of reading after that before it sends: the messages in the link's buffer are old."""
 ARM_TRIES: Final = 10
 """A drive that has not armed by then needs a person."""
 
 
 class DriveCommand(Enum):
-    """What the drive is to be told in a cycle."""
+    """Command to the drive in a cycle."""
 
     NOTHING = 0
     TORQUE = 1
@@ -56,13 +57,13 @@ class ArmingInhibit(Enum):
     OUTSIDE_LIMITS = 2
     WILL_NOT = 3
     LET_GO = 4
-    """It held the robot and does not any more; it is armed again when a person asks for it."""
+    """The drive lost torque after it held the robot; it is re-armed when a person asks for it."""
     WAITING = 5
-    """It holds by its own loop; it is taken over once a planner is heard."""
+    """The drive holds by its own loop; it is taken over once a planner is there."""
 
 
 class DriveAction(NamedTuple):
-    """What came of a cycle."""
+    """Outcome of a cycle."""
 
     event: JointEvent | None
     order: DriveCommand
@@ -82,14 +83,14 @@ class DriveManager:
     """One module's service between its drive and the bus.
 
     Attributes:
-        controller: the control law and its memory.
+        controller: the control law and its state.
         onboard: True if the motors' own loops hold the module.
     """
 
     def __init__(
         self, config: RobotConfig, name: str, last_state: LastState = LastState.NOTHING
     ) -> None:
-        """Take what the service before this one left, if it died; start DISARMED."""
+        """Take the last state of the service before this one; start DISARMED."""
         self.last_state = last_state
         self.controller = JointController(config, name)
         self._left_alone = DriveFallback(config, name)

@@ -1,13 +1,13 @@
 """The local law split once more, between joint service and drive (docs/drives.md). Pure.
 
 Each motor's own loop holds a module's mean stiffness and damping about the references; the
-rest (the difference of the two axes, the feedforward, what the gate took off) goes in as
-torque, worked out for the sample at hand. So at every sample the drive gives the very torque
-that the service asks for, and between samples, and when the service has died, its own law
+rest (the difference of the two axes, the feedforward, the limiter's reduction) goes in as torque,
+computed for each sample. So at every sample the drive gives exactly the torque of the service;
+between samples, and when the service has died, its own law
 
     torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel)
 
-goes on. In motor space a module's stiffness is 1/4N^2 [[k1 + k2, k1 - k2], [k1 - k2, k1 + k2]]
+continues. In motor space a module's stiffness is 1/4N^2 [[k1 + k2, k1 - k2], [k1 - k2, k1 + k2]]
 per rad, with k1 and k2 of theta and phi.
 """
 
@@ -23,13 +23,14 @@ from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
 
 GAIN_CHANGE: Final = 0.02
-"""Gains that have changed by less than this share are left as they are on the drive: what is
-missing goes in as torque, and the bus is spared."""
+"""Relative change of the gains below which the drive keeps its old ones: the difference goes in as
+torque, and the bus is spared."""
 FOLLOW_MS: Final = 8
-"""Between two changes of the drive's gains. In a blend they would change in every cycle, and three
-modules on one CAN bus were 15 to 20 ms behind by its end; what is missing goes in as torque."""
+"""Time between two changes of the drive's gains, ns. In a blend they would change in every cycle,
+and three modules on one CAN bus were 15 to 20 ms behind by its end; the difference goes in as
+torque."""
 POS_GAIN_MAX: Final = 400.0
-"""1/s; a stiffness with hardly a damping is given the damping that this asks for."""
+"""1/s; least damping per stiffness, given to a stiffness with hardly any damping."""
 INPUT_TORQUE_SHARE: Final = 0.75
 """Fraction of current_lim's torque that may go in as input_torque: the firmware clamps that by
 itself. A hip held with (900, 26) N m/rad has 463 on both motors, and from 0.25 rad off its
@@ -70,7 +71,7 @@ class DriveSetpointLaw:
         Args:
             now_ns: this module's monotonic clock.
             setpoint: the local law of this instant.
-            tau: joint torques (phi, theta) that are to act now, N m, after the gate.
+            tau: joint torques (phi, theta) for this sample, N m, after the limiter.
             pos: motor positions of the sample, turns.
             vel: motor velocities of the sample, turn/s.
         """

@@ -1,4 +1,4 @@
-"""What the registers of an ODrive's two axes say of the module: a pure judgement."""
+"""Status of a module from the registers of its ODrive's two axes. Pure."""
 
 from __future__ import annotations
 
@@ -32,8 +32,7 @@ class AxesStatus:
     def errors(registers: Sequence[int], *, wanted_armed: bool) -> int:
         """Return `AxisError` bits of (axis, motor, encoder, controller) of axis0, then axis1.
 
-        A watchdog that ran out in IDLE, where nobody wants the drive armed, only says
-        that nobody has written yet.
+        A watchdog that ran out in IDLE only shows that nothing was written yet, and is no error.
         """
         errors = 0
         for i in (0, 4):

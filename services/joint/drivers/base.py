@@ -23,12 +23,12 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
     error: int
     """Error bits of both axes, or-ed."""
     torque: Pair | None = None
-    """What the motors' own loops ask for, N m; known while a drive that was found armed is
-    waiting to be taken over."""
+    """Torque of the motors' own loops, N m; known while a drive that was found armed waits for its
+    take-over."""
 
 
 class MotorTarget(msgspec.Struct, gc=False, frozen=True):
-    """What both motors' own loops are to do, axis0 and axis1 (docs/drives.md).
+    """Target of both motors' own loops, axis0 and axis1 (docs/drives.md).
 
     torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel), no integrator.
     """
@@ -58,10 +58,10 @@ class Drive(Protocol):
         """Send motor torques in N m to axis0 and axis1, together; never blocks or raises."""
 
     def write(self, target: MotorTarget) -> None:
-        """Send what both motors' own loops are to do, together; never blocks or raises."""
+        """Send the target of both motors' own loops, together; never blocks or raises."""
 
     def arm(self, *, onboard: bool) -> None:
-        """Ask for closed loop control on both axes; `status` tells when it is so.
+        """Request closed loop control on both axes; `status` shows when it is reached.
 
         Args:
             onboard: True for the motors' own position loop (`write`), with no gains at
@@ -72,10 +72,10 @@ class Drive(Protocol):
         """Ask both axes to go idle."""
 
     def set_position(self, turns: Pair) -> None:
-        """Tell both motors where they are, turns; only while they are idle.
+        """Write both motors' position, turns; only while they are idle.
 
         Raises:
-            DriveError: the drive cannot be told. Not for the control path.
+            DriveError: the drive does not take it. Not for the control path.
         """
 
     def close(self) -> None:

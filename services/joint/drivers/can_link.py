@@ -31,7 +31,7 @@ BUS_OFF: Final = 0x40
 Frame: TypeAlias = tuple[int, bytes]
 """Arbitration id, with SocketCAN's flags, and payload."""
 Receive: TypeAlias = Callable[[float], Sequence[Frame]]
-"""Waits for at most so many seconds and returns all that is there."""
+"""Waits for at most the given seconds and returns all received frames."""
 Send: TypeAlias = Callable[[Sequence[can.Message]], int]
 """Returns how many of the messages, from the first, the bus has taken."""
 
@@ -168,7 +168,7 @@ class CanLink:
         self._retry_at_ns = 1 << 63
 
     def _send_orders(self) -> bool:
-        """Send what the bus has room for; True if nothing is left."""
+        """Send as many frames as the bus has room for; True if none is left."""
         if now_ns() > self._orders_until_ns:
             self._orders = ()
         else:

@@ -27,7 +27,7 @@ class EncoderPair:
         self._fresh = 0  # bit i: axis i has an estimate since the last sample
 
     def take(self, axis: int, estimate: Pair, now_ns: int) -> None:
-        """Take in an estimate of axis 0 or 1; what is no number is none."""
+        """Take an estimate of axis 0 or 1; one that is not a finite number is ignored."""
         pos, vel = estimate
         if not (isfinite(pos) and isfinite(vel)):
             return
@@ -40,7 +40,7 @@ class EncoderPair:
         self._fresh |= 1 << axis
 
     def forget(self) -> None:
-        """Begin anew: what came before belongs to no sample."""
+        """Start over: earlier estimates belong to no sample."""
         self._fresh = 0
 
     def complete(self) -> bool:

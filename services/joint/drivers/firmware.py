@@ -1,17 +1,17 @@
-"""What an ODrive's two axes report over CANSimple, whichever firmware speaks. Pure.
+"""Reports of an ODrive's two axes over CANSimple, of either firmware. Pure.
 
 Firmware 0.5 and 0.6 share set-points, gains, limits, estimates and the axis state in byte 4 of
-a heartbeat. They differ in what its other bytes say and in the numbers of the errors. Which
-one speaks is found out, not configured:
+a heartbeat. They differ in its other bytes and in the numbers of the errors. The
+firmware is detected, not configured:
 
-- 0.6 answers a request for its version (0x000); to 0.5 the same frame is food for the watchdog.
+- 0.6 answers a request for its version (0x000); on 0.5 the same frame feeds the watchdog.
 - Byte 7 of a heartbeat is reserved in 0.6, and 0.5 sets its top bit while no trajectory runs.
 - Byte 5 is a flag in 0.5; a procedure result of 2 and more can only be 0.6.
-- A drive that leaves `UNANSWERED` requests without an answer is taken for 0.5: should it be
-  0.6 after all, its heartbeats look like errors, and its next answer corrects it.
+- A drive that leaves `UNANSWERED` requests without an answer counts as 0.5. If it is 0.6 after all,
+its heartbeats look like errors, and its next answer corrects that.
 
-The other way round would be dangerous: 0.6's byte 5 says "busy" where 0.5's says that the motor
-has failed. So 0.6 is believed on evidence only.
+The other way round would be dangerous: byte 5 of 0.6 says "busy" where 0.5 says that the motor
+failed. So a drive counts as 0.6 on evidence only.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ Dialect = Literal["", "0.5", "0.6"]
 HEARTBEAT_BYTES: Final = 8
 VERSION_BYTES: Final = 8
 UNANSWERED: Final = 10
-"""Requests for the version, one for each heartbeat that tells nothing: so many are not lost."""
+"""Number of version requests, one for each heartbeat that shows no firmware: not all of them get
+lost."""
 
 OTHER_ERROR: Final = 0x8000_0000
 """An error that `AxisError` has no name for, or of a drive whose dialect is not known yet."""
@@ -89,8 +90,8 @@ def dialect_of(heartbeat: bytes) -> Dialect:
 def judged(dialect: Dialect, heartbeat: bytes, *, wanted_armed: bool) -> tuple[int, int]:
     """Return an axis's state and its errors, `AxisError` bits and `OTHER_ERROR`.
 
-    Out of closed loop, where nobody has asked for it, a watchdog that ran out only says that
-    nobody has written yet. While the dialect is not known, whatever could be an error is one.
+    Out of closed loop that was not requested, a watchdog that ran out only shows that nothing was
+    written yet. While the dialect is unknown, every possible error counts as one.
 
     Args:
         dialect: which firmware speaks.
@@ -116,14 +117,14 @@ def judged(dialect: Dialect, heartbeat: bytes, *, wanted_armed: bool) -> tuple[i
 
 
 class AxesReport:
-    """What both axes have reported, and what it says of the module.
+    """Reports of both axes, and the module's status from them.
 
     An axis that was armed and is no longer in closed loop is an error even without an error
-    bit, in either dialect. Both axes of an ODrive speak the same.
+    bit, in either dialect. Both axes of an ODrive have the same firmware.
 
     Attributes:
         dialect: "" until it is known.
-        firmware: (major, minor, revision) as 0.6 told it; None: not told.
+        firmware: (major, minor, revision) as 0.6 reports it; None: unknown.
         status: by the last heartbeats.
     """
 
@@ -144,7 +145,7 @@ class AxesReport:
         return self._errors[0] | self._errors[1]
 
     def forget(self) -> None:
-        """Believe nothing until both have sent a heartbeat: it may be another drive by now."""
+        """Forget both axes until they have sent a heartbeat: it may be another drive by now."""
         self.dialect = ""
         self.firmware = None
         self._unanswered = 0
@@ -152,7 +153,7 @@ class AxesReport:
         self.status = DriveStatus.LOST
 
     def requested(self, *, armed: bool) -> None:
-        """Begin anew: closed loop or IDLE was asked for, and heartbeats are to tell what came."""
+        """Start over: closed loop or IDLE was requested, and heartbeats will show the outcome."""
         self._wanted_armed = armed
         self._discard_reports()
         self._errors = [0, 0]
@@ -174,7 +175,7 @@ class AxesReport:
         self._judge()
 
     def receive_version(self, data: bytes) -> None:
-        """Take in an answer to 0x000; what was heard before is judged again if need be."""
+        """Take an answer to 0x000; earlier heartbeats are judged again if needed."""
         self.firmware = cansimple_06.unpack_version(data).firmware
         if self.dialect != "0.6":
             self._learn("0.6")

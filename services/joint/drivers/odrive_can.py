@@ -36,20 +36,21 @@ from shared.exceptions import DriveError
 __all__ = ["RETRY_MS", "OdriveCan"]
 
 REBOOT_MS: Final = 500
-"""After so long a silence the drive may have been switched off and on: what its
-heartbeats said before is forgotten. So it is when an axis sends estimates and no heartbeats:
-nothing else would tell that it has disarmed."""
+"""Silence after which the drive may have been switched off and on: its earlier heartbeats are
+forgotten. The same holds for an axis that sends estimates and no heartbeats, because nothing else
+would show that it disarmed."""
 ARM_GRACE_MS: Final = 10
-"""Heartbeats this soon after `arm` may have been sent before it; they are not believed."""
+"""Time after `arm` in which heartbeats may be from before it, and are ignored."""
 FEED_MS: Final = 1000
-"""So long after `arm` reading feeds the watchdogs until the drive is ARMED: that shows
-only in the next heartbeat, and a watchdog may run out before it."""
+"""Time after `arm` in which reading feeds the watchdogs until the drive is ARMED: that shows only
+in the next heartbeat, and a watchdog may run out before it."""
 INSIST_MS: Final = 1000
-"""So long after `idle` an axis that still reports closed loop is told again at once."""
+"""Time after `idle` from which an axis that still reports closed loop is commanded again at
+once."""
 LOST_MS: Final = 100
 """Silence of a drive without a watchdog after which it counts as lost."""
 CLOSE_MS: Final = 20
-"""So long an order that the bus had no room for may hold up `close`."""
+"""Time for which a command that the bus had no room for may hold up `close`."""
 
 _unpack_two_floats = struct.Struct("<ff").unpack_from
 
@@ -57,16 +58,15 @@ _unpack_two_floats = struct.Struct("<ff").unpack_from
 class OdriveCan:
     """Both axes of one ODrive; implements `services.joint.drivers.base.Drive`.
 
-    The bus need not be there yet: until it is, and whenever it goes away, the status is
-    LOST and reading retries by itself; it stays LOST until both axes have sent a
-    heartbeat, for only that tells their state. What is lost on the way to the drive is counted,
-    not raised.
+    The bus may be absent: until it is there, and whenever it goes away, the status is LOST and
+    reading retries by itself. The status stays LOST until both axes have sent a heartbeat, because
+    only that shows their state. Frames lost on the way to the drive are counted, not raised.
 
-    `DriveReading.error` holds `AxisError` bits whichever firmware speaks; 0.6's errors are
-    told by the bit of the same meaning, what has none by `odrive_dialects.OTHER_ERROR`.
+    `DriveReading.error` holds `AxisError` bits for either firmware; errors of 0.6 map to
+    the bit of the same meaning, others to `OTHER_ERROR`.
 
     Attributes:
-        write_failures: torque pairs and targets that were not handed to the bus.
+        write_failures: torque pairs and targets that the bus did not take.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class OdriveCan:
 
     @property
     def firmware(self) -> tuple[int, int, int] | None:
-        """The firmware's version as 0.6 told it; None: not told."""
+        """Firmware version as 0.6 reports it; None: unknown."""
         return self._report.firmware
 
     @property
@@ -189,9 +189,9 @@ class OdriveCan:
                 self._due.cut_off(GainRow.ALL)
 
     def write(self, target: MotorTarget) -> None:
-        """Send what both motors' own loops are to do; gains before what they act on.
+        """Send the target of both motors' own loops; gains before the values they act on.
 
-        A target that holds no number is not sent: the drive goes on with the last. Over CAN
+        A target that is not finite is not sent: the drive keeps the last one. Over CAN
         velocity and torque travel in thousandths: 0.035 N m at the joint.
         """
         frames = self._frames
@@ -208,11 +208,11 @@ class OdriveCan:
             self._due.cut_off(row)
 
     def arm(self, *, onboard: bool) -> None:
-        """Ask for closed loop control on both axes; see `Drive.arm`.
+        """Request closed loop control on both axes; see `Drive.arm`.
 
         Errors are cleared, and `input_torque` and the gains zeroed first: re-arming would
-        otherwise bring back the torque of before, and the gains the drive ships with have
-        an integrator. `status` is IDLE until heartbeats tell more.
+        otherwise bring back the earlier torque, and the factory gains have an integrator. `status`
+        is IDLE until heartbeats show more.
         """
         self._order(odrive_frames.arming(self._drive, onboard=onboard), armed=True)
         now = now_ns()
@@ -228,11 +228,11 @@ class OdriveCan:
         self._feed_until_ns = 0
 
     def set_position(self, turns: Pair) -> None:
-        """Tell both motors where they are, turns; see `Drive.set_position`.
+        """Write both motors' position, turns; see `Drive.set_position`.
 
         Raises:
-            DriveError: the drive has not shown which firmware it has, it takes counts and
-                their number was not given, or the bus takes nothing.
+            DriveError: the firmware is unknown, the counts per turn are missing, or the bus is
+                full.
         """
         frames = odrive_frames.positions(self._node_ids, turns, self.dialect, self._counts_per_turn)
         if not self._link.send(frames):
@@ -250,7 +250,7 @@ class OdriveCan:
         self._link.close()
 
     def _order(self, commands: tuple[odrive_frames.Order, ...], *, armed: bool) -> None:
-        """Send commands to both axes and forget what the axes reported before."""
+        """Send commands to both axes and forget their earlier reports."""
         self._report.requested(armed=armed)
         self._answers.forget_torques()
         self._believe_from_ns = now_ns() + ARM_GRACE_MS * NS_PER_MS
@@ -314,7 +314,7 @@ class OdriveCan:
         return self._reading(DriveStatus.LOST)
 
     def _forget(self) -> None:
-        """Forget what the drive has said of itself: it may have been switched off and on."""
+        """Forget the drive's reports: it may have been switched off and on."""
         self._report.forget()
         self._answers.forget_counts()
 

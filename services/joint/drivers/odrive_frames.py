@@ -1,6 +1,6 @@
-"""The CANSimple frames that an ODrive's two axes are told with. Pure.
+"""CANSimple frames for an ODrive's two axes. Pure.
 
-They are the same in both dialects (`odrive_dialects`), but for where a motor is said to be.
+They are the same for both firmwares except those that write a position.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Order = tuple[Command, bytes]
 """A command with its payload, for both axes."""
 
 LARGEST: Final = 1e9
-"""In any unit; more is no target, and no single float can hold what comes after."""
+"""Largest target, in any unit; beyond it a single float holds no fraction."""
 
 _pack_float = Struct("<f").pack
 _pack_two_floats = Struct("<ff").pack
@@ -104,7 +104,7 @@ class Frames:
         )
 
     def fill_torques(self, torque: Pair) -> None:
-        """Write torques, N m, at most `current_lim`'s worth; what is no number is zero."""
+        """Write torques, N m, within `current_lim`; one that is not finite becomes zero."""
         limit = self._torque_max
         for frame, value in zip(self.torques, torque, strict=True):
             if not -limit <= value <= limit:
@@ -132,11 +132,10 @@ class Frames:
 def positions(
     nodes: Nodes, turns: Pair, dialect: Dialect, counts_per_turn: int | None
 ) -> list[can.Message]:
-    """Return the frames that tell both motors where they are: turns to 0.6, counts to 0.5.
+    """Return the frames that write both motors' position: turns for 0.6, counts for 0.5.
 
     Raises:
-        DriveError: the dialect is not known, or the counts to a turn are not; or they are told
-            what is no position.
+        DriveError: the firmware or the counts per turn are unknown, or the position is invalid.
     """
     who = f"CAN nodes {nodes[0]} and {nodes[1]}"
     if dialect == "":

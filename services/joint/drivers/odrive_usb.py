@@ -3,11 +3,11 @@
 Threads. The rule is that a service has one; this driver is the exception. The package
 brings its own asyncio loop in a thread (and libodrive a second one under it), and a
 transfer may take 0.5 s to fail. So every transfer runs on the package's loop, and the
-control thread only swaps: it takes the newest sample and leaves the newest target. What
-crosses are references to frozen objects, each written by one side only.
+control thread only swaps: it takes the newest sample and leaves the newest target. Only
+references to frozen objects cross, each written by one side.
 
-An exchange is a sample, and at once the target that the control thread makes of it: a target
-that is a period late has let the robot shake. There are at most 200 a second. Every four
+An exchange is a sample, and at once the control thread's target for it: with a target that was a
+period late the robot shook. There are at most 200 a second. Every four
 endpoints cost a round trip, so only what is new is written, and the states are read less often.
 That is for the drives' own loops; at 1 kHz use CAN.
 """
@@ -36,11 +36,11 @@ from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
 
 EXCHANGE_HZ: Final = 200
-"""At most; more than a v3 board answers over USB helps nobody (docs/drives.md)."""
+"""Largest rate, Hz: a v3 board answers no faster over USB (docs/drives.md)."""
 PATIENCE: Final = 1.5
 """Periods of the exchange for which `read` waits at least: one alone is often just missed."""
 FEED_MS: Final = 1000
-"""So long after `arm` the watchdogs are fed without a target: the control loop waits."""
+"""Time after `arm` in which the watchdogs are fed without a target: the control loop waits."""
 LOST_S: Final = 0.1
 """Silence of a drive without a watchdog after which it counts as lost."""
 RETRY_S: Final = 0.2
@@ -48,17 +48,17 @@ RETRY_S: Final = 0.2
 STATES_EVERY: Final = 4
 """Exchanges of a drive that we hold armed from one look at its states to the next: 20 ms."""
 ANSWER_S: Final = 0.003
-"""So long an exchange waits for the control thread's target after its sample."""
+"""Time an exchange waits for the control thread's target after its sample."""
 TELL_S: Final = 5.0
-"""A drive that is not found by then is told of: its number may be another's."""
+"""Time after which a drive that is not found is reported: its number may be another's."""
 CLOSE_S: Final = 1.0
-"""So long `close` waits for a last request; it is not for the control path."""
+"""Time that `close` waits for a last request; not for the control path."""
 
 _ZERO = (0.0, 0.0)
 
 
 class _Request:
-    """What the control thread asks for; told apart from an earlier request by identity."""
+    """Request of the control thread; its identity tells it from an earlier one."""
 
     def __init__(self, *, arm: bool) -> None:
         self.arm = arm
@@ -153,8 +153,8 @@ class OdriveUsb:
     def write(self, target: MotorTarget) -> None:
         """Leave a target for the next exchange; the newest wins.
 
-        The feedforward is at most `current_lim`'s worth. A target that holds no number
-        is not sent: the drive goes on with the last.
+        The feedforward is at most `current_lim`'s worth. A target that is not finite
+        is not sent: the drive keeps the last one.
         """
         fields = (*target.pos_turns, *target.vel_turns, *target.pos_gain, *target.vel_gain)
         if not self._connected or not all(map(isfinite, (*fields, *target.torque))):
@@ -171,11 +171,11 @@ class OdriveUsb:
             self._manager.loop.call_soon_threadsafe(_resolve, awaited)
 
     def arm(self, *, onboard: bool) -> None:  # noqa: ARG002 - see below
-        """Ask for closed loop on both axes; errors are cleared and the gains zeroed first.
+        """Request closed loop on both axes; errors are cleared and the gains zeroed first.
 
-        It is position mode for `onboard` and for torques alike: with zero gains it asks for
-        the same torque, and torque mode would limit it by whatever vel_gain stands there.
-        Like `idle` it is forgotten if the drive is lost before: it is asked for again.
+        It is position mode for `onboard` and for torques alike: with zero gains it gives
+        the same torque, and torque mode would limit it by the present vel_gain. Like `idle` the
+        request is dropped if the drive is lost before; the caller repeats it.
         """
         self._request = _Request(arm=True)
 
@@ -184,7 +184,7 @@ class OdriveUsb:
         self._request = _Request(arm=False)
 
     def set_position(self, turns: Pair) -> None:
-        """Ask to tell both encoders where they are, turns; forgotten if the drive is lost before.
+        """Request writing both encoders' position, turns; dropped if the drive is lost before.
 
         Raises:
             DriveError: it is lost now.
@@ -250,7 +250,7 @@ class OdriveUsb:
         return None
 
     def _tell(self, trouble: str) -> None:
-        """Log what keeps the drive away, unless it is what was said last."""
+        """Log why the drive is absent, unless that was the last line."""
         if trouble != self.trouble:
             self.trouble = trouble
             log.get("xrl").warning("ODrive %s: %s", self._serial_number, trouble)
@@ -330,7 +330,7 @@ class OdriveUsb:
         self._status = self._axes.judge(states, self._errors)
 
     async def _carry_out(self, board: OdriveV3, request: _Request) -> None:
-        """Arm or idle both axes; what they reported before is forgotten."""
+        """Arm or idle both axes; their earlier reports are forgotten."""
         if request.arm:
             await board.arm(self._drive.vel_limit, self._drive.current_lim)
             self._feed_until_ns = now_ns() + FEED_MS * NS_PER_MS

@@ -52,7 +52,7 @@ class EndpointBatch:
 
 
 class TargetWriter:
-    """Writes what both motors' own loops are to do, as far as it is new to the drive.
+    """Writes the target of both motors' own loops, as far as it is new to the drive.
 
     Args:
         device: the package's `RuntimeDevice`.
@@ -67,7 +67,7 @@ class TargetWriter:
         self._batches: dict[tuple[int, ...], EndpointBatch] = {}
 
     def forget(self) -> None:
-        """Write everything the next time: what the drive holds is not known."""
+        """Write everything the next time: the drive's present values are not known."""
         self._written = None
 
     async def write(self, target: MotorTarget) -> None:
@@ -95,10 +95,10 @@ class TargetWriter:
 def values_of(target: MotorTarget) -> tuple[float, ...]:
     """Return a target's values in the order of `TargetWriter`.
 
-    `input_vel` stays at zero, for four inputs are one round trip and six are two: the velocity
-    goes with the position, `pos + vel / pos_gain`, which the firmware's law, its clamp included,
-    cannot tell from the target itself; with the torque where there is no pos_gain. So the torque
-    is the same, also when nobody writes any more.
+    `input_vel` stays at zero, because four inputs are one round trip and six are two. The velocity
+    goes with the position, `pos + vel / pos_gain`: for the firmware's law, its clamp included, the
+    same target; without a pos_gain it goes with the torque. So the torque is the same, also
+    when writing stops.
     """
     pos_0, torque_0 = _inputs_of(target, 0)
     pos_1, torque_1 = _inputs_of(target, 1)
@@ -155,7 +155,7 @@ class OdriveV3:
         self._signs = (1, 1)
 
     async def look(self) -> None:
-        """Look what is set and saved, not switched: watchdogs, and which way currents count."""
+        """Read saved settings: watchdogs, and the direction of the currents."""
         enabled = await self._watchdogs.read()
         self._food = [
             self.device.functions[f"{axis}.watchdog_feed"]
@@ -189,7 +189,7 @@ class OdriveV3:
             await self.device.call_function(food)
 
     async def set_position(self, turns: Pair) -> None:
-        """Tell both encoders what they read here, turns at the motor."""
+        """Write both encoders' reading, turns at the motor."""
         counts_per_turn = await self._counts_per_turn.read()
         for axis, where, cpr in zip(_AXES, turns, counts_per_turn, strict=True):
             name = f"{axis}.encoder.set_linear_count"
