@@ -1,12 +1,13 @@
-"""What a joint service believes of its planner. Pure.
+"""Envelope of the commands that a joint service accepts from its planner. Pure.
 
-A planner may be wrong in any way: gains of zero, a sign, a unit, a bit. Each module compares what
-it is told with what the law can ask of it in any pose (`GainSchedule.bounds`, made by `xrl gains`),
-with where its joint is, and with the command before. What lies outside is refused, counted and told
-(`JointState.outside`); a planner that goes on so is too old soon, and the module holds.
+A planner may be wrong in any way: zero gains, a sign, a unit, a bit. Each module compares a command
+with the law's bounds over all poses (`GainSchedule.bounds`, made by `xrl gains`), with the joint's
+position, and with the command before. A command outside is refused, counted and reported
+(`JointState.outside`). If a planner goes on like that its last good command becomes too old, and
+the module holds.
 
-A command with `hold` is obeyed all the same, but a module that does not believe its numbers is not
-ready to track (`Failsafe.ready`), so no planner leads by such numbers.
+A command with `hold` is obeyed anyway, but a module that refused its numbers is not ready to track
+(`Failsafe.ready`), so no planner leads with such numbers.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Envelope:
     """The bounds of one module."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Take the bounds; without a schedule that has them everything is believed."""
+        """Take the bounds; without a schedule that has them every command is inside."""
         schedule = config.gain_schedule
         table = schedule.bounds if config.law.split == "certified" and schedule else None
         self._bounds = table[kind_of(module)] if table else None
@@ -51,18 +52,18 @@ class Envelope:
         age_s: float = 0.0,
         settled: bool = True,
     ) -> Outside:
-        """Return the first number that is not believed.
+        """Return the first part of a command that lies outside.
 
         Written so that a NaN is outside: every comparison with it is false.
 
         Args:
-            command: what came.
-            last: what the module tracks, if it does.
-            q: where the joint is, rad.
-            v: its rates, rad/s.
-            age_s: how far the reference is moved on by its rate before it is used, s.
-            settled: TRACK has blended in: before, a robot that was held off centre is still on
-                its way to the reference.
+            command: the received command.
+            last: the command that the module tracks; None if it does not track.
+            q: joint angles, rad.
+            v: joint rates, rad/s.
+            age_s: time by which the reference is extrapolated, s.
+            settled: True if TRACK has blended in; before, a robot that was held off centre still
+        moves to the reference.
         """
         bounds, c = self._bounds, command
         if bounds is None:

@@ -1,10 +1,9 @@
-"""What a drive's samples say of the joint, and which of them are believed. Pure.
+"""The joint's position and speed from a drive's samples, and which samples are accepted. Pure.
 
-A drive that does not know where it is goes on reporting numbers: firmware 0.5.6 repeats the last
-of an encoder that it has lost until a heartbeat tells, and begins anew, turns away, when it is
-back; one that has restarted says 0. Believed for 40 ms, a knee at 0 was asked for -107 N m. So a
-sample that the joint cannot have come to is not used, and after a few of them the position counts
-as lost.
+A drive without a valid position goes on reporting numbers. Firmware 0.5.6 repeats the last value of
+a lost encoder until a heartbeat shows the error, and starts over, turns away, when it is back; a
+restarted drive reports 0. Accepted for 40 ms, a knee at 0 was commanded -107 N m. So a sample that
+the joint cannot have reached is rejected, and after a few of them the position counts as lost.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 
 JUMP_TURNS: Final = 0.1
-"""At the motor, beyond what the last velocity explains: 0.02 rad at the joint."""
+"""Largest jump at the motor beyond the last velocity, turns: 0.02 rad at the joint."""
 JUMP_SPEED: Final = 10.0
 """turn/s that a motor may have gained since the last sample, which may be 100 ms old: a leg
 in free fall gains 8."""
 ODD_MAX: Final = 3
-"""So many unbelievable samples, one after the other, and the position is lost."""
+"""Number of rejected samples in a row after which the position is lost."""
 
 _EVENT: Final = {
     DriveStatus.LOST: Event.DRIVE_LOST,
@@ -38,7 +37,7 @@ _EVENT: Final = {
 
 
 class JointEstimate(msgspec.Struct):
-    """The newest believed sample of a module, at the joint."""
+    """Newest accepted sample of a module, at the joint."""
 
     gear_ratio: float
     q: Pair = (0.0, 0.0)
@@ -50,21 +49,21 @@ class JointEstimate(msgspec.Struct):
     vel: Pair = (0.0, 0.0)
     """turn/s"""
     t_ns: int = 0
-    """When the drive's newest sample came, believed or not; 0 before the first."""
+    """Time of the drive's newest sample, accepted or not; 0 before the first."""
     status: DriveStatus = DriveStatus.LOST
     error: int = 0
     """The drive's error bits."""
     accepted_ns: int = 0
-    """When the newest believed sample came."""
+    """Time of the newest accepted sample."""
     rejected_count: int = 0
-    """Samples since then that were not believed."""
+    """Samples rejected since then."""
 
     def take(self, reading: DriveReading, *, armed: bool) -> Event:
-        """Take in a sample; return what it means for the failsafe.
+        """Take a sample; return its event for the failsafe.
 
         Args:
-            reading: of the drive.
-            armed: the module is controlled; else a joint may be found anywhere.
+            reading: the drive's sample.
+            armed: True if the module is controlled; otherwise any position is accepted.
         """
         self.status, self.error, self.t_ns = reading.status, reading.error, reading.t_ns
         event = _EVENT[reading.status]

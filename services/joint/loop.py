@@ -30,7 +30,7 @@ from shared.exceptions import DriveError
 from shared.process import StopFlag
 
 READ_TIMEOUT_S: Final = 0.005
-"""A cycle without an encoder sample runs all the same: ages and the failsafe go on."""
+"""Longest wait for a sample; a cycle without one still runs the age rule and the failsafe."""
 
 REPORT_EVERY_NS: Final = 10 * NS_PER_S
 """What keeps a drive from being armed is said so often."""

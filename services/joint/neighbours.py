@@ -1,16 +1,16 @@
-"""What the six joint services tell each other on their host: shared memory, no bus.
+"""Shared memory between the six joint services of one host, without a bus.
 
-After an emergency stop the knees sink. A torso on hips that only damp is dragged along by the
-thighs: it turned back by 1.5 rad, and with its COM 5 cm back and 10 cm up it threw the robot over.
-A hip that knows how its ankle and its knee have turned holds the torso as it stood. And a knee that
-sinks beside one whose service is dead tips the robot sideways: it was down in 4 s. It has to know
-that the other one does not sink. A limp module makes the others stiffen, in HOLD and in DAMP
-(`shared.robot.limp_leg_support`). Without that the robot fell within 1.3 s of a knee that went
-limp with the planner dead, and within 2 s of a stop beside a limp knee.
+After an emergency stop the knees sink. Hips that only damp are dragged along by the thighs: the
+torso turned back by 1.5 rad, and with its COM 5 cm back and 10 cm up the robot fell over. A hip
+that knows the angles of its ankle and knee holds the torso's attitude. A knee that sinks beside a
+knee whose service is dead tips the robot sideways: it fell within 4 s. So each knee must know
+whether the other one sinks. A limp module makes the others stiffen, in HOLD and in DAMP
+(`shared.robot.limp_leg_support`). Without that the robot fell within 1.3 s of a knee that went limp
+with the planner dead, and within 2 s of a stop beside a limp knee.
 
-All this with planner and bus dead: so each service writes down where it is in a file that all six
-have mapped, by a store to memory in each cycle, which the control path may do. What runs on another
-host is not known: hips then damp, knees sink, and only a planner has the others stiffen.
+All this must work with planner and bus dead. So each service writes its row into a file that all
+six have mapped: a store to memory in each cycle, which the control path may do. Modules on another
+host are unknown: hips then damp, knees sink, and only a planner makes the others stiffen.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from shared.robot.limp_leg_support import SUPPORT_FOR, Support
 STALE_NS: Final = 20 * NS_PER_MS
 """An older angle says nothing of where the joint is now."""
 GONE_NS: Final = 100 * NS_PER_MS
-"""What is older was written by a service that is no more, or about a drive that is lost."""
+"""Age of a row beyond which its service is dead or its drive is lost, ns."""
 _ROW: Final = struct.Struct("<QQddQQ")
 """A number that is odd while it is written, then a `NeighbourRow`."""
 _NUMBER: Final = struct.Struct("<Q")
@@ -42,7 +42,7 @@ class NeighbourRow(NamedTuple):
     """One module, as its service wrote it."""
 
     t_ns: int
-    """When its drive's newest believed sample came; 0: never."""
+    """Time of the drive's newest accepted sample; 0: none yet."""
     theta: float
     """rad"""
     rate: float
@@ -54,14 +54,14 @@ class NeighbourRow(NamedTuple):
 
 
 class NeighbourView(NamedTuple):
-    """What a module knows of its neighbours."""
+    """View of a module's neighbours."""
 
     below: Pair | None = None
     """For a hip: theta and rate of ankle and knee together, rad, rad/s; None: not known now."""
     sinks: bool = True
     """For a knee: False if the robot would tip unless it holds where it is."""
     stiffen: bool = False
-    """Another module is limp, and this one is to stiffen for it."""
+    """True if another module is limp and this one must stiffen for it."""
 
 
 UNKNOWN: Final = NeighbourView()
@@ -73,11 +73,11 @@ def path_of(run_dir: Path) -> Path:
 
 
 def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> NeighbourView:
-    """Return what a module makes of the rows.
+    """Return a module's view of the rows.
 
     Args:
-        module: whose service asks.
-        rows: of the six; None while a row is being written.
+        module: name of the viewing module.
+        rows: the six rows; None while one is being written.
         now_ns: the host's monotonic clock.
     """
     kind, own = kind_of(module), MODULES.index(module)
@@ -97,12 +97,12 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
 
 
 def _is_fresh(row: NeighbourRow, now_ns: int) -> bool:
-    """Return True if a row tells of now; it may be newer than the clock was read."""
+    """Return True if a row is recent; it may be newer than the clock reading."""
     return abs(now_ns - row.t_ns) <= STALE_NS
 
 
 def _stays(row: NeighbourRow, now_ns: int) -> bool:
-    """Return True if a knee that was heard of once does not sink."""
+    """Return True if a knee that was seen before does not sink."""
     if row.t_ns == 0 or row.t_ns > now_ns + STALE_NS:
         return False  # of another host, or its clock
     return now_ns - row.t_ns > GONE_NS or row.mode != Mode.DAMP or row.caught > 0
@@ -133,7 +133,7 @@ class Neighbours:
 
     @staticmethod
     def mode_of(run_dir: Path, module: str) -> Mode | None:
-        """Return what a module's service on this host wrote last; None if there was none."""
+        """Return the mode last written by a module's service on this host; None if none."""
         try:
             with path_of(run_dir).open("rb") as file:
                 file.seek(MODULES.index(module) * _ROW.size)

@@ -81,9 +81,9 @@ def freeze(setpoint: Setpoint, moving_share: float) -> Setpoint:
     """Return a setpoint frozen: q_ref, tau_ff and gains stay, the rest fades.
 
     Args:
-        setpoint: what was in force when the references froze.
-        moving_share: what is left of v_ref and tau_coupled, 1 .. 0. v_ref fades as well,
-            for in the middle of a squat k_d v_ref is 10 N m, which at once is a blow.
+        setpoint: the setpoint when the references froze.
+        moving_share: fraction of v_ref and tau_coupled that is left, 1 .. 0. v_ref fades too,
+    because in the middle of a squat k_d v_ref is 10 N m, a blow if dropped at once.
     """
     s, share = setpoint, moving_share
     if share <= 0.0:
@@ -118,14 +118,14 @@ def raise_gains(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpo
 def limit_stiffening(setpoint: Setpoint, q: Pair, k_p: Pair, added_max: float) -> Setpoint:
     """Return a setpoint that may stiffen: no spring then pulls harder by more than `added_max`.
 
-    An axis that is too far from its reference for that holds where it is: what its spring carries
-    becomes feedforward, the torque stays as it is.
+    An axis that is too far from its reference for that holds its position: its spring's torque
+    becomes feedforward, so the torque does not change.
 
     Args:
-        setpoint: in force until now.
-        q: where the joint is, rad.
-        k_p: to which the gains are going to rise, N m/rad.
-        added_max: N m
+        setpoint: the present setpoint.
+        q: joint angles, rad.
+        k_p: gains to which it will rise, N m/rad.
+        added_max: most added torque of a spring, N m.
     """
     s = setpoint
     away = (s.q_ref[0] - q[0], s.q_ref[1] - q[1])
@@ -141,15 +141,15 @@ def limit_stiffening(setpoint: Setpoint, q: Pair, k_p: Pair, added_max: float) -
 
 
 def load_to_feedforward(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:
-    """Return a setpoint in which the axes that are to sink carry their load as feedforward.
+    """Return a setpoint in which the sinking axes carry their load as feedforward.
 
-    DAMP lets go of their springs, but not of the load: a stand without a planner has no
-    other feedforward to fade.
+    DAMP removes their springs but not the load: a stand without a planner has no other
+    feedforward to fade.
 
     Args:
-        setpoint: in force until now.
-        sinks: for (phi, theta), True if the axis is to sink.
-        q: where it is, rad.
+        setpoint: the present setpoint.
+        sinks: for (phi, theta), True if the axis sinks.
+        q: joint angles, rad.
     """
     s = setpoint
     tau_ff = (
@@ -169,11 +169,11 @@ def damp(
     """Return DAMP's law: axes that sink lose their stiffness, the others hold.
 
     Args:
-        setpoint: what `load_to_feedforward` gave, its rates and coupling faded.
-        sinks: for (phi, theta), True if the axis is to sink.
+        setpoint: from `load_to_feedforward`, with rates and coupling faded.
+        sinks: for (phi, theta), True if the axis sinks.
         k_d: damping of an axis that sinks, N m s/rad.
-        feedforward_share: what is left of its feedforward, 1 .. 0.
-        risen: how far its damping has come from what it was to k_d, 0 .. 1.
+        feedforward_share: fraction of its feedforward that is left, 1 .. 0.
+        risen: progress of its damping to k_d, 0 .. 1.
     """
     s, share = setpoint, feedforward_share
     phi, theta = sinks

@@ -1,9 +1,9 @@
-"""The pendant, a dead man's handle: all six stop once it falls silent. Pure.
+"""The pendant, a dead man's handle: all six modules stop when it falls silent. Pure.
 
-Whatever fails of the person's hand, a cable, a radio and a host between, it is silent. It beats in
-each module's shared memory (`services.joint.rearm_guard`), which needs no bus. A pendant that was
-never heard, or was laid down in order, is not missed. Silence is counted in cycles that the module
-ran: while the whole machine stood still, nobody was silent.
+Whatever fails between the person's hand and the robot, a cable, a radio or a host, shows as
+silence. The pendant beats in each module's shared memory (`services.joint.rearm_guard`), without a
+bus. A pendant that was never there, or was laid down in order, is not missed. Silence is counted in
+cycles of the module, so a pause of the whole machine does not count.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 from shared.clock import NS_PER_MS
 
 CYCLE_MAX_NS: Final = 20 * NS_PER_MS
-"""So much of the time since the last cycle counts at most."""
+"""Most time between two cycles that counts as silence."""
 
 
 class PendantWatch:

@@ -1,19 +1,17 @@
-"""What a joint service is told, and tells, without a bus: a few bytes of shared memory.
+"""State that a joint service keeps in shared memory, without a bus: three things in a few bytes.
 
-The first is what a service that dies leaves to its successor.
+The first is the last state of a service, for its successor. A module that lost torque is never
+re-armed automatically (`shared.robot.fault_table`). The supervisor restarts a service that crashed,
+and meanwhile its drive may have disarmed or an emergency stop may hold: the new service would arm
+and stiffen the module unasked. So each service writes its last state, and a person who asks for the
+module (`xrl kill`, `xrl start`, `xrl up`) clears it.
 
-What has let go of the robot never takes hold of it again by itself (`shared.robot.fault_table`). A
-service that crashes is started again by the supervisor, and a drive may have disarmed in the
-meantime, or an emergency stop be in force: the new service would arm it, and stiffen, unasked.
-So each writes down what it last was, and a person who asks for the module (`xrl kill`, `xrl start`,
-`xrl up`) wipes it out.
+The second is the emergency stop of someone on the robot's own host (`xrl estop`). It works with the
+planner dead and every link of the bus cut, and holds until a person restarts the module.
 
-The second is the emergency stop of whoever is on the robot's own host (`xrl estop`): it is heard
-with the planner dead and every link of the bus cut, and stays in force until a person starts the
-module again. The third is how often a pendant has said that a person still holds it
-(`services.joint.pendant`).
+The third is the pendant's count of beats (`services.joint.pendant`).
 
-A mapped file: reading and writing it are loads and stores, which the control path may do.
+The file is mapped: reading and writing it are loads and stores, which the control path may do.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final
 
-_WILL, _STOP = range(2)
+_LAST_STATE, _STOP = range(2)
 _BEATS: Final = struct.Struct("<Q")
 _BEATS_AT: Final = 8
 """Aligned, so that a store of it is whole."""
@@ -34,12 +32,12 @@ _NEW: Final = bytes(_BEATS_AT + _BEATS.size)
 
 
 class LastState(IntEnum):
-    """What the service before this one was."""
+    """Last state of the service before this one."""
 
     NOTHING = 0
-    """There was none, or it ended in order, or a person has asked for the module anew."""
+    """There was none, or it ended in order, or a person has asked for the module."""
     HELD = 1
-    """It held the robot: a drive that does not any more has let go."""
+    """It held the robot: a drive that is no longer armed lost torque."""
     DAMP = 2
     """It sank after an emergency stop: so does the next."""
 
@@ -62,21 +60,21 @@ class RearmGuard:
         self._written = self.read()
 
     def read(self) -> LastState:
-        """Return what was left; what is no will is the most careful one that holds."""
-        value = self._memory[_WILL]
+        """Return the last state; an unreadable value is treated as HELD."""
+        value = self._memory[_LAST_STATE]
         return LastState(value) if value in tuple(LastState) else LastState.HELD
 
     def write(self, last_state: LastState) -> None:
-        """Leave this to whoever comes next; what is left already is not written again.
+        """Write the last state; an equal value is not written again.
 
-        So `clear` stands, and a service that has nothing new to say does not undo it.
+        So a running service without a change does not undo `clear`.
         """
         if last_state is not self._written:
-            self._memory[_WILL] = self._written = last_state
+            self._memory[_LAST_STATE] = self._written = last_state
 
     @property
     def stop_asked(self) -> bool:
-        """True if someone on this host has asked for the emergency stop."""
+        """True if someone on this host has set the emergency stop."""
         return self._memory[_STOP] != 0
 
     @property
@@ -86,9 +84,9 @@ class RearmGuard:
 
 
 def clear(run_dir: Path, module: str) -> None:
-    """Wipe out what a module's services have left: a person asks for it anew.
+    """Clear the state of a module's earlier services: a person asks for the module.
 
-    In place, for a service that runs has the file mapped.
+    It is cleared in place, because a running service has the file mapped.
     """
     with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
         file.write(_NEW)
@@ -127,12 +125,12 @@ class Pendant:
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Those that hear it."""
+        """Modules that the pendant reaches."""
         return tuple(self._memories)
 
     @property
     def beats(self) -> tuple[int, ...]:
-        """What the modules hear, of this pendant or of another."""
+        """Beats as the modules read them, of this pendant or of another."""
         return tuple(_BEATS.unpack_from(row, _BEATS_AT)[0] for row in self._memories.values())
 
     def beat(self) -> None:
@@ -141,7 +139,7 @@ class Pendant:
         self._tell(self._beats)
 
     def lay_down(self) -> None:
-        """Take it that nobody has to hold it any more."""
+        """End the pendant's watch: nobody has to hold it any more."""
         self._tell(0)
 
     def _tell(self, beats: int) -> None:

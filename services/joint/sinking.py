@@ -1,13 +1,13 @@
-"""DAMP: how a module sinks after an emergency stop, with nobody but its own leg to know. Pure.
+"""DAMP: how a module sinks after an emergency stop, knowing only its own leg. Pure.
 
 Ankles and every phi hold. The theta axes of `damp_sinks` lose their stiffness and carry their load
-on as feedforward that fades: a slow sink, never a drop. A knee is caught at its stop, or where it
-is once the other does not sink with it. A hip that knows how ankle and knee have turned holds the
-torso as it stood; one that does not damps, and the torso goes with the thighs
-(`services.joint.neighbours`).
+as feedforward that fades: a slow sink, never a drop. A knee is caught at its stop, or at its
+present angle when the other knee does not sink with it. A hip that knows the angles of ankle and
+knee holds the torso's attitude; a hip that does not know them damps, and the torso turns with the
+thighs (`services.joint.neighbours`).
 
-A module that is to stiffen for a limp one stops sinking: it holds where it is, on all its stand
-gains, with the load that it carries. A leg with a limp knee stands as a strut only on a stiff hip.
+A module that must stiffen for a limp one stops sinking: it holds its position with all its stand
+gains and the load that it carries. A leg with a limp knee stands as a strut only on a stiff hip.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from shared.config.robot_config import RobotConfig
 from shared.robot.joints import kind_of
 
 DOUBT_NS: Final = 100 * NS_PER_MS
-"""A stop does not reach all six in the same cycle, and services pause: a module that holds for the
-others' sake has had reason to for so long."""
+"""Time for which a reason to hold must last: a stop does not reach all six in the same cycle, and
+services pause."""
 LEVEL_MAX: Final = 0.1
 """rad; a torso that is farther off is brought back no harder than that."""
 
@@ -79,7 +79,7 @@ class Sinking:
         self.doubt_ns = self.held_ns = -1
 
     def begin(self, setpoint: Setpoint, q: Pair) -> Setpoint:
-        """Return what it starts from, of the setpoint in force until now and where the joint is."""
+        """Return the setpoint that sinking starts from, at joint angles q (rad)."""
         self.stop = min(self.stop, q[1])
         self.upright = self.held = self.below = None
         self.caught, self.doubt_ns, self.held_ns = False, -1, -1
@@ -91,10 +91,10 @@ class Sinking:
         """Return the local law.
 
         Args:
-            frozen_setpoint: what `begin` returned.
-            since_ns: since then.
-            q: where the joint is, rad.
-            near: what is known of the other modules.
+            frozen_setpoint: the setpoint that `begin` returned.
+            since_ns: time since then, ns.
+            q: joint angles, rad.
+            near: view of the other modules.
         """
         if near.stiffen and self.held is None:
             self.held, self.held_ns = q[1], since_ns
@@ -151,7 +151,7 @@ class Sinking:
     def _levelled(
         self, sunk: Setpoint, theta: float, near: NeighbourView, risen: float
     ) -> Setpoint:
-        """Return the law of a hip; a leg of which nothing is heard any more stays as it is."""
+        """Return the law of a hip; if its leg is no longer seen, the leg's last angle holds."""
         rate = 0.0
         if near.below is not None:
             self.below, rate = near.below

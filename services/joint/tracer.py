@@ -17,9 +17,9 @@ from shared.bus.messages import JointCommand
 from shared.bus.traces import CycleTrace, JointTrace
 
 CYCLES: Final = 10
-"""In a message; so much is lost with a killed service."""
+"""Cycles in a message; these are lost with a killed service."""
 MEMORY_EVERY: Final = 50
-"""Messages from one with the service's memory to the next: 1 s."""
+"""Messages between two with the service's snapshot: 1 s."""
 
 _NOTHING: Final = (0.0, 0.0)
 
@@ -87,6 +87,6 @@ class Tracer:
         return trace
 
     def _remember(self) -> None:
-        """Take down the memory if the next message is to have it."""
+        """Take the snapshot if the next message carries it."""
         due = self._seq % MEMORY_EVERY == 0
         self._snapshot = self._encode(self._module.snapshot()).decode() if due else ""

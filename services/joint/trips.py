@@ -1,7 +1,7 @@
-"""What a joint service trips on by itself: it then holds, whatever its planner says. Pure.
+"""Trips that a joint service detects by itself: it then holds, whatever its planner sends. Pure.
 
-A robot whose gains do not suit its drivetrain shakes within a tenth of a second of being led, and
-nobody but the six services sees it at 500 Hz. Each looks at its own torque and speed while it
+With gains that do not suit its drivetrain the robot shakes within a tenth of a second of being led,
+and only the six services see it at 500 Hz. Each watches its own torque and speed while it
 tracks (`shared.robot.trip_table`; limits: [trips] of the robot file):
 
     shaking   torque above `SHAKE_ABOVE_HZ`, as the root of its mean square over `SHAKE_S`
@@ -9,7 +9,7 @@ tracks (`shared.robot.trip_table`; limits: [trips] of the robot file):
     speed     a joint that turns faster than it is ever led
 
 The law's own torques end at some 4 Hz (`GainSchedule.coupling_bandwidth_hz`). Led, pushed with
-75 % of what soles and motors bear and on plants with every error drawn, shaking went to 4 N m; on
+75 % of what soles and motors bear and on plants with every error drawn, shaking reached 4 N m; on
 the drivetrains on which the unfiltered law falls it is 55 to 77 N m, and 15 after 20 to 60 ms.
 """
 
@@ -85,9 +85,9 @@ class JointTrips(msgspec.Struct):
 
         Args:
             now_ns: this module's clock.
-            tau: what the drive was told last, N m.
+            tau: torque of the last cycle, N m.
             v: measured joint rates, rad/s.
-            limits: the module's.
+            limits: the module's limits.
         """
         (phi, theta), (slow_phi, slow_theta) = tau, self.slow
         slow_phi += limits.slow_share * (phi - slow_phi)

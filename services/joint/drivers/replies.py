@@ -25,22 +25,22 @@ class Replies:
     """Both axes' newest answers; axis0, then axis1.
 
     Attributes:
-        ask_version: the requests that have the firmware's version for an answer.
-        ask_currents: those that have the currents.
-        ask_counts: those that have what the encoders have counted.
-        counted: position in turns and no velocity of an axis whose estimates say nothing;
-            None: it has not told, or its own estimates are there by now.
+        ask_version: requests for the firmware's version.
+        ask_currents: requests for the currents.
+        ask_counts: requests for the encoders' counts.
+        counted: position in turns, without velocity, of an axis that sends no estimates; None: no
+    answer, or estimates have arrived.
     """
 
     def __init__(
         self, node_ids: tuple[int, int], torque_constant: float, counts_per_turn: int | None
     ) -> None:
-        """Begin with nothing told.
+        """Begin without answers.
 
         Args:
             node_ids: CAN nodes of axis0 and axis1.
             torque_constant: N m/A.
-            counts_per_turn: of the encoders; None: no count is taken.
+            counts_per_turn: counts of an encoder per turn; None: counts are ignored.
         """
         self.ask_version = [request_of(n, Command06.GET_VERSION) for n in node_ids]
         self.ask_currents = [request_of(n, Command.GET_IQ) for n in node_ids]
@@ -52,12 +52,12 @@ class Replies:
 
     @property
     def torques(self) -> Pair | None:
-        """What both motors' own loops ask for, N m; None: not told."""
+        """Torque of both motors' own loops, N m; None: unknown."""
         a, b = self._torques
         return (a, b) if a is not None and b is not None else None
 
     def forget_counts(self) -> None:
-        """Forget what was counted: the drive may have restarted, or be another one."""
+        """Forget the counts: the drive may have restarted, or be another one."""
         self.counted[:] = None, None
 
     def forget_torques(self) -> None:
@@ -65,16 +65,16 @@ class Replies:
         self._torques[:] = None, None
 
     def take_count(self, axis: int, data: bytes) -> None:
-        """Take in what axis 0 or 1 has counted; it does not tell how fast."""
+        """Take the count of axis 0 or 1; it shows no velocity."""
         if len(data) == _BYTES and self._counts_per_turn is not None:
             shadow_count, _ = cansimple.unpack_two_ints(data)
             self.counted[axis] = (shadow_count / self._counts_per_turn, 0.0)
 
     def take_current(self, axis: int, data: bytes) -> None:
-        """Take in the current that axis 0 or 1 asks for; what is no number is no answer.
+        """Take the current setpoint of axis 0 or 1; one that is not finite is no answer.
 
         Its sign is the torque's where `encoder.config.direction` is 1: CAN of firmware 0.5 cannot
-        ask for that, `xrl doctor` looks over USB.
+        read that; `xrl doctor` reads it over USB.
         """
         if len(data) == _BYTES:
             current, _ = cansimple.unpack_two_floats(data)

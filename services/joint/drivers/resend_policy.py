@@ -1,8 +1,8 @@
-"""When an ODrive on CAN is told its gains, limits and modes along with a target. Pure.
+"""When gains, limits and modes go to an ODrive on CAN along with a target. Pure.
 
-Nothing shows whether a drive has taken them, and a frame may have been lost: a stiffness that
-should be off, and is not, adds to the torques that are worked out without it (25 N m for 100 ms
-in the study); 2 turn/s or torque mode would be felt as well.
+Nothing shows whether a drive has received them, and a frame may be lost. A stiffness that should be
+off but is on adds to the torques computed without it (25 N m for 100 ms in a study); a limit of 2
+turn/s or torque mode would be felt too.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from shared.clock import NS_PER_MS
 GAINS_MS: Final = 100
 """Gains go to the drive when they change, and this often."""
 DRIFT_MS: Final = 10
-"""Gains that change go once more with the next target; those that have changed within so long
-before, only after as long: they drift, a lost one is soon replaced, and the bus has other work."""
+"""Gains that change are sent once more with the next target. Gains that changed within this time
+before are sent again only after this time: they drift, a lost frame is soon replaced, and the bus
+has other work."""
 SETTLE_MS: Final = 1000
-"""So long after `arm`, or the first target, limits and modes are told every `GAINS_MS`."""
+"""Time after `arm`, or the first target, in which limits and modes are sent every `GAINS_MS`."""
 
 Gains = tuple[Pair, Pair]
 """Position gains 1/s and velocity gains N m s/turn, of both axes."""
@@ -38,10 +39,10 @@ class GainRow(IntEnum):
 
 
 class ResendPolicy:
-    """Remembers what the drive was told, and when.
+    """Keeps what was sent to the drive, and when.
 
     Attributes:
-        gains: that were told last; None: nothing since the bus was opened.
+        gains: sent last; None: none since the bus was opened.
     """
 
     def __init__(self) -> None:
@@ -52,7 +53,7 @@ class ResendPolicy:
         self._settle_until_ns = 0
 
     def connected(self) -> None:
-        """Begin with a bus that was opened: the drive has what it has."""
+        """Start over with a newly opened bus: the drive's values are unknown."""
         self.gains = None
 
     def armed(self, now_ns: int) -> None:
@@ -66,7 +67,7 @@ class ResendPolicy:
         self._settle_until_ns = 0
 
     def with_target(self, gains: Gains, now_ns: int) -> GainRow:
-        """Return what goes with a target that has these gains, and take it for told."""
+        """Return the gains to send with a target, and count them as sent."""
         new = gains != self.gains
         due = new or now_ns >= self._gains_at_ns
         if self.gains is None:  # taken over as it stands
@@ -81,14 +82,14 @@ class ResendPolicy:
         return GainRow.GAINS if due else GainRow.INPUTS
 
     def with_torques(self, now_ns: int) -> bool:
-        """Return whether limits and modes are due, and take them for told."""
+        """Return True if limits and modes are due, and count them as sent."""
         due = self._settle_at_ns <= now_ns < self._settle_until_ns
         if due:
             self._settle_at_ns = now_ns + GAINS_MS * NS_PER_MS
         return due
 
     def cut_off(self, row: GainRow) -> None:
-        """Take back what was told last: the bus did not take all of it."""
+        """Undo the last sending: the bus did not take all of it."""
         if row >= GainRow.GAINS:
             self._gains_at_ns = 0
         if row is GainRow.ALL:
