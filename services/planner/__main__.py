@@ -1,4 +1,4 @@
-"""`python -m services.planner`: the whole-body law of the fleet."""
+"""Runs the planner process (`python -m services.planner`): the fleet's whole-body law."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from shared.process import (
 from shared.traces import PlannerCheckpoint
 
 FIFO_PRIORITY = 15
-"""Below the joint services: the failsafe outranks the law."""
+"""Below the joint services, because the failsafe has priority over the law."""
 
 
 def main() -> int:
-    """Wire the planner to the bus and run it."""
+    """Connect the planner to the bus and run it."""
     parser = service_parser(
         "Run the whole-body law.", "python -m services.planner --run-dir /tmp/xrl"
     )

@@ -1,18 +1,17 @@
-"""The failsafe certificate: do these local gains stand alone? (docs/law.md#certificate). Pure.
+"""Failsafe certificate: the local gains stand alone (docs/law.md#certificate). Pure.
 
-With the planner gone, tau = D (q_ref - q) + tau_ff, and both feet stay where they are.
-T (12, 6) are the joint rates per unit of p along the closed chain: [J; C] T = [I; 0].
-The stiffness that p then feels is
+With the planner dead, tau = D (q_ref - q) + tau_ff, and both feet stay in place. T (12, 6) are the
+joint rates per unit of p along the closed chain: [J; C] T = [I; 0]. The stiffness along p is then
 
     K_fail = sym(T^T D T) + K_geo,    K_geo = T^T H T,
     H = d(J^T F_O + J_harness^T F_assist)/dq,
 
-K_geo being minus d/dp of T^T (tau_ff held - gravity and load). The robot stands only if
-K_fail > 0. A margin is its smallest eigenvalue with every direction measured by what is
-required of it (`certificate.K_required`): 1 is all that is required, 0 is a fall.
+K_geo is minus d/dp of T^T (tau_ff held - gravity and load). The robot stands only if K_fail > 0. A
+margin is the smallest eigenvalue of K_fail, with every direction scaled by the required stiffness
+(`certificate.K_required`). 1 meets the requirement, 0 is a fall.
 
-Tier 3: with its joint service gone too, each motor of a module holds with the mean of the
-two joints' stiffnesses (docs/drives.md), so D is averaged module by module.
+Tier 3: with its joint service dead too, each motor of a module holds with the mean of the two
+joints' stiffnesses (docs/drives.md). D is therefore averaged per module.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from shared.joints import N_JOINTS
 Array = NDArray[np.float64]
 
 DIRECTIONS = ("lean forward", "lean sideways", "sink", "roll", "pitch", "yaw")
-"""What a motion along each part of p is, in words."""
+"""Name of the motion along each part of p."""
 UNITS = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
 
 
 class Margins(NamedTuple):
-    """Smallest eigenvalues, in shares of what is required."""
+    """Smallest eigenvalues, as fractions of the required stiffness."""
 
     service: float
     """Tier 2: the joint services hold."""
@@ -42,16 +41,17 @@ class Margins(NamedTuple):
 
 
 class Weakest(NamedTuple):
-    """The direction in which a stiffness gives way first."""
+    """The direction with the smallest margin."""
 
     direction: str
     margin: float
     stiffness: float
-    """Along that direction, N/m or N m/rad: margin times what is required."""
+    """Stiffness along that direction, N/m or N m/rad: margin times the required stiffness."""
     required: float
     unit: str
     p: Array
-    """(6,) m and rad, its largest part 1 in units of the required stiffness's root."""
+    """Direction (6,), m and rad; scaled by the root of the required stiffness, its largest part is
+    1."""
 
 
 def motor_mean(D: Array) -> Array:
@@ -60,10 +60,10 @@ def motor_mean(D: Array) -> Array:
 
 
 class Certificate:
-    """The certificate at one configuration; `at` moves it there."""
+    """Certificate at one configuration; `at` sets the configuration."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Take what is required."""
+        """Set the required stiffness."""
         self.K_required: Array = np.array(config.certificate.K_required)
         self._scale = 1.0 / np.sqrt(self.K_required)
         self._T_scaled: Array = np.zeros((N_JOINTS, 6))
@@ -71,7 +71,7 @@ class Certificate:
         self._pair: Array = np.zeros((2, N_JOINTS, 1))
 
     def at(self, T: Array, hessian_O: Array) -> None:
-        """Move to a configuration.
+        """Set the configuration.
 
         Args:
             T: joint rates per unit of p along the closed chain (12, 6).
@@ -82,9 +82,9 @@ class Certificate:
         self._K_geo = 0.5 * (K_geo + K_geo.T)
 
     def margins(self, D: Array) -> Margins:
-        """Return how far local stiffnesses D (12,), N m/rad, are from a fall.
+        """Return the margins of local stiffnesses D (12,), N m/rad.
 
-        Zero at angles for which the chain has no rates: nothing is certified there.
+        Zero at angles at which the closed chain has no finite rates: nothing is certified there.
         """
         pair = self._pair
         pair[0, :, 0] = D

@@ -1,4 +1,4 @@
-"""The six commands of a tick, as they are sent. Pure."""
+"""Builds the six commands of a tick. Pure."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from shared.limp_leg_support import Support
 from shared.messages import JointCommand, JointState, Pair
 
 
-class Common(NamedTuple):
-    """What the six commands of a tick have in common."""
+class CommandHeader(NamedTuple):
+    """Fields that the six commands of a tick share."""
 
     now_ns: int
     seq: int
@@ -25,15 +25,15 @@ class Common(NamedTuple):
 
 
 def commands_of(
-    common: Common, states: Sequence[JointState], output: LawOutput, support: Support
+    header: CommandHeader, states: Sequence[JointState], output: LawOutput, support: Support
 ) -> list[JointCommand]:
     """Return the commands, in the order of `MODULES`.
 
     Args:
-        common: what all tell.
+        header: fields that all commands share.
         states: the newest of each module; its stamp is echoed.
-        output: what the law found.
-        support: which modules are to stiffen, beside a limp one.
+        output: of the law.
+        support: which modules are to stiffen to support a limp one.
     """
     rows = np.array(
         (
@@ -48,21 +48,21 @@ def commands_of(
     ).reshape(7, N_MODULES, 2)
     by_module = rows.transpose(1, 0, 2).tolist()
     return [
-        _command(common, state.t_ns, rows, stiffen=support.includes(module))
+        _command(header, state.t_ns, rows, stiffen=support.includes(module))
         for module, state, rows in zip(MODULES, states, by_module, strict=True)
     ]
 
 
 def _command(
-    common: Common, echo_t_ns: int, rows: list[list[float]], *, stiffen: bool
+    header: CommandHeader, echo_t_ns: int, rows: list[list[float]], *, stiffen: bool
 ) -> JointCommand:
     pairs: list[Pair] = [(row[0], row[1]) for row in rows]
     return JointCommand(
-        t_ns=common.now_ns,
-        seq=common.seq,
-        session=common.session,
+        t_ns=header.now_ns,
+        seq=header.seq,
+        session=header.session,
         echo_t_ns=echo_t_ns,
-        hold=common.hold,
+        hold=header.hold,
         q_ref=pairs[0],
         v_ref=pairs[1],
         tau_ff=pairs[2],
@@ -70,7 +70,7 @@ def _command(
         tau_coupled=pairs[4],
         k_p=pairs[5],
         k_d=pairs[6],
-        margin=common.margins.service,
-        margin_onboard=common.margins.onboard,
+        margin=header.margins.service,
+        margin_onboard=header.margins.onboard,
         stiffen=stiffen,
     )

@@ -1,11 +1,11 @@
-"""The dynamic certificate: does the sampled-data loop stand on joints that flex? Offline and pure.
+"""Dynamic certificate: the sampled-data loop is stable on flexible joints. Offline and pure.
 
-Beside the static certificate (`services.planner.certificate`), which asks for stiffness, this asks
-that no motion of `services.planner.sampled_loop` grows: at every pose of the schedule, for every
-drivetrain from `robustness.stiffness`, hand and delay of the robot file,
+The static certificate (`services.planner.certificate`) requires stiffness. This one requires that
+no motion of `services.planner.sampled_loop` grows. It covers every pose of the schedule, and every
+drivetrain (`robustness.stiffness`), hand and delay of the robot file:
 
-- with every feedback torque, and with tau_coupled alone, `gain_margin` times what it is;
-- with `delay_margin` times the delay;
+- with every feedback torque, and with tau_coupled alone, scaled by `gain_margin`;
+- with the delay scaled by `delay_margin`;
 - in HOLD with the services, and with the drives alone.
 """
 
@@ -40,17 +40,18 @@ from shared.joints import MODULES
 
 Array = NDArray[np.float64]
 
-LEAST_DELAY_S: Final = 2e-3
-"""From a sample to the first use of its command, over a bus of no delay."""
+DELAY_MIN_S: Final = 2e-3
+"""s, from a sample to the first use of its command, over a bus without delay."""
 DRIVE_STEP_S: Final = 1e-3
-"""The drives' loop is taken as slow as the simulated one; the firmware's 8 kHz is kinder."""
+"""s. The drives' loop is modelled as slow as the simulated one; the firmware's 8 kHz is less
+critical."""
 DRIFT_HZ: Final = 0.05
-"""Slower than this it is no oscillation: the person who leads is part of it."""
+"""A slower motion is no oscillation but a drift: the leading operator is part of that loop."""
 HALF_NAMES: Final = ("fore and aft", "sideways")
 
 
 class Design(NamedTuple):
-    """What is chosen by this certificate, one set for all poses."""
+    """Gains chosen with this certificate, one set for all poses."""
 
     D_B: tuple[float, ...]
     """(6,) local damping of a leg, N m s/rad."""
@@ -68,10 +69,10 @@ class StiffnessNode(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """One case that the loop has to fade in."""
+    """One case in which every motion of the loop must decay."""
 
     mode: str
-    """TRACK, HOLD, or drives alone."""
+    """"TRACK", "HOLD" or "drives alone"."""
     node: StiffnessNode
     half: int
     stiffness: float
@@ -80,7 +81,7 @@ class Condition(NamedTuple):
     gains: Gains
 
     def words(self) -> str:
-        """Return the case in words."""
+        """Return a description of the case."""
         parts = [
             f"{self.mode}, COM {self.node.z:.2f} m, pitch {self.node.pitch:.1f} rad",
             f"k = {self.stiffness:g} N m/rad",
@@ -96,20 +97,20 @@ class Condition(NamedTuple):
 
 
 class DynamicVerdict(NamedTuple):
-    """The worst case that was found."""
+    """The worst case found."""
 
     growth: Growth
     condition: Condition
     excess: float
-    """1/s: the rate, less what is allowed of a drift."""
+    """1/s: the growth rate, minus the rate allowed for a drift."""
 
     @property
     def stable(self) -> bool:
-        """True if it fades, or is no more than a drift where the person leads."""
+        """True if the motion decays, or is a slow drift in directions that the operator leads."""
         return self.excess < 0.0
 
     def words(self) -> str:
-        """Return the case and what happens in it, in words."""
+        """Return a description of the case and its growth."""
         g = self.growth
         what = "grows" if g.rate > 0.0 else "fades"
         return f"{self.condition.words()}: {what} by {abs(g.rate):.2f}/s at {g.frequency_hz:.1f} Hz"
@@ -118,17 +119,17 @@ class DynamicVerdict(NamedTuple):
 def nodes_of(
     config: RobotConfig, D_at: Callable[[float, float], Array], heights: Array, pitches: Array
 ) -> list[StiffnessNode]:
-    """Return the poses that can be reached, linearised, without and with the full assist.
+    """Return the reachable poses, linearised, without and with the full assist.
 
     Args:
         config: the robot.
-        D_at: local stiffness (12,) of a COM height (m) and a pitch (rad).
+        D_at: returns the local stiffness (12,), N m/rad, at a COM height (m) and a pitch (rad).
         heights: of the COM, m.
         pitches: of the torso, rad.
     """
     poses, inertia = Poses(config), BodyInertia(config)
     S = np.array(config.law.S, float)
-    found = []
+    nodes = []
     for z in heights:
         for pitch in pitches:
             node = poses.node(float(z), float(pitch))
@@ -147,17 +148,17 @@ def nodes_of(
                     hessian,
                     S,
                 )
-                found.append(
+                nodes.append(
                     StiffnessNode(float(z), float(pitch), stand, D_at(float(z), float(pitch)))
                 )
-    return found
+    return nodes
 
 
 class DynamicCertificate:
-    """The conditions of a robot, and the loop in each of them."""
+    """The conditions of a robot, and the loop in each condition."""
 
     def __init__(self, config: RobotConfig, nodes: list[StiffnessNode]) -> None:
-        """Take the robot and its poses."""
+        """Set the robot and its poses."""
         self._config = config
         self._nodes = nodes
         law, wanted = config.law, config.robustness
@@ -170,12 +171,12 @@ class DynamicCertificate:
         self._hold = _hold_gains(config)
 
     def feedback(self, node: StiffnessNode, design: Design) -> Feedback:
-        """Return what services and planner do in TRACK at a pose."""
+        """Return the feedback of services and planner in TRACK at a pose."""
         T, J = node.stand.T, node.stand.J
         D_B = np.tile(design.D_B, 2)
-        missing = UncoupledGains(self._K_p, self._B_p, self._S, design.coupling.damping)
+        uncoupled = UncoupledGains(self._K_p, self._B_p, self._S, design.coupling.damping)
         K_fail = T.T @ (node.D[:, np.newaxis] * T) + node.stand.K_geo
-        K_c, B_c = missing.at(K_fail, (T.T * D_B) @ T)
+        K_c, B_c = uncoupled.at(K_fail, (T.T * D_B) @ T)
         # tau_coupled = C_q e_q + C_v e_v, with J e_q = p_ref - p in the closed rows
         return Feedback(
             node.D,
@@ -188,13 +189,13 @@ class DynamicCertificate:
         )
 
     def held(self, node: StiffnessNode, design: Design, *, onboard: bool) -> Feedback:
-        """Return what holds in HOLD, by the services or by the drives alone."""
+        """Return the feedback in HOLD, of the services or of the drives alone (`onboard`)."""
         k_p, k_d = self._hold
         D, D_B = np.maximum(node.D, k_p), np.maximum(np.tile(design.D_B, 2), k_d)
         if onboard:
             D, D_B = motor_mean(D), motor_mean(D_B)
-        nothing = np.zeros((len(D), len(D)))
-        return Feedback(D, D_B, nothing, nothing, 1.0)
+        zero_coupling = np.zeros((len(D), len(D)))
+        return Feedback(D, D_B, zero_coupling, zero_coupling, 1.0)
 
     def loop(self, condition: Condition, design: Design) -> SampledLoop:
         """Return the loop of a condition."""
@@ -209,57 +210,57 @@ class DynamicCertificate:
         return SampledLoop(stand, half, feedback, drivetrain, timing, c.hand)
 
     def conditions(self, *, margins: bool = True) -> Iterator[Condition]:
-        """Yield every condition; without margins only as it is meant to run."""
+        """Yield every condition; without `margins`, nominal gains and delays only."""
         yield from self._cases(self._in_track, margins=margins)
         yield from self._cases(self._in_hold, margins=margins)
 
     def worst(self, design: Design, *, margins: bool = True) -> DynamicVerdict:
-        """Return the condition that fades most slowly."""
+        """Return the condition with the slowest decay."""
         return self._worst(self.conditions(margins=margins), design, np.inf)
 
     def worst_in_track(
-        self, design: Design, *, margins: bool = True, enough: float = np.inf
+        self, design: Design, *, margins: bool = True, stop_above: float = np.inf
     ) -> DynamicVerdict:
-        """Return the worst while the planner leads; stop at the first above `enough`, 1/s."""
-        return self._worst(self._cases(self._in_track, margins=margins), design, enough)
+        """Return the worst condition in TRACK; stop at the first excess above `stop_above`, 1/s."""
+        return self._worst(self._cases(self._in_track, margins=margins), design, stop_above)
 
     def worst_in_hold(self, design: Design, *, margins: bool = True) -> DynamicVerdict:
-        """Return the worst without a planner, with the services and with the drives alone."""
+        """Return the worst condition in HOLD, with the services and with the drives alone."""
         return self._worst(self._cases(self._in_hold, margins=margins), design, np.inf)
 
     def led(self, stiffness: float) -> Iterator[Condition]:
-        """Yield the upright poses without a hand, at the least and at the designed delay."""
+        """Yield upright TRACK conditions without a hand, at the minimum and the designed delay."""
         for node in self._nodes:
             if node.pitch == 0.0:
-                for delay in (LEAST_DELAY_S, self._wanted.delay_ms / 1e3):
+                for delay in (DELAY_MIN_S, self._wanted.delay_ms / 1e3):
                     yield Condition("TRACK", node, 0, stiffness, delay, NO_HAND, NOMINAL)
 
     def sway(self, design: Design) -> float:
-        """Return the rate (1/s, negative) of the oscillation that fades most slowly in TRACK."""
+        """Return the rate (1/s, negative) of the TRACK oscillation with the slowest decay."""
         cases = self._cases(self._in_track, margins=False)
         return max(self.loop(c, design).growth(c.gains, DRIFT_HZ).rate for c in cases)
 
     @property
     def stiffnesses(self) -> tuple[float, ...]:
-        """Drivetrains that are asked about, N m/rad."""
+        """Drivetrain stiffnesses that the certificate covers, N m/rad."""
         return self._wanted.stiffness
 
     def judge(self, condition: Condition, design: Design) -> DynamicVerdict:
-        """Return what the loop does in a condition."""
+        """Return the growth of the loop in a condition, and its excess."""
         growth = self.loop(condition, design).growth(condition.gains)
         drifts = condition.half == 0 and growth.frequency_hz < DRIFT_HZ
         allowed = self._wanted.drift_max if drifts and condition.mode == "TRACK" else 0.0
         return DynamicVerdict(growth, condition, growth.rate - allowed)
 
     def _worst(
-        self, conditions: Iterable[Condition], design: Design, enough: float
+        self, conditions: Iterable[Condition], design: Design, stop_above: float
     ) -> DynamicVerdict:
         worst: DynamicVerdict | None = None
         for condition in conditions:
             verdict = self.judge(condition, design)
             if worst is None or verdict.excess > worst.excess:
                 worst = verdict
-                if verdict.excess > enough:
+                if verdict.excess > stop_above:
                     break
         assert worst is not None  # noqa: S101 - there is always a pose
         return worst
@@ -279,7 +280,7 @@ class DynamicCertificate:
         delay = wanted.delay_ms / 1e3
         hands = self._hands if half == 0 else self._hands[:1]
         for hand in hands:
-            case = Condition("TRACK", node, half, stiffness, LEAST_DELAY_S, hand, NOMINAL)
+            case = Condition("TRACK", node, half, stiffness, DELAY_MIN_S, hand, NOMINAL)
             yield case
             yield case._replace(delay_s=delay)
             if margins:
@@ -292,7 +293,7 @@ class DynamicCertificate:
         self, node: StiffnessNode, stiffness: float, half: int, *, margins: bool
     ) -> Iterator[Condition]:
         for mode in ("HOLD", "drives alone"):
-            case = Condition(mode, node, half, stiffness, LEAST_DELAY_S, NO_HAND, NOMINAL)
+            case = Condition(mode, node, half, stiffness, DELAY_MIN_S, NO_HAND, NOMINAL)
             yield case
             if margins:
                 yield case._replace(gains=Gains(torque=self._wanted.gain_margin))
@@ -315,7 +316,7 @@ class DynamicCertificate:
 
 
 def _hold_gains(config: RobotConfig) -> tuple[Array, Array]:
-    """Return (k_p, k_d) (12,) that every module rises to in HOLD."""
+    """Return the minimum (k_p, k_d) (12,) of every module in HOLD."""
     pairs = [config.hold_gains(module) for module in MODULES]
     return (
         np.array([k_p for k_p, _ in pairs]).ravel(),

@@ -1,14 +1,14 @@
-"""When the planner leads and when it asks all six modules to hold (docs/architecture.md#age-rule).
+"""Decides when all six modules track and when they hold (docs/architecture.md#age-rule).
 
-All six track or none does: while one module's state is stale, or one is not in TRACK,
-every command carries `hold`, so that no leg works against the other. Modules tell
-`ready` once fresh commands have come for long enough; when all are ready, `hold` is
-lifted for all in the same tick. An overload at the harness and gains that would not stand
-alone ask for `hold` too.
+All six modules track or none does. While one module's state is stale, or one module is not in
+TRACK, every command carries `hold`, so that no leg works against the other. Modules report `ready`
+once commands have been fresh for long enough. When all are ready, the planner engages: it lifts
+`hold` for all in the same tick. An overload at the harness and gains that do not stand alone also
+set `hold`.
 
-After a drop-out of any module the planner waits before it leads again, the longer the more
-there were: six links that take turns at dropping out flap as one. Pure: state, inputs ->
-outputs.
+After a drop-out of any module the planner waits before it re-engages; the wait grows with the
+number of recent drop-outs. Six links that drop out in turn would otherwise make the robot flap
+between TRACK and HOLD. Pure: state, inputs -> outputs.
 """
 
 from __future__ import annotations
@@ -21,30 +21,31 @@ from shared.clock import NS_PER_S
 from shared.messages import Mode, PlannerMode
 
 GRACE_NS = 150_000_000
-"""After lifting `hold`, modules may take this long to report TRACK."""
+"""ns; after `hold` is lifted, modules may take this long to report TRACK."""
 WAITS_NS: Final = tuple(round(s * NS_PER_S) for s in (0.0, 0.5, 1.5, 4.0, 10.0, 20.0, 30.0))
-"""From a drop-out to leading again at the earliest, by how many are remembered. With these and
-`FORGET_NS` no network whatever makes more than six drop-outs in a minute. The first is cheap: a
-stall of the machine is not to hold the person up."""
+"""ns; shortest time from a drop-out to re-engaging, by the number of counted drop-outs. With these
+and `FORGET_NS`, no network causes more than six drop-outs in a minute. The first wait is zero,
+because one stall of the machine must not stop the operator."""
 FORGET_NS: Final = 25 * NS_PER_S
-"""Of leading without a drop-out make one forgotten. With 20 s seven would fit into a minute."""
+"""ns; a time engaged without a drop-out that removes one from the count. With 20 s, seven drop-outs
+would fit into a minute."""
 
-_GONE: Final = (Mode.FAULT, Mode.DAMP)
-"""No module comes from these to TRACK: there is nothing to wait for."""
+_NOT_TRACKABLE: Final = (Mode.FAULT, Mode.DAMP)
+"""Modes from which no module returns to TRACK, so that waiting is useless."""
 
 
 class Engagement(msgspec.Struct):
-    """Where the engagement stands."""
+    """State of the engagement."""
 
     mode: PlannerMode = PlannerMode.WAITING
     since_ns: int = 0
-    """When the mode was entered."""
+    """Time at which the mode was entered."""
     dropouts: int = 0
-    """Times that leading was lost and that are not yet forgotten; an index of `WAITS_NS`."""
+    """Drop-outs counted and not yet forgotten; an index of `WAITS_NS`."""
     dropped_ns: int = 0
-    """When it was lost last."""
+    """Time of the last drop-out."""
     steady_since_ns: int = 0
-    """Since when it has been led without losing or forgetting one."""
+    """Time since which the planner is engaged without a drop-out, or since one was forgotten."""
 
     def advance(
         self,
@@ -54,24 +55,25 @@ class Engagement(msgspec.Struct):
         modes: list[int],
         inhibit: PlannerMode | None = None,
     ) -> bool:
-        """Take the six modules' news; return True if the mode changed.
+        """Advance by one tick; return True if the mode changed.
 
         Args:
             now_ns: the planner's clock.
             fresh: per module, a state has come within `planner.state_stale_ms`.
             ready: per module, `JointState.ready`.
             modes: per module, `JointState.mode`.
-            inhibit: why the planner may not lead, OVERLOADED and so on; None: it may.
+            inhibit: mode that says why the planner may not engage, such as OVERLOADED; None if it
+                may.
         """
-        after = self._next(now_ns, fresh, ready, modes, inhibit)
-        self._count_dropouts(now_ns, after)
-        changed = after is not self.mode
+        next_mode = self._next(now_ns, fresh, ready, modes, inhibit)
+        self._count_dropouts(now_ns, next_mode)
+        changed = next_mode is not self.mode
         if changed:
-            self.mode, self.since_ns = after, now_ns
+            self.mode, self.since_ns = next_mode, now_ns
         return changed
 
     def wait_ns(self, now_ns: int) -> int:
-        """Return how long it does not lead yet because of drop-outs, ns; 0 if it may."""
+        """Return the rest of the wait after drop-outs, ns; 0 if the planner may engage."""
         return max(0, self.dropped_ns + WAITS_NS[self.dropouts] - now_ns)
 
     def _next(
@@ -87,18 +89,20 @@ class Engagement(msgspec.Struct):
         if inhibit is not None:
             return inhibit
         if self.mode is PlannerMode.LEADING:
-            settled = now_ns - self.since_ns > GRACE_NS
-            lost = any(mode in _GONE or (settled and mode != Mode.TRACK) for mode in modes)
-            return PlannerMode.ALIGNING if lost else PlannerMode.LEADING
+            grace_over = now_ns - self.since_ns > GRACE_NS
+            dropped = any(
+                mode in _NOT_TRACKABLE or (grace_over and mode != Mode.TRACK) for mode in modes
+            )
+            return PlannerMode.ALIGNING if dropped else PlannerMode.LEADING
         if self.mode is PlannerMode.ALIGNING and not self.wait_ns(now_ns) and all(ready):
             return PlannerMode.LEADING
         return PlannerMode.ALIGNING
 
-    def _count_dropouts(self, now_ns: int, after: PlannerMode) -> None:
-        """Count what is lost, and forget one after a good time; `after` is the next mode."""
+    def _count_dropouts(self, now_ns: int, next_mode: PlannerMode) -> None:
+        """Count a drop-out, or forget one after `FORGET_NS` without any."""
         if self.mode is not PlannerMode.LEADING:
             self.steady_since_ns = now_ns
-        elif after in (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED):
+        elif next_mode in (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED):
             self.dropouts = min(self.dropouts + 1, len(WAITS_NS) - 1)
             self.dropped_ns = now_ns
         elif self.dropouts and now_ns - self.steady_since_ns >= FORGET_NS:

@@ -1,4 +1,4 @@
-"""Joint stiffness and damping of the whole body (paper section III). Pure.
+"""Computes joint stiffness and damping of the whole body (paper section III). Pure.
 
 K_q = N K_0 + J^T K_p J - sum_i H_i F_i, B_q = N B_0 + J^T B_p J, N = I - J^+ J.
 """
@@ -30,7 +30,7 @@ class GainLaw:
     """Gains at one configuration."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Filter K_p and B_p by S_perp: no stiffness where the person leads."""
+        """Filter K_p and B_p by S_perp: no stiffness in the directions that the operator leads."""
         law = config.law
         self.S: Array = np.array(law.S, dtype=float)
         closed = 1.0 - self.S
@@ -48,7 +48,7 @@ class GainLaw:
             hessian_F: sum_i H_i F_i (12, 12), N m/rad.
         """
         J = kinematics.J
-        # damped: at a straight knee the plain pseudo-inverse jumps
+        # damped, because the plain pseudo-inverse jumps at a straight knee
         N = self._identity - J.T @ np.linalg.solve(J @ J.T + self._damping, J)
         K_q = self._K_0 * N + (J.T * self.K_p) @ J - hessian_F
         B_q = self._B_0 * N + (J.T * self.B_p) @ J

@@ -1,16 +1,16 @@
-"""The whole-body law: Hybrid Open-Loop Closed-Loop Control (paper, docs/law.md).
+"""Whole-body law: Hybrid Open-Loop Closed-Loop Control (paper, docs/law.md).
 
 One tick, in the paper's letters:
 
-    p, J                 from the measured joints, the feet as they were taken to stand
+    p, J                 from the measured joints and the stance of the feet
     p_ref = S_perp p_C + S p
     q_ref = IK(p_ref)
     v_ref                J v_ref = S J v + S_perp pdot_C, C v_ref = 0
     F     = K_p (p_ref - p) + B_p (pdot_ref - pdot) + F_O
     T                    [J; C] T = [I; 0] at q_ref, so v_ref = T (S J v + S_perp pdot_C)
     K_q, B_q             at q_ref
-    D, D_B               what the joint services hold alone: schedule and certificate
-    K_c, B_c             what these lack of K_p and B_p
+    D, D_B               local gains that the joint services hold: schedule and certificate
+    K_c, B_c             the part of K_p and B_p that D and D_B lack
     tau_ff  = J^T (m g up) + J_harness^T F_assist up
     tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot)] }
 
@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.assist import AssistLaw, LeadEasing, force_up, in_world, is_still
+from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still, wrench_in_world
 from services.planner.coupling import CouplingFilter, UncoupledGains
 from services.planner.gains import GainLaw, JointGains
 from services.planner.inverse_kinematics import InverseKinematics
@@ -34,28 +34,29 @@ from services.planner.load import Load
 from services.planner.shift import ShiftReference
 from services.planner.snapshots import LawState
 from services.planner.split import GainSplit, LocalGains
-from services.planner.stance import FOLLOWED_S, Stance
+from services.planner.stance import FOLLOW_S, Stance
 from shared.config import GRAVITY, RobotConfig
 from shared.messages import STRAIGHT, Pair, Vector3, Vector4, Wrench
 
 Array = NDArray[np.float64]
 
 
-GLIDES = np.array([True, True, False, True, False, True])
-"""Rows of p whose closed-loop reference is brought to zero: no roll or yaw, and the COM over the
-ankles by gravity: off them by its height times the slope of the floor."""
+RECENTRED = np.array([True, True, False, True, False, True])
+"""Rows of p whose closed-loop reference returns to zero: no roll or yaw, and the COM above the
+ankles along gravity. Along the floor's normal the COM is off them by its height times the floor's
+slope."""
 
 
 class LawOutput(NamedTuple):
-    """What one tick asks of the twelve joints, (12,) where not said otherwise."""
+    """Outputs of one tick for the twelve joints, (12,) where no other shape is given."""
 
     q_ref: Array
     v_ref: Array
     tau_ff: Array
     dtau_ff: Array
     tau_coupled: Array
-    tau_missing: Array
-    """J^T [K_c e + B_c e'], before its low-pass."""
+    tau_unfiltered: Array
+    """J^T [K_c e + B_c e'], `tau_coupled` before its low-pass."""
     local: LocalGains
     """D and D_B, certified."""
     p: Array
@@ -66,18 +67,18 @@ class LawOutput(NamedTuple):
     assist: float
     """N"""
     slope: Pair
-    """The floor's rise along x and y, rad."""
+    """Rise of the floor along x and y, rad."""
     stance: Array
-    """The right foot against the left (6,), beyond the robot file, m and rad."""
+    """The right foot relative to the left (6,), as deviation from the robot file, m and rad."""
     ik_iterations: int
     ik_residual: float
 
 
 class Hocca:
-    """The law with its little memory: the closed-loop reference p_C and the assist."""
+    """The law and its state: chiefly the closed-loop reference p_C and the assist."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Prepare; the first tick starts from the measured pose."""
+        """Build the law; the first tick starts from the measured pose."""
         self._measured = Kinematics(config)
         limits = np.array(config.joint_limits())
         self._ik = InverseKinematics(Kinematics(config), limits)
@@ -85,7 +86,9 @@ class Hocca:
         self._split = GainSplit(config)
         self._S = self._gains.S
         coupling = self._split.coupling
-        self._missing = UncoupledGains(self._gains.K_p, self._gains.B_p, self._S, coupling.damping)
+        self._uncoupled = UncoupledGains(
+            self._gains.K_p, self._gains.B_p, self._S, coupling.damping
+        )
         self._coupling = CouplingFilter(coupling.bandwidth_hz)
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
@@ -95,10 +98,10 @@ class Hocca:
         self._F_O: Array = np.zeros(6)
         size = config.geometry.torso_size
         inertia = config.torso_mass * (size[0] ** 2 + size[2] ** 2) / 12.0
-        # the paper's split is there to be compared with: nothing is added to it
+        # the paper's split serves for comparison only: no load correction is added to it
         certified = config.law.split == "certified"
-        largest = config.law.load_correction if certified else (0.0, 0.0)
-        self._load = Load(largest, self._weight, config.torso_mass, inertia)
+        correction_max = config.law.load_correction if certified else (0.0, 0.0)
+        self._load = Load(correction_max, self._weight, config.torso_mass, inertia)
         self._T: Array = np.zeros((12, 6))
         assist = config.assist
         self._assist = AssistLaw(
@@ -111,29 +114,29 @@ class Hocca:
         self._aligned = False
         self._has_led = False
         self._F_assist: Array = np.zeros(3)
-        self._per_p: Array = np.eye(12)[:, :6].copy()
+        self._unit_p: Array = np.eye(12)[:, :6].copy()
 
     @property
     def stance_refused(self) -> bool:
-        """True while the feet stand so that the law does not lead them."""
+        """True while the planner must hold because of the feet's stance."""
         return self._stance.refused
 
     def stance_refusal(self) -> str:
-        """Return in words why it is refused; "" if it is not."""
+        """Return why the stance is refused, as text; "" if it is accepted."""
         return self._stance.refusal() if self._stance.refused else ""
 
     @property
     def load(self) -> Vector3:
-        """What it carries beyond the robot file: kg, and moments a and b, N m."""
+        """Load beyond the robot file: kg, and moments a and b, N m."""
         return self._load.kg, self._load.a, self._load.b
 
     @property
     def load_refused(self) -> bool:
-        """True while the load is farther from the robot file than the law leads."""
+        """True while the load differs from the robot file by more than the law accepts."""
         return self._load.refused
 
     def load_refusal(self) -> str:
-        """Return in words why the load is not led; "" if it is."""
+        """Return why the load is refused, as text; "" if it is accepted."""
         return self._load.refusal()
 
     def tick(
@@ -153,25 +156,25 @@ class Hocca:
         Args:
             q: measured joint angles (12,), rad.
             v: measured joint rates (12,), rad/s.
-            assist_wanted: assist force that the operator asks for, N; rate limited here,
-                but for the first tick, which takes over what HOLD carries.
+            assist_wanted: assist force that the operator requests, N. Its rate is limited here,
+                except in the first tick, which takes over the assist that HOLD carries.
             dt: time since the last tick, s.
-            shift_requested: where x, y (m), roll and yaw (rad) are asked to be; limited here.
-            align: start from the measured pose, so that taking over makes no step: p_C is
-                where the robot is, and glides to zero (COM over the ankles, no roll, no
-                yaw; height and pitch stay) in `law.recentre_s` of ticks without `align`. A
-                planner that has led before starts from zero: where it finds the robot is a
-                sway, and if it is lost again, HOLD would stay where the sway was. A robot
-                held off centre by 25 mm fell at the second push; the modules' blend makes
-                no step of it. Where it was asked to be (`shift_requested`) it stays.
+            shift_requested: requested x, y (m), roll and yaw (rad) of the shift; limited here.
+            align: start from the measured pose, so that engaging makes no step. p_C starts at the
+                measured pose and returns to zero (COM over the ankles, no roll, no yaw; height and
+                pitch stay) during `law.recentre_s` of ticks without `align`. A planner that was
+                engaged before starts from p_C = 0 instead. The pose it finds is then part of a
+                sway, and after another drop-out HOLD would stay at that pose. A robot held off
+                centre by 25 mm fell at the second push. The modules' blend avoids a step in this
+                case. The requested shift (`shift_requested`) is kept.
             wrench: of the operator on the torso, if it is fresh and valid.
             up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
         measured, ik = self._measured, self._ik
         if align or not self._aligned:
-            share = min(1.0, dt / FOLLOWED_S) if self._has_led else 1.0
-            self._stance.take(measured.stance_at(q), share)
-            self._stand_as_taken()
+            fraction = min(1.0, dt / FOLLOW_S) if self._has_led else 1.0
+            self._stance.take(measured.stance_at(q), fraction)
+            self._apply_stance()
         measured.update(q)
         self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._aligned)
         up = self._levelling.up
@@ -196,13 +199,13 @@ class Hocca:
             force = force_up(wrench.force, measured.p[3], measured.p[4])
             moment_pitch = wrench.moment[1]
         still = not align and is_still(pdot[2], pdot[4])
-        given = None if force is None else -force
-        assist_rate = self._assist.advance(assist_wanted, given, dt, still=still)
+        measured_assist = None if force is None else -force
+        assist_rate = self._assist.advance(assist_wanted, measured_assist, dt, still=still)
         ease_z, ease_pitch = self._easing.ease(force, moment_pitch, self._assist.assist, dt)
 
         result = ik.solve(p_ref, measured.D_left)
         q_ref = ik.q.copy()
-        T = self._T = ik.solve_rates(self._per_p)
+        T = self._T = ik.solve_rates(self._unit_p)
         v_ref = T @ pdot_ref
 
         at_ref = ik.kinematics
@@ -219,11 +222,12 @@ class Hocca:
 
         local = self._split.split(body_gains, at_ref.p[2], at_ref.p[4], T, hessian_O)
         K_fail = self._split.certificate.failsafe_stiffness(local.D)
-        K_c, B_c = self._missing.at(K_fail, (T.T * local.D_B) @ T)
-        tau_missing = (K_c @ e_p + B_c @ e_pdot) @ at_ref.J
-        tau_coupled = self._coupling.advance(tau_missing, dt)
-        # the eased lead goes where HOLD drops it: in tau_ff it would outlive the hand. It is a
-        # force fed forward, not joints' rates fed back: the harness filter is all that it needs
+        K_c, B_c = self._uncoupled.at(K_fail, (T.T * local.D_B) @ T)
+        tau_unfiltered = (K_c @ e_p + B_c @ e_pdot) @ at_ref.J
+        tau_coupled = self._coupling.advance(tau_unfiltered, dt)
+        # The eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive
+        # the hand. It is a force fed forward, not fed-back joint rates, so the harness
+        # filter is enough.
         tau_coupled += ease_z * at_ref.J_harness[2] + ease_pitch * at_ref.J[4]
         return LawOutput(
             q_ref,
@@ -231,7 +235,7 @@ class Hocca:
             tau_ff,
             dtau_ff,
             tau_coupled,
-            tau_missing,
+            tau_unfiltered,
             local,
             measured.p.copy(),
             pdot,
@@ -255,29 +259,29 @@ class Hocca:
         return leg_loads(self._measured.C, tau)
 
     def weigh(self, tau: Array, v: Array, wrench: Wrench | None, dt: float, *, led: bool) -> None:
-        """Look for a load that the robot file does not know, at the last tick's pose.
+        """Update the estimate of the load beyond the robot file, at the last tick's pose.
 
         Args:
             tau: measured joint torques (12,), N m.
             v: joint rates (12,), rad/s.
-            wrench: of the operator on the torso; None: it is not known.
-            dt: since the last tick, s.
-            led: the planner leads.
+            wrench: of the operator on the torso; None if it is not known.
+            dt: time since the last tick, s.
+            led: the planner is engaged.
         """
-        if not self._load.looked_for:
+        if not self._load.enabled:
             return
         if wrench is None:
             self._load.advance_without_harness(float(tau @ self._T[:, 2]), dt, led=led)
             return
         at_ref, p = self._ik.kinematics, self._measured.p
-        force, turn = in_world(wrench, float(p[3]), float(p[4]))
-        held = tau + force @ at_ref.J_harness + turn * at_ref.J[4]
+        force, moment = wrench_in_world(wrench, float(p[3]), float(p[4]))
+        tau_held = tau + force @ at_ref.J_harness + moment * at_ref.J[4]
         T, rates = self._T, (self.harness_rate(v), float(self._measured.J[4] @ v))
-        self._load.advance(held @ T, at_ref.J_harness[2] @ T, float(p[4]), rates, dt, led=led)
+        self._load.advance(tau_held @ T, at_ref.J_harness[2] @ T, float(p[4]), rates, dt, led=led)
 
-    def miss_load(self) -> None:
-        """Take it that torques tell nothing now: a state is stale, a leg straight or folded."""
-        self._load.miss()
+    def pause_load_estimate(self) -> None:
+        """Pause the load estimate: a state is stale, or a straight or folded leg hides the load."""
+        self._load.pause()
 
     def harness_rate(self, v: Array) -> float:
         """Return the vertical rate of the harness point at the last tick's pose, m/s, world.
@@ -304,42 +308,44 @@ class Hocca:
             self._load.snapshot(),
         )
 
-    def restore(self, memory: LawState) -> None:
+    def restore(self, state: LawState) -> None:
         """Continue from a state."""
-        self._p_C0 = np.array(memory.p_C0)
-        self._since_align_s, self._aligned = memory.since_align_s, memory.aligned
-        self._has_led = memory.has_led
-        self._ik.q[:] = memory.q
-        self._assist.restore(memory.assist)
-        self._easing.restore(memory.easing)
-        self._coupling.restore(memory.coupling)
-        self._levelling.restore(memory.levelling)
-        self._shift.restore(memory.shift)
-        self._stance.restore(memory.stance)
-        self._load.restore(memory.load)
-        self._stand_as_taken()
+        self._p_C0 = np.array(state.p_C0)
+        self._since_align_s, self._aligned = state.since_align_s, state.aligned
+        self._has_led = state.has_led
+        self._ik.q[:] = state.q
+        self._assist.restore(state.assist)
+        self._easing.restore(state.easing)
+        self._coupling.restore(state.coupling)
+        self._levelling.restore(state.levelling)
+        self._shift.restore(state.shift)
+        self._stance.restore(state.stance)
+        self._load.restore(state.load)
+        self._apply_stance()
 
-    def _stand_as_taken(self) -> None:
+    def _apply_stance(self) -> None:
         for kinematics in (self._measured, self._ik.kinematics):
             kinematics.stance[:] = self._stance.taken
 
     def _align(self, q: Array) -> None:
         self._aligned = True
         self._coupling.reset()
-        begins_at = np.where(GLIDES & self._has_led, 0.0, self._S_perp)
+        kept_rows = np.where(RECENTRED & self._has_led, 0.0, self._S_perp)
         p = self._measured.p.copy()
         p[:2] -= self._levelling.up[:2] / self._levelling.up[2] * p[2]
-        self._p_C0 = p * begins_at
+        self._p_C0 = p * kept_rows
         self._since_align_s = 0.0
         self._ik.q[:] = q
 
     def _closed_loop_reference(self, dt: float) -> tuple[Array, Array]:
-        """Return p_C and its rate: from where `align` found the robot to zero, min-jerk.
+        """Return p_C and its rate: a minimum-jerk path from the pose found by `align` to zero.
 
-        Height and pitch stay where they were found, if they are closed: zero is no stand.
+        Height and pitch stay where they were found, if they are closed: at zero nothing stands.
         """
         self._since_align_s += dt
         s = min(1.0, self._since_align_s / self._recentre_s)
-        left = 1.0 - s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
+        remaining = 1.0 - s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
         rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / self._recentre_s
-        return self._p_C0 * np.where(GLIDES, left, 1.0), self._p_C0 * np.where(GLIDES, rate, 0.0)
+        return self._p_C0 * np.where(RECENTRED, remaining, 1.0), self._p_C0 * np.where(
+            RECENTRED, rate, 0.0
+        )

@@ -1,7 +1,7 @@
-"""What the person asks for, for as long as it is heard (`operator/intent`). Pure.
+"""Keeps the operator's newest intent (`operator/intent`) and fades it out once stale. Pure.
 
-An intent that is not said again goes stale: who asked for 100 N and has gone is not to be lifted
-for ever. It fades out slowly, for somebody may still lean on it:
+An intent that is not repeated goes stale: an operator who requested 100 N and left must not be
+lifted forever. It fades out slowly, because somebody may still lean on the robot:
 
     wish = intent                                       younger than `assist.stale_ms`
     wish = intent max(0, 1 - (age - stale) / fade)      older
@@ -18,37 +18,37 @@ from shared.messages import STRAIGHT, OperatorIntent, Vector4
 
 
 class Wish(NamedTuple):
-    """What the planner is to give."""
+    """Assist force and shift that the operator requests."""
 
     assist_n: float = 0.0
     shift: Vector4 = STRAIGHT
     """x, y in m; roll, yaw in rad."""
     source: str = ""
-    """Who asks; "": nobody does, or no longer."""
+    """Name of the requester; "" if nobody requests anything, or the intent is stale."""
 
 
 class Intents:
-    """Keeps the newest intent, and lets it fade once it is stale."""
+    """Keeps the newest intent, and fades it out once it is stale."""
 
     def __init__(self, config: AssistConfig) -> None:
-        """Take how soon an intent is stale, and how fast it then fades."""
+        """Set the age at which an intent is stale, and the time of its fade."""
         self._stale_ns = round(config.stale_ms * NS_PER_MS)
         self._fade_ns = round(config.fade_s * NS_PER_S)
         self._wish = Wish()
-        self._heard_ns = 0
+        self._received_ns = 0
 
     def receive(self, intent: OperatorIntent, now_ns: int) -> None:
-        """Take an intent that has arrived; one that holds what is no number is none."""
+        """Store an intent that has arrived; ignore one with a value that is not finite."""
         if all(map(math.isfinite, (intent.assist_n, *intent.shift))):
             self._wish = Wish(intent.assist_n, intent.shift, intent.source)
-            self._heard_ns = now_ns
+            self._received_ns = now_ns
 
     def wish(self, now_ns: int) -> Wish:
-        """Return what is asked for now."""
-        late_ns = now_ns - self._heard_ns - self._stale_ns
+        """Return the assist and shift that are requested now."""
+        late_ns = now_ns - self._received_ns - self._stale_ns
         if late_ns <= 0:
             return self._wish
-        share = max(0.0, 1.0 - late_ns / self._fade_ns)
+        scale = max(0.0, 1.0 - late_ns / self._fade_ns)
         x, y, roll, yaw = self._wish.shift
-        shift = share * x, share * y, share * roll, share * yaw
-        return Wish(share * self._wish.assist_n, shift)
+        shift = scale * x, scale * y, scale * roll, scale * yaw
+        return Wish(scale * self._wish.assist_n, shift)

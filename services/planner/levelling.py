@@ -1,19 +1,22 @@
-"""Which way is up, seen from the floor under the feet. Pure.
+"""Estimates the floor's slope from IMU and joints, as the direction of up in floor axes. Pure.
 
-The planner's axes are the floor's: z is its normal (docs/law.md#slopes). On a slope gravity leans
-in them by the slope's angle, and a COM above the ankles by the floor's normal is not above them by
-gravity: at a height of 1 m and 5 degrees it is 87 mm off, and the weight pulls it along the floor.
+The planner's axes are the floor's: z is the floor's normal (docs/law.md#slopes). On a slope,
+gravity leans in these axes by the slope's angle. A COM above the ankles along the floor's normal is
+then not above them along gravity. At a height of 1 m and 5 degrees it is 87 mm off, and the weight
+pulls it downhill.
 
-The IMU says where up is in torso axes, the joints say how the torso stands on the floor:
+The IMU gives up in torso axes, and the joints give the torso's orientation on the floor:
 
-    up_floor = R_torso(q) up_torso,        followed through one pole of `imu.levelling_s`
+    up_floor = R_torso(q) up_torso,        low-passed by one pole of `imu.levelling_s`
 
-Zero errors of the ankles turn R_torso and so up_floor: the COM is led above the ankles all the
-same. Those of knees and hips do so too, where without an IMU they would not have mattered: half a
-degree at both hips moves the COM by 8 mm. Joints that flex are not in q: a sway looks like a floor
-that tilts, which is why it is followed slowly. A floor does not jump: with no IMU for a while the
-last slope stands, with none since this planner began the floor is level, and an IMU that is first
-heard while the planner leads is followed from level on.
+Zero errors of the ankles turn R_torso and so up_floor, but the COM is still controlled to be above
+the ankles. Zero errors of knees and hips also turn it; without an IMU they would not matter. Half a
+degree at both hips moves the COM by 8 mm.
+
+Deflection of flexible joints is not in q, so a sway looks like a floor that tilts. The slope is
+therefore followed slowly. A floor does not jump: without an IMU the last slope stays. If this
+planner never received one, the floor counts as level. An IMU first received while the planner is
+engaged is followed from level on.
 """
 
 from __future__ import annotations
@@ -29,19 +32,19 @@ from shared.messages import Pair, Vector3
 Array = NDArray[np.float64]
 
 SLOPE_MAX: Final = 0.12
-"""rad either way, 7 degrees: beyond it is no floor that this robot stands on, but an IMU that has
-come loose, and what it says is left out."""
+"""rad each way, 7 degrees. This robot stands on no steeper floor, so a larger value means an IMU
+that has come loose, and is ignored."""
 
 
 class Levelling:
-    """The slope of the floor, low-passed.
+    """Low-passed slope of the floor.
 
     Attributes:
         slope: rise of the floor along x and along y, rad, as in the plant's `floor.slope`.
     """
 
     def __init__(self, levelling_s: float) -> None:
-        """Begin on a level floor.
+        """Start with a level floor.
 
         Args:
             levelling_s: time constant, s.
@@ -53,41 +56,41 @@ class Levelling:
 
     @property
     def up(self) -> Array:
-        """(3,) unit vector against gravity, floor axes."""
+        """Unit vector against gravity (3,), floor axes."""
         return self._up
 
     def advance(
         self, up_torso: Vector3 | None, angles: Array, dt: float, *, jump: bool = False
     ) -> None:
-        """Take what the IMU says.
+        """Update the slope with the IMU's newest attitude.
 
         Args:
-            up_torso: unit vector against gravity, torso axes; None: not known now.
-            angles: the torso's roll, pitch and yaw on the floor by the joints, rad.
-            dt: since the last call, s.
-            jump: nobody is led: the first that is heard is taken as it is.
+            up_torso: unit vector against gravity, torso axes; None if it is not known now.
+            angles: the torso's roll, pitch and yaw on the floor from the joints, rad.
+            dt: time since the last call, s.
+            jump: the planner is not engaged: take the first known slope at once.
         """
         if up_torso is None:
             return
         x, y = slope_of(up_torso, *angles.tolist())
         if max(abs(x), abs(y)) > SLOPE_MAX:
             return
-        whole = jump and not self._known
+        at_once = jump and not self._known
         self._known = True
-        share = 1.0 if whole else 1.0 - math.exp(-dt / self._levelling_s)
+        gain = 1.0 if at_once else 1.0 - math.exp(-dt / self._levelling_s)
         before = self.slope
-        self._stand_on((before[0] + share * (x - before[0]), before[1] + share * (y - before[1])))
+        self._set_slope((before[0] + gain * (x - before[0]), before[1] + gain * (y - before[1])))
 
     def snapshot(self) -> tuple[bool, float, float]:
         """Return whether a slope is known, and the slope, rad."""
         return (self._known, *self.slope)
 
-    def restore(self, memory: tuple[bool, float, float]) -> None:
-        """Go on from what `snapshot` returned."""
-        self._known = memory[0]
-        self._stand_on(memory[1:])
+    def restore(self, state: tuple[bool, float, float]) -> None:
+        """Continue from a state that `snapshot` returned."""
+        self._known = state[0]
+        self._set_slope(state[1:])
 
-    def _stand_on(self, slope: Pair) -> None:
+    def _set_slope(self, slope: Pair) -> None:
         self.slope = slope
         self._up[:] = up_of(slope)
 
@@ -99,13 +102,13 @@ def up_of(slope: Pair) -> Vector3:
 
 
 def slope_of(up_torso: Vector3, roll: float, pitch: float, yaw: float) -> Pair:
-    """Return the floor's rise along x and y, rad; upside down is steeper than any floor.
+    """Return the floor's rise along x and y, rad; (pi, pi) if the torso is upside down.
 
     Args:
         up_torso: unit vector against gravity, torso axes.
         roll: of the torso on the floor, rad; R = Rz(yaw) Rx(roll) Ry(pitch).
-        pitch: rad.
-        yaw: rad.
+        pitch: of the torso on the floor, rad.
+        yaw: of the torso on the floor, rad.
     """
     x, y, z = up_torso
     x, z = math.cos(pitch) * x + math.sin(pitch) * z, math.cos(pitch) * z - math.sin(pitch) * x

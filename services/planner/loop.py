@@ -1,4 +1,4 @@
-"""The planner's loop: read six states, think, publish six commands and a status."""
+"""Runs the planner's loop: read six states, compute, publish six commands and a status."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from shared.traces import PlannerCheckpoint
 
 
 class PlannerPorts(msgspec.Struct, frozen=True):
-    """The planner's bus ends; per module in `MODULES` order."""
+    """The planner's subscribers and publishers; one per module in `MODULES` order."""
 
     states: Sequence[Latest[JointState]]
     wrench: Latest[Wrench]
@@ -37,33 +37,33 @@ class PlannerPorts(msgspec.Struct, frozen=True):
 
 
 POLL_NS = 400 * NS_PER_US
-"""Between two looks for states, once they are due."""
-REST_SHARE = 0.8
-"""Of a period: so long nothing is expected after a tick."""
+"""ns between two polls for states, once they are due."""
+REST_FRACTION = 0.8
+"""Fraction of a period after a tick in which no states are expected."""
 
 
 class PlannerLoop:
-    """Ticks the planner as its six states come, at its rate."""
+    """Ticks the planner when its six states have arrived, at their rate."""
 
     def __init__(self, config: RobotConfig, planner: Planner, ports: PlannerPorts) -> None:
         self._planner = planner
         self._ports = ports
-        self._rest_ns = round(REST_SHARE * NS_PER_S / config.planner.rate_hz)
+        self._rest_ns = round(REST_FRACTION * NS_PER_S / config.planner.rate_hz)
         self._intents = Intents(config.assist)
         self._checkpoints = Checkpoints(config.planner.rate_hz)
 
     def run(self, stop: StopFlag) -> None:
-        """Run until told to stop."""
+        """Run until `stop` is set."""
         while not stop:
             now = now_ns()
-            if self.listen(now):
+            if self.receive_states(now):
                 self.tick(now)
                 sleep_until(now + self._rest_ns)
             else:
                 sleep_until(now + POLL_NS)
 
-    def listen(self, now: int) -> bool:
-        """Take in new states; return True if it is time to tick."""
+    def receive_states(self, now: int) -> bool:
+        """Receive new states; return True if a tick is due."""
         planner = self._planner
         for module, latest in enumerate(self._ports.states):
             state = latest.take()
@@ -72,7 +72,7 @@ class PlannerLoop:
         return planner.is_due(now)
 
     def tick(self, now: int) -> None:
-        """Think and publish."""
+        """Receive the other inputs, run one tick and publish its results."""
         planner, ports = self._planner, self._ports
         wrench = ports.wrench.take()
         if wrench is not None:

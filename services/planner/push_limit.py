@@ -1,19 +1,19 @@
-"""How hard a push a stand bears before a sole tips, a motor saturates or a foot slides. Pure.
+"""Computes the largest constant push before a sole tips, a motor saturates or a foot slides. Pure.
 
-The stiffness certificate (`services.planner.certificate`) is linear: it knows no limits. This
-module adds them, for a constant horizontal push F u at the torso's origin:
+The stiffness certificate (`services.planner.certificate`) is linear and has no limits. This module
+adds them, for a constant horizontal push F u at the torso's origin:
 
-1. Held by local gains D, references at rest, and while the planner leads by K_c beside them
-   (`services.planner.coupling`). The body moves to dp and every torque changes:
+1. Limit of the gains. Local gains D hold with references at rest; while the planner is engaged,
+   K_c acts beside them (`services.planner.coupling`). The body moves by dp and the torques change:
 
        (K_fail + K_c) dp = F pi,   pi = (dr_torso/dp)^T u,   dtau = -D T dp - J^T K_c dp
 
-2. Whatever the control does, the joints where they are: a linear program over how the two legs
-   share weight and push. No gains bear more at that pose.
+2. Limit of the body, whatever the control does, at fixed joint angles. A linear program chooses how
+   the two legs share weight and push. No gains hold a harder push at that pose.
 
-Leg i carries the wrench W_i of the torso, tau_i = J_i^T W_i + the weight of its knee. Its sole
-carries W_i moved to the ankle, and the leg's weight. J_i^T dW_i = dtau_i - (H T dp)_i.
-Every limit is linear in tau and in the soles' wrenches, so the first one met gives the force.
+Leg i carries the torso wrench W_i: tau_i = J_i^T W_i + the torque of its knee's weight. Its sole
+carries W_i moved to the ankle, plus the leg's weight. J_i^T dW_i = dtau_i - (H T dp)_i. Every limit
+is linear in tau and in the soles' wrenches, so the first limit reached sets the force.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from shared.robot_model import ankle_positions
 Array = NDArray[np.float64]
 
 FRICTION: Final = 0.5
-"""Coefficient of the soles on a poor floor."""
+"""Friction coefficient of the soles on a slippery floor."""
 DIRECTIONS: Final = {
     "forwards": (1.0, 0.0),
     "back": (-1.0, 0.0),
     "sideways": (0.0, 1.0),
 }
-"""World x and y of a push; left and right are alike."""
+"""World x and y of each push. Left and right are symmetric."""
 _SLOPE_MIN: Final = 1e-12
 _LEGS: Final = (slice(0, N_LEG), slice(N_LEG, N_JOINTS))
 
@@ -50,37 +50,40 @@ class PushLimit(NamedTuple):
     """The hardest push along one direction."""
 
     force_n: float
-    """0: it does not stand without a push either."""
+    """0 if the pose does not stand even without a push."""
     part: str
-    """What gives way first, such as "left sole's outer edge"."""
+    """The limit reached first, such as "left sole's outer edge"."""
 
 
 class PushLimits(NamedTuple):
-    """The hardest constant push along one direction, by who holds."""
+    """The hardest constant push along one direction, for each set of active controllers."""
 
     led: PushLimit
-    """TRACK: the joint services and the planner."""
+    """TRACK: joint services and planner."""
     held: PushLimit
-    """HOLD: the planner is dead."""
+    """HOLD: joint services only, the planner is dead."""
     drives: PushLimit
-    """The joint services are dead as well."""
+    """Drives only, the joint services are dead as well."""
     body: PushLimit
-    """Soles and motors, whatever the control."""
+    """Limit of soles and motors under any control."""
 
 
 class Response(NamedTuple):
-    """What a push of 1 N does once the body has come to rest."""
+    """Change caused by a push of 1 N, once the body has come to rest."""
 
     dp: Array
     """(6,) m and rad."""
     dtau: Array
-    """(12,) N m at the joints."""
+    """(12,) joint torques, N m."""
     soles: Array
     """(12,): force and moment at each ankle, N and N m, right leg first."""
 
 
 class _Limit(NamedTuple):
-    """row @ (tau, soles) <= bound; tau (12,) in N m, soles (12,) as force and moment at ankles."""
+    """Linear limit row @ (tau, soles) <= bound.
+
+    `tau` (12,) is in N m; `soles` (12,) holds force and moment at each ankle, N and N m.
+    """
 
     part: str
     row: Array
@@ -88,10 +91,10 @@ class _Limit(NamedTuple):
 
 
 class LoadedStand:
-    """One pose under its own weight: torques and wrenches, and how they change with a push."""
+    """Torques and wrenches of one pose under its own weight, and their change with a push."""
 
     def __init__(self, config: RobotConfig, kinematics: Kinematics, T: Array, H: Array) -> None:
-        """Take the pose.
+        """Compute the loads of the pose.
 
         Args:
             config: the robot.
@@ -104,11 +107,11 @@ class LoadedStand:
         self._J_body = kinematics.J.copy()
         C = kinematics.C
         self._J = (-C[:, :N_LEG], C[:, N_LEG:].copy())
-        """Torso's twist per joint rate of each leg (6, 6), linear before angular."""
+        """Torso twist per joint rate of each leg (6, 6), linear before angular."""
         D_left = kinematics.D_left
         weight = config.torso_mass * GRAVITY
         self._W = [weight * shares[:, 2] for shares in (np.eye(6) - D_left, D_left)]
-        """Torso's wrench on each leg (6,), N and N m at its origin."""
+        """Torso wrench on each leg (6,), N and N m at the torso's origin."""
         F_O = np.zeros(6)
         F_O[2] = config.total_mass * GRAVITY
         self._tau: Array = F_O @ kinematics.J
@@ -117,14 +120,15 @@ class LoadedStand:
         ankles = ankle_positions(config) + np.outer((0.5, -0.5), kinematics.stance[:3])
         self._arms = [kinematics.r_torso - ankle for ankle in ankles]
         self._leg_weights = [
-            # the knee's weight turns the ankle by what the ankle's torque says
+            # the knee's weight turns the ankle with the moment that the ankle's torques
+            # show
             np.array([0.0, 0.0, 2.0 * config.mass.module * GRAVITY, *self._tau_knees[leg][:2], 0.0])
             for leg in _LEGS
         ]
         self._limits = _limits(config)
 
     def along_p(self, gains: Array) -> Array:
-        """Return T^T diag(gains) T (6, 6): joint gains (12,) as the body feels them."""
+        """Return T^T diag(gains) T (6, 6): the joint gains (12,) in the coordinates p."""
         return np.asarray((self._T.T * gains) @ self._T, float)
 
     def stiffness(self, D: Array) -> Array:
@@ -135,12 +139,12 @@ class LoadedStand:
     def response(
         self, D: Array, direction: tuple[float, float], K_c: Array | None = None
     ) -> Response | None:
-        """Return what a constant push of 1 N does, None if the gains do not stand at all.
+        """Return the response to a constant push of 1 N; None if the gains do not stand at all.
 
         Args:
-            D: local stiffnesses (12,), N m/rad; on a drivetrain that flexes with k, D k / (D + k).
+            D: local stiffnesses (12,), N m/rad. With drivetrain stiffness k, pass D k / (D + k).
             direction: world x and y, a unit vector.
-            K_c: what the planner adds along p (6, 6); None: it is dead.
+            K_c: stiffness that the planner adds along p (6, 6); None if the planner is dead.
         """
         T = self._T
         K = self.stiffness(D) + (0.0 if K_c is None else K_c)
@@ -152,15 +156,15 @@ class LoadedStand:
         dtau: Array = np.asarray(-D * dq, float)
         if K_c is not None:
             dtau -= self._J_body.T @ (K_c @ dp)
-        turned = dtau - self._H @ dq
+        dtau_wrench = dtau - self._H @ dq
         dW: list[Array] = [
-            np.asarray(np.linalg.solve(J.T, turned[leg]), float)
+            np.asarray(np.linalg.solve(J.T, dtau_wrench[leg]), float)
             for J, leg in zip(self._J, _LEGS, strict=True)
         ]
         soles = self._soles(dW) - np.concatenate(self._leg_weights)
-        moved = (self._J[0] @ dq[_LEGS[0]])[:3]
-        for leg, W in enumerate(self._W):  # the torso's weight moves with it
-            soles[6 * leg + 3 : 6 * leg + 6] += np.cross(moved, W[:3])
+        torso_shift = (self._J[0] @ dq[_LEGS[0]])[:3]
+        for leg, W in enumerate(self._W):  # the torso's weight moves with the torso
+            soles[6 * leg + 3 : 6 * leg + 6] += np.cross(torso_shift, W[:3])
         return Response(dp, dtau, soles)
 
     def limit_held(
@@ -170,18 +174,18 @@ class LoadedStand:
         response = self.response(D, direction, K_c)
         if response is None:
             return PushLimit(0.0, "the stiffness")
-        begin = np.concatenate((self._tau, self._soles(self._W)))
+        unpushed = np.concatenate((self._tau, self._soles(self._W)))
         per_newton = np.concatenate((response.dtau, response.soles))
-        found = PushLimit(math.inf, "nothing")
+        hardest = PushLimit(math.inf, "nothing")
         for part, row, bound in self._limits:
             slope = float(row @ per_newton)
             if slope > _SLOPE_MIN:
-                force = max(0.0, (bound - float(row @ begin)) / slope)
-                found = min(found, PushLimit(force, part))
-        return found
+                force = max(0.0, (bound - float(row @ unpushed)) / slope)
+                hardest = min(hardest, PushLimit(force, part))
+        return hardest
 
     def limit_of_body(self, direction: tuple[float, float]) -> PushLimit:
-        """Return the hardest push that soles and motors bear at this pose, whatever the control.
+        """Return the hardest push that soles and motors bear at this pose under any control.
 
         Args:
             direction: world x and y, a unit vector.
@@ -189,42 +193,45 @@ class LoadedStand:
         total, unit = self._W[0] + self._W[1], _horizontal(direction)
 
         def loads(x: Array) -> Array:
-            """Return (tau, soles): the right leg carries x[:6], the push is x[6]."""
+            """Return (tau, soles); the right leg carries x[:6], the push is x[6] in N."""
             W = [x[:6], total - x[6] * unit - x[:6]]
             return np.concatenate((self._joint_torques(W) + self._tau_knees, self._soles(W)))
 
-        begin = loads(np.zeros(7))
-        slopes = np.array([loads(e) - begin for e in np.eye(7)]).T
+        unpushed = loads(np.zeros(7))
+        slopes = np.array([loads(e) - unpushed for e in np.eye(7)]).T
         rows = np.array([limit.row for limit in self._limits])
-        bounds = np.array([limit.bound for limit in self._limits]) - rows @ begin
-        found = scipy.optimize.linprog(
+        bounds = np.array([limit.bound for limit in self._limits]) - rows @ unpushed
+        solution = scipy.optimize.linprog(
             -np.eye(7)[6],
             A_ub=rows @ slopes,
             b_ub=bounds,
             bounds=[(None, None)] * 6 + [(0.0, None)],
         )
-        if not found.success:
+        if not solution.success:
             return PushLimit(0.0, "the pose itself")
-        tightest = int(np.argmin(bounds - rows @ slopes @ found.x))
-        return PushLimit(float(found.x[6]), self._limits[tightest].part)
+        tightest = int(np.argmin(bounds - rows @ slopes @ solution.x))
+        return PushLimit(float(solution.x[6]), self._limits[tightest].part)
 
     def _joint_torques(self, W: list[Array]) -> Array:
-        """Return the torques (12,), N m, that carry the torso's wrench on each leg."""
+        """Return the joint torques (12,), N m, that carry the torso's wrench on each leg."""
         return np.concatenate([J.T @ wrench for J, wrench in zip(self._J, W, strict=True)])
 
     def _soles(self, W: list[Array]) -> Array:
         """Return both soles' wrenches (12,), N and N m at the ankles."""
         wrenches = []
-        for wrench, arm, own in zip(W, self._arms, self._leg_weights, strict=True):
+        for wrench, arm, leg_weight in zip(W, self._arms, self._leg_weights, strict=True):
             moment = wrench[3:] + np.cross(arm, wrench[:3])
-            wrenches.append(np.concatenate((wrench[:3], moment)) + own)
+            wrenches.append(np.concatenate((wrench[:3], moment)) + leg_weight)
         return np.concatenate(wrenches)
 
 
 def limits_at(
     config: RobotConfig, kinematics: Kinematics, T: Array, H: Array, D: Array, D_B: Array
 ) -> dict[str, PushLimits]:
-    """Return the limits of a pose along each of `DIRECTIONS`; arguments as for the two below."""
+    """Return the limits of a pose along each of `DIRECTIONS`.
+
+    Args as for `LoadedStand` and `limits_along`.
+    """
     stand = LoadedStand(config, kinematics, T, H)
     return {
         name: limits_along(stand, config, D, D_B, direction)
@@ -246,22 +253,22 @@ def limits_along(
     """
     law, schedule = config.law, config.gain_schedule
     damping = 0.0 if schedule is None else schedule.coupling_damping
-    missing = UncoupledGains(np.array(law.K_p), np.array(law.B_p), np.array(law.S), damping)
-    K_c, _ = missing.at(stand.stiffness(D), stand.along_p(D_B))
-    in_hold = np.maximum(D, np.ravel([config.hold_gains(module)[0] for module in MODULES]))
+    uncoupled = UncoupledGains(np.array(law.K_p), np.array(law.B_p), np.array(law.S), damping)
+    K_c, _ = uncoupled.at(stand.stiffness(D), stand.along_p(D_B))
+    D_hold = np.maximum(D, np.ravel([config.hold_gains(module)[0] for module in MODULES]))
     return PushLimits(
         stand.limit_held(D, direction, K_c),
-        stand.limit_held(in_hold, direction),
-        stand.limit_held(motor_mean(in_hold), direction),
+        stand.limit_held(D_hold, direction),
+        stand.limit_held(motor_mean(D_hold), direction),
         stand.limit_of_body(direction),
     )
 
 
 def slope_pulling(config: RobotConfig, force_n: float) -> float:
-    """Return the floor's slope, rad, that pulls the weight along it as hard as a push (N).
+    """Return the floor slope, rad, that pulls the weight downhill as hard as a push (N).
 
-    Without an IMU the planner stands along the floor's normal, and the weight leans on the gains
-    like a push at the torso: somewhat less, for a third of the mass hangs lower.
+    Without an IMU the planner stands along the floor's normal, and the weight loads the gains like
+    a push at the torso. The real load is somewhat smaller, because a third of the mass hangs lower.
     """
     return math.asin(min(1.0, force_n / (config.total_mass * GRAVITY)))
 
@@ -271,7 +278,7 @@ def _horizontal(direction: tuple[float, float]) -> Array:
 
 
 def _limits(config: RobotConfig) -> list[_Limit]:
-    """Return the limits of every motor pair, sole edge and sole's friction."""
+    """Return the limits of every motor pair, sole edge and sole friction."""
     limits = []
     for index, module in enumerate(MODULES):
         for phi in (-1.0, 1.0):

@@ -1,8 +1,8 @@
-"""Where the person asks the closed directions to be: a follower with limits. Pure.
+"""Second-order follower, with limits, for the operator's shift of the closed directions. Pure.
 
-The robot keeps its COM over the ankles and its torso straight by itself. A person may ask for a
-little off that (`operator/intent`): COM forwards or aside, torso rolled or turned. The reference
-goes there without a jump, no faster than `SHIFT_S` for the whole range, and no farther than
+By itself the robot keeps its COM over the ankles and its torso upright. The operator may request a
+small offset (`operator/intent`): COM forwards or sideways, torso rolled or yawed. The reference
+follows without a jump. It takes at least `SHIFT_S` for the whole range and stays within
 `law.shift_max`:
 
     r'' = w^2 (wanted - r) - 2 w r',   |r'| <= shift_max / SHIFT_S
@@ -22,22 +22,22 @@ from shared.messages import Vector4
 Array = NDArray[np.float64]
 
 ROWS: Final = (0, 1, 3, 5)
-"""Rows of p that are shifted: x, y, roll, yaw."""
+"""Rows of p that the shift moves: x, y, roll, yaw."""
 SHIFT_S: Final = 1.0
-"""The whole range from the middle takes so long, s."""
+"""Shortest time from the middle to the end of the range, s."""
 OMEGA: Final = 6.0
-"""rad/s; critically damped."""
+"""w, rad/s; the follower is critically damped."""
 
 
 class ShiftReference:
-    """The reference (x, y, roll, yaw) that follows what is asked.
+    """Reference (x, y, roll, yaw) that follows the requested shift.
 
-    In plain numbers: NumPy's calls on four of them cost more than the arithmetic.
+    It uses plain floats: for four values, NumPy's calls cost more than the arithmetic.
     """
 
-    def __init__(self, largest: Sequence[float]) -> None:
-        """Take the largest shift each way: m, m, rad, rad."""
-        self._largest = tuple(largest)
+    def __init__(self, shift_max: Sequence[float]) -> None:
+        """Set the largest shift each way: m, m, rad, rad."""
+        self._shift_max = tuple(shift_max)
         self._at = [0.0] * len(ROWS)
         self._rate = [0.0] * len(ROWS)
 
@@ -45,18 +45,18 @@ class ShiftReference:
         """Follow for dt seconds.
 
         Args:
-            wanted: x, y in m, roll, yaw in rad; beyond the limits: the limits.
-            dt: since the last tick, s.
+            wanted: x, y in m, roll, yaw in rad; clipped to the limits.
+            dt: time since the last tick, s.
         """
         at, rate = self._at, self._rate
-        for i, most in enumerate(self._largest):
-            aim, fastest = min(most, max(-most, wanted[i])), most / SHIFT_S
-            speed = rate[i] + dt * OMEGA * (OMEGA * (aim - at[i]) - 2.0 * rate[i])
-            rate[i] = min(fastest, max(-fastest, speed))
+        for i, limit in enumerate(self._shift_max):
+            target, rate_max = min(limit, max(-limit, wanted[i])), limit / SHIFT_S
+            rate_next = rate[i] + dt * OMEGA * (OMEGA * (target - at[i]) - 2.0 * rate[i])
+            rate[i] = min(rate_max, max(-rate_max, rate_next))
             at[i] += dt * rate[i]
 
     def rest(self) -> None:
-        """Stay where it is while nobody is led."""
+        """Stop at the current shift while the planner is not engaged."""
         self._rate = [0.0] * len(ROWS)
 
     def add_to(self, p: Array, pdot: Array) -> None:
@@ -67,13 +67,13 @@ class ShiftReference:
 
     def snapshot(self) -> ShiftState:
         """Return the state."""
-        return ShiftState(_four(self._at), _four(self._rate))
+        return ShiftState(_vector4(self._at), _vector4(self._rate))
 
-    def restore(self, memory: ShiftState) -> None:
+    def restore(self, state: ShiftState) -> None:
         """Continue from a state."""
-        self._at, self._rate = list(memory.at), list(memory.rate)
+        self._at, self._rate = list(state.at), list(state.rate)
 
 
-def _four(values: Sequence[float]) -> Vector4:
+def _vector4(values: Sequence[float]) -> Vector4:
     a, b, c, d = values
     return a, b, c, d

@@ -1,9 +1,9 @@
-"""The gain split: what of K_q and B_q the joint services hold alone (docs/law.md#gain-split).
+"""Gain split: the part of K_q and B_q that the joint services hold alone (docs/law.md#gain-split).
 
-`certified` takes D from the schedule made offline, `diagonal` is the paper's diag(K_q).
-Either way no gains leave without their certificate: where the margin is not met, D is
-stiffened towards gains that stand, and if none of these does either, the split says so
-and the robot is to hold. Pure.
+`certified` takes D from the schedule computed offline; `diagonal` is the paper's diag(K_q). In both
+cases the certificate checks the gains. Where D misses the margin, the split stiffens D towards
+certified gains. If no step meets the margin, the source is UNCERTIFIED and the robot must hold.
+Pure.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from shared.messages import SplitSource
 
 Array = NDArray[np.float64]
 
-STIFFEN: Final = (0.25, 0.5, 0.75, 1.0)
-"""Shares of the way from the wanted D to the stiff one, tried in turn."""
+STIFFEN_FRACTIONS: Final = (0.25, 0.5, 0.75, 1.0)
+"""Fractions of the way from the wanted D to the stiff one, tried in turn."""
 
 
 class LocalGains(NamedTuple):
-    """What the joint services hold alone."""
+    """Local gains that the joint services hold alone."""
 
     D: Array
     """(12,) local stiffness, N m/rad, >= 0."""
@@ -42,22 +42,22 @@ class LocalGains(NamedTuple):
 
 
 class CouplingGains(NamedTuple):
-    """How much the planner may add, and how fast (`services.planner.coupling`)."""
+    """Damping and bandwidth of the planner's coupled torque (`services.planner.coupling`)."""
 
     bandwidth_hz: float
     damping: float
-    """c, in shares of B_p."""
+    """c, as a fraction of B_p."""
 
 
 UNCERTIFIED_COUPLING: Final = CouplingGains(4.0, 1.0)
-"""Of a robot without a schedule: the paper's split, or averaged legs, for comparison."""
+"""For a robot without a schedule: the paper's split, or averaged legs, for comparison."""
 
 
 class ScheduledGains:
-    """D over COM height and pitch: bilinear between nodes, held beyond the last."""
+    """D over COM height and pitch: bilinear between nodes, constant beyond the last."""
 
     def __init__(self, schedule: GainSchedule) -> None:
-        """Take the table."""
+        """Store the table."""
         self._z, self._pitch = schedule.z, schedule.pitch
         table = np.array(schedule.D)
         self._table: Array = np.concatenate((table, table), axis=2)
@@ -66,8 +66,8 @@ class ScheduledGains:
 
     def at(self, z: float, pitch: float) -> Array:
         """Return D (12,), N m/rad, at a COM height (m) and a torso pitch (rad)."""
-        i, a = _between(self._z, z)
-        j, b = _between(self._pitch, pitch)
+        i, a = _interval(self._z, z)
+        j, b = _interval(self._pitch, pitch)
         low, high = self._table[i], self._table[i + 1]
         return np.asarray(
             (1.0 - a) * ((1.0 - b) * low[j] + b * low[j + 1])
@@ -76,18 +76,18 @@ class ScheduledGains:
         )
 
 
-def _between(nodes: tuple[float, ...], value: float) -> tuple[int, float]:
-    """Return the interval's index and the share of the way through it, 0 .. 1."""
+def _interval(nodes: tuple[float, ...], value: float) -> tuple[int, float]:
+    """Return the interval's index and the fraction of the way through it, 0 .. 1."""
     i = min(max(bisect_right(nodes, value) - 1, 0), len(nodes) - 2)
-    share = (value - nodes[i]) / (nodes[i + 1] - nodes[i])
-    return i, min(1.0, max(0.0, share))
+    fraction = (value - nodes[i]) / (nodes[i + 1] - nodes[i])
+    return i, min(1.0, max(0.0, fraction))
 
 
 class GainSplit:
     """Chooses D and D_B and certifies them."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Take the schedule, the limits and the stiff gains to fall back on.
+        """Load the schedule, the limits and the stiff gains to fall back on.
 
         Raises:
             ConfigError: the split needs a schedule, and the robot's is missing or stale.
@@ -100,8 +100,8 @@ class GainSplit:
             if stale or config.gain_schedule is None:
                 raise ConfigError("robot", "law.split", stale, "run `xrl gains --config FILE`")
             self._schedule = ScheduledGains(config.gain_schedule)
-            made = config.gain_schedule
-            self.coupling = CouplingGains(made.coupling_bandwidth_hz, made.coupling_damping)
+            schedule = config.gain_schedule
+            self.coupling = CouplingGains(schedule.coupling_bandwidth_hz, schedule.coupling_damping)
         limits = config.certificate
         self._margins_min = Margins(limits.margin_min, limits.onboard_margin_min)
         self._k_q_fraction_max = limits.k_q_fraction_max
@@ -122,7 +122,7 @@ class GainSplit:
         """Return the local gains at a reference pose.
 
         Args:
-            body_gains: K_q and B_q there; asked for only where the schedule does not do.
+            body_gains: returns K_q and B_q there; called only if the schedule misses the margins.
             z: COM height, m.
             pitch: of the torso, rad.
             T: joint rates per unit of p along the closed chain (12, 6).
@@ -134,38 +134,38 @@ class GainSplit:
         if schedule is not None:
             D = schedule.at(z, pitch)
             margins = certificate.margins(D)
-            if self._enough(margins):
+            if self._meets_margins(margins):
                 return LocalGains(D, schedule.D_B, margins, SplitSource.SCHEDULE)
-            diagonal, D_B = self._of_body(body_gains())[0], schedule.D_B
+            diagonal, D_B = self._diagonal_gains(body_gains())[0], schedule.D_B
         else:
-            diagonal, D_B = self._of_body(body_gains())
+            diagonal, D_B = self._diagonal_gains(body_gains())
             D, margins = diagonal, certificate.margins(diagonal)
-            if self._enough(margins):
+            if self._meets_margins(margins):
                 return LocalGains(D, D_B, margins, SplitSource.DIAGONAL)
-        D, margins, source = self._stiffened(D, diagonal, margins)
+        D, margins, source = self._stiffen(D, diagonal, margins)
         return LocalGains(D, D_B, margins, source)
 
-    def _of_body(self, body: JointGains) -> tuple[Array, Array]:
-        """Return diag(K_q) and the configured share of diag(B_q), as far as they are allowed."""
-        own = self._damping_fraction * np.diagonal(body.B_q)
+    def _diagonal_gains(self, body: JointGains) -> tuple[Array, Array]:
+        """Return diag(K_q) and the configured fraction of diag(B_q), each within its limits."""
+        D_B = self._damping_fraction * np.diagonal(body.B_q)
         return (
             np.minimum(np.maximum(np.diagonal(body.K_q), 0.0), self._k_max),
-            np.minimum(np.maximum(own, 0.0), self._d_max),
+            np.minimum(np.maximum(D_B, 0.0), self._d_max),
         )
 
-    def _enough(self, margins: Margins) -> bool:
-        least = self._margins_min
-        return margins.service >= least.service and margins.onboard >= least.onboard
+    def _meets_margins(self, margins: Margins) -> bool:
+        minimum = self._margins_min
+        return margins.service >= minimum.service and margins.onboard >= minimum.onboard
 
-    def _stiffened(
+    def _stiffen(
         self, D: Array, diagonal: Array, margins: Margins
     ) -> tuple[Array, Margins, SplitSource]:
-        """Return the nearest certified gains on the way to the stiffest that are allowed."""
+        """Return the softest certified gains on the way to the stiffest allowed ones."""
         stiff = np.maximum(np.maximum(D, self._stand), self._k_q_fraction_max * diagonal)
         stiff = np.minimum(stiff, self._k_max)
-        for share in STIFFEN:
-            D_near = D + share * (stiff - D)
-            margins = self.certificate.margins(D_near)
-            if self._enough(margins):
-                return D_near, margins, SplitSource.STIFFENED
+        for fraction in STIFFEN_FRACTIONS:
+            D_try = D + fraction * (stiff - D)
+            margins = self.certificate.margins(D_try)
+            if self._meets_margins(margins):
+                return D_try, margins, SplitSource.STIFFENED
         return stiff, margins, SplitSource.UNCERTIFIED

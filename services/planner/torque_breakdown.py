@@ -1,6 +1,6 @@
-"""One tick laid open: every matrix of the law and each joint's torque by origin. Pure.
+"""Breaks one planner tick down: gains, margins, and each joint's torque by origin. Pure.
 
-What `Hocca.tick` computes on its way and does not keep, computed again from what is in
+`Hocca.tick` computes these matrices and does not keep them. This module computes them again from
 the log: the joints, the references and the assist (docs/law.md).
 """
 
@@ -25,39 +25,39 @@ Array = NDArray[np.float64]
 
 
 class TorqueBreakdown(NamedTuple):
-    """A tick; torques (12,) in N m, poses (6,) in m and rad."""
+    """Breakdown of one tick; torques (12,) in N m, poses (6,) in m and rad."""
 
     p: Array
-    """Measured."""
+    """Measured pose."""
     pdot: Array
     p_ref: Array
     F: Array
     """K_p (p_ref - p) + B_p (pdot_ref - pdot) + F_O (6,), N and N m."""
     singular_values: Array
-    """Of J (6,): per rad, with m and rad mixed."""
+    """Singular values of J (6,); m and rad are mixed."""
     K_q: Array
     """(12, 12) N m/rad."""
     B_q: Array
     """(12, 12) N m s/rad."""
     local: LocalGains
     weakest: Weakest
-    """With the joint services alone."""
+    """Weakest direction with the joint services alone."""
     weakest_onboard: Weakest
-    """With the drives alone."""
+    """Weakest direction with the drives alone."""
     pushes: dict[str, PushLimits]
     """The hardest constant push along each direction, without assist."""
     gravity: Array
     assist: Array
     local_pd: Array
     coupled: Array
-    """What the planner adds, before its low-pass."""
+    """Torque that the planner adds, before its low-pass."""
     eased: Array
-    """What the low-pass takes off that, and what eases the operator's lead: not computed here,
-    for the log holds neither filter."""
+    """Change of the coupled torque by its low-pass, plus the easing of the operator's lead. Not
+    computed here, because the log holds the state of neither filter."""
 
     @property
     def total(self) -> Array:
-        """What the module is asked for at age zero (12,), N m."""
+        """Torque requested from the joints at command age zero (12,), N m."""
         return self.gravity + self.assist + self.local_pd + self.coupled + self.eased
 
 
@@ -71,20 +71,20 @@ def torque_breakdown(
     slope: Pair = (0.0, 0.0),
     stance: Vector6 = AS_CONFIGURED,
 ) -> TorqueBreakdown:
-    """Return the account of a tick.
+    """Return the breakdown of a tick.
 
     Args:
         config: the robot.
         q: measured joint angles (12,), rad.
         v: measured joint rates (12,), rad/s.
         q_ref: references (12,), rad.
-        v_ref: their rates (12,), rad/s.
+        v_ref: rates of the references (12,), rad/s.
         assist: assist force in the feedforward, N.
-        slope: of the floor along x and y, as the planner took it, rad.
-        stance: the right foot against the left, as the planner took it, m and rad.
+        slope: floor slope along x and y that the planner used, rad.
+        stance: the right foot relative to the left that the planner used, m and rad.
 
     Raises:
-        ConfigError: the gain split lacks its schedule.
+        ConfigError: the gain split needs a schedule, and the robot's is missing or stale.
     """
     measured, at_ref = Kinematics(config), Kinematics(config)
     for kinematics in (measured, at_ref):
@@ -103,9 +103,9 @@ def torque_breakdown(
     T = per_unit_of_p(at_ref)
     local = split.split(lambda: body, float(at_ref.p[2]), float(at_ref.p[4]), T, hessian_O)
     certificate: Certificate = split.certificate
-    missing = UncoupledGains(law.K_p, law.B_p, law.S, split.coupling.damping)
+    uncoupled = UncoupledGains(law.K_p, law.B_p, law.S, split.coupling.damping)
     K_fail = certificate.failsafe_stiffness(local.D)
-    K_c, B_c = missing.at(K_fail, (T.T * local.D_B) @ T)
+    K_c, B_c = uncoupled.at(K_fail, (T.T * local.D_B) @ T)
     e_q, e_v, e_pdot = q_ref - q, v_ref - v, at_ref.J @ v_ref - pdot
     return TorqueBreakdown(
         p=measured.p,
