@@ -38,7 +38,7 @@ def torque(output: LawOutput, q: Array, v: Array = STILL) -> Array:
     """Return what the joint services apply from a command that is not aged, once it settles."""
     spring = output.local.D * (output.q_ref - q)
     damper = output.local.D_B * (output.v_ref - v)
-    return np.asarray(output.tau_ff + output.tau_missing + spring + damper, float)
+    return np.asarray(output.tau_ff + output.tau_unfiltered + spring + damper, float)
 
 
 def gravity(robot: RobotConfig, q: Array) -> Array:
@@ -164,11 +164,11 @@ def test_coupled_torques_come_slowly_and_ease_at_once(
     law.tick(q, STILL, 0.0, DT, align=True)
     q_moved = moved(robot, ik, q, 1, 0.01)
     first = law.tick(q_moved, STILL, 0.0, DT)
-    assert np.abs(first.tau_missing).max() > 1.0
-    assert np.abs(first.tau_coupled).max() < 0.05 * np.abs(first.tau_missing).max()
+    assert np.abs(first.tau_unfiltered).max() > 1.0
+    assert np.abs(first.tau_coupled).max() < 0.05 * np.abs(first.tau_unfiltered).max()
     for _ in range(250):
         output = law.tick(q_moved, STILL, 0.0, DT)
-    np.testing.assert_allclose(output.tau_coupled, output.tau_missing, atol=0.02)
+    np.testing.assert_allclose(output.tau_coupled, output.tau_unfiltered, atol=0.02)
 
 
 def test_align_makes_no_step(law: Hocca, closed: Closed) -> None:

@@ -12,7 +12,7 @@ from services.planner.kinematics import Kinematics
 from services.planner.planner import Planner
 from services.planner.poses import Poses
 from services.planner.push_limit import LoadedStand
-from services.planner.stance import FOLLOWED_S, Stance
+from services.planner.stance import FOLLOW_S, Stance
 from shared.config import RobotConfig
 from shared.messages import PlannerMode
 from tests.planner import oracle
@@ -152,7 +152,7 @@ def test_while_it_leads_it_keeps_the_stance_and_in_hold_it_follows_slowly(
     for _ in range(round(0.1 / DT)):
         taken = law.tick(moved, STILL, 0.0, DT, align=True).stance.copy()
     assert 0.0 < np.abs(taken - began).max() < 0.1 * away, "a drop-out of 0.1 s"
-    for _ in range(round(4 * FOLLOWED_S / DT)):
+    for _ in range(round(4 * FOLLOW_S / DT)):
         taken = law.tick(moved, STILL, 0.0, DT, align=True).stance.copy()
     np.testing.assert_allclose(taken, there, atol=0.05 * away)
 
