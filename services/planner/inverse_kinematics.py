@@ -29,8 +29,7 @@ TOLERANCE = 1e-6
 DAMPING = 1e-4
 """Levenberg damping; bounds the step where the legs are nearly singular."""
 STEP_SURE = 1e-3
-"""rad; the error of a Gauss-Newton step is below the step's square (m or rad), so below
-`TOLERANCE`."""
+"""rad; a Gauss-Newton step's error is below the step's square (m or rad), so below `TOLERANCE`."""
 STEP_MAX = 0.2
 """rad; a longer step leaves the region in which the linearisation is good."""
 
@@ -43,8 +42,7 @@ COLD_STEP_MAX = 0.5
 EVALUATIONS_MAX = 60
 """Evaluations of the kinematics per start; from a bent stand the median is 8."""
 CLOSURE_WEIGHT = 10.0
-"""Weight of the closure relative to p, where both cannot be met. The shift removes the rest of the
-closure error."""
+"""Weight of the closure relative to p, where both cannot be met; the shift removes the rest."""
 CLOSING_ROUNDS = 5
 """Rounds of the multiplier method; each reduces the closure error about a hundredfold."""
 STATIONARY = 1e-3
@@ -143,10 +141,8 @@ class InverseKinematics:
                 return IkResult(iterations, largest * largest)
             after = self._residual(p_ref, D_left)
             gained = cost - float(self._error @ self._error)
-            leaving_region = (
-                not limited and largest >= STEP_MAX / 2
-            )  # the way to p_ref may first go uphill
-            if not leaving_region and gained < (GAIN_AT_LIMIT * cost if limited else 0.0):
+            long_step = not limited and largest >= STEP_MAX / 2  # it may have to go uphill first
+            if not long_step and gained < (GAIN_AT_LIMIT * cost if limited else 0.0):
                 self.q[:] = before
                 return IkResult(iterations, self._residual(p_ref, D_left))
             residual = after
@@ -192,8 +188,7 @@ class InverseKinematics:
             if float(np.abs(self._error).max()) <= TOLERANCE:
                 break
         else:
-            # from `initial` too: the nearest pose with the legs apart need not be the
-            # nearest closed one
+            # from `initial` too: the nearest pose with the legs apart may not be the closed one
             found = [self._nearest_closed(p_ref, start) for start in (nearest, initial)]
             self.q[:] = min(found, key=lambda one: one[0])[1]
         return self.examine(p_ref)
@@ -201,9 +196,9 @@ class InverseKinematics:
     def examine(self, p_ref: Array) -> Reach:
         """Return the distance of `q` from p_ref and what limits it; `q` does not change.
 
-        At the nearest pose where the legs agree, J^T e + C^T mu is zero for some mu. Exceptions are
-        joints at a limit that would move beyond it. These are the optimality conditions of min
-        |e|^2 / 2, e = p_ref - p, subject to closure = 0 and the limits.
+        At the nearest pose where the legs agree, J^T e + C^T mu is zero for some mu, except at
+        joints at a limit that would move beyond it. These are the optimality conditions of
+        min |e|^2 / 2, e = p_ref - p, subject to closure = 0 and the limits.
 
         Args:
             p_ref: (6,), m and rad.
@@ -334,7 +329,7 @@ def describe(reach: Reach, p_ref: Array, limits: Array) -> str:
     scale = max(float(np.abs(reach.error).max()), TOLERANCE)
     digits = max(2, 1 - math.floor(math.log10(scale)))
     misses = [
-        f"{name} {p_ref[row]:.{digits}f} {unit} requested, "
+        f"{name} {p_ref[row]:.{digits}f} {unit} wanted, "
         f"{p_ref[row] - reach.error[row]:.{digits}f} {unit}"
         for row, (name, unit) in sorted(enumerate(POSE_ROWS), key=lambda r: -abs(reach.error[r[0]]))
         if abs(reach.error[row]) >= 0.1 * scale

@@ -111,7 +111,7 @@ class Load:
         return "; ".join(reasons)
 
     def force(self) -> float:
-        """Return the part of the weight beyond friction, N at the harness point, within the limit."""
+        """Return the part of the weight beyond friction, N at the harness point; limited."""
         return _deadband(GRAVITY * self.kg, FRICTION_BAND[0], GRAVITY * self._kg_max)
 
     def moment(self, pitch: float) -> float:
