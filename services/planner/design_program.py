@@ -70,7 +70,7 @@ def choose(
         if verdict.stable:
             return found
         if any(node is verdict.condition.node for node in checked):
-            return best  # only a drivetrain in between fails: no better design is possible
+            return best  # only a drivetrain in between fails: fall back to the stable start
         checked.append(verdict.condition.node)
 
 

@@ -196,8 +196,8 @@ class InverseKinematics:
     def examine(self, p_ref: Array) -> Reach:
         """Return the distance of `q` from p_ref and what limits it; `q` does not change.
 
-        At the nearest pose where the legs agree, J^T e + C^T mu is zero for some mu, except at
-        joints at a limit that would move beyond it. These are the optimality conditions of
+        At the nearest pose where the legs agree, J^T e + C^T mu is zero for some mu. Joints at
+        a limit that would move beyond it are excepted. These are the optimality conditions of
         min |e|^2 / 2, e = p_ref - p, subject to closure = 0 and the limits.
 
         Args:

@@ -1,7 +1,7 @@
 """Computes the certified gain schedule offline (docs/law.md#gain-split).
 
-At each node of a grid over COM height and torso pitch, the local stiffnesses D of one leg solve a
-semidefinite program (the other leg is alike):
+The grid spans COM height and torso pitch. At each node, the local stiffnesses D of one leg solve a
+semidefinite program; the other leg is alike:
 
     minimise    K_loc[z, z] / 1000 + K_loc[pitch, pitch] / 10 + 1e-3 sum(D)
     subject to  K_loc(D) + K_geo >= diag(K_required)

@@ -15,10 +15,10 @@ robot file):
     unattended the robot drifts with nobody's hand on it (`services.planner.unattended`)
 
 The trips are checked while the planner is engaged. `unloaded` counts only once both legs have
-carried the torso, because on the hoist neither does. `sagging` counts only once the person has not
-pressed, because a hand that was held up in HOLD catches up. A trip ends when every value has been
-within its limit for `CALM_NS`. It counts as a drop-out (`services.planner.engagement_fsm`): after
-repeated trips the planner re-engages after ever longer waits.
+carried the torso, because on the hoist neither does. `sagging` counts only after the person has
+once not pressed, because a hand held up in HOLD first catches up. A trip ends when every value has
+been within its limit for `CALM_NS`. It counts as a drop-out (`services.planner.engagement_fsm`):
+after repeated trips the planner re-engages after ever longer waits.
 """
 
 from __future__ import annotations
