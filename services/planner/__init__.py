@@ -1,1 +1,1 @@
-"""The planner: whole-body law from measured joints to references, gains and torques."""
+"""Planner process: whole-body law from measured joints to references, gains and torques."""

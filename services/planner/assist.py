@@ -1,7 +1,7 @@
-"""The harness in the loop: assist, easing of the lead, overload (docs/law.md#harness).
+"""Controls forces at the harness: assist, easing of the lead, overload (docs/law.md#harness).
 
-The wrench is what the operator does to the torso at the harness point, in torso axes. The
-robot's upward force on him is minus its part along the world's z. Pure: inputs -> outputs.
+The wrench is what the operator applies to the torso at the harness point, in torso axes. The
+robot's upward force on the operator is minus its part along the world's z. Pure: inputs -> outputs.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from shared.config.sections import HarnessConfig
 Array = NDArray[np.float64]
 
 ERROR_MIN: Final = 5.0
-"""N: what dry friction in the joints hides. Within it the force does not follow the assist
-(0.3 N m a joint: 5 to 6 N at the harness), and an integral would hunt."""
+"""N; force that dry friction in the joints hides (0.3 N m a joint: 5 to 6 N at the harness). Within
+it the force does not follow the assist, and an integral would hunt."""
 SETTLE_S: Final = 0.3
-"""The integral waits so long after the wish or the pose has moved."""
+"""s; wait of the integral after the request or the pose has moved."""
 STILL_RATE_Z: Final = 0.02
-"""m/s of the COM: above it the operator is leading."""
+"""m/s of the COM; above it the operator is leading."""
 STILL_RATE_PITCH: Final = 0.05
-"""rad/s of the torso: above it the operator is leading."""
+"""rad/s of the torso; above it the operator is leading."""
 LEAD_MAX: Final = (150.0, 60.0)
-"""N and N m: a hand that leads does no more, and no more is amplified."""
+"""N and N m; a leading hand does no more, and larger values are not amplified."""
 LEAD_FADE_S: Final = 0.1
-"""The easing goes out over this time when the wrench is lost."""
-RELEASE_SHARE: Final = 0.8
-"""Fraction of the overload limits; below it the harness counts as released."""
+"""s; the easing fades out over this time when the wrench is lost."""
+RELEASE_FRACTION: Final = 0.8
+"""Fraction of an overload's limits; below it the harness counts as released."""
 _W_RAD_S: Final = tuple(10.0 ** (exponent / 1000.0) for exponent in range(-1000, 3000))
-"""0.1 to 1000 rad/s: a person's slowest lead, and far beyond what a joint service follows."""
+"""0.1 to 1000 rad/s: from a person's slowest lead to far beyond a joint service's bandwidth."""
 
 
 def force_up(force: Vector3, roll: float, pitch: float) -> float:
@@ -54,10 +54,10 @@ def force_up(force: Vector3, roll: float, pitch: float) -> float:
 
 
 def wrench_in_world(wrench: Wrench, roll: float, pitch: float) -> tuple[Array, float]:
-    """Return the person's force in the torso's plane (3,), N, world but for yaw, and moment, N m.
+    """Return the operator's force (3,), N, and moment about pitch, N m, in world axes without yaw.
 
     Args:
-        wrench: of the person on the torso.
+        wrench: of the operator on the torso.
         roll: of the torso, rad.
         pitch: rad; the moment is about its axis.
     """
@@ -67,24 +67,24 @@ def wrench_in_world(wrench: Wrench, roll: float, pitch: float) -> tuple[Array, f
 
 
 def is_still(rate_z: float, rate_pitch: float) -> bool:
-    """Return True if the operator is not leading: COM rate in m/s, torso's pitch in rad/s."""
+    """Return True if the operator is not leading; COM rate in m/s, pitch rate in rad/s."""
     return abs(rate_z) <= STILL_RATE_Z and abs(rate_pitch) <= STILL_RATE_PITCH
 
 
 class AssistLaw:
-    """The assist force: what is wanted, rate limited, and a slow integral on its error.
+    """Assist force: the rate-limited request plus a slow integral on its error.
 
-    assist = ramp + integral; while a wish stands and the pose is still
+    assist = ramp + integral; while the request is constant and the pose is still
 
         d integral / dt = e / integral_s,  |integral| <= integral_max
 
     with e = wanted - measured beyond `ERROR_MIN`.
 
-    The integral is frozen while there is no reading (stale, invalid or saturated), while
-    the robot holds, while the wish moves, and while the operator leads: what his hand adds
-    is then no error of the assist, and an integral over it would outlast the lead and pull
-    at him after the turn. With no wish it leaks to zero with the same time constant. It
-    never takes the assist below zero: the robot does not pull the operator down.
+    The integral is frozen without a reading (stale, invalid or saturated), in HOLD, while the
+    request changes, and while the operator leads. The force of a leading hand is no error of the
+    assist. An integral over it would outlast the lead and pull at the operator after the turn. With
+    no request the integral decays to zero with the same time constant. It never takes the assist
+    below zero: the robot does not pull the operator down.
 
     Stability: `integral_s_min`.
     """
@@ -92,12 +92,12 @@ class AssistLaw:
     def __init__(
         self, force_max: float, rate_max: float, integral_max: float, integral_s: float
     ) -> None:
-        """Start with nothing; the first `advance` takes over what is wanted at once.
+        """Start without assist; the first `advance` adopts the request at once.
 
         Args:
             force_max: of the ramp, N.
             rate_max: of the ramp, N/s.
-            integral_max: N either way; 0 leaves the integral out.
+            integral_max: N either way; 0 disables the integral.
             integral_s: time constant, s.
         """
         self._force_max = force_max
@@ -114,25 +114,25 @@ class AssistLaw:
         """Return the state."""
         return AssistState(self._ramp, self._wanted, self._still_s, self.integral)
 
-    def restore(self, memory: AssistState) -> None:
+    def restore(self, state: AssistState) -> None:
         """Continue from a state."""
-        m = memory
+        m = state
         self._ramp, self._wanted, self._still_s, self.integral = (
             m.ramp, m.wanted, m.still_s, m.integral
         )  # fmt: skip
 
     @property
     def assist(self) -> float:
-        """What the feedforward carries, N."""
+        """Assist force in the feedforward, N."""
         return (self._ramp or 0.0) + self.integral
 
     def advance(self, wanted: float, measured: float | None, dt: float, *, still: bool) -> float:
-        """Move on by one tick; return the rate of `assist` in N/s.
+        """Advance by one tick; return the rate of `assist` in N/s.
 
         Args:
-            wanted: upward force on the operator, N.
-            measured: the same as the harness feels it, N; None if not known now.
-            dt: since the last tick, s.
+            wanted: requested upward force on the operator, N.
+            measured: the same force measured at the harness, N; None if not known now.
+            dt: time since the last tick, s.
             still: False while the robot holds or the operator leads.
         """
         wanted = min(self._force_max, max(0.0, wanted))
@@ -157,19 +157,19 @@ class AssistLaw:
 
 
 class LeadEasing:
-    """The lead made lighter: F_O += alpha S w_h (docs/law.md#harness).
+    """Amplifies the operator's lead: F_O += alpha S w_h (docs/law.md#harness).
 
-    w_h is what the operator does in the directions he leads: his upward force beyond the
-    load that the assist carries, f + assist, and his moment about the torso's pitch axis.
-    With alpha the robot's apparent mass falls from M to M / (1 + alpha). As with F_assist,
-    the force belongs through the Jacobian of the harness point, not of the COM; and it
-    belongs into tau_coupled, which HOLD drops: in tau_ff it would outlive the hand.
+    w_h is the operator's wrench in the directions he leads. It is his upward force beyond the load
+    that the assist carries, f + assist, and his moment about the torso's pitch axis. With alpha the
+    robot's apparent mass falls from M to M / (1 + alpha). As with F_assist, the force acts through
+    the Jacobian of the harness point, not of the COM. It belongs in tau_coupled, which HOLD drops;
+    in tau_ff it would outlive the hand.
 
     Stability: `alpha_max`.
     """
 
     def __init__(self, alpha: float) -> None:
-        """Take alpha in [0, 1); 0 leaves it out."""
+        """Set alpha in [0, 1); 0 disables the easing."""
         self._alpha = alpha
         self._lead = (0.0, 0.0)
         self._left = 0.0
@@ -178,9 +178,9 @@ class LeadEasing:
         """Return the state."""
         return EasingState(self._lead, self._left)
 
-    def restore(self, memory: EasingState) -> None:
+    def restore(self, state: EasingState) -> None:
         """Continue from a state."""
-        self._lead, self._left = memory.lead, memory.left
+        self._lead, self._left = state.lead, state.left
 
     def ease(
         self, up: float | None, moment_pitch: float, assist: float, dt: float
@@ -188,10 +188,10 @@ class LeadEasing:
         """Return alpha w_h: N along the world's z at the harness, N m about the pitch axis.
 
         Args:
-            up: of the operator's force, N, world; None if not known now: the easing fades.
+            up: upward force of the operator, N, world; None if not known now: the easing fades.
             moment_pitch: of the operator about the torso's y, N m.
-            assist: that the feedforward carries, N.
-            dt: since the last tick, s.
+            assist: assist force in the feedforward, N.
+            dt: time since the last tick, s.
         """
         if up is None:
             self._left = max(0.0, self._left - dt / LEAD_FADE_S)
@@ -207,15 +207,15 @@ class LeadEasing:
 
 
 class Overload:
-    """Whether the harness carries more than it may: then all six modules are to hold.
+    """Detects an overload of the harness, during which all six modules must hold.
 
-    It begins when the force or the moment has been beyond its limit for `after_ns`, or at
-    once with a saturated cell. It ends when both have been below `RELEASE_SHARE` of their
-    limits for `release_ns`. Numbers that are not valid neither begin nor end it.
+    It begins when the force or the moment has been beyond its limit for `after_ns`, or at once if a
+    cell saturates. It ends when both have been below `RELEASE_FRACTION` of their limits for
+    `release_ns`. Invalid readings neither begin nor end it.
     """
 
     def __init__(self, force_max: float, moment_max: float, after_ns: int, release_ns: int) -> None:
-        """Take the limits: N, N m, ns, ns."""
+        """Set the limits: N, N m, ns, ns."""
         self._force_max = force_max
         self._moment_max = moment_max
         self._after_ns = after_ns
@@ -223,11 +223,11 @@ class Overload:
         self._beyond_since_ns: int | None = None
         self._below_since_ns: int | None = None
         self.hold = False
-        """True while it lasts."""
+        """True during an overload."""
 
     @classmethod
     def of(cls, harness: HarnessConfig) -> Overload:
-        """Return one with the limits of a robot file."""
+        """Return a detector with the limits of a robot file."""
         after_ns = round(harness.overload_after_ms * NS_PER_MS)
         release_ns = round(harness.overload_release_s * NS_PER_S)
         return cls(harness.overload_force, harness.overload_moment, after_ns, release_ns)
@@ -236,20 +236,20 @@ class Overload:
         """Return the state."""
         return OverloadState(self._beyond_since_ns, self._below_since_ns, self.hold)
 
-    def restore(self, memory: OverloadState) -> None:
+    def restore(self, state: OverloadState) -> None:
         """Continue from a state."""
-        m = memory
+        m = state
         self._beyond_since_ns, self._below_since_ns = m.beyond_since_ns, m.below_since_ns
         self.hold = m.hold
 
     def receive(self, wrench: Wrench, now_ns: int) -> None:
-        """Take a wrench that arrived now."""
-        share = max(
+        """Update with a wrench that arrived now."""
+        load_ratio = max(
             math.hypot(*wrench.force) / self._force_max,
             math.hypot(*wrench.moment) / self._moment_max,
         )
-        beyond = wrench.valid and share > 1.0
-        below = wrench.valid and share < RELEASE_SHARE
+        beyond = wrench.valid and load_ratio > 1.0
+        below = wrench.valid and load_ratio < RELEASE_FRACTION
         self._beyond_since_ns = _since(self._beyond_since_ns, now_ns, beyond)
         self._below_since_ns = _since(self._below_since_ns, now_ns, below)
         if wrench.saturated or _lasted(self._beyond_since_ns, now_ns, self._after_ns):
@@ -258,39 +258,39 @@ class Overload:
             self.hold = False
 
 
-def _since(since_ns: int | None, now_ns: int, true: bool) -> int | None:
-    if not true:
+def _since(since_ns: int | None, now_ns: int, condition: bool) -> int | None:
+    if not condition:
         return None
     return now_ns if since_ns is None else since_ns
 
 
-def _lasted(since_ns: int | None, now_ns: int, for_ns: int) -> bool:
-    return since_ns is not None and now_ns - since_ns >= for_ns
+def _lasted(since_ns: int | None, now_ns: int, duration_ns: int) -> bool:
+    return since_ns is not None and now_ns - since_ns >= duration_ns
 
 
 class Coupling(msgspec.Struct, frozen=True, kw_only=True):
-    """One direction, z or pitch: the robot, the hand on it and the way between them.
+    """Robot, hand and the path between them, in one direction (z or pitch).
 
     m s^2 x = -(b_r s + k_r) x + w,   w = -(b s + k) x      (units of the direction)
     """
 
     mass: float
-    """m: the robot's effective mass, kg, or inertia, kg m^2."""
+    """m: effective mass of the robot, kg, or inertia, kg m^2."""
     b_r: float
-    """Its own damping: joints, and local gains that references do not cancel."""
+    """Damping of the robot: joints, and local gains that references do not cancel."""
     k_r: float
-    """Its own stiffness: 0 where it is free to be led."""
+    """Stiffness of the robot: 0 in directions that the operator leads."""
     k: float
     """Stiffness of the hand."""
     b: float
     """Damping of the hand."""
     delay_s: float
-    """From wrench to torque: once each way over the bus, and the periods between."""
+    """From wrench to torque, s: one bus transfer each way, and the periods between."""
     low_pass_hz: float
     """Bandwidth of the harness filter, Hz."""
 
     def force_by_force(self, s: complex) -> complex:
-        """Return G: what the hand feels of a force of the robot, delayed and filtered.
+        """Return G: the hand's force response to a force of the robot, delayed and filtered.
 
         G(s) = (b s + k) / (m s^2 + (b + b_r) s + k + k_r) e^(-s delay) / (1 + s / w_f)
         """
@@ -301,15 +301,15 @@ class Coupling(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def alpha_max(coupling: Coupling) -> float:
-    """Return the alpha below which the eased lead is stable; infinite if every one is.
+    """Return the alpha below which the eased lead is stable; infinite if every alpha is.
 
     Robot and hand, with alpha w fed back: 1 + alpha G(s) = 0. By Nyquist it is stable if
 
         alpha |G(j w)| < 1   wherever the phase of G(j w) is -180 degrees
 
-    Seen from the hand: a force late by t is damping of -alpha k t, so that for slow modes
-    this says alpha (k t - b) < b + b_r. A well damped hand (k t < b) is then limited at
-    higher frequencies only, where m is what counts: alpha < m w / b, about.
+    Seen from the hand, a force late by t is damping of -alpha k t. For slow modes this requires
+    alpha (k t - b) < b + b_r. A well damped hand (k t < b) is then limited at higher frequencies
+    only, where m dominates: alpha < m w / b, about.
     """
     return gain_max(coupling.force_by_force)
 
@@ -317,8 +317,8 @@ def alpha_max(coupling: Coupling) -> float:
 def integral_s_min(coupling: Coupling) -> float:
     """Return the time constant above which the integral on the assist is stable, s.
 
-    The measured force follows the assist by G, so the loop is G / (integral_s s). With no
-    delay, and nothing of the robot's own but its mass, that is m / b - b / k.
+    The measured force follows the assist by G, so the loop is G / (integral_s s). With no delay and
+    a robot that is a pure mass, the limit is m / b - b / k.
     """
     limit = gain_max(lambda s: coupling.force_by_force(s) / s)
     return 1.0 / limit
@@ -331,7 +331,7 @@ def gain_max(loop: Callable[[complex], complex]) -> float:
     for high in _W_RAD_S[1:]:
         a, b = loop(1j * low), loop(1j * high)
         if a.imag * b.imag <= 0.0 and a.real + b.real < 0.0:
-            share = a.imag / (a.imag - b.imag)
-            limit = min(limit, -1.0 / (a.real + share * (b.real - a.real)))
+            fraction = a.imag / (a.imag - b.imag)
+            limit = min(limit, -1.0 / (a.real + fraction * (b.real - a.real)))
         low = high
     return limit

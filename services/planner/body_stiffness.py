@@ -1,7 +1,7 @@
-"""How stiff the body must be to balance, from the paper's section IV. Pure.
+"""Computes the body stiffness needed to balance, from the paper's section IV. Pure.
 
-Leaning as an inverted pendulum of mass m (ankles not counted: they stand) and height z_max
-over two ankles:
+The robot leans as an inverted pendulum of mass m and height z_max over two ankles. The ankles do
+not count towards m, because they stand still:
 
     theta_max  = arcsin(2 tau_max / (m g z))     the ankles' torque is used up
     theta_edge = arctan(half sole / z)           the COM is over the sole's edge
@@ -10,8 +10,8 @@ over two ankles:
     K_x_min    = 2 K_ank_min / z^2               N/m, in the body's coordinates
     K_x(tau)   = 2 tau_max / (theta_edge z^2)    uses tau_max at the edge
 
-The paper's formula for theta_edge prints l_foot, but its text and its number (2.81 deg)
-take w_foot / 2; here the caller says which half of the sole it is.
+The paper's formula for theta_edge prints l_foot, but its text and its number (2.81 deg) take w_foot
+/ 2. Here the caller passes the half of the sole to use.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 
 
 class BodyStiffness(NamedTuple):
-    """The design of one direction."""
+    """Stiffness design for one direction."""
 
     theta_max: float
-    """rad; nan if the ankles could hold any lean."""
+    """rad; NaN if the ankles could hold any lean."""
     theta_edge: float
     """rad"""
     tau_edge: float
@@ -36,7 +36,7 @@ class BodyStiffness(NamedTuple):
     K_min: float
     """N/m"""
     K_tau_max: float
-    """N/m: with it the ankles give tau_max at the sole's edge."""
+    """N/m; with it the ankles give tau_max at the sole's edge."""
 
 
 def body_stiffness(
@@ -48,7 +48,7 @@ def body_stiffness(
         mass: that leans, kg.
         height: of its COM above the ankles, m.
         half_sole: from the ankle to the sole's edge in this direction, m.
-        tau_max: one ankle's torque, N m.
+        tau_max: of one ankle, N m.
     """
     weight_moment = mass * GRAVITY * height
     sine = 2.0 * tau_max / weight_moment
@@ -66,10 +66,10 @@ def body_stiffness(
 
 
 def for_robot(config: RobotConfig) -> dict[str, BodyStiffness]:
-    """Return the design for x and y of a robot, upright with its legs straight.
+    """Return the design for x and y of a robot, upright with straight legs.
 
-    The soles stand side by side: x is over half their length, y over half their width
-    (the legs' spread, which helps in y, is left out, as the paper does).
+    The soles stand side by side: x uses half their length, y half their width. The legs' spread
+    helps in y and is left out, as in the paper.
     """
     geometry = config.geometry
     mass = config.torso_mass + 2 * config.mass.module

@@ -1,4 +1,4 @@
-"""When the planner's memory is written down, so that it can be executed again from there. Pure."""
+"""Decides when the planner's state is recorded, so that re-execution can start from it. Pure."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from shared.bus.traces import PlannerCheckpoint
 
 
 class Checkpoints:
-    """Counts ticks: the memory after each that is a power of two, then after one a second.
+    """Counts ticks; due after every tick number that is a power of two, then once a second.
 
-    Often at first, for a recorder hears a new planner a moment late.
+    It is frequent at first, because a recorder discovers a new planner with a short delay.
     """
 
     def __init__(self, rate_hz: float) -> None:
-        """Take the planner's rate."""
+        """Set the planner's rate, Hz."""
         self._every = round(rate_hz)
         self._tick = 0
         self._seq = 0
         self._encode = msgspec.json.Encoder().encode
 
     def after(self, planner: Planner, now_ns: int) -> PlannerCheckpoint | None:
-        """Return the memory after the tick that has been, if it is time to write it."""
+        """Return the state after the tick just run, if it is due."""
         self._tick += 1
         tick = self._tick
         first = tick < self._every and tick & (tick - 1) == 0

@@ -75,7 +75,7 @@ class BoundsOverPoses:
         }
 
     def _by_theta(self, column: int) -> tuple[Bounds, ...]:
-        """Return the bounds of tau_ff per bin of the joint's theta, neighbouring bins included."""
+        """Return the bounds of tau_ff per bin of theta, each including the bins beside it."""
         theta, tau = np.array(self._q)[:, column + 1], np.array(self._tau_ff)
         edges = np.linspace(*_rounded(theta), THETA_BINS + 1)
         width = edges[1] - edges[0]

@@ -1,17 +1,17 @@
-"""The coupled torque: what the planner adds to the local gains, low-passed. Pure.
+"""Computes the coupled torque, which the planner adds to the local gains, low-passed. Pure.
 
-Local gains stand alone with K_fail = T^T D T + K_geo (`services.planner.certificate`) and damp
-with T^T D_B T. Of the body's K_p and B_p (paper, section IV) that leaves, in the closed rows of p,
+Alone, the local gains stand with K_fail = T^T D T + K_geo (`services.planner.certificate`) and damp
+with T^T D_B T. In the closed rows of p, the rest of the body's K_p and B_p (paper, section IV) is
 
     K_c = (K_p - K_fail)+        B_c = (c B_p - T^T D_B T)+        c: `coupling_damping`
 
-(.)+ keeps the positive part: the planner only ever adds stiffness and damping. It asks for
+(.)+ keeps the positive part: the planner only ever adds stiffness and damping. It requests
 
     tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot)] }
 
-through two poles at `coupling_bandwidth_hz`. The feedback is some milliseconds old and meets the
-bare rotors of a flexible drivetrain: unfiltered, the robot shook below 40 000 N m/rad and fell.
-Which bandwidth and damping are safe is computed (`services.planner.dynamic_certificate`).
+through two poles at `coupling_bandwidth_hz`. The feedback is some milliseconds old and acts on the
+bare rotors of a flexible drivetrain. Without the filter, the robot shook below 40 000 N m/rad and
+fell. `services.planner.dynamic_certificate` computes which bandwidth and damping are safe.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from shared.robot.joints import N_JOINTS
 Array = NDArray[np.float64]
 
 
-LEAST = 1e-9
-"""Smallest gain of the body that counts, N/m or N m/rad."""
+GAIN_MIN = 1e-9
+"""Smallest gain of the body; a smaller one counts as zero."""
 
 
 class UncoupledGains:
-    """K_c and B_c: what local gains lack of the body's stiffness and damping."""
+    """K_c and B_c: the body's stiffness and damping that the local gains lack."""
 
     def __init__(self, K_p: Array, B_p: Array, S: Array, damping: float) -> None:
-        """Take the body's gains.
+        """Set the body's gains.
 
         Args:
             K_p: (6,) N/m and N m/rad.
             B_p: (6,) N s/m and N m s/rad.
             S: (6,), 1 where the person leads: nothing is added there.
-            damping: c, in shares of B_p.
+            damping: c, as a fraction of B_p.
         """
         closed = np.flatnonzero(S == 0.0)
         self._rows = np.ix_(closed, closed)
         body = np.array((K_p[closed], damping * B_p[closed]))
         self._body: Array = body[:, :, np.newaxis] * np.eye(len(closed))
-        root = np.sqrt(np.where(body > LEAST, body, 1.0))
+        root = np.sqrt(np.where(body > GAIN_MIN, body, 1.0))
         self._scale: Array = root[:, :, np.newaxis] * root[:, np.newaxis, :]
-        """(2, closed, closed): makes metres and radians comparable, of K and of B."""
+        """(2, closed, closed): scales of K and of B that make metres and radians comparable."""
 
     def at(self, K_fail: Array, B_local: Array) -> tuple[Array, Array]:
         """Return K_c and B_c (6, 6), symmetric and not negative.
 
-        Zero at angles for which the chain has no rates: nothing can be added there.
+        Zero at angles at which the closed chain has no finite rates: nothing can be added there.
 
         Args:
-            K_fail: stiffness that the local gains leave, along p (6, 6).
+            K_fail: stiffness of the local gains along p (6, 6).
             B_local: T^T D_B T (6, 6).
         """
         local = np.array((K_fail[self._rows], B_local[self._rows]))
@@ -65,19 +65,19 @@ class UncoupledGains:
         if not np.isfinite(scaled).all():
             return K_c, B_c
         values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
-        kept = (vectors * np.maximum(values, 0.0)[:, np.newaxis]) @ vectors.transpose(0, 2, 1)
-        kept *= self._scale
-        K_c[self._rows], B_c[self._rows] = kept
+        positive = (vectors * np.maximum(values, 0.0)[:, np.newaxis]) @ vectors.transpose(0, 2, 1)
+        positive *= self._scale
+        K_c[self._rows], B_c[self._rows] = positive
         return K_c, B_c
 
 
 def follow(bandwidth_hz: float, dt: float) -> float:
-    """Return how far a pole of this bandwidth goes towards its input in dt (s), 0 .. 1."""
+    """Return the step of a first-order pole towards its input in dt (s), as a fraction 0 .. 1."""
     return 1.0 - math.exp(-2.0 * math.pi * bandwidth_hz * dt)
 
 
 class CouplingFilter:
-    """Two equal poles."""
+    """Low-pass with two equal poles."""
 
     def __init__(self, bandwidth_hz: float) -> None:
         """Start at rest."""
@@ -90,15 +90,15 @@ class CouplingFilter:
 
         Args:
             tau: unfiltered (12,), N m.
-            dt: since the last tick, s.
+            dt: time since the last tick, s.
         """
-        share = follow(self._bandwidth_hz, dt)
-        self._first += share * (tau - self._first)
-        self._second += share * (self._first - self._second)
+        gain = follow(self._bandwidth_hz, dt)
+        self._first += gain * (tau - self._first)
+        self._second += gain * (self._first - self._second)
         return self._second.copy()
 
     def reset(self) -> None:
-        """Forget what was asked for."""
+        """Reset the filter to zero."""
         self._first[:] = 0.0
         self._second[:] = 0.0
 
@@ -107,5 +107,5 @@ class CouplingFilter:
         return (*self._first.tolist(), *self._second.tolist())
 
     def restore(self, state: tuple[float, ...]) -> None:
-        """Go on from a state that `snapshot` returned."""
+        """Continue from a state that `snapshot` returned."""
         self._first[:], self._second[:] = state[:N_JOINTS], state[N_JOINTS:]

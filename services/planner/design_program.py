@@ -1,11 +1,12 @@
-"""Chooses damping and coupling by the dynamic certificate. Offline; run by `xrl gains`.
+"""Chooses damping and coupling with the dynamic certificate. Offline; run by `xrl gains`.
 
-    minimise    what the hand feels in a squat [N] + SWAY_WEIGHT (slowest decay + DECAY_WANTED)+
-    subject to  every condition of `services.planner.dynamic_certificate` fades
+    minimise    effort of the hand in a squat [N] + SWAY_WEIGHT (slowest decay + DECAY_WANTED)+
+    subject to  every condition of `services.planner.dynamic_certificate` decays
 
-over the six local dampings of a leg, and the bandwidth and damping of tau_coupled, all on a
-ladder of ratios. Coordinate descent from a stable start: the certificate is evaluated at a few
-poses and drivetrains on the way and at all of them at the end. A pose that fails there is added.
+The variables are the six local dampings of a leg, and bandwidth and damping of tau_coupled, all on
+a ladder of ratios. The method is coordinate descent from a stable start. Each step evaluates the
+certificate at a few poses and drivetrains; the end evaluates all of them. A pose that fails there
+is added.
 """
 
 from __future__ import annotations
@@ -25,17 +26,16 @@ from shared.exceptions import RunError
 Progress = Callable[[str], None]
 
 STEP: Final = 1.25
-"""Ratio of neighbours on the ladders."""
+"""Ratio between neighbours on the ladders."""
 ROUNDS: Final = 3
 START: Final = Design((40.0, 30.0, 40.0, 8.0, 40.0, 6.0), CouplingGains(3.0, 1.7))
 LEAD_HZ: Final = 0.3
-"""Frequency at which the hand's effort is judged: between the squat's 0.2 Hz and a quick
-person's."""
+"""Frequency at which the squat's effort is computed: between its 0.2 Hz and a quick person's."""
 LEAD_M_S: Final = 0.15
-"""Speed of the hand in the reference squat."""
+"""Speed of the hand in the reference squat, m/s."""
 NOMINAL_STIFFNESS: Final = 8000.0
 DECAY_WANTED: Final = 0.6
-"""1/s: sway that fades more slowly costs."""
+"""1/s; sway that decays more slowly adds to the cost."""
 SWAY_WEIGHT: Final = 40.0
 """N per 1/s of missing decay."""
 
@@ -48,30 +48,30 @@ def choose(
     Args:
         config: the robot.
         nodes: poses of its schedule, with local stiffness.
-        progress: told what has been found so far, in words.
+        progress: called with text on the best design so far.
 
     Raises:
-        RunError: the robot cannot meet the certificate; says what stands in the way.
+        RunError: the robot cannot meet the certificate; names the failing condition.
     """
     full = DynamicCertificate(config, nodes)
     for verdict, lower in (
         (full.worst_in_hold(START), "the k_d of [stand]"),
-        (full.worst_in_track(START), "law.lead_easing or what [robustness] asks for"),
+        (full.worst_in_track(START), "law.lead_easing or the requirements of [robustness]"),
     ):
         if not verdict.stable:
-            raise RunError(f"no stable gains: {verdict.words()}; lower {lower}")
-    asked = _few(nodes)
+            raise RunError(f"no stable gains found: {verdict.words()}; lower {lower}")
+    checked = _sample_nodes(nodes)
     best = START
     while True:
-        rough = DynamicCertificate(_rough(config), asked)
-        found = _descend(rough, best, progress)
-        progress("every pose and drivetrain")
+        reduced = DynamicCertificate(_with_few_drivetrains(config), checked)
+        found = _descend(reduced, best, progress)
+        progress("checking every pose and drivetrain")
         verdict = full.worst_in_track(found, stop_above=0.0)
         if verdict.stable:
             return found
-        if any(node is verdict.condition.node for node in asked):
-            return best  # only a drivetrain in between minds: as good as it gets
-        asked.append(verdict.condition.node)
+        if any(node is verdict.condition.node for node in checked):
+            return best  # only a drivetrain in between fails: fall back to the stable start
+        checked.append(verdict.condition.node)
 
 
 def check(
@@ -80,34 +80,39 @@ def check(
     design: Design,
     progress: Progress = lambda _text: None,
 ) -> None:
-    """Hold a design to the certificate.
+    """Check a design against the certificate.
 
     Raises:
-        RunError: it is not stable; says where.
+        RunError: it is not stable; names the condition.
     """
-    progress("every pose and drivetrain")
+    progress("checking every pose and drivetrain")
     verdict = DynamicCertificate(config, nodes).worst(design)
     if not verdict.stable:
-        raise RunError(f"this damping is not stable: {verdict.words()}; run `xrl gains` without it")
+        raise RunError(
+            f"the given damping is not stable: {verdict.words()}; run `xrl gains` without it"
+        )
 
 
-def _descend(rough: DynamicCertificate, design: Design, progress: Progress) -> Design:
-    """Return the cheapest design that is found from one that is stable."""
-    cost = _cost(rough, design)
-    for turn in range(ROUNDS):
+def _descend(reduced: DynamicCertificate, design: Design, progress: Progress) -> Design:
+    """Return the cheapest design found by descent from a stable one."""
+    cost = _cost(reduced, design)
+    for round_index in range(ROUNDS):
         before = cost
         for candidate in _neighbours(design):
-            wanted = _cost(rough, candidate)
-            if wanted < cost - 0.01 and rough.worst_in_track(candidate, stop_above=0.0).stable:
-                design, cost = candidate, wanted
-                progress(f"damping, round {turn + 1}: hand and sway cost {cost:.1f} N")
+            candidate_cost = _cost(reduced, candidate)
+            if (
+                candidate_cost < cost - 0.01
+                and reduced.worst_in_track(candidate, stop_above=0.0).stable
+            ):
+                design, cost = candidate, candidate_cost
+                progress(f"damping, round {round_index + 1}: hand and sway cost {cost:.1f} N")
         if before - cost < 0.05:
             break
     return design
 
 
 def _cost(certificate: DynamicCertificate, design: Design) -> float:
-    """Return the hand's effort in N, and what slow sway costs beside it."""
+    """Return the hand's effort plus the cost of slow sway, N."""
     effort = [
         LEAD_M_S * abs(certificate.loop(condition, design).impedance_z(2.0 * math.pi * LEAD_HZ))
         for condition in certificate.led(NOMINAL_STIFFNESS)
@@ -117,7 +122,7 @@ def _cost(certificate: DynamicCertificate, design: Design) -> float:
 
 
 def _neighbours(design: Design) -> Iterator[Design]:
-    """Yield designs one step away, each way, of every parameter; of phi also all at once."""
+    """Yield designs one step up or down in each parameter, in all phi, and in two theta."""
     for ratio in (STEP, 1.0 / STEP):
         for joints in ((0,), (1,), (2,), (3,), (4,), (5,), (0, 2, 4), (3, 5)):
             D_B = tuple(d * ratio if i in joints else d for i, d in enumerate(design.D_B))
@@ -127,16 +132,16 @@ def _neighbours(design: Design) -> Iterator[Design]:
         yield design._replace(coupling=CouplingGains(bandwidth, damping * ratio))
 
 
-def _rough(config: RobotConfig) -> RobotConfig:
-    """Return a robot asked about its softest, nominal and stiffest drivetrain only."""
-    wanted = config.robustness
-    few = sorted({min(wanted.stiffness), NOMINAL_STIFFNESS, max(wanted.stiffness)})
+def _with_few_drivetrains(config: RobotConfig) -> RobotConfig:
+    """Return the robot with its softest, nominal and stiffest drivetrain only."""
+    robustness = config.robustness
+    stiffnesses = sorted({min(robustness.stiffness), NOMINAL_STIFFNESS, max(robustness.stiffness)})
     return msgspec.structs.replace(
-        config, robustness=msgspec.structs.replace(wanted, stiffness=tuple(few))
+        config, robustness=msgspec.structs.replace(robustness, stiffness=tuple(stiffnesses))
     )
 
 
-def _few(nodes: list[StiffnessNode]) -> list[StiffnessNode]:
+def _sample_nodes(nodes: list[StiffnessNode]) -> list[StiffnessNode]:
     """Return the lowest, a middle and the highest upright pose, and a pitched one."""
     upright = [node for node in nodes if node.pitch == 0.0]
     pitched = [node for node in nodes if node.pitch > 0.5]

@@ -112,7 +112,7 @@ class DynamicVerdict(NamedTuple):
     def words(self) -> str:
         """Return a description of the case and its growth."""
         g = self.growth
-        what = "grows" if g.rate > 0.0 else "fades"
+        what = "grows" if g.rate > 0.0 else "decays"
         return f"{self.condition.words()}: {what} by {abs(g.rate):.2f}/s at {g.frequency_hz:.1f} Hz"
 
 

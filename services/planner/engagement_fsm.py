@@ -1,4 +1,4 @@
-"""State machine that decides when all six modules track (docs/architecture.md#age-rule).
+"""Decides when all six modules track and when they hold (docs/architecture.md#age-rule).
 
 All six modules track or none does. While one module's state is stale, or one module is not in
 TRACK, every command carries `hold`, so that no leg works against the other. Modules report `ready`

@@ -75,7 +75,7 @@ class LawOutput(NamedTuple):
 
 
 class Hocca:
-    """The law and its state: chiefly the closed-loop reference p_C and the assist."""
+    """The law and its state, such as the closed-loop reference p_C and the assist."""
 
     def __init__(self, config: RobotConfig) -> None:
         """Build the law; the first tick starts from the measured pose."""
@@ -86,9 +86,7 @@ class Hocca:
         self._split = GainSplit(config)
         self._S = self._gains.S
         coupling = self._split.coupling
-        self._uncoupled = UncoupledGains(
-            self._gains.K_p, self._gains.B_p, self._S, coupling.damping
-        )
+        self._coupled = UncoupledGains(self._gains.K_p, self._gains.B_p, self._S, coupling.damping)
         self._coupling = CouplingFilter(coupling.bandwidth_hz)
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
@@ -222,12 +220,11 @@ class Hocca:
 
         local = self._split.split(body_gains, at_ref.p[2], at_ref.p[4], T, hessian_O)
         K_fail = self._split.certificate.failsafe_stiffness(local.D)
-        K_c, B_c = self._uncoupled.at(K_fail, (T.T * local.D_B) @ T)
+        K_c, B_c = self._coupled.at(K_fail, (T.T * local.D_B) @ T)
         tau_unfiltered = (K_c @ e_p + B_c @ e_pdot) @ at_ref.J
         tau_coupled = self._coupling.advance(tau_unfiltered, dt)
-        # The eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive
-        # the hand. It is a force fed forward, not fed-back joint rates, so the harness
-        # filter is enough.
+        # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive the
+        # hand. It is a force fed forward, not fed-back joint rates, so the harness filter is enough
         tau_coupled += ease_z * at_ref.J_harness[2] + ease_pitch * at_ref.J[4]
         return LawOutput(
             q_ref,

@@ -1,12 +1,12 @@
-"""Inverse kinematics with both feet on the ground (docs/law.md).
+"""Solves the inverse kinematics with both feet on the ground (docs/law.md).
 
-Six task rows (p = p_ref) and six closure rows (both legs agree on the torso) make a
-square system in the 12 joint angles. Two ways to solve it:
+Six task rows (p = p_ref) and six closure rows (both legs agree on the torso) form a square system
+in the 12 joint angles. There are two solvers:
 
-- `solve`, each tick: Gauss-Newton from the last solution, one or two steps;
-- `solve_from_anywhere`, at the start and in tools: Levenberg-Marquardt inside the joint
-  limits from several starts; where p_ref is out of reach it ends at the nearest pose at
-  which the legs still agree, and says what stands in the way.
+- `solve`, each tick: Gauss-Newton from the last solution, one or two steps.
+- `solve_from_anywhere`, at the start and in tools: Levenberg-Marquardt inside the joint limits,
+  from several starts. If p_ref is out of reach, it ends at the nearest pose at which the legs still
+  agree, and reports what limits it.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-6
 """Largest residual of a solution, m or rad."""
 DAMPING = 1e-4
-"""Levenberg damping: bounds the step where the legs are nearly singular."""
+"""Levenberg damping; bounds the step where the legs are nearly singular."""
 STEP_SURE = 1e-3
-"""rad; the error of a Gauss-Newton step is below its square (m or rad), so below `TOLERANCE`."""
+"""rad; a Gauss-Newton step's error is below the step's square (m or rad), so below `TOLERANCE`."""
 STEP_MAX = 0.2
-"""rad; a longer step leaves the region where the linearisation is good."""
+"""rad; a longer step leaves the region in which the linearisation is good."""
 
 GAIN_AT_LIMIT = 0.01
-"""Least relative gain of the sum of squares: below it, out of reach, the legs would creep into a
-twist."""
+"""Least reduction, as a fraction of the sum of squares. With smaller steps, out of reach, the legs
+would creep into a twist."""
 
 COLD_STEP_MAX = 0.5
-"""rad; longer than `STEP_MAX`, for here a step that does not pay is taken back."""
+"""rad; longer than `STEP_MAX`, because here a step that does not reduce the cost is taken back."""
 EVALUATIONS_MAX = 60
-"""Most evaluations of the kinematics for one start; from a bent stand the median is 8."""
+"""Evaluations of the kinematics per start; from a bent stand the median is 8."""
 CLOSURE_WEIGHT = 10.0
-"""Weight of the closure against p where not both can be met; `shift` takes up the rest."""
+"""Weight of the closure relative to p, where both cannot be met; the shift removes the rest."""
 CLOSING_ROUNDS = 5
-"""Each makes what is left of the closure about a hundred times smaller."""
+"""Rounds of the multiplier method; each reduces the closure error about a hundredfold."""
 STATIONARY = 1e-3
-"""Relative size of joint gradients below which nothing moves any more."""
-EQUAL_SHARES: Array = 0.5 * np.eye(6)
-"""Load sharing (6, 6) for a cold start: the same at every q, so that J is what p changes by."""
+"""Fraction of the error; joint gradients below it count as zero."""
+EQUAL_SHARING: Array = 0.5 * np.eye(6)
+"""Load sharing (6, 6) for a cold start: the same at every q, so that J is exactly dp/dq."""
 POSE_ROWS = (
     *(("COM x", "m"), ("COM y", "m"), ("COM z", "m")),
     *(("roll", "rad"), ("pitch", "rad"), ("yaw", "rad")),
@@ -57,7 +57,7 @@ POSE_ROWS = (
 
 
 class IkResult(NamedTuple):
-    """Outcome of a solve."""
+    """Result of a solve."""
 
     iterations: int
     residual: float
@@ -74,23 +74,23 @@ class IkEnding(IntEnum):
 
     CONVERGED = 0
     JOINT_LIMIT = 1
-    """As near as the joints' limits let it come."""
+    """The nearest pose inside the joint limits."""
     OUT_OF_REACH = 2
-    """As near as the legs reach; no joint limit stands in the way."""
+    """The nearest pose that the legs reach; no joint limit stops them."""
     UNFINISHED = 3
-    """Evaluations ran out on the way; there may be something nearer."""
+    """The evaluations ran out; a nearer pose may exist."""
 
 
 class Reach(NamedTuple):
-    """How near p_ref a configuration is, and what keeps it from coming nearer."""
+    """Distance of a configuration from p_ref, and the limits that prevent a nearer one."""
 
     outcome: IkEnding
     error: Array
-    """p_ref - p (6,), m and rad: which rows are missed, and to which side."""
+    """p_ref - p (6,), m and rad: the missed rows, with sign."""
     closure: float
-    """Largest disagreement of the legs, m or rad."""
+    """Largest difference between the legs' estimates of the torso, m or rad."""
     stopped: tuple[int, ...]
-    """For each of the 12 joints: +1 pressed against its upper limit, -1 its lower, else 0."""
+    """Per joint (12): +1 if pressed against its upper limit, -1 if against its lower, else 0."""
     evaluations: int
     """Evaluations of the kinematics since the last solve began."""
 
@@ -101,10 +101,10 @@ class Reach(NamedTuple):
 
 
 class InverseKinematics:
-    """q_ref = IK(p_ref), in `q`; `kinematics` is left updated at the solution."""
+    """Solves q_ref = IK(p_ref) into `q`; leaves `kinematics` updated at the solution."""
 
     def __init__(self, kinematics: Kinematics, limits: Array) -> None:
-        """Take the kinematics to solve with and the joint limits (12, 2), rad."""
+        """Set the kinematics to solve with and the joint limits (12, 2), rad."""
         self.kinematics = kinematics
         self.q: Array = np.zeros(N_JOINTS)
         self._low, self._high = limits[:, 0], limits[:, 1]
@@ -116,71 +116,71 @@ class InverseKinematics:
     def solve(self, p_ref: Array, D_left: Array | None = None, iterations_max: int = 4) -> IkResult:
         """Improve `q` until p(q) = p_ref and the legs agree.
 
-        A step so short that its second-order error is below the tolerance is taken
-        without computing the kinematics again: from tick to tick one evaluation does.
-        `kinematics` is then at most `STEP_SURE` rad from `q`.
+        A step whose second-order error is below the tolerance is taken without computing the
+        kinematics again. From tick to tick one evaluation is therefore enough. `kinematics` is then
+        at most `STEP_SURE` rad from `q`.
 
         Args:
             p_ref: (6,), m and rad.
-            D_left: load sharing to use, as in `Kinematics.update`; where the legs
-                agree they change J but not p.
-            iterations_max: Gauss-Newton steps at most.
+            D_left: load sharing to use, as in `Kinematics.update`; where the legs agree it changes
+                J but not p.
+            iterations_max: largest number of Gauss-Newton steps.
         """
         self._evaluations = 0
         residual = self._residual(p_ref, D_left)
         iterations = 0
         while residual > TOLERANCE and iterations < iterations_max:
             before, cost = self.q.copy(), float(self._error @ self._error)
-            step, limited = self._limited_step()
+            step, limited = self._step_within_limits()
             self.q += step
             if limited:
-                self.q[:] = self._inside(self.q)  # to the last bit
+                self.q[:] = self._inside(self.q)  # exactly inside the limits
             iterations += 1
             largest = float(np.abs(step).max())
             if largest < STEP_SURE and not limited:
                 return IkResult(iterations, largest * largest)
             after = self._residual(p_ref, D_left)
             gained = cost - float(self._error @ self._error)
-            far = not limited and largest >= STEP_MAX / 2  # uphill first may be the way there
-            if not far and gained < (GAIN_AT_LIMIT * cost if limited else 0.0):
+            long_step = not limited and largest >= STEP_MAX / 2  # it may have to go uphill first
+            if not long_step and gained < (GAIN_AT_LIMIT * cost if limited else 0.0):
                 self.q[:] = before
                 return IkResult(iterations, self._residual(p_ref, D_left))
             residual = after
         return IkResult(iterations, residual)
 
-    def _limited_step(self) -> tuple[Array, bool]:
-        """Return the next step (12,), inside the joint limits, and whether they changed it.
+    def _step_within_limits(self) -> tuple[Array, bool]:
+        """Return the next step (12,), inside the joint limits, and True if the limits changed it.
 
-        Clipping alone would let the other joints go on without the one that stopped.
+        Clipping alone would let the other joints move on without the joint that stopped.
         """
-        step = _shortened(self.solve_rates(self._error), STEP_MAX)
+        step = _limited_length(self.solve_rates(self._error), STEP_MAX)
         limited = bool((self._inside(self.q + step) != self.q + step).any())
         if limited:
-            step = self._step_inside(self._system, self._error, DAMPING**2)
-            step = _shortened(step, STEP_MAX)
+            step = self._damped_step(self._system, self._error, DAMPING**2)
+            step = _limited_length(step, STEP_MAX)
         return step, limited
 
     def solve_rates(self, right_side: Array) -> Array:
-        """Return x (12,) with [J; C] x = right side (12,), damped."""
+        """Return x (12,) that solves [J; C] x = right side (12,), damped."""
         A = self._system
         return np.asarray(np.linalg.solve(A.T @ A + self._damping, A.T @ right_side), float)
 
     def solve_from_anywhere(self, p_ref: Array) -> Reach:
-        """Improve `q` as far as it goes, from wherever it is, inside the joint limits.
+        """Improve `q` as far as possible inside the joint limits, from any configuration.
 
-        Starts at `q`, then at bent stands with the asked pitch, then with one knee twisted
-        (near the top of the workspace some poses lie beyond a fold that no descent from a
-        stand crosses). If none reaches p_ref, `q` is the nearest pose found at which the
-        legs agree. Nothing in it is random. Not for every tick: out of reach it takes
-        several hundred evaluations.
+        The solver starts at `q`, then at bent stands with the requested pitch, then with one knee
+        twisted. Near the top of the workspace some poses lie beyond a fold that no descent from a
+        stand crosses. If no start reaches p_ref, `q` is the nearest pose found at which the legs
+        agree. Nothing is random. Not meant for every tick: out of reach it takes several hundred
+        evaluations.
 
         Args:
             p_ref: (6,), m and rad.
         """
         self._evaluations = 0
-        begin = self._inside(self.q)
-        nearest, cost_least = begin, math.inf
-        for start in (begin, *self._starts(float(p_ref[4]))):
+        initial = self._inside(self.q)
+        nearest, cost_least = initial, math.inf
+        for start in (initial, *self._start_poses(float(p_ref[4]))):
             self.q[:] = start
             cost = self._descend(p_ref, np.ones(N_JOINTS), np.zeros(N_JOINTS))
             if cost < cost_least:
@@ -188,17 +188,17 @@ class InverseKinematics:
             if float(np.abs(self._error).max()) <= TOLERANCE:
                 break
         else:
-            # from `begin` too: what is nearest with the legs apart need not be nearest with them
-            found = [self._nearest_closed(p_ref, start) for start in (nearest, begin)]
+            # from `initial` too: the nearest pose with the legs apart may not be the closed one
+            found = [self._nearest_closed(p_ref, start) for start in (nearest, initial)]
             self.q[:] = min(found, key=lambda one: one[0])[1]
         return self.examine(p_ref)
 
     def examine(self, p_ref: Array) -> Reach:
-        """Return how near p_ref `q` is and what keeps it from coming nearer; moves nothing.
+        """Return the distance of `q` from p_ref and what limits it; `q` does not change.
 
-        At the nearest pose where the legs agree, J^T e + C^T mu is zero for some mu but at
-        joints that stand at a limit and would go on (the optimality conditions of
-        min |e|^2 / 2, e = p_ref - p, subject to closure = 0 and the limits).
+        At the nearest pose where the legs agree, J^T e + C^T mu is zero for some mu. Joints at
+        a limit that would move beyond it are excepted. These are the optimality conditions of
+        min |e|^2 / 2, e = p_ref - p, subject to closure = 0 and the limits.
 
         Args:
             p_ref: (6,), m and rad.
@@ -214,15 +214,15 @@ class InverseKinematics:
             free = at_limit == 0.0
             mu = np.linalg.lstsq(C[:, free].T, -pull[free], rcond=None)[0]
             left = pull + mu @ C
-            moves = np.abs(left) > STATIONARY * float(np.abs(error).max())
-            stopped = at_limit * (moves & (left * at_limit > 0.0))
-            if closure > STEP_SURE or bool((moves & (stopped == 0.0)).any()):
+            not_stationary = np.abs(left) > STATIONARY * float(np.abs(error).max())
+            stopped = at_limit * (not_stationary & (left * at_limit > 0.0))
+            if closure > STEP_SURE or bool((not_stationary & (stopped == 0.0)).any()):
                 outcome = IkEnding.UNFINISHED
             else:
                 outcome = IkEnding.JOINT_LIMIT if stopped.any() else IkEnding.OUT_OF_REACH
         return Reach(outcome, error, closure, tuple(map(int, stopped)), self._evaluations)
 
-    def _starts(self, pitch: float) -> Iterator[Array]:
+    def _start_poses(self, pitch: float) -> Iterator[Array]:
         """Yield configurations (12,) to start from, with a torso pitch in rad."""
         for knee in (-0.5, -1.6):
             yield self._inside(np.tile([0.0, 0.2, 0.0, knee, 0.0, pitch - 0.2 - knee], 2))
@@ -233,9 +233,9 @@ class InverseKinematics:
                 yield self._inside(q)
 
     def _nearest_closed(self, p_ref: Array, start: Array) -> tuple[float, Array]:
-        """Return the miss and q of the nearest pose downhill at which the legs agree.
+        """Return the weighted error and q of the nearest pose downhill at which the legs agree.
 
-        The method of multipliers: `shift` is what holds the closure against the pull of p_ref.
+        It uses the method of multipliers: `shift` holds the closure against the pull of p_ref.
         """
         self.q[:] = start
         weights = np.repeat([1.0, CLOSURE_WEIGHT], 6)
@@ -246,12 +246,12 @@ class InverseKinematics:
         return float(np.linalg.norm(weights * self._error)), self.q.copy()
 
     def _descend(self, p_ref: Array, weights: Array, shift: Array) -> float:
-        """Move `q` downhill in |weights * error + shift|^2 until nothing moves; return it.
+        """Move `q` downhill in |weights * error + shift|^2 until it stops; return that cost.
 
-        Levenberg-Marquardt with the joint limits as an active set; a step is taken only
-        if it gains a part of what the linearisation promises.
+        Levenberg-Marquardt with the joint limits as an active set. A step is kept only if it gains
+        at least a fraction of the gain that the linearisation predicts.
         """
-        self._residual(p_ref, EQUAL_SHARES)
+        self._residual(p_ref, EQUAL_SHARING)
         e, A = weights * self._error + shift, weights[:, None] * self._system
         cost, damping = float(e @ e), 1e-3
         last = self._evaluations + EVALUATIONS_MAX
@@ -259,13 +259,13 @@ class InverseKinematics:
             if float(np.abs(self._error).max()) <= 0.1 * TOLERANCE:
                 break
             before, kept = self.q.copy(), self._error.copy()
-            step = _shortened(self._step_inside(A, e, damping), COLD_STEP_MAX)
+            step = _limited_length(self._damped_step(A, e, damping), COLD_STEP_MAX)
             e_linear = e - A @ step
             promised = cost - float(e_linear @ e_linear)
             if abs(promised) <= 1e-14 * cost:
                 break
-            self.q[:] = self._inside(self.q + step)  # to the last bit
-            self._residual(p_ref, EQUAL_SHARES)
+            self.q[:] = self._inside(self.q + step)  # exactly inside the limits
+            self._residual(p_ref, EQUAL_SHARING)
             e_after = weights * self._error + shift
             gained = cost - float(e_after @ e_after)
             if gained > max(0.0, 1e-3 * promised):
@@ -276,26 +276,26 @@ class InverseKinematics:
                 damping = 8.0 * max(damping, 1e-6)
         return cost
 
-    def _step_inside(self, A: Array, e: Array, damping: float) -> Array:
+    def _damped_step(self, A: Array, e: Array, damping: float) -> Array:
         """Return a damped step (12,) towards A step = e that ends inside the joint limits.
 
-        Joints that stand at a limit with the gradient pointing out are held from the start
-        (all others may come off theirs); joints that the step would take out of their range
-        go as far as it goes. What is then left is for the others.
+        Joints at a limit with the gradient pointing outwards are blocked from the start; all others
+        may leave their limit. Joints that the step would take out of their range move up to the
+        limit. The other joints share the remaining error.
         """
         room_low, room_high = self._low - self.q, self._high - self.q
         step = np.zeros(N_JOINTS)
         downhill = A.T @ e
-        held = ((room_high <= 0.0) & (downhill > 0.0)) | ((room_low >= 0.0) & (downhill < 0.0))
-        free = leaving = ~held
-        while leaving.any():
+        blocked = ((room_high <= 0.0) & (downhill > 0.0)) | ((room_low >= 0.0) & (downhill < 0.0))
+        free = newly_blocked = ~blocked
+        while newly_blocked.any():
             J = A * free
-            to_do = J.T @ (e - A @ (step * ~free))
-            wanted = np.linalg.solve(J.T @ J + damping * np.eye(N_JOINTS), to_do)
-            inside = np.minimum(np.maximum(wanted, room_low), room_high)
+            gradient = J.T @ (e - A @ (step * ~free))
+            unlimited = np.linalg.solve(J.T @ J + damping * np.eye(N_JOINTS), gradient)
+            inside = np.minimum(np.maximum(unlimited, room_low), room_high)
             step = np.where(free, inside, step)
-            leaving = free & (inside != wanted)
-            free = free & ~leaving
+            newly_blocked = free & (inside != unlimited)
+            free = free & ~newly_blocked
         return step
 
     def _inside(self, q: Array) -> Array:
@@ -311,16 +311,16 @@ class InverseKinematics:
         return float(np.abs(self._error).max())
 
 
-def _shortened(step: Array, largest: float) -> Array:
-    """Return a step of the same direction with no part over the largest."""
+def _limited_length(step: Array, largest: float) -> Array:
+    """Return a step of the same direction with no part above `largest`."""
     return step * (largest / max(largest, float(np.abs(step).max())))
 
 
 def describe(reach: Reach, p_ref: Array, limits: Array) -> str:
-    """Return one line for people: what was asked, how far it goes and what stops it.
+    """Return one line of text: the requested pose, the nearest one and the limits that stop it.
 
     Args:
-        reach: of a solve for p_ref.
+        reach: result of a solve for p_ref.
         p_ref: (6,), m and rad.
         limits: of the joints (12, 2), rad.
     """
@@ -328,8 +328,8 @@ def describe(reach: Reach, p_ref: Array, limits: Array) -> str:
         return "p_ref is reached"
     scale = max(float(np.abs(reach.error).max()), TOLERANCE)
     digits = max(2, 1 - math.floor(math.log10(scale)))
-    missed = [
-        f"{name} {p_ref[row]:.{digits}f} {unit} asked, "
+    misses = [
+        f"{name} {p_ref[row]:.{digits}f} {unit} wanted, "
         f"{p_ref[row] - reach.error[row]:.{digits}f} {unit}"
         for row, (name, unit) in sorted(enumerate(POSE_ROWS), key=lambda r: -abs(reach.error[r[0]]))
         if abs(reach.error[row]) >= 0.1 * scale
@@ -341,9 +341,9 @@ def describe(reach: Reach, p_ref: Array, limits: Array) -> str:
     )
     if reach.outcome is IkEnding.UNFINISHED:
         verdict = "was not reached"
-        why = f"given up after {reach.evaluations} evaluations, there may be something nearer"
+        why = f"stopped after {reach.evaluations} evaluations, a closer pose may exist"
     else:
         verdict = "cannot be reached"
         why = stops or "the legs reach no further, no joint is at its limit"
-    others = "".join(f"; {row} there" for row in missed[1:])
-    return f"p_ref {verdict}: {missed[0]} is as far as it goes: {why}{others}"
+    others = "".join(f"; {row} there" for row in misses[1:])
+    return f"p_ref {verdict}: {misses[0]} is the closest: {why}{others}"

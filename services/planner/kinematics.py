@@ -1,9 +1,9 @@
-"""The pose p, its Jacobian and the Hessian term, as numbers (paper section IV).
+"""Evaluates the pose p, its Jacobian and the Hessian term as numbers (paper section IV).
 
-p = [COM x y z; torso roll pitch yaw]. The two legs' estimates of the torso are mixed by
-the load-sharing matrices D: J_torso = [D_R^T J_R, D_L^T J_L], so that J^T F asks each
-foot for a wrench its sole can give. The knees' masses enter through their own leg. The
-equations stand in `services.planner.symbolic`.
+p = [COM x y z; torso roll pitch yaw]. The load-sharing matrices D mix the two legs' estimates of
+the torso: J_torso = [D_R^T J_R, D_L^T J_L]. J^T F then requests from each foot a wrench that its
+sole can give. The knees' masses enter through their own leg. `services.planner.symbolic` holds the
+equations.
 """
 
 from __future__ import annotations
@@ -24,28 +24,27 @@ Array = NDArray[np.float64]
 
 
 _GRAPHS: Final[dict[tuple[MassConfig, GeometryConfig, LawConfig], symbolic.Graphs]] = {}
-"""A process builds the graphs of a robot once: that takes a tenth of a second."""
+"""Graphs per robot. A process builds each once, because that takes a tenth of a second."""
 _GRAPHS_KEPT: Final = 16
 DETERMINANT_MIN: Final = 0.05
-"""Least determinant of a leg's Jacobian, m^3. Straighter or more folded legs (outside 0.79 to 1.27
-m) give no wrench: a N m of friction would be more than 10 N."""
+"""m^3, of a leg's Jacobian. Straighter or more folded legs (outside 0.79 to 1.27 m) give no wrench,
+because 1 N m of friction would be more than 10 N."""
 
 
 class Kinematics:
     """p, J and the closure of the two legs at one joint configuration.
 
-    After `update(q)`; the arrays are overwritten by the next one:
+    `update(q)` writes these arrays, and the next call overwrites them:
 
-    - `p` (6,): m and rad; `J` (6, 12): dp/dq;
-    - `closure` (6,): left minus right estimate of the torso, m and rad; `C` (6, 12):
-      d closure/dq;
-    - `J_harness` (3, 12): harness point's velocity per joint rate, m/rad, world;
-    - `r_torso` (3,), `r_harness` (3,): m, world;
+    - `p` (6,): m and rad; `J` (6, 12): dp/dq.
+    - `closure` (6,): left minus right estimate of the torso, m and rad; `C` (6, 12): d closure/dq.
+    - `J_harness` (3, 12): harness point's velocity per joint rate, m/rad, world.
+    - `r_torso` (3,), `r_harness` (3,): m, world.
     - `D_left` (6, 6): the left leg's share of a torso wrench; the right's is I - D_left.
 
-    Written from outside:
+    The caller writes:
 
-    - `stance` (6,): where the right foot is against the left, beyond how the robot file has them:
+    - `stance` (6,): pose of the right foot relative to the left, as deviation from the robot file:
       x, y, z in m and a rotation vector in rad, world axes. The world is midway between the feet.
     """
 
@@ -69,12 +68,12 @@ class Kinematics:
         ) = self._pose.results
 
     def update(self, q: Array, D_left: Array | None = None) -> None:
-        """Compute everything at joint angles q (12,), rad.
+        """Compute all outputs at joint angles q (12,), rad.
 
         Args:
             q: joint angles.
-            D_left: load sharing (6, 6) to use; None computes that of q. Within a tick the
-                sharing is one choice, made where the robot is.
+            D_left: load sharing (6, 6) to use; None computes it at q. Within a tick the sharing is
+                fixed, chosen at the measured pose.
         """
         if D_left is None:
             self._sharing.arguments[0][:] = q
@@ -94,10 +93,10 @@ class Kinematics:
         return self._stance.results[0]
 
     def hessian_times(self, F: Array, F_harness: Array) -> Array:
-        """Return sum_i H_i F_i (12, 12), plus the harness point's for its force, N m/rad.
+        """Return sum_i H_i F_i (12, 12), plus the harness point's term for its force, N m/rad.
 
-        d(J^T F)/dq where `update` was, with each leg's share of the wrench held: symmetric,
-        and exact along the closed chain. Overwritten by the next call.
+        It is d(J^T F)/dq at the last `update`, with each leg's share of the wrench constant. It is
+        symmetric, and exact along the closed chain. The next call overwrites it.
 
         Args:
             F: wrench along p (6,): N, and N m along roll, pitch, yaw.
@@ -122,20 +121,20 @@ def _graphs_of(config: RobotConfig) -> symbolic.Graphs:
 
 
 def leg_loads(C: Array, tau: Array) -> tuple[float, float]:
-    """Return the upward force of right and left leg on the torso, N; NaN: it is not known.
+    """Return the upward force of right and left leg on the torso, N; NaN if it is not known.
 
-    Straight and folded legs do not tell (`DETERMINANT_MIN`). A leg's own Jacobian J_leg (6, 6) is
-    its part of the closure's, whose sign is the leg's: J_leg^T W = tau. Of its own weight a leg
-    carries some; it is not taken off.
+    Straight and folded legs give none (`DETERMINANT_MIN`). A leg's own Jacobian J_leg (6, 6) is its
+    part of the closure's, with the leg's sign: J_leg^T W = tau. A leg carries part of its own
+    weight, which is not subtracted.
 
     Args:
         C: d closure/dq (6, 12): left minus right.
         tau: joint torques (12,), N m.
     """
-    return _load(-C[:, :6], tau[:6]), _load(C[:, 6:], tau[6:])
+    return _vertical_force(-C[:, :6], tau[:6]), _vertical_force(C[:, 6:], tau[6:])
 
 
-def _load(J_leg: Array, tau: Array) -> float:
+def _vertical_force(J_leg: Array, tau: Array) -> float:
     if not abs(float(np.linalg.det(J_leg))) > DETERMINANT_MIN:
         return math.nan
     return float(np.linalg.solve(J_leg.T, tau)[2])

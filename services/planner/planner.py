@@ -1,7 +1,7 @@
-"""One planner tick without any I/O: six states in, six commands and a status out.
+"""Runs planner ticks without I/O: six states in, six commands and a status out.
 
-The same object runs live behind the bus, in lockstep under virtual time, and in
-re-execution from a log.
+The same object runs live behind the bus, in lockstep under virtual time, and in re-execution from a
+log.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from shared.robot.limp_leg_support import Support
 
 Array = NDArray[np.float64]
 
-EARLY_SHARE = 0.5
-"""Fraction of a period: states that arrive sooner after a tick still belong to that tick."""
-LATE_SHARE = 1.25
-"""Multiple of the period after which the planner ticks with the states it has."""
+EARLY_FRACTION = 0.5
+"""Fraction of a period; states that arrive sooner after a tick still belong to that tick."""
+LATE_FRACTION = 1.25
+"""Fraction of a period after which the planner ticks with the states it has."""
 TICK_GAP_MAX_S = 0.02
 """A longer gap between ticks (a stopped process) is not integrated over."""
 
@@ -52,14 +52,14 @@ _ALL_NEW = (1 << N_MODULES) - 1
 
 
 class Planner:
-    """The whole-body law behind its engagement rule."""
+    """Whole-body law behind its engagement rule."""
 
     def __init__(self, config: RobotConfig, session: int) -> None:
         """Start waiting for six fresh states.
 
         Args:
             config: the robot.
-            session: drawn at random for each start; told in every command.
+            session: drawn at random at each start; sent in every command.
         """
         self.session = session
         self._law = Hocca(config)
@@ -91,10 +91,10 @@ class Planner:
         self._seq = 0
         self._output: LawOutput | None = None
         self._source: SplitSource | None = None
-        """Where the gains of the last tick came from."""
+        """Source of the gains of the last tick."""
 
     def receive_state(self, module: int, state: JointState, now_ns: int) -> None:
-        """Take a module's newest state, if it can be one."""
+        """Store a module's newest state, if it is plausible."""
         if not self._plausible.is_state(module, state):
             return
         self._states[module] = state
@@ -105,35 +105,34 @@ class Planner:
         self._tau[2 * module : 2 * module + 2] = state.tau
 
     def receive_wrench(self, wrench: Wrench, now_ns: int) -> None:
-        """Take the harness's newest wrench."""
+        """Store the harness's newest wrench."""
         self._wrench_seq = wrench.seq
         self._wrench, self._wrench_ns = wrench, now_ns
         self._overload.receive(wrench, now_ns)
 
     def receive_attitude(self, attitude: Attitude, now_ns: int) -> None:
-        """Take the IMU's newest attitude."""
+        """Store the IMU's newest attitude."""
         self._attitude_seq = attitude.seq
         self._attitude, self._attitude_ns = attitude, now_ns
 
     def receive_wish(self, wish: Wish) -> None:
-        """Take what the person asks for now (`services.planner.intents`)."""
+        """Store the operator's current request (`services.planner.intents`)."""
         self._wish = wish
 
     def is_due(self, now_ns: int) -> bool:
-        """Return True if it is time to tick: as soon as all six have a new state.
+        """Return True if a tick is due: as soon as all six modules have a new state.
 
-        Age is what costs: in the open directions the local gains are cancelled by fresh
-        references only. On a timer of its own the planner would let states lie for up to
-        a period; waiting for them it ticks at their rate, and on late ones it does not
-        wait for long.
+        Low age matters, because in the open directions only fresh references cancel the local
+        gains. On its own timer the planner would let states age for up to a period. Waiting for
+        them, it ticks at their rate, and it waits only briefly for late ones.
         """
         since_s = (now_ns - self._last_ns) / NS_PER_S
         if self._new == _ALL_NEW:
-            return since_s >= EARLY_SHARE * self._period_s
-        return since_s >= LATE_SHARE * self._period_s
+            return since_s >= EARLY_FRACTION * self._period_s
+        return since_s >= LATE_FRACTION * self._period_s
 
     def tick(self, now_ns: int) -> list[JointCommand]:
-        """Run the law; return six commands, or none while a module was never heard.
+        """Run the law; return six commands, or none until every module has sent a state.
 
         Args:
             now_ns: the planner's monotonic clock.
@@ -156,7 +155,8 @@ class Planner:
             self._inhibit(),
         )
         self._support = self._limp_legs.advance(now_ns, states)
-        # until all engage the law starts anew from the measured pose: there is no step
+        # until all engage, the law restarts from the measured pose each tick: there is no
+        # step
         self._output = self._law.tick(
             self._q,
             self._v,
@@ -182,10 +182,10 @@ class Planner:
         values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)
         self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
-        common = CommandHeader(
+        header = CommandHeader(
             now_ns, self._seq, self.session, self._hold(), self._output.local.margins
         )
-        return commands_of(common, states, self._output, self._support)
+        return commands_of(header, states, self._output, self._support)
 
     def snapshot(self) -> TickState:
         """Return the state between two ticks; `restore` continues from it."""
@@ -210,9 +210,9 @@ class Planner:
             self._unattended.snapshot(),
         )
 
-    def restore(self, memory: TickState) -> None:
+    def restore(self, snapshot: TickState) -> None:
         """Continue from a state, bit for bit."""
-        m = memory
+        m = snapshot
         for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
             if state is not None:
                 self.receive_state(module, state, arrived_ns)
@@ -229,14 +229,14 @@ class Planner:
         self._trips.restore(m.trips)
 
     def _usable_wrench(self, now_ns: int) -> Wrench | None:
-        """Return the newest wrench, or None if it is not valid or has come too long ago."""
+        """Return the newest wrench, or None if it is invalid or too old."""
         wrench = self._wrench
         if wrench is None or not wrench.valid or now_ns - self._wrench_ns > self._wrench_stale_ns:
             return None
         return wrench
 
     def _drift(self, now_ns: int, lifted: float | None) -> float:
-        """Return how far the robot has drifted since a hand was felt last, m."""
+        """Return how far the robot has drifted since a hand was last felt, m."""
         wrench, output = self._usable_wrench(now_ns), self._output
         if wrench is None or lifted is None or output is None:
             force = moment = math.nan
@@ -253,14 +253,14 @@ class Planner:
         return force_up(wrench.force, float(output.p[3]), float(output.p[4]))
 
     def _usable_up(self, now_ns: int) -> Vector3 | None:
-        """Return where up is, torso axes, or None if the newest is not valid or too old."""
+        """Return the unit vector up, torso axes, or None if the newest is invalid or too old."""
         attitude = self._attitude
         if attitude is None or not attitude.valid:
             return None
         return attitude.up if now_ns - self._attitude_ns <= self._attitude_stale_ns else None
 
     def _inhibit(self) -> PlannerMode | None:
-        """Return why the planner may not lead, by what the last tick found; None if it may."""
+        """Return why the planner may not engage, from the last tick's results; None if it may."""
         if self._overload.hold:
             return PlannerMode.OVERLOADED
         if self._law.stance_refused:
@@ -276,12 +276,12 @@ class Planner:
     def _hold(self) -> bool:
         """Return True if commands carry `hold`.
 
-        By what this very tick found: no gains are lent to TRACK without a certificate.
+        It uses this tick's results: without a certificate no gains go to modules in TRACK.
         """
         return self._engagement.hold or self._inhibit() is not None
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
-        """Return what the last tick saw and decided."""
+        """Return the inputs and decisions of the last tick."""
         output = self._output
         states = self._states
         seqs = [state.seq if state is not None else -1 for state in states]
@@ -292,8 +292,8 @@ class Planner:
         leads = self._engagement.mode is PlannerMode.LEADING
         p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         if output is not None:
-            seen = output.p, output.pdot, output.p_ref, output.closure, output.stance
-            p, pdot, p_ref, closure, stance = map(_six, seen)
+            vectors = output.p, output.pdot, output.p_ref, output.closure, output.stance
+            p, pdot, p_ref, closure, stance = map(_vector6, vectors)
         return PlannerStatus(
             t_ns=now_ns,
             seq=self._seq,
@@ -327,6 +327,6 @@ class Planner:
         )
 
 
-def _six(values: Array) -> Vector6:
+def _vector6(values: Array) -> Vector6:
     a, b, c, d, e, f = values.tolist()
     return a, b, c, d, e, f

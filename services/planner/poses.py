@@ -80,7 +80,7 @@ class Poses:
         return ends[0], ends[1]
 
     def outwards(self, z: float, pitches: Sequence[float]) -> Iterator[tuple[int, float]]:
-        """Yield (index, pitch) from upright outwards: each pose starts from its neighbour."""
+        """Yield (index, pitch), from upright outwards; each pose starts from its neighbour."""
         upright = min(range(len(pitches)), key=lambda j: abs(pitches[j]))
         for direction in (range(upright, len(pitches)), range(upright - 1, -1, -1)):
             self._solve_stand(z, 0.0)

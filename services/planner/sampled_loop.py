@@ -1,23 +1,23 @@
-"""The sampled-data loop around a pose, linearised, with a flexible drivetrain. Offline and pure.
+"""Models the sampled-data loop around a pose: linear, with a flexible drivetrain. Offline and pure.
 
-What `docs` of the law calls the dynamic certificate rests on this model. Around a stand, in
-deviations from it, with the feet where they are:
+The dynamic certificate (docs/law.md) rests on this model. Around a standing pose, in deviations
+from it, with both feet in place:
 
     M p''     = T^T s - (K_geo + K_hand) p - (B_hand + d_joint T^T T) p'
     I theta'' = tau - s - d_motor theta',       s = k (theta - T p) + b (theta' - T p')
     lag tau'  = u - tau
     q^' = v^ + 2 w (theta - q^),  v^' = w^2 (theta - q^)        the drive's estimator
 
-and on it, each at its own rate:
+The controllers run on it, each at its own rate:
 
     drive          u = W - D_m q^ - D_Bm v^                     D_m: the module's mean
     joint service  W = tau + D_m q^ + D_Bm v^, tau the law of `services.joint.pd_law` on q^, v^
     planner        r = S J q^, q_ref = T r, tau_coupled filtered, sent d later than sampled
 
-One planner period is a linear map; the loop is stable if its spectral radius is below 1.
+One planner period is a linear map. The loop is stable if the map's spectral radius is below 1.
 
-Every quantity of a stand that is symmetric, left to right, splits into a sagittal half (x, z,
-pitch) and a lateral one (y, roll, yaw): `halves`.
+A standing pose is symmetric, left to right. Its quantities therefore split into a sagittal half (x,
+z, pitch) and a lateral one (y, roll, yaw): `halves`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 
 class DrivetrainModel(NamedTuple):
-    """Between motor and joint, as the certificate takes it."""
+    """Flexible drivetrain between motor and joint."""
 
     stiffness: float
     """k, N m/rad."""
@@ -54,7 +54,7 @@ class DrivetrainModel(NamedTuple):
 
 
 class HandModel(NamedTuple):
-    """The hand at the harness."""
+    """Stiffness and damping of the hand at the harness, along z and pitch."""
 
     k_z: float
     b_z: float
@@ -66,20 +66,20 @@ NO_HAND: Final = HandModel(0.0, 0.0, 0.0, 0.0)
 
 
 class LoopTiming(NamedTuple):
-    """When what happens, s."""
+    """Periods and delays of the loop, s."""
 
     joint_period: float
     planner_period: float
     delay: float
     """From a state's sample to the first joint cycle that uses its command."""
     drive_step: float = 125e-6
-    """Period of the drive's own loop, s."""
+    """Period of the drive's own loop."""
     write_delay: float = 1e-3
-    """From a joint cycle to the drive's acting on it; a multiple of `drive_step`."""
+    """From a joint cycle to the drive's response; a multiple of `drive_step`."""
 
 
 class Feedback(NamedTuple):
-    """What is done with the measurements, at one pose; matrices (12, 12) or (12,)."""
+    """Feedback gains at one pose; matrices (12, 12) or (12,)."""
 
     D: Array
     D_B: Array
@@ -88,14 +88,14 @@ class Feedback(NamedTuple):
     C_v: Array
     """Coupled damping, N m s/rad."""
     bandwidth_hz: float
-    """Bandwidth of the two poles of tau_coupled, Hz."""
+    """Bandwidth of the two poles of tau_coupled."""
     lead_easing: float = 0.0
     easing_bandwidth_hz: float = 40.0
-    """Bandwidth of the pole on the measured hand force, Hz."""
+    """Bandwidth of the pole on the hand's measured wrench."""
 
 
 class Gains(NamedTuple):
-    """Factors on parts of the loop: a margin is how far they may go."""
+    """Factors on parts of the loop; a margin is the largest stable factor."""
 
     coupling: float = 1.0
     """On tau_coupled."""
@@ -107,15 +107,15 @@ NOMINAL: Final = Gains()
 
 
 class Growth(NamedTuple):
-    """The motion that fades last, or grows."""
+    """The motion that decays most slowly, or grows fastest."""
 
     rate: float
-    """1/s; negative: it fades."""
+    """1/s; negative if it decays."""
     frequency_hz: float
 
 
 class Stand(NamedTuple):
-    """A pose, linearised."""
+    """Linearised pose."""
 
     M: Array
     """(6, 6) inertia along p, without rotors."""
@@ -134,7 +134,7 @@ class Stand(NamedTuple):
 
 
 class Half(NamedTuple):
-    """A part of the loop that lives by itself."""
+    """Part of the loop that is decoupled from the rest."""
 
     P: Array
     """(6, n) basis of p."""
@@ -143,7 +143,7 @@ class Half(NamedTuple):
 
 
 def halves() -> tuple[Half, Half]:
-    """Return (sagittal, lateral): the mirror swaps the legs and turns every phi's sign."""
+    """Return (sagittal, lateral); the mirror swaps the legs and inverts the sign of every phi."""
     mirror = np.array([-1.0, 1.0] * (N_LEG // 2))
     eye = np.eye(N_LEG) / math.sqrt(2.0)
     sagittal, lateral = np.vstack((eye, eye * mirror)), np.vstack((eye, -eye * mirror))
@@ -152,7 +152,7 @@ def halves() -> tuple[Half, Half]:
 
 
 def whole() -> Half:
-    """Return the identity: all of the loop at once."""
+    """Return the identity: the whole loop at once."""
     return Half(np.eye(6), np.eye(N_JOINTS))
 
 
@@ -173,13 +173,13 @@ class SampledLoop:
 
         Args:
             stand: the pose.
-            half: what of the loop is looked at.
+            half: part of the loop to analyse.
             feedback: of services and planner.
             drivetrain: of every joint.
-            timing: when what happens.
+            timing: periods and delays of the loop.
             hand: at the harness.
-            served: (12,), 0 for joints whose service is dead: their drives hold what they have.
-                With the whole of the loop only. None: all are served.
+            served: (12,), 0 for joints whose service is dead: their drives keep their last target.
+                Only with the whole loop. None if all services run.
         """
         self._timing, self._feedback = timing, feedback
         P, V = half.P, half.V
@@ -206,7 +206,7 @@ class SampledLoop:
         self._ease_p = -alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1])
         self._ease_v = -alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1])
         self.n_z = n_z
-        """(n_p,): how high the harness point goes with p."""
+        """(n_p,): rise of the harness point along p."""
         self._plant(P.T @ stand.M @ P, P.T @ stand.K_geo @ P, drivetrain)
         self._n_x = 2 * self._n_p + 5 * n
 
@@ -249,14 +249,14 @@ class SampledLoop:
     ) -> tuple[Array, Array]:
         """Return (Phi, Gamma): X+ = Phi X + Gamma f over one planner period.
 
-        X holds plant and estimator, the drives' targets, the filters, and commands on their way;
-        f is a force along p, held over the period.
+        X holds plant and estimator, the drives' targets, the filters, and the commands in transit.
+        f is a force along p, constant over the period.
 
         Args:
             gains: on parts of the loop, for its margins.
-            delay: s; None: that of the timing.
-            slots: room for at least so many commands on their way, so that maps of different
-                delays fit one another.
+            delay: s; None uses the delay of the timing.
+            slots: least number of slots for commands in transit, so that maps of different delays
+                have the same size.
         """
         t, n, n_open, n_x = self._timing, self._n_q, len(self._open), self._n_x
         delay = t.delay if delay is None else delay
@@ -296,11 +296,11 @@ class SampledLoop:
         return np.asarray(np.linalg.eigvals(self.period_map(gains)[0]), complex)
 
     def growth(self, gains: Gains = NOMINAL, above_hz: float = 0.0) -> Growth:
-        """Return how fast the loop's slowest motion grows, and its frequency.
+        """Return the growth rate of the loop's slowest decay, and its frequency.
 
         Args:
             gains: on parts of the loop.
-            above_hz: leave out what is slower.
+            above_hz: ignore slower motions.
         """
         values = self.eigenvalues(gains)
         if above_hz > 0.0:
@@ -314,7 +314,7 @@ class SampledLoop:
     def impedance_z(self, w: float) -> complex:
         """Return force over velocity of the harness point, N s/m, when a hand moves it at w rad/s.
 
-        Only of the half that holds z. The force acts along the world's z at the harness.
+        Valid only for the half that holds z. The force acts along the world's z at the harness.
         """
         Phi, Gamma = self.period_map()
         z = np.exp(1j * w * self._timing.planner_period)
@@ -324,37 +324,37 @@ class SampledLoop:
     def _tick(
         self, x: Array, f_1: Array, f_2: Array, eased: Array
     ) -> tuple[Array, Array, Array, Array]:
-        """Run the planner on the samples of now; return its filter and what it sends."""
+        """Run the planner on the current samples; return its filter states and its command."""
         q, v = x[self._q], x[self._v]
         r, rate = self._J_open @ q, self._J_open @ v
         e_q, e_v = self._T_open @ r - q, self._T_open @ rate - v
         raw = self._C_q @ e_q + self._C_v @ e_v
-        share = follow(self._feedback.bandwidth_hz, self._timing.planner_period)
-        f_1 = f_1 + share * (raw - f_1)
-        f_2 = f_2 + share * (f_1 - f_2)
-        share = follow(self._feedback.easing_bandwidth_hz, self._timing.planner_period)
+        pole_gain = follow(self._feedback.bandwidth_hz, self._timing.planner_period)
+        f_1 = f_1 + pole_gain * (raw - f_1)
+        f_2 = f_2 + pole_gain * (f_1 - f_2)
+        pole_gain = follow(self._feedback.easing_bandwidth_hz, self._timing.planner_period)
         felt = self._ease_p @ x[self._p] + self._ease_v @ x[self._pd]
-        eased = eased + share * (felt - eased)
+        eased = eased + pole_gain * (felt - eased)
         return f_1, f_2, eased, np.vstack((r, rate, f_2 + eased))
 
     def _target(self, x: Array, entry: Array, age: float, gains: Gains) -> Array:
-        """Run the joint service on the samples of now; return W of the drives' law."""
+        """Run the joint service on the current samples; return W of the drives' law."""
         q, v, n_open = x[self._q], x[self._v], len(self._open)
         r, rate, coupled = entry[:n_open], entry[n_open : 2 * n_open], entry[2 * n_open :]
         q_ref, v_ref = self._T_open @ (r + age * rate), self._T_open @ rate
         tau = self._D @ (q_ref - q) + self._D_B @ (v_ref - v) + gains.coupling * coupled
-        # a gain on all feedback is none on the weight's feedforward
+        # a gain on all feedback does not scale the weight's feedforward
         tau = tau + self._H @ q_ref / gains.torque
         return np.asarray(self._served @ (tau + self._D_m @ q + self._D_Bm @ v), float)
 
 
 def follow(bandwidth_hz: float, period: float) -> float:
-    """Return how far a pole of this bandwidth goes towards its input in a period, 0 .. 1."""
+    """Return the step of a first-order pole towards its input in a period, as a fraction 0 .. 1."""
     return 1.0 - math.exp(-2.0 * math.pi * bandwidth_hz * period)
 
 
 def _repeated(F: Array, G: Array, G_f: Array, times: int) -> tuple[Array, Array, Array]:
-    """Return the map of so many steps with the same inputs."""
+    """Return the map of `times` steps with constant inputs."""
     total, by_w, by_f = np.eye(len(F)), np.zeros_like(G), np.zeros_like(G_f)
     for _ in range(times):
         total, by_w, by_f = F @ total, F @ by_w + G, F @ by_f + G_f

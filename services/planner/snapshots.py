@@ -1,4 +1,4 @@
-"""What the planner knows beyond its configuration, as data: it goes on from there bit for bit."""
+"""State of the planner beyond its configuration, as data: it resumes from it bit for bit."""
 
 from __future__ import annotations
 
@@ -55,27 +55,27 @@ class ShiftState(msgspec.Struct, frozen=True):
 
 
 class TripsState(msgspec.Struct, frozen=True):
-    """State of `Trips`."""
+    """State of `PlannerTrips`."""
 
     since_ns: tuple[int, ...] = (0,) * len(PLANNER_TRIPS)
-    """Since when each is beyond its limit; 0: it is not."""
+    """Time since which each value is beyond its limit; 0 if it is not."""
     calm_ns: int = 0
-    """Since when none is."""
+    """Time since which no value is beyond its limit."""
     tripped: Trip = Trip.NONE
     why: str = ""
     stands: bool = False
-    """Both legs have been seen to bear the torso since leading began."""
+    """Both legs have carried the torso since the planner engaged."""
     light: bool = False
-    """The person has been seen not to press on it since leading began."""
+    """The person has stopped pressing on the robot since the planner engaged."""
 
 
 class UnattendedState(msgspec.Struct, frozen=True):
     """State of `Unattended`."""
 
     felt_ns: int = 0
-    """When a hand was felt last."""
+    """Time at which a hand was last felt."""
     left: Pair | None = None
-    """Where it left the robot: height of the COM, m, and the torso's pitch, rad."""
+    """Pose in which it left the robot: height of the COM, m, and the torso's pitch, rad."""
 
 
 class LoadState(msgspec.Struct, frozen=True):
@@ -97,22 +97,22 @@ class LawState(msgspec.Struct, frozen=True):
     since_align_s: float
     aligned: bool
     q: tuple[float, ...]
-    """Where the inverse kinematics starts from, rad."""
+    """Start of the inverse kinematics, rad."""
     assist: AssistState
     easing: EasingState
     has_led: bool = False
     coupling: tuple[float, ...] = (0.0,) * (2 * N_JOINTS)
     """State of `CouplingFilter`, N m."""
     levelling: tuple[bool, float, float] = (False, 0.0, 0.0)
-    """Whether a slope is known, and the slope, rad: the memory of `Levelling`."""
+    """State of `Levelling`: True if a slope is known, and the slope, rad."""
     shift: ShiftState = ShiftState()
     stance: tuple[Vector6, bool] = (AS_CONFIGURED, False)
-    """Memory of `Stance`: what is taken, m and rad, and whether it is refused."""
+    """State of `Stance`: the adopted stance, m and rad, and True if it is refused."""
     load: LoadState = LoadState()
 
 
 class TickState(msgspec.Struct, frozen=True):
-    """State of `Planner` before a tick."""
+    """State of `Planner`, before a tick."""
 
     states: tuple[JointState | None, ...]
     arrived_ns: tuple[int, ...]

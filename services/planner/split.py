@@ -100,8 +100,8 @@ class GainSplit:
             if stale or config.gain_schedule is None:
                 raise ConfigError("robot", "law.split", stale, "run `xrl gains --config FILE`")
             self._schedule = ScheduledGains(config.gain_schedule)
-            table = config.gain_schedule
-            self.coupling = CouplingGains(table.coupling_bandwidth_hz, table.coupling_damping)
+            schedule = config.gain_schedule
+            self.coupling = CouplingGains(schedule.coupling_bandwidth_hz, schedule.coupling_damping)
         limits = config.certificate
         self._margins_min = Margins(limits.margin_min, limits.onboard_margin_min)
         self._k_q_fraction_max = limits.k_q_fraction_max
@@ -146,7 +146,7 @@ class GainSplit:
         return LocalGains(D, D_B, margins, source)
 
     def _diagonal_gains(self, body: JointGains) -> tuple[Array, Array]:
-        """Return diag(K_q) and the configured fraction of diag(B_q), clipped to their range."""
+        """Return diag(K_q) and the configured fraction of diag(B_q), each within its limits."""
         D_B = self._damping_fraction * np.diagonal(body.B_q)
         return (
             np.minimum(np.maximum(np.diagonal(body.K_q), 0.0), self._k_max),

@@ -1,15 +1,15 @@
-"""The certified gain schedule, computed offline (docs/law.md#gain-split).
+"""Computes the certified gain schedule offline (docs/law.md#gain-split).
 
-At each node of a grid over COM height and torso pitch, the local stiffnesses D of one leg
-(the other is alike) solve a semidefinite program:
+The grid spans COM height and torso pitch. At each node, the local stiffnesses D of one leg solve a
+semidefinite program; the other leg is alike:
 
     minimise    K_loc[z, z] / 1000 + K_loc[pitch, pitch] / 10 + 1e-3 sum(D)
     subject to  K_loc(D) + K_geo >= diag(K_required)
                 K_loc(motor mean of D) + K_geo >= onboard_fraction diag(K_required)
                 0 <= D <= k_q_fraction_max diag(K_q)
 
-K_loc = T^T D T, K_geo as in `services.planner.certificate`, both without and with the full
-assist (K_geo is linear in it, so every assist in between is covered).
+K_loc = T^T D T, and K_geo is as in `services.planner.certificate`. The constraints hold without and
+with the full assist. K_geo is linear in the assist, so every assist in between is covered.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from shared.robot.joints import N_LEG
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
-"""Told how many nodes are done, of how many."""
+"""Called with the number of nodes done and their total."""
 
 N_HEIGHTS: Final = 25
 DYNAMIC_HEIGHTS: Final = 5
@@ -48,13 +48,13 @@ DYNAMIC_PITCHES: Final = (0.0, 1.2)
 PITCHES: Final = (-0.4, 0.0, 0.4, 0.8, 1.2, 1.5)
 """rad"""
 FULL_SCALE: Final = 1000.0
-"""N m/rad; D in the program is in units of this, so that the solver sees numbers near 1."""
+"""N m/rad; unit of D in the program, so that the solver works on numbers near 1."""
 
 
 def solve(
     config: RobotConfig,
     progress: Progress = lambda _done, _of: None,
-    tell: Callable[[str], None] = lambda _text: None,
+    report: Callable[[str], None] = lambda _text: None,
     design: Design | None = None,
     *,
     check: bool = True,
@@ -63,13 +63,13 @@ def solve(
 
     Args:
         config: the robot.
-        progress: told about the poses.
-        tell: told in words how the search for damping goes.
-        design: damping and coupling to take as they are; None: searched for.
-        check: whether a design that is taken is held to the dynamic certificate here.
+        progress: called with the poses done and their total.
+        report: called with text on the search for damping.
+        design: damping and coupling to use; None to search for them.
+        check: check a given design against the dynamic certificate.
 
     Raises:
-        RunError: at a pose no local gains meet the certificate; says which.
+        RunError: at a pose no local gains meet the certificate; names the pose.
     """
     poses = Poses(config)
     z_nodes = np.linspace(*poses.reach(), N_HEIGHTS)
@@ -102,9 +102,9 @@ def solve(
         lead_easing=config.law.lead_easing,
     )
     if design is None:
-        design = design_program.choose(config, dynamic_nodes(config, stiffness), tell)
+        design = design_program.choose(config, dynamic_nodes(config, stiffness), report)
     elif check:
-        design_program.check(config, dynamic_nodes(config, stiffness), design, tell)
+        design_program.check(config, dynamic_nodes(config, stiffness), design, report)
     return msgspec.structs.replace(
         stiffness,
         D_B=_rounded(np.array(design.D_B)),
@@ -115,14 +115,14 @@ def solve(
 
 
 def dynamic_nodes(config: RobotConfig, schedule: GainSchedule) -> list[DynamicNode]:
-    """Return the poses that the dynamic certificate is asked about."""
+    """Return the poses that the dynamic certificate covers."""
     z = np.array(schedule.z)
     heights = z[np.linspace(0, len(z) - 1, DYNAMIC_HEIGHTS).round().astype(int)]
     return nodes_of(config, ScheduledGains(schedule).at, heights, np.array(DYNAMIC_PITCHES))
 
 
 def design_of(schedule: GainSchedule) -> Design:
-    """Return what a schedule says of damping and coupling."""
+    """Return the damping and coupling of a schedule."""
     coupling = CouplingGains(schedule.coupling_bandwidth_hz, schedule.coupling_damping)
     return Design(schedule.D_B, coupling)
 
@@ -132,13 +132,13 @@ def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
 
     Args:
         config: the robot.
-        schedule: to be checked.
+        schedule: schedule to check.
     """
     poses, certificate, scheduled = Poses(config), Certificate(config), ScheduledGains(schedule)
     service = onboard = np.inf
     z_nodes, pitches = np.array(schedule.z), np.array(schedule.pitch)
-    for z in _with_middles(z_nodes):
-        for pitch in _with_middles(pitches):
+    for z in _with_midpoints(z_nodes):
+        for pitch in _with_midpoints(pitches):
             node = poses.node(z, pitch)
             for hessian in node.hessians if node is not None else ():
                 assert node is not None  # noqa: S101 - for the type checker
@@ -150,14 +150,14 @@ def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
 
 
 def push_limits(config: RobotConfig, heights: int) -> Iterator[tuple[float, dict[str, PushLimits]]]:
-    """Yield COM heights, m, and how hard a push is held there, upright.
+    """Yield COM heights, m, and the push limits there, upright.
 
     Args:
         config: the robot, with its gain schedule.
-        heights: how many, over the schedule's range.
+        heights: number of heights over the schedule's range.
     """
     schedule = config.gain_schedule
-    assert schedule is not None  # noqa: S101 - the caller has just made it
+    assert schedule is not None  # noqa: S101 - the caller has just computed it
     poses, scheduled = Poses(config), ScheduledGains(schedule)
     for z in np.linspace(schedule.z[0], schedule.z[-1], heights):
         node = poses.node(float(z), 0.0)
@@ -167,7 +167,7 @@ def push_limits(config: RobotConfig, heights: int) -> Iterator[tuple[float, dict
             yield float(z), limits_at(config, kinematics, node.T, H, D, scheduled.D_B)
 
 
-def _with_middles(nodes: Array) -> Array:
+def _with_midpoints(nodes: Array) -> Array:
     return np.sort(np.concatenate((nodes, 0.5 * (nodes[1:] + nodes[:-1]))))
 
 
@@ -175,15 +175,15 @@ def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Arr
     """Return D of one leg (6,), N m/rad, at a node.
 
     Raises:
-        RunError: there is none.
+        RunError: no D meets the constraints.
     """
     K_required = np.array(config.certificate.K_required)
     T = node.T / np.sqrt(K_required)
-    of_joint = [np.outer(T[i], T[i]) + np.outer(T[i + N_LEG], T[i + N_LEG]) for i in range(N_LEG)]
+    per_joint = [np.outer(T[i], T[i]) + np.outer(T[i + N_LEG], T[i + N_LEG]) for i in range(N_LEG)]
     D = cp.Variable(N_LEG, nonneg=True)
     mean = np.kron(np.eye(N_LEG // 2), np.full((2, 2), 0.5))
-    K_loc = _weighted_sum(of_joint, FULL_SCALE * D)
-    K_onboard = _weighted_sum(of_joint, FULL_SCALE * (mean @ D))
+    K_loc = _weighted_sum(per_joint, FULL_SCALE * D)
+    K_onboard = _weighted_sum(per_joint, FULL_SCALE * (mean @ D))
     constraints = [node.D_max / FULL_SCALE >= D]
     for hessian in node.hessians:
         K_geo = T.T @ hessian @ T
@@ -201,7 +201,7 @@ def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Arr
     where = f"COM height {z:.3f} m, pitch {pitch:.2f} rad"
     try:
         with warnings.catch_warnings():
-            # an inaccurate solution is judged by its certificate, not by the solver's doubts
+            # the certificate judges an inaccurate solution, not the solver's warning
             warnings.simplefilter("ignore", UserWarning)
             problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as error:
@@ -219,7 +219,7 @@ def _weighted_sum(matrices: list[Array], weights: cp.Expression) -> cp.Expressio
 
 
 def _nearest(found: dict[tuple[int, int], Array], i: int, j: int) -> Array:
-    """Return D of a node, or of the reachable one nearest in pitch at the same height."""
+    """Return D of a node, or of the reachable node closest in pitch at the same height."""
     at_height = {b: D for (a, b), D in found.items() if a == i}
     return at_height[min(at_height, key=lambda b: (abs(b - j), b))]
 

@@ -1,17 +1,19 @@
-"""Where the feet stand, against where the robot file has them. Pure.
+"""Adopts the stance of the feet from the joints, relative to the robot file. Pure.
 
-The law knows its feet by the joints alone: both legs carry the same torso, so a foot that is
-ahead, turned, or nearer than `geometry.w_base` shows as two places for one torso. Before the
-planner leads it takes the stance in which the legs agree, and keeps it while it leads: then no leg
-works against the other, and each foot is asked for what its own place lets it give. With the feet
-taken as in the file, 0.1 m too wide tipped a sole by 0.18 rad; taken as they stand, by 0.002.
+The law knows its feet by the joints alone. Both legs carry the same torso, so two estimates of one
+torso show a foot that is ahead, turned, or nearer than `geometry.w_base`. Before the planner
+engages, it adopts the stance in which the legs agree. It keeps that stance while engaged. No leg
+then works against the other, and each foot gets a wrench that its own position allows. With the
+feet taken from the file, 0.1 m too wide tipped a sole by 0.18 rad; with the measured stance, by
+0.002 rad.
 
-Between two times of leading it follows the joints slowly: feet that were moved in HOLD are found,
-and a sole that lifts in a sway is not taken for one. A planner that has not led yet cannot tell the
-two apart: started while a push tips the soles, it keeps what it saw then until it is not led again.
+While the planner is not engaged, the stance follows the joints slowly. Feet that were moved in HOLD
+are found, and a sole that lifts in a sway is not mistaken for one. A planner that has not been
+engaged yet cannot tell the two apart. If it starts while a push tips the soles, it keeps that
+stance until it disengages again.
 
-Zero errors of the joints are taken along: they look like feet that are a little off. A stance
-beyond `law.stance_max` is not led: it was not shown to stand, or something is broken.
+Zero errors of the joints become part of the stance: they look like feet that are slightly off. The
+planner refuses a stance beyond `law.stance_max`: it was not shown to stand, or something is broken.
 """
 
 from __future__ import annotations
@@ -35,68 +37,69 @@ _ROWS: Final = (
     ("pitched toes down against", "pitched toes up against", "deg"),
     ("turned inwards against", "turned outwards against", "deg"),
 )
-"""The right foot against the left, a positive and a negative row of a stance, and its unit."""
+"""Right foot relative to the left: text for a positive and a negative row of a stance, and its
+unit."""
 _TO_UNIT: Final = {"mm": 1e3, "deg": 180.0 / math.pi}
 
 FOLLOW_S: Final = 2.0
-"""A planner that has led takes a new stance in about this time, s."""
-FOLLOW_MIN: Final = 0.03
-"""m or rad: until the stance taken is so near to the one measured, it is not led."""
+"""s; time constant with which a planner that was engaged before follows a new stance."""
+FOLLOW_TOLERANCE: Final = 0.03
+"""m or rad; the planner does not engage while adopted and measured stance differ by more."""
 
 
 class Stance:
-    """The stance that the law reckons with.
+    """Stance that the law uses.
 
     Attributes:
-        taken: (6,) the right foot against the left, beyond the robot file: x, y, z in m and a
-            rotation vector in rad, world axes.
-        refused: True while the feet stand farther off than the law leads them, or have moved and
-            are not followed yet.
+        taken: (6,) adopted stance of the right foot relative to the left, as deviation from the
+            robot file: x, y, z in m and a rotation vector in rad, world axes.
+        refused: True while the stance is beyond the limits, or the feet have moved and their new
+            stance is not adopted yet.
     """
 
-    def __init__(self, largest: Sequence[float]) -> None:
-        """Begin with the feet as configured.
+    def __init__(self, stance_max: Sequence[float]) -> None:
+        """Start with the feet as configured.
 
         Args:
-            largest: `law.stance_max`, m and rad; zero in a row: it is not taken, nor refused.
+            stance_max: `law.stance_max`, m and rad; a zero row is neither adopted nor refused.
         """
-        self._largest: Array = np.array(largest)
+        self._stance_max: Array = np.array(stance_max)
         self.taken: Array = np.zeros(6)
         self._measured: Array = np.zeros(6)
         self.refused = False
 
-    def take(self, measured: Array, share: float = 1.0) -> None:
-        """Take the stance in which the legs agree now.
+    def take(self, measured: Array, fraction: float = 1.0) -> None:
+        """Adopt the stance in which the legs agree now.
 
         Args:
             measured: (6,), m and rad.
-            share: of the way there; 1: at once.
+            fraction: of the way to it; 1 adopts it at once.
         """
         self._measured[:] = measured
-        if not np.isfinite(measured).all():  # by angles that are none: nothing to follow
+        if not np.isfinite(measured).all():  # joint angles that give no stance: nothing to follow
             self.refused = True
             return
-        heeded = self._largest > 0.0
-        beyond = bool((heeded & (np.abs(measured) > self._largest)).any())
-        wanted = np.where(heeded, measured, 0.0)
-        if not beyond:  # what is refused is not followed: it may be a broken encoder
-            self.taken += share * (wanted - self.taken)
-        self.refused = beyond or bool((np.abs(wanted - self.taken) > FOLLOW_MIN).any())
+        checked = self._stance_max > 0.0
+        beyond = bool((checked & (np.abs(measured) > self._stance_max)).any())
+        wanted = np.where(checked, measured, 0.0)
+        if not beyond:  # a refused stance is not followed: it may be a broken encoder
+            self.taken += fraction * (wanted - self.taken)
+        self.refused = beyond or bool((np.abs(wanted - self.taken) > FOLLOW_TOLERANCE).any())
 
     def refusal(self) -> str:
-        """Return in words why the stance measured last is not led."""
+        """Return why the stance measured last is refused, as text."""
         if not np.isfinite(self._measured).all():
-            return "the joints' angles make no stance"
-        rows = zip(self._measured.tolist(), self._largest.tolist(), _ROWS, strict=True)
+            return "the joint angles give no stance: check the encoders"
+        rows = zip(self._measured.tolist(), self._stance_max.tolist(), _ROWS, strict=True)
         return (
             "; ".join(
                 f"the right foot is {abs(value) * _TO_UNIT[unit]:.0f} {unit} "
-                f"{more if value > 0.0 else less} the left: "
-                f"at most {most * _TO_UNIT[unit]:.0f} {unit} is led (law.stance_max)"
-                for value, most, (more, less, unit) in rows
-                if 0.0 < most < abs(value)
+                f"{positive if value > 0.0 else negative} the left: "
+                f"at most {limit * _TO_UNIT[unit]:.0f} {unit} is accepted (law.stance_max)"
+                for value, limit, (positive, negative, unit) in rows
+                if 0.0 < limit < abs(value)
             )
-            or "the feet have moved: wait until their new places are taken"
+            or "the feet have moved: wait until the planner has adopted the new stance"
         )
 
     def snapshot(self) -> tuple[Vector6, bool]:
@@ -104,6 +107,6 @@ class Stance:
         a, b, c, d, e, f = self.taken.tolist()
         return (a, b, c, d, e, f), self.refused
 
-    def restore(self, memory: tuple[Vector6, bool]) -> None:
+    def restore(self, state: tuple[Vector6, bool]) -> None:
         """Continue from a state."""
-        self.taken[:], self.refused = memory
+        self.taken[:], self.refused = state

@@ -1,9 +1,9 @@
-"""The kinematics as expression graphs, built once and run without Python in between.
+"""Builds the kinematics as expression graphs, once, and evaluates them without Python in between.
 
-The equations of docs/law.md#load-sharing in CasADi: both legs as products of exponentials, the
-torso mixed from them by the load-sharing matrices D, p and its Jacobian, and the Hessian
-term of K_q. In NumPy, calls on 3-vectors cost more than their arithmetic: a planner tick
-took 0.5 ms alone and 1.5 ms among the other processes of the fleet on two cores.
+The CasADi graphs hold the equations of docs/law.md#load-sharing. Both legs are products of
+exponentials, and the load-sharing matrices D mix the torso from them. p, its Jacobian and the
+Hessian term of K_q follow. In NumPy, calls on 3-vectors cost more than their arithmetic. A planner
+tick took 0.5 ms alone, and 1.5 ms among the fleet's other processes on two cores.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from shared.robot.joints import N_JOINTS, N_LEG
 
 
 class Graphs(NamedTuple):
-    """The functions of the law; what they return is told in `services.planner.kinematics`."""
+    """Functions of the law; `services.planner.kinematics` documents their results."""
 
     sharing: ca.Function
-    """(q, stance) -> D_L (6, 6), the left leg's share; the right's is I - D_L."""
+    """(q, stance) -> D_L (6, 6), the left leg's load share; the right leg's is I - D_L."""
     pose: ca.Function
     """(q, stance, D_L) -> p, closure, J, C, J_harness, r_torso, r_harness."""
     hessian: ca.Function
     """(q, stance, D_L, F, F_harness) -> sum_i H_i F_i (12, 12)."""
     stance: ca.Function
-    """q -> the stance (6,) in which the legs agree: where the right foot is against the left."""
+    """q -> stance (6,) in which the legs agree: position of the right foot relative to the left."""
 
 
 class _Foot(NamedTuple):
-    """Where a foot stands, world axes."""
+    """Pose of a foot, world axes."""
 
     r: ca.SX
     """Ankle (3,), m."""
     rotation: ca.SX
-    """Against where the robot file has it (3, 3)."""
+    """Rotation relative to the robot file's foot (3, 3)."""
 
 
 class _Leg(NamedTuple):
@@ -61,7 +61,7 @@ def build(config: RobotConfig, geometry: tuple[LegGeometry, LegGeometry]) -> Gra
     F, F_harness = ca.SX.sym("F", 6), ca.SX.sym("F_h", 3)
     hessian = _hessian(config, legs, D_left, pose, F, F_harness)
     return Graphs(
-        sharing=ca.Function("sharing", [q, stance], [_share(config, feet, legs)]),
+        sharing=ca.Function("sharing", [q, stance], [_left_load_share(config, feet, legs)]),
         pose=ca.Function(
             "pose",
             [q, stance, D_left],
@@ -76,7 +76,7 @@ def build(config: RobotConfig, geometry: tuple[LegGeometry, LegGeometry]) -> Gra
 
 
 def _feet(geometry: tuple[LegGeometry, LegGeometry], stance: ca.SX) -> list[_Foot]:
-    """Return both feet in a stance: half of it is laid on each, so that the world is midway."""
+    """Return both feet in a stance; each takes half of it, so the world is midway between them."""
     return [
         _Foot(ca.DM(leg.r_foot) + half * stance[:3], _rotation(half * stance[3:]))
         for leg, half in zip(geometry, (0.5, -0.5), strict=True)
@@ -91,15 +91,15 @@ def _chains(geometry: tuple[LegGeometry, LegGeometry], feet: list[_Foot], q: ca.
 
 
 def _stance(geometry: tuple[LegGeometry, LegGeometry], q: ca.SX) -> ca.SX:
-    """Return the stance in which both legs carry the torso to the same place.
+    """Return the stance in which both legs carry the torso to the same pose.
 
-    With the feet as in the robot file they carry it to (R_i, x_i). The feet are then turned by
+    With the feet as in the robot file, they carry it to (R_i, x_i). The feet are then rotated by
     +-phi/2 and shifted by +-d/2:
 
         Rot(phi) = R_L R_R^T
         f_R + d/2 + Rot(phi/2) (x_R - f_R) = f_L - d/2 + Rot(-phi/2) (x_L - f_L)
 
-    A turn beyond a right angle is no stance, and none is made of it: not a number.
+    A rotation beyond a right angle is no stance; the result is then NaN.
     """
     right, left = _chains(geometry, _feet(geometry, ca.SX.zeros(6)), q)
     turn = left.rotation @ right.rotation.T
@@ -112,7 +112,7 @@ def _stance(geometry: tuple[LegGeometry, LegGeometry], q: ca.SX) -> ca.SX:
 
 
 def _chain(geometry: LegGeometry, foot: _Foot, q: ca.SX) -> _Leg:
-    """Carry the knee and the torso up one leg: a product of exponentials, foot first."""
+    """Return knee, torso and Jacobians of one leg: a product of exponentials, foot first."""
     rotation = foot.rotation
     shift = foot.r - rotation @ ca.DM(geometry.r_foot)
     axes, points = [], []
@@ -160,10 +160,10 @@ def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
     r_torso = right.r_torso + towards_left[:3]
     twists = [ca.vertcat(leg.J_lin, leg.J_ang) for leg in legs]
     J_torso = ca.horzcat((ca.SX.eye(6) - D_left).T @ twists[0], D_left.T @ twists[1])
-    torso_share = config.torso_mass / config.total_mass
-    knee_share = config.mass.module / config.total_mass
-    r_com = torso_share * r_torso + knee_share * (right.r_knee + left.r_knee)
-    J_com = torso_share * J_torso[:3, :] + knee_share * ca.horzcat(right.J_knee, left.J_knee)
+    torso_fraction = config.torso_mass / config.total_mass
+    knee_fraction = config.mass.module / config.total_mass
+    r_com = torso_fraction * r_torso + knee_fraction * (right.r_knee + left.r_knee)
+    J_com = torso_fraction * J_torso[:3, :] + knee_fraction * ca.horzcat(right.J_knee, left.J_knee)
     angles = _angles(rotation)
     E_inverse = _angle_rates_from_omega(angles[0], angles[2])
     arm = rotation @ ca.DM(config.geometry.harness_point)
@@ -185,31 +185,31 @@ def _hessian(
 ) -> ca.SX:
     """Return d(J^T F + J_harness^T F_harness)/dq, symmetric, block diagonal by leg.
 
-    Each leg's share of the wrench is held: how the sharing turns with q moves forces
-    between the legs only, which no motion of the closed chain feels. For joint j below
-    joint k, dJ_k/dq_j = a_j x J_k and da_k/dq_j = a_j x a_k; of a moment the symmetric part
-    is its second derivative by the torso's rotation vector. What the angles and the arm to
-    the harness point curve by that rotation is told by AD and half of it laid on each leg.
+    Each leg's share of the wrench is constant. A change of the sharing with q only moves forces
+    between the legs, which no motion of the closed chain feels. For joint j below joint k,
+    dJ_k/dq_j = a_j x J_k and da_k/dq_j = a_j x a_k. The symmetric part for a moment is its second
+    derivative by the torso's rotation vector. Automatic differentiation gives the curvature of the
+    angles and of the arm to the harness point over that rotation; half of it is added to each leg.
     Along the closed chain (J T = I, C T = 0) T^T H T is then exact: -F . d2q/dp2.
     """
-    torso_share = config.torso_mass / config.total_mass
+    torso_fraction = config.torso_mass / config.total_mass
     knee_force = config.mass.module / config.total_mass * F[:3]
-    force = torso_share * F[:3] + F_harness
+    force = torso_fraction * F[:3] + F_harness
     moment = pose.E_inverse.T @ F[3:] + ca.cross(pose.r_harness - pose.r_torso, F_harness)
     wrench = ca.vertcat(force, moment)
     left_share = D_left @ wrench
     by_rotation = _by_rotation(config, pose.rotation, F[3:], F_harness)
     blocks = []
-    for leg, share in zip(legs, (wrench - left_share, left_share), strict=True):
+    for leg, leg_wrench in zip(legs, (wrench - left_share, left_share), strict=True):
         block = ca.SX.zeros(N_LEG, N_LEG)
         for k in range(N_LEG):
             for j in range(k + 1):
                 a_j = leg.J_ang[:, j]
-                value = ca.dot(ca.cross(share[:3], a_j), leg.J_lin[:, k])
+                value = ca.dot(ca.cross(leg_wrench[:3], a_j), leg.J_lin[:, k])
                 if k < 2:
                     value += ca.dot(ca.cross(knee_force, a_j), leg.J_knee[:, k])
                 if j < k:
-                    value += 0.5 * ca.dot(ca.cross(share[3:], a_j), leg.J_ang[:, k])
+                    value += 0.5 * ca.dot(ca.cross(leg_wrench[3:], a_j), leg.J_ang[:, k])
                 block[j, k] = block[k, j] = value
         blocks.append(block + 0.5 * leg.J_ang.T @ by_rotation @ leg.J_ang)
     return ca.diagcat(*blocks)
@@ -224,21 +224,21 @@ def _by_rotation(config: RobotConfig, rotation: ca.SX, moment: ca.SX, F_harness:
     return ca.substitute(ca.hessian(work, turn)[0], turn, ca.SX.zeros(3))
 
 
-def _share(config: RobotConfig, feet: list[_Foot], legs: list[_Leg]) -> ca.SX:
-    """Return D_L, how much of a torso wrench the left leg takes (docs/law.md#load-sharing).
+def _left_load_share(config: RobotConfig, feet: list[_Foot], legs: list[_Leg]) -> ca.SX:
+    """Return D_L (6, 6), the left leg's share of a torso wrench (docs/law.md#load-sharing).
 
-    Leg i can give the torso the wrench X_i w_i, w_i at its foot. Foot moments are dear:
-    beyond a few centimetres of lever the sole tips. With W weighting them, the least-
-    effort distribution of a torso wrench F is w_i = W X_i^T A^-1 F, A = sum X_i W X_i^T,
-    so leg i's share at the torso is D_i = X_i W X_i^T A^-1. Moments are in the foot's axes.
+    Leg i gives the torso the wrench X_i w_i, with w_i at its foot. Foot moments are costly: beyond
+    a lever of a few centimetres the sole tips. W weights them. The least-effort distribution of a
+    torso wrench F is w_i = W X_i^T A^-1 F, with A = sum X_i W X_i^T. Leg i's share at the torso is
+    therefore D_i = X_i W X_i^T A^-1. Moments are in the foot's axes.
     """
     middle = 0.5 * (legs[0].r_torso + legs[1].r_torso)
     if config.law.jacobian == "average":
         return ca.densify(0.5 * ca.SX.eye(6) + 0 * middle[0])
-    share_x, share_y, l_z = config.law.load_sharing_moment_arms
-    l_x = share_x * config.geometry.l_foot / 2
-    l_y = share_y * config.geometry.w_foot / 2
-    # a moment about x is held over the sole's width, one about y over its length
+    fraction_x, fraction_y, l_z = config.law.load_sharing_moment_arms
+    l_x = fraction_x * config.geometry.l_foot / 2
+    l_y = fraction_y * config.geometry.w_foot / 2
+    # the sole's width bears a moment about x, its length one about y
     W = ca.diag(ca.DM([1.0, 1.0, 1.0, l_y**2, l_x**2, l_z**2]))
     weighted = []
     for foot in feet:
@@ -267,8 +267,8 @@ def _angles(rotation: ca.SX) -> ca.SX:
 def _angle_rates_from_omega(roll: ca.SX, yaw: ca.SX) -> ca.SX:
     """Return E^-1 (3, 3): (roll, pitch, yaw) rates = E^-1 omega, omega in world axes.
 
-    R = Rz(yaw) Rx(roll) Ry(pitch), so omega = E rates with E = [Rz x, Rz Rx y, z]; this is
-    its inverse in closed form, singular at roll = +-pi/2 only.
+    R = Rz(yaw) Rx(roll) Ry(pitch), so omega = E rates with E = [Rz x, Rz Rx y, z]. This is the
+    inverse of E in closed form, singular at roll = +-pi/2 only.
     """
     cf, sf, cp, sp = ca.cos(roll), ca.sin(roll), ca.cos(yaw), ca.sin(yaw)
     return ca.vertcat(
@@ -281,8 +281,9 @@ def _angle_rates_from_omega(roll: ca.SX, yaw: ca.SX) -> ca.SX:
 def _rotation_vector(rotation: ca.SX) -> ca.SX:
     """Return the rotation vector of a small rotation.
 
-    Where they are led the legs disagree by far less than 0.2 rad; the series of asin(s)/s is then
-    good to 1e-9 and, unlike the quotient, regular at zero. At 0.34 rad it is good to 2e-6.
+    While the planner is engaged the legs disagree by far less than 0.2 rad. The series of asin(s)/s
+    is then accurate to 1e-9 and, unlike the quotient, regular at zero. At 0.34 rad it is accurate
+    to 2e-6.
     """
     axis = 0.5 * ca.vertcat(
         rotation[2, 1] - rotation[1, 2],
@@ -294,7 +295,7 @@ def _rotation_vector(rotation: ca.SX) -> ca.SX:
 
 
 def _rotation(vector: ca.SX) -> ca.SX:
-    """Return the rotation of a small rotation vector, by series regular at zero."""
+    """Return the rotation of a small rotation vector, by series that are regular at zero."""
     s2 = ca.dot(vector, vector)
     a = 1 - s2 / 6 + s2**2 / 120
     b = 0.5 - s2 / 24 + s2**2 / 720

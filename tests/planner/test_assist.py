@@ -13,7 +13,7 @@ from services.planner.assist import (
     ERROR_MIN,
     LEAD_FADE_S,
     LEAD_MAX,
-    RELEASE_SHARE,
+    RELEASE_FRACTION,
     SETTLE_S,
     STILL_RATE_PITCH,
     STILL_RATE_Z,
@@ -271,14 +271,14 @@ def test_a_saturated_cell_asks_for_hold_at_once(valid: bool) -> None:
 
 
 @pytest.mark.parametrize("kind", ["force", "moment"])
-@pytest.mark.parametrize("share", [0.0, RELEASE_SHARE - 0.001, RELEASE_SHARE + 0.001, 0.99])
+@pytest.mark.parametrize("share", [0.0, RELEASE_FRACTION - 0.001, RELEASE_FRACTION + 0.001, 0.99])
 @pytest.mark.parametrize("for_ns", [RELEASE - 1, RELEASE, 3 * RELEASE])
 def test_hold_ends_below_the_lower_limit_for_its_time(kind: str, share: float, for_ns: int) -> None:
     overload = make_overload()
     overload.receive(wrench(valid=False, saturated=True), T0)
     overload.receive(at(share, kind), T0)
     overload.receive(at(share, kind), T0 + for_ns)
-    assert overload.hold is not (share < RELEASE_SHARE and for_ns >= RELEASE)
+    assert overload.hold is not (share < RELEASE_FRACTION and for_ns >= RELEASE)
 
 
 def test_numbers_that_are_not_valid_neither_begin_nor_end_it() -> None:

@@ -300,7 +300,7 @@ def test_too_high_says_how_far_it_goes_and_which_joints_stop_it(
     assert reach.outcome is IkEnding.JOINT_LIMIT
     assert reach.stopped == (0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0)
     assert describe(reach, p_ref, limits) == (
-        "p_ref cannot be reached: COM z 1.31 m asked, 0.93 m is as far as it goes: "
+        "p_ref cannot be reached: COM z 1.31 m wanted, 0.93 m is the closest: "
         "knee_right_theta at its limit -0.2 rad, knee_left_theta at its limit -0.2 rad"
     )
 
@@ -324,7 +324,7 @@ def test_a_configuration_on_the_way_is_not_called_the_nearest(
     ik.q[:] = closed(1.0)
     reach = ik.examine(p_ref)
     assert reach.outcome is IkEnding.UNFINISHED
-    assert describe(reach, p_ref, limits).startswith("p_ref was not reached: COM z 1.31 m asked")
+    assert describe(reach, p_ref, limits).startswith("p_ref was not reached: COM z 1.31 m wanted")
     ik.solve_from_anywhere(p_ref)  # its knees now stand at their limit, and can come off it
     reach = ik.examine(np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]))
     assert reach.outcome is IkEnding.UNFINISHED

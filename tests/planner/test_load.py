@@ -11,7 +11,7 @@ import pytest
 
 from services.planner.hocca import Hocca
 from services.planner.kinematics import Kinematics
-from services.planner.load import AGAIN_SHARE, HIDDEN, WEIGHING_S, Load
+from services.planner.load import FRICTION_BAND, RESUME_FRACTION, WEIGHING_S, Load
 from services.planner.snapshots import LoadState
 from shared.bus.messages import Pair, Tare, Wrench
 from shared.config.robot_config import GRAVITY, RobotConfig
@@ -160,7 +160,7 @@ def test_one_that_hangs_is_refused_at_once_and_weighed_before_it_is_led(load: Lo
 
 def test_while_it_is_weighed_it_says_so(load: Load) -> None:
     bears(load, 0.3, DT)
-    while load.kg < -AGAIN_SHARE * LARGEST[0]:
+    while load.kg < -RESUME_FRACTION * LARGEST[0]:
         bears(load, 1.0, DT)
     bears(load, 1.0, DT)
     assert load.refusal() == "its load is weighed"
@@ -221,11 +221,15 @@ def test_in_motion_it_is_looked_for_only_while_nobody_is_led(load: Load, rates: 
 def test_what_friction_may_be_is_left_to_the_hand_and_no_more_is_given_than_may(
     load: Load, sign: float
 ) -> None:
-    for newtons, given in ((0.9 * HIDDEN[0], 0.0), (HIDDEN[0] + 10.0, 10.0), (500.0, 8 * GRAVITY)):
+    for newtons, given in (
+        (0.9 * FRICTION_BAND[0], 0.0),
+        (FRICTION_BAND[0] + 10.0, 10.0),
+        (500.0, 8 * GRAVITY),
+    ):
         found(load, sign * newtons / GRAVITY)
         assert load.force() == pytest.approx(sign * given, abs=0.05)
     found(load, 0.0, sign * 9.0)
-    assert load.moment(0.0) == pytest.approx(sign * (9.0 - HIDDEN[1]), abs=0.05)
+    assert load.moment(0.0) == pytest.approx(sign * (9.0 - FRICTION_BAND[1]), abs=0.05)
     assert load.moment(math.pi / 2) == pytest.approx(0.0, abs=0.05)
 
 
@@ -244,7 +248,7 @@ def test_far_from_the_file_it_is_refused_until_it_is_well_within(
     found(load, kg, a)
     assert load.refused
     assert said in load.refusal()
-    within = 1.05 * AGAIN_SHARE
+    within = 1.05 * RESUME_FRACTION
     found(load, math.copysign(8.0 * within, kg) if kg else 0.0, 20.0 * within if a else 0.0)
     assert load.refused or a < 0.0, "it does not flap at the limit"
     found(load, 0.0)

@@ -8,7 +8,7 @@ import pytest
 
 from services.planner.certificate import Margins
 from services.planner.intents import Wish
-from services.planner.planner import EARLY_SHARE, LATE_SHARE, TICK_GAP_MAX_S, Planner
+from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX_S, Planner
 from shared.bus.messages import (
     DriveStatus,
     JointCommand,
@@ -177,7 +177,7 @@ def test_six_new_states_are_due_after_half_a_period(
     robot: RobotConfig, planner: Planner, q: Array
 ) -> None:
     last = lead(planner, q)
-    half = round(EARLY_SHARE * NS_PER_S / robot.planner.rate_hz)
+    half = round(EARLY_FRACTION * NS_PER_S / robot.planner.rate_hz)
     receive_all(planner, q, last + 1, seq=50)
     assert not planner.is_due(last + half - 1)
     assert planner.is_due(last + half)
@@ -188,7 +188,7 @@ def test_fewer_than_six_are_due_after_a_period_and_a_quarter(
     robot: RobotConfig, planner: Planner, q: Array, heard: int
 ) -> None:
     last = lead(planner, q)
-    late = round(LATE_SHARE * NS_PER_S / robot.planner.rate_hz)
+    late = round(LATE_FRACTION * NS_PER_S / robot.planner.rate_hz)
     for module in range(heard):
         planner.receive_state(module, state(module, q, seq=50), last + 1)
         planner.receive_state(module, state(module, q, seq=51), last + 2)

@@ -141,7 +141,7 @@ def test_a_pose_is_found_and_explained(
         ((), "one of them"),
         (("--q", "1,2,3"), f"{N_JOINTS} finite ones"),
         (("--q", "a,b"), f"write {N_JOINTS} numbers"),
-        (("--p", "0,0,1.4,0,0,0"), "COM z 1.40 m asked"),
+        (("--p", "0,0,1.4,0,0,0"), "COM z 1.40 m wanted"),
         (("--p", "0,0,0.8,0,0,0", "--q", "0"), "one of them"),
         (("no_such.mcap",), "cannot be read"),
     ],
