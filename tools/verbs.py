@@ -85,8 +85,8 @@ def add_run_dir(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=default_run_dir(),
         metavar="DIR",
-        help=f"directory of the fleet's sockets and logs (default {default_run_dir()}, "
-        f"or ${RUN_DIR_VARIABLE}); keep it short",
+        help="directory of the fleet's sockets and logs (default: "
+        f"${RUN_DIR_VARIABLE}, else /tmp/xrl-UID of the user); keep it short",
     )
 
 
