@@ -15,7 +15,7 @@ from shared.bus.session import open_session
 from shared.clock import now_ns
 from shared.config.files import load
 from shared.process import default_run_dir
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet.supervise import SupervisedFleet
 
 FOR_S, ASSIST_N = 5.0, 40.0
 

@@ -17,7 +17,10 @@ from shared.exceptions import XrlError
 RUN_DIR_VARIABLE = "XRL_RUN_DIR"
 """Environment variable that names the run directory of the fleet."""
 
-DEFAULT_CONFIG = Path(__file__).resolve().parent.parent / "deploy" / "robot.toml"
+CHECKOUT = Path(__file__).resolve().parents[1]
+"""Top of this checkout; where the packages are installed, the folder that holds them."""
+
+DEFAULT_CONFIG = CHECKOUT / "deploy" / "robot.toml"
 
 SOCKET_PATH_MAX = 100
 """Longest path of a UNIX socket that works everywhere; the kernel takes 107 bytes."""

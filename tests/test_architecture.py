@@ -58,9 +58,9 @@ VENDORS = {
         "shared/robot/compiled_graph.py",
     ],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
-    "mcap": ["services/recorder/mcap_log.py", "tools/reexecution/rewritten.py"],
-    "foxglove": ["tools/reports/foxglove.py"],
-    "supervisor": ["tools/supervision/*.py"],
+    "mcap": ["services/recorder/mcap_log.py", "tools/analysis/reexecution/rewritten.py"],
+    "foxglove": ["tools/analysis/reports/foxglove.py"],
+    "supervisor": ["tools/fleet/*.py"],
     "can": [
         "shared/can/unix_can.py",
         "services/joint/drivers/odrive_can.py",
@@ -117,9 +117,9 @@ LAWS = [
     "services/recorder/mcap_encoding.py",
     "services/recorder/mcap_records.py",
     "services/recorder/disk_guard.py",
-    "tools/reexecution/compare.py",
-    "tools/reexecution/found.py",
-    "tools/reexecution/params.py",
+    "tools/analysis/reexecution/compare.py",
+    "tools/analysis/reexecution/found.py",
+    "tools/analysis/reexecution/params.py",
     "services/simulator/axis_bank.py",
     "services/simulator/axis_control.py",
     "services/simulator/axis_conditions.py",
@@ -192,6 +192,15 @@ def test_a_service_imports_only_shared_and_itself(file: str) -> None:
 @pytest.mark.parametrize("file", [file for file in IMPORTS if file.startswith("tools/")])
 def test_a_tool_imports_no_test(file: str) -> None:
     assert [i.full for i in IMPORTS[file] if i.top == "tests"] == []
+
+
+def test_nobody_imports_a_verb() -> None:
+    importers = {
+        file
+        for file, found in IMPORTS.items()
+        if any(i.full.startswith("tools.verbs.") for i in found)
+    }
+    assert importers == set(), "what two verbs share belongs beside them, not in one of them"
 
 
 @pytest.mark.parametrize("vendor", VENDORS)

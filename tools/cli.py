@@ -1,4 +1,4 @@
-"""`xrl`: the command line. One file per verb beside this one; `tools.verbs` lists them."""
+"""`xrl`: the command line. One file per verb in `tools/verbs`; `tools.verb_table` lists them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from types import FrameType
 
 from shared.exceptions import XrlError
-from tools.verbs import VERBS
+from tools.verb_table import VERBS
 
 # Before NumPy is imported: on small matrices more threads only wait for one another, and figures
 # are the same bit by bit from one thread.
@@ -50,7 +50,7 @@ def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
     wanted = next((word for word in arguments if not word.startswith("-")), "")
     for verb in VERBS:
         if verb.name == wanted:
-            module = importlib.import_module(verb.module)
+            module = importlib.import_module(f"tools.verbs.{verb.name}")
             module.add_parser(subparsers)
             subparsers.choices[verb.name].set_defaults(run=module.run)
         else:

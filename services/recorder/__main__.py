@@ -33,7 +33,7 @@ from shared.config.files import load
 from shared.config.sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
 from shared.priority import raise_priority
-from shared.process import StopFlag, run_service, service_parser
+from shared.process import CHECKOUT, StopFlag, run_service, service_parser
 from shared.robot import gain_schedule
 
 FIFO_PRIORITY: Final = 5
@@ -213,7 +213,6 @@ def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
 def _metadata(
     robot: str, arguments: argparse.Namespace, config: RecorderConfig
 ) -> dict[str, dict[str, str]]:
-    root = Path(__file__).resolve().parents[2]
     run = {
         "schema_version": SCHEMA_VERSION,
         "robot": robot,
@@ -223,7 +222,7 @@ def _metadata(
         "scenario_file": arguments.scenario.name if arguments.scenario else "",
     }
     return {
-        "run": run | provenance.code(root) | provenance.machine(),
+        "run": run | provenance.code(CHECKOUT) | provenance.machine(),
         "packages": provenance.packages(),
         "recorder": {
             "flush_ms": f"{config.flush_ms:g}",

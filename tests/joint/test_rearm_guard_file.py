@@ -11,11 +11,10 @@ import pytest
 from services.joint import neighbours
 from services.joint.rearm_guard import LastState, Pendant, RearmGuard, ask_stop, clear, path_of
 from shared.robot.joints import MODULES
-from tools import kill
-from tools.supervision import fleet as fleets
-from tools.supervision import procfs, supervise
-from tools.supervision.run_dir import RunDir
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet import process_table, procfs, supervise
+from tools.fleet.run_dir import RunDir
+from tools.fleet.supervise import SupervisedFleet
+from tools.verbs import kill
 
 MODULE = "knee_left"
 PID = 4711
@@ -225,7 +224,7 @@ def test_a_fleet_does_not_hear_of_what_held_before_it(
     if ends == "a new fleet":
         plan = SimpleNamespace(listeners=(), processes=(), config_path=tmp_path / "robot.toml")
         plan.processes = (SimpleNamespace(name=MODULE, topic="", stop_s=1.0),)
-        RunDir(tmp_path).prepare(cast("fleets.FleetPlan", plan))
+        RunDir(tmp_path).prepare(cast("process_table.FleetPlan", plan))
     else:
         RunDir(tmp_path).clear(keep_logs=True)
     assert not path_of(tmp_path, MODULE).exists()

@@ -25,8 +25,8 @@ from tests.lockstep.runs import push, variant
 from tests.planner.conftest import standing_torque
 from tests.test_architecture import IMPORTS, Import, imports_in
 from tools import cli
-from tools.centralised.control import CentralPlanner, PassThrough
-from tools.centralised.fleet import CONTROLS, SHIPPED, torques_only
+from tools.runs.centralised.control import CentralPlanner, PassThrough
+from tools.runs.centralised.fleet import CONTROLS, SHIPPED, torques_only
 from tools.runs.lockstep import Lockstep
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -245,17 +245,17 @@ def test_once_it_leads_the_planner_leads_whatever_it_hears(robot: RobotConfig) -
 
 
 def knows_it(imports: list[Import]) -> bool:
-    return any(f"{one.full}.".startswith("tools.centralised.") for one in imports)
+    return any(f"{one.full}.".startswith("tools.runs.centralised.") for one in imports)
 
 
 @pytest.mark.parametrize(
     "source",
     [
-        "from tools.centralised.control import PassThrough",
-        "from tools.centralised import fleet",
-        "from tools import centralised",
-        "import tools.centralised",
-        "def f():\n    import tools.centralised.control as c",
+        "from tools.runs.centralised.control import PassThrough",
+        "from tools.runs.centralised import fleet",
+        "from tools.runs import centralised",
+        "import tools.runs.centralised",
+        "def f():\n    import tools.runs.centralised.control as c",
     ],
 )
 def test_whoever_imports_it_is_seen_however_it_is_written(source: str) -> None:
@@ -266,9 +266,10 @@ def test_whoever_imports_it_is_seen_however_it_is_written(source: str) -> None:
 def test_nothing_but_two_tools_knows_it_and_no_file_names_it() -> None:
     users = {file for file, imports in IMPORTS.items() if knows_it(imports)}
     assert users == {
-        "tools/sim.py",
-        "tools/sweeps/latency_trial.py",
-        "tools/centralised/fleet.py",
+        "tools/runs/recorded_lockstep.py",
+        "tools/verbs/sim.py",
+        "tools/studies/sweeps/latency_trial.py",
+        "tools/runs/centralised/fleet.py",
     }
     for file in (*(ROOT / "deploy").glob("*.toml"), *(ROOT / "deploy" / "scenarios").glob("*")):
         assert "centralised" not in file.read_text(encoding="utf-8")

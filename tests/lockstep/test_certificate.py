@@ -8,8 +8,12 @@ import pytest
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tools.sweeps import certificate_study as study
-from tools.sweeps.certificate_study import CertificateCase, CertificateCases, CertificateResult
+from tools.studies.sweeps import certificate_study as study
+from tools.studies.sweeps.certificate_study import (
+    CertificateCase,
+    CertificateCases,
+    CertificateResult,
+)
 
 SEED = 1
 DRAWN = 300

@@ -15,7 +15,7 @@ from shared.config.scenarios import Fault, Keyframe, Kill, Restart
 from shared.robot.joints import MODULES
 from tests.lockstep.runs import still
 from tools.runs.lockstep import Lockstep
-from tools.sweeps import plants
+from tools.studies.sweeps import plants
 
 
 @pytest.mark.parametrize("height", [1.188, 0.9])

@@ -13,7 +13,7 @@ from shared.config.scenarios import Fault, FaultKind, Kill
 from shared.robot.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import Run, kill, push, run, variant
 from tools.runs.lockstep import Lockstep
-from tools.sweeps import plants
+from tools.studies.sweeps import plants
 
 PUSHED_AFTER = 1.0
 LASTING = 2.6

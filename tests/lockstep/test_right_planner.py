@@ -20,8 +20,8 @@ from shared.network.impairment import Impairment
 from shared.robot.trip_table import JOINT_TRIPS
 from tests.lockstep.runs import kill, push, restart, variant
 from tools.runs.lockstep import Lockstep
-from tools.sweeps import plants
-from tools.sweeps.push_range import PushRange
+from tools.studies.sweeps import plants
+from tools.studies.sweeps.push_range import PushRange
 
 DOWN = (Keyframe(at=0.0, height=1.188), Keyframe(at=1.5, height=0.95))
 

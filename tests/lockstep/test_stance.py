@@ -12,7 +12,7 @@ from shared.config.scenarios import Keyframe
 from shared.network.impairment import Impairment
 from tests.lockstep.runs import kill, push, restart, run, variant
 from tools.runs.lockstep import Lockstep
-from tools.sweeps import plants
+from tools.studies.sweeps import plants
 
 Foot = tuple[float, float, float]
 

@@ -22,7 +22,7 @@ from shared.exceptions import FleetError
 from shared.network.impairment import Direction
 from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.network.proxy_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
-from tools.runs.proxy_client import ProxyClient
+from tools.fleet.proxy_client import ProxyClient
 
 DELAY = Inject(link="planner->joints", at=0.0, delay_ms=30.0)
 LOSS = Inject(link="all", at=0.0, loss=0.5, duration=2.0)

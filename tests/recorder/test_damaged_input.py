@@ -19,9 +19,9 @@ from shared.exceptions import RunError
 from tests.recorder import runs
 from tests.recorder.runs import STATE_KEY, Killed
 from tools import cli
-from tools.info import as_json
-from tools.logs.survey import Survey
+from tools.analysis.logs.survey import Survey
 from tools.runs.run_log import read_run
+from tools.verbs.info import as_json
 
 CUTS = 1000
 CUTS_BY_VERB = 40

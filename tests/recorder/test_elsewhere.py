@@ -4,7 +4,7 @@ The rules are those of PlotJuggler 3 (3.9 to 3.17: DataLoadMCAP, nlohmann_parser
 data_load_mcap 1.2, parser_json 1.1.1). A run in virtual time is opened as it was recorded, as
 recovered after a cut, as exported with its scene, and split (the last second of it, for speed);
 and a file with a message of every topic. Foxglove's own library takes every schema in
-tests/reports/test_scene.py.
+tests/tools/analysis/reports/test_scene.py.
 """
 
 from __future__ import annotations

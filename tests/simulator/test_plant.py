@@ -16,7 +16,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.lockstep.runs import variant
 from tools.runs.lockstep import Lockstep
-from tools.sweeps import plants
+from tools.studies.sweeps import plants
 
 WRONG = {
     "body.payload_scale": 0.85,

@@ -14,7 +14,7 @@ from typing import Final
 import pytest
 
 from tests.system.stalls import FILE_VARIABLE, start_watch
-from tools.supervision.pace import PACE_VARIABLE, SLOWER
+from tools.fleet.pace import PACE_VARIABLE, SLOWER
 
 FULL: Final = 0.75
 """Fraction of all cores: a fleet that takes more drops out now and then, and its tests with it."""

@@ -33,11 +33,11 @@ from shared.config.scenarios import Push, Scenario
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.system.namespaces import Network
+from tools.fleet import process_table
+from tools.fleet.parent_death import die_with_parent
+from tools.fleet.supervise import SupervisedFleet
 from tools.runs import experiment
 from tools.runs.scenario_runner import LiveSnapshot, ScenarioRunner
-from tools.supervision import fleet
-from tools.supervision.parent_death import die_with_parent
-from tools.supervision.supervise import SupervisedFleet
 
 BODY: Final = "body"
 LEGS: Final = {
@@ -153,7 +153,7 @@ def spread(robot: RobotConfig, network: Network) -> RobotConfig:
 
 def write_table(path: Path, network: Network) -> Path:
     """Write the process table with each command on its host."""
-    table: dict[str, Any] = msgspec.to_builtins(fleet.load_table())
+    table: dict[str, Any] = msgspec.to_builtins(process_table.load_table())
     for row in table["process"]:
         row["command"] = [*network.entering(host_of(row["name"])), *row["command"]]
     path.write_text(tomli_w.dumps(table), encoding="utf-8")

@@ -35,7 +35,7 @@ from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.recorder.runs import sample
 from tests.system.stalls import has_stalled, stalled_before_it_began
-from tools.runs.proxy_client import ProxyClient
+from tools.fleet.proxy_client import ProxyClient
 from tools.runs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.stalls import stalled_before_it_began
-from tools.supervision import procfs
+from tools.fleet import procfs
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 

@@ -15,8 +15,8 @@ from shared.bus.messages import PlannerStatus, Wrench
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
 from tests.system.stalls import stalled_before_it_began
+from tools.fleet import procfs
 from tools.runs.run_log import read_run
-from tools.supervision import procfs
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 

@@ -20,7 +20,7 @@ from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 

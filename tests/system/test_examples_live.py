@@ -16,7 +16,7 @@ from shared.bus.session import open_session
 from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG, RUN_DIR_VARIABLE
 from shared.robot.joints import MODULES
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
 

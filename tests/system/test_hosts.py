@@ -23,8 +23,8 @@ from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.system.waiting import wait_for
 from tools import cli
-from tools.supervision import procfs
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet import procfs
+from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 

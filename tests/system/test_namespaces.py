@@ -37,8 +37,8 @@ from tests.recorder.runs import ROBOT, sample, write
 from tests.system.multihost import BODY, LEGS, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in
 from tests.system.stalls import stalled_before_it_began
+from tools.fleet import procfs
 from tools.runs.run_log import RunLog, read_run
-from tools.supervision import procfs
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 

@@ -27,7 +27,7 @@ from shared.network.proxy_protocol import SOCKET
 from shared.process import DEFAULT_CONFIG
 from tests.recorder.runs import sample
 from tools import cli
-from tools.runs.proxy_client import ProxyClient
+from tools.fleet.proxy_client import ProxyClient
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 

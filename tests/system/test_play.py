@@ -19,7 +19,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.playback.bench import (
+from tests.tools.analysis.playback.bench import (
     NAME,
     ROOT,
     STATE,
@@ -74,7 +74,7 @@ STANDS_STILL = """
 import os, signal, sys, time
 from pathlib import Path
 from shared.bus.session import open_session
-from tests.playback.bench import LISTEN, ROBOT
+from tests.tools.analysis.playback.bench import LISTEN, ROBOT
 with open_session(ROBOT, "ear", Path(sys.argv[1]), connect=[LISTEN]) as session:
     stream = session.stream(["replay/**"], capacity=1_000_000)
     while stream.take() is None:

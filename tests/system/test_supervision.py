@@ -19,8 +19,8 @@ from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
 from tests.system.waiting import wait_for
 from tools import cli
-from tools.supervision import procfs
-from tools.supervision.supervise import ServiceInfo, SupervisedFleet
+from tools.fleet import procfs
+from tools.fleet.supervise import ServiceInfo, SupervisedFleet
 
 pytestmark = pytest.mark.system
 
@@ -234,13 +234,13 @@ def test_a_port_in_use_is_refused_before_anything_starts(run_dir: Path, tmp_path
 def up_in_a_process(run_dir: Path, table: Path, *, then: str = "") -> subprocess.Popen[str]:
     """Start a fleet as `xrl up` does, in a process of its own that may be interrupted."""
     code = (
-        "import sys, time, tools.cli, tools.up, tools.supervision.supervise as s\n"
+        "import sys, time, tools.cli, tools.verbs.up, tools.fleet.supervise as s\n"
         "from pathlib import Path\n"
         "def run(args):\n"
         f"    s.SupervisedFleet.start(args.config, args.run_dir, table_path=Path({str(table)!r}),"
         f" leashed={bool(then)}, timeout_s=60)\n"
         f"    {then or 'return 0'}\n"
-        "tools.up.run = run\n"
+        "tools.verbs.up.run = run\n"
         f"sys.exit(tools.cli.main(['up', '--run-dir', {str(run_dir)!r}]))\n"
     )
     return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)

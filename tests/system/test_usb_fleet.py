@@ -12,8 +12,8 @@ import pytest
 from shared.robot.joints import MODULES
 from tests.system.stalls import stalled_before_it_began
 from tests.usb import robot_file
-from tools.supervision import procfs
-from tools.supervision.pace import PACE_VARIABLE, usual_pace
+from tools.fleet import procfs
+from tools.fleet.pace import PACE_VARIABLE, usual_pace
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
 

@@ -27,8 +27,8 @@ from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
 from tools.bringup import bench, zeroing
 from tools.bringup.zeroing import DriveLook, look
-from tools.supervision import procfs
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet import procfs
+from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.verbs import VERBS
+from tools.verb_table import VERBS
 
 MINE = ("up", "status", "kill", "tare", "down")
 

@@ -10,17 +10,17 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from tests.usb import robot_file
-from tools.supervision import fleet
+from tools.fleet import process_table
 
 
-def plan(path: Path, *, simulation: bool) -> fleet.FleetPlan:
-    return fleet.make_plan(
+def plan(path: Path, *, simulation: bool) -> process_table.FleetPlan:
+    return process_table.make_plan(
         path,
         Path("/tmp/xrl-t"),
         overrides={},
         services=None,
         simulation=simulation,
-        table_path=fleet.TABLE,
+        table_path=process_table.TABLE,
     )
 
 
@@ -56,4 +56,4 @@ def test_only_an_emulated_robot_on_usb_has_the_stand_in(tmp_path: Path) -> None:
     path = robot_file.write(tmp_path)
     assert plan(path, simulation=True).emulated_usb
     assert not plan(path, simulation=False).emulated_usb
-    assert not plan(fleet.DEFAULT_CONFIG, simulation=True).emulated_usb
+    assert not plan(process_table.DEFAULT_CONFIG, simulation=True).emulated_usb

@@ -21,9 +21,9 @@ from shared.exceptions import FleetError, XrlError
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.bringup import reach
-from tools.supervision import fleet, procfs
-from tools.supervision.run_dir import RunDir
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet import process_table, procfs
+from tools.fleet.run_dir import RunDir
+from tools.fleet.supervise import SupervisedFleet
 
 SETTLE_S: Final = 1.5
 """Until an emulated robot hangs still in its hoist."""
@@ -92,7 +92,7 @@ def drives_to_ourselves(
         if started:
             say("no fleet is up and the drives are emulated: their simulator runs for the while")
             time.sleep(SETTLE_S)
-        if fleet.is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
+        if process_table.is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
             stack.enter_context(reach.emulated_usb(run_dir))
         yield started
 
@@ -113,7 +113,7 @@ def confirm(question: str, *, yes: bool) -> bool:
 def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]:
     """Return what tells a drive from all others; an emulated one by its run directory too."""
     wiring = robot.module_named(module)
-    place = str(run_dir) if fleet.is_simulated(robot) else ""
+    place = str(run_dir) if process_table.is_simulated(robot) else ""
     if robot.joint_service.driver == "odrive_usb":
         return (place, wiring.serial_number.upper())
     bus = robot.can[wiring.bus]

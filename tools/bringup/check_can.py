@@ -16,7 +16,7 @@ from tools.bringup.can_monitor import BusHeard, NodeHeard, mean_ms, period_ms
 from tools.bringup.check_board import describe_flags, state_row
 from tools.bringup.check_socketcan import up_command
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
-from tools.supervision.fleet import SIMULATED_CAN
+from tools.fleet.process_table import SIMULATED_CAN
 
 PERIOD_SHARE: Final = 0.2
 """A measured period may differ by this much: more is a setting, and not a busy machine."""

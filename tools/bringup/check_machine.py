@@ -16,7 +16,7 @@ from shared import priority
 from shared.config.robot_config import RobotConfig
 from tools.bringup.check_socketcan import ask_ip, socketcan_rows
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
-from tools.supervision.fleet import is_simulated
+from tools.fleet.process_table import is_simulated
 
 SUBJECT: Final = "machine"
 CPUS_MIN: Final = 2

@@ -10,8 +10,8 @@ from shared.exceptions import FleetError
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.bringup.rows import Finding, judged, ok, warning, wrong
-from tools.supervision import fleet
-from tools.supervision.fleet import ListenPoint
+from tools.fleet import process_table
+from tools.fleet.process_table import ListenPoint
 
 SUBJECT: Final = "robot file"
 
@@ -20,7 +20,7 @@ def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
     """Check the robot file; that it can be read at all is known by now."""
     count = len(robot.assumed)
     found = f"{count} values assumed" if count else "all values measured"
-    if count and fleet.is_simulated(robot):
+    if count and process_table.is_simulated(robot):
         assumed = ok(SUBJECT, "assumed", f"{found}; the drives are emulated by them")
     elif count:
         fix = f"measure {', '.join(robot.assumed)}; then take them off `assumed`"
@@ -40,7 +40,7 @@ def services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
     return tuple(
         service
         for service in robot.services
-        if fleet.is_listening(expand(robot.bus.endpoints[service], run_dir))
+        if process_table.is_listening(expand(robot.bus.endpoints[service], run_dir))
     )
 
 
@@ -68,7 +68,7 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
         for service, endpoint in robot.bus.endpoints.items()
     ]
     try:
-        fleet.check_free(listeners)
+        process_table.check_free(listeners)
     except FleetError as error:
         fix = "`xrl down`, or another --run-dir"
         return [wrong("bus", "endpoints", str(error), "free", fix)]

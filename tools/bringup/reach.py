@@ -23,10 +23,10 @@ from shared.config.sections import CanConfig
 from shared.exceptions import FleetError
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import listen
-from tools.supervision import procfs
-from tools.supervision.fleet import SIMULATED_CAN, is_simulated
-from tools.supervision.run_dir import RunDir
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet import procfs
+from tools.fleet.process_table import SIMULATED_CAN, is_simulated
+from tools.fleet.run_dir import RunDir
+from tools.fleet.supervise import SupervisedFleet
 
 STARTED_S: Final = 15.0
 """Longest wait for the first frames of a simulator that was started."""

@@ -16,7 +16,7 @@ from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, nu
 from tools.bringup.can_monitor import BusHeard, listen, long_enough
 from tools.bringup.reach import boards_on_usb, drives_within_reach, is_up
 from tools.bringup.rows import Finding, FindingKind, judged, ok
-from tools.supervision.fleet import is_simulated
+from tools.fleet.process_table import is_simulated
 
 Groups = dict[str, list[Finding]]
 """Rows by the heading that they stand under."""

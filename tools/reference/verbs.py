@@ -7,7 +7,7 @@ import importlib
 import os
 from typing import Any, Final
 
-from tools.verbs import VERBS
+from tools.verb_table import VERBS
 
 _WIDTH: Final = "96"
 _INTRODUCTION: Final = """\
@@ -41,7 +41,7 @@ def _parsers() -> list[tuple[str, str]]:
     parser = argparse.ArgumentParser(prog="xrl")
     subparsers = parser.add_subparsers()
     for verb in VERBS:
-        importlib.import_module(verb.module).add_parser(subparsers)
+        importlib.import_module(f"tools.verbs.{verb.name}").add_parser(subparsers)
     found = []
     for verb in VERBS:
         one = subparsers.choices[verb.name]

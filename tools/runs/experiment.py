@@ -35,7 +35,7 @@ from shared.process import DEFAULT_CONFIG
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.runs.describe_inject import in_words_of, parse_inject
-from tools.verbs import add_config
+from tools.verb_table import add_config
 
 E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
 

@@ -14,10 +14,10 @@ from shared.bus.session import Session, open_session
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.robot.robot_model import mjcf
+from tools.fleet.pace import PACE_MIN, PACE_VARIABLE, SLOWER, CoresFullError, usual_pace
+from tools.fleet.supervise import SupervisedFleet
 from tools.runs import experiment
 from tools.runs.experiment import PLANT_FILE
-from tools.supervision.pace import PACE_MIN, PACE_VARIABLE, SLOWER, CoresFullError, usual_pace
-from tools.supervision.supervise import SupervisedFleet
 
 T = TypeVar("T")
 

@@ -57,6 +57,8 @@ READY_NS = 20 * NS_PER_S
 
 Record = Callable[[Topic, str, Message], None]
 """Takes what live would be on the bus: topic, module or "", message."""
+Watch = Callable[[SimTruth], None]
+"""Sees the simulated world at its rate."""
 
 
 def forget(_topic: Topic, _module: str, _message: Message) -> None:

@@ -17,8 +17,8 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES, SIDES
-from tools.reports import scene
-from tools.reports.scene import RobotPose
+from tools.analysis.reports import scene
+from tools.analysis.reports.scene import RobotPose
 from tools.runs.run_log import RunLog
 
 Array = NDArray[np.float64]

@@ -26,7 +26,7 @@ from shared.config.scenarios import Inject, Keyframe, Kill, Push, Restart, Scena
 from shared.exceptions import RunError
 from shared.robot.joints import MODULE_INDEX, MODULES
 from tools.runs.lockstep import Lockstep, Record, forget
-from tools.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
+from tools.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 
 FailureKind = Literal["links", "commands", "states", "frozen"]
 KINDS: Final[Mapping[FailureKind, str]] = {

@@ -21,7 +21,7 @@ from services.recorder.reader import LostBytes, Piece, opened
 from services.recorder.sequence_stats import KeyCount
 from shared.bus.topics import Topic
 from shared.exceptions import RunError
-from tools.logs.files import files_in
+from tools.analysis.logs.files import files_in
 
 
 class Series:

@@ -28,10 +28,10 @@ from shared.clock import NS_PER_S, machine_s, now_ns, pace
 from shared.config.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES
-from tools.runs.proxy_client import ProxyClient
-from tools.supervision import procfs
-from tools.supervision.pace import IDLE_LEAST, CoresFullError, IdleMeter
-from tools.supervision.supervise import SupervisedFleet
+from tools.fleet import procfs
+from tools.fleet.pace import IDLE_LEAST, CoresFullError, IdleMeter
+from tools.fleet.proxy_client import ProxyClient
+from tools.fleet.supervise import SupervisedFleet
 
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""

@@ -1,0 +1,1 @@
+"""Tests of the reports, the re-execution and the playback of logs."""

@@ -1,0 +1,72 @@
+"""What a terminal sends, as keys."""
+
+from __future__ import annotations
+
+import os
+import pty
+import sys
+import termios
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tools.analysis.playback.keyboard import Keyboard, Press, understood
+
+TYPED = {b" ": Press.PAUSE, b"\x1b[C": Press.STEP, b"\x1bOA": Press.FASTER, b"q": Press.QUIT}
+
+
+@given(st.lists(st.sampled_from(sorted(TYPED))), st.integers(1, 3))
+def test_keys_are_understood_however_their_bytes_come(typed: list[bytes], size: int) -> None:
+    text = b"".join(typed)
+    found, rest = [], b""
+    for start in range(0, len(text), size):
+        presses, rest = understood(rest + text[start : start + size])
+        found += presses
+    assert found == [TYPED[code] for code in typed]
+    assert rest == b""
+
+
+@given(st.binary())
+def test_whatever_comes_leaves_no_more_than_the_start_of_a_key(text: bytes) -> None:
+    _, rest = understood(text)
+    assert rest in {code[:n] for code in TYPED for n in range(3)} | {b"\x1b[", b"\x1bO"}
+
+
+def test_other_keys_mean_nothing() -> None:
+    assert understood(b"xyz\r\n\x1b[5~") == ([], b"")
+
+
+def test_on_a_pipe_it_only_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, write = os.pipe()
+    os.write(write, b" q")
+    with os.fdopen(read) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        with Keyboard() as keyboard:
+            assert not keyboard.present
+            assert keyboard.wait(0.001) == []
+    os.close(write)
+
+
+def test_a_terminal_is_given_back_as_it_was() -> None:
+    pid, descriptor = pty.fork()
+    if pid == 0:  # a terminal of its own: never back into pytest
+        code = 1
+        try:
+            sys.stdin = os.fdopen(0)
+            before = termios.tcgetattr(0)
+            with Keyboard() as keyboard:
+                os.write(1, b"ready")
+                pressed = keyboard.wait(20.0)
+                changed = termios.tcgetattr(0) != before
+            back = termios.tcgetattr(0) == before
+            code = 0 if pressed == [Press.PAUSE] and changed and back else 2
+        finally:
+            os._exit(code)
+    heard = b""
+    while b"ready" not in heard:
+        heard += os.read(descriptor, 100)
+    os.write(descriptor, b" ")
+    _, status = os.waitpid(pid, 0)
+    os.close(descriptor)
+    assert os.waitstatus_to_exitcode(status) == 0

@@ -1,0 +1,171 @@
+"""A run's services executed again: every tick equal, and a changed parameter seen."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from services.simulator.plant import PlantConfig, changed
+from shared.bus import topics
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Fault, Kill, Restart
+from shared.network.impairment import Impairment
+from shared.robot.joints import MODULES
+from tests.imu.robots import with_imu
+from tests.lockstep.runs import still
+from tools.analysis.reexecution.outcome import ReexecutionResult
+from tools.runs.recorded_lockstep import simulate
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog, read_run
+from tools.verbs import resim
+
+
+@pytest.fixture(scope="module")
+def recorded(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a run with a dead planner, a dead joint service and a fault in it, on a slope."""
+    scenario = still(
+        5.0,
+        height=1.1,
+        kill=(Kill(service="planner", at=1.0), Kill(service="knee_left", at=2.5)),
+        restart=(Restart(service="planner", at=1.5), Restart(service="knee_left", at=2.6)),
+        fault=(Fault(module="hip_right", kind="link_lost", at=4.3),),
+    )
+    folder = tmp_path_factory.mktemp("resim")
+    simulate(
+        with_imu(robot),
+        scenario,
+        Impairment(delay_ms=1.0, jitter_ms=0.5),
+        3,
+        folder,
+        true_plant=changed(PlantConfig(), {"floor.slope": [0.03, -0.02]}),
+    )
+    return folder / "run.mcap"
+
+
+@pytest.fixture
+def log(recorded: Path) -> RunLog:
+    return read_run(recorded)
+
+
+def execute(log: RunLog, robot: RobotConfig, name: str, *, exact: bool = True) -> ReexecutionResult:
+    outcome = ReexecutionResult(name, 0.0, exact=exact)
+    for _ in resim.execute(log, robot, name, outcome):
+        pass
+    return outcome
+
+
+def edited(log: RunLog, key: str, change: Any) -> None:
+    """Change the decoded messages of a key."""
+    log._series[key].decoded = change
+
+
+@pytest.mark.parametrize("name", resim.SERVICES)
+def test_every_tick_of_a_run_with_restarts_holds_and_a_fault_is_equal_bit_for_bit(
+    log: RunLog, name: str
+) -> None:
+    outcome = execute(log, robot_of(log), name)
+    assert outcome.comparison.first is None
+    assert outcome.ticks > 900
+    assert outcome.lost_inputs == 0
+    assert outcome.skipped <= 4  # before the first memory of each planner
+    restarted = name in ("planner", "knee_left")
+    assert outcome.starts == (2 if restarted else 1)
+    assert outcome.comparison.compared > outcome.ticks // 3
+
+
+def test_the_planner_of_the_record_knew_the_slope(log: RunLog) -> None:
+    assert log.messages(topics.PLANNER_STATUS)[-1].slope == pytest.approx((0.03, -0.02), abs=0.02)
+
+
+def test_an_attitude_that_the_log_lacks_is_told(log: RunLog) -> None:
+    key = topics.ATTITUDE.key(log.robot)
+    second = [row for row in log.messages(topics.PLANNER_STATUS) if row.session != 1]
+    taken = second[300].attitude_seq
+    edited(log, key, [row for row in log.messages(topics.ATTITUDE) if row.seq != taken])
+    outcome = execute(log, robot_of(log), "planner")
+    assert outcome.lost_inputs == 1
+    assert outcome.comparison.first is None
+
+
+def test_one_bit_in_one_recorded_command_is_found_where_it_was_taken(log: RunLog) -> None:
+    key = topics.JOINT_COMMAND.key(log.robot, "hip_left")
+    commands = list(log.messages(topics.JOINT_COMMAND, "hip_left"))
+    at = len(commands) // 2
+    a, b = commands[at].q_ref
+    commands[at] = msgspec.structs.replace(commands[at], q_ref=(a, b + 2.3e-16 * max(1.0, abs(b))))
+    edited(log, key, commands)
+    outcome = execute(log, robot_of(log), "hip_left")
+    first = outcome.comparison.first
+    assert first is not None
+    assert commands[at].t_ns <= first.t_ns <= commands[at].t_ns + 200_000_000
+    assert execute(log, robot_of(log), "hip_right").comparison.first is None
+
+
+def test_a_state_that_the_log_lacks_is_told_and_execution_goes_on_at_the_next_memory(
+    log: RunLog,
+) -> None:
+    key = topics.JOINT_STATE.key(log.robot, "ankle_left")
+    states = list(log.messages(topics.JOINT_STATE, "ankle_left"))
+    statuses = log.messages(topics.PLANNER_STATUS)
+    second = [status for status in statuses if status.session != statuses[0].session]
+    taken = second[300].state_seq[MODULES.index("ankle_left")]
+    edited(log, key, [state for state in states if state.seq != taken])
+    outcome = execute(log, robot_of(log), "planner")
+    assert outcome.lost_inputs == 1
+    assert outcome.starts == 3
+    assert 0 < outcome.skipped < 300
+    assert outcome.comparison.first is None
+
+
+def test_a_trace_that_the_log_lacks_does_not_let_the_service_go_on_from_a_guess(
+    log: RunLog,
+) -> None:
+    key = topics.JOINT_TRACE.key(log.robot, "ankle_left")
+    traces = list(log.messages(topics.JOINT_TRACE, "ankle_left"))
+    del traces[70]
+    edited(log, key, traces)
+    outcome = execute(log, robot_of(log), "ankle_left")
+    assert outcome.starts == 2
+    assert outcome.comparison.first is None
+
+
+def test_a_changed_gain_changes_what_comes_out_from_the_first_tick_with_an_error_on(
+    log: RunLog, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "changed.mcap"
+    code = resim.run(
+        Namespace(
+            log=recorded, service=["planner"], param=["gains.k_p_x=2000"], out=out,
+            until_first_difference=False, tolerance=0.0,
+        )
+    )  # fmt: skip
+    assert code == 0
+    text = capsys.readouterr().out
+    assert "planner, first at" in text
+    assert "largest changes" in text
+    new = read_run(out)
+    assert new.metadata["resim"]["params"] == "gains.k_p_x=2000"
+    assert new.count(topics.SIM_TRUTH.key(log.robot)) == log.count(topics.SIM_TRUTH.key(log.robot))
+    old_commands = log.messages(topics.JOINT_COMMAND, "ankle_left")
+    new_commands = new.messages(topics.JOINT_COMMAND, "ankle_left")
+    assert 0.9 * len(old_commands) < len(new_commands) <= len(old_commands)
+    changed = {(c.session, c.seq): c for c in new_commands}
+    same = [c for c in old_commands if changed.get((c.session, c.seq)) == c]
+    assert len(same) < 0.5 * len(old_commands)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_run_says_how_many_of_its_cycles_were_traced(log: RunLog, module: str) -> None:
+    cycles = sum(len(trace.cycles) for trace in log.messages(topics.JOINT_TRACE, module))
+    states = log.messages(topics.JOINT_STATE, module)
+    expected = sum(state.cycle for state in states if _is_last(states, state))
+    assert cycles >= expected - 20 * 2
+
+
+def _is_last(states: list[Any], state: Any) -> bool:
+    index = states.index(state)
+    return index + 1 == len(states) or states[index + 1].cycle < state.cycle

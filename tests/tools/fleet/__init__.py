@@ -1,0 +1,1 @@
+"""Tests of the fleet: process table, supervision, proxy client."""

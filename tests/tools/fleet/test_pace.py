@@ -1,0 +1,127 @@
+"""A simulated fleet on cores that do not carry it: one slower clock for all of its processes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shared import clock
+from shared.exceptions import FleetError
+from tools.fleet import pace
+from tools.fleet.pace import CoresFullError, check_pace, usual_pace
+from tools.runs import live
+
+
+@pytest.fixture(autouse=True)
+def _real_time_again(tmp_path: Path) -> Iterator[None]:
+    yield
+    clock.keep_pace(tmp_path / "no fleet")
+
+
+def test_a_fleet_in_slow_motion_reads_a_slower_clock_and_waits_for_longer(tmp_path: Path) -> None:
+    (tmp_path / clock.PACE_FILE).write_text("0.5\n")
+    clock.keep_pace(tmp_path)
+    machine_ns = time.monotonic_ns()
+    assert clock.now_ns() == pytest.approx(0.5 * machine_ns, abs=1e9)
+    assert clock.machine_s(0.02) == 0.04
+    begin_s = time.monotonic()
+    clock.sleep_until(clock.now_ns() + 20 * clock.NS_PER_MS)
+    assert time.monotonic() - begin_s >= 0.04
+
+
+def test_a_fleet_without_a_pace_goes_by_the_machines_clock(tmp_path: Path) -> None:
+    (tmp_path / clock.PACE_FILE).write_text("0.5\n")
+    clock.keep_pace(tmp_path)
+    clock.keep_pace(tmp_path / "another")
+    before_ns = time.monotonic_ns()
+    assert before_ns <= clock.now_ns() <= time.monotonic_ns()
+
+
+@pytest.mark.parametrize("text", ["", "fast", "0", "-1", "1.5", "nan", "inf"])
+def test_a_file_that_tells_no_pace_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / clock.PACE_FILE).write_text(text)
+    with pytest.raises(FleetError, match="is no pace"):
+        clock.keep_pace(tmp_path)
+
+
+def test_real_drives_know_no_slow_motion() -> None:
+    check_pace(0.5, simulated=True)
+    check_pace(1.0, simulated=False)
+    with pytest.raises(FleetError, match="only a simulated fleet"):
+        check_pace(0.5, simulated=False)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.05, 1.01, float("nan")])
+def test_a_pace_out_of_range_is_refused(value: float) -> None:
+    with pytest.raises(FleetError, match="to 1 is right"):
+        check_pace(value, simulated=True)
+
+
+def test_a_variable_that_is_no_number_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(pace.PACE_VARIABLE, "slow")
+    with pytest.raises(FleetError, match="no number"):
+        usual_pace()
+
+
+class Machine:
+    """Carries a fleet up to some pace."""
+
+    def __init__(self, carries: float) -> None:
+        self.carries = carries
+        self.paces: list[float] = []
+
+    def run_once(self, *_: object, pace: float, **__: object) -> str:
+        self.paces.append(pace)
+        if pace > self.carries:
+            raise CoresFullError("full")
+        return "led"
+
+
+def run_live(
+    machine: Machine,
+    monkeypatch: pytest.MonkeyPatch,
+    out: Path,
+    asked: float | None,
+    told: list[str],
+) -> str:
+    monkeypatch.setattr(live, "_run_once", machine.run_once)
+    return live.run_live(
+        out, None, None, None,  # type: ignore[arg-type]  # the machine takes them
+        verb="demo", seed=0, true_plant=None, no_restart=(), pace=asked, tell=told.append,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def test_where_the_cores_are_full_the_fleet_runs_slower_and_so_do_those_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(pace.PACE_VARIABLE, "1")
+    machine, told = Machine(carries=0.5), list[str]()
+    (tmp_path / "run.mcap").touch()
+    assert run_live(machine, monkeypatch, tmp_path, None, told) == "led"
+    assert machine.paces == [1.0, 0.6, 0.36]
+    assert len(told) == 2
+    assert not (tmp_path / "run.mcap").exists(), "nothing of the tries is left"
+    run_live(machine, monkeypatch, tmp_path, None, told)
+    assert machine.paces[3:] == [0.36]
+
+
+def test_a_pace_that_was_asked_for_is_kept_or_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Machine(carries=0.5)
+    with pytest.raises(CoresFullError):
+        run_live(machine, monkeypatch, tmp_path, 1.0, [])
+    assert machine.paces == [1.0]
+
+
+def test_a_machine_that_carries_no_fleet_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(pace.PACE_VARIABLE, "1")
+    machine = Machine(carries=0.0)
+    with pytest.raises(CoresFullError):
+        run_live(machine, monkeypatch, tmp_path, None, [])
+    assert min(machine.paces) >= pace.PACE_MIN

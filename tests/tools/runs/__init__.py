@@ -1,0 +1,1 @@
+"""Tests of runs: scenarios, verdicts, virtual time."""

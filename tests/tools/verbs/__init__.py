@@ -1,0 +1,1 @@
+"""Tests of the verbs: flags, output, exit codes."""

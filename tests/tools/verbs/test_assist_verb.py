@@ -1,0 +1,118 @@
+"""`xrl assist` against a planner that the test plays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import pytest
+from rich.text import Text
+
+from services.planner.planner import Planner
+from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO
+from shared.exceptions import FleetError
+from tools.verbs import assist
+
+WISH = OperatorIntent(t_ns=1, seq=0, assist_n=80.0, shift=(0.02, 0.0, 0.0, 0.0), source="me")
+
+
+class FakePlanner:
+    """Says what `answer` makes of the intents so far."""
+
+    def __init__(self, answer: Callable[[list[OperatorIntent]], PlannerStatus | None]) -> None:
+        self.heard: list[OperatorIntent] = []
+        self.lines: list[str] = []
+        self._answer = answer
+
+    def put(self, message: OperatorIntent) -> bool:
+        self.heard.append(message)
+        return True
+
+    def take(self) -> PlannerStatus | None:
+        return self._answer(self.heard)
+
+    def update(self, renderable: Text) -> None:
+        self.lines.append(renderable.plain)
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(assist, "REPEAT_S", 0.001)
+    monkeypatch.setattr(assist, "HEARD_S", 0.05)
+
+
+def status(robot: RobotConfig, requested_by: str, given: float = 0.0) -> PlannerStatus:
+    blank = Planner(robot, 1).status(0, 0.0)
+    return msgspec.structs.replace(
+        blank, requested_by=requested_by, assist_n=given, mode=int(PlannerMode.LEADING)
+    )
+
+
+def test_it_asks_until_it_is_told_to_stop_and_says_what_is_given(robot: RobotConfig) -> None:
+    def answer(heard: list[OperatorIntent]) -> PlannerStatus:
+        return status(robot, "me", 80.0) if len(heard) > 2 else status(robot, SCENARIO)
+
+    planner = FakePlanner(answer)
+    given = assist.ask(planner, planner, WISH, lambda: len(planner.heard) > 20, planner)
+    assert given == 80.0
+    assert {(each.assist_n, each.shift, each.source) for each in planner.heard} == {
+        (80.0, WISH.shift, "me")
+    }
+    numbers = [each.seq for each in planner.heard]
+    assert numbers == sorted(set(numbers))
+    assert "asked for 80 N, given 80 N, shift x 0.02 m" in planner.lines[-1]
+
+
+def test_it_ends_by_itself_after_the_time_it_was_given(robot: RobotConfig) -> None:
+    planner = FakePlanner(lambda heard: status(robot, "me" if heard else "", 80.0))
+    assert assist.ask(planner, planner, WISH, lambda: False, planner, for_s=0.02) == 80.0
+
+
+def test_one_who_asks_already_goes_on(robot: RobotConfig) -> None:
+    planner = FakePlanner(lambda _: status(robot, "xrl assist by ada (7)"))
+    with pytest.raises(FleetError, match=r"xrl assist by ada \(7\) asks already"):
+        assist.ask(planner, planner, WISH, lambda: False, planner)
+    assert not planner.heard
+
+
+def test_a_planner_that_does_not_take_it_is_told(robot: RobotConfig) -> None:
+    planner = FakePlanner(lambda _: status(robot, SCENARIO))
+    with pytest.raises(FleetError, match="does not take what is asked; it follows the scenario"):
+        assist.ask(planner, planner, WISH, lambda: False, planner)
+
+
+def test_no_planner_is_told() -> None:
+    planner = FakePlanner(lambda _: None)
+    with pytest.raises(FleetError, match="the planner is not heard"):
+        assist.ask(planner, planner, WISH, lambda: False, planner)
+
+
+def test_why_it_is_not_given_is_shown(robot: RobotConfig) -> None:
+    holds = msgspec.structs.replace(
+        status(robot, "me"), mode=int(PlannerMode.TRIPPED), why="the torso turns fast"
+    )
+    assert "TRIPPED: the torso turns fast" in assist.describe(WISH, holds)
+
+
+@pytest.mark.parametrize(
+    ("force", "shift", "said"),
+    [
+        (-1.0, STRAIGHT, "0 to 200 N"),
+        (201.0, STRAIGHT, "0 to 200 N"),
+        (float("nan"), STRAIGHT, "0 to 200 N"),
+        (0.0, (0.031, 0.0, 0.0, 0.0), "x 0.031 m: -0.03 to 0.03 m"),
+        (0.0, (0.0, 0.0, 0.0, -0.2), "yaw -0.2 rad"),
+    ],
+)
+def test_what_the_planner_would_not_give_is_refused(
+    robot: RobotConfig, force: float, shift: Vector4, said: str
+) -> None:
+    with pytest.raises(FleetError, match=said):
+        assist.refuse_beyond_limits(robot, force, shift)
+
+
+def test_the_limits_themselves_can_be_asked_for(robot: RobotConfig) -> None:
+    x, y, roll, yaw = robot.law.shift_max
+    assist.refuse_beyond_limits(robot, robot.assist.force_max, (x, -y, roll, -yaw))

@@ -1,0 +1,224 @@
+"""`xrl configure` on emulated drives, from the command line to what the drives keep."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from shared.can.drive_settings import of_module
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.sections import CanConfig
+from shared.exceptions import DriveError, FleetError
+from shared.robot.joints import MODULES
+from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
+from tools import cli
+from tools.bringup import backup, changes, reach
+from tools.bringup.boards import FoundBoards, Value
+from tools.bringup.jog_drive import Interrupts
+from tools.fleet import procfs
+from tools.fleet.run_dir import RunDir
+from tools.verbs import configure
+
+VEL_LIMIT = "axis0.controller.config.vel_limit"
+REGEN = "config.dc_max_negative_current"
+MODULE = "knee_left"
+SERIAL = "3A0000000005"
+
+
+@contextmanager
+def listening(path: Path) -> Iterator[None]:
+    """Listen where a service would."""
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        yield
+    path.unlink()
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as folder:
+        path = Path(folder) / "r"
+        yield path
+        assert procfs.fleet_pids(path) == set(), "no process is left"
+
+
+def verb(run_dir: Path, out: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tools.cli", "configure", "--run-dir", str(run_dir)]
+    command += ["--out", str(out), *arguments]
+    environment = {**os.environ, "COLUMNS": "120"}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+@pytest.mark.system
+@pytest.mark.timeout(180)
+def test_the_difference_is_shown_and_nothing_is_written(run_dir: Path, tmp_path: Path) -> None:
+    result = verb(run_dir, tmp_path / "b", f"--plant={MODULE}.{VEL_LIMIT}=2")
+    assert result.returncode == 1, result.stderr
+    assert "vel_limit" in result.stdout
+    assert "OVERSPEED" in result.stdout
+    assert "nothing was written" in result.stdout
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.system
+@pytest.mark.timeout(180)
+def test_drives_as_wanted_have_nothing_to_change(run_dir: Path, tmp_path: Path) -> None:
+    result = verb(run_dir, tmp_path / "b", "--apply")
+    assert result.returncode == 0, result.stderr
+    assert "nothing to change" in result.stdout
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.system
+@pytest.mark.timeout(180)
+def test_traps_are_taken_out_and_a_backup_brings_them_back(run_dir: Path, tmp_path: Path) -> None:
+    plants = [f"--plant={MODULE}.{VEL_LIMIT}=2", f"--plant=hip_right.{REGEN}=-0.01"]
+    result = verb(run_dir, tmp_path, "--apply", *plants)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "2 settings written" in result.stdout
+    assert "hip_right, knee_left; `xrl zero`" in result.stdout
+    (file,) = tmp_path.glob("*.json")
+    kept = {board["module"]: board for board in json.loads(file.read_text())["boards"]}
+    assert list(kept) == list(MODULES)
+    assert kept[MODULE]["settings"][VEL_LIMIT] == 2.0
+    assert kept[MODULE]["serial_number"] == SERIAL
+    assert len(kept[MODULE]["settings"]) > 60, "all settings, not those that are changed"
+
+    back = verb(run_dir, tmp_path / "2", "--restore", str(file), "--module", MODULE, "--apply")
+    assert back.returncode == 0, back.stdout + back.stderr
+    assert "1 settings written" in back.stdout
+    assert "hip_right" not in back.stdout
+
+
+@pytest.fixture
+def arguments(tmp_path: Path) -> argparse.Namespace:
+    return argparse.Namespace(restore=tmp_path / "b.json", module=None)
+
+
+def saved_as(serial: str, firmware: str = "0.5.6", **settings: Value) -> backup.Backup:
+    board = backup.of_board(MODULE, serial, firmware, settings)
+    return backup.Backup(time="", robot_file="", boards=(board,))
+
+
+def test_a_backup_is_for_the_modules_that_it_has(
+    robot: RobotConfig, arguments: argparse.Namespace
+) -> None:
+    assert configure.modules_of(arguments, robot, saved_as(SERIAL.lower())) == (MODULE,)
+    assert configure.modules_of(arguments, robot, None) == MODULES
+    arguments.module = ["hip_left"]
+    with pytest.raises(DriveError, match="no hip_left; it has knee_left"):
+        configure.modules_of(arguments, robot, saved_as(SERIAL))
+
+
+def test_a_backup_of_another_board_is_refused(
+    robot: RobotConfig, arguments: argparse.Namespace
+) -> None:
+    with pytest.raises(DriveError, match=f"3A00000000FF there and {SERIAL}"):
+        configure.modules_of(arguments, robot, saved_as("3A00000000FF"))
+
+
+def test_a_backup_of_another_firmware_is_refused(robot: RobotConfig) -> None:
+    boards = {MODULE: BoardInMemory(as_wanted())}
+    with pytest.raises(DriveError, match=r"firmware 0\.5\.1, the board has 0\.5\.6"):
+        configure.differences(robot, boards, saved_as(SERIAL, "0.5.1"))
+    difference = configure.differences(robot, boards, saved_as(SERIAL, **{VEL_LIMIT: 2.0}))
+    assert [change.name for change in difference] == [VEL_LIMIT]
+
+
+def test_a_board_that_is_not_there_or_not_known_is_refused(robot: RobotConfig) -> None:
+    absent = FoundBoards({}, {SERIAL: "not plugged in"}, ("0000000000AA",))
+    with pytest.raises(DriveError, match=r"not plugged in; .*0000000000AA"):
+        configure.boards_of(robot, [MODULE], absent)
+    newer = BoardInMemory({})
+    newer.firmware = (0, 6, 10)
+    with pytest.raises(DriveError, match=r"firmware 0\.6\.10"):
+        configure.boards_of(robot, [MODULE], FoundBoards({SERIAL: newer}, {}, ()))
+
+
+def test_a_board_that_is_older_than_its_settings_names_is_refused(robot: RobotConfig) -> None:
+    older = BoardInMemory({})
+    older.firmware = (0, 5, 1)
+    with pytest.raises(DriveError, match=r"firmware 0\.5\.1"):
+        configure.boards_of(robot, [MODULE], FoundBoards({SERIAL: older}, {}, ()))
+
+
+class Interrupted(BoardInMemory):
+    """A board at which somebody presses Ctrl-C while it is being written."""
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        super().write(values)
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_ctrl_c_finishes_the_board_that_was_begun_and_touches_no_other(robot: RobotConfig) -> None:
+    """Half of a board's settings would be in force, and none saved."""
+    boards = {
+        module: kind(as_wanted() | {VEL_LIMIT: 2.0})
+        for module, kind in zip(
+            MODULES[:3], (BoardInMemory, Interrupted, BoardInMemory), strict=True
+        )
+    }
+    difference = [
+        change
+        for module, board in boards.items()
+        for change in changes.against_wanted(module, of_module(robot, MODULE), board)
+    ]
+    interrupts = Interrupts()
+    with interrupts.kept():
+        outcomes = configure.apply(Console(quiet=True), boards, difference, interrupts)
+    assert interrupts.number == signal.SIGINT
+    assert [board.kept[VEL_LIMIT] for board in boards.values()] == [60.0, 60.0, 2.0]
+    assert [board.saves for board in boards.values()] == [1, 1, 0]
+    assert [(o.change.module, o.good) for o in outcomes] == [(m, True) for m in MODULES[:2]]
+
+
+def test_nothing_is_written_while_a_joint_service_is_up(robot: RobotConfig, run_dir: Path) -> None:
+    run_dir.mkdir()
+    endpoint = expand(robot.bus.endpoints[MODULE], run_dir).removeprefix("unixsock-stream/")
+    configure.refuse_services(robot, run_dir, MODULES)
+    with listening(Path(endpoint)), pytest.raises(FleetError, match=r"knee_left.*xrl down"):
+        configure.refuse_services(robot, run_dir, MODULES)
+    with listening(Path(endpoint)):
+        configure.refuse_services(robot, run_dir, ["hip_left"])
+
+
+def test_no_fleet_can_be_started_on_real_drives_meanwhile(
+    robot: RobotConfig, run_dir: Path
+) -> None:
+    can = {name: CanConfig(interface="socketcan", channel=name) for name in robot.can}
+    real = msgspec.structs.replace(robot, can=can)
+    with reach.no_fleet_meanwhile(real, run_dir), pytest.raises(FleetError, match="a fleet is up"):
+        RunDir(run_dir).claim()
+    assert not run_dir.exists()
+
+
+def test_the_backup_is_written_before_anything_else_and_under_its_time(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
+    board = BoardInMemory(as_wanted() | {VEL_LIMIT: 2.0})
+    path = configure.keep(tmp_path / "new", {MODULE: board}, Path("robot.toml"))
+    assert board.writes == []
+    (kept,) = backup.read(path).boards
+    assert backup.settings_of(kept) == as_wanted() | {VEL_LIMIT: 2.0}
+    assert (kept.module, kept.firmware) == (MODULE, "0.5.6")
+
+
+def test_help_says_that_it_changes_nothing_by_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(["configure", "--help"])
+    assert left.value.code == 0
+    assert "without --apply" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,216 @@
+"""`xrl doctor` on the emulated robot, from the command line to the last line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared.can import cansimple
+from shared.can.cansimple import Command
+from shared.can.cansimple_06 import Command06
+from shared.process import DEFAULT_CONFIG
+from tools import cli
+from tools.fleet import procfs
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
+
+AXIS = "knee_left.axis0"
+TRAPS = {
+    "controller.config.vel_limit": ("2", "60"),
+    "config.can.encoder_rate_ms": ("10", "2"),
+    "controller.config.vel_integrator_gain": ("0.333", "0"),
+}
+MEASURED = ("heartbeat", "encoder frames", "load cells", "processors")
+"""What depends on how busy the machine is."""
+START_S = 60.0
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as folder:
+        path = Path(folder) / "r"
+        yield path
+        assert procfs.fleet_pids(path) == set(), "no process is left"
+        assert not path.exists(), "and no file"
+
+
+def doctor(run_dir: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the verb in a process of its own: the stand-in of libusb is for a whole process."""
+    command = [sys.executable, "-m", "tools.cli", "doctor", "--run-dir", str(run_dir), *arguments]
+    environment = {**os.environ, "COLUMNS": "100"}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+def rows_of(result: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
+    report = json.loads(result.stdout)
+    rows = [row for group in report["groups"].values() for row in group]
+    assert report["wrong"] == sum(row["verdict"] == "wrong" for row in rows)
+    return rows
+
+
+def test_nothing_is_wrong_with_the_emulated_robot_as_shipped(run_dir: Path) -> None:
+    result = doctor(run_dir, "--json")
+    assert result.returncode == 0, result.stdout + result.stderr
+    rows = rows_of(result)
+    bad = [row for row in rows if row["verdict"] != "ok"]
+    assert [row for row in bad if row["what"] not in MEASURED] == []
+    whats = [row["what"] for row in rows]
+    assert whats.count("settings") == 6
+    assert whats.count("calibrated") == 12
+    assert whats.count("zero") == 6
+    assert whats.count("heartbeat") == 12
+    assert {"load cells", "gain schedule", "endpoints", "real-time priority"} <= set(whats)
+
+
+RECORDED = """
+import contextlib, json, sys
+from shared.can import unix_can
+from tools import cli
+from tools.bringup import reach
+
+said = {"can": [], "usb": [], "reads": 0}
+send_many = unix_can.UnixCanBus.send_many
+
+def record_many(bus, messages):
+    said["can"] += [[m.arbitration_id, m.is_remote_frame] for m in messages]
+    send_many(bus, messages)
+
+unix_can.UnixCanBus.send_many = record_many
+emulated_usb = reach.emulated_usb
+
+@contextlib.contextmanager
+def recorded_usb(run_dir):
+    with emulated_usb(run_dir):
+        from odrive.libodrive import Device
+        read = Device.read_endpoints
+
+        async def reads(*args, **names):
+            said["reads"] += 1
+            return await read(*args, **names)
+
+        def recorded(name):
+            before = getattr(Device, name)
+            def call(*args, **names):
+                said["usb"].append(name)
+                return before(*args, **names)
+            return call
+
+        Device.read_endpoints = reads
+        for name in ("write_endpoints", "call_function"):
+            setattr(Device, name, recorded(name))
+        yield
+
+reach.emulated_usb = recorded_usb
+code = cli.main(["doctor", "--json", "--run-dir", sys.argv[1]])
+print(json.dumps(said), file=sys.stderr)
+sys.exit(code)
+"""
+"""The verb, with everything that it tells a drive written down."""
+
+
+def test_it_writes_no_endpoint_calls_no_function_and_sends_questions_only(run_dir: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-c", RECORDED, str(run_dir)],
+        capture_output=True,
+        text=True,
+        cwd=DEFAULT_CONFIG.parents[1],
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    said = json.loads(result.stderr.splitlines()[-1])
+    assert said["usb"] == []
+    assert said["reads"] > 6, "it did read, through what is recorded here"
+    assert len(said["can"]) == 36, "three questions to each axis"
+    for arbitration_id, is_remote in said["can"]:
+        _, command = cansimple.split_id(arbitration_id)
+        assert is_remote
+        assert command in (Command06.GET_VERSION, Command.GET_VBUS, Command.GET_ENCODER_COUNT)
+
+
+def test_a_board_that_is_not_set_up_as_the_others_is_named(run_dir: Path) -> None:
+    plant = "--plant=knee_left.axis1.motor.config.pole_pairs=20"
+    result = doctor(run_dir, "--json", plant)
+    assert result.returncode == 0, "a warning: nothing that is wanted is missing"
+    bad = [row for row in rows_of(result) if row["verdict"] != "ok" and row["what"] not in MEASURED]
+    assert [(row["subject"], row["what"], row["found"]) for row in bad] == [
+        ("knee_left.axis1", "motor.config.pole_pairs", "20")
+    ]
+
+
+def test_a_current_that_counts_the_other_way_is_wrong_over_can(run_dir: Path) -> None:
+    result = doctor(run_dir, "--json", f"--plant={AXIS}.encoder.config.direction=-1")
+    assert result.returncode == 1, result.stderr
+    (row,) = [row for row in rows_of(result) if row["verdict"] == "wrong"]
+    assert (row["subject"], row["what"], row["found"]) == (AXIS, "encoder.config.direction", "-1")
+    assert "two of the motor's phases" in row["fix"]
+
+
+def test_three_planted_traps_are_named_all_three(run_dir: Path) -> None:
+    plants = [f"--plant={AXIS}.{name}={found}" for name, (found, _) in TRAPS.items()]
+    result = doctor(run_dir, "--json", *plants)
+    assert result.returncode == 1, result.stderr
+    wrong = [row for row in rows_of(result) if row["verdict"] == "wrong"]
+    assert {(row["subject"], row["what"]): (row["found"], row["wanted"]) for row in wrong} == {
+        (AXIS, name): values for name, values in TRAPS.items()
+    }
+    assert {row["fix"] for row in wrong} == {"`xrl configure --apply --module knee_left`"}
+    periods = [row for row in rows_of(result) if row["what"] == "encoder frames"]
+    assert next(row for row in periods if row["subject"] == AXIS)["verdict"] == "warning"
+
+
+def test_the_terminal_ends_in_what_is_wrong(run_dir: Path) -> None:
+    result = doctor(run_dir, f"--plant={AXIS}.motor.config.pre_calibrated=false")
+    assert result.returncode == 1
+    words = " ".join(result.stdout.split())
+    last = words[words.rindex("2 wrong:") :]
+    assert last.startswith(f"2 wrong: {AXIS} pre_calibrated, {AXIS} calibrated")
+
+
+def test_ctrl_c_stops_the_simulator_that_was_started(run_dir: Path) -> None:
+    command = [sys.executable, "-m", "tools.cli", "doctor", "--run-dir", str(run_dir)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+    )
+    deadline = time.monotonic() + START_S
+    while not (run_dir / "can_knee_left.sock").exists() and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors.decode()
+    assert b"Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("plant", "says"),
+    [
+        ("knee_left.axis0.vel_limit=2", "the nearest is axis0.controller.config.vel_limit"),
+        ("knee_lft.axis0.controller.config.vel_limit=2", "the nearest is knee_left"),
+    ],
+)
+def test_a_plant_that_makes_no_sense_starts_nothing(
+    run_dir: Path, capsys: pytest.CaptureFixture[str], plant: str, says: str
+) -> None:
+    assert cli.main(["doctor", "--run-dir", str(run_dir), "--plant", plant]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_nothing_is_planted_in_real_drives(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = DEFAULT_CONFIG.read_text(encoding="utf-8").replace('"xrl_unix"', '"socketcan"')
+    real = tmp_path / "real.toml"
+    real.write_text(text, encoding="utf-8")
+    plant = f"--plant={AXIS}.controller.config.vel_limit=2"
+    assert cli.main(["doctor", "--config", str(real), "--run-dir", str(run_dir), plant]) == 2
+    assert "real ones" in capsys.readouterr().err

@@ -1,0 +1,161 @@
+"""`xrl explain`: one tick of a run, or a pose, laid open."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from services.planner.kinematics import Kinematics
+from services.planner.torque_breakdown import torque_breakdown
+from shared.bus import topics
+from shared.bus.messages import PlannerStatus
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import JOINTS, MODULES, N_JOINTS
+from shared.robot.robot_model import stand_pose
+from tools import cli
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog, read_run
+from tools.verbs import explain
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
+    """Return a run: down for 1.5 s, the planner killed, back, and down again."""
+    out = tmp_path_factory.mktemp("explain")
+    flags = ["--duration", "2.5", "--kill", "planner@1.5", "--restart", "planner@1.8"]
+    assert cli.main(["sim", "--out", str(out), *flags]) == 0
+    return read_run(out / "run.mcap")
+
+
+@pytest.mark.parametrize("at_s", [0.3, 1.2, 2.4, None])
+def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(
+    log: RunLog, at_s: float | None
+) -> None:
+    tick = explain.tick_at(log, at_s)
+    robot = robot_of(log)
+    q, v = (np.array([getattr(s, n) for s in tick.states]).ravel() for n in ("q", "v"))
+    commands = {
+        name: np.array([getattr(command, name) for command in tick.commands]).ravel()
+        for name in ("q_ref", "v_ref", "tau_ff", "k_p", "k_d")
+    }
+    status = tick.status
+    q_ref, v_ref = commands["q_ref"], commands["v_ref"]
+    found = torque_breakdown(
+        robot, q, v, q_ref, v_ref, status.assist_n, status.slope, status.stance
+    )
+    np.testing.assert_allclose(found.p, tick.status.p, atol=1e-12)
+    np.testing.assert_allclose(found.gravity + found.assist, commands["tau_ff"], atol=0.05)
+    np.testing.assert_allclose(found.local.D, commands["k_p"], rtol=0.01)
+    np.testing.assert_allclose(found.local.D_B, commands["k_d"], rtol=0.01)
+    assert found.local.margins.service == pytest.approx(tick.status.margin, rel=0.01)
+    assert found.local.margins.onboard == pytest.approx(tick.status.margin_onboard, rel=0.01)
+
+
+def test_the_tick_is_the_last_at_or_before_the_time(log: RunLog) -> None:
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    early, late = explain.tick_at(log, 1.0).status, explain.tick_at(log, 1.004).status
+    assert late.seq == early.seq + 1
+    assert explain.tick_at(log, None).status == statuses[-1]
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
+    """Return a run: late commands from 0.5 s, then nothing passes from 1.2 s on."""
+    out = tmp_path_factory.mktemp("cut")
+    late, gone = "planner->joints delay=20 at=0.5 for=0.5", "all partition at=1.2 for=0.4"
+    flags = ["--duration", "2", "--inject", late, "--inject", gone]
+    assert cli.main(["sim", "--out", str(out), *flags]) == 0
+    return read_run(out / "run.mcap")
+
+
+@pytest.mark.parametrize(
+    ("at", "words"),
+    [
+        ("0.3", "network: nothing is done to it here"),
+        ("0.8", "network: planner->joints delay=20ms, 0.50 to 1.00 s"),
+        ("1.5", "network: all partition, 1.20 to 1.60 s"),
+    ],
+)
+def test_what_is_done_to_the_network_at_the_tick_is_told(
+    cut: RunLog, at: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", str(cut.path), "--at", at]) == 0
+    assert words in capsys.readouterr().out
+
+
+def test_how_old_each_command_was_is_told(cut: RunLog, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["explain", str(cut.path), "--at", "0.8"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    for module in MODULES:
+        found = re.search(rf"{module} TRACK (\d+\.\d) ms", shown)
+        assert found is not None
+        assert 20.0 <= float(found[1]) < 32.0
+
+
+def test_where_the_planner_did_not_tick_the_modules_are_told_as_they_were_then(
+    cut: RunLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", str(cut.path), "--at", "1.5"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "at 1.5 s the planner did not tick" in shown
+    assert re.search(r"The modules at 1.5 s: ankle_right HOLD 30\d\.\d ms", shown)
+
+
+def test_the_torques_by_origin_of_every_joint_are_printed(
+    log: RunLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", str(log.path), "--at", "1.2"]) == 0
+    shown = capsys.readouterr().out
+    for joint in JOINTS:
+        rows = re.findall(rf"^ ?{joint} +(.*)$", shown, re.MULTILINE)
+        assert [len(row.split()) for row in rows] == [4, 6]
+        *parts, total = map(float, rows[1].split())
+        assert sum(parts) == pytest.approx(total, abs=0.04)
+    assert "planner LEADING" in shown
+    assert re.search(r"margin, joint services alone: \d\.\d\d; weakest: \w+", shown)
+    assert re.search(r"push sideways: led \d+ N \(.+\), planner dead \d+ N", shown)
+
+
+def test_a_pose_is_explained_without_a_log(
+    robot: RobotConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    q = stand_pose(robot, 1.0)
+    assert cli.main(["explain", "--q", ",".join(f"{angle:.6f}" for angle in q)]) == 0
+    kinematics = Kinematics(robot)
+    kinematics.update(np.array(q))
+    assert f"{kinematics.p[2]:.4f}" in capsys.readouterr().out
+
+
+def test_a_pose_is_found_and_explained(
+    robot: RobotConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", "--p", "0.01,0,0.75,0,0.6,0.1"]) == 0
+    shown = capsys.readouterr().out
+    assert re.search(r"p: m, rad +0.0100 +0.0000 +0.7500 +0.0000 +0.6000 +0.1000", shown)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ((), "one of them"),
+        (("--q", "1,2,3"), f"{N_JOINTS} finite ones"),
+        (("--q", "a,b"), f"write {N_JOINTS} numbers"),
+        (("--p", "0,0,1.4,0,0,0"), "COM z 1.40 m wanted"),
+        (("--p", "0,0,0.8,0,0,0", "--q", "0"), "one of them"),
+        (("no_such.mcap",), "cannot be read"),
+    ],
+)
+def test_bad_input_is_one_clear_line(
+    flags: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", *flags]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_time_without_ticks_says_when_there_are_some(
+    log: RunLog, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["explain", str(log.path), "--at", "60"]) == 2
+    assert re.search(r"ticks in this log from -?\d", capsys.readouterr().err)

@@ -1,0 +1,123 @@
+"""`xrl inject`: what its flags ask of the network proxy, and what it shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shared.bus.links import COMMANDS
+from shared.config.scenarios import Inject
+from shared.network.proxy_protocol import RequestedImpairment
+from tools import cli
+from tools.verbs import inject
+
+BEGUN = RequestedImpairment(1, "planner->joints", "delay=30ms", None, 10, 0, hidden=COMMANDS[:3])
+COMING = RequestedImpairment(2, "all", "loss=100%", 7.0, 0, 0, in_s=2.0)
+
+
+class FakeProxy:
+    """In place of the client of one that is there."""
+
+    began: tuple[Inject, float] | None = None
+    cleared = ""
+
+    def __init__(self, run_dir: Path) -> None:
+        pass
+
+    def begin(self, what: Inject, in_s: float) -> tuple[RequestedImpairment, ...]:
+        FakeProxy.began = (what, in_s)
+        return (BEGUN, COMING)
+
+    def clear(self, link: str) -> tuple[RequestedImpairment, ...]:
+        FakeProxy.cleared = link
+        return (COMING,)
+
+    def list(self) -> tuple[RequestedImpairment, ...]:
+        return (BEGUN, COMING)
+
+
+@pytest.fixture(autouse=True)
+def proxy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inject, "ProxyClient", FakeProxy)
+    monkeypatch.setattr(FakeProxy, "began", None)
+    monkeypatch.setenv("COLUMNS", "150")
+
+
+def test_the_flags_say_what_where_and_when_and_the_injector_does_the_waiting() -> None:
+    words = "inject --link left->planner --delay 0.03s --loss 20% --ordered --at 500s --for 4"
+    assert cli.main(words.split()) == 0
+    what = Inject(
+        link="left->planner", at=500.0, duration=4.0, delay_ms=30.0, loss=0.2, ordered=True
+    )
+    assert FakeProxy.began == (what, 500.0)
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ("--loss 20", "--loss: '20' is out of range; must be from 0 to 1 (1 is 100 %)"),
+        ("--loss x", "--loss: 'x' is not understood; write 0.2 or 20%"),
+        ("--delay 100s", "--delay: '100s' is out of range; must be from 0 to 60000 ms"),
+        ("--delay 5 --for 0", "--for: '0' is out of range"),
+        ("--delay 5 --at inf", "--at: 'inf' is not understood; write 4 (s) or 500ms"),
+        ("--delay 5 --at 1e12", "--at: '1e12' is out of range; must be from 0 to 86400 s"),
+        ("--delay 5 --at -1", "--at: '-1' is out of range"),
+        ("--jitter 5 --distribution wild", "--distribution: 'wild'; one of uniform"),
+        ("--link elbow --loss 1", "--link: 'elbow'; one of planner->joints"),
+        ("--loss 0.1 --distribution pareto", "give a jitter"),
+        ("--reorder 0.1", "give a delay"),
+        ("--ordered", "give a delay, a rate or a partition"),
+        ("", "give a delay"),
+        ("all loss=x", "'all loss=x': loss: 'x' is not understood; write 0.2 or 20%"),
+        ("all loss=1 --link all", "'LINK KEY=VALUE ...' with --link: without effect"),
+        ("--clear --link planner-", "--link: 'planner-'; the shell took the rest"),
+        ("--list all loss=1", "--list with 'LINK KEY=VALUE ...': without effect"),
+        ("--list --delay 30", "--list with --delay: without effect"),
+        ("--list --link all", "--list with --link: without effect"),
+        ("--clear --for 3 --partition", "--clear with --for, --partition: without effect"),
+    ],
+)
+def test_what_is_wrong_or_without_effect_is_refused_by_its_flag(
+    flags: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = flags.replace("all loss", "all_loss").split()
+    assert cli.main(["inject", *(word.replace("_", " ") for word in words)]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert FakeProxy.began is None
+
+
+def test_the_words_of_other_verbs_are_taken_too() -> None:
+    assert cli.main(["inject", "all loss=20% at=2 for=3"]) == 0
+    assert FakeProxy.began == (Inject(link="all", at=2.0, duration=3.0, loss=0.2), 2.0)
+
+
+def test_clearing_tells_what_it_ended_with_its_counts_and_what_is_left(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for words, link in (("--clear", "all"), ("--clear --link planner->left", "planner->left")):
+        assert cli.main(["inject", *words.split()]) == 0
+        assert FakeProxy.cleared == link
+        ended, left = capsys.readouterr().out.split("\n", 1)
+        assert ended == "ended: planner->joints delay=30ms; 10 passed, 0 lost"
+        assert "loss=100%" in left
+
+
+def test_the_list_shows_what_is_hidden_and_by_which_rule_and_what_is_to_come(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["inject", "--list"]) == 0
+    shown = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert "planner->joints delay=30ms hidden on 3 of 6 until --clear 10 0" in shown
+    assert "all loss=100% in 2.0 s 5.0 s 0 0" in shown
+    assert f"hidden: {inject.RULE}" in shown
+
+
+def test_the_help_says_which_of_several_counts_and_that_a_loss_of_1_is_all(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["inject", "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"O{inject.RULE[1:]}" in shown
+    assert "1 is all, and not 1%" in shown

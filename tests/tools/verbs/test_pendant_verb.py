@@ -1,0 +1,138 @@
+"""The dead man's handle: it is held, laid down, or gone; nothing else is between."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from services.joint.neighbours import NeighbourRow, Neighbours
+from services.joint.rearm_guard import RearmGuard
+from shared.bus.messages import Mode
+from shared.robot.joints import MODULES
+from tools import cli
+
+ROOT = Path(__file__).parents[3]
+PATIENCE_S = 30.0
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[RearmGuard]:
+    """Return what six joint services of a fleet have open."""
+    return [RearmGuard(tmp_path, module) for module in MODULES]
+
+
+def started(run_dir: Path, stdin: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "tools.cli", "pendant", "--run-dir", str(run_dir)]
+    return subprocess.Popen(
+        command, cwd=ROOT, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for(happens: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not happens():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_killed_it_says_no_more(tmp_path: Path, files: list[RearmGuard]) -> None:
+    process = started(tmp_path)
+    try:
+        wait_for(lambda: all(file.beats > 3 for file in files))
+        process.send_signal(signal.SIGKILL)
+    finally:
+        process.kill()
+        process.communicate()
+    beats = [file.beats for file in files]
+    assert min(beats) > 3
+    time.sleep(0.1)
+    assert [file.beats for file in files] == beats, "and the services' rule does the rest"
+
+
+def test_enter_lays_it_down(tmp_path: Path, files: list[RearmGuard]) -> None:
+    person, terminal = pty.openpty()
+    process = started(tmp_path, terminal)
+    try:
+        wait_for(lambda: files[0].beats > 3)
+        os.write(person, b"\n")
+        said, _ = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+        os.close(person)
+        os.close(terminal)
+    assert process.returncode == 0
+    assert "laid down" in said
+    assert [file.beats for file in files] == [0] * 6
+
+
+def test_ctrl_c_is_the_stop_and_says_who_has_not_stopped(
+    tmp_path: Path, files: list[RearmGuard]
+) -> None:
+    """Five services stop in this test, the sixth does not hear it."""
+    rows = {module: Neighbours(tmp_path, module) for module in MODULES}
+    for module, row in rows.items():
+        row.write(NeighbourRow(1, 0.0, 0.0, Mode.DAMP if module != "hip_left" else Mode.HOLD))
+    process = started(tmp_path)
+    try:
+        wait_for(lambda: files[0].beats > 3)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == 2
+    assert "hip_left" in error
+    assert "knee_left" not in error
+    assert all(file.stop_asked for file in files), "at once, and not by silence"
+
+
+def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[RearmGuard]) -> None:
+    """Its hang-up ends the program; one that was started to outlive it stops all the same."""
+    person, terminal = pty.openpty()
+    process = started(tmp_path, terminal)
+    try:
+        wait_for(lambda: files[0].beats > 3)
+        os.close(terminal)
+        os.close(person)
+        wait_for(lambda: all(file.stop_asked for file in files))
+        process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == 2, "no service is there to stop"
+
+
+def test_a_second_pendant_is_refused_for_the_first_would_not_be_missed(
+    tmp_path: Path, files: list[RearmGuard], capsys: pytest.CaptureFixture[str]
+) -> None:
+    process = started(tmp_path)
+    try:
+        wait_for(lambda: files[0].beats > 3)
+        assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
+    finally:
+        process.kill()
+        process.communicate()
+    assert "another pendant is held" in capsys.readouterr().err
+
+
+def test_a_time_lays_it_down_by_itself(
+    tmp_path: Path, files: list[RearmGuard], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["pendant", "--for", "0.1", "--run-dir", str(tmp_path)]) == 0
+    assert "laid down" in capsys.readouterr().out
+    assert files[3].beats == 0
+
+
+def test_where_nobody_hears_it_it_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
+    assert "no joint service" in capsys.readouterr().err
+    assert cli.main(["pendant", "--for", "0", "--run-dir", str(tmp_path)]) == 2
+    assert "--for 0" in capsys.readouterr().err

@@ -1,0 +1,137 @@
+"""`xrl play` without a bus: what it refuses, and what it makes of its arguments."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.process import DEFAULT_CONFIG
+from tests.recorder import runs
+from tests.recorder.runs import item, write
+from tools import cli
+from tools.analysis.playback import arguments, reading
+from tools.verbs import play
+
+LENGTH = 40
+"""Messages, a millisecond apart."""
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return write(tmp_path, [item(n) for n in range(LENGTH)])
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """Return the one line that a command line is refused with."""
+    assert cli.main(["play", *words]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("xrl: ")
+    assert error.count("\n") == 1, error
+    return error
+
+
+@pytest.mark.parametrize(
+    ("words", "right"),
+    [
+        (("--rate", "0"), "0.001 .. 1000 is right"),
+        (("--rate", "nan"), "0.001 .. 1000 is right"),
+        (("--rate", "-1"), "0.001 .. 1000 is right"),
+        (("--start-offset", "-0.1"), "--start-offset -0.1"),
+        (("--start-offset", "9"), "the log is 0.04 s long"),
+        (("--duration", "0"), "--duration 0"),
+        (("--clock-hz", "0"), "--clock-hz 0"),
+        (("--topics", "joint/*/sate"), "the nearest is joint/*/state"),
+        (("--topics", "estop"), "nothing is left to play; the log holds joint/*/state"),
+        (("--exclude", "wrenchh"), "the nearest is harness/wrench"),
+        (("--remap", "joint/knee_right/state"), "OLD=NEW is right"),
+        (("--prefix", "xrl/lab"), "--prefix"),
+        (("--config", "nowhere.toml"), "nowhere.toml"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_line_that_says_what_would_be_right(
+    log: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], right: str
+) -> None:
+    error = refused(capsys, str(log), "--run-dir", str(log.parent / "r"), *words)
+    assert right in error
+    assert not (log.parent / "r").exists()
+
+
+def test_a_file_behind_a_list_of_names_is_asked_for(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "write it first" in refused(capsys, "--topics", "joint/*/state", str(log))
+
+
+def test_a_play_that_nobody_could_begin_is_refused(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--start-paused", "--listen", "none", "--run-dir", str(log.parent / "r"))
+    assert "a terminal is needed" in refused(capsys, str(log), *words)
+    assert not (log.parent / "r").exists()
+
+
+def test_help_shows_the_keys_and_the_way_to_subscribe() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.cli", "play", "--help"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for words in (
+        "examples:\n  xrl play",
+        "replay/xrl/<robot>/x",
+        arguments.LISTEN,
+        "space",
+        "130",
+    ):
+        assert words in done.stdout
+
+
+def arguments_of(log: Path, *words: str) -> argparse.Namespace:
+    return cli._parser(["play"]).parse_args(["play", str(log), *words])
+
+
+def test_the_bus_is_that_of_the_robot_file_given_else_of_the_log_else_as_shipped(
+    tmp_path: Path, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = tmp_path / "given.toml"
+    given.write_text(DEFAULT_CONFIG.read_text().replace('name = "xrl"', 'name = "given"', 1))
+    words = ("--run-dir", str(tmp_path / "r"))
+    old = write(tmp_path / "old", [item(0)])  # its robot file is one that cannot be used
+    recording = reading.read([old])
+    found = play.bus_of(recording, arguments_of(old, *words))
+    assert found.robot.name == robot.name
+    assert "another version" in found.note
+    found = play.bus_of(recording, arguments_of(old, "--config", str(given), *words))
+    assert (found.robot.name, found.note) == ("given", "")
+    text = config_file.to_toml(robot).replace('name = "xrl"', 'name = "lab"', 1)
+    monkeypatch.setitem(runs.ATTACHMENTS, "robot.toml", text.encode())
+    new = write(tmp_path / "new", [item(0)])
+    found = play.bus_of(reading.read([new]), arguments_of(new, *words))
+    assert (found.robot.name, found.note) == ("lab", "")
+
+
+def test_a_part_of_the_log_is_counted_from_its_first_message_of_all_topics(log: Path) -> None:
+    recording = reading.read([log])
+    args = arguments_of(log, "--start-offset", "0.01", "--duration", "0.005")
+    part = play.part_of(recording, args)
+    keys = {key: key for key in recording.keys}
+    schedule = play.schedule_of(recording, keys, part, loop=False)
+    assert len(schedule) == 5
+    assert schedule.pop().payload == item(10)[1]
+
+
+def test_old_logs_are_played_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    about = {**runs.METADATA["run"], "schema_version": "0"}
+    monkeypatch.setitem(runs.METADATA, "run", about)
+    payload = b'{"t_ns":1,"seq":2,"nobody":"knows"}'
+    old = write(tmp_path, [(runs.STATE_KEY, payload, 5)])
+    assert [entry.payload for entry in reading.read([old]).entries] == [payload]

@@ -1,0 +1,283 @@
+"""`xrl zero`: against a drive that the test plays, and the verb on the emulated robot."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import math
+import re
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from services.joint.differential import joint_from_motor, motor_from_joint
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from shared.bus.messages import Pair
+from shared.can.cansimple import AxisError
+from shared.clock import now_ns
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import FleetError, RunError, XrlError
+from tools.bringup import bench, zeroing
+from tools.bringup.standing import standing
+from tools.bringup.zeroing import Back, DriveLook, is_right, look, outside, refusal, zero
+from tools.fleet.supervise import SupervisedFleet
+from tools.verbs import zero as verb
+
+MODULE = "knee_left"
+MARK = 64.0
+N = 17.5
+STILL = DriveLook(DriveStatus.IDLE, zeroed=True, q=(0.0, -1.0), speed=0.0, moved=0.0, error=0)
+
+
+class PlayedDrive:
+    """A drive as it counts itself; each reading says what the test wants.
+
+    Attributes:
+        pos: turns of both motors.
+        vel: turn/s of both motors.
+        creep: turns that the motors go on at each reading.
+        deaf: so many more positions told are lost on the way.
+    """
+
+    def __init__(self) -> None:
+        self.pos: Pair = (0.3, 0.6)
+        self.vel: Pair = (0.0, 0.0)
+        self.status = DriveStatus.IDLE
+        self.error = self.deaf = self.told = 0
+        self.creep = 0.0
+
+    def read(self, timeout_s: float) -> DriveReading | None:
+        time.sleep(min(timeout_s, 0.001))
+        if self.status is DriveStatus.LOST:
+            return None
+        self.pos = (self.pos[0] + self.creep, self.pos[1] + self.creep)
+        return DriveReading(now_ns(), self.pos, self.vel, self.status, self.error)
+
+    def set_position(self, turns: Pair) -> None:
+        self.told += 1
+        if self.deaf > 0:
+            self.deaf -= 1
+        else:
+            self.pos = turns
+
+    def write_torque(self, torque: Pair) -> None:
+        raise AssertionError(f"{torque}: a zero moves nothing")
+
+    def write(self, target: MotorTarget) -> None:
+        raise AssertionError(f"{target}: a zero moves nothing")
+
+    def arm(self, *, onboard: bool) -> None:
+        raise AssertionError(f"{onboard}: a zero arms nothing")
+
+    def idle(self) -> None:
+        raise AssertionError("a zero changes no state")
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zeroing, "LOOK_S", 0.02)
+    monkeypatch.setattr(zeroing, "ANSWER_S", 0.02)
+    monkeypatch.setattr(zeroing, "SET_S", 0.02)
+    monkeypatch.setattr(zeroing, "TAKEN_S", 0.0)
+
+
+def test_motors_are_told_the_mark_and_what_the_joints_angles_are_at_them(
+    robot: RobotConfig,
+) -> None:
+    drive = PlayedDrive()
+    back = zero(drive, (0.05, -0.8), robot)
+    assert is_right(back, (0.05, -0.8))
+    m1, m2 = motor_from_joint((0.05, -0.8), robot.joint.gear_ratio)
+    mark = robot.drive.zero_mark_turns
+    assert drive.pos == pytest.approx((mark + m1, mark + m2))
+    assert drive.told == 1
+
+
+def test_what_was_lost_on_the_way_is_told_again(robot: RobotConfig) -> None:
+    drive = PlayedDrive()
+    drive.deaf = 2
+    assert is_right(zero(drive, (0.0, -1.0), robot), (0.0, -1.0))
+    assert drive.told == 3
+
+
+def test_a_drive_that_does_not_take_it_is_not_said_to_be_zeroed(robot: RobotConfig) -> None:
+    drive = PlayedDrive()
+    drive.deaf = 100
+    back = zero(drive, (0.0, -1.0), robot)
+    assert back is not None
+    assert not is_right(back, (0.0, -1.0))
+    assert not is_right(None, (0.0, -1.0))
+    off = (0.0, -1.0 + 1.01 * zeroing.WITHIN)
+    assert not is_right(Back(off, armed=False), (0.0, -1.0))
+    assert is_right(Back(off, armed=True), (0.0, -1.0)), "held by its service, it sags"
+
+
+def test_a_sample_of_the_time_before_is_no_proof(robot: RobotConfig) -> None:
+    """It may be so near to what was told that it seems to be right."""
+
+    class Late(PlayedDrive):
+        def read(self, timeout_s: float) -> DriveReading | None:
+            reading = super().read(timeout_s)
+            return None if reading is None else msgspec.structs.replace(reading, t_ns=1)
+
+    assert zero(Late(), (0.0, -1.0), robot) is None
+
+
+def test_a_drive_that_its_service_armed_meanwhile_is_not_told_again(robot: RobotConfig) -> None:
+    drive = PlayedDrive()
+    drive.deaf, drive.status = 100, DriveStatus.ARMED
+    assert zero(drive, (0.0, -1.0), robot) is not None
+    assert drive.told == 1
+
+
+@pytest.mark.parametrize(
+    ("turns", "zeroed"),
+    [((MARK + 1.0, MARK - 2.0), True), ((0.2, 0.9), False), ((MARK, 0.4), False)],
+)
+def test_a_drive_that_lost_its_power_is_known(turns: Pair, zeroed: bool) -> None:
+    drive = PlayedDrive()
+    drive.pos = turns
+    seen = look(drive, MARK, N)
+    assert seen.zeroed == zeroed
+    assert seen.status is DriveStatus.IDLE
+    if zeroed:
+        assert seen.q == pytest.approx(joint_from_motor((1.0, -2.0), N))
+
+
+def test_an_armed_drive_is_armed_though_it_is_unzeroed() -> None:
+    drive = PlayedDrive()
+    drive.status = DriveStatus.ARMED
+    assert "armed" in refusal(look(drive, MARK, N))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, "^$"),
+        ({"speed": 0.049, "moved": 0.0049}, "^$"),
+        ({"speed": 0.051}, "it moves: 0.05 rad/s"),
+        ({"moved": 0.0051}, "it moves.*hold it still"),
+        ({"status": DriveStatus.LOST}, "does not answer"),
+        ({"status": DriveStatus.ARMED}, "armed"),
+        ({"status": DriveStatus.ERROR, "error": int(AxisError.WATCHDOG_TIMER_EXPIRED)}, "^$"),
+        ({"status": DriveStatus.ERROR, "error": int(AxisError.ENCODER_FAILED)}, "encoder error"),
+        ({"zeroed": False}, "^$"),
+    ],
+)
+def test_only_a_joint_that_is_still_and_a_drive_that_is_idle_are_zeroed(
+    change: dict[str, object], words: str
+) -> None:
+    assert re.search(words, refusal(STILL._replace(**change)))  # type: ignore[arg-type]
+
+
+def test_motion_is_seen_by_the_rate_and_by_the_way() -> None:
+    drive = PlayedDrive()
+    drive.vel = (1.0, 1.0)
+    assert look(drive, MARK, N).speed == pytest.approx(joint_from_motor((1.0, 1.0), N)[1])
+    drive = PlayedDrive()
+    drive.creep = 0.01
+    assert look(drive, MARK, N).moved > 0.005
+    drive.status = DriveStatus.LOST
+    assert look(drive, MARK, N).status is DriveStatus.LOST
+
+
+@pytest.mark.parametrize(
+    ("q", "inside"),
+    [
+        ((0.0, -0.5), True),
+        ((0.6, -3.0), True),
+        ((0.601, -0.5), False),
+        ((0.0, -0.199), False),
+        ((math.nan, -0.5), False),
+    ],
+)
+def test_angles_outside_of_the_limits_are_refused(
+    robot: RobotConfig, q: Pair, inside: bool
+) -> None:
+    assert (outside(robot, MODULE, q) == "") == inside
+
+
+def asked(**changes: object) -> argparse.Namespace:
+    fields = {"module": MODULE, "all": False, "at": None, "standing": None}
+    return argparse.Namespace(**{**fields, **changes})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"at": "0.1"}, "write phi and theta"),
+        ({"at": "a,b"}, "write phi and theta"),
+        ({"at": "0,0,0"}, "write phi and theta"),
+        ({"at": "0,0"}, r"knee_left: theta 0 rad is outside of -3 \.\. -0\.2"),
+        ({"at": "nan,-0.5"}, "phi nan"),
+        ({"at": "0,-0.5", "all": True, "module": None}, "for one module"),
+        ({"at": "0,-28"}, r"outside .*if these are degrees: --at 0,-0\.4887$"),
+        ({"at": "0,-3.1"}, "leg could then not be bent by lifting alone$"),
+        ({"standing": 1.5}, "between 0 and"),
+        ({"standing": 1188.0}, r"if these are mm: --standing 1\.188"),
+        ({"standing": math.nan}, "between 0 and"),
+        ({"standing": 0.4}, "cannot be reached"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_any_drive_is_touched(
+    robot: RobotConfig, arguments: dict[str, object], words: str
+) -> None:
+    with pytest.raises(XrlError, match=words):
+        verb.angles_of(asked(**arguments), robot, Console(quiet=True))
+
+
+@pytest.mark.parametrize("words", [["--at", "-0.02,0.14"], ["--at=-.02,0.14"], ["--at", "-1,-1"]])
+def test_angles_that_begin_with_a_minus_are_angles(words: list[str]) -> None:
+    parser = argparse.ArgumentParser()
+    verb.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["zero", "ankle_right", *words])
+    assert args.at.startswith("-")
+    assert args.module == "ankle_right"
+
+
+@pytest.mark.parametrize("height", [0.9, 1.188])
+def test_a_stand_is_at_its_height_level_and_inside_the_limits(
+    robot: RobotConfig, height: float
+) -> None:
+    """By the plain geometry of a leg in its plane, not by the planner's kinematics."""
+    stand = standing(robot, height)
+    lengths = robot.geometry
+    for side in ("right", "left"):
+        q = {kind: stand.q[f"{kind}_{side}"] for kind in ("ankle", "knee", "hip")}
+        assert sum(theta for _, theta in q.values()) == pytest.approx(0.0, abs=5e-3)
+        shin = q["ankle"][1]
+        thigh = shin + q["knee"][1]
+        reach = lengths.l2 * math.cos(shin) + lengths.l1 * math.cos(thigh)
+        span = (lengths.w_hip - lengths.w_base) / 2.0
+        assert math.hypot(height, span) == pytest.approx(reach, abs=2e-3)
+        forward = lengths.l2 * math.sin(shin) + lengths.l1 * math.sin(thigh)
+        assert stand.hips_forward == pytest.approx(forward, abs=2e-3)
+    for module, q_module in stand.q.items():
+        assert outside(robot, module, q_module) == ""
+
+
+def test_a_stand_that_no_leg_reaches_says_why(robot: RobotConfig) -> None:
+    with pytest.raises(RunError, match=r"--standing 1\.294.*at its limit"):
+        standing(robot, 1.294)
+
+
+def test_over_usb_the_services_must_be_down(robot: RobotConfig, tmp_path: Path) -> None:
+    usb = msgspec.structs.replace(
+        robot, joint_service=msgspec.structs.replace(robot.joint_service, driver="odrive_usb")
+    )
+    with pytest.raises(FleetError, match=r"has the drive's USB.*xrl down"):
+        verb.refuse_services(usb, {MODULE: SupervisedFleet(tmp_path)})
+    verb.refuse_services(usb, {MODULE: None})
+
+
+def test_without_a_terminal_yes_must_be_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO("y"))
+    with pytest.raises(FleetError, match="--yes"):
+        bench.confirm("sure?", yes=False)
+    assert bench.confirm("sure?", yes=True)

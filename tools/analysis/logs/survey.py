@@ -1,0 +1,181 @@
+"""Counts what is in MCAP files: by file and by topic, finished or not, ours or foreign."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from services.recorder import mcap_records as mcap
+from services.recorder.files import in_use
+from services.recorder.mcap_log import PROFILE
+from services.recorder.mcap_records import Channel, Malformed
+from services.recorder.reader import LostBytes, Piece, Salvage, opened
+from services.recorder.sequence_stats import KeyCount
+from shared.clock import NS_PER_S
+from tools.analysis.logs.files import Metadata
+
+_NEVER: Final = -1
+
+
+class TopicFacts(msgspec.Struct, kw_only=True):
+    """One topic, over all files surveyed."""
+
+    schema: str
+    nominal_hz: float
+    """As the table of topics had it when it was recorded; 0: events, or unknown."""
+    bytes: int = 0
+    """Size of the payload before compression, bytes."""
+    first_ns: int = _NEVER
+    last_ns: int = _NEVER
+    longest_gap_ns: int = 0
+    """Between two messages after each other; by the sender's clock in our logs."""
+    gap_at_ns: int = 0
+    """When it began."""
+    sequence: KeyCount = msgspec.field(default_factory=KeyCount)
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Return the mean rate from the first to the last message."""
+        span_ns = self.last_ns - self.first_ns
+        return (self.sequence.count - 1) * NS_PER_S / span_ns if span_ns > 0 else None
+
+
+class FileFacts(msgspec.Struct, kw_only=True):
+    """One file."""
+
+    path: Path
+    size: int
+    finished: bool
+    in_use: bool
+    """A recorder is writing it."""
+    profile: str = ""
+    library: str = ""
+    messages: int = 0
+    first_ns: int = _NEVER
+    """Log times; -1 without messages."""
+    last_ns: int = _NEVER
+    orphans: int = 0
+    """Messages of channels that are nowhere described."""
+    attachments: dict[str, int] = msgspec.field(default_factory=dict)
+    """Sizes by name."""
+    metadata: Metadata = msgspec.field(default_factory=dict)
+    cut: LostBytes | None = None
+    damage: list[LostBytes] = msgspec.field(default_factory=list)
+
+    @property
+    def ours(self) -> bool:
+        """Return True for a log of this project, whatever its version."""
+        return self.profile == PROFILE
+
+
+class Survey:
+    """Files, and their topics taken together; feed it the files of a run in order."""
+
+    def __init__(self) -> None:
+        self.files: list[FileFacts] = []
+        self.topics: dict[str, TopicFacts] = {}
+
+    @property
+    def messages(self) -> int:
+        """Messages in all files."""
+        return sum(file.messages for file in self.files)
+
+    @property
+    def first_ns(self) -> int:
+        """Log time of the first message; -1 without any."""
+        return min((f.first_ns for f in self.files if f.messages), default=_NEVER)
+
+    @property
+    def last_ns(self) -> int:
+        """Log time of the last message; -1 without any."""
+        return max((f.last_ns for f in self.files if f.messages), default=_NEVER)
+
+    def add(self, path: Path) -> FileFacts:
+        """Read a file.
+
+        Raises:
+            RunError: it is missing, empty, or no MCAP file.
+        """
+        with opened(path) as salvage:
+            facts = FileFacts(
+                path=path, size=salvage.size, finished=salvage.finished, in_use=_in_use(path)
+            )
+            _Reading(facts, self.topics).read(salvage)
+            facts.cut, facts.damage = salvage.cut, salvage.damage
+        self.files.append(facts)
+        return facts
+
+
+class _Reading:
+    """One file being read."""
+
+    def __init__(self, facts: FileFacts, topics: dict[str, TopicFacts]) -> None:
+        self._facts, self._topics = facts, topics
+        self._schemas: dict[int, str] = {0: ""}
+        self._channels: dict[int, TopicFacts] = {}
+
+    def read(self, salvage: Salvage) -> None:
+        for piece in salvage:
+            with contextlib.suppress(Malformed):
+                self._take(piece.opcode, piece.body)
+                for opcode, body in piece.others:
+                    self._take(opcode, body)
+            if piece.rows:
+                self._count(piece)
+
+    def _take(self, opcode: int, body: bytes) -> None:
+        if opcode == mcap.HEADER:
+            self._facts.profile, self._facts.library = mcap.header(body)
+        elif opcode == mcap.SCHEMA:
+            schema = mcap.schema(body)
+            self._schemas[schema.id] = schema.name
+        elif opcode == mcap.CHANNEL:
+            self._define(mcap.channel(body))
+        elif opcode == mcap.METADATA:
+            name, entries = mcap.metadata(body)
+            self._facts.metadata[name] = entries
+        elif opcode == mcap.ATTACHMENT:
+            attachment = mcap.attachment(body)
+            self._facts.attachments[attachment.name] = len(attachment.data)
+
+    def _define(self, channel: Channel) -> None:
+        nominal_hz = 0.0
+        with contextlib.suppress(ValueError):
+            nominal_hz = float(channel.metadata.get("rate_hz", "0"))
+        facts = TopicFacts(schema=self._schemas.get(channel.schema_id, ""), nominal_hz=nominal_hz)
+        self._channels[channel.id] = self._topics.setdefault(channel.topic, facts)
+
+    def _count(self, piece: Piece) -> None:
+        """Count the messages of a chunk; the hot loop."""
+        file, channels, ours = self._facts, self._channels, self._facts.ours
+        for channel, seq, log_ns, publish_ns, start, end in piece.rows:
+            topic = channels.get(channel)
+            if topic is None:
+                file.orphans += 1
+                continue
+            if file.messages == 0:
+                file.first_ns = file.last_ns = log_ns
+            elif log_ns > file.last_ns:
+                file.last_ns = log_ns
+            elif log_ns < file.first_ns:
+                file.first_ns = log_ns
+            file.messages += 1
+            topic.bytes += end - start
+            topic.sequence.feed(seq)
+            time_ns = publish_ns if ours else log_ns
+            gap_ns = time_ns - topic.last_ns
+            if topic.last_ns == _NEVER:
+                topic.first_ns = time_ns
+            elif gap_ns > topic.longest_gap_ns:
+                topic.longest_gap_ns, topic.gap_at_ns = gap_ns, topic.last_ns
+            topic.last_ns = time_ns
+
+
+def _in_use(path: Path) -> bool:
+    try:
+        return in_use(path)
+    except OSError:
+        return False

@@ -1,0 +1,102 @@
+"""What a person sees of a play: before it, while it goes on, and after it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+
+from shared.bus.session import RawPublisher
+from shared.clock import NS_PER_MS, NS_PER_S
+from tools.analysis.logs.files import further_files
+from tools.analysis.playback.player import Player
+from tools.analysis.playback.reading import Recording
+from tools.analysis.playback.schedule import Window
+
+
+def introduce(recording: Recording, paths: list[Path], note: str, console: Console) -> None:
+    """Print what a person should know of a log before it is played."""
+    if note:
+        console.print(escape(note), style="dim", soft_wrap=True)
+    for path in recording.unfinished:
+        words = f"{path}: not finished; plays as far as it goes"
+        console.print(escape(words), style="yellow", soft_wrap=True)
+    for path in recording.damaged:
+        words = f"{path}: parts of it cannot be read and are left out; see `xrl info`"
+        console.print(escape(words), style="yellow", soft_wrap=True)
+    if len(paths) == 1 and (others := further_files(paths[0])):
+        names = ", ".join(path.name for path in others)
+        words = f"further files of this run: {names}; give the directory to play all"
+        console.print(escape(words), style="dim", soft_wrap=True)
+
+
+def where(keys: Sequence[str], robot: str, part: Window, listening: str) -> str:
+    """Return in one line what goes where.
+
+    Args:
+        keys: on the bus.
+        robot: of the log.
+        part: what is played.
+        listening: endpoint; empty if there is none.
+    """
+    common = keys[0] if len(keys) == 1 else f"{_common(keys)}**"
+    length_s = (part.end_ns - 1 - part.start_ns) / NS_PER_S
+    line = f"{length_s:.2f} s of {robot}, {len(keys)} keys, onto {common}"
+    return f"{line}; subscribers dial {listening}" if listening else line
+
+
+def _common(keys: Sequence[str]) -> str:
+    first, last = min(keys), max(keys)
+    same = next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
+    return first[: first.rfind("/", 0, same) + 1]
+
+
+def summary(player: Player, took_s: float, *, heard: bool) -> str:
+    """Return how it went, in one line."""
+    tally = player.tally
+    keys = sum(1 for count in tally.counts if count)
+    line = f"{tally.put} messages on {keys} keys in {took_s:.2f} s"
+    if player.schedule.passes:
+        line += f", {player.schedule.passes} passes and a part"
+    if tally.put:
+        mean_ms = tally.late_sum_ns / (tally.put + tally.failed) / NS_PER_MS
+        line += f"; late by {mean_ms:.2f} ms on average, {tally.late_max_ns / NS_PER_MS:.1f} ms "
+        line += "at most"
+    line += f"; {tally.failed} not sent: the session is closed" if tally.failed else "; all sent"
+    return line if heard else f"{line}; nobody listened"
+
+
+class Display:
+    """One line on a terminal that is written anew; nothing on a pipe."""
+
+    def __init__(self, ports: Sequence[RawPublisher]) -> None:
+        self.heard = False
+        """Somebody has subscribed to a key, as far as has been looked."""
+        self._ports = ports
+        self._terminal = sys.stdout.isatty()
+
+    def show(self, player: Player) -> None:
+        """Write the line."""
+        self.heard = self.heard or any(port.matched for port in self._ports)
+        if not self._terminal:
+            return
+        head, schedule, tally = player.head, player.schedule, player.tally
+        line = (
+            f"{player.position_ns() / NS_PER_S:8.2f} / {schedule.length_ns / NS_PER_S:.2f} s  "
+            f"{head.rate:.3g}x  {tally.put} messages, "
+            f"{sum(1 for count in tally.counts if count)} of {len(self._ports)} keys"
+        )
+        if schedule.passes:
+            line += f", pass {schedule.passes + 1}"
+        line += ", paused" if head.paused else ""
+        line += "" if self.heard else ", nobody listens"
+        sys.stdout.write(f"\r\x1b[2K{line}")
+        sys.stdout.flush()
+
+    def clear(self) -> None:
+        """Take the line away."""
+        if self._terminal:
+            sys.stdout.write("\r\x1b[2K")

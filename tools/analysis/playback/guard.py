@@ -1,0 +1,134 @@
+"""What may not be put on the live keys of a robot that may move."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from shared.bus import topics
+from shared.bus.messages import JointState
+from shared.bus.session import open_session
+from shared.bus.topics import Topic
+from shared.config.robot_config import RobotConfig, expand
+from shared.exceptions import FleetError
+from shared.robot.joints import MODULES
+from tools.analysis.playback.selection import LIVE, short
+from tools.fleet.process_table import is_listening
+from tools.fleet.supervise import SupervisedFleet
+
+IN_THE_LOOP: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND, topics.WRENCH, topics.ATTITUDE)
+"""What makes a robot move by itself: never put beside a live drive, whatever is forced.
+
+A recorded command is too old for a joint service, until after a restart of the machine its
+clock passes the moment of the recording again. Of recorded states and wrenches the planner
+makes fresh commands."""
+
+ACTED_ON: Final = (
+    *IN_THE_LOOP,
+    topics.OPERATOR_INTENT,
+    topics.ESTOP,
+    topics.HARNESS_TARE,
+    topics.SIM_CONTROL,
+)
+"""What a live service, other than the recorder, takes from the bus."""
+
+LISTEN_S: Final = 1.0
+"""So long a joint service is listened for: it says its state 250 times a second."""
+_POLL_S: Final = 0.01
+
+
+def those_of(rows: Iterable[Topic], keys: Iterable[str]) -> list[str]:
+    """Return the live keys that belong to some topics, of whatever robot."""
+    names = "|".join(re.escape(row.name).replace(r"\*", "[^/]+") for row in rows)
+    pattern = re.compile(f"{LIVE}/[^/]+/({names})")
+    return [key for key in keys if pattern.fullmatch(key)]
+
+
+class LiveRobotWatch:
+    """Listens for a live robot, in a session of its own: it does not hear the player."""
+
+    def __init__(self, robot: RobotConfig, run_dir: Path) -> None:
+        self._robot, self._run_dir = robot, run_dir
+        self._session = open_session(robot, "play-watch", run_dir)
+        self._states = {
+            module: self._session.latest(topics.JOINT_STATE, JointState, module)
+            for module in MODULES
+        }
+
+    def __enter__(self) -> Self:
+        """Return the watch itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave the bus."""
+        self._session.close()
+
+    def look(self) -> str:
+        """Return why a live drive is taken to be on the bus, in words; empty if it is not."""
+        try:
+            fleet = SupervisedFleet.attach(self._run_dir)
+        except FleetError:
+            pass
+        else:
+            if set(fleet.manifest.services) & set(MODULES):
+                return f"the fleet in {fleet.run.path} has joint services"
+        for module in MODULES:
+            endpoint = expand(self._robot.bus.endpoints[module], self._run_dir)
+            if is_listening(endpoint):
+                return f"the joint service {module} listens on {endpoint}"
+        deadline = time.monotonic() + LISTEN_S
+        while time.monotonic() < deadline:
+            if heard := self.heard():
+                return heard
+            time.sleep(_POLL_S)
+        return ""
+
+    def heard(self) -> str:
+        """Return which joint service has been heard since the last call, in words."""
+        for module, states in self._states.items():
+            if states.take() is not None or states.refused:
+                return f"the joint service {module} is heard"
+        return ""
+
+
+def allowed(targets: Mapping[str, str], live: str, *, force: bool) -> dict[str, str]:
+    """Return what may be put on the bus.
+
+    Args:
+        targets: key on the bus of each key of the log.
+        live: from `LiveRobotWatch.look`.
+        force: also what a live robot acts on, but for what moves it by itself.
+
+    Raises:
+        FleetError: something is refused, or nothing is left.
+    """
+    refused = set(those_of(IN_THE_LOOP if force else ACTED_ON, targets.values()))
+    if not live or not refused:
+        return dict(targets)
+    if not force:
+        raise FleetError(
+            f"{live}, and it acts on {describe(refused)}: leave these out with --exclude, play "
+            "under a --prefix, or --force"
+        )
+    left = {key: target for key, target in targets.items() if target not in refused}
+    if not left:
+        raise FleetError(
+            f"{live}: {describe(refused)} would move it, and is not put even with --force; "
+            "play under a --prefix, or `xrl down` first"
+        )
+    return left
+
+
+def describe(keys: Iterable[str]) -> str:
+    """Return live keys as topics, each once."""
+    names = (re.sub("^joint/[^/]+/", "joint/*/", short(key)) for key in keys)
+    return ", ".join(sorted(set(names)))

@@ -1,0 +1,126 @@
+"""Executes a joint service again, cycle by cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import msgspec
+
+from services.joint.drive_manager import DriveManager
+from services.joint.drivers.base import DriveReading
+from services.joint.neighbours import NeighbourView
+from services.joint.snapshots import DriveManagerState
+from shared.bus import topics
+from shared.bus.messages import DriveStatus, JointCommand, JointState, Message
+from shared.bus.traces import CycleTrace, JointTrace
+from shared.config.robot_config import RobotConfig
+from tools.analysis.reexecution.compare import Comparison
+from tools.analysis.reexecution.outcome import ReexecutionResult
+from tools.runs.run_log import RunLog
+
+_decode = msgspec.json.Decoder(DriveManagerState).decode
+_encode: Final = msgspec.json.Encoder().encode
+
+
+class JointExecution:
+    """One module's service, from its traces."""
+
+    def __init__(
+        self, log: RunLog, robot: RobotConfig, name: str, outcome: ReexecutionResult
+    ) -> None:
+        """Take the log, the robot to execute with, the module's name and what to fill in."""
+        self._robot, self._name, self._outcome = robot, name, outcome
+        self._log = log
+        self._traces: list[JointTrace] = log.messages(topics.JOINT_TRACE, name)
+        commands: list[JointCommand] = log.messages(topics.JOINT_COMMAND, name)
+        self._commands = {(command.session, command.seq): command for command in commands}
+        states: list[JointState] = log.messages(topics.JOINT_STATE, name)
+        self._states = {(state.t_ns, state.cycle): state for state in states}
+        self._events = {event.t_ns: event for event in log.messages(topics.JOINT_EVENT, name)}
+        service = robot.joint_service
+        self._state_every = round(service.rate_hz / service.state_rate_hz)
+        self._module: DriveManager | None = None
+
+    def run(self) -> Iterator[Message]:
+        """Execute every cycle that can be; yield what comes out, where the log has its like."""
+        expected = 0
+        for trace in self._traces:
+            if trace.seq != expected:
+                self._module = None  # the log lacks what came between, or it was started anew
+            expected = trace.seq + 1
+            if trace.snapshot:
+                self._remember(trace)
+            for cycle in trace.cycles:
+                if self._module is None:
+                    self._outcome.skipped += 1
+                else:
+                    yield from self._cycle(self._module, cycle)
+
+    def snapshot(self) -> DriveManagerState | None:
+        """Return what the service knows now; None while it cannot be executed."""
+        return None if self._module is None else self._module.snapshot()
+
+    def _remember(self, trace: JointTrace) -> None:
+        """Go on from a recorded memory, or hold ours to it."""
+        if self._module is None:
+            self._module = DriveManager(self._robot, self._name)
+            self._module.restore(_decode(trace.snapshot))
+            self._outcome.starts += 1
+            return
+        if self._outcome.exact:
+            mine = msgspec.structs.replace(
+                trace, snapshot=_encode(self._module.snapshot()).decode()
+            )
+            self._compare("trace", self._module.controller.cycle, trace, mine)
+
+    def _cycle(self, module: DriveManager, cycle: CycleTrace) -> Iterator[Message]:
+        c, outcome = cycle, self._outcome
+        command = None
+        if c.command_seq >= 0:
+            command = self._commands.get((c.session, c.command_seq))
+            if command is None:
+                outcome.lost_inputs += 1
+                outcome.skipped += 1
+                self._module = None
+                return
+        near = NeighbourView(c.below if c.knows_below else None, c.sinks, c.stiffen)
+        step = module.step(c.now_ns, _reading(c), command, c.estop, near)
+        controller = module.controller
+        outcome.ticks += 1
+        mine = msgspec.structs.replace(cycle, drive_command=step.order.value, tau=controller.tau)
+        if mine != cycle:
+            self._compare("trace", controller.cycle, _single(cycle), _single(mine))
+        if controller.cycle % self._state_every == 0:
+            state = controller.state(c.now_ns)
+            recorded = self._states.get((state.t_ns, state.cycle))
+            if recorded is not None:
+                self._compare("state", controller.cycle, recorded, state)
+                yield state
+        if step.event is not None:
+            told = self._events.get(step.event.t_ns)
+            if told is not None:
+                self._compare("event", controller.cycle, told, step.event)
+                yield step.event
+
+    def _compare(self, what: str, tick: int, recorded: Message, recomputed: Message) -> None:
+        comparison: Comparison = self._outcome.comparison
+        comparison.take(f"joint/{self._name}/{what}", tick, recorded, recomputed)
+
+
+def _single(cycle: CycleTrace) -> JointTrace:
+    return JointTrace(t_ns=cycle.now_ns, seq=0, snapshot="", cycles=(cycle,))
+
+
+def _reading(c: CycleTrace) -> DriveReading | None:
+    """Return the drive's sample of a cycle."""
+    if c.sampled_ns < 0:
+        return None
+    return DriveReading(
+        c.sampled_ns,
+        c.pos,
+        c.vel,
+        DriveStatus(c.status),
+        c.error,
+        c.carried if c.carries else None,
+    )

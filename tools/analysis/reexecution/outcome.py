@@ -1,0 +1,33 @@
+"""What came of executing a service again."""
+
+from __future__ import annotations
+
+from tools.analysis.reexecution.compare import Comparison
+
+
+class ReexecutionResult:
+    """Counts of one service, filled in as it is executed.
+
+    Attributes:
+        service: its name.
+        exact: the memory is compared as well; not where a parameter was changed.
+        ticks: cycles or ticks that were executed.
+        skipped: that were not: before the first memory in the log, or after a loss.
+        starts: how often execution began from a recorded memory.
+        lost_inputs: messages that the service took and the log lacks.
+        comparison: of what came out.
+    """
+
+    def __init__(self, service: str, tolerance: float, *, exact: bool) -> None:
+        self.service = service
+        self.exact = exact
+        self.ticks = 0
+        self.skipped = 0
+        self.starts = 0
+        self.lost_inputs = 0
+        self.comparison = Comparison(tolerance)
+
+    @property
+    def equal(self) -> bool:
+        """True if something was executed, and nothing came out otherwise."""
+        return self.ticks > 0 and self.comparison.first is None

@@ -1,0 +1,122 @@
+"""Log of a run as arrays over one time axis."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from shared.bus import topics
+from shared.bus.messages import DriveStatus
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import XrlError
+from shared.robot.joints import MODULES
+from tools.analysis.reports.signals import Array, Span, message_times
+from tools.runs import verdict
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog
+from tools.runs.verdict import Course
+
+
+class RunData:
+    """A log, its time axis and its robot."""
+
+    def __init__(self, log: RunLog) -> None:
+        self.log = log
+        self.course: Course | None = None
+        """Trajectory of the simulated world; None if the log has none or its scenario never
+        began."""
+        self.without_course = ""
+        """Reason why `course` is None."""
+        try:
+            self.course = verdict.course(log)
+        except XrlError as error:
+            self.without_course = _reason(log, error)
+        self.robot: RobotConfig | None = None
+        """Configuration of the robot; None if the log holds none that this version can read."""
+        self.without_robot = ""
+        """Reason why `robot` is None."""
+        try:
+            self.robot = robot_of(log)
+        except XrlError as error:
+            self.without_robot = _reason(log, error)
+        self.zero_ns = self.course.zero_ns if self.course else log.began_ns()
+        self.span = self._span()
+        self._times: dict[tuple[str, str], Array] = {}
+
+    @property
+    def axis(self) -> str:
+        """Description of the time axis."""
+        if self.course is None:
+            return "time since the log begins, s"
+        if self.course.began:
+            return "scenario time, s"
+        return "time since the hoist released the robot, s"
+
+    def times(self, topic: Topic, module: str = "") -> Array:
+        """Return the time of each message, s.
+
+        A joint service that has no sample from its drive yet publishes a stamp of 0. A message
+        with a stamp from before the log is placed at its time of reception.
+        """
+        found = self._times.get((topic.name, module))
+        if found is None:
+            messages: list[Any] = self.log.messages(topic, module)
+            received = self.log.received_ns(topic, module)
+            earliest_ns = self.log.began_ns() - NS_PER_S // 5
+            stamps = [
+                message.t_ns if message.t_ns >= earliest_ns else received_ns
+                for message, received_ns in zip(messages, received, strict=True)
+            ]
+            found = message_times(stamps, self.zero_ns, received)
+            self._times[topic.name, module] = found
+        return found
+
+    def columns(self, topic: Topic, module: str, *names: str) -> list[Array]:
+        """Return one array for each field: (n,), or (n, k) for a field of k numbers."""
+        messages: list[Any] = self.log.messages(topic, module)
+        return [
+            np.array([getattr(message, name) for message in messages], dtype=np.float64)
+            for name in names
+        ]
+
+    def armed_s(self) -> float:
+        """Return when all six drives were armed for the first time, s; if never, the begin.
+
+        Earlier figures describe a robot that does not stand yet.
+        """
+        found = []
+        for module in MODULES:
+            (drive,) = self.columns(topics.JOINT_STATE, module, "drive")
+            armed = np.flatnonzero(drive == DriveStatus.ARMED)
+            if not len(armed):
+                return self.span.begin
+            found.append(float(self.times(topics.JOINT_STATE, module)[armed[0]]))
+        return max(found)
+
+    def has(self, topic: Topic, module: str = "") -> bool:
+        """Return True if there is at least one message."""
+        return self.log.count(topic.key(self.log.robot, module)) > 0
+
+    def _span(self) -> Span:
+        received = [
+            times
+            for key, topic in topics.all_keys(self.log.robot).items()
+            if (times := self.log.received_ns(topic, module_of(topic, key)))
+        ]
+        if not received:
+            return Span(0.0, 0.0)
+        first, last = min(map(min, received)), max(map(max, received))
+        return Span((first - self.zero_ns) / NS_PER_S, (last - self.zero_ns) / NS_PER_S)
+
+
+def module_of(topic: Topic, key: str) -> str:
+    """Return the module of a full key; empty if its topic has no modules."""
+    return key.split("/")[-2] if topic.per_module else ""
+
+
+def _reason(log: RunLog, error: XrlError) -> str:
+    """Return an error's text without the path of the file, since pages are shared."""
+    return str(error).replace(f"{log.path}: ", "").replace(str(log.path), log.path.name)

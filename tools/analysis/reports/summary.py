@@ -1,0 +1,201 @@
+"""Head and foot of a page: verdict, facts about the run, lost messages, input files."""
+
+from __future__ import annotations
+
+import io
+import json
+import tomllib
+from datetime import datetime
+from typing import Any, Final, NamedTuple
+
+from rich.console import Console
+
+from services.recorder.recover import describe_lost
+from shared.bus import topics
+from shared.clock import NS_PER_S
+from shared.exceptions import XrlError
+from tools.analysis.reports.run_data import RunData
+from tools.runs import verdict, verdict_table
+from tools.runs.verdict import Summary
+from tools.runs.verdict_limits import LIMITS
+
+REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
+"""Figures without a meaning in virtual time."""
+
+MACHINE: Final = {
+    "python": "Python", "platform": "platform", "cpu_model": "CPU", "cpu_count": "CPUs",
+}  # fmt: skip
+
+
+class RunVerdict(NamedTuple):
+    """Verdict on a run."""
+
+    sentence: str
+    good: bool | None
+    """None: no verdict."""
+    rows: list[tuple[str, str, str, str]]
+    """(figure, measured, limit, `ok` or `over`, the latter possibly with the reason)."""
+    caution: str = ""
+    """Reason not to trust the figures."""
+
+
+class TopicLoss(NamedTuple):
+    """Recorded and lost messages of one topic."""
+
+    name: str
+    messages: int
+    rate_hz: float | None
+    """Mean rate from the first to the last message."""
+    nominal_hz: float
+    lost: int
+    gaps: int
+    restarts: int
+
+
+def judge(run: RunData) -> RunVerdict:
+    """Return the verdict in the words of the command that made the run."""
+    log = run.log
+    if run.course is None:
+        return RunVerdict(f"No verdict: {run.without_course}", None, [])
+    try:
+        summary = verdict.summarise(log, _duration_s(run))
+    except XrlError as error:
+        return RunVerdict(f"No verdict: {error}", None, [])
+    if log.metadata["run"].get("lockstep"):
+        summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+    lines = _verdict_lines(summary)
+    caution = "" if summary["in_real_time"] else lines[-2]
+    return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)
+
+
+def _duration_s(run: RunData) -> float:
+    """Return the planned duration of the scenario; without one, the duration of the run."""
+    raw = run.log.attachments.get("scenario.toml", b"")
+    try:
+        return float(tomllib.loads(raw.decode())["duration"])
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
+        assert run.course is not None  # noqa: S101 - called with a course only
+        return float(run.course.t[-1])
+
+
+def _verdict_lines(summary: Summary) -> list[str]:
+    """Return the printed lines of the verdict; the last line is the verdict itself."""
+    text = io.StringIO()
+    console = Console(file=text, width=200, color_system=None, soft_wrap=True)
+    verdict_table.show(summary, console)
+    return [line.strip() for line in text.getvalue().strip().splitlines()]
+
+
+def _rows(summary: Summary) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for limit in LIMITS:
+        value = summary.get(limit.key)
+        if value is None:
+            continue
+        unit = f" {limit.unit}" if limit.unit else ""
+        measured = f"{verdict_table.digits(value)}{unit}"
+        mark = verdict_table.mark(limit, summary)
+        rows.append((limit.what, measured, f"{limit.limit:g}{unit}", mark))
+    return rows
+
+
+def head(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, value) of the facts that a reader needs first."""
+    log, about = run.log, run.log.metadata["run"]
+    begin, end = run.span
+    rows = [
+        ("scenario", _scenario(run)),
+        ("started", _date(about.get("started", ""))),
+        ("virtual time", about.get("lockstep", "")),
+        ("length", f"{end - begin:.1f} s"),
+        ("file", log.path.name),
+        (
+            "recording",
+            "complete" if log.complete else "incomplete: the recorder did not close the file",
+        ),
+        ("git commit", _commit(about)),
+        ("robot", log.robot),
+        ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
+        ("log version", about.get("schema_version", "")),
+    ]
+    rows += [(name, about.get(key, "")) for key, name in MACHINE.items()]
+    rows.append(("threads", _threads(about.get("thread_env", ""))))
+    return [(name, value) for name, value in rows if value]
+
+
+def _threads(raw: str) -> str:
+    """Return the environment variables that limit threads; the raw text if it is not JSON."""
+    try:
+        found = json.loads(raw or "{}")
+        return ", ".join(f"{name}={value}" for name, value in sorted(found.items()))
+    except (json.JSONDecodeError, AttributeError):
+        return raw
+
+
+def _date(started: str) -> str:
+    """Return a readable date; the raw text if it is not in ISO format."""
+    try:
+        return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
+    except ValueError:
+        return started
+
+
+def _scenario(run: RunData) -> str:
+    name = run.log.metadata["run"].get("scenario", "")
+    raw = run.log.attachments.get("scenario.toml", b"")
+    try:
+        about = str(tomllib.loads(raw.decode()).get("about", ""))
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        about = ""
+    return ": ".join(part for part in (name, about) if part)
+
+
+def _commit(about: dict[str, str]) -> str:
+    commit = about.get("git_commit", "")
+    return f"{commit} with changes" if about.get("git_dirty") == "true" else commit
+
+
+def message_losses(run: RunData) -> list[TopicLoss]:
+    """Return recorded and lost messages of each topic, by sequence numbers."""
+    log, rows = run.log, []
+    known = topics.all_keys(log.robot)
+    for key, count in sorted(log.gaps().items()):
+        received = [row[0] for row in log.raw(key)]
+        span_s = (max(received) - min(received)) / NS_PER_S
+        nominal_hz = known[key].rate_hz if key in known else 0.0
+        rate = (len(received) - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
+        name = key.removeprefix(f"xrl/{log.robot}/")
+        rows.append(
+            TopicLoss(
+                name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts
+            )
+        )
+    return rows
+
+
+def damage(run: RunData) -> list[str]:
+    """Return the unreadable parts of the file, one line each."""
+    log = run.log
+    if log.complete and not log.damage:
+        return []
+    return describe_lost(log.cut, log.damage, finished=log.complete)
+
+
+def files(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, text) of the input files of the run, from its log."""
+    found = []
+    for name, raw in sorted(run.log.attachments.items(), key=lambda row: _order(row[0])):
+        if name.endswith((".toml", ".json")):
+            found.append((name, raw.decode(errors="replace")))
+    return found
+
+
+def _order(name: str) -> tuple[bool, str]:
+    """Sort files written by people before computed ones."""
+    return not name.endswith(".toml"), name
+
+
+def packages(run: RunData) -> list[tuple[str, str]]:
+    """Return (name, version) of all installed packages."""
+    found: dict[str, Any] = run.log.metadata.get("packages", {})
+    return sorted(found.items(), key=lambda row: row[0].lower())

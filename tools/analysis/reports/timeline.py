@@ -1,0 +1,295 @@
+"""Timeline of a run: its events, mode changes, silences and limit violations, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final, TypeVar
+
+import numpy as np
+
+from shared.bus import topics
+from shared.bus.messages import (
+    Cause,
+    DriveStatus,
+    JointEvent,
+    JointState,
+    Mode,
+    PlannerMode,
+    PlannerStatus,
+    RunEvent,
+    RunEventKind,
+    SimTruth,
+    Tare,
+    Wrench,
+)
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.robot.joints import MODULES
+from tools.analysis.reports.limit_violations import limit_violations
+from tools.analysis.reports.page_model import TimelineEvent
+from tools.analysis.reports.run_data import RunData
+from tools.analysis.reports.signals import GAP_S, message_times
+from tools.runs.impairment_intervals import impairments
+
+TOGETHER_S: Final = 0.1
+"""Equal changes of several modules within this time share one row."""
+ROWS_MAX: Final = 500
+BACKOFF_MIN_S: Final = 0.5
+"""Shortest back-off of the planner after drop-outs that has a row."""
+END_S: Final = 0.1
+"""An impairment that ends this close to the end of the log has no mark for its end."""
+
+Row = TypeVar("Row", bound=tuple[Any, ...])
+
+KINDS: Final = {
+    RunEventKind.KILLED: "kill",
+    RunEventKind.RESTARTED: "restart",
+    RunEventKind.PUSHED: "push",
+    RunEventKind.FAULTED: "fault",
+    RunEventKind.STARTED: "note",
+    RunEventKind.FINISHED: "note",
+}
+_NORMAL_MODES: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
+
+
+def timeline_events(run: RunData) -> list[TimelineEvent]:
+    """Return all events of a run in the order of time."""
+    found = [
+        *_run_events(run),
+        *_mode_changes(run),
+        *_drives(run),
+        *_planner(run),
+        *_harness(run),
+        *_world(run),
+        *_silences(run),
+        *limit_violations(run),
+        *_network(run),
+    ]
+    found.sort(key=lambda row: row.t)
+    if len(found) > ROWS_MAX:
+        left = len(found) - ROWS_MAX
+        kept = [row for row in found if row.mark] + _first_unmarked(found)
+        found = sorted(kept, key=lambda row: row.t)
+        found.append(TimelineEvent(run.span.end, "note", f"about {left} more rows are left out"))
+    return found
+
+
+def _first_unmarked(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
+    """Return the first rows without a mark, as many as the page has room for."""
+    unmarked = [row for row in found if not row.mark]
+    return unmarked[: max(0, ROWS_MAX - (len(found) - len(unmarked)))]
+
+
+def _at(run: RunData, t_ns: int) -> float:
+    return (t_ns - run.zero_ns) / NS_PER_S
+
+
+def _run_events(run: RunData) -> Iterator[TimelineEvent]:
+    events: list[RunEvent] = run.log.messages(topics.RUN_EVENT)
+    for event in events:
+        kind = KINDS.get(_member(RunEventKind, event.kind), "note")
+        text = _describe_run_event(event)
+        mark = ""
+        if kind != "note":
+            mark = f"{event.subject} {event.detail}".strip() if kind != "restart" else ""
+            mark = mark or f"{event.subject} back"
+        if kind == "push":
+            mark = f"push {event.detail.partition(' for ')[0]}"
+        yield TimelineEvent(_at(run, event.t_ns), kind, text, mark)
+    last = None
+    for stop in run.log.messages(topics.ESTOP):
+        t = _at(run, stop.t_ns)
+        if last is None or t - last > 1.0:  # a stop is published repeatedly
+            yield TimelineEvent(t, "estop", f"emergency stop by {stop.source}", "e-stop")
+        last = t
+    for request in run.log.messages(topics.HARNESS_TARE):
+        yield TimelineEvent(_at(run, request.t_ns), "note", f"tare requested by {request.source}")
+
+
+def _network(run: RunData) -> Iterator[TimelineEvent]:
+    """Yield the begin and the end of each impairment, of all its directions together."""
+    for row in impairments(run.log.messages(topics.LINK_EVENT)):
+        begin_s, end_s = row.begin_s(run.zero_ns), row.end_s(run.zero_ns)
+        yield TimelineEvent(begin_s, "network", f"network, {row.title}", row.title)
+        if end_s is None:
+            continue
+        text = f"network, {row.title} ends; {row.counts()}"
+        mark = f"{row.link} ends" if end_s < run.span.end - END_S else ""
+        yield TimelineEvent(end_s, "network" if mark else "note", text, mark)
+
+
+def _describe_run_event(event: RunEvent) -> str:
+    texts = {
+        RunEventKind.STARTED: f"{event.subject} starts",
+        RunEventKind.KILLED: f"{event.subject} gets SIG{event.detail}",
+        RunEventKind.RESTARTED: f"{event.subject} restarts",
+        RunEventKind.PUSHED: f"push {event.detail}",
+        RunEventKind.FINISHED: f"{event.subject} ends {event.detail}".strip(),
+        RunEventKind.FAULTED: f"{event.subject}: fault {event.detail} begins",
+    }
+    other = f"{event.subject} {_name(RunEventKind, event.kind)} {event.detail}"
+    return texts.get(_member(RunEventKind, event.kind), other.strip())
+
+
+def _mode_changes(run: RunData) -> Iterator[TimelineEvent]:
+    changes: list[tuple[float, str, JointEvent]] = sorted(
+        (_at(run, event.t_ns), module, event)
+        for module in MODULES
+        for event in run.log.messages(topics.JOINT_EVENT, module)
+    )
+    for group in _together(
+        changes, lambda row: (row[2].mode_before, row[2].mode_after, row[2].cause)
+    ):
+        t, _, first = group[0]
+        yield TimelineEvent(t, _severity(first), _describe_mode_change(group))
+
+
+def _together(changes: Sequence[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
+    """Group rows with equal keys at about the same time. The first field of a row is its time."""
+    groups: list[list[Row]] = []
+    open_: dict[Any, list[Row]] = {}
+    for row in changes:
+        group = open_.get(key(row))
+        if group is None or row[0] - group[0][0] > TOGETHER_S:
+            group = open_[key(row)] = []
+            groups.append(group)
+        group.append(row)
+    return groups
+
+
+def _modules(found: Iterable[str]) -> str:
+    modules = sorted(set(found), key=MODULES.index)
+    return "all six" if len(modules) == len(MODULES) else ", ".join(modules)
+
+
+def _severity(event: JointEvent) -> str:
+    return "bad" if event.mode_after in (Mode.FAULT, Mode.DAMP) else "note"
+
+
+def _describe_mode_change(group: Sequence[tuple[float, str, JointEvent]]) -> str:
+    first = group[0][2]
+    modules = _modules(module for _, module, _ in group)
+    step = max(
+        abs(b - a)
+        for _, _, event in group
+        for a, b in zip(event.tau_before, event.tau_after, strict=True)
+    )
+    within_ms = (group[-1][0] - group[0][0]) * 1e3
+    text = (
+        f"{modules}: {_name(Mode, first.mode_before)} to {_name(Mode, first.mode_after)}, "
+        f"{_name(Cause, first.cause)}"
+    )
+    if len(group) > 1 and within_ms > 0.0:
+        text += f", within {within_ms:.1f} ms"
+    ages = [event.age_ns for _, _, event in group if event.age_ns >= 0]
+    if ages:
+        text += f"; command {max(ages) / NS_PER_MS:.1f} ms old"
+    return f"{text}; torque step {step:.2f} N m"
+
+
+def _drives(run: RunData) -> Iterator[TimelineEvent]:
+    changes: list[tuple[float, str, JointState, JointState]] = []
+    for module in MODULES:
+        states: list[JointState] = run.log.messages(topics.JOINT_STATE, module)
+        t = run.times(topics.JOINT_STATE, module)
+        changes += [
+            (float(t[index]), module, states[index - 1], states[index])
+            for index in _changes([(state.drive, state.drive_error) for state in states])
+        ]
+    changes.sort(key=lambda row: row[0])
+    for group in _together(changes, _describe_drive_change):
+        t_s, _, before, after = group[0]
+        worse = after.drive != DriveStatus.ARMED and before.drive == DriveStatus.ARMED
+        bad = worse or after.drive == DriveStatus.ERROR or after.drive_error != 0
+        modules = _modules(module for _, module, _, _ in group)
+        text = f"{modules}: {_describe_drive_change(group[0])}"
+        yield TimelineEvent(t_s, "bad" if bad else "note", text)
+
+
+def _describe_drive_change(row: tuple[float, str, JointState, JointState]) -> str:
+    _, _, before, after = row
+    parts = []
+    if before.drive != after.drive:
+        parts.append(
+            f"drive {_name(DriveStatus, before.drive)} to {_name(DriveStatus, after.drive)}"
+        )
+    if before.drive_error != after.drive_error:
+        parts.append(f"error bits {after.drive_error:#x}")
+    return ", ".join(parts)
+
+
+def _planner(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[PlannerStatus] = run.log.messages(topics.PLANNER_STATUS)
+    t = run.times(topics.PLANNER_STATUS)
+    for index in _changes([(row.mode, row.session) for row in rows]):
+        before, after = rows[index - 1], rows[index]
+        fresh = " in a new session" if before.session != after.session else ""
+        text = f"planner: {_name(PlannerMode, before.mode)} to {_name(PlannerMode, after.mode)}"
+        bad = after.mode not in _NORMAL_MODES
+        yield TimelineEvent(float(t[index]), "bad" if bad else "note", text + fresh)
+    for index in _changes([row.wait_s > 0.0 for row in rows]):
+        if rows[index].wait_s >= BACKOFF_MIN_S:
+            text = f"planner: backs off for {rows[index].wait_s:.1f} s or more, after drop-outs"
+            yield TimelineEvent(float(t[index]), "note", text)
+
+
+def _harness(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[Wrench] = run.log.messages(topics.WRENCH)
+    t = run.times(topics.WRENCH)
+    for index in _changes([(row.valid, row.saturated, row.tare) for row in rows]):
+        row = rows[index]
+        state = "valid" if row.valid else "saturated" if row.saturated else "not valid"
+        tare = "" if row.tare == Tare.DONE else f", tare {_name(Tare, row.tare)}"
+        kind = "note" if row.valid else "bad"
+        yield TimelineEvent(float(t[index]), kind, f"harness sensor {state}{tare}")
+
+
+def _world(run: RunData) -> Iterator[TimelineEvent]:
+    rows: list[SimTruth] = run.log.messages(topics.SIM_TRUTH)
+    for row in rows:
+        if row.fallen:
+            yield TimelineEvent(_at(run, row.t_ns), "fall", "the robot fell", "fell")
+            return
+
+
+def _silences(run: RunData) -> Iterator[TimelineEvent]:
+    """Yield the gaps in periodic topics, by the recorder's clock."""
+    found: list[tuple[float, str, float]] = []
+    for key, topic in topics.all_keys(run.log.robot).items():
+        if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
+            continue
+        t = message_times([row[0] for row in run.log.raw(key)], run.zero_ns)
+        steps = np.diff(t)
+        name = key.removeprefix(f"xrl/{run.log.robot}/")
+        found += [
+            (float(t[index]), name, float(steps[index]))
+            for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz))
+        ]
+    for group in _together(sorted(found), lambda _: None):
+        names = ", ".join(_merged([name for _, name, _ in group]))
+        longest = max(length for *_, length in group)
+        most = "up to " if len(group) > 1 else ""
+        text = f"{names} silent for {most}{longest:.2f} s"
+        yield TimelineEvent(group[0][0], "note", text)
+
+
+def _merged(names: Sequence[str]) -> list[str]:
+    """Return names of topics; the six of one topic as one name."""
+    left = list(dict.fromkeys(names))
+    for topic in topics.TOPICS:
+        six = [topic.name.replace("*", module) for module in MODULES]
+        if topic.per_module and set(six) <= set(left):
+            left = [topic.name, *(name for name in left if name not in six)]
+    return left
+
+
+def _changes(values: Sequence[Any]) -> list[int]:
+    return [index for index in range(1, len(values)) if values[index] != values[index - 1]]
+
+
+def _name(enumeration: Any, code: int) -> str:
+    found = _member(enumeration, code)
+    return str(found.name) if found is not None else f"unknown ({code})"
+
+
+def _member(enumeration: Any, code: int) -> Any:
+    return next((member for member in enumeration if member == code), None)

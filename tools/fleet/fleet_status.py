@@ -1,0 +1,263 @@
+"""What `xrl status` knows: every service by its supervisor and by its messages, every module."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import msgspec
+
+from shared.bus.messages import (
+    Cause,
+    DriveStatus,
+    JointState,
+    Message,
+    Mode,
+    Outside,
+    Pair,
+    PlannerMode,
+    PlannerStatus,
+    Trip,
+)
+from shared.bus.session import Latest, Session
+from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOPICS
+from shared.clock import NS_PER_S, now_ns, pace
+from shared.exceptions import FleetError
+from shared.robot.fault_table import recovery_of
+from shared.robot.joints import MODULES
+from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from tools.fleet.proxy_client import ProxyClient
+from tools.fleet.supervise import SupervisedFleet
+
+TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
+"""Who holds a module up: the planner (1) or its joint service alone (2). In every other
+mode the joint service does not, and the mode says why."""
+
+PLANNER: Final = "planner"
+SILENT_PROXY: Final = "not known, for the network proxy does not answer"
+
+_LINKS_S: Final = 1.0
+"""Longest wait for the first message of each service."""
+_WINDOW_S: Final = 0.5
+"""Time over which rates are counted."""
+_FRESH_S: Final = 1.0
+"""An older message is history: its sender is dead, suspended or cut off."""
+_POLL_S: Final = 0.002
+RESTART: Final = "xrl kill MODULE"
+"""Its supervisor starts it again."""
+
+
+class ServiceStatus(msgspec.Struct, frozen=True):
+    """One service, by its supervisor and by its messages."""
+
+    pid: int | None
+    state: str
+    uptime_s: float
+    age_s: float | None
+    """Age of its newest message; None if none has come, or it publishes none steadily."""
+    rate_hz: float | None
+    """Its messages per second, by their sequence numbers; None as for `age_s`."""
+    restarts: int
+    last_exit: str
+
+
+class ModuleStatus(msgspec.Struct, frozen=True):
+    """One module, by the newest state of its joint service."""
+
+    mode: str | None
+    """Name of its `Mode`; None if its joint service is not heard now."""
+    tier: int | None
+    """See `TIERS`; None in every other mode."""
+    cause: str | None
+    """Name of the `Cause` of its last change of mode."""
+    drive: str | None
+    """Name of the `DriveStatus` of its drive."""
+    q: Pair | None
+    """(phi, theta), rad; None if its drive does not know."""
+    way_out: str
+    """What a person does to have it track again; empty if nothing has to be done."""
+    stiffened: bool = False
+    """It holds with all of its stand gains, for another may be limp."""
+    outside: str = ""
+    """Name of what it does not believe of the newest command (`Outside`); empty if it does."""
+
+
+class LeadStatus(msgspec.Struct, frozen=True):
+    """What the planner does, by its newest status."""
+
+    mode: str
+    """Name of its `PlannerMode`."""
+    wait_s: float
+    """Until it may lead again after drop-outs, s."""
+    margin: float
+    """Failsafe certificate of the gains; 1 is what is required."""
+    why: str = ""
+    """Why it does not lead, in words, where the mode does not say it all."""
+
+
+class FleetStatus(msgspec.Struct, frozen=True):
+    """What `xrl status --json` prints."""
+
+    run_dir: str
+    config: str
+    services: dict[str, ServiceStatus]
+    modules: dict[str, ModuleStatus]
+    lead: LeadStatus | None = None
+    """None if no planner is heard now."""
+    network: tuple[str, ...] = ()
+    """What the network proxy does to links now, in words."""
+    pace: float = 1.0
+    """How fast the fleet's clock goes; below 1 it is in slow motion."""
+
+
+class RateMonitor:
+    """Listens to one service: newest message, first and last of the present window."""
+
+    def __init__(self, latest: Latest[Message]) -> None:
+        self._latest = latest
+        self._first: Message | None = None
+        self.newest: Message | None = None
+
+    def listen(self) -> None:
+        """Take what has come."""
+        message = self._latest.take()
+        if message is None:
+            return
+        restarted = self.newest is not None and message.seq < self.newest.seq
+        if self._first is None or restarted:
+            self._first = message
+        self.newest = message
+
+    def new_window(self) -> None:
+        """Count the rate from here on."""
+        self._first = self.newest
+
+    def age_s(self) -> float | None:
+        """Return the time since the newest message was made."""
+        return None if self.newest is None else (now_ns() - self.newest.t_ns) / NS_PER_S
+
+    def is_fresh(self) -> bool:
+        """Return True if the newest message still says how things are."""
+        age_s = self.age_s()
+        return age_s is not None and age_s < _FRESH_S
+
+    def rate_hz(self) -> float | None:
+        """Return messages per second in this window; 0 if none has come in it."""
+        if self._first is None or self.newest is None:
+            return None
+        span_ns = self.newest.t_ns - self._first.t_ns
+        return (self.newest.seq - self._first.seq) * NS_PER_S / span_ns if span_ns > 0 else 0.0
+
+
+def ears_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMonitor]:
+    """Return an ear for each service that publishes something steadily.
+
+    Args:
+        session: on the bus.
+        topics: of the services of this fleet; modules and planner may run on other hosts.
+    """
+    elsewhere = dict.fromkeys(MODULES, JOINT_STATE.name) | {PLANNER: PLANNER_STATUS.name}
+    by_name = {topic.name: topic for topic in TOPICS}
+    ears = {}
+    for service, name in (elsewhere | dict(topics)).items():
+        if name:
+            topic = by_name[name]
+            module = service if topic.per_module else ""
+            ears[service] = RateMonitor(session.latest(topic, topic.type, module))
+    return ears
+
+
+def listen_for_all(ears: Mapping[str, RateMonitor]) -> None:
+    """Wait for a first message of each, but not for long."""
+    _listen(ears, _LINKS_S, until=lambda: all(ear.newest for ear in ears.values()))
+
+
+def look(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> FleetStatus:
+    """Listen for one window and return the fleet's status."""
+    for ear in ears.values():
+        ear.new_window()
+    _listen(ears, _WINDOW_S)
+    # Before the supervisor is asked: on a busy machine that takes a while.
+    heard = {name: (ear.age_s(), ear.rate_hz()) for name, ear in ears.items()}
+    fresh = {name for name, ear in ears.items() if ear.is_fresh()}
+    services = {}
+    for service in fleet.info():
+        age_s, rate_hz = heard.get(service.name, (None, None))
+        services[service.name] = ServiceStatus(
+            pid=service.pid,
+            state=service.state,
+            uptime_s=service.uptime_s,
+            age_s=age_s,
+            rate_hz=rate_hz,
+            restarts=service.restarts,
+            last_exit=service.last_exit,
+        )
+    modules = {
+        module: module_status(ears[module].newest if module in fresh else None)
+        for module in MODULES
+        if module in ears
+    }
+    lead = lead_status(ears[PLANNER].newest if PLANNER in fresh else None)
+    config, network = fleet.manifest.config, impairments(fleet)
+    return FleetStatus(str(fleet.run.path), config, services, modules, lead, network, pace())
+
+
+def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
+    """Return what is done to the network now, in words; nothing where there is no network proxy."""
+    if "network_proxy" not in fleet.manifest.services:
+        return ()
+    try:
+        return tuple(row.describe() for row in ProxyClient(fleet.run.path).list())
+    except FleetError:
+        return (SILENT_PROXY,)
+
+
+def module_status(state: Message | None) -> ModuleStatus:
+    """Return a module's mode and tier from the newest state of its joint service."""
+    if not isinstance(state, JointState):
+        return ModuleStatus(None, None, None, None, None, "")
+    mode, cause, drive = Mode(state.mode), Cause(state.cause), DriveStatus(state.drive)
+    way_out = ""
+    if mode is Mode.FAULT:
+        way_out = f"{recovery_of(cause)}; then {RESTART}"
+    elif mode is Mode.DAMP:
+        way_out = RESTART
+    elif drive is DriveStatus.UNZEROED:
+        way_out = "hang the robot, xrl zero"
+    elif drive is DriveStatus.HOLDING:
+        way_out = "by itself, with the planner: the drive holds"
+    elif mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):
+        way_out = f"if it lasts: its log says why; hang the robot, then {RESTART}"
+    elif mode is Mode.HOLD and cause in JOINT_TRIPS:
+        way_out = f"by itself, after a wait; if again: {JOINT_TRIPS[cause].recovery}"
+    outside = Outside(state.outside).name if state.outside else ""
+    if outside and not way_out:
+        told = f"the planner's {outside.lower()} is not believed"
+        way_out = f"{told}: by itself after a push or a stall; if it lasts, xrl kill planner"
+    knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
+    q = state.q if knows else None
+    stiffened = state.stiffened and mode in (Mode.HOLD, Mode.DAMP)
+    tier = TIERS.get(mode)
+    return ModuleStatus(mode.name, tier, cause.name, drive.name, q, way_out, stiffened, outside)
+
+
+def lead_status(message: Message | None) -> LeadStatus | None:
+    """Return what the planner does, from its newest status."""
+    if not isinstance(message, PlannerStatus):
+        return None
+    mode = PlannerMode(message.mode).name
+    why = message.why
+    if message.trip:
+        why += f": {PLANNER_TRIPS[Trip(message.trip)].recovery}"
+    return LeadStatus(mode, message.wait_s, message.margin, why)
+
+
+def _listen(
+    ears: Mapping[str, RateMonitor], duration_s: float, until: Callable[[], bool] = lambda: False
+) -> None:
+    deadline = time.monotonic() + duration_s
+    while time.monotonic() < deadline and not until():
+        for ear in ears.values():
+            ear.listen()
+        time.sleep(_POLL_S)

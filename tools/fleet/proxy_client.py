@@ -1,0 +1,103 @@
+"""Speaks to the network proxy of a fleet that is up."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from shared.config.scenarios import Inject
+from shared.exceptions import FleetError
+from shared.network.proxy_protocol import (
+    SOCKET,
+    Begin,
+    Clear,
+    List,
+    Reply,
+    Request,
+    RequestedImpairment,
+)
+from tools.fleet.run_dir import RunDir
+
+_PATIENCE_S: Final = 2.0
+_decode = msgspec.json.Decoder(Reply).decode
+
+
+class ProxyClient:
+    """One question, one answer, one connection each."""
+
+    def __init__(self, run_dir: Path) -> None:
+        """Name the fleet's run directory; nothing is opened yet."""
+        self._path = run_dir / SOCKET
+
+    def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[RequestedImpairment, ...]:
+        """Put an impairment in force, in so many s; return all that is asked for then.
+
+        Raises:
+            FleetError: the network proxy is not there, or refuses.
+        """
+        return self._ask(Begin(inject, in_s))
+
+    def clear(self, link: str) -> tuple[RequestedImpairment, ...]:
+        """End all that touches a link; return what is left.
+
+        Raises:
+            FleetError: the network proxy is not there, or knows no such link.
+        """
+        return self._ask(Clear(link))
+
+    def list(self) -> tuple[RequestedImpairment, ...]:
+        """Return what is asked for.
+
+        Raises:
+            FleetError: the network proxy is not there.
+        """
+        return self._ask(List())
+
+    def _ask(self, request: Request) -> tuple[RequestedImpairment, ...]:
+        try:
+            with socket.socket(socket.AF_UNIX) as asking:
+                asking.settimeout(_PATIENCE_S)
+                asking.connect(str(self._path))
+                asking.sendall(msgspec.json.encode(request) + b"\n")
+                with asking.makefile("rb") as answers:
+                    line = answers.readline()
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise FleetError(self._why_absent()) from None
+        except OSError as error:
+            kill = "`xrl kill network_proxy`"
+            out = f"{kill[:-1]} --signal CONT` if it was stopped, or {kill}"
+            said = f"{self._path}: the network proxy does not answer: {error}; {out}"
+            raise FleetError(said) from None
+        if not line:
+            raise FleetError(
+                f"{self._path}: the network proxy ended without an answer; see its log"
+            )
+        try:
+            reply = _decode(line)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            said = f"{self._path}: the answer is none of a network proxy of this version: {error}"
+            raise FleetError(said) from None
+        if reply.error:
+            raise FleetError(f"refused: {reply.error}")
+        return reply.requested
+
+    def _why_absent(self) -> str:
+        """Return why nobody listens there, and the way out."""
+        folder = RunDir(self._path.parent)
+        manifest = folder.read_manifest()
+        if manifest is None or not folder.supervisor_socket.exists():
+            return (
+                f"no fleet is up in {folder.path}; `xrl up --injectable` starts one to inject into"
+            )
+        if "network_proxy" not in manifest.services:
+            return (
+                f"the fleet in {folder.path} was started without a network proxy; `xrl down`, then "
+                "`xrl up --injectable`"
+            )
+        return (
+            f"the network proxy in {folder.path} is down or restarting, and every impairment "
+            "is over; `xrl status`, `xrl start network_proxy`"
+        )

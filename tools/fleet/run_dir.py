@@ -1,0 +1,206 @@
+"""The run directory of one fleet: what lies in it, who owns it, how it is cleared."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shlex
+import shutil
+import stat
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import msgspec
+
+from services.joint import neighbours, rearm_guard
+from shared.clock import PACE_FILE
+from shared.exceptions import FleetError
+from shared.robot.joints import MODULES
+from tools.fleet.process_table import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_listening
+
+_NEVER_GIVE_UP = 1_000_000
+"""Starts that may fail in a row; each waits a second longer than the one before."""
+
+
+class Manifest(msgspec.Struct, frozen=True):
+    """What a later command needs to know of a fleet that is up."""
+
+    config: str
+    """The robot file, absolute."""
+    services: tuple[str, ...]
+    topics: dict[str, str]
+    """Topic that each service publishes steadily; empty if there is none."""
+    sockets: tuple[str, ...]
+    """Every socket that the services may leave behind."""
+    stop_s: float
+    """Longest time a service may take to stop."""
+
+
+class RunDir:
+    """Paths in a run directory; nothing is made before `claim`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(os.path.abspath(path))  # noqa: PTH100 - no symlink resolved: paths stay short
+        self.pace = self.path / PACE_FILE
+        self.supervisor_socket = self.path / SUPERVISOR_SOCKET
+        self.supervisor_config = self.path / "supervisord.conf"
+        self.supervisor_pid = self.path / "supervisord.pid"
+        self.manifest = self.path / "fleet.json"
+        self.logs = self.path / "logs"
+        self.supervisor_log = self.logs / "supervisord.log"
+        self.supervisor_stderr = self.logs / "supervisord.stderr"
+
+    def log_of(self, service: str) -> Path:
+        """Return where a service's output goes."""
+        return self.logs / f"{service}.log"
+
+    def claim(self) -> int:
+        """Make the directory and lock it; return the descriptor that holds the lock.
+
+        The supervisor inherits the descriptor, so the lock lives as long as it does.
+
+        Raises:
+            FleetError: a fleet is up here, or the directory is not ours.
+        """
+        while True:
+            descriptor = self._open()
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(descriptor)
+                raise FleetError(
+                    f"a fleet is up in {self.path}; stop it with `xrl down`, "
+                    "or give another directory with --run-dir"
+                ) from None
+            if self._is_current(descriptor):
+                return descriptor
+            os.close(descriptor)  # removed by a `down` before we had the lock: again
+
+    def _open(self) -> int:
+        try:
+            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+        except OSError as error:
+            raise FleetError(f"{self.path}: cannot be a run directory: {error.strerror}") from None
+        if os.fstat(descriptor).st_uid != os.getuid():
+            os.close(descriptor)
+            raise FleetError(f"{self.path}: belongs to another user; give another --run-dir")
+        return descriptor
+
+    def _is_current(self, descriptor: int) -> bool:
+        try:
+            return os.path.samestat(os.fstat(descriptor), self.path.stat())
+        except FileNotFoundError:
+            return False
+
+    def prepare(self, plan: FleetPlan, pace: float = 1.0) -> None:
+        """Start with empty logs and no dead sockets; write the manifest and the clock's pace."""
+        self.pace.unlink(missing_ok=True)
+        if pace != 1.0:
+            self.pace.write_text(f"{pace:g}\n", encoding="ascii")
+        shutil.rmtree(self.logs, ignore_errors=True)
+        self.logs.mkdir()
+        sockets = [item.endpoint for item in plan.listeners if item.endpoint.startswith(UNIX)]
+        manifest = Manifest(
+            config=str(plan.config_path),
+            services=tuple(row.name for row in plan.processes),
+            topics={row.name: row.topic for row in plan.processes},
+            sockets=tuple(endpoint.removeprefix(UNIX) for endpoint in sockets),
+            stop_s=max(row.stop_s for row in plan.processes),
+        )
+        self.manifest.write_bytes(msgspec.json.format(msgspec.json.encode(manifest)))
+        for path in (*manifest.sockets, str(self.supervisor_socket)):
+            _remove_socket(Path(path))
+        self._remove_shared_memory()
+
+    def _remove_shared_memory(self) -> None:
+        """Forget what joint services of another time have left: a fleet is asked for anew."""
+        for module in MODULES:
+            rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
+        neighbours.path_of(self.path).unlink(missing_ok=True)
+
+    def read_manifest(self) -> Manifest | None:
+        """Return the manifest of the fleet that is or was up here, or None."""
+        try:
+            return msgspec.json.decode(self.manifest.read_bytes(), type=Manifest)
+        except (OSError, msgspec.DecodeError):
+            return None
+
+    def clear(self, *, keep_logs: bool) -> None:
+        """Remove what a fleet has made here, and the directory itself if it is then empty."""
+        manifest = self.read_manifest()
+        for path in manifest.sockets if manifest else ():
+            _remove_socket(Path(path))
+        _remove_socket(self.supervisor_socket)
+        self._remove_shared_memory()
+        for file in (self.supervisor_config, self.supervisor_pid, self.manifest, self.pace):
+            file.unlink(missing_ok=True)
+        if not keep_logs:
+            shutil.rmtree(self.logs, ignore_errors=True)
+        if self.path.is_dir() and not any(self.path.iterdir()):
+            self.path.rmdir()
+
+
+def supervisor_config(run: RunDir, plan: FleetPlan, no_restart: Collection[str]) -> str:
+    """Return supervisord's configuration.
+
+    Args:
+        run: the run directory.
+        plan: what is to be started, in the order of the start.
+        no_restart: services that stay down when they end.
+    """
+    sections: list[tuple[str, Mapping[str, object]]] = [
+        ("unix_http_server", {"file": run.supervisor_socket, "chmod": "0700"}),
+        (
+            "supervisord",
+            {
+                "logfile": run.supervisor_log,
+                "pidfile": run.supervisor_pid,
+                "nodaemon": "true",
+                "silent": "true",
+                "nocleanup": "true",
+            },
+        ),
+        (
+            "rpcinterface:supervisor",
+            {"supervisor.rpcinterface_factory": "supervisor.rpcinterface:make_main_rpcinterface"},
+        ),
+    ]
+    for priority, row in enumerate(plan.processes):
+        restarts = row.name not in no_restart
+        settings = {
+            "command": shlex.join(plan.commands[row.name]),
+            "priority": priority,
+            "autostart": _word(row.autostart),
+            "autorestart": _word(restarts),
+            "startsecs": row.settle_s,
+            "startretries": _NEVER_GIVE_UP if restarts else 0,
+            "stopsignal": row.stop_signal,
+            "stopwaitsecs": row.stop_s,
+            "stopasgroup": "true",
+            "killasgroup": "true",
+            "redirect_stderr": "true",
+            "stdout_logfile": run.log_of(row.name),
+            "stdout_logfile_maxbytes": "5MB",
+            "stdout_logfile_backups": 1,
+        }
+        sections.append((f"program:{row.name}", settings))
+    return "\n".join(_section(name, settings) for name, settings in sections)
+
+
+def _section(name: str, settings: Mapping[str, object]) -> str:
+    lines = [f"{key}={value}".replace("%", "%%") for key, value in settings.items()]
+    return "\n".join([f"[{name}]", *lines, ""])
+
+
+def _word(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def _remove_socket(path: Path) -> None:
+    """Remove a socket that nobody listens on, and the lock that Zenoh lays beside it."""
+    if path.exists() and stat.S_ISSOCK(path.lstat().st_mode) and not is_listening(f"{UNIX}{path}"):
+        path.unlink(missing_ok=True)
+    lock = Path(f"{path}.lock")
+    if not path.exists():
+        lock.unlink(missing_ok=True)

@@ -1,0 +1,331 @@
+"""A fleet of services under supervisord: start, look, signal, stop.
+
+supervisord restarts what ends, with a growing delay for what ends at once. It runs on a
+leash (`tools.fleet.parent_death`): if it is killed, so is every service.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Self
+
+from services.joint import rearm_guard
+from services.simulator import usb_standin
+from shared.exceptions import FleetError
+from tools.fleet import process_table, procfs
+from tools.fleet.pace import check_pace, usual_pace
+from tools.fleet.run_dir import Manifest, RunDir, supervisor_config
+from tools.fleet.supervisor_client import RefusedError, ServiceInfo, Supervisor
+
+_POLL_S = 0.1
+_KILLED_S = 5.0  # until the kernel has cleared away what SIGKILL has ended
+_FAILED = ("backoff", "exited", "fatal")
+_INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class SupervisedFleet:
+    """The services of one run directory."""
+
+    def __init__(self, run_dir: Path) -> None:
+        """Name a fleet that may be up; `start` and `attach` make sure of it."""
+        self.run = RunDir(run_dir)
+        self._supervisor = Supervisor(self.run)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @classmethod
+    def start(
+        cls,
+        config_path: Path,
+        run_dir: Path,
+        *,
+        overrides: Mapping[str, Sequence[str]] | None = None,
+        no_restart: frozenset[str] = frozenset(),
+        services: Collection[str] | None = None,
+        asleep: Collection[str] = (),
+        simulation: bool = True,
+        injected: bool = False,
+        pace: float | None = None,
+        leashed: bool = False,
+        table_path: Path = process_table.TABLE,
+        timeout_s: float = 30.0,
+    ) -> Self:
+        """Start the services and wait until every one is up.
+
+        Interrupted or failed, it stops what it has started; the logs of a failure stay.
+
+        Args:
+            config_path: the robot file.
+            run_dir: for sockets and logs; made if it is not there.
+            overrides: further arguments for some services.
+            no_restart: services that stay down when they end.
+            services: which to start; None for all that the table starts by itself.
+            asleep: of these, which wait for `start_service`.
+            simulation: False leaves the simulator out; where all drives are real it always is.
+            injected: with the network proxy on the links of planner, joints and sensors.
+            pace: how fast the clock of a simulated fleet goes; None: `usual_pace` where it is
+                simulated, else as the machine's.
+            leashed: stop the fleet if this process dies.
+            table_path: the process table.
+            timeout_s: time in which every service has to be up.
+
+        Raises:
+            ConfigError: the robot file or the table cannot be used.
+            FleetError: the run directory or an endpoint is in use, a service is unknown,
+                ends at once or is not up in time; or drives are to be emulated on USB and
+                there is no C compiler.
+        """
+        started = cls(run_dir)
+        plan = process_table.make_plan(
+            config_path,
+            started.run.path,
+            overrides=overrides or {},
+            services=services,
+            asleep=asleep,
+            simulation=simulation,
+            injected=injected,
+            table_path=table_path,
+        )
+        process_table.check_known(no_restart, list(plan.commands))
+        simulated = "simulator" in plan.commands
+        clock_pace = pace if pace is not None else usual_pace() if simulated else 1.0
+        check_pace(clock_pace, simulated=simulated)
+        lock = started.run.claim()
+        try:
+            process_table.check_free(plan.listeners)
+            started.run.prepare(plan, clock_pace)
+            text = supervisor_config(started.run, plan, no_restart)
+            started.run.supervisor_config.write_text(text, encoding="utf-8")
+            environment = dict(plan.environment)
+            if plan.emulated_usb:
+                environment |= usb_standin.prepare(started.run.path)
+            started._launch(environment, lock, leashed=leashed)
+            started._wait_until_up(plan, timeout_s)
+        except BaseException as error:
+            with _uninterrupted():
+                started._end()
+                started._clear(keep_logs=isinstance(error, FleetError))
+            raise
+        finally:
+            os.close(lock)
+        return started
+
+    @classmethod
+    def attach(cls, run_dir: Path) -> Self:
+        """Return the fleet that is up in a run directory.
+
+        Raises:
+            FleetError: none is.
+        """
+        attached = cls(run_dir)
+        if attached.run.read_manifest() is None or not attached.run.supervisor_socket.exists():
+            raise FleetError(f"no fleet is up in {attached.run.path}; `xrl up` starts one")
+        attached._supervisor.call("getState")
+        return attached
+
+    @property
+    def manifest(self) -> Manifest:
+        """What was started: robot file, services, topics."""
+        manifest = self.run.read_manifest()
+        if manifest is None:
+            raise FleetError(f"no fleet is up in {self.run.path}; `xrl up` starts one")
+        return manifest
+
+    def info(self) -> list[ServiceInfo]:
+        """Return every service, in the order of the process table."""
+        return self._supervisor.info(self.manifest.services)
+
+    def pids(self) -> dict[str, int]:
+        """Return the process id of each service that has a process."""
+        return self._supervisor.pids()
+
+    def kill(self, service: str, number: int = signal.SIGKILL) -> int:
+        """Send a signal to a service, at once, and return the process id it went to.
+
+        Raises:
+            FleetError: the service is unknown or has no process now.
+        """
+        process_table.check_known([service], self.manifest.services)
+        pid = self.pids().get(service)
+        if pid is None:
+            raise FleetError(f"{service} has no process to signal now; see `xrl status`")
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            raise FleetError(f"{service} (pid {pid}) has just ended by itself") from None
+        return pid
+
+    def forget(self, service: str) -> None:
+        """Have the next process of a joint service arm its drive, whatever the last left."""
+        rearm_guard.clear(self.run.path, service)
+
+    def start_service(self, service: str) -> None:
+        """Start a service that is down, without waiting for a restart that is delayed.
+
+        It is asked for: a drive that has let go is armed again (`services.joint.rearm_guard`).
+        One that is suspended is continued; one that runs is left alone.
+
+        Raises:
+            FleetError: the service is unknown, or cannot be started.
+        """
+        process_table.check_known([service], self.manifest.services)
+        pid = self.pids().get(service)
+        if pid is None:
+            self.forget(service)
+            with contextlib.suppress(RefusedError):
+                self._supervisor.call("stopProcess", service)  # ends the wait of a backoff
+            try:
+                self._supervisor.call("startProcess", service, False)
+            except RefusedError as refusal:
+                raise FleetError(f"{service}: cannot be started: {refusal}") from None
+        elif procfs.is_suspended(pid):
+            os.kill(pid, signal.SIGCONT)
+
+    def stop(self, *, keep_logs: bool = False) -> None:
+        """Stop every service and the supervisor, and remove what they have made.
+
+        Each by its own signal first, suspended ones too; SIGKILL for what does not end in
+        its time. Does nothing where no fleet is. Nothing is left in the run directory but the
+        logs, if they are wanted, and files that are not the fleet's.
+
+        Raises:
+            FleetError: a process is left that even SIGKILL did not end.
+        """
+        self._end()
+        try:
+            lock = self.run.claim()
+        except FleetError:
+            return  # the next fleet is starting here already, and has cleared up
+        try:
+            self._clear(keep_logs=keep_logs)
+        finally:
+            os.close(lock)
+
+    def _clear(self, *, keep_logs: bool) -> None:
+        """Remove what the fleet has made in the run directory."""
+        usb_standin.clear(self.run.path)
+        self.run.clear(keep_logs=keep_logs)
+
+    def _end(self) -> None:
+        """End every process of the fleet."""
+        manifest = self.run.read_manifest()
+        procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGCONT)
+        try:
+            self._supervisor.call("stopAllProcesses", False)  # all at once,
+            self._supervisor.call("shutdown")  # which by itself goes one by one
+        except FleetError:
+            # no supervisor, or none that answers: whatever is there is told directly
+            # (SIGINT: a joint service told so leaves its drive idle)
+            procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGINT)
+        patience_s = (manifest.stop_s if manifest else 0.0) + 2.0
+        left = procfs.wait_until_gone(self.run.path, patience_s)
+        if left:
+            procfs.signal_all(left, signal.SIGKILL)
+            left = procfs.wait_until_gone(self.run.path, _KILLED_S)
+        if self._process is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_POLL_S)  # else it stays a zombie of ours
+        if left:
+            raise FleetError(f"processes {sorted(left)} do not end, not even by SIGKILL")
+
+    def _launch(self, environment: Mapping[str, str], lock: int, *, leashed: bool) -> None:
+        leash = ["--parent", str(os.getpid())] if leashed else []
+        command = [
+            sys.executable,
+            "-m",
+            "tools.fleet.parent_death",
+            *leash,
+            "--",
+            "--nodaemon",
+        ]
+        command += ["--configuration", str(self.run.supervisor_config)]
+        marked = {**os.environ, **environment, procfs.FLEET_VARIABLE: str(self.run.path)}
+        # An interrupt between fork and exec would leave a process that nobody can find;
+        # `tools.fleet.parent_death` unblocks in the child.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
+        try:
+            with self.run.supervisor_stderr.open("wb") as output:
+                self._process = subprocess.Popen(
+                    command,
+                    env=marked,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    start_new_session=True,  # Ctrl-C in the terminal is for us alone
+                    pass_fds=(lock,),
+                )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def _wait_until_up(self, plan: process_table.FleetPlan, timeout_s: float) -> None:
+        endpoints = {
+            item.service: item.endpoint for item in plan.listeners if item.key.startswith("bus.")
+        }
+        waiting = {row.name: row for row in plan.processes if row.autostart}
+        watched = tuple(waiting)
+        deadline = time.monotonic() + timeout_s
+        while waiting:
+            time.sleep(_POLL_S)
+            for service in self._info_or_none():
+                failed = service.state in _FAILED or service.restarts > 0
+                if failed and service.name in watched:
+                    raise FleetError(self._first_end(service))
+                row = waiting.get(service.name)
+                if row is not None and _is_up(row, service, endpoints.get(row.name)):
+                    del waiting[row.name]
+            if waiting and time.monotonic() > deadline:
+                log = self.run.log_of(next(iter(waiting)))
+                words = f"not up after {timeout_s:g} s: {', '.join(waiting)}; {log}:"
+                raise FleetError(f"{words}\n{_tail(log)}".rstrip())
+
+    def _info_or_none(self) -> list[ServiceInfo]:
+        """Return every service; none while the supervisor is still starting.
+
+        Raises:
+            FleetError: the supervisor has ended.
+        """
+        if self._process is not None and self._process.poll() is not None:
+            words = _tail(self.run.supervisor_stderr) or _tail(self.run.supervisor_log)
+            raise FleetError(f"supervisord has ended while starting\n{words}".rstrip())
+        if not self.run.supervisor_socket.exists():
+            return []
+        try:
+            return self.info()
+        except FleetError:
+            return []
+
+    def _first_end(self, service: ServiceInfo) -> str:
+        """Return what to say of a service that ended while the fleet was starting."""
+        log = self.run.log_of(service.name)
+        how = service.last_exit or "could not be run"
+        return f"{service.name} ended at once ({how}); {log}:\n{_tail(log)}".rstrip()
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Hold back interrupts while what was started is being stopped."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _is_up(row: process_table.Process, service: ServiceInfo, endpoint: str | None) -> bool:
+    if row.ready == "running" or endpoint is None:
+        return service.state == "running"
+    return service.pid is not None and process_table.is_listening(endpoint)
+
+
+def _tail(log: Path, lines: int = 5) -> str:
+    """Return the last lines of a log, indented."""
+    with contextlib.suppress(OSError):
+        text = log.read_text(encoding="utf-8", errors="replace").rstrip()
+        return "\n".join(f"  {line}" for line in text.splitlines()[-lines:])
+    return ""

@@ -1,0 +1,168 @@
+"""`xrl sweep certificate`: is the sign of K_fail right? Said against what the simulation does."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from rich.console import Console
+
+from services.planner.certificate import DIRECTIONS
+from services.simulator.plant import IDEAL, PlantConfig
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.process import DEFAULT_CONFIG
+from tools.studies.sweeps import certificate_study, study
+from tools.studies.sweeps.certificate_study import CertificateCases, CertificateResult
+from tools.studies.sweeps.table import CaseTable, code_digest, code_of
+from tools.verb_table import add_config
+
+N: Final = 200
+BATCH: Final = 20
+"""Cases a worker is given at once: what draws them is built once for a batch."""
+TABLE: Final = "certificate.csv"
+PICTURE: Final = "certificate.png"
+CODE: Final = code_of("tools.studies.sweeps.certificate_study")
+WORDS: Final = {"stood": {"True", "False"}, "weakest": frozenset(DIRECTIONS)}
+
+EXAMPLES: Final = """
+    xrl sweep certificate
+    xrl sweep certificate --n 1000 --seed 3 --rigid
+    xrl sweep certificate --friction
+"""
+
+
+class CaseBatch(NamedTuple):
+    """Cases to run in one go."""
+
+    robot: RobotConfig
+    seed: int
+    numbers: tuple[int, ...]
+    rigid: bool
+    plant: PlantConfig
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the study's flags."""
+    add_config(parser)
+    parser.add_argument("--n", type=int, default=N, help=f"cases ({N})")
+    parser.add_argument(
+        "--rigid", action="store_true", help="a floor as hard as the certificate takes it"
+    )
+    parser.add_argument(
+        "--friction",
+        action="store_true",
+        help="with the joints' dry friction, which holds up what is a little too soft",
+    )
+    study.add_flags(parser, "certificate", f"{TABLE} and {PICTURE}")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study; 1 if a case fell that was said to stand."""
+    study.check_least(("--n", args.n, 1))
+    crew = study.executor_of(args, CODE)
+    robot = config_file.load(args.config)
+    plant = IDEAL if args.friction else certificate_study.FRICTIONLESS
+    console = Console()
+    out = study.folder(args.out, "certificate")
+    first = row_of(
+        certificate_study.run(
+            robot, CertificateCases(robot).draw(args.seed, 0), rigid=args.rigid, plant=plant
+        )
+    )
+    with CaseTable(out, TABLE, tuple(first), _inputs(args, robot), WORDS) as table:
+        missing = [number for number in range(args.n) if number not in table.numbers]
+        batches = [
+            CaseBatch(robot, args.seed, tuple(missing[start : start + BATCH]), args.rigid, plant)
+            for start in range(0, len(missing), BATCH)
+        ]
+        with study.resumable(table, out, _command(args), crew, console):
+            study.fill(table, JOB, batches, crew, args.n, console)
+    rows = table.rows(args.n)
+    said = [(float(row["margin"]), row["stood"] == "True") for row in rows]
+    found = certificate_study.confusion(said)
+    console.print(
+        f"said to stand: {found.stand_stood} stood, {found.stand_fell} fell\n"
+        f"said to fall: {found.fall_stood} stood, {found.fall_fell} fell\n"
+        f"fewest mistakes with a margin of {certificate_study.threshold(said):.3f} as the limit"
+    )
+    for row, (margin, stood) in zip(rows, said, strict=True):
+        if (margin > 0.0) != stood:
+            console.print(
+                f"  case {row['number']}: margin {row['margin']}, weakest {row['weakest']}, COM "
+                f"{row['com_mm']} mm away",
+                style="dim",
+            )
+    title = f"{len(rows)} random postures and gains, seed {args.seed}"
+    certificate_study.draw_picture(rows, title, out / PICTURE)
+    console.print(f"{out / TABLE}, {PICTURE}", style="dim", soft_wrap=True)
+    return 1 if found.stand_fell else 0
+
+
+def row_of(outcome: CertificateResult) -> dict[str, object]:
+    """Return an outcome as a row of the table."""
+    case, posture, weakest = outcome.case, outcome.case.posture, outcome.case.weakest
+    row: dict[str, object] = {
+        "number": case.number,
+        "margin": outcome.margin,
+        "stood": outcome.stood,
+        "weakest": weakest.direction,
+        "stiffness": weakest.stiffness,
+        "com_mm": 1e3 * outcome.com_m,
+        "angle_rad": outcome.angle_rad,
+        "growth": outcome.growth,
+        "ended_s": outcome.ended_s,
+        "height_m": posture.height,
+        "pitch_rad": posture.pitch,
+        "payload_kg": posture.payload,
+        "assist_n": posture.assist,
+        "nudge_x_n": case.nudge[0],
+        "nudge_y_n": case.nudge[1],
+    }
+    return row | {f"D{joint}": float(value) for joint, value in enumerate(case.D[:6])}
+
+
+def _run_batch(batch: CaseBatch) -> list[CertificateResult]:
+    cases = CertificateCases(batch.robot)
+    return [
+        certificate_study.run(
+            batch.robot, cases.draw(batch.seed, number), rigid=batch.rigid, plant=batch.plant
+        )
+        for number in batch.numbers
+    ]
+
+
+def _name(batch: CaseBatch) -> str:
+    return f"cases {batch.numbers[0]} to {batch.numbers[-1]} (seed {batch.seed})"
+
+
+def _rows(_batch: CaseBatch, outcomes: list[CertificateResult]) -> list[dict[str, object]]:
+    return [row_of(outcome) for outcome in outcomes]
+
+
+def _fell(row: Mapping[str, object]) -> bool:
+    return str(row["stood"]) == "False"
+
+
+JOB: Final = study.Job(_run_batch, _name, _rows, _fell)
+
+
+def _command(args: argparse.Namespace) -> str:
+    """Return the command of this study, but for --out."""
+    flags = [f"--n {args.n}", f"--seed {args.seed}"]
+    if args.config != DEFAULT_CONFIG:
+        flags.append(f"--config {args.config}")
+    flags += [f"--{name}" for name in ("rigid", "friction") if getattr(args, name)]
+    return " ".join(["xrl sweep certificate", *flags])
+
+
+def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
+    return {
+        "study": "certificate",
+        "seed": str(args.seed),
+        "rigid": str(args.rigid),
+        "friction": str(args.friction),
+        "robot": study.digest_of(robot),
+        "code": code_digest(CODE),
+    }

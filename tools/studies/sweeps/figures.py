@@ -1,0 +1,105 @@
+"""What the kill and the latency study share of a case: which rows count, how it ends, figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from enum import StrEnum
+from typing import Final
+
+import msgspec
+
+from shared.bus.messages import JointEvent, SimTruth
+from shared.config.robot_config import RobotConfig
+from tools.runs.lockstep import Watch
+from tools.runs.standing import is_tipping
+
+END_TOLERANCE_S: Final = 0.1
+
+
+class Ending(StrEnum):
+    """How a case came out."""
+
+    STOOD = "stood"
+    FELL = "fell"
+    TIPPING = "tipping"
+    """Not down yet at the end, but a sole is up or the COM beyond the soles: it will fall."""
+    UNREADY = "unready"
+    """The robot stands, but the six modules never came to track: there was no scenario."""
+
+
+ENDINGS: Final = frozenset(str(ending) for ending in Ending)
+
+
+class Ended(msgspec.Struct, frozen=True, kw_only=True):
+    """What every outcome says first."""
+
+    ending: str
+    fell_at_s: float | None = None
+    """Scenario time."""
+
+    @property
+    def stood(self) -> bool:
+        """True if the robot stood to the end."""
+        return self.ending == Ending.STOOD
+
+
+def that_count(
+    run: Iterable[SimTruth], from_s: float, watch: Watch | None, after_fall_s: float
+) -> Iterator[SimTruth]:
+    """Run to the end or to the fall; yield what counts of it, a fall included.
+
+    Args:
+        run: the world, as a fleet in virtual time gives it.
+        from_s: scenario time from which on a row counts, s.
+        watch: sees every row, also what does not count.
+        after_fall_s: how long to go on after a fall.
+    """
+    fell_at_s: float | None = None
+    for row in run:
+        if watch is not None:
+            watch(row)
+        if fell_at_s is not None:
+            if row.scenario_s > fell_at_s + after_fall_s:
+                return
+        elif row.fallen or row.scenario_s >= from_s:
+            fell_at_s = row.scenario_s if row.fallen else None
+            yield row
+
+
+def ending_of(last: SimTruth, end_s: float, robot: RobotConfig) -> Ending:
+    """Return how a case came out, by the last row that counts.
+
+    Args:
+        last: that row.
+        end_s: when the case is over, scenario time, s.
+        robot: for the size of its feet.
+    """
+    if last.fallen or last.scenario_s < end_s - END_TOLERANCE_S:
+        return Ending.FELL
+    return Ending.TIPPING if is_tipping(last, robot) else Ending.STOOD
+
+
+def com_max_mm(rows: Sequence[SimTruth]) -> float:
+    """Return the largest horizontal distance of the COM from the middle of the ankles, mm."""
+    return 1e3 * max(math.hypot(*row.over) for row in rows)
+
+
+def operator_peak_n(rows: Sequence[SimTruth]) -> float:
+    """Return the hand's largest vertical force, N."""
+    return max(abs(row.operator_force[2]) for row in rows)
+
+
+def sole_tilt_max_rad(rows: Sequence[SimTruth]) -> float:
+    """Return the largest tilt of a sole, rad."""
+    return max(max(row.foot_right_tilt, row.foot_left_tilt) for row in rows)
+
+
+def step_nm(before: Sequence[float], after: Sequence[float]) -> float:
+    """Return the largest change of a joint's torque, N m."""
+    return max(abs(b - a) for a, b in zip(before, after, strict=True))
+
+
+def event_steps_nm(events: Iterable[JointEvent]) -> list[float]:
+    """Return the step of torque at each change of mode, N m."""
+    return [step_nm(event.tau_before, event.tau_after) for event in events]

@@ -1,0 +1,87 @@
+"""One case alone, recorded and judged like a run of `xrl sim`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import msgspec
+from rich.console import Console
+
+from services.simulator.plant import PlantConfig
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from tools.runs import experiment
+from tools.runs.lockstep import Record, Watch
+from tools.runs.recorded_lockstep import AFTER_FALL_S, judge_run, record_run
+from tools.studies.sweeps import study
+from tools.studies.sweeps.figures import Ended
+
+Outcome_co = TypeVar("Outcome_co", bound=Ended, covariant=True)
+
+
+class Run(Protocol[Outcome_co]):
+    """Runs a case."""
+
+    def __call__(
+        self,
+        *,
+        record: Record | None = None,
+        watch: Watch | None = None,
+        after_fall_s: float = 0.0,
+    ) -> Outcome_co:
+        """Run it; `record` takes every message, `watch` sees the world at its rate."""
+
+
+def run_alone(
+    run: Run[Ended],
+    scenario: Scenario,
+    robot: RobotConfig,
+    out: Path | None,
+    facts: dict[str, str],
+    console: Console,
+    true_plant: PlantConfig,
+) -> int:
+    """Run a case under a progress bar and print its figures.
+
+    Args:
+        run: runs it.
+        scenario: what happens.
+        robot: ready to run.
+        out: folder for its log; None: no log.
+        facts: for the log, as for `record_run`.
+        console: to print on.
+        true_plant: that `run` simulates.
+
+    Returns:
+        0 if the robot stood, else 1.
+
+    Raises:
+        RunError: the log cannot be written.
+    """
+    with study.bar("{task.completed:.1f} of {task.total:.1f} s", console) as bar:
+        shown = bar.add_task("", total=scenario.duration)
+
+        def watch(truth: SimTruth) -> None:
+            bar.update(shown, completed=max(0.0, truth.scenario_s))
+
+        if out is None:
+            outcome = run(watch=watch)
+        else:
+            experiment.make_out(out, "sweep")
+            outcome = record_run(
+                scenario,
+                robot,
+                out,
+                facts,
+                lambda record, look: run(record=record, watch=look, after_fall_s=AFTER_FALL_S),
+                watch,
+                true_plant,
+            )
+            judge_run(scenario, out)
+    study.show("Measured", msgspec.structs.asdict(outcome), console)
+    if out is not None:
+        console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
+    console.print(f"[bold]{outcome.ending}[/]")
+    return 0 if outcome.stood else 1

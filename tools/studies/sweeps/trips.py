@@ -1,0 +1,185 @@
+"""`xrl sweep trips`: does each trip come where it is to, on each plant, and none where not?"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Final, TypeAlias
+
+import msgspec
+from rich.console import Console
+from rich.table import Table as Printed
+
+from shared.bus.messages import Cause, Trip
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.process import DEFAULT_CONFIG
+from tools.runs import experiment
+from tools.studies.sweeps import study
+from tools.studies.sweeps.table import CaseTable, Row, code_digest, code_of
+from tools.studies.sweeps.trips_trial import PLANTS, TROUBLES, TripResult, run_trial
+from tools.verb_table import add_config
+
+TABLE: Final = "trips.csv"
+CODE: Final = code_of("tools.studies.sweeps.trips_trial")
+Task: TypeAlias = "tuple[int, str, str, RobotConfig, int]"
+"""Number, trouble, plant, robot, seed of the noise."""
+
+EXAMPLES: Final = """
+    xrl sweep trips
+    xrl sweep trips --trouble sags --trouble drops
+    xrl sweep trips --on "k 2000" --out out/trips
+"""
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the study's flags."""
+    add_config(parser)
+    for flag, names in (("trouble", TROUBLES), ("on", PLANTS)):
+        parser.add_argument(
+            f"--{flag}", action="append", choices=tuple(names), help="only this; may be repeated"
+        )
+    study.add_flags(parser, "trips", TABLE)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the study; 1 if a trip did not come, came for nothing, or did not save the robot.
+
+    Raises:
+        RunError: on this robot nothing trips.
+    """
+    crew = study.executor_of(args, CODE)
+    robot = experiment.load_robot(args.config)
+    if robot.gain_schedule is None:
+        raise RunError(
+            f'law.split = "{robot.law.split}": only robots of the certified split have trips'
+        )
+    console = Console()
+    grid = list(product(args.trouble or TROUBLES, args.on or PLANTS))
+    begins = [
+        {"number": number, "trouble": trouble, "on": plant}
+        for number, (trouble, plant) in enumerate(grid)
+    ]
+    out = study.folder(args.out, "trips")
+    columns = [*begins[0], *TripResult.__struct_fields__]
+    with CaseTable(out, TABLE, columns, _inputs(args, robot, grid), WORDS, begins) as table:
+        missing = [
+            (number, trouble, plant, robot, args.seed)
+            for number, (trouble, plant) in enumerate(grid)
+            if number not in table.numbers
+        ]
+        with study.resumable(table, out, _command(args), crew, console):
+            study.fill(table, JOB, missing, crew, len(grid), console)
+    rows = table.rows(len(grid))
+    _show(rows, console)
+    wrong = [row for row in rows if wrong_with(row)]
+    for row in wrong:
+        console.print(
+            f"{row['trouble']} on {row['on']}: {wrong_with(row)}", style="red", highlight=False
+        )
+    if not wrong:
+        console.print("what was to trip did, and stood; nothing tripped for nothing", style="green")
+    console.print(f"{out / TABLE}", style="dim", soft_wrap=True)
+    return 1 if wrong else 0
+
+
+def wrong_with(row: Mapping[str, str]) -> str:
+    """Return what is wrong with a row of the table in words; empty: nothing.
+
+    Any trip will do: a robot that tips over may be caught by the one or by the other.
+    """
+    wanted = TROUBLES[row["trouble"]].trip
+    if row["fell_at_s"]:
+        return f"fell at {row['fell_at_s']} s"
+    if row["led"] != "True" and not TROUBLES[row["trouble"]].unfiltered:
+        return "the robot was never led so far that anything could happen"
+    if wanted is None:
+        return f"tripped for nothing: {row['tripped']}" if row["tripped"] else ""
+    if row["tripped"]:
+        return ""
+    stands = isinstance(wanted, Cause) and not row["untripped_fell_at_s"]
+    return "" if stands else f"{wanted.name} never tripped"
+
+
+def _show(rows: Sequence[Row], console: Console) -> None:
+    """Print troubles by plant: what tripped and how soon, and what comes of it without."""
+    plants = list(dict.fromkeys(row["on"] for row in rows))
+    printed = Printed(
+        title="What tripped, after so many s; the torso's largest speed, m/s; below: untripped",
+        title_justify="left",
+        show_lines=True,
+    )
+    for heading in ("", *plants):
+        printed.add_column(heading)
+    for trouble in dict.fromkeys(row["trouble"] for row in rows):
+        some = {row["on"]: _cell(row) for row in rows if row["trouble"] == trouble}
+        printed.add_row(trouble, *(some[plant] for plant in plants))
+    console.print(printed)
+    for trouble in dict.fromkeys(row["trouble"] for row in rows):
+        console.print(f"  {trouble:16} {TROUBLES[trouble].about}", highlight=False)
+
+
+def _cell(row: Row) -> str:
+    after = row["tripped_after_s"]
+    with_trips = f"{row['tripped'].split()[0].lower()} {float(after):.2f}" if after else "-"
+    with_trips += f", {float(row['speed_max']):.2f}"
+    if row["fell_at_s"]:
+        with_trips = f"[red]fell[/] {with_trips}"
+    fell = bool(row["untripped_fell_at_s"])
+    without = "fell" if fell else f"{float(row['untripped_speed_max']):.2f}"
+    return f"{with_trips}\n[dim]{without}[/]"
+
+
+def _run_task(task: Task) -> TripResult:
+    _, trouble, plant, robot, seed = task
+    return run_trial(trouble, plant, robot, seed)
+
+
+def _name(task: Task) -> str:
+    return f"{task[1]} on {task[2]}"
+
+
+def _rows(task: Task, outcome: TripResult) -> list[dict[str, object]]:
+    number, trouble, plant, *_ = task
+    begin = {"number": number, "trouble": trouble, "on": plant}
+    return [begin | msgspec.structs.asdict(outcome)]
+
+
+class _TripNames(frozenset[str]):
+    """What the column of trips may hold: names of trips and causes, in any number."""
+
+    def __contains__(self, text: object) -> bool:
+        known = {trip.name for trip in Trip} | {cause.name for cause in Cause}
+        return isinstance(text, str) and set(text.split()) <= known
+
+
+WORDS: Final = {
+    "trouble": frozenset(TROUBLES),
+    "on": frozenset(PLANTS),
+    "led": frozenset(("True", "False")),
+    "tripped": _TripNames(),
+}
+JOB: Final = study.Job(_run_task, _name, _rows, lambda row: bool(row["fell_at_s"]))
+
+
+def _inputs(
+    args: argparse.Namespace, robot: RobotConfig, grid: Sequence[tuple[str, str]]
+) -> dict[str, str]:
+    return {
+        "study": "trips",
+        "grid": repr(grid),
+        "seed": str(args.seed),
+        "robot": study.digest_of(robot),
+        "code": code_digest(CODE),
+    }
+
+
+def _command(args: argparse.Namespace) -> str:
+    """Return the command of this study, but for `--out`."""
+    words = [f"xrl sweep trips --seed {args.seed}"]
+    if args.config != DEFAULT_CONFIG:
+        words.append(f"--config {args.config}")
+    for flag in ("trouble", "on"):
+        words += [f"--{flag} {value!r}" for value in getattr(args, flag) or ()]
+    return " ".join(words)

@@ -1,0 +1,100 @@
+"""The verbs of the command line: one table, and what their parsers have in common."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Final, NamedTuple, TypeAlias
+
+from shared.process import DEFAULT_CONFIG, RUN_DIR_VARIABLE, default_run_dir
+
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
+"""What `add_parser` is given."""
+
+RUN_HELP: Final = "a run's record, finished or not; or its directory: all files of a split run"
+
+
+class Verb(NamedTuple):
+    """One row; `tools.verbs.NAME` has `add_parser(subparsers)` and `run(args) -> int`."""
+
+    name: str
+    help: str
+
+
+VERBS: Final = (
+    Verb("demo", "run the reference experiment, kill the planner, judge the outcome"),
+    Verb("sim", "run the same experiment in virtual time, with a modelled network"),
+    Verb("sweep", "run many random cases in virtual time and count the falls"),
+    Verb("crashtest", "kill one service after the other, live, and judge each run"),
+    Verb("up", "start the fleet"),
+    Verb("status", "show every service and every module"),
+    Verb("faults", "list the faults: what the robot does then, and the way out"),
+    Verb("kill", "send a signal to one service"),
+    Verb("inject", "delay, drop or cut a live fleet's messages for a while"),
+    Verb("start", "start a service that is down, or continue one that is paused"),
+    Verb("estop", "stop every module: a slow sink, never a drop"),
+    Verb("pendant", "hold a dead man's handle: when it ends, every module stops"),
+    Verb("assist", "ask the robot to carry some of the person, while it runs"),
+    Verb("gains", "compute the certified gain schedule of a robot"),
+    Verb("tare", "set the harness's zero from its unloaded reading"),
+    Verb("doctor", "check drives, buses and computer against the robot file"),
+    Verb("configure", "write the drives' settings, after a backup of the old ones"),
+    Verb("zero", "write each joint's position to its drive"),
+    Verb("jog", "move one joint of one module a little and judge the response"),
+    Verb("info", "show what is in a log: topics, rates, gaps, losses"),
+    Verb("recover", "finish a log that was cut off"),
+    Verb("play", "put a log back onto the bus, beside the live robot"),
+    Verb("explain", "break one planner tick down: gains, margins, torque by origin"),
+    Verb("report", "write a run as one page: plots, timeline, torques, versions"),
+    Verb("export", "copy a log with a 3-D scene in it, or write a viewer's layout"),
+    Verb("resim", "run a log's services again and compare, bit for bit or changed"),
+    Verb("whatif", "kill a service at each moment of a run: would it have stood?"),
+    Verb("bench", "measure how fast the law and lockstep run here"),
+    Verb("stiffness", "print how stiff the body must be to balance"),
+    Verb("down", "stop the fleet and leave nothing behind"),
+)
+"""A verb's module is imported only when the verb is used."""
+
+HELP: Final = {verb.name: verb.help for verb in VERBS}
+
+
+def add_verb(subparsers: Subparsers, name: str, examples: str) -> argparse.ArgumentParser:
+    """Add a verb's parser, with its line of the table as description and its examples.
+
+    Args:
+        subparsers: of `xrl`.
+        name: of the verb, as in `VERBS`.
+        examples: command lines, one per line.
+    """
+    lines = "\n".join(f"  {line.strip()}" for line in examples.strip().splitlines())
+    sentence = f"{HELP[name][0].upper()}{HELP[name][1:]}."
+    return subparsers.add_parser(
+        name,
+        help=HELP[name],
+        description=sentence,
+        epilog=f"examples:\n{lines}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_run_dir(parser: argparse.ArgumentParser) -> None:
+    """Add `--run-dir`: which fleet is meant."""
+    parser.add_argument(
+        "--run-dir",
+        type=Path,
+        default=default_run_dir(),
+        metavar="DIR",
+        help="directory of the fleet's sockets and logs (default: "
+        f"${RUN_DIR_VARIABLE}, else /tmp/xrl-UID of the user); keep it short",
+    )
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """Add `--config`: the robot file."""
+    parser.add_argument(
+        "--config",
+        type=Path,
+        default=DEFAULT_CONFIG,
+        metavar="FILE",
+        help="robot file (default: deploy/robot.toml of this checkout)",
+    )

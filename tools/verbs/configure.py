@@ -1,0 +1,287 @@
+"""`xrl configure`: write the drives' settings; the difference first, and a backup."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+from rich.markup import escape
+
+from shared.can import drive_settings
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import DriveError, FleetError
+from shared.robot.joints import MODULES
+from tools.bringup import backup, bench, changes
+from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
+from tools.bringup.changes import ChangeResult, SettingChange
+from tools.bringup.check_robot import joint_services, services_up
+from tools.bringup.difference import shown
+from tools.bringup.jog_drive import Interrupts
+from tools.bringup.reach import (
+    add_plant,
+    boards_on_usb,
+    check_plants,
+    drives_within_reach,
+    no_fleet_meanwhile,
+)
+from tools.fleet.process_table import is_simulated
+from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+
+BACKUPS: Final = Path("out") / "drive-backups"
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "configure",
+        """
+        xrl configure                          # what would be changed, and nothing else
+        xrl configure --apply
+        xrl configure --apply --module knee_left
+        xrl configure --restore out/drive-backups/20260301-101500.json --apply
+        """,
+    )
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="show the difference only, as without --apply; exit code 1 if there is one",
+    )
+    what.add_argument("--apply", action="store_true", help="write and save it; the boards restart")
+    parser.add_argument(
+        "--module", action="append", choices=MODULES, metavar="MODULE",
+        help="this one only; may be given several times (default: all six)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--restore",
+        type=Path,
+        metavar="BACKUP.json",
+        help="what a backup has, instead of what the robot file wants",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=BACKUPS, metavar="DIR",
+        help=f"where the backup is written (default {BACKUPS})",
+    )  # fmt: skip
+    add_config(parser)
+    add_run_dir(parser)
+    add_plant(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show the difference, and close it if told to; 0 if the drives are as wanted now."""
+    console = Console()
+    path = bench.robot_file(args)
+    robot = config_file.load_without_schedule(path)
+    saved = backup.read(args.restore) if args.restore else None
+    modules = modules_of(args, robot, saved)
+    check_plants(robot, args.run_dir, args.plant)
+    with contextlib.ExitStack() as stack:
+        if args.apply:
+            stack.enter_context(no_fleet_meanwhile(robot, args.run_dir))
+            refuse_services(robot, args.run_dir, modules)
+        return look_and_write(args, console, robot, path, modules, saved)
+
+
+def look_and_write(
+    args: argparse.Namespace,
+    console: Console,
+    robot: RobotConfig,
+    path: Path,
+    modules: Sequence[str],
+    saved: backup.Backup | None,
+) -> int:
+    """Show what differs; with `--apply` keep a backup, write it and read it back."""
+    with (
+        drives_within_reach(robot, path, args.run_dir, args.plant) as started,
+        boards_on_usb(robot, args.run_dir, modules) as found,
+    ):
+        boards = boards_of(robot, modules, found)
+        difference = differences(robot, boards, saved)
+        console.print(shown(difference) if difference else "nothing to change")
+        if not args.apply or not difference:
+            if difference:
+                console.print("\nnothing was written; `--apply` writes it")
+            return 1 if difference else 0
+        for module, board in boards.items():
+            changes.refuse_armed(module, board)
+        kept = keep(args.out, boards, path)
+        console.print(f"\nwhat the boards had: {kept}; `xrl configure --restore {kept}` shows it")
+        interrupts = Interrupts()
+        with interrupts.kept():
+            outcomes = apply(console, boards, difference, interrupts)
+    code = conclude(console, robot, outcomes, emulated=started)
+    if interrupts.number:
+        begun = {outcome.change.module for outcome in outcomes}
+        rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
+        console.print(f"stopped before {', '.join(rest)}" if rest else "nothing was left to do")
+        sys.exit(128 + interrupts.number)
+    return code
+
+
+def modules_of(
+    args: argparse.Namespace, robot: RobotConfig, saved: backup.Backup | None
+) -> tuple[str, ...]:
+    """Return the modules that are meant: those that were named, or of the backup, or all.
+
+    Raises:
+        DriveError: the backup does not have one of them, or has it with another board.
+    """
+    if saved is None:
+        return tuple(args.module or MODULES)
+    by_module = {board.module: board for board in saved.boards}
+    modules = tuple(args.module or by_module)
+    for module in modules:
+        if module not in by_module:
+            raise DriveError(f"{args.restore}: it has no {module}; it has {', '.join(by_module)}")
+        mine = robot.module_named(module).serial_number.upper() if module in MODULES else ""
+        other = by_module[module].serial_number.upper()
+        if mine != other:
+            raise DriveError(
+                f"{args.restore}: {module} is ODrive {other} there and {mine or 'unnamed'} in the "
+                "robot file; a backup is for the board that it was made of"
+            )
+    return modules
+
+
+def refuse_services(robot: RobotConfig, run_dir: Path, modules: Sequence[str]) -> None:
+    """Refuse to write where a joint service has one of the drives.
+
+    Raises:
+        FleetError: naming it, and what to do.
+    """
+    for service in joint_services(services_up(robot, run_dir)):
+        if service in modules:
+            raise FleetError(
+                f"the joint service of {service} is up in {run_dir}: saving settings restarts the "
+                "board under it. Hang the robot; `xrl down` first"
+            )
+    for module in modules:
+        other = bench.service_on(robot, module, run_dir)
+        if other is not None:
+            raise FleetError(
+                f"a joint service has the drive of {module}, in {other.run.path}; hang the robot; "
+                f"`xrl down --run-dir {other.run.path}` first"
+            )
+
+
+def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) -> dict[str, Board]:
+    """Return the boards by module, every one of them.
+
+    Raises:
+        DriveError: one is not there, or has a firmware whose settings are not known here.
+    """
+    boards = {}
+    for module in modules:
+        serial = robot.module_named(module).serial_number.upper()
+        board = found.boards.get(serial)
+        if board is None:
+            there = f"; plugged in and in no [[module]]: {', '.join(found.strangers)}"
+            raise DriveError(
+                f"{module}: {serial or 'no serial_number in its [[module]]'}: "
+                f"{found.troubles.get(serial, 'not known')}{there if found.strangers else ''}. "
+                "Settings are written over USB; `xrl doctor` says what is missing"
+            )
+        if not is_known(board.firmware):
+            raise DriveError(
+                f"{module}: firmware {describe_firmware(board.firmware)}; these settings are those "
+                f"of {describe_firmware(FIRMWARE)}"
+            )
+        boards[module] = board
+    return boards
+
+
+def differences(
+    robot: RobotConfig, boards: Mapping[str, Board], saved: backup.Backup | None
+) -> list[SettingChange]:
+    """Return everything that is to be changed, module by module.
+
+    Raises:
+        DriveError: a board does not answer, or has another firmware than its backup.
+    """
+    rows: list[SettingChange] = []
+    kept = {board.module: board for board in saved.boards} if saved else {}
+    for module, board in boards.items():
+        if saved is None:
+            wanted = drive_settings.of_module(robot, module)
+            rows += changes.against_wanted(module, wanted, board)
+            continue
+        firmware = describe_firmware(board.firmware)
+        if firmware != kept[module].firmware:
+            raise DriveError(
+                f"{module}: the backup is of firmware {kept[module].firmware}, the board has "
+                f"{firmware}: settings may mean something else there"
+            )
+        rows += changes.against_backup(module, backup.settings_of(kept[module]), board)
+    return rows
+
+
+def keep(folder: Path, boards: Mapping[str, Board], robot_file: Path) -> Path:
+    """Write all settings of the boards into a new file and return its path.
+
+    Raises:
+        DriveError: it cannot be written, or a board does not answer.
+    """
+    path = folder / time.strftime("%Y%m%d-%H%M%S.json")
+    rows = [
+        backup.of_board(
+            module,
+            board.serial_number,
+            describe_firmware(board.firmware),
+            board.read(board.settings),
+        )
+        for module, board in boards.items()
+    ]
+    backup.write(path, rows, time=time.strftime("%Y-%m-%dT%H:%M:%S%z"), robot_file=str(robot_file))
+    return path
+
+
+def apply(
+    console: Console,
+    boards: Mapping[str, Board],
+    difference: Sequence[SettingChange],
+    interrupts: Interrupts,
+) -> list[ChangeResult]:
+    """Write, save and read back, board after board; one that fails does not stop the others.
+
+    A board that was begun is finished before an interrupt is heeded: half of its settings would be
+    in force and none saved.
+    """
+    outcomes: list[ChangeResult] = []
+    for module, board in boards.items():
+        mine = [change for change in difference if change.module == module]
+        if interrupts.number or not mine:
+            continue
+        try:
+            with console.status(f"{module}: writing, saving, restarting"):
+                outcomes += changes.apply(board, mine)
+        except DriveError as error:
+            console.print(f"[bold red]{module}[/]: {escape(str(error))}")
+            outcomes += [ChangeResult(change, None, good=False) for change in mine]
+    return outcomes
+
+
+def conclude(
+    console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResult], *, emulated: bool
+) -> int:
+    """Say what came of it and return the exit code."""
+    bad = [outcome for outcome in outcomes if not outcome.good]
+    for change, now, _ in bad:
+        what = change.obstacle or f"it is {changes.describe(now)} after the restart"
+        console.print(f"[bold red]not as wanted[/]: {change.module} {change.name}: {escape(what)}")
+    done = len(outcomes) - len(bad)
+    console.print(f"{done} settings written, saved, and read back after the restart")
+    if done and robot.drive.zero_mark_turns > 0.0:
+        written = (outcome.change for outcome in outcomes if not outcome.change.obstacle)
+        restarted = dict.fromkeys(change.module for change in written)
+        console.print(f"restarted, and so without a zero: {', '.join(restarted)}; `xrl zero`")
+    if emulated and is_simulated(robot):
+        console.print(bench.GONE)
+    return 1 if bad else 0

@@ -1,0 +1,225 @@
+"""`xrl crashtest`: one thing after the other dies on the live fleet, and the robot is judged."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import time
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from services.recorder import provenance
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.process import CHECKOUT
+from tools.fleet import procfs
+from tools.runs import experiment
+from tools.runs.scenario_runner import LiveSnapshot
+from tools.studies.crash import report
+from tools.studies.crash.cases import CASES, CrashCase, CrashVerdict
+from tools.studies.crash.report import JUNIT, RESULTS, Result
+from tools.studies.crash.runner import run_case
+from tools.verb_table import Subparsers, add_config, add_verb
+
+EXIT_FELL: Final = 1
+EXIT_UNJUDGED: Final = 2
+CASE_S: Final = 14.0
+"""What a case takes, s, until some have told."""
+UNJUDGED_MAX: Final = 3
+"""So many cases in a row that cannot be judged: what is wrong is not the robot."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "crashtest",
+        """
+        xrl crashtest --quick
+        xrl crashtest --out out/matrix
+        xrl crashtest --only kill-knee_left
+        xrl crashtest --only 'pair-*' --only 'disarmed-*'
+        xrl crashtest --list
+        """,
+    )
+    add_config(parser)
+    parser.add_argument(
+        "--quick", action="store_true", help="one case of each kind, in 5 minutes or less"
+    )
+    parser.add_argument(
+        "--only",
+        action="append",
+        metavar="NAME",
+        help="this case alone, or those that fit a pattern such as 'kill-*'; may be repeated",
+    )
+    parser.add_argument("--list", action="store_true", help="print the cases and run none")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help=f"where {RESULTS}, {JUNIT} and a folder for each case go (default: "
+        "out/crashtest-<time>); a case that did not stand keeps its run.mcap",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the matrix; 0 only if no case came out worse than it has to."""
+    console = Console()
+    cases = select(CASES, quick=args.quick, only=args.only)
+    if args.list:
+        report.list_cases(cases, console)
+        return 0
+    robot = experiment.load_robot(args.config)
+    out = _make_out(args.out)
+    for other in procfs.fleets():
+        console.print(f"[yellow]another fleet runs in {other}: two do not fit on two cores[/]")
+    console.print(
+        f"{len(cases)} cases, loop {robot.joint_service.loop!r}, about "
+        f"{_minutes(len(cases) * CASE_S)}; each with a fleet of its own",
+        style="dim",
+        highlight=False,
+    )
+    results: list[Result] = []
+    try:
+        _run_all(cases, robot, args.seed, out, results, console)
+    except (KeyboardInterrupt, SystemExit, RunError):
+        if results:
+            report.show(results, console)
+        console.print(f"stopped; {len(results)} of {len(cases)} cases are in {out}/{RESULTS}")
+        raise
+    report.show(results, console)
+    console.print(f"{out}/{RESULTS}, {JUNIT}", style="dim", highlight=False, soft_wrap=True)
+    return exit_code(results)
+
+
+def select(
+    cases: Sequence[CrashCase], *, quick: bool, only: Sequence[str] | None
+) -> list[CrashCase]:
+    """Return the cases that are asked for, in their order.
+
+    Args:
+        cases: the matrix.
+        quick: those of the short run only.
+        only: names or patterns; None for all.
+
+    Raises:
+        RunError: a name fits no case.
+    """
+    for name in only or ():
+        if not any(fnmatchcase(case.name, name) for case in cases):
+            near = difflib.get_close_matches(name, [case.name for case in cases], n=3, cutoff=0.4)
+            hint = f"perhaps {', '.join(near)}; " if near else ""
+            raise RunError(f"--only {name}: no such case; {hint}`xrl crashtest --list` has all")
+    return [
+        case
+        for case in cases
+        if (case.quick or not quick)
+        and (only is None or any(fnmatchcase(case.name, name) for name in only))
+    ]
+
+
+def exit_code(results: Sequence[Result]) -> int:
+    """Return 0, 1 if a case came out worse than it has to, 2 if one could not be judged."""
+    bad = {result.outcome.verdict for result in results if not result.good}
+    if bad - {CrashVerdict.UNJUDGED}:
+        return EXIT_FELL
+    return EXIT_UNJUDGED if bad else 0
+
+
+def _run_all(
+    cases: Sequence[CrashCase],
+    robot: RobotConfig,
+    seed: int,
+    out: Path,
+    results: list[Result],
+    console: Console,
+) -> None:
+    """Run the cases, each written as it is done.
+
+    Raises:
+        RunError: no fleet can be run here.
+    """
+    about = _about(robot)
+    with _bar(console) as bar:
+        shown = bar.add_task("", total=len(cases), case="", left="", now="")
+        for number, case in enumerate(cases):
+            left = _minutes(_left_s(results, len(cases) - number))
+            bar.update(shown, case=case.name, left=left, now="starting")
+            view = _View(bar, shown)
+            outcome = run_case(case, robot, out / case.name, view.show, seed=seed)
+            results.append(Result(case, outcome))
+            report.write(results, out, about, planned=len(cases))
+            bar.update(shown, advance=1)
+            left = _minutes(_left_s(results, len(cases) - number - 1))
+            place = f"[dim]{number + 1}/{len(cases)}, {left} left[/]"
+            bar.console.print(report.line_of(results[-1]), place, highlight=False, soft_wrap=True)
+            last = results[-UNJUDGED_MAX:]
+            if len(last) == UNJUDGED_MAX and all(_is_unjudged(result) for result in last):
+                reason = outcome.remarks[0]
+                raise RunError(f"{UNJUDGED_MAX} cases in a row cannot be judged: {reason}")
+
+
+def _is_unjudged(result: Result) -> bool:
+    return result.outcome.verdict is CrashVerdict.UNJUDGED
+
+
+class _View:
+    """Shows a run in the progress line."""
+
+    def __init__(self, bar: Progress, task: TaskID) -> None:
+        self._bar, self._task = bar, task
+
+    def show(self, snapshot: LiveSnapshot) -> None:
+        """Show the run as it is now."""
+        if snapshot.truth is not None:
+            now_s, modes = max(0.0, snapshot.truth.scenario_s), "".join(snapshot.modes)
+            height = snapshot.truth.torso[2]
+            self._bar.update(self._task, now=f"{now_s:4.1f} s {height:.2f} m {modes}")
+
+
+def _left_s(results: Sequence[Result], cases: int) -> float:
+    """Return how long so many cases take, by those that are done, s."""
+    done = [result.outcome.wall_s for result in results]
+    return cases * (sum(done) / len(done) if done else CASE_S)
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 90.0 else f"{seconds:.0f} s"
+
+
+def _about(robot: RobotConfig) -> dict[str, str]:
+    """Return what the results were made from."""
+    run = {
+        "robot": robot.name,
+        "loop": robot.joint_service.loop,
+        "driver": robot.joint_service.driver,
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    return run | provenance.code(CHECKOUT) | provenance.machine()
+
+
+def _make_out(out: Path | None) -> Path:
+    """Make the folder of the results.
+
+    Raises:
+        RunError: it cannot be made, or holds results already.
+    """
+    if out is not None and (out / RESULTS).exists():
+        raise RunError(f"{out}: holds results already; choose another --out, or remove it")
+    return experiment.make_out(out, "crashtest")
+
+
+def _bar(console: Console) -> Progress:
+    return Progress(
+        BarColumn(bar_width=20),
+        TextColumn("{task.completed}/{task.total}  {task.fields[left]} left"),
+        TextColumn("{task.fields[case]}  {task.fields[now]}"),
+        console=console,
+        transient=True,
+    )

@@ -1,0 +1,33 @@
+"""`xrl down`: stop the fleet and leave nothing behind."""
+
+from __future__ import annotations
+
+import argparse
+
+from tools.fleet.supervise import SupervisedFleet
+from tools.verb_table import Subparsers, add_run_dir, add_verb
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "down",
+        """
+        xrl down
+        xrl down --run-dir /tmp/bench
+        """,
+    )
+    add_run_dir(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Stop every service, also of a fleet whose supervisor is dead; keep the logs."""
+    fleet = SupervisedFleet(args.run_dir)
+    was_up = fleet.run.read_manifest() is not None
+    fleet.stop(keep_logs=True)
+    if was_up:
+        print(f"the fleet in {fleet.run.path} is down; its logs stay in {fleet.run.logs}")
+    else:
+        print(f"no fleet was up in {fleet.run.path}")
+    return 0

@@ -1,0 +1,315 @@
+"""`xrl explain`: one tick of the law laid open, from a run's log or for a pose."""
+
+from __future__ import annotations
+
+import argparse
+import bisect
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from services.planner.certificate import Weakest
+from services.planner.inverse_kinematics import InverseKinematics
+from services.planner.inverse_kinematics import describe as in_words_of_reach
+from services.planner.kinematics import Kinematics
+from services.planner.push_limit import PushLimits
+from services.planner.torque_breakdown import TorqueBreakdown, torque_breakdown
+from shared.bus import topics
+from shared.bus.messages import JointCommand, JointState, PlannerMode, PlannerStatus, SplitSource
+from shared.clock import NS_PER_MS
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.robot import gain_schedule
+from shared.robot.joints import JOINTS, MODULES, N_JOINTS
+from shared.robot.robot_model import stand_pose
+from tools.runs import snapshot_text, verdict
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog, read_run
+from tools.verb_table import RUN_HELP, Subparsers, add_config, add_verb
+
+Array = NDArray[np.float64]
+
+AWAY_S = 0.1
+"""A tick so long before the time that was asked for is not what the robot did then."""
+DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
+SPLIT_IN_WORDS = {
+    SplitSource.DIAGONAL: "diag(K_q)",
+    SplitSource.SCHEDULE: "certified schedule",
+    SplitSource.STIFFENED: "stiffened: what was wanted does not meet the certificate",
+    SplitSource.UNCERTIFIED: "none meets the certificate: hold",
+}
+
+
+class Tick(NamedTuple):
+    """A tick as it stands in the log."""
+
+    status: PlannerStatus
+    commands: list[JointCommand]
+    states: list[JointState]
+    """The states the tick was made from."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "explain",
+        """
+        xrl explain out/a/run.mcap --at 2.5
+        xrl explain --q 0,0.139,0,-1.015,0,0.876,0,0.139,0,-1.015,0,0.876
+        xrl explain --q stand.txt --assist 200 --config lab.toml
+        xrl explain --p 0,0,0.75,0,0.6,0
+        """,
+    )
+    parser.add_argument("log", nargs="?", type=Path, metavar="RUN", help=RUN_HELP)
+    parser.add_argument("--at", type=float, metavar="T", help="scenario time, s (default: the end)")
+    parser.add_argument(
+        "--q",
+        metavar="ANGLES|FILE",
+        help=f"explain a robot at rest at twelve joint angles in rad, separated by commas: "
+        f"{', '.join(JOINTS[:4])}, ...; or a file that holds them",
+    )
+    parser.add_argument(
+        "--p",
+        metavar="POSE",
+        help="explain a robot at rest at p: COM x, y, z in m and torso roll, pitch, yaw in rad, "
+        "separated by commas; write --p=-0.01,... if it begins with a minus",
+    )
+    parser.add_argument(
+        "--assist", type=float, default=0.0, metavar="N", help="with --q and --p (0 N)"
+    )
+    add_config(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the account of one tick."""
+    console = Console()
+    if sum(given is not None for given in (args.log, args.q, args.p)) != 1:
+        raise RunError("give a run's log, --q ANGLES or --p POSE; one of them")
+    if args.log is None:
+        robot = config_file.load(args.config)
+        gain_schedule.require(robot, args.config)
+        q = at_pose(robot, args.p) if args.q is None else parse("--q", args.q, N_JOINTS)
+        still = np.zeros(N_JOINTS)
+        show(robot, torque_breakdown(robot, q, still, q, still, args.assist), console)
+        return 0
+    log = read_run(args.log)
+    robot = robot_of(log)
+    tick = tick_at(log, args.at)
+    _introduce(log, tick, args.at, console)
+    q, v = (_joined(tick.states, name) for name in ("q", "v"))
+    q_ref, v_ref = (_joined(tick.commands, name) for name in ("q_ref", "v_ref"))
+    found = torque_breakdown(
+        robot, q, v, q_ref, v_ref, tick.status.assist_n, tick.status.slope, tick.status.stance
+    )
+    found = found._replace(eased=_joined(tick.commands, "tau_coupled") - found.coupled)
+    show(robot, found, console)
+    sent = _joined(tick.commands, "tau_ff")
+    console.print(
+        f"sent and recomputed: margins {tick.status.margin:.2f} and "
+        f"{found.local.margins.service:.2f}, feedforward within "
+        f"{np.abs(sent - found.gravity - found.assist).max():.2g} N m",
+        style="dim",
+    )
+    return 0
+
+
+def parse(flag: str, text: str, count: int) -> Array:
+    """Read so many numbers from a text, or from the file that it names.
+
+    Raises:
+        RunError: it is something else.
+    """
+    path = Path(text)
+    try:
+        content = path.read_text(encoding="utf-8") if path.is_file() else text
+        numbers = [float(part) for part in content.replace(",", " ").split()]
+    except (OSError, ValueError):
+        raise RunError(f"{flag} {text!r}: write {count} numbers, or a file of them") from None
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise RunError(f"{flag}: {len(numbers)} numbers; {count} finite ones are right")
+    return np.array(numbers)
+
+
+def at_pose(robot: RobotConfig, text: str) -> Array:
+    """Return joint angles (12,), rad, at a pose p written as a text.
+
+    Raises:
+        RunError: it is no pose, or one that the robot cannot reach; says why.
+    """
+    p_ref = parse("--p", text, 6)
+    limits = np.array(robot.joint_limits())
+    ik = InverseKinematics(Kinematics(robot), limits)
+    ik.q[:] = stand_pose(robot, robot.simulation.stand_height)
+    reach = ik.solve_from_anywhere(p_ref)
+    if not reach.converged:
+        raise RunError(in_words_of_reach(reach, p_ref, limits))
+    return ik.q
+
+
+def tick_at(log: RunLog, at_s: float | None) -> Tick:
+    """Return the planner's last tick at or before a scenario time; by default the last.
+
+    Raises:
+        RunError: the planner did not tick there, or the log lacks what it was made from.
+    """
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    led = [row for row in statuses if row.mode != PlannerMode.WAITING]
+    if not led:
+        raise RunError(f"{log.path}: the planner never ticked with all six states")
+    index = len(led) - 1
+    if at_s is not None:
+        zero_ns = verdict.course(log).zero_ns
+        at_ns = zero_ns + round(at_s * 1e9)
+        index = bisect.bisect_right([row.t_ns for row in led], at_ns) - 1
+        first, last = ((row.t_ns - zero_ns) / 1e9 for row in (led[0], led[-1]))
+        if index < 0 or at_s > last + 1.0:
+            raise RunError(
+                f"--at {at_s:g}: the planner ticks in this log from {first:.2f} to {last:.2f} s"
+            )
+    status = led[index]
+    commands, states = [], []
+    for number, module in enumerate(MODULES):
+        command = _find(log.messages(topics.JOINT_COMMAND, module), status.seq, status.session)
+        state = _find(log.messages(topics.JOINT_STATE, module), status.state_seq[number])
+        if command is None or state is None:
+            raise RunError(f"{log.path}: {module}: tick {status.seq} is not whole in the log")
+        commands.append(command)
+        states.append(state)
+    return Tick(status, commands, states)
+
+
+def _find(messages: list[Any], seq: int, session: int | None = None) -> Any:
+    """Return the newest message with a sequence number, or None."""
+    for message in reversed(messages):
+        if message.seq == seq and (session is None or message.session == session):
+            return message
+    return None
+
+
+def _joined(messages: list[Any], name: str) -> Array:
+    return np.array([getattr(message, name) for message in messages], dtype=float).ravel()
+
+
+def _introduce(log: RunLog, tick: Tick, at_s: float | None, console: Console) -> None:
+    status = tick.status
+    course = verdict.course(log)
+    ages = max(status.state_age_ns) / NS_PER_MS
+    console.print(
+        f"[bold]tick {status.seq}[/] at {(status.t_ns - course.zero_ns) / 1e9:.3f} s: planner "
+        f"{PlannerMode(status.mode).name}{' with hold' if status.hold else ''}, states up to "
+        f"{ages:.1f} ms old, assist {status.assist_n:.1f} N, IK {status.ik_iterations} steps, "
+        f"residual {status.ik_residual:.1e}"
+    )
+    words = snapshot_text.describe_modules(tick.states)
+    console.print(f"modules, and how old their commands were: {words}", style="dim")
+    at_ns = status.t_ns if at_s is None else course.zero_ns + round(at_s * 1e9)
+    late_s = (at_ns - status.t_ns) / 1e9
+    if late_s > AWAY_S:
+        words = snapshot_text.describe_modules(snapshot_text.states_at(log, at_ns))
+        console.print(
+            f"[yellow]at {at_s:g} s the planner did not tick: its last, {late_s:.2f} s before, "
+            f"is shown. The modules at {at_s:g} s: {words}[/]"
+        )
+    network = snapshot_text.describe_network(log, at_ns, course.zero_ns)
+    if network:
+        console.print(f"network: {network}", style="yellow", markup=False, highlight=False)
+
+
+def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
+    """Print an account."""
+    poses = _table("Body", DIRECTIONS)
+    for row, values, digits in (
+        ("p: m, rad", found.p, 4), ("p_ref: m, rad", found.p_ref, 4),
+        ("pdot: m/s, rad/s", found.pdot, 4), ("F: N, N m", found.F, 1),
+    ):  # fmt: skip
+        poses.add_row(row, *_numbers(values, digits))
+    S = ("led" if s else "held" for s in robot.law.S)
+    poses.add_row("S", *S)
+    console.print(poses)
+    console.print(f"J's singular values: {', '.join(_numbers(found.singular_values, 3))}")
+    eigenvalues = np.linalg.eigvalsh(found.K_q)
+    console.print(f"K_q's eigenvalues: {eigenvalues[0]:.0f} .. {eigenvalues[-1]:.0f} N m/rad")
+    console.print()
+    console.print(_gains(found))
+    console.print(
+        "The drive gets torques only; what its own loop would hold with is D averaged over "
+        "each module.",
+        style="dim",
+    )
+    console.print(f"local gains: {SPLIT_IN_WORDS[found.local.source]}")
+    for who, weakest in (
+        ("joint services alone", found.weakest), ("drives alone", found.weakest_onboard),
+    ):  # fmt: skip
+        console.print(f"margin, {who}: {describe(weakest)}")
+    for name, limits in found.pushes.items():
+        console.print(f"push {name}: {describe_limits(limits)}", highlight=False, soft_wrap=True)
+    console.print()
+    console.print(_torques(found))
+
+
+def describe(weakest: Weakest) -> str:
+    """Return for example "0.24; weakest: lean forward, 71 N/m of 300"."""
+    parts = ", ".join(
+        f"{name} {value:.2f}"
+        for name, value in zip(DIRECTIONS, weakest.p / np.abs(weakest.p).max(), strict=True)
+        if abs(value) > 0.05 * np.abs(weakest.p).max()
+    )
+    outcome = "" if weakest.margin > 0.0 else ": [red]falls[/]"
+    return (
+        f"{weakest.margin:.2f}{outcome}; weakest: {weakest.direction}, "
+        f"{weakest.stiffness:.0f} {weakest.unit} of {weakest.required:.0f} "
+        f"(as a motion in m and rad: {parts})"
+    )
+
+
+def describe_limits(limits: PushLimits) -> str:
+    """Return for example "led 72 N (left sole's toe), planner dead 56 N (...), ..."."""
+    who = ("led", "planner dead", "drives alone", "soles and motors bear")
+    return ", ".join(
+        f"{name} {limit.force_n:.0f} N ({limit.part})"
+        for name, limit in zip(who, limits, strict=True)
+    )
+
+
+def _gains(found: TorqueBreakdown) -> Table:
+    table = _table(
+        "Gains, N m/rad and N m s/rad",
+        ("K_q", "D: service", "B_q", "D_B: service"),
+    )
+    K_q, B_q, local = found.K_q.diagonal(), found.B_q.diagonal(), found.local
+    for index, joint in enumerate(JOINTS):
+        stiffness = np.array((K_q[index], local.D[index]))
+        damping = np.array((B_q[index], local.D_B[index]))
+        table.add_row(joint, *_numbers(stiffness, 0), *_numbers(damping, 1))
+    return table
+
+
+def _torques(found: TorqueBreakdown) -> Table:
+    table = _table(
+        "Torques by origin, N m",
+        ("gravity", "assist", "local PD", "coupled", "low-pass", "total"),
+    )
+    rows = (found.gravity, found.assist, found.local_pd, found.coupled, found.eased, found.total)
+    for joint, torques in zip(JOINTS, np.array(rows).T, strict=True):
+        table.add_row(joint, *_numbers(torques, 2))
+    return table
+
+
+def _table(title: str, columns: tuple[str, ...]) -> Table:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("", no_wrap=True)
+    for column in columns:
+        table.add_column(column, justify="right", no_wrap=True)
+    return table
+
+
+def _numbers(values: Array, digits: int) -> list[str]:
+    """Return numbers with so many digits, none of them -0."""
+    return [f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0]

@@ -1,0 +1,132 @@
+"""`xrl export`: a run for other viewers: with a 3-D scene in it, and a layout for Foxglove."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+
+from services.recorder.files import SUFFIX
+from services.recorder.scene import extended
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.process import DEFAULT_CONFIG
+from tools.analysis.reports import scene
+from tools.output import write_atomically
+from tools.runs.moving_picture import write_gif
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog, read_run
+from tools.verb_table import Subparsers, add_verb
+
+SCENE_SUFFIX: Final = ".scene" + SUFFIX
+LAYOUT: Final = DEFAULT_CONFIG.parent / "foxglove" / "xrl.json"
+"""For a robot of this name; `--layout` writes it for the name in the log."""
+LAYOUT_ROBOT: Final = "xrl"
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "export",
+        """
+        xrl export out/a/run.mcap --scene
+        xrl export out/a/run.mcap --scene -o shown.mcap --layout layout.json
+        xrl export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
+        """,
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="a run's record; it is not touched")
+    parser.add_argument(
+        "--scene",
+        action="store_true",
+        help="copy it with frames, bodies and forces at 30 Hz, for the 3-D views of Foxglove "
+        "(all of it) and Rerun (frames and bodies)",
+    )
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        metavar="OUT",
+        help="where the copy goes (default: NAME.scene.mcap beside the record)",
+    )
+    parser.add_argument(
+        "--layout",
+        type=Path,
+        metavar="FILE",
+        help="also write Foxglove's layout for this robot's name (deploy/foxglove/xrl.json "
+        "is the one for `xrl`)",
+    )
+    parser.add_argument(
+        "--gif",
+        type=Path,
+        metavar="FILE",
+        help="also draw the robot from the side and the front, as an animated picture",
+    )
+    parser.add_argument("--force", action="store_true", help="replace what exists")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write what was asked for."""
+    if not args.scene and args.layout is None and args.gif is None:
+        raise RunError("say what to write: --scene, --layout FILE, --gif FILE, or several of them")
+    path: Path = args.file
+    if path.is_dir():
+        raise RunError(f"{path}: is a directory; give one of its files")
+    log = read_run(path)
+    console = Console()
+    if args.scene:
+        out: Path = args.out or path.with_name(path.name.removesuffix(SUFFIX) + SCENE_SUFFIX)
+        _free(out, path, force=args.force)
+        count = export_scene(log, robot_of(log), out)
+        console.print(f"[bold]{escape(str(out))}[/]: {count} messages", soft_wrap=True)
+    if args.gif is not None:
+        _free(args.gif, path, force=args.force)
+        _draw(log, args.gif, console)
+    if args.layout is not None:
+        _free(args.layout, path, force=args.force)
+        write_atomically(args.layout, json.dumps(layout_for(log.robot), indent=2).encode() + b"\n")
+        console.print(f"[bold]{escape(str(args.layout))}[/]: import it in Foxglove")
+    return 0
+
+
+def _draw(log: RunLog, out: Path, console: Console) -> None:
+    """Draw the run's moving picture, with progress."""
+    with Progress(console=console, transient=True) as shown:
+        bar = shown.add_task("drawing", total=1.0)
+        count = write_gif(log, robot_of(log), out, lambda part: shown.update(bar, completed=part))
+    console.print(f"[bold]{escape(str(out))}[/]: {count} frames", soft_wrap=True)
+
+
+def export_scene(log: RunLog, robot: RobotConfig, out: Path) -> int:
+    """Write a copy of a log with its scene; return how many messages it has.
+
+    Raises:
+        RunError: the log cannot be copied or lacks states, or the copy cannot be written.
+    """
+    return extended(log.path, out, scene.channels(log.robot), scene.messages(log, robot))
+
+
+def layout_for(robot: str) -> dict[str, Any]:
+    """Return Foxglove's layout for a robot of some name.
+
+    Raises:
+        RunError: it is not where this project has it.
+    """
+    try:
+        text = LAYOUT.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"{LAYOUT}: cannot be read: {error.strerror}") from None
+    found: dict[str, Any] = json.loads(text.replace(f"xrl/{LAYOUT_ROBOT}/", f"xrl/{robot}/"))
+    return found
+
+
+def _free(out: Path, source: Path, *, force: bool) -> None:
+    if out.exists() and source.exists() and out.samefile(source):
+        raise RunError(f"{out}: is the record itself, which stays as it is; give another name")
+    if out.exists() and not force:
+        raise RunError(f"{out}: exists already; remove it, give another name, or --force")

@@ -1,0 +1,206 @@
+"""`xrl gains`: compute the certified gain schedule of a robot, or say whether it fits."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+import msgspec
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from services.planner.push_limit import DIRECTIONS, slope_pulling
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import ConfigError
+from shared.robot import gain_schedule
+from shared.robot.gain_table import GainSchedule
+from tools.verb_table import Subparsers, add_config, add_verb
+
+ROOM_EVERY = 5
+"""Every n-th pose gets its printed margins."""
+RIGID_FROM = 1e6
+"""N m/rad"""
+PUSH_HEIGHTS = 4
+SHOWN = 6
+"""Heights in the printed table."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "gains",
+        """
+        xrl gains
+        xrl gains --config lab.toml
+        xrl gains --config lab.toml --damping-of deploy/robot.gains.json
+        xrl gains --picture damping.png
+        xrl gains --check
+        """,
+    )
+    add_config(parser)
+    parser.add_argument(
+        "--damping-of",
+        type=Path,
+        metavar="FILE",
+        help="take damping and coupling from another schedule, such as deploy/robot.gains.json, "
+        "and hold them to the dynamic certificate; without it they are searched for (two minutes)",
+    )
+    parser.add_argument(
+        "--picture",
+        type=Path,
+        metavar="FILE.png",
+        help="draw how each motion decays, over the drivetrain's stiffness",
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="only say whether the schedule fits the robot"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the schedule beside the robot file; with --check 1 if it would have to be."""
+    path = gain_schedule.path_beside(args.config)
+    console = Console()
+    if args.check:
+        stale = gain_schedule.why_stale(config_file.load(args.config))
+        console.print(f"{path}: {stale or 'fits the robot'}", soft_wrap=True)
+        return 1 if stale else 0
+    robot = config_file.load_without_schedule(args.config)
+    schedule = compute(robot, console, args.damping_of)
+    gain_schedule.write(path, schedule)
+    _show(robot, schedule, console)
+    if args.picture is not None:
+        draw_damping(robot, schedule, args.picture)
+        console.print(f"drawn to {args.picture}", style="dim", soft_wrap=True)
+    console.print(f"written to {path}", style="dim", soft_wrap=True)
+    return 0
+
+
+def compute(robot: RobotConfig, console: Console, damping_of: Path | None = None) -> GainSchedule:
+    """Solve the schedule with a progress bar.
+
+    Args:
+        robot: the robot.
+        console: to print on.
+        damping_of: schedule to take damping and coupling from; None: they are searched for.
+
+    Raises:
+        RunError: no local gains meet the certificate somewhere.
+    """
+    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
+
+    design = None
+    if damping_of is not None:
+        other = gain_schedule.read(damping_of)
+        if other is None:
+            raise ConfigError(str(damping_of), "(file)", "not found", "a schedule by `xrl gains`")
+        design = split_program.design_of(other)
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
+        console=console, transient=True,
+    )  # fmt: skip
+    with bar as progress:
+        task = progress.add_task("poses of the gain schedule", total=None)
+        search = progress.add_task("", total=None, visible=False)
+        return split_program.solve(
+            robot,
+            lambda done, total: progress.update(task, completed=done, total=total),
+            lambda text: progress.update(search, description=text, visible=True),
+            design,
+        )
+
+
+def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
+    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
+
+    table = Table(title="Local stiffness D of each leg, torso upright, N m/rad")
+    table.add_column("COM m", justify="right")
+    for kind in ("ankle", "knee", "hip"):
+        for axis in ("phi", "theta"):
+            table.add_column(f"{kind}\n{axis}", justify="right")
+    upright = min(range(len(schedule.pitch)), key=lambda j: abs(schedule.pitch[j]))
+    step = (len(schedule.z) - 1) / (SHOWN - 1)
+    for i in (round(n * step) for n in range(SHOWN)):
+        row = schedule.D[i][upright]
+        table.add_row(f"{schedule.z[i]:.3f}", *(f"{value:.0f}" for value in row))
+    console.print(table)
+    _show_damping(robot, schedule, console)
+    _show_pushes(robot, schedule, console)
+    margins = split_program.smallest_margins(robot, schedule)
+    console.print(
+        f"smallest margin, nodes and half way between: {margins.service:.2f} of what is "
+        f"required with the joint services alone, {margins.onboard:.2f} with the drives alone"
+    )
+
+
+def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
+    """Print how hard a constant push each tier holds, upright."""
+    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
+
+    table = Table(title="Hardest constant push, N: led / planner dead / drives alone / body")
+    table.add_column("COM m", justify="right")
+    for name in DIRECTIONS:
+        table.add_column(name, justify="right", no_wrap=True)
+    parts = list[str]()
+    least = dict.fromkeys(DIRECTIONS, math.inf)
+    ready = msgspec.structs.replace(robot, gain_schedule=schedule)
+    for z, limits in split_program.push_limits(ready, PUSH_HEIGHTS):
+        cells = [" / ".join(f"{limit.force_n:.0f}" for limit in row) for row in limits.values()]
+        table.add_row(f"{z:.3f}", *cells)
+        parts += [row.held.part for row in limits.values()]
+        for name, row in limits.items():
+            least[name] = min(least[name], row.held.force_n, row.led.force_n)
+    console.print(table)
+    first = ", ".join(dict.fromkeys(parts))
+    console.print(f"gives way first, with the planner dead: {first}", style="dim")
+    slopes = ", ".join(
+        f"{math.degrees(slope_pulling(robot, force_n)):.1f} degrees {name}"
+        for name, force_n in least.items()
+    )
+    console.print(f"slope without an IMU, planner dead or led: {slopes}", style="dim")
+    console.print(
+        "body: what soles and motors bear at that pose, whatever the control", style="dim"
+    )
+
+
+def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
+    """Print what was chosen by the dynamic certificate, and what it leaves in hand."""
+    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
+    from services.planner.dynamic_certificate import DynamicCertificate  # noqa: PLC0415
+    from services.planner.stability_room import room_of  # noqa: PLC0415
+
+    D_B = ", ".join(f"{value:.1f}" for value in schedule.D_B)
+    console.print(
+        f"local damping of a leg, ankle to hip, phi and theta: {D_B} N m s/rad; tau_coupled: two "
+        f"poles at {schedule.coupling_bandwidth_hz:g} Hz, damping up to "
+        f"{schedule.coupling_damping:g} B_p"
+    )
+    nodes = split_program.dynamic_nodes(robot, schedule)[::ROOM_EVERY]
+    certificate, design = DynamicCertificate(robot, nodes), split_program.design_of(schedule)
+    table = Table(title="In hand before any motion grows (TRACK, HOLD, drives alone)")
+    for heading in ("drivetrain N m/rad", "all feedback", "tau_coupled", "delay ms"):
+        table.add_column(heading, justify="right")
+    for room in room_of(certificate, design):
+        name = "rigid" if room.stiffness >= RIGID_FROM else f"{room.stiffness:g}"
+        table.add_row(
+            name, _decibels(room.torque), _decibels(room.coupling), f">= {1e3 * room.delay_s:.0f}"
+        )
+    console.print(table)
+    fades = certificate.sway(design)
+    console.print(f"slowest oscillation while led fades with {-fades:.2f}/s")
+
+
+def draw_damping(robot: RobotConfig, schedule: GainSchedule, path: Path) -> None:
+    """Draw the eigenvalue paths of a schedule into a PNG file."""
+    from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
+    from tools.runs import damping_picture  # noqa: PLC0415 - and so does matplotlib
+
+    nodes = [node for node in split_program.dynamic_nodes(robot, schedule) if node.pitch == 0.0]
+    damping_picture.draw(robot, nodes, split_program.design_of(schedule), path)
+
+
+def _decibels(factor: float) -> str:
+    return "none" if factor == 0.0 else f">= {20.0 * math.log10(factor):.0f} dB"

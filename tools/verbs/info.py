@@ -1,0 +1,263 @@
+"""`xrl info`: what is in a log, finished or not."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from services.recorder.mcap_log import SCHEMA_VERSION
+from services.recorder.reader import LostBytes
+from services.recorder.recover import clock_time, describe_lost
+from shared.bus import topics
+from shared.clock import NS_PER_S
+from shared.exceptions import XrlError
+from tools.analysis.logs.files import files_of_run
+from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
+from tools.output import printable
+from tools.runs import verdict
+from tools.runs.impairment_intervals import impairments
+from tools.runs.run_log import RunLog, read_run
+from tools.verb_table import Subparsers, add_verb
+
+SLOW: Final = 0.9
+"""Fraction of a topic's nominal rate below which it is marked."""
+MIB: Final = 1 << 20
+INJECTED_MAX: Final = 12
+"""Impairments with a line of their own."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "info",
+        """
+        xrl info out/a/run.mcap
+        xrl info out/a/run.mcap --run
+        xrl info out/a/run.mcap --json | jq '.topics | map_values(.lost)'
+        """,
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="an MCAP file, finished or not")
+    parser.add_argument(
+        "--run",
+        dest="whole_run",
+        action="store_true",
+        help="all files of the run that it belongs to, counted together",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON, in SI units")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print it; 0 if the file can be read."""
+    survey = Survey()
+    first = survey.add(args.file)
+    run_files = files_of_run(args.file, first.metadata)
+    if args.whole_run and len(run_files) > 1:
+        survey = Survey()
+        for path in run_files:
+            survey.add(path)
+    if args.json:
+        print(json.dumps(as_json(survey, run_files), indent=2))
+    else:
+        show(survey, run_files, Console())
+    return 0
+
+
+def as_json(survey: Survey, run_files: list[Path]) -> dict[str, Any]:
+    """Return the survey as plain values: SI units, times in ns since 1970."""
+    about = survey.files[0].metadata.get("run", {})
+    return {
+        "files": [_file_as_json(file) for file in survey.files],
+        "run_files": [str(path) for path in run_files],
+        "robot": about.get("robot"),
+        "scenario": about.get("scenario"),
+        "git_commit": about.get("git_commit"),
+        "schema_version": about.get("schema_version"),
+        "start_ns": survey.first_ns if survey.messages else None,
+        "duration_s": _seconds(survey.first_ns, survey.last_ns) if survey.messages else None,
+        "messages": survey.messages,
+        "topics": {
+            name: {
+                "schema": topic.schema,
+                "count": topic.sequence.count,
+                "bytes": topic.bytes,
+                "rate_hz": topic.rate_hz,
+                "nominal_hz": topic.nominal_hz or None,
+                "longest_gap_s": topic.longest_gap_ns / NS_PER_S,
+                "lost": topic.sequence.missing,
+                "gaps": topic.sequence.gaps,
+                "restarts": topic.sequence.restarts,
+            }
+            for name, topic in sorted(survey.topics.items())
+        },
+    }
+
+
+def show(survey: Survey, run_files: list[Path], console: Console) -> None:
+    """Print the survey."""
+    for file in survey.files:
+        _show_file(file, console)
+    others = [path for path in run_files if path not in [file.path for file in survey.files]]
+    if others:
+        names = ", ".join(path.name for path in others)
+        console.print(f"further files of this run: {printable(names)} (--run counts all together)")
+    _show_run(survey, console)
+    heard = {name: topic for name, topic in survey.topics.items() if topic.sequence.count}
+    robot = survey.files[0].metadata.get("run", {}).get("robot", "")
+    if heard:
+        console.print()
+        console.print(_table(heard, f"xrl/{robot}/", events=survey.files[0].ours))
+    silent = len(survey.topics) - len(heard)
+    if silent:
+        console.print(f"{silent} more topics without a message", style="dim")
+
+
+def _show_file(file: FileFacts, console: Console) -> None:
+    state = "finished"
+    if not file.finished:
+        state = "[yellow]being written[/]" if file.in_use else "[yellow]not finished[/]"
+    size = f"{file.size / MIB:.2f} MiB" if file.size >= MIB else f"{file.size} bytes"
+    console.print(f"[bold]{printable(str(file.path))}[/]: {size}, {state}", soft_wrap=True)
+    if not file.finished or file.damage:
+        for line in describe_lost(file.cut, file.damage, finished=file.finished):
+            console.print(f"  {line}", style="yellow", soft_wrap=True)
+    if file.orphans:
+        console.print(f"  {file.orphans} messages of channels that are nowhere described")
+    flush_ms = file.metadata.get("recorder", {}).get("flush_ms", "")
+    if not file.finished and not file.in_use:
+        if flush_ms:
+            console.print(f"  written every {printable(flush_ms)} ms: all after that is missing")
+        command = f"xrl recover {printable(str(file.path))}"
+        console.print(f"  finish it with: {command}", soft_wrap=True)
+    elif file.damage:
+        command = f"xrl recover {printable(str(file.path))}"
+        console.print(f"  a copy without the damage: {command}", soft_wrap=True)
+    note = file.metadata.get("recovered")
+    if note is not None:
+        console.print(f"  recovered from {printable(note.get('from', '?'))}", style="dim")
+
+
+def _show_run(survey: Survey, console: Console) -> None:
+    file = survey.files[0]
+    about = file.metadata.get("run", {})
+    grid = Table.grid(padding=(0, 2))
+    if survey.messages:
+        duration = f"{_seconds(survey.first_ns, survey.last_ns):.2f} s"
+        grid.add_row("duration", f"{duration} from {clock_time(survey.first_ns)}")
+    grid.add_row("messages", str(survey.messages))
+    for label, name in (("robot", "robot"), ("scenario", "scenario"), ("lockstep", "lockstep")):
+        if about.get(name):
+            grid.add_row(label, printable(about[name]))
+    if about.get("git_commit"):
+        dirty = " with changes" if about.get("git_dirty") == "true" else ""
+        grid.add_row("git commit", printable(about["git_commit"]) + dirty)
+    split = file.metadata.get("split", {})
+    if split.get("snapshot"):
+        grid.add_row("snapshot", printable(split["snapshot"]))
+    if file.attachments:
+        sizes = ", ".join(f"{name} ({size} bytes)" for name, size in file.attachments.items())
+        grid.add_row("attachments", printable(sizes))
+    version = about.get("schema_version", "")
+    if not file.ours:
+        written = printable(f"profile {file.profile!r}, written by {file.library}")
+        grid.add_row("foreign", f"{written}: `xrl` reads no more of it than this")
+    elif version != SCHEMA_VERSION:
+        grid.add_row(
+            "version", f"{printable(version) or 'unknown'}; this code writes {SCHEMA_VERSION}"
+        )
+    for number, line in enumerate(_injected(survey)):
+        grid.add_row("" if number else "injected", printable(line))
+    console.print(grid)
+
+
+def _injected(survey: Survey) -> list[str]:
+    """Return a line for each impairment of the network, times as of the scenario if it began.
+
+    Files without one are not read again.
+    """
+    robot = survey.files[0].metadata.get("run", {}).get("robot", "")
+    topic = survey.topics.get(topics.LINK_EVENT.key(robot))
+    if topic is None or not topic.sequence.count or not survey.files[0].ours:
+        return []
+    try:
+        logs = [read_run(file.path) for file in survey.files]
+        events = [event for log in logs for event in log.messages(topics.LINK_EVENT)]
+        zero_ns, since = _zero(logs[0])
+    except XrlError as error:
+        return [str(error)]
+    lines = [f"{row.title}: {row.when(zero_ns)}; {row.counts()}" for row in impairments(events)]
+    more = len(lines) - INJECTED_MAX
+    if more > 0:
+        lines[INJECTED_MAX:] = [f"and {more} more"]
+    return [line + since for line in lines[:1]] + lines[1:]
+
+
+def _zero(log: RunLog) -> tuple[int, str]:
+    """Return the stamp that impairments are told from, and what it is if not the scenario's."""
+    try:
+        return verdict.course(log).zero_ns, ""
+    except XrlError:
+        return log.began_ns(), " (s since the log begins)"
+
+
+def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
+    """Return a row for each topic.
+
+    Args:
+        found: topics with at least one message each.
+        prefix: left out of their names.
+        events: a topic without a rate is one of events: its mean rate means nothing.
+    """
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("topic", overflow="fold")
+    for name in ("count", "Hz", "of Hz", "gap ms", "lost", "restarts"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, topic in sorted(found.items()):
+        rate, nominal = topic.rate_hz, topic.nominal_hz
+        slow = rate is not None and nominal > 0.0 and rate < SLOW * nominal
+        steady = rate is not None and (nominal > 0.0 or not events)
+        lost = topic.sequence.missing
+        table.add_row(
+            printable(name.removeprefix(prefix)),
+            str(topic.sequence.count),
+            Text(f"{rate:.1f}" if steady else "", style="yellow" if slow else ""),
+            f"{nominal:g}" if nominal else "",
+            f"{topic.longest_gap_ns * 1e-6:.1f}" if steady else "",
+            Text(str(lost), style="yellow" if lost else ""),
+            str(topic.sequence.restarts),
+        )
+    return table
+
+
+def _file_as_json(file: FileFacts) -> dict[str, Any]:
+    return {
+        "path": str(file.path),
+        "bytes": file.size,
+        "finished": file.finished,
+        "in_use": file.in_use,
+        "profile": file.profile,
+        "library": file.library,
+        "messages": file.messages,
+        "start_ns": file.first_ns if file.messages else None,
+        "end_ns": file.last_ns if file.messages else None,
+        "orphans": file.orphans,
+        "cut": _loss_as_json(file.cut),
+        "damage": [_loss_as_json(loss) for loss in file.damage],
+        "attachments": file.attachments,
+        "metadata": file.metadata,
+    }
+
+
+def _loss_as_json(loss: LostBytes | None) -> dict[str, int] | None:
+    return None if loss is None else loss._asdict()
+
+
+def _seconds(first_ns: int, last_ns: int) -> float:
+    return (last_ns - first_ns) / NS_PER_S

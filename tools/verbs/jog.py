@@ -1,0 +1,236 @@
+"""`xrl jog`: move one joint a little and back, on the bench, and judge it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Final
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from services.joint.__main__ import open_drive
+from services.joint.differential import joint_from_motor
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import DriveError, FleetError, XrlError
+from shared.robot.joints import AXES, MODULES
+from tools.bringup import bench, limits
+from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_words, jog_drive
+from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see
+from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+
+BY: Final = 0.05
+PERIOD_S: Final = 2.0
+CYCLES: Final = 2
+TORQUE_LIMIT: Final = 10.0
+EMULATED: Final = 40.0
+"""N m that bend a leg of the emulated robot, which hangs with its soles on the floor."""
+BY_MAX: Final = 0.5
+PERIOD_MIN_S: Final = 0.5
+CYCLES_MAX: Final = 100
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "jog",
+        """
+        xrl jog knee_left
+        xrl jog hip_right --axis phi --by -0.1 --period 4
+        xrl jog knee_left --torque-limit 30     # where its load needs more
+        """,
+    )
+    parser.add_argument("module", choices=MODULES, metavar="MODULE", help="which module")
+    parser.add_argument("--axis", choices=AXES, default="theta", help="default: %(default)s")
+    parser.add_argument(
+        "--by",
+        type=float,
+        default=BY,
+        metavar="RAD",
+        help="how far, and back; positive theta leans forward (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--period",
+        type=float,
+        default=PERIOD_S,
+        metavar="S",
+        help="time of one there and back (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--cycles", type=int, default=CYCLES, metavar="N", help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--torque-limit",
+        type=float,
+        default=TORQUE_LIMIT,
+        metavar="NM",
+        help="of both axes together at the joint; the drive's own current limit is set to it "
+        "(default: %(default)s)",
+    )
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    add_config(parser)
+    add_run_dir(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look, ask, move, idle, judge."""
+    console = Console()
+    plan = plan_of(args)
+    path = bench.robot_file(args)
+    module: str = args.module
+    robot = config_file.load_without_schedule(path)
+    limited = gentle(robot, plan)
+    refuse_service(robot, args)
+    interrupts = Interrupts()
+    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
+        if started:
+            console.print(f"its soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
+        outcome = look_ask_move(args, console, limited, plan, interrupts)
+        if outcome is None:
+            console.print("nothing was moved")
+            return 2
+        if outcome.is_idle:
+            _give_limits_back(robot, args, console)
+    code = report(outcome, module, plan, console)
+    if interrupts.number:
+        sys.exit(128 + interrupts.number)
+    return code
+
+
+def look_ask_move(
+    args: argparse.Namespace,
+    console: Console,
+    robot: RobotConfig,
+    plan: JogPlan,
+    interrupts: Interrupts,
+) -> JogResult | None:
+    """Open the drive, look at the joint, ask, and move it; None if the answer was no.
+
+    Args:
+        args: of the verb.
+        console: to speak on.
+        robot: as `gentle` made it.
+        plan: what to do.
+        interrupts: kept while the drive may be armed.
+
+    Raises:
+        DriveError: the drive does not answer, or the joint may not go there.
+        FleetError: a joint service has the drive.
+    """
+    module: str = args.module
+    drive = open_drive(robot, module, args.run_dir)
+    try:
+        try:
+            reading = first_words(drive)
+        except DriveError as error:
+            raise DriveError(f"{module}: {error}") from None
+        q = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)
+        if why := outside(robot, module, plan, q):
+            raise DriveError(f"{module}: {why}")
+        _introduce(robot, module, plan, console)
+        if not bench.confirm("Is the joint free, and the power switch at hand?", yes=args.yes):
+            return None
+        refuse_service(robot, args)  # a person may take minutes to answer
+        with interrupts.kept():
+            return jog_drive(
+                drive,
+                robot,
+                module,
+                plan,
+                q_seen=q,
+                interrupts=interrupts,
+                progress=lambda sample: console.print(progress(sample, plan)),
+            )
+    finally:
+        drive.close()
+
+
+def plan_of(args: argparse.Namespace) -> JogPlan:
+    """Return what is asked for.
+
+    Raises:
+        DriveError: it is out of range.
+    """
+    if not 0.0 < abs(args.by) <= BY_MAX:
+        raise DriveError(f"--by {args.by:g}: up to {BY_MAX:g} rad either way, and not 0, is right")
+    if not PERIOD_MIN_S <= args.period <= 60.0:
+        raise DriveError(f"--period {args.period:g}: {PERIOD_MIN_S:g} .. 60 s is right")
+    if not 1 <= args.cycles <= CYCLES_MAX:
+        raise DriveError(f"--cycles {args.cycles}: 1 .. {CYCLES_MAX} is right")
+    return JogPlan(AXES.index(args.axis), args.by, args.period, args.cycles, args.torque_limit)
+
+
+def refuse_service(robot: RobotConfig, args: argparse.Namespace) -> None:
+    """Refuse a module whose joint service is up: a drive has one master.
+
+    Raises:
+        FleetError: it is.
+    """
+    fleet = bench.service_on(robot, args.module, args.run_dir)
+    if fleet is not None:
+        raise FleetError(
+            f"{args.module}: its joint service in {fleet.run.path} has the drive; hang the robot "
+            f"and `xrl down --run-dir {fleet.run.path}` first"
+        )
+
+
+def progress(sample: Sample, plan: JogPlan) -> str:
+    """Return a line on a sample."""
+    axis = plan.axis
+    return (
+        f"{sample.t_s:6.2f} s  {AXES[axis]} asked {sample.q_ref[axis]:+.4f}, "
+        f"is {sample.q[axis]:+.4f} rad, torque {sample.tau[axis]:+6.2f} N m"
+    )
+
+
+def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> int:
+    """Print how it went; return 0 if the joint followed, else 1."""
+    code = 1
+    if outcome.trouble:
+        console.print(f"[bold red]STOPPED[/]: {escape(outcome.trouble)}")
+    else:
+        rows = judge(outcome.samples, plan)
+        table = Table(box=box.SIMPLE_HEAD)
+        for heading in ("", "measured", "wanted", ""):
+            table.add_column(heading)
+        for row in rows:
+            verdict = "" if not row.wanted else "ok" if row.good else "[bold red]not good[/]"
+            table.add_row(row.what, row.value, row.wanted, verdict)
+        console.print(table)
+        code = 0 if all(row.good for row in rows) else 1
+        words = "[bold green]FOLLOWED[/]" if code == 0 else "[bold red]DID NOT FOLLOW[/]"
+        console.print(f"{words}: {module} {AXES[plan.axis]}")
+        console.print(
+            f"right only if you saw this: {what_to_see(module, plan.axis, plan.by)}; "
+            "an encoder on the motor cannot tell"
+        )
+    if outcome.is_idle:
+        console.print("both axes are idle")
+        return code
+    console.print(f"[bold red]{NOT_IDLE}[/]")
+    return 1
+
+
+def _give_limits_back(robot: RobotConfig, args: argparse.Namespace, console: Console) -> None:
+    """Set the drive's limits as the robot file has them, or say that they are the jog's still."""
+    try:
+        limits.give_back(robot, args.module, args.run_dir)
+    except XrlError as error:
+        console.print(
+            f"[yellow]the drive still has the limits of this jog ({escape(str(error))}): until it "
+            "is armed by its service or restarted, `xrl doctor` finds them wrong[/]"
+        )
+
+
+def _introduce(robot: RobotConfig, module: str, plan: JogPlan, console: Console) -> None:
+    """Say what is going to happen."""
+    console.print(
+        f"{module} {AXES[plan.axis]}: {plan.by:+g} rad and back, {plan.cycles} times in "
+        f"{plan.period_s:g} s each, with at most {plan.torque_limit:g} N m "
+        f"({robot.drive.current_lim:.1f} A a motor, {robot.drive.vel_limit:.1f} turn/s)"
+    )
+    console.print(f"to see: {what_to_see(module, plan.axis, plan.by)}")

@@ -1,0 +1,227 @@
+"""`xrl play`: put a log back onto the bus, beside the live robot and not into it."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
+
+from shared.bus.session import RawPublisher, Session, open_session
+from shared.clock import NS_PER_S, now_ns
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig, expand
+from shared.exceptions import ConfigError, FleetError, RunError
+from shared.process import DEFAULT_CONFIG
+from tools.analysis.playback import arguments, guard, reading, selection
+from tools.analysis.playback.display import Display, introduce, summary, where
+from tools.analysis.playback.keyboard import Keyboard, Press
+from tools.analysis.playback.player import Player
+from tools.analysis.playback.reading import Recording
+from tools.analysis.playback.schedule import Playhead, Schedule, Window, window
+from tools.cli import INTERRUPTED
+from tools.fleet.supervise import SupervisedFleet
+from tools.verb_table import Subparsers, add_verb
+
+_POLL_S: Final = 0.01
+_FLUSH_S: Final = 1.0
+"""A session that closes gives what is still queued a quarter of a second, then drops it."""
+
+
+class Bus(NamedTuple):
+    """Where the player joins."""
+
+    robot: RobotConfig
+    note: str
+    """What a person should know about how it was found; else empty."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(subparsers, "play", arguments.EXAMPLES)
+    arguments.add(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play until the end, q or Ctrl-C."""
+    console = Console()
+    arguments.check(args)
+    prefix = selection.check_prefix(args.prefix)
+    paths = reading.files_named(args.files)
+    recording = reading.read(paths)
+    chosen = selection.choose(recording.keys, args.topics, args.exclude)
+    targets = selection.targets(chosen, prefix, args.remap, recording.robot)
+    part = part_of(recording, args)
+    bus = bus_of(recording, args)
+    introduce(recording, paths, bus.note, console)
+    with contextlib.ExitStack() as stack:
+        stack.callback(_leave_no_directory, args.run_dir, made=not args.run_dir.exists())
+        acting = [] if prefix else guard.those_of(guard.ACTED_ON, targets.values())
+        watch = (
+            stack.enter_context(guard.LiveRobotWatch(bus.robot, args.run_dir)) if acting else None
+        )
+        if watch is not None:
+            targets = _permitted(targets, watch, console, force=args.force)
+        schedule = schedule_of(recording, targets, part, loop=args.loop)
+        listen = [] if args.listen == arguments.NOWHERE else [args.listen]
+        session = stack.enter_context(open_session(bus.robot, "play", args.run_dir, listen=listen))
+        listening = expand(args.listen, args.run_dir) if listen else ""
+        words = where(list(targets.values()), recording.robot, part, listening)
+        console.print(words, markup=False, soft_wrap=True)
+        keyboard = stack.enter_context(Keyboard())
+        if args.start_paused and not keyboard.present:
+            raise RunError("--start-paused: nobody could press space here; a terminal is needed")
+        return _play(args, schedule, targets, session, keyboard, _alarm(watch, targets, args))
+
+
+def part_of(recording: Recording, args: argparse.Namespace) -> Window:
+    """Return what of the log is to be played.
+
+    Raises:
+        RunError: it begins behind the log's end.
+    """
+    part = window(
+        recording.began_ns,
+        recording.ended_ns,
+        round(args.start_offset * NS_PER_S),
+        None if args.duration is None else math.ceil(args.duration * NS_PER_S),
+    )
+    if part.start_ns > recording.ended_ns:
+        length_s = (recording.ended_ns - recording.began_ns) / NS_PER_S
+        raise RunError(f"--start-offset {args.start_offset:g}: the log is {length_s:.2f} s long")
+    return part
+
+
+def bus_of(recording: Recording, args: argparse.Namespace) -> Bus:
+    """Return the robot whose bus to join: as given, of the fleet that is up, or of the log.
+
+    Raises:
+        ConfigError: the file given cannot be used.
+    """
+    if args.config is not None:
+        return Bus(config_file.load_without_schedule(args.config), "")
+    with contextlib.suppress(FleetError):
+        fleet = SupervisedFleet.attach(args.run_dir)
+        return Bus(config_file.load_without_schedule(Path(fleet.manifest.config)), "")
+    why = "the log holds no robot file"
+    if recording.robot_file is not None:
+        try:
+            robot = config_file.parse(recording.robot_file, f"{reading.ROBOT_FILE} in the log")
+            return Bus(robot, "")
+        except ConfigError as error:
+            why = f"{error}: of another version"
+    note = f"{why}; the bus is that of {DEFAULT_CONFIG.name} as shipped (--config: another)"
+    return Bus(config_file.load_without_schedule(DEFAULT_CONFIG), note)
+
+
+def schedule_of(
+    recording: Recording, targets: dict[str, str], part: Window, *, loop: bool
+) -> Schedule:
+    """Return the messages to be put, numbered by the keys of `targets`.
+
+    Raises:
+        RunError: there is none.
+    """
+    number = {key: index for index, key in enumerate(targets)}
+    new = [number.get(key, -1) for key in recording.keys]
+    entries = [
+        entry._replace(key=new[entry.key]) for entry in recording.entries if new[entry.key] >= 0
+    ]
+    schedule = Schedule(entries, part, loop=loop)
+    if not len(schedule):
+        raise RunError("none of these topics has a message in this part of the log")
+    return schedule
+
+
+def _permitted(
+    targets: dict[str, str], watch: guard.LiveRobotWatch, console: Console, *, force: bool
+) -> dict[str, str]:
+    live = watch.look()
+    left = guard.allowed(targets, live, force=force)
+    out = [target for key, target in targets.items() if key not in left]
+    if out:
+        words = f"{live}: left out even with --force: {guard.describe(out)}"
+        console.print(escape(words), style="yellow", soft_wrap=True)
+    return left
+
+
+def _alarm(
+    watch: guard.LiveRobotWatch | None, targets: dict[str, str], args: argparse.Namespace
+) -> Callable[[], None]:
+    """Return what ends a play onto live keys when a joint service comes up meanwhile."""
+    rows = guard.IN_THE_LOOP if args.force else guard.ACTED_ON
+    refused = guard.those_of(rows, targets.values())
+
+    def look() -> None:
+        if watch is not None and refused and (heard := watch.heard()):
+            raise FleetError(f"stopped: {heard}, and it acts on {guard.describe(refused)}")
+
+    return look
+
+
+def _play(
+    args: argparse.Namespace,
+    schedule: Schedule,
+    targets: dict[str, str],
+    session: Session,
+    keyboard: Keyboard,
+    alarm: Callable[[], None],
+) -> int:
+    """Play, and say at the end how it went."""
+    patient = bool(args.prefix.strip("/"))  # nobody on the live keys is to be waited for
+    ports = [session.raw_publisher(key, patient=patient) for key in targets.values()]
+    clock = None
+    if args.clock:
+        key = selection.clock_key(selection.check_prefix(args.prefix))
+        clock = session.raw_publisher(key, patient=patient)
+    if not args.start_paused:
+        _await_subscriber(ports, args.wait, keyboard)
+    display = Display(ports)
+
+    def show() -> None:
+        alarm()
+        display.show(player)
+
+    gc.freeze()  # the log is no garbage: a collector that walks it makes messages late
+    player = Player(
+        schedule,
+        Playhead(now_ns(), args.rate, paused=args.start_paused),
+        ports,
+        keyboard,
+        now_ns=now_ns,
+        show=show,
+        clock=clock,
+        clock_hz=args.clock_hz,
+    )
+    began_ns = now_ns()
+    try:
+        player.run()
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    finally:
+        display.clear()
+        print(summary(player, (now_ns() - began_ns) / NS_PER_S, heard=display.heard), flush=True)
+    if patient and display.heard:
+        time.sleep(_FLUSH_S)
+    return 1 if player.tally.failed else 0
+
+
+def _await_subscriber(ports: Sequence[RawPublisher], wait_s: float, keyboard: Keyboard) -> None:
+    deadline = time.monotonic() + wait_s
+    while time.monotonic() < deadline and not any(port.matched for port in ports):
+        if Press.QUIT in keyboard.wait(_POLL_S):
+            return
+
+
+def _leave_no_directory(run_dir: Path, *, made: bool) -> None:
+    """Remove the run directory if it was made for this play's socket and nobody uses it."""
+    if made:
+        with contextlib.suppress(OSError):
+            run_dir.rmdir()

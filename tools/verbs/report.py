@@ -1,0 +1,70 @@
+"""`xrl report`: writes a run as one page that opens in any browser without a network."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+from rich.markup import escape
+
+from shared.exceptions import RunError
+from tools.analysis.reports.page import render
+from tools.output import write_atomically
+from tools.runs.run_log import read_run
+from tools.verb_table import RUN_HELP, Subparsers, add_verb
+
+MIB: Final = 1 << 20
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "report",
+        """
+        xrl report out/a/run.mcap
+        xrl report out/a/run.mcap -o report.html --open no
+        """,
+    )
+    parser.add_argument("file", type=Path, metavar="RUN", help=RUN_HELP)
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        metavar="OUT",
+        help="path of the page (default: NAME.html beside the log); an old page is replaced",
+    )
+    parser.add_argument(
+        "--open",
+        choices=("yes", "no", "auto"),
+        default="auto",
+        help="open the page in a browser; auto (default): if run in a terminal with a display",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the page."""
+    path: Path = args.file
+    log = read_run(path)
+    out: Path = args.out or log.files[0].with_suffix(".html")
+    if out.is_dir():
+        raise RunError(f"{out}: is a directory; give a file with -o")
+    if out.exists() and path.exists() and out.samefile(path):
+        raise RunError(f"{out}: is the log itself; give another file with -o")
+    page = render(log).encode()
+    write_atomically(out, page)
+    name = escape(str(out))
+    Console().print(f"[bold]{name}[/]: {len(page) / MIB:.2f} MiB, one file", soft_wrap=True)
+    if args.open == "yes" or (args.open == "auto" and _has_display()):
+        webbrowser.open(out.resolve().as_uri())
+    return 0
+
+
+def _has_display() -> bool:
+    display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.stdout.isatty() and display

@@ -1,0 +1,203 @@
+"""`xrl resim`: a run's services executed again from its log, and held to what they did."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from rich import box
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from services.recorder.provenance import machine
+from shared.bus import topics
+from shared.bus.messages import JointEvent, JointState, Message, PlannerStatus
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.robot.joints import MODULES
+from tools.analysis.reexecution import rewritten
+from tools.analysis.reexecution.compare import size
+from tools.analysis.reexecution.joint import JointExecution
+from tools.analysis.reexecution.outcome import ReexecutionResult
+from tools.analysis.reexecution.params import with_params
+from tools.analysis.reexecution.planner import PlannerExecution
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog, read_run
+from tools.verb_table import RUN_HELP, Subparsers, add_verb
+
+SERVICES: Final = ("planner", *MODULES)
+SHOWN: Final = 12
+"""Fields that are listed, those that change most first."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "resim",
+        """
+        xrl resim out/a/run.mcap                              # planner and six services
+        xrl resim out/a/run.mcap --service knee_left --until-first-difference
+        xrl resim out/a/run.mcap --service planner --param law.K_p.x=2000
+        xrl resim out/a/run.mcap --tolerance 1e-9             # of another machine class
+        xrl resim out/a                                       # a split run, all of its files
+        """,
+    )
+    parser.add_argument("log", type=Path, metavar="RUN", help=RUN_HELP)
+    parser.add_argument(
+        "--service",
+        action="append",
+        choices=(*SERVICES, "all"),
+        metavar="NAME",
+        help=f"all (default), or one of {', '.join(SERVICES)}; may be given several times",
+    )
+    parser.add_argument(
+        "--param",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a key of the robot file with another value, such as law.K_p.x=2000 or "
+        "joint_service.blend_ms=100: the same inputs, and what would have come out; a new file "
+        "is written beside the old",
+    )
+    parser.add_argument(
+        "--until-first-difference", action="store_true", help="stop there; sooner done"
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=0.0,
+        metavar="T",
+        help="numbers may differ by so much (default 0: not in one bit)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="with --param: the new file (default: RUN.resim.mcap beside the old)",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Execute, compare, tell."""
+    if not args.tolerance >= 0.0:
+        raise RunError(f"--tolerance {args.tolerance:g}: zero or more is right")
+    console = Console()
+    log = read_run(args.log)
+    robot = robot_of(log)
+    if args.param:
+        robot = with_params(robot, args.param, str(args.log))
+    chosen = set(args.service or ("all",))
+    names = SERVICES if "all" in chosen else tuple(name for name in SERVICES if name in chosen)
+    path = args.out or log.files[0].with_suffix(".resim.mcap")
+    if args.param and path.exists():
+        raise RunError(f"{path}: is there already; remove it, or name another with --out")
+    outcomes, recomputed = [], dict[str, list[Message]]()
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("executing again", total=len(names))
+        for name in names:
+            progress.update(task, description=f"executing {name}")
+            outcome = ReexecutionResult(name, args.tolerance, exact=not args.param)
+            for key, message in execute(log, robot, name, outcome):
+                if args.param:
+                    recomputed.setdefault(key, []).append(message)
+                if args.until_first_difference and outcome.comparison.first is not None:
+                    break
+            outcomes.append(outcome)
+            progress.advance(task)
+    _other_machine(log, console)
+    console.print(summary(outcomes))
+    for outcome in outcomes:
+        tell(outcome, log, console, changed=bool(args.param))
+    if not any(outcome.ticks for outcome in outcomes):
+        raise RunError(
+            f"{args.log}: nothing could be executed: it holds no memory of these services; a "
+            "run that was recorded by this version for more than a second does"
+        )
+    if args.param:
+        count = rewritten.write(log, path, recomputed, {"params": ", ".join(args.param)})
+        console.print(f"{count} messages, the recomputed ones among them, in {path}")
+        return 0
+    return 0 if all(outcome.equal for outcome in outcomes if outcome.ticks) else 1
+
+
+def execute(
+    log: RunLog, robot: RobotConfig, name: str, outcome: ReexecutionResult
+) -> Iterator[tuple[str, Message]]:
+    """Execute a service; yield what comes out, with its full key."""
+    if name == "planner":
+        for module, message in PlannerExecution(log, robot, outcome).run():
+            status = isinstance(message, PlannerStatus)
+            topic = topics.PLANNER_STATUS if status else topics.JOINT_COMMAND
+            yield topic.key(log.robot, module), message
+        return
+    for message in JointExecution(log, robot, name, outcome).run():
+        if isinstance(message, JointState):
+            yield topics.JOINT_STATE.key(log.robot, name), message
+        elif isinstance(message, JointEvent):
+            yield topics.JOINT_EVENT.key(log.robot, name), message
+
+
+def summary(outcomes: list[ReexecutionResult]) -> Table:
+    """Return the counts as a table."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("service", "ticks", "not executed", "messages compared", "result"):
+        table.add_column(heading, justify="left" if heading in ("service", "result") else "right")
+    for outcome in outcomes:
+        comparison = outcome.comparison
+        if not outcome.ticks:
+            result = "[yellow]nothing executed[/]"
+        elif comparison.first is None:
+            result = f"{outcome.ticks} ticks, all equal"
+        else:
+            result = f"[bold red]{comparison.differing} differ[/]"
+        table.add_row(
+            outcome.service,
+            str(outcome.ticks),
+            str(outcome.skipped),
+            str(comparison.compared),
+            result,
+        )
+    return table
+
+
+def tell(outcome: ReexecutionResult, log: RunLog, console: Console, *, changed: bool) -> None:
+    """Print the first difference of a service, and with a changed parameter the largest."""
+    first = outcome.comparison.first
+    if outcome.lost_inputs:
+        console.print(
+            f"{outcome.service}: the log lacks {outcome.lost_inputs} messages that it took; "
+            "execution went on from the next memory"
+        )
+    if first is None:
+        return
+    at_s = (first.t_ns - log.began_ns()) / 1e9
+    console.print(f"[bold]{outcome.service}[/], first at {at_s:.3f} s: {first.describe()}")
+    if not changed:
+        return
+    table = Table(title="largest changes", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("topic", "field", "at s", "recorded", "recomputed"):
+        table.add_column(heading, justify="left" if heading in ("topic", "field") else "right")
+    rows = sorted(outcome.comparison.largest.values(), key=size, reverse=True)
+    for row in rows[:SHOWN]:
+        seconds = (row.t_ns - log.began_ns()) / 1e9
+        recorded, recomputed = (_short(value) for value in (row.recorded, row.recomputed))
+        table.add_row(row.key, row.field, f"{seconds:.3f}", recorded, recomputed)
+    console.print(table)
+
+
+def _short(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)[:24]
+
+
+def _other_machine(log: RunLog, console: Console) -> None:
+    """Say so if the run is of another processor: BLAS then takes other kernels."""
+    recorded, here = log.metadata["run"].get("cpu_model", ""), machine()["cpu_model"]
+    if recorded and recorded != here:
+        console.print(
+            f"recorded on {recorded}, executed on {here}: last bits may differ; see --tolerance",
+            style="yellow",
+        )

@@ -1,0 +1,96 @@
+"""`xrl sim`: the experiment in virtual time: no processes, bit-identical, as fast as it can."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from services.simulator.plant import plant_from
+from shared.bus.messages import SimTruth
+from shared.exceptions import RunError
+from shared.network.impairment import Impairment
+from tools.runs import experiment, recorded_lockstep, verdict_table
+from tools.runs.centralised.fleet import CONTROLS, SHIPPED
+from tools.verb_table import Subparsers, add_verb
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "sim",
+        """
+        xrl sim
+        xrl sim --delay 10 --out out/slow
+        xrl sim --delay 5 --jitter 5 --loss 0.1 --seed 3
+        xrl sim --scenario crawl --kill planner@8
+        xrl sim --delay 50 --control centralised
+        xrl sim --plant drivetrain.stiffness=3000 --plant drivetrain.play=0.01
+        xrl sim --plant ideal
+        xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
+        xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
+        """,
+    )
+    experiment.add_flags(parser)
+    parser.add_argument(
+        "--delay", type=float, default=1.0, metavar="MS", help="of every link, each way (1)"
+    )
+    parser.add_argument(
+        "--jitter",
+        type=float,
+        default=0.0,
+        metavar="MS",
+        help="half the width of a uniform spread (0)",
+    )
+    parser.add_argument(
+        "--loss",
+        type=float,
+        default=0.0,
+        metavar="P",
+        help="probability that a message is lost, 0 to 1 (0)",
+    )
+    parser.add_argument(
+        "--control",
+        choices=CONTROLS,
+        default=SHIPPED,
+        help="who computes the torques; centralised: the planner all of them, a baseline to "
+        "compare with (default: distributed)",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="where results go (default: out/sim-<time>)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the experiment; 0 only if the robot stood to the end."""
+    if args.delay < 0.0 or args.jitter < 0.0 or not 0.0 <= args.loss <= 1.0:
+        raise RunError("--delay and --jitter must be at least 0 ms, --loss from 0 to 1")
+    console = Console()
+    robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
+    true_plant = plant_from(args.plant)
+    network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
+    out = experiment.make_out(args.out, "sim")
+    console.print(f"[bold]{scenario.name}[/]: {scenario.about}{experiment.describe(scenario)}")
+    bar = Progress(
+        BarColumn(), TextColumn("{task.completed:5.1f} of {task.total:g} s"),
+        TimeRemainingColumn(), console=console, transient=True,
+    )  # fmt: skip
+    begin = time.monotonic()
+    with bar as progress:
+        task = progress.add_task("", total=scenario.duration)
+
+        def watch(truth: SimTruth) -> None:
+            progress.update(task, completed=max(0.0, truth.scenario_s))
+
+        simulated_s = recorded_lockstep.simulate(
+            robot, scenario, network, args.seed, out, watch, args.control, true_plant
+        )
+    factor = simulated_s / (time.monotonic() - begin)
+    summary = recorded_lockstep.judge_run(scenario, out, speed=factor)
+    verdict_table.show(summary, console)
+    console.print(f"{factor:.1f} x real time; {out}/run.mcap, run.png, summary.json", style="dim")
+    return 0 if summary["stood"] else 1

@@ -1,0 +1,135 @@
+"""`xrl tare`: a new zero for the harness sensor."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import math
+import time
+from pathlib import Path
+from typing import Final, Protocol
+
+from rich.console import Console
+
+from shared.bus import topics
+from shared.bus.messages import Tare, TareRequest, Wrench
+from shared.bus.session import open_session
+from shared.clock import now_ns
+from shared.config.files import load
+from shared.exceptions import FleetError
+from tools.fleet.supervise import SupervisedFleet
+from tools.verb_table import Subparsers, add_run_dir, add_verb
+
+LOADED_N: Final = 30.0
+"""A harness that reads more is taken for one that is held; drift is less."""
+REPEAT_S: Final = 0.02
+"""The bus may drop a message: it is said again until the tare has begun."""
+HEARD_S: Final = 3.0
+"""Longest wait for the first wrench."""
+GIVE_UP_S: Final = 10.0
+
+
+class TareClient(Protocol):
+    """The way to the harness service."""
+
+    def put(self, message: TareRequest) -> bool:
+        """Send without waiting."""
+
+
+class Wrenches(Protocol):
+    """The way back."""
+
+    def take(self) -> Wrench | None:
+        """Return the newest wrench since the last call, or None."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "tare",
+        """
+        xrl tare
+        xrl tare --anyway
+        """,
+    )
+    add_run_dir(parser)
+    parser.add_argument(
+        "--anyway",
+        action="store_true",
+        help=f"even if it reads more than {LOADED_N:g} N: the sensor has drifted so far",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask for it, and wait until the wrench is valid again."""
+    fleet = SupervisedFleet.attach(args.run_dir)
+    robot = load(Path(fleet.manifest.config))
+    with open_session(robot, "tare", args.run_dir) as session:
+        requests = session.publisher(topics.HARNESS_TARE, TareRequest)
+        wrenches = session.latest(topics.WRENCH, Wrench)
+        before = tare(requests, wrenches, anyway=args.anyway)
+    read = describe(before) if before.valid else "nothing valid"
+    Console().print(f"the harness is tared: what it reads now is zero; before it read {read}")
+    return 0
+
+
+def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
+    """Ask until the tare has begun, and wait until it is done.
+
+    Args:
+        requests: to the harness service.
+        wrenches: from it.
+        anyway: also if the harness seems to be held.
+
+    Returns:
+        What the harness said before.
+
+    Raises:
+        FleetError: it is not heard, is held, or finds no zero.
+    """
+    before = newest = _first(wrenches)
+    if before.valid and math.hypot(*before.force) > LOADED_N and not anyway:
+        raise FleetError(
+            f"the harness reads {describe(before)}: let go of it, and again; "
+            "or --anyway, if nobody holds it and the sensor has drifted"
+        )
+    source = f"xrl tare by {getpass.getuser()}"
+    begun = False
+    deadline = time.monotonic() + GIVE_UP_S
+    seq = 0
+    while time.monotonic() < deadline:
+        if not begun:
+            seq += 1
+            requests.put(TareRequest(t_ns=now_ns(), seq=seq, source=source))
+        time.sleep(REPEAT_S)
+        newest = wrenches.take() or newest
+        begun = begun or newest.tare != Tare.DONE
+        if begun and newest.valid:
+            return before
+    raise FleetError(f"no zero after {GIVE_UP_S:g} s: {_why_not(newest, begun=begun)}")
+
+
+def describe(wrench: Wrench) -> str:
+    """Return a wrench's size."""
+    return f"{math.hypot(*wrench.force):.1f} N, {math.hypot(*wrench.moment):.1f} N m"
+
+
+def _first(wrenches: Wrenches) -> Wrench:
+    deadline = time.monotonic() + HEARD_S
+    while time.monotonic() < deadline:
+        wrench = wrenches.take()
+        if wrench is not None:
+            return wrench
+        time.sleep(REPEAT_S)
+    raise FleetError("the harness service is not heard; see `xrl status`")
+
+
+def _why_not(newest: Wrench, *, begun: bool) -> str:
+    if not begun:
+        return "the harness service did not begin; see `xrl status`"
+    if newest.saturated:
+        return "a load cell is at the end of its range; unload the harness"
+    if newest.tare == Tare.UNSTEADY:
+        return "the forces move; keep robot and harness still, it goes on by itself"
+    return "its load cells send nothing steady; look at their bus"

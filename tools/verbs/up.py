@@ -1,0 +1,170 @@
+"""`xrl up`: start the fleet."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from services.simulator.plant import plant_from
+from shared.config import files as config_file
+from shared.exceptions import FleetError
+from shared.robot import gain_schedule
+from shared.robot.joints import MODULES
+from tools.fleet.pace import add_pace
+from tools.fleet.process_table import check_known, load_table
+from tools.fleet.supervise import SupervisedFleet
+from tools.runs.experiment import add_plant, make_out, scenario_file
+from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+
+SETTLE_S = 3.0
+"""A scenario starts so long after the hoist is down."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "up",
+        """
+        xrl up
+        xrl up --scenario crawl --out out/crawl
+        xrl up --injectable                            # then: xrl inject --link ... --delay 30
+        xrl up --config lab.toml --no-sim
+        xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # of one host
+        xrl up --config lab.toml --no-sim --readonly   # move the joints by hand, and look
+        """,
+    )
+    add_config(parser)
+    add_run_dir(parser)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where the recorder writes (default: out/ and the time)",
+    )
+    parser.add_argument(
+        "--scenario",
+        metavar="NAME|FILE",
+        help="what the simulated operator does once the robot stands: a file, or a name from "
+        "deploy/scenarios (its kills are left to you)",
+    )
+    add_plant(parser)
+    add_pace(parser)
+    parser.add_argument(
+        "--no-sim",
+        action="store_true",
+        help="start no simulator: the drives are real, or come later",
+    )
+    parser.add_argument(
+        "--only",
+        type=_names,
+        metavar="SERVICE,...",
+        help="only these: the robot's other services run on other hosts, where their endpoints in "
+        "the robot file are",
+    )
+    parser.add_argument(
+        "--snapshot",
+        type=float,
+        metavar="SECONDS",
+        help="record nothing until something goes wrong, then so much before and after it",
+    )
+    parser.add_argument(
+        "--no-planner",
+        action="store_true",
+        help="six modules that HOLD by themselves; `xrl start planner` lets it lead",
+    )
+    parser.add_argument(
+        "--injectable",
+        action="store_true",
+        help="put the network proxy between planner, joints and sensors, for `xrl inject`",
+    )
+    parser.add_argument(
+        "--readonly",
+        action="store_true",
+        help="the joint services listen to their drives and publish, and send them nothing",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the fleet and say where it is."""
+    gain_schedule.require(config_file.load(args.config), args.config)
+    services = _services(args)
+    out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
+    overrides = _overrides(args, out)
+    if services is not None:
+        overrides = {name: words for name, words in overrides.items() if name in services}
+    if services is None or "recorder" in services:
+        make_out(out, "up")
+    asleep = args.no_planner and (services is None or "planner" in services)
+    fleet = SupervisedFleet.start(
+        args.config,
+        args.run_dir,
+        overrides=overrides,
+        services=services,
+        asleep=("planner",) if asleep else (),
+        simulation=not args.no_sim,
+        injected=args.injectable,
+        pace=args.pace,
+    )
+    up = len(fleet.manifest.services) - asleep
+    record = f", record: {out}" if "recorder" in fleet.manifest.services else ""
+    print(
+        f"{up} service{'s are' if up != 1 else ' is'} up in {fleet.run.path} "
+        f"(logs: {fleet.run.logs}{record}); `xrl status` shows them, `xrl down` stops them"
+    )
+    return 0
+
+
+def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:
+    """Return what the arguments add to the services' own."""
+    overrides = {"recorder": ["--out", str(out.absolute())]}
+    if args.snapshot is not None:
+        overrides["recorder"] += ["--snapshot", f"{args.snapshot:g}"]
+    if args.readonly:
+        overrides |= {module: ["--readonly"] for module in MODULES}
+    if args.scenario is not None:
+        path = str(scenario_file(args.scenario))
+        overrides["simulator"] = ["--scenario", path, "--autostart", str(SETTLE_S)]
+        overrides["recorder"] += ["--scenario", path, "--scenario-text", args.scenario]
+    if args.plant:
+        plant_from(args.plant)  # refused before anything is started
+        words = [word for given in args.plant for word in ("--plant", _absolute(given))]
+        overrides["simulator"] = [*overrides.get("simulator", []), *words]
+    return overrides
+
+
+def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
+    """Return what `--only` names, None for all, if it goes with the other arguments.
+
+    Raises:
+        FleetError: an argument is for a service that is not started.
+    """
+    only: tuple[str, ...] | None = args.only
+    absent = {"simulator"} if args.no_sim else set()
+    if only is not None:
+        if not only:
+            raise FleetError("--only names no service; --only planner,harness,recorder, say")
+        check_known(only, [row.name for row in load_table().process])
+        absent |= {"simulator", "recorder", "planner", *MODULES} - set(only)
+    for option, is_given, service in (
+        ("--scenario", args.scenario is not None, "simulator"),
+        ("--plant", bool(args.plant), "simulator"),
+        ("--snapshot", args.snapshot is not None, "recorder"),
+        ("--injectable", args.injectable, "planner"),
+    ):
+        if is_given and service in absent:
+            why = "--no-sim" if only is None or service in only else "--only"
+            raise FleetError(f"{option} is for the {service}, and {why} starts none; leave one")
+    if only is not None and args.injectable:
+        return (*only, "network_proxy")
+    return only
+
+
+def _absolute(word: str) -> str:
+    """Return a word of `--plant`; a file's path as it is from anywhere."""
+    return str(Path(word).absolute()) if word.endswith(".toml") and "=" not in word else word
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))

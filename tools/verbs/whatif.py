@@ -1,0 +1,164 @@
+"""`xrl whatif`: had something died at this moment of a recorded run, would it have stood?"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from services.simulator.plant import PlantConfig
+from shared.config import scenarios
+from shared.config.scenarios import Scenario
+from shared.config.toml_file import parse_toml
+from shared.exceptions import RunError
+from shared.robot.joints import MODULES
+from tools.runs.experiment import PLANT_FILE
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog, read_run
+from tools.studies.counterfactual import picture
+from tools.studies.counterfactual.moments import moments_of
+from tools.studies.counterfactual.run import Counterfactual, Task, counterfactual_of
+from tools.studies.sweeps.pool import cores, results
+from tools.verb_table import RUN_HELP, Subparsers, add_verb
+
+KILLABLE: Final = ("planner", *MODULES)
+WIDTH: Final = 72
+"""Characters of a line of the strip."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "whatif",
+        """
+        xrl whatif out/a/run.mcap --kill planner
+        xrl whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
+        """,
+    )
+    parser.add_argument("log", type=Path, metavar="RUN", help=f"{RUN_HELP}; of a simulated robot")
+    parser.add_argument(
+        "--kill",
+        action="append",
+        required=True,
+        choices=KILLABLE,
+        metavar="SERVICE",
+        help=f"dies at the moment: {', '.join(KILLABLE)}; may be given several times",
+    )
+    parser.add_argument(
+        "--every", type=float, default=0.1, metavar="S", help="between two moments (0.1 s)"
+    )
+    parser.add_argument(
+        "--for",
+        dest="for_s",
+        type=float,
+        default=4.0,
+        metavar="S",
+        help="so long it is gone on with, pushes and hand as in the run (4 s)",
+    )
+    parser.add_argument("--workers", type=int, default=cores(), metavar="N", help="processes")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="for whatif.json and whatif.png (beside the log)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Go on from every moment; 0 if the robot would have stood each time."""
+    if not (args.every >= 0.1 - 1e-9 and args.for_s > 0.0 and args.workers >= 1):
+        raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
+    console = Console()
+    log = read_run(args.log)
+    robot, scenario = robot_of(log), scenario_of(log)
+    moments = moments_of(log, robot, args.every)
+    kill = tuple(dict.fromkeys(args.kill))
+    true_plant = plant_of(log)
+    tasks = [Task(robot, scenario, true_plant, moment, kill, args.for_s) for moment in moments]
+    counterfactuals: list[Counterfactual] = []
+    bar = Progress(
+        TextColumn("{task.fields[fell]}"), BarColumn(), MofNCompleteColumn(),
+        TimeRemainingColumn(), console=console, transient=True,
+    )  # fmt: skip
+    with bar as progress:
+        shown = progress.add_task("", total=len(tasks), fell="0 fell")
+        for _, fate in results(
+            counterfactual_of, tasks, args.workers, lambda task: f"{task.moment.at_s:g} s"
+        ):
+            counterfactuals.append(fate)
+            fell = sum(not one.stood for one in counterfactuals)
+            progress.update(shown, advance=1, fell=f"{fell} fell")
+    counterfactuals.sort(key=lambda one: one.at_s)
+    out = args.out or log.files[0].parent
+    out.mkdir(parents=True, exist_ok=True)
+    names = " and ".join(kill)
+    (out / "whatif.json").write_bytes(
+        msgspec.json.format(
+            msgspec.json.encode({"kill": kill, "for_s": args.for_s, "fates": counterfactuals})
+        )
+    )
+    picture.draw(
+        log, counterfactuals, f"{names} killed at each moment", args.every, out / "whatif.png"
+    )
+    show(counterfactuals, names, args.for_s, console)
+    console.print(f"{out}/whatif.json, whatif.png", style="dim")
+    return 0 if all(one.stood for one in counterfactuals) else 1
+
+
+def _name(task: Task) -> str:
+    return f"{task.moment.at_s:g} s"
+
+
+def scenario_of(log: RunLog) -> Scenario:
+    """Return the scenario of a run.
+
+    Raises:
+        RunError: the log does not hold it.
+    """
+    text = log.attachments.get("scenario.toml")
+    if text is None:
+        raise RunError(f"{log.path}: holds no scenarios.toml; a run that was led by one has it")
+    scenario = parse_toml(text.decode(), f"{log.path}: scenarios.toml", Scenario)
+    scenarios.check(str(log.path), scenario)
+    return scenario
+
+
+def plant_of(log: RunLog) -> PlantConfig:
+    """Return the plant that a run was simulated with.
+
+    Raises:
+        RunError: the log does not hold it.
+    """
+    text = log.attachments.get(PLANT_FILE)
+    if text is None:
+        raise RunError(f"{log.path}: holds no {PLANT_FILE}; a run of `xrl sim` or `demo` has one")
+    return parse_toml(text.decode(), f"{log.path}: {PLANT_FILE}", PlantConfig)
+
+
+def show(counterfactuals: list[Counterfactual], names: str, for_s: float, console: Console) -> None:
+    """Print the strip and the worst moments."""
+    for begin in range(0, len(counterfactuals), WIDTH):
+        row = counterfactuals[begin : begin + WIDTH]
+        strip = Text(f"{row[0].at_s:6.1f} s ")
+        for one in row:
+            strip.append("█", style="green" if one.stood else "red")
+        console.print(strip)
+    fell = [one for one in counterfactuals if not one.stood]
+    worst = max(
+        counterfactuals, key=lambda one: (not one.stood, max(one.com_x_max_mm, one.com_y_max_mm))
+    )
+    console.print(
+        f"{names} killed at {len(counterfactuals)} moments, each gone on with for {for_s:g} s: "
+        f"{len(counterfactuals) - len(fell)} stood, {len(fell)} fell"
+    )
+    if fell:
+        times = ", ".join(f"{one.at_s:.1f}" for one in fell[:20])
+        console.print(f"[red]fell[/] when killed at {times}{' ...' if len(fell) > 20 else ''} s")
+    margin = "" if worst.margin is None else f", margin {worst.margin:.2f}"
+    console.print(
+        f"worst at {worst.at_s:.1f} s: COM up to x {worst.com_x_max_mm:.0f}, "
+        f"y {worst.com_y_max_mm:.0f} mm, soles tilt {worst.sole_tilt_max_rad:.3f} rad{margin}"
+    )

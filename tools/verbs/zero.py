@@ -1,0 +1,277 @@
+"""`xrl zero`: tell drives where their joints are."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import re
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from services.joint.__main__ import open_drive
+from services.joint.drivers.base import Drive
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, Pair
+from shared.bus.session import open_session
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import DriveError, FleetError
+from shared.robot.joints import MODULES
+from tools.bringup import bench
+from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, zero
+from tools.fleet.supervise import SupervisedFleet
+from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+
+DEGREES_FROM: Final = 7.0
+"""No joint has an angle of so many rad: more than a turn."""
+_NEGATIVE = re.compile(r"-\.?\d")
+
+HEARD_S: Final = 2.0
+"""Longest wait for the states of joint services that are up."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "zero",
+        """
+        xrl zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
+        xrl zero ankle_right --at -0.02,0.14
+        xrl zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
+        """,
+    )
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("module", nargs="?", choices=MODULES, metavar="MODULE", help="one module")
+    which.add_argument("--all", action="store_true", help="all six")
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument(
+        "--at",
+        metavar="PHI,THETA",
+        help="the joint is at these angles now, rad, as 0,-0.5",
+    )
+    # "-0.02,0.14" is a value and no option, as a single negative number is to argparse
+    parser._negative_number_matcher = _NEGATIVE  # noqa: SLF001 - no public way
+    where.add_argument(
+        "--standing",
+        type=float,
+        metavar="HEIGHT",
+        help="the robot stands or hangs as if it stood: both soles flat and level, at their "
+        "distance (geometry.w_base), torso upright, COM over the ankles, the hips' axis so many "
+        "m above the ankles'; the angles then follow from the lengths in the robot file",
+    )
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    add_config(parser)
+    add_run_dir(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look, ask, set, read back."""
+    console = Console()
+    path = bench.robot_file(args)
+    robot = config_file.load_without_schedule(path)
+    wanted = angles_of(args, robot, console)
+    holders = {module: bench.service_on(robot, module, args.run_dir) for module in wanted}
+    with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
+        refuse_services(robot, holders)
+        with contextlib.ExitStack() as stack:
+            drives = {module: _open(robot, module, args.run_dir, stack) for module in wanted}
+            before = _look_all(robot, drives)
+            console.print(plan_table(wanted, before))
+            _warn(wanted, holders, console)
+            if not bench.confirm("Are the joints at these angles now?", yes=args.yes):
+                console.print("nothing was changed")
+                return 1
+            refuse_services(robot, holders)  # a person may take minutes to answer
+            _look_all(robot, drives)
+            code = _set_all(robot, drives, wanted, console)
+    if started:
+        console.print(bench.GONE)
+    return code
+
+
+def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) -> dict[str, Pair]:
+    """Return where each module that is meant is, (phi, theta), rad.
+
+    Raises:
+        DriveError: it is not two angles, or one is outside of the limits.
+        RunError: there is no such stand.
+    """
+    modules = MODULES if args.all else (args.module,)
+    if args.at is not None:
+        if args.all:
+            raise DriveError("--at is for one module; for all give --standing HEIGHT")
+        wanted = {args.module: _pair(args.at)}
+    else:
+        from tools.bringup.standing import standing  # noqa: PLC0415 - takes a second
+
+        stand = standing(robot, args.standing)
+        console.print(
+            f"a stand with the hips {args.standing:g} m above the ankles and "
+            f"{abs(stand.hips_forward):.3f} m {'before' if stand.hips_forward > 0 else 'behind'} "
+            "them, torso upright, soles flat"
+        )
+        wanted = {module: stand.q[module] for module in modules}
+    for module, q in wanted.items():
+        if fault := outside(robot, module, q):
+            raise DriveError(f"{module}: {fault}{_if_degrees(q)}")
+    return wanted
+
+
+def _if_degrees(q: Pair) -> str:
+    """Return what to write instead of angles that can only be degrees; "" if they cannot."""
+    if not max(map(abs, q)) > DEGREES_FROM:
+        return ""
+    phi, theta = map(math.radians, q)
+    return f"; if these are degrees: --at {phi:.4g},{theta:.4g}"
+
+
+def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | None]) -> None:
+    """Refuse where a joint service has the drive's USB, or is not DISARMED.
+
+    Raises:
+        FleetError: naming the first such module, and what to do.
+    """
+    up = {module: fleet for module, fleet in holders.items() if fleet is not None}
+    for module, fleet in up.items():
+        if robot.joint_service.driver == "odrive_usb":
+            raise FleetError(
+                f"{module}: its joint service in {fleet.run.path} has the drive's USB; "
+                "`xrl down` first"
+            )
+    for fleet in {fleet.run.path: fleet for fleet in up.values()}.values():
+        mine = [module for module, other in up.items() if other.run.path == fleet.run.path]
+        heard = _states(robot, fleet, mine)
+        for module in mine:
+            state = heard.get(module)
+            if state is None:
+                raise FleetError(
+                    f"{module}: its joint service in {fleet.run.path} is up, but not heard; "
+                    "see `xrl status`, or `xrl down` first"
+                )
+            if state.mode != Mode.DISARMED:
+                raise FleetError(f"{module}: {_way_out(module, Mode(state.mode))}")
+
+
+def plan_table(wanted: Mapping[str, Pair], before: Mapping[str, DriveLook]) -> Table:
+    """Return what is to be changed, for the terminal."""
+    table = _table("before, rad", "after, rad", "change, rad")
+    for module, q in wanted.items():
+        seen = before[module]
+        if seen.zeroed:
+            change = (q[0] - seen.q[0], q[1] - seen.q[1])
+            table.add_row(module, _angles(seen.q), _angles(q), _angles(change))
+        else:
+            table.add_row(module, "unzeroed", _angles(q), "-")
+    return table
+
+
+def _set_all(
+    robot: RobotConfig, drives: Mapping[str, Drive], wanted: Mapping[str, Pair], console: Console
+) -> int:
+    """Set all, read all back, show it; return the exit code."""
+    table = _table("told, rad", "read back, rad", "")
+    code = 0
+    for module, q in wanted.items():
+        try:
+            back = zero(drives[module], q, robot)
+        except DriveError as error:  # the others are told all the same
+            console.print(f"[bold red]{module}[/]: {escape(str(error))}")
+            back = None
+        good = is_right(back, q)
+        code = code if good else 1
+        read = "nothing" if back is None else _angles(back.q)
+        table.add_row(module, _angles(q), read, "zeroed" if good else "[bold red]NOT zeroed[/]")
+    console.print(table)
+    if code:
+        console.print("[bold red]what is not zeroed must not be armed[/]: look at it, and again")
+    return code
+
+
+def _look_all(robot: RobotConfig, drives: Mapping[str, Drive]) -> dict[str, DriveLook]:
+    """Look at every drive.
+
+    Raises:
+        DriveError: one cannot be zeroed now; names all that cannot.
+    """
+    mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
+    seen = {module: look(drive, mark, gear_ratio) for module, drive in drives.items()}
+    faults = [f"{module}: {why}" for module, one in seen.items() if (why := refusal(one))]
+    if faults:
+        raise DriveError("; ".join(faults) + "; nothing was changed")
+    return seen
+
+
+def _open(robot: RobotConfig, module: str, run_dir: Path, stack: contextlib.ExitStack) -> Drive:
+    """Return a module's drive as it counts itself; the stack releases it."""
+    unmarked = msgspec.structs.replace(robot.drive, zero_mark_turns=0.0)
+    drive = open_drive(msgspec.structs.replace(robot, drive=unmarked), module, run_dir)
+    stack.callback(drive.close)
+    return drive
+
+
+def _warn(
+    wanted: Mapping[str, Pair], holders: Mapping[str, SupervisedFleet | None], console: Console
+) -> None:
+    """Say what comes by itself once a drive is zeroed."""
+    armed = [module for module in wanted if holders[module] is not None]
+    if armed:
+        console.print(
+            f"[yellow]{', '.join(armed)}: the joint service is up and, unless it is read-only, "
+            "arms the drive as soon as it is zeroed[/]"
+        )
+
+
+def _states(
+    robot: RobotConfig, fleet: SupervisedFleet, modules: list[str]
+) -> dict[str, JointState]:
+    """Return a state of each of a fleet's modules that is heard."""
+    heard: dict[str, JointState] = {}
+    with open_session(robot, "zero", fleet.run.path) as session:
+        ends = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in modules}
+        deadline = time.monotonic() + HEARD_S
+        while time.monotonic() < deadline and len(heard) < len(modules):
+            for module, latest in ends.items():
+                state = latest.take()
+                if state is not None:  # its stamp is the drive's, which may be silent
+                    heard[module] = state
+            time.sleep(0.01)
+    return heard
+
+
+def _way_out(module: str, mode: Mode) -> str:
+    """Return why a joint service in this mode is in the way, and what to do."""
+    if mode in (Mode.HOLD, Mode.TRACK):
+        return f"its joint service holds it ({mode.name}); hang the robot and `xrl down` first"
+    return (
+        f"its joint service is in {mode.name}; hang the robot and `xrl kill {module}` "
+        "(a restart leaves it), or `xrl down` first"
+    )
+
+
+def _pair(text: str) -> Pair:
+    try:
+        phi, theta = (float(part) for part in text.split(","))
+    except ValueError:
+        raise DriveError(f"--at {text!r}: write phi and theta in rad, such as 0,-0.5") from None
+    return phi, theta
+
+
+def _angles(q: Pair) -> str:
+    return f"{q[0]:+.4f} {q[1]:+.4f}"
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, caption="phi, theta", caption_justify="left")
+    for heading in ("module", *columns):
+        table.add_column(heading, no_wrap=True)
+    return table
