@@ -18,12 +18,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from services.recorder import provenance
-from services.recorder.auto_recover import Rescue
+from services.recorder.auto_recover import AutoRecovery
 from services.recorder.disk_guard import MIB
-from services.recorder.files import FIRST
-from services.recorder.mcap_log import SCHEMA_VERSION, MessageSource, RunWriter
-from services.recorder.recording import CAPACITY, Recorder, free_bytes_at, summary
+from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
 from services.recorder.snapshot import SnapshotRing
 from shared import log
 from shared.bus import topics
@@ -32,6 +29,9 @@ from shared.clock import keep_pace, now_ns, pace
 from shared.config.files import load
 from shared.config.sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
+from shared.mcap_log import provenance
+from shared.mcap_log.files import FIRST
+from shared.mcap_log.writer import SCHEMA_VERSION, MessageSource, RunWriter
 from shared.priority import raise_priority
 from shared.process import CHECKOUT, StopFlag, run_service, service_parser
 from shared.robot import gain_schedule
@@ -80,7 +80,7 @@ def main() -> int:
     # The bus before the file: an endpoint that is taken leaves no empty file behind.
     with open_session(config, "recorder", arguments.run_dir) as session:
         stream = session.stream([f"xrl/{config.name}/**"], capacity=CAPACITY)
-        rescue = Rescue(arguments.out, config.recorder.free_min_mib * MIB, logger)
+        auto_recovery = AutoRecovery(arguments.out, config.recorder.free_min_mib * MIB, logger)
         try:
             with RunWriter(
                 arguments.out,
@@ -95,13 +95,13 @@ def main() -> int:
                     stream, writer, config.recorder, logger, arguments.out, snapshot
                 )
                 logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
-                rescue.start()
+                auto_recovery.start()
                 _record(recording, stop, asked)
         except RunError as error:
             logger.error("%s", error)
             return 1
         finally:
-            rescue.halt()
+            auto_recovery.halt()
     what = f"finished {writer.path}" if writer.begun else "nothing written"
     logger.info("%s: %s", what, summary(writer, snapshot))
     return 0

@@ -12,13 +12,13 @@ import threading
 import time
 from pathlib import Path
 
-from services.recorder import recover
-from services.recorder.files import RECOVERED, SUFFIX, locked, recovered_name
-from services.recorder.recover import Interrupted
 from shared.exceptions import RunError
+from shared.mcap_log import recover
+from shared.mcap_log.files import RECOVERED, SUFFIX, locked, recovered_name
+from shared.mcap_log.recover import Interrupted
 
 
-class Rescue(threading.Thread):
+class AutoRecovery(threading.Thread):
     """Looks through a directory once, and ends."""
 
     def __init__(self, directory: Path, keep_free: int, logger: logging.Logger) -> None:
@@ -29,7 +29,7 @@ class Rescue(threading.Thread):
             keep_free: bytes that are to stay free beside a copy.
             logger: for what was recovered.
         """
-        super().__init__(name="rescue", daemon=True)
+        super().__init__(name="auto_recovery", daemon=True)
         self._directory, self._keep_free = directory, keep_free
         self._logger = logger
         self._halt = threading.Event()
@@ -49,7 +49,7 @@ class Rescue(threading.Thread):
             if path.name.endswith(RECOVERED) or path.is_symlink():
                 continue
             try:
-                rescue(path, self._keep_free, self._logger, self._pace)
+                recover_in_place(path, self._keep_free, self._logger, self._pace)
             except Interrupted:
                 self._logger.info("%s: recovery goes on at the next start", path)
                 return
@@ -63,7 +63,9 @@ class Rescue(threading.Thread):
         return stopped
 
 
-def rescue(path: Path, keep_free: int, logger: logging.Logger, stop: recover.Stop) -> None:
+def recover_in_place(
+    path: Path, keep_free: int, logger: logging.Logger, stop: recover.Stop
+) -> None:
     """Recover one file, if it is unfinished and nobody writes it.
 
     What was only cut off is replaced by its recovered copy once that is on the disk. If

@@ -14,11 +14,11 @@ from typing import Final
 
 import msgspec
 
-from services.recorder.mcap_log import MessageSource
 from shared.bus import topics
 from shared.bus.messages import Mode
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
+from shared.mcap_log.writer import MessageSource
 
 FAULTS: Final = frozenset((Mode.FAULT, Mode.DAMP))
 """Modes of a joint service that are worth a file."""

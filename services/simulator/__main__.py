@@ -16,6 +16,7 @@ from services.simulator.harness_front import HarnessFront
 from services.simulator.imu_front import ImuFront
 from services.simulator.loop import SimulatorLoop, SimulatorPorts
 from services.simulator.plant import plant_from
+from services.simulator.unix_can_hub import UnixCanHub
 from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
 from shared import log
@@ -23,7 +24,6 @@ from shared.bus import topics
 from shared.bus.messages import OperatorIntent, SimControl, SimTruth
 from shared.bus.session import open_session
 from shared.bus.traces import SimState
-from shared.can.unix_can_hub import UnixCanHub
 from shared.config import files as config_file
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig, expand

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from services.simulator.axis_bank import AxisBank
 from services.simulator.axis_settings import N_DRIVES
 from services.simulator.cansimple_dialects import DIALECTS, DialectName, Setter
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.can.cansimple_06 import Command06
 from shared.can.unix_can import REMOTE_FLAG, pack_frames
-from shared.can.unix_can_hub import UnixCanHub
 from shared.robot.joints import N_JOINTS
 
 _DATA_BYTES = 8

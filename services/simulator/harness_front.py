@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from services.simulator.frame_hub import FrameHub
+from services.simulator.unix_can_hub import FrameHub
 from shared.can import loadcell_can
 from shared.config.robot_config import RobotConfig
 from shared.robot import stewart

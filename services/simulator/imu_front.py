@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.simulator.frame_hub import FrameHub
 from services.simulator.plant import ImuErrors
+from services.simulator.unix_can_hub import FrameHub
 from services.simulator.world import World
 from shared.can import imu_can
 from shared.config.sections import ImuConfig

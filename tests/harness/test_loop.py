@@ -15,12 +15,12 @@ from services.harness.__main__ import make_sensor
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
 from services.simulator.harness_front import BIAS_MAX, HarnessFront
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.bus.codec import Decoder
 from shared.bus.messages import Wrench
 from shared.can import sensor_loop
 from shared.can.loadcell_can import SampleAssembler, pack
 from shared.can.sensor_loop import next_deadline, run
-from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import NS_PER_MS
 from shared.config.sections import CanConfig
 from tests.harness.helpers import (

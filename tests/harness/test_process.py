@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from services.simulator.harness_front import HarnessFront
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.bus import topics
 from shared.bus.messages import Tare, TareRequest, Wrench
 from shared.bus.session import open_session
-from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import now_ns
 from tests.harness.helpers import ROBOT
 

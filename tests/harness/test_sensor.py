@@ -9,9 +9,9 @@ import can
 import pytest
 
 from services.harness.sensor import CanHarnessSensor
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.can import loadcell_can
 from shared.can.can_sensor import DRAIN_MAX, RETRY_NS
-from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.exceptions import ConfigError
 from tests.harness.helpers import PERIOD_NS, CanHub

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.bus import topics
 from shared.bus.messages import Attitude
 from shared.bus.session import open_session
 from shared.can import imu_can
-from shared.can.unix_can_hub import UnixCanHub
 from shared.config.files import load, to_toml
 from shared.config.robot_config import RobotConfig
 from shared.robot.gain_schedule import path_beside, write

@@ -22,7 +22,7 @@ from shared.bus.messages import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES, SIDES
-from tests.recorder.runs import sample as sample_of
+from tests.shared.mcap_log.runs import sample as sample_of
 from tools.runs import partial
 from tools.runs.partial import KINDS, SUBSETS, PartialCase, PartialStart, run_case
 

@@ -6,8 +6,8 @@ from services.recorder.snapshot import OVERHEAD, SnapshotRing
 from shared.bus import codec, topics
 from shared.bus.messages import Estop, JointEvent, Mode
 from shared.clock import NS_PER_S
-from tests.recorder import runs
-from tests.recorder.runs import ROBOT, STATE_KEY, Queue
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import ROBOT, STATE_KEY, Queue
 
 Item = tuple[str, bytes, int]
 EVENT_KEY = topics.JOINT_EVENT.key(ROBOT, "knee_right")

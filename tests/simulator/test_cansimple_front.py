@@ -19,11 +19,11 @@ from services.simulator.cansimple_dialects import (
     errors_06,
 )
 from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisState, Command, arbitration_id
 from shared.can.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode
 from shared.can.unix_can import REMOTE_FLAG, UnixCanBus
-from shared.can.unix_can_hub import UnixCanHub
 from tests.simulator.banks import CPR, DT, ZERO, make_bank
 
 NODE, AXIS = 5, 3  # axis1 of knee_right

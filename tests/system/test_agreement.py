@@ -33,7 +33,7 @@ from shared.network.impairment import Impairer, Impairment
 from shared.network.proxy_protocol import SOCKET
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
-from tests.recorder.runs import sample
+from tests.shared.mcap_log.runs import sample
 from tests.system.stalls import has_stalled, stalled_before_it_began
 from tools.fleet.proxy_client import ProxyClient
 from tools.runs.run_log import read_run

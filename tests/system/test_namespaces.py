@@ -33,7 +33,7 @@ from shared.bus.messages import (
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
-from tests.recorder.runs import ROBOT, sample, write
+from tests.shared.mcap_log.runs import ROBOT, sample, write
 from tests.system.multihost import BODY, LEGS, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in
 from tests.system.stalls import stalled_before_it_began

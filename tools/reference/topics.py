@@ -8,9 +8,9 @@ from typing import Final, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from services.recorder.schema import ENUMERATIONS
 from shared.bus import messages, topics
 from shared.bus.topics import Topic
+from shared.mcap_log.schema import ENUMERATIONS
 from tools.reference.field_docs import field_docs, one_line, summary
 
 ENUMS: Final[tuple[type[IntEnum], ...]] = tuple(

@@ -10,8 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from services.recorder import provenance
-from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
 from services.simulator.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.codec import encode
@@ -20,6 +18,8 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
+from shared.mcap_log import provenance
+from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.network.impairment import Impairment
 from shared.process import CHECKOUT
 from shared.robot.robot_model import mjcf

@@ -2,25 +2,23 @@
 
 A killed file has no summary, and may end in the middle of a record; the readers of
 the mcap package find nothing in the first and may stumble over the second (docs/logs.md).
-`services.recorder.reader` walks the records from the start and keeps every whole one; here they are
+`shared.mcap_log.reader` walks the records from the start and keeps every whole one; here they are
 sorted by key.
 """
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from services.recorder import mcap_records as mcap
-from services.recorder.mcap_log import SCHEMA_VERSION
-from services.recorder.mcap_records import Malformed
-from services.recorder.reader import LostBytes, Piece, opened
-from services.recorder.sequence_stats import KeyCount
 from shared.bus.topics import Topic
 from shared.exceptions import RunError
+from shared.mcap_log.reader import LogRecord, LostBytes, open_log
+from shared.mcap_log.records import Attachment, Channel, Metadata
+from shared.mcap_log.sequence_stats import KeyCount
+from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.analysis.logs.files import files_in
 
 
@@ -147,13 +145,12 @@ class RunLog:
 
     def _read(self, file: Path) -> None:
         self._by_channel = {}
-        with opened(file) as salvage:
-            for piece in salvage:
-                with contextlib.suppress(Malformed):
-                    self._take(piece)
-            self.complete = self.complete and salvage.finished
-            self.damage += salvage.damage
-            self.cut = salvage.cut or self.cut
+        with open_log(file) as reader:
+            for record in reader:
+                self._take(record)
+            self.complete = self.complete and reader.finished
+            self.damage += reader.damage
+            self.cut = reader.cut or self.cut
 
     def _key(self, topic: Topic, module: str) -> str:
         if topic.per_module != bool(module):
@@ -173,33 +170,26 @@ class RunLog:
             )
         return value
 
-    def _take(self, piece: Piece) -> None:
-        if piece.opcode == mcap.METADATA:
-            name, entries = mcap.metadata(piece.body)
-            self.metadata[name] = entries
-        elif piece.opcode == mcap.ATTACHMENT:
-            attachment = mcap.attachment(piece.body)
-            self.attachments[attachment.name] = attachment.data
-        elif piece.opcode == mcap.CHANNEL:
-            self._take_channel(piece.body)
-        for opcode, body in piece.others:
-            if opcode == mcap.CHANNEL:
-                self._take_channel(body)
-        self._take_messages(piece)
+    def _take(self, record: LogRecord) -> None:
+        for value in record.values():
+            match value:
+                case Metadata(name=name, metadata=entries):
+                    self.metadata[name] = entries
+                case Attachment(name=name, data=data):
+                    self.attachments[name] = data
+                case Channel(id=number, topic=topic):
+                    self._by_channel[number] = self._series.setdefault(topic, Series())
+        self._take_messages(record)
 
-    def _take_messages(self, piece: Piece) -> None:
+    def _take_messages(self, record: LogRecord) -> None:
         """Sort messages by channel; the hot loop of reading."""
-        body, by_channel = piece.body, self._by_channel
-        for channel, seq, log_ns, _, start, end in piece.rows:
+        body, by_channel = record.body, self._by_channel
+        for channel, seq, log_ns, _, start, end in record.rows:
             series = by_channel.get(channel)
             if series is not None:
                 series.payloads.append(body[start:end])
                 series.received_ns.append(log_ns)
                 series.seq.append(seq)
-
-    def _take_channel(self, body: bytes) -> None:
-        channel = mcap.channel(body)
-        self._by_channel[channel.id] = self._series.setdefault(channel.topic, Series())
 
 
 def read_run(path: Path) -> RunLog:

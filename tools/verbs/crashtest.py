@@ -13,9 +13,9 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from services.recorder import provenance
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.mcap_log import provenance
 from shared.process import CHECKOUT
 from tools.fleet import procfs
 from tools.runs import experiment

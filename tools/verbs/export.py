@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from services.recorder.files import SUFFIX
-from services.recorder.scene import extended
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.mcap_log.extended_copy import write_extended
+from shared.mcap_log.files import SUFFIX
 from shared.process import DEFAULT_CONFIG
 from tools.analysis.reports import scene
 from tools.output import write_atomically
@@ -108,7 +108,7 @@ def export_scene(log: RunLog, robot: RobotConfig, out: Path) -> int:
     Raises:
         RunError: the log cannot be copied or lacks states, or the copy cannot be written.
     """
-    return extended(log.path, out, scene.channels(log.robot), scene.messages(log, robot))
+    return write_extended(log.path, out, scene.channels(log.robot), scene.messages(log, robot))
 
 
 def layout_for(robot: str) -> dict[str, Any]:

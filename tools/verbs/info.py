@@ -12,12 +12,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from services.recorder.mcap_log import SCHEMA_VERSION
-from services.recorder.reader import LostBytes
-from services.recorder.recover import clock_time, describe_lost
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
+from shared.mcap_log.reader import LostBytes
+from shared.mcap_log.recover import clock_time, describe_lost
+from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.analysis.logs.files import files_of_run
 from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
 from tools.output import printable

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from services.recorder import recover
-from services.recorder.files import in_use, recovered_name
-from services.recorder.reader import opened
 from shared.exceptions import RunError
-from tools.analysis.logs.files import Metadata, head_of
+from shared.mcap_log import recover
+from shared.mcap_log.files import in_use, recovered_name
+from shared.mcap_log.reader import open_log
+from tools.analysis.logs.files import MetadataByName, head_of
 from tools.output import printable
 from tools.verb_table import Subparsers, add_verb
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     if not outcome.finished and flush_ms:
         console.print(
             f"  the recorder wrote every {printable(flush_ms)} ms: what came after its last write "
-            "is nowhere",
+            "is lost",
             soft_wrap=True,
         )
     return 0
@@ -69,12 +69,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _is_whole(path: Path) -> bool:
     """Return True if a file is finished and every record of it can be read."""
-    with opened(path) as salvage:
-        if not salvage.finished:
+    with open_log(path) as reader:
+        if not reader.finished:
             return False
-        for _ in salvage:
+        for _ in reader:
             pass
-        return not salvage.damage
+        return not reader.damage
 
 
 def _in_use(path: Path) -> bool:
@@ -84,7 +84,7 @@ def _in_use(path: Path) -> bool:
         return False
 
 
-def _head(path: Path) -> Metadata:
+def _head(path: Path) -> MetadataByName:
     try:
         return head_of(path)
     except RunError:

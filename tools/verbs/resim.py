@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from services.recorder.provenance import machine
 from shared.bus import topics
 from shared.bus.messages import JointEvent, JointState, Message, PlannerStatus
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.mcap_log.provenance import machine
 from shared.robot.joints import MODULES
 from tools.analysis.reexecution import rewritten
 from tools.analysis.reexecution.compare import size

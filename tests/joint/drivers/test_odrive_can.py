@@ -19,9 +19,9 @@ from services.joint.drivers.odrive_can import ARM_GRACE_MS, RETRY_MS, OdriveCan
 from services.simulator.axis_bank import AxisBank
 from services.simulator.cansimple_dialects import DialectName
 from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisError, AxisState, Command, arbitration_id, pack_two_floats
 from shared.can.unix_can import UnixCanBus
-from shared.can.unix_can_hub import UnixCanHub
 from shared.config.sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
 

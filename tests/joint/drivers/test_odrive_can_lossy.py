@@ -13,9 +13,9 @@ from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import OdriveCan
 from services.simulator.cansimple_dialects import DialectName
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, ControlMode
 from shared.can.unix_can import Frame
-from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import NS_PER_MS
 from tests.joint.drivers.test_odrive_can import AXES, DRIVE, MS, Rig, make_driver, path
 

@@ -18,9 +18,9 @@ import pytest
 
 from services.joint.drivers import can_link, odrive_can
 from services.joint.drivers.base import DriveStatus, MotorTarget
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState
 from shared.can.unix_can import Frame
-from shared.can.unix_can_hub import UnixCanHub
 from shared.clock import NS_PER_MS
 from tests.joint.drivers.test_odrive_can import AXES, Rig, make_driver
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from services.simulator.unix_can_hub import UnixCanHub
 from shared.can import cansimple, imu_can, loadcell_can
 from shared.can.cansimple import AxisState, Command, Heartbeat, arbitration_id
 from shared.can.cansimple_06 import Command06, Version, pack_version
 from shared.can.unix_can import REMOTE_FLAG
-from shared.can.unix_can_hub import UnixCanHub
 from shared.config.sections import CanConfig
 from tools.bringup.can_monitor import listen
 

@@ -15,7 +15,7 @@ from shared.clock import NS_PER_S
 from shared.config.scenarios import Inject
 from shared.network.impairment import Direction, Impairment
 from shared.network.impairment_schedule import ImpairmentSchedule
-from tests.recorder.runs import sample
+from tests.shared.mcap_log.runs import sample
 from tools.fleet.live_view import LiveView, active, waiting
 from tools.runs import verdict_table
 from tools.runs.impairment_intervals import impairments, touches

@@ -11,8 +11,8 @@ import pytest
 from shared.bus import codec, topics
 from shared.bus.messages import JointState, Wrench
 from shared.bus.traces import LinkEvent
-from tests.recorder import runs
-from tests.recorder.runs import OFFSET_NS, ROBOT, STATE_KEY, Queue
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import OFFSET_NS, ROBOT, STATE_KEY, Queue
 from tools import cli
 
 WRENCH_KEY = topics.WRENCH.key(ROBOT)

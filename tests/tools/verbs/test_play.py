@@ -12,8 +12,8 @@ import pytest
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
-from tests.recorder import runs
-from tests.recorder.runs import item, write
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import item, write
 from tools import cli
 from tools.analysis.playback import arguments, reading
 from tools.verbs import play

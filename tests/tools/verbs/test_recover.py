@@ -1,4 +1,4 @@
-"""`xrl recover`; what it can bring back is in tests/recorder/test_recover.py."""
+"""`xrl recover`; what it can bring back is in tests/shared/mcap_log/test_recover.py."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.recorder import runs
-from tests.recorder.runs import STATE_KEY, Queue, item
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import STATE_KEY, Queue, item
 from tools import cli
 from tools.runs.run_log import read_run
 

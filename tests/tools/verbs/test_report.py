@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from services.recorder.mcap_log import SCHEMA_VERSION
-from tests.recorder import runs
+from shared.mcap_log.writer import SCHEMA_VERSION
+from tests.shared.mcap_log import runs
 from tools import cli
 
 

@@ -6,32 +6,31 @@ import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 
-from services.recorder import mcap_records as mcap
-from services.recorder.files import SUFFIX
-from services.recorder.reader import opened
 from shared.exceptions import RunError
+from shared.mcap_log.files import SUFFIX
+from shared.mcap_log.reader import open_log
+from shared.mcap_log.records import Metadata
 
-Metadata = dict[str, dict[str, str]]
+MetadataByName = dict[str, dict[str, str]]
 
 
-def head_of(path: Path) -> Metadata:
+def head_of(path: Path) -> MetadataByName:
     """Return the metadata at the start of a file, up to its first messages.
 
     Raises:
         RunError: it is missing, empty, or no MCAP file.
     """
-    found: Metadata = {}
-    with opened(path) as salvage:
-        for piece in salvage:
-            if piece.rows:
+    found: MetadataByName = {}
+    with open_log(path) as reader:
+        for record in reader:
+            if record.rows:
                 break
-            if piece.opcode == mcap.METADATA:
-                name, entries = mcap.metadata(piece.body)
-                found[name] = entries
+            if isinstance(record.value, Metadata):
+                found[record.value.name] = record.value.metadata
     return found
 
 
-def files_of_run(path: Path, metadata: Metadata) -> list[Path]:
+def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
     """Return the files of the run that one of them belongs to, in order; that one at least.
 
     A recovered copy stands in for nothing: only if the original is gone it is taken.
@@ -90,6 +89,6 @@ def _names(directory: Path) -> Iterable[Path]:
     return sorted(directory.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
 
 
-def _number(metadata: Metadata) -> int:
+def _number(metadata: MetadataByName) -> int:
     text = metadata.get("split", {}).get("number", "")
     return int(text) if text.isdecimal() and text.isascii() and len(text) < 10 else 0

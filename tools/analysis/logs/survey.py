@@ -8,14 +8,13 @@ from typing import Final
 
 import msgspec
 
-from services.recorder import mcap_records as mcap
-from services.recorder.files import in_use
-from services.recorder.mcap_log import PROFILE
-from services.recorder.mcap_records import Channel, Malformed
-from services.recorder.reader import LostBytes, Piece, Salvage, opened
-from services.recorder.sequence_stats import KeyCount
 from shared.clock import NS_PER_S
-from tools.analysis.logs.files import Metadata
+from shared.mcap_log.files import in_use
+from shared.mcap_log.reader import LogReader, LogRecord, LostBytes, open_log
+from shared.mcap_log.records import Attachment, Channel, Header, McapRecord, Metadata, Schema
+from shared.mcap_log.sequence_stats import KeyCount
+from shared.mcap_log.writer import PROFILE
+from tools.analysis.logs.files import MetadataByName
 
 _NEVER: Final = -1
 
@@ -61,7 +60,7 @@ class FileFacts(msgspec.Struct, kw_only=True):
     """Messages of channels that are nowhere described."""
     attachments: dict[str, int] = msgspec.field(default_factory=dict)
     """Sizes by name."""
-    metadata: Metadata = msgspec.field(default_factory=dict)
+    metadata: MetadataByName = msgspec.field(default_factory=dict)
     cut: LostBytes | None = None
     damage: list[LostBytes] = msgspec.field(default_factory=list)
 
@@ -99,12 +98,12 @@ class Survey:
         Raises:
             RunError: it is missing, empty, or no MCAP file.
         """
-        with opened(path) as salvage:
+        with open_log(path) as reader:
             facts = FileFacts(
-                path=path, size=salvage.size, finished=salvage.finished, in_use=_in_use(path)
+                path=path, size=reader.size, finished=reader.finished, in_use=_in_use(path)
             )
-            _Reading(facts, self.topics).read(salvage)
-            facts.cut, facts.damage = salvage.cut, salvage.damage
+            _Reading(facts, self.topics).read(reader)
+            facts.cut, facts.damage = reader.cut, reader.damage
         self.files.append(facts)
         return facts
 
@@ -117,29 +116,25 @@ class _Reading:
         self._schemas: dict[int, str] = {0: ""}
         self._channels: dict[int, TopicFacts] = {}
 
-    def read(self, salvage: Salvage) -> None:
-        for piece in salvage:
-            with contextlib.suppress(Malformed):
-                self._take(piece.opcode, piece.body)
-                for opcode, body in piece.others:
-                    self._take(opcode, body)
-            if piece.rows:
-                self._count(piece)
+    def read(self, reader: LogReader) -> None:
+        for record in reader:
+            for value in record.values():
+                self._take(value)
+            if record.rows:
+                self._count(record)
 
-    def _take(self, opcode: int, body: bytes) -> None:
-        if opcode == mcap.HEADER:
-            self._facts.profile, self._facts.library = mcap.header(body)
-        elif opcode == mcap.SCHEMA:
-            schema = mcap.schema(body)
-            self._schemas[schema.id] = schema.name
-        elif opcode == mcap.CHANNEL:
-            self._define(mcap.channel(body))
-        elif opcode == mcap.METADATA:
-            name, entries = mcap.metadata(body)
-            self._facts.metadata[name] = entries
-        elif opcode == mcap.ATTACHMENT:
-            attachment = mcap.attachment(body)
-            self._facts.attachments[attachment.name] = len(attachment.data)
+    def _take(self, value: McapRecord) -> None:
+        match value:
+            case Header(profile=profile, library=library):
+                self._facts.profile, self._facts.library = profile, library
+            case Schema(id=number, name=name):
+                self._schemas[number] = name
+            case Channel():
+                self._define(value)
+            case Metadata(name=name, metadata=entries):
+                self._facts.metadata[name] = entries
+            case Attachment(name=name, data=data):
+                self._facts.attachments[name] = len(data)
 
     def _define(self, channel: Channel) -> None:
         nominal_hz = 0.0
@@ -148,10 +143,10 @@ class _Reading:
         facts = TopicFacts(schema=self._schemas.get(channel.schema_id, ""), nominal_hz=nominal_hz)
         self._channels[channel.id] = self._topics.setdefault(channel.topic, facts)
 
-    def _count(self, piece: Piece) -> None:
+    def _count(self, record: LogRecord) -> None:
         """Count the messages of a chunk; the hot loop."""
         file, channels, ours = self._facts, self._channels, self._facts.ours
-        for channel, seq, log_ns, publish_ns, start, end in piece.rows:
+        for channel, seq, log_ns, publish_ns, start, end in record.rows:
             topic = channels.get(channel)
             if topic is None:
                 file.orphans += 1

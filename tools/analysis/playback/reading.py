@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Sequence
 from operator import attrgetter
 from pathlib import Path
@@ -10,12 +9,11 @@ from typing import Final
 
 import msgspec
 
-from services.recorder import mcap_records as mcap
-from services.recorder.mcap_records import Malformed
-from services.recorder.reader import Piece, Salvage, opened
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tools.analysis.logs.files import Metadata, files_in
+from shared.mcap_log.reader import LogReader, LogRecord, open_log
+from shared.mcap_log.records import Attachment, Channel, Metadata
+from tools.analysis.logs.files import MetadataByName, files_in
 from tools.analysis.playback.schedule import Entry
 
 ROBOT_FILE: Final = "robot.toml"
@@ -123,16 +121,16 @@ class _File:
 
     def __init__(self, path: Path, index: dict[str, int]) -> None:
         self.path = path
-        self.metadata: Metadata = {}
+        self.metadata: MetadataByName = {}
         self.robot_file: str | None = None
         self.entries: list[Entry] = []
         self.offset_ns = 0
         self._index = index
         self._channels: dict[int, str] = {}
-        with opened(path) as salvage:
-            self._read(salvage)
-            self.finished = salvage.finished
-            self.damaged = bool(salvage.damage)
+        with open_log(path) as reader:
+            self._read(reader)
+            self.finished = reader.finished
+            self.damaged = bool(reader.damage)
 
     def check(self) -> None:
         """Refuse what is no run of this project.
@@ -154,29 +152,21 @@ class _File:
         self.offset_ns = offset_ns
         self.entries = [row._replace(time_ns=row.time_ns - offset_ns) for row in self.entries]
 
-    def _read(self, salvage: Salvage) -> None:
-        for piece in salvage:
-            with contextlib.suppress(Malformed):
-                self._take(piece.opcode, piece.body)
-                for opcode, body in piece.others:
-                    self._take(opcode, body)
-            self._take_messages(piece)
+    def _read(self, reader: LogReader) -> None:
+        for record in reader:
+            for value in record.values():
+                match value:
+                    case Channel(id=number, topic=topic):
+                        self._channels[number] = topic
+                    case Metadata(name=name, metadata=entries):
+                        self.metadata[name] = entries
+                    case Attachment(name=name, data=data) if name == ROBOT_FILE:
+                        self.robot_file = data.decode(errors="replace")
+            self._take_messages(record)
 
-    def _take(self, opcode: int, body: bytes) -> None:
-        if opcode == mcap.CHANNEL:
-            channel = mcap.channel(body)
-            self._channels[channel.id] = channel.topic
-        elif opcode == mcap.METADATA:
-            name, entries = mcap.metadata(body)
-            self.metadata[name] = entries
-        elif opcode == mcap.ATTACHMENT:
-            attachment = mcap.attachment(body)
-            if attachment.name == ROBOT_FILE:
-                self.robot_file = attachment.data.decode(errors="replace")
-
-    def _take_messages(self, piece: Piece) -> None:
-        body, index = piece.body, self._index
-        for channel, _, log_ns, _, start, end in piece.rows:
+    def _take_messages(self, record: LogRecord) -> None:
+        body, index = record.body, self._index
+        for channel, _, log_ns, _, start, end in record.rows:
             topic = self._channels.get(channel)
             if topic is not None:
                 key = index.setdefault(topic, len(index))

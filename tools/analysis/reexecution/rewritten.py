@@ -10,10 +10,10 @@ import msgspec
 from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
-from services.recorder import schema
 from shared.bus import topics
 from shared.bus.messages import Message
 from shared.exceptions import RunError
+from shared.mcap_log import schema
 from tools.runs.run_log import RunLog
 
 PROFILE: Final = "xrl"

@@ -15,12 +15,12 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from services.planner.kinematics import Kinematics
-from services.recorder.scene import NewChannel, NewMessage
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode, PlannerStatus, SimTruth, Vector3, Wrench
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.mcap_log.extended_copy import NewChannel, NewMessage
 from shared.robot.joints import MODULES, SIDES
 from shared.robot.robot_model import MODULE_RADIUS, side_sign
 from tools.analysis.reports import foxglove, urdf

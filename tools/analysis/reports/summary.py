@@ -10,10 +10,10 @@ from typing import Any, Final, NamedTuple
 
 from rich.console import Console
 
-from services.recorder.recover import describe_lost
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
+from shared.mcap_log.recover import describe_lost
 from tools.analysis.reports.run_data import RunData
 from tools.runs import verdict, verdict_table
 from tools.runs.verdict import Summary

@@ -20,8 +20,8 @@ from shared.bus.messages import Estop, JointCommand, JointState, Message, SimTru
 from shared.bus.session import Session, open_session
 from shared.config import files as config_file
 from shared.process import DEFAULT_CONFIG
-from tests.recorder import runs
-from tests.recorder.runs import Queue, sample
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import Queue, sample
 from tools.analysis.playback.arguments import LISTEN
 
 ROOT = DEFAULT_CONFIG.parents[1]

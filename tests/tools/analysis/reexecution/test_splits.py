@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from services.recorder.mcap_log import RunWriter
 from shared.bus import topics
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Restart
 from shared.exceptions import RunError
+from shared.mcap_log.writer import RunWriter
 from shared.robot.joints import MODULES
 from tests.lockstep.runs import still
-from tests.recorder.runs import Queue
+from tests.shared.mcap_log.runs import Queue
 from tools import cli
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.runs.network import BASE

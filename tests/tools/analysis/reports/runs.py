@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import msgspec
 
-from services.recorder.mcap_log import RunWriter
 from shared.bus import topics
 from shared.clock import NS_PER_S
-from tests.recorder.runs import Queue
+from shared.mcap_log.writer import RunWriter
+from tests.shared.mcap_log.runs import Queue
 from tools import cli
 from tools.runs.run_log import RunLog, read_run
 

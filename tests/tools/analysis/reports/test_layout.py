@@ -12,10 +12,10 @@ import msgspec
 import pytest
 from mcap.reader import make_reader
 
-from services.recorder import schema
 from shared.bus import topics
 from shared.bus.messages import DriveStatus, Mode, PlannerMode, SplitSource
 from shared.config.robot_config import RobotConfig
+from shared.mcap_log import schema
 from tests.tools.analysis.reports.layout_types import FIELD, PANELS, TOPIC, Layout, Plot, Split, Tab
 from tests.tools.analysis.reports.runs import Made
 from tools import cli

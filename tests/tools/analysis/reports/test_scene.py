@@ -19,13 +19,13 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
-from services.recorder import schema
 from shared.bus import codec, topics
 from shared.config.robot_config import RobotConfig
+from shared.mcap_log import schema
 from shared.robot.joints import JOINTS, MODULES, SIDES
 from shared.robot.robot_model import ankle_positions, mjcf
-from tests.recorder.runs import sample
-from tests.recorder.test_schema import fits
+from tests.shared.mcap_log.runs import sample
+from tests.shared.mcap_log.test_schema import fits
 from tests.tools.analysis.reports import runs
 from tests.tools.analysis.reports.runs import Made
 from tools import cli

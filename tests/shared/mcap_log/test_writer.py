@@ -9,11 +9,11 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
-from services.recorder import mcap_log
 from shared.bus import codec
 from shared.exceptions import RunError
-from tests.recorder import runs
-from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, Queue, item
+from shared.mcap_log import files
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, Queue, item
 from tools.runs.run_log import read_run
 
 
@@ -105,7 +105,7 @@ def test_a_full_disk_is_one_run_error(tmp_path: Path, monkeypatch: pytest.Monkey
         opened.append(full.open("wb"))
         return full, opened[-1]
 
-    monkeypatch.setattr(mcap_log.files, "create", create)
+    monkeypatch.setattr(files, "create", create)
     with pytest.raises(RunError, match=r"^/dev/full: cannot be written: No space left"):
         runs.writer(tmp_path)
     assert opened[0].closed
@@ -190,8 +190,8 @@ def test_while_no_file_is_open_messages_are_counted_as_left_out(tmp_path: Path) 
 
 def test_a_file_is_locked_while_it_is_written(tmp_path: Path) -> None:
     with runs.writer(tmp_path) as run:
-        assert mcap_log.files.in_use(run.path)
-    assert not mcap_log.files.in_use(run.path)
+        assert files.in_use(run.path)
+    assert not files.in_use(run.path)
 
 
 def test_a_sync_that_fails_is_one_run_error(
@@ -200,6 +200,6 @@ def test_a_sync_that_fails_is_one_run_error(
     def fail(_descriptor: int) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr("services.recorder.fsync_thread.os.fsync", fail)
+    monkeypatch.setattr("shared.mcap_log.fsync_thread.os.fsync", fail)
     with pytest.raises(RunError, match=r"run\.mcap: cannot be .*Input/output error"):
         runs.write(tmp_path, [item(0)])

@@ -9,6 +9,7 @@ import socket
 import stat
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Protocol
 
 from shared.can.unix_can import PACKET_BYTES, Frame, pack_frames, unpack_frames
 from shared.exceptions import FleetError
@@ -16,6 +17,16 @@ from shared.exceptions import FleetError
 _PATH_BYTES = 107  # sun_path less its closing zero
 _BACKLOG = 16
 _ROUNDS = 64  # a client that floods the bus must not hold up the simulator
+
+
+class FrameHub(Protocol):
+    """What a simulated sensor needs of its CAN bus."""
+
+    def poll(self) -> object:
+        """Admit new clients and take the frames that they sent; never waits."""
+
+    def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
+        """Send frames (id, data) to every client, as one packet."""
 
 
 class UnixCanHub:

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from services.recorder.scene import NOTE, NewChannel, NewMessage, extended
 from shared.exceptions import RunError
-from tests.recorder import runs
-from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, item
+from shared.mcap_log.extended_copy import NOTE, NewChannel, NewMessage, write_extended
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, STATE_KEY, item
 from tools.runs.run_log import read_run
 
 SCHEMA = b"\n\x00\xff of any kind"
@@ -39,7 +39,7 @@ def test_the_copy_holds_what_was_recorded_and_what_was_added_in_order(
 ) -> None:
     out = tmp_path / "out.mcap"
     new = added(0, 1_400_000_250, 2_999_999_000, 9_000_000_000)
-    assert extended(record, out, [CHANNEL], new) == 3004
+    assert write_extended(record, out, [CHANNEL], new) == 3004
     found = everything(out)
     assert [row for row in found if row[0] == STATE_KEY] == everything(record)
     mine = [row for row in found if row[0] == CHANNEL.topic]
@@ -51,7 +51,7 @@ def test_the_copy_holds_what_was_recorded_and_what_was_added_in_order(
 
 def test_the_copy_is_a_log_like_any_other(record: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
-    extended(record, out, [CHANNEL], added(5))
+    write_extended(record, out, [CHANNEL], added(5))
     log = read_run(out)
     assert (log.complete, log.damaged, log.attachments) == (True, 0, ATTACHMENTS)
     assert log.metadata[NOTE] == {"from": record.name}
@@ -68,7 +68,7 @@ def test_the_copy_is_a_log_like_any_other(record: Path, tmp_path: Path) -> None:
 def test_what_was_added_stands_near_what_was_recorded_then(record: Path, tmp_path: Path) -> None:
     """A viewer reads by chunks: one that spans the whole run would be read all the time."""
     out = tmp_path / "out.mcap"
-    extended(record, out, [CHANNEL], added(*range(0, 3_000_000_000, 10_000_000)))
+    write_extended(record, out, [CHANNEL], added(*range(0, 3_000_000_000, 10_000_000)))
     with out.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -80,7 +80,7 @@ def test_what_was_added_stands_near_what_was_recorded_then(record: Path, tmp_pat
 def test_an_unfinished_log_is_copied_and_finished(tmp_path: Path) -> None:
     killed = runs.killed_file(tmp_path)
     out = tmp_path / "out.mcap"
-    extended(killed.path, out, [CHANNEL], added(0))
+    write_extended(killed.path, out, [CHANNEL], added(0))
     assert len(everything(out)) == killed.flushed[-1][1] + 1
 
 
@@ -88,9 +88,9 @@ def test_a_topic_that_is_there_already_is_refused_and_nothing_is_written(
     record: Path, tmp_path: Path
 ) -> None:
     out, again = tmp_path / "out.mcap", tmp_path / "again.mcap"
-    extended(record, out, [CHANNEL], added(0))
+    write_extended(record, out, [CHANNEL], added(0))
     with pytest.raises(RunError, match="has xrl/lab/scene/x already"):
-        extended(out, again, [CHANNEL], added(0))
+        write_extended(out, again, [CHANNEL], added(0))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.mcap", "run.mcap"]
     with pytest.raises(RunError, match="cannot be written"):
-        extended(record, tmp_path / "absent" / "x.mcap", [CHANNEL], added(0))
+        write_extended(record, tmp_path / "absent" / "x.mcap", [CHANNEL], added(0))

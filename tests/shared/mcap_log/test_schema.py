@@ -6,11 +6,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from services.recorder import schema
 from shared.bus import codec, messages, topics
 from shared.bus.topics import Topic
 from shared.exceptions import RunError
-from tests.recorder.runs import sample
+from shared.mcap_log import schema
+from tests.shared.mcap_log.runs import sample
 
 RECORDED = [topic for topic in topics.TOPICS if topic.recorded]
 PLAIN = {"boolean": bool, "integer": int, "number": (int, float), "string": str}

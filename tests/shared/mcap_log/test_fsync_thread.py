@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from services.recorder import fsync_thread
-from services.recorder.fsync_thread import Syncer
-from tests.recorder import runs
-from tests.recorder.runs import Queue, item
+from shared.mcap_log import fsync_thread
+from shared.mcap_log.fsync_thread import FsyncThread
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import Queue, item
 
 
 class SlowDisk:
@@ -46,7 +46,7 @@ def test_a_file_that_is_closed_meanwhile_is_synced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = SlowDisk(monkeypatch)
-    waiting = Syncer()
+    waiting = FsyncThread()
     for name in ("a", "b"):
         with (tmp_path / name).open("wb") as file:
             waiting.request(file.fileno(), last=True)
@@ -63,7 +63,7 @@ def test_an_error_of_the_disk_comes_with_the_next_request(
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(fsync_thread.os, "fsync", fail)
-    failing = Syncer()
+    failing = FsyncThread()
     with (tmp_path / "a").open("wb") as file:
         failing.request(file.fileno())
         with pytest.raises(OSError, match="Input/output"):

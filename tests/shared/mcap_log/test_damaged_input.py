@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from services.recorder import recover
 from shared.bus import topics
 from shared.exceptions import RunError
-from tests.recorder import runs
-from tests.recorder.runs import STATE_KEY, Killed
+from shared.mcap_log import recover
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import STATE_KEY, Killed
 from tools import cli
 from tools.analysis.logs.survey import Survey
 from tools.runs.run_log import read_run

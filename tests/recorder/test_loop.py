@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 
 from services.recorder.disk_guard import MIB
-from services.recorder.mcap_log import RunWriter
-from services.recorder.recording import Recorder, free_bytes_at
+from services.recorder.loop import Recorder, free_bytes_at
 from services.recorder.snapshot import SnapshotRing
 from shared.bus import codec, topics
 from shared.bus.messages import JointEvent, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import RecorderConfig
-from tests.recorder import runs
-from tests.recorder.runs import ROBOT, STATE_KEY, Queue, item
+from shared.mcap_log.writer import RunWriter
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import ROBOT, STATE_KEY, Queue, item
 from tools.runs.run_log import read_run
 
 CYCLE_NS = 20 * NS_PER_MS

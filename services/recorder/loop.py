@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Final
 
 from services.recorder.disk_guard import MIB, DiskChange, SpaceGuard
-from services.recorder.mcap_log import MessageSource, RunWriter
 from services.recorder.snapshot import SnapshotRing
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import RecorderConfig
+from shared.mcap_log.writer import MessageSource, RunWriter
 
 CAPACITY: Final = 65_536
 """Messages that may wait while the disk is slow: 13 s of the fleet."""

@@ -1,4 +1,4 @@
-"""What the recorder and the tools leave behind, for the tests of test_elsewhere.py."""
+"""What the recorder and the tools leave behind, for the tests of test_plotjuggler.py."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 
 from mcap.writer import Writer
 
-from services.recorder import recover
-from services.recorder.mcap_log import RunWriter
 from shared.bus import codec, topics
 from shared.clock import NS_PER_S
-from tests.recorder import runs
-from tests.recorder.runs import Queue, sample
+from shared.mcap_log import recover
+from shared.mcap_log.writer import RunWriter
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import Queue, sample
 from tools import cli
 from tools.runs.run_log import RunLog, read_run
 

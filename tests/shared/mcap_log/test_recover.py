@@ -11,12 +11,13 @@ from mcap.reader import SeekingReader, make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from services.recorder import auto_recover, recover
-from services.recorder.recover import Interrupted
+from services.recorder import auto_recover
 from shared.bus import topics
 from shared.exceptions import RunError
-from tests.recorder import runs
-from tests.recorder.runs import ATTACHMENTS, STATE_KEY, Queue, item
+from shared.mcap_log import recover
+from shared.mcap_log.recover import Interrupted
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import ATTACHMENTS, STATE_KEY, Queue, item
 from tools.runs.run_log import read_run
 
 LOGGER = logging.getLogger("test")
@@ -133,7 +134,7 @@ def test_a_foreign_file_is_recovered_too(
 
 def test_an_unfinished_file_at_the_start_is_replaced_by_its_recovery(tmp_path: Path) -> None:
     path = runs.killed_file(tmp_path).path
-    auto_recover.rescue(path, 0, LOGGER, lambda: False)
+    auto_recover.recover_in_place(path, 0, LOGGER, lambda: False)
     assert by_the_package(path) == list(range(1200))
     assert [p.name for p in tmp_path.glob("*.mcap")] == ["killed.mcap"]
 
@@ -144,7 +145,7 @@ def test_a_damaged_original_stays_and_its_recovery_goes_beside_it_once(tmp_path:
     data[data.index(b"zstd", killed.flushed[5][0]) + 100] ^= 1
     killed.path.write_bytes(data)
     for _ in range(2):
-        auto_recover.rescue(killed.path, 0, LOGGER, lambda: False)
+        auto_recover.recover_in_place(killed.path, 0, LOGGER, lambda: False)
     assert killed.path.read_bytes() == data
     beside = tmp_path / "killed.recovered.mcap"
     assert len(by_the_package(beside)) >= 1100
@@ -156,7 +157,7 @@ def test_a_file_that_a_recorder_is_writing_is_left_alone(tmp_path: Path) -> None
     before = path.read_bytes()
     with path.open("rb") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        auto_recover.rescue(path, 0, LOGGER, lambda: False)
+        auto_recover.recover_in_place(path, 0, LOGGER, lambda: False)
     assert path.read_bytes() == before
 
 
@@ -165,7 +166,7 @@ def test_without_space_for_a_copy_the_original_stays(
 ) -> None:
     path = runs.killed_file(tmp_path).path
     before = path.read_bytes()
-    auto_recover.rescue(path, 1 << 62, LOGGER, lambda: False)
+    auto_recover.recover_in_place(path, 1 << 62, LOGGER, lambda: False)
     assert path.read_bytes() == before
     assert "no space to recover it" in caplog.text
 
@@ -175,7 +176,7 @@ def test_a_recovery_that_is_stopped_leaves_the_original_and_nothing_else(tmp_pat
     before, there = path.read_bytes(), sorted(tmp_path.iterdir())
     asked = iter([False] * 9 + [True])
     with pytest.raises(Interrupted):
-        auto_recover.rescue(path, 0, LOGGER, lambda: next(asked))
+        auto_recover.recover_in_place(path, 0, LOGGER, lambda: next(asked))
     assert path.read_bytes() == before
     assert sorted(tmp_path.iterdir()) == there
 
@@ -189,7 +190,7 @@ def test_a_full_disk_while_recovering_leaves_the_original_and_one_line(
     def full(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("services.recorder.recover.os.fsync", full)
+    monkeypatch.setattr("shared.mcap_log.recover.os.fsync", full)
     with pytest.raises(RunError, match="cannot be written: No space left") as caught:
         recover.recover(path, tmp_path / "out.mcap")
     assert "\n" not in str(caught.value)
@@ -208,7 +209,7 @@ def test_the_rescue_of_a_directory_takes_what_is_unfinished_and_survives_the_res
     finished = runs.write(tmp_path / "written2", [item(0)])
     target = tmp_path / "finished.mcap"
     target.write_bytes(finished.read_bytes())
-    thread = auto_recover.Rescue(tmp_path, 0, LOGGER)
+    thread = auto_recover.AutoRecovery(tmp_path, 0, LOGGER)
     thread.start()
     thread.join(60.0)
     assert not thread.is_alive()

@@ -1,4 +1,4 @@
-"""Our files held against the rules by which PlotJuggler reads them (tests/recorder/elsewhere.py).
+"""Our files held against the rules by which PlotJuggler reads them (`plotjuggler.py`).
 
 The rules are those of PlotJuggler 3 (3.9 to 3.17: DataLoadMCAP, nlohmann_parsers) and 4 (plugins
 data_load_mcap 1.2, parser_json 1.1.1). A run in virtual time is opened as it was recorded, as
@@ -18,14 +18,14 @@ from typing import Any
 import msgspec
 import pytest
 
-from services.recorder import schema
 from shared.bus import topics
+from shared.mcap_log import schema
 from shared.robot.joints import MODULES
-from tests.recorder import elsewhere_files, runs
-from tests.recorder.elsewhere import LAST, Opened, Refused, opened_by_3, opened_by_4
-from tests.recorder.elsewhere_files import write_one
-from tests.recorder.mcap_doctor import examined
-from tests.recorder.runs import OFFSET_NS, STATE_KEY, item
+from tests.shared.mcap_log import runs, sample_logs
+from tests.shared.mcap_log.mcap_doctor import examined
+from tests.shared.mcap_log.plotjuggler import LAST, Opened, Refused, opened_by_3, opened_by_4
+from tests.shared.mcap_log.runs import OFFSET_NS, STATE_KEY, item
+from tests.shared.mcap_log.sample_logs import write_one
 from tools.runs.run_log import RunLog, read_run
 
 VERSIONS = (opened_by_3, opened_by_4)
@@ -40,8 +40,8 @@ Open = Callable[[Reader, str], Opened]
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    recorded = elsewhere_files.record(tmp_path_factory.mktemp("elsewhere"))
-    return elsewhere_files.make(recorded, tmp_path_factory.mktemp("made"))
+    recorded = sample_logs.record(tmp_path_factory.mktemp("elsewhere"))
+    return sample_logs.make(recorded, tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture(scope="module")

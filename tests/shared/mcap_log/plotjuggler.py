@@ -1,8 +1,8 @@
 """PlotJuggler's rules for an MCAP file with JSON in it, written down from its sources.
 
 PlotJuggler is C++ on Qt and comes as snap, AppImage or ROS package: the tests cannot install it.
-What it does with a file is followed here record by record, and tests/recorder/test_elsewhere.py
-holds our files against it. Two readers:
+What it does with a file is followed here record by record, and
+tests/shared/mcap_log/test_plotjuggler.py holds our files against it. Two readers:
 
 `opened_by_3`: PlotJuggler 3.9 to 3.17 (repository facontidavide/PlotJuggler), of
 plotjuggler_plugins/DataLoadMCAP/dataload_mcap.cpp (db606ba) and

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from services.recorder import provenance
+from shared.mcap_log import provenance
 
 
 def git(root: Path, *arguments: str) -> None:

@@ -12,7 +12,7 @@ clocks; one offset, taken at the start and written as `offset_ns` into metadata 
 maps them to ns since 1970 so that viewers show dates: wall = monotonic + offset_ns.
 `publish_time` therefore means something only for senders on the recorder's host.
 
-A file whose writer was killed has no summary: `services/recorder/recover.py` gives it
+A file whose writer was killed has no summary: `shared/mcap_log/recover.py` gives it
 one, and `tools/runs/run_log.py` reads it as it is. While it is written it is locked.
 """
 
@@ -32,11 +32,11 @@ from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
-from services.recorder import files, schema
-from services.recorder.fsync_thread import Syncer
-from services.recorder.sequence_stats import KeyCount
 from shared.bus.topics import Topic
 from shared.exceptions import RunError
+from shared.mcap_log import files, schema
+from shared.mcap_log.fsync_thread import FsyncThread
+from shared.mcap_log.sequence_stats import KeyCount
 
 SCHEMA_VERSION: Final = "5"
 """Version of the layout above and of the messages in `shared/bus/messages.py`."""
@@ -123,7 +123,7 @@ class RunWriter:
         """Counts when the file was begun."""
         self._decode = msgspec.json.Decoder(_Head).decode
         self._file: BinaryIO | None = None
-        self._syncer = Syncer()
+        self._syncer = FsyncThread()
         if begin:
             self.begin()
 

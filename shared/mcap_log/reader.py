@@ -1,8 +1,8 @@
-"""What can be read of an MCAP file: finished, cut off anywhere, or damaged.
+"""Reads an MCAP file that is finished, cut off anywhere, or damaged.
 
-Every record that is whole is given, in the order of the file. Where the file ends within
-a chunk, the messages that can be had of its start are given as well. Behind damage the
-reading goes on at the next chunk that proves to be one.
+Every whole record is given, in the order of the file. Where the file ends inside a chunk, so are
+the messages that can be read of its start. After damage, reading continues at the next chunk that
+proves to be one.
 """
 
 from __future__ import annotations
@@ -12,25 +12,39 @@ import mmap
 import os
 import stat
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import msgspec
+from mcap.opcode import Opcode
+from mcap.records import Channel, McapRecord
 
-from services.recorder import mcap_records as mcap
-from services.recorder.mcap_records import Chunk, ChunkMessage, Malformed
 from shared.exceptions import RunError
+from shared.mcap_log.records import (
+    CHUNK_TIMES,
+    DECOMPRESSED_MAX,
+    KNOWN,
+    MAGIC,
+    PREFIX,
+    ChunkMessage,
+    Malformed,
+    decode,
+    decode_chunk,
+    decompressed,
+    decompressed_start,
+    split_chunk,
+)
 
 _FOOTER_LENGTH: Final = 20
-_TAIL: Final = mcap.PREFIX.size + _FOOTER_LENGTH + len(mcap.MAGIC)
+_TAIL: Final = PREFIX.size + _FOOTER_LENGTH + len(MAGIC)
 _CHUNK_MARKS: Final = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
-_MARK_AT: Final = mcap.PREFIX.size + mcap.CHUNK_TIMES.size
-"""A chunk's compression stands so far behind its start."""
+_MARK_AT: Final = PREFIX.size + CHUNK_TIMES.size
+"""Offset of a chunk's compression from its start."""
 _LOOSE_HEAD: Final = struct.Struct("<HIQQ")  # of a message that is in no chunk
 
 
-class Piece(NamedTuple):
+class LogRecord(NamedTuple):
     """One record that could be read."""
 
     opcode: int
@@ -38,14 +52,21 @@ class Piece(NamedTuple):
     """Offset of the record in the file."""
     end: int
     body: bytes
-    """Content of the record; of a chunk, its decompressed content."""
-    chunk: Chunk | None = None
-    rows: tuple[ChunkMessage, ...] | list[ChunkMessage] = ()
-    """Messages of the chunk: `body[row.start:row.end]` is the payload."""
-    others: tuple[tuple[int, bytes], ...] | list[tuple[int, bytes]] = ()
-    """Schemas and channels within the chunk."""
+    """Content of the record; of a chunk, its decompressed data."""
+    value: McapRecord | None = None
+    """The record decoded; None for a message or an index."""
+    rows: Sequence[ChunkMessage] = ()
+    """Messages of the chunk, or the message itself: `body[row.start:row.end]` is the payload."""
+    definitions: Sequence[LogRecord] = ()
+    """Schemas and channels inside the chunk."""
     whole: bool = True
     """False: the start of a chunk in which the file ends."""
+
+    def values(self) -> Iterator[McapRecord]:
+        """Yield the decoded record and those inside the chunk."""
+        for record in (self, *self.definitions):
+            if record.value is not None:
+                yield record.value
 
 
 class LostBytes(NamedTuple):
@@ -58,7 +79,7 @@ class LostBytes(NamedTuple):
     """Log times; 0: unknown."""
 
 
-class Salvage:
+class LogReader:
     """Reads one file; iterate over it once, then look at what was lost."""
 
     def __init__(self, data: bytes | mmap.mmap) -> None:
@@ -76,85 +97,86 @@ class Salvage:
         self._end = self.size
         self._summary_start = self._find_summary()
 
-    def __iter__(self) -> Iterator[Piece]:
+    def __iter__(self) -> Iterator[LogRecord]:
         """Give every record up to the end of the data; the summary's channels come first.
 
         The channels and schemas at the end of a finished file are copies of those in its
         first chunk, and stand in for them if that is the chunk that is damaged.
         """
         yield from self._summary()
-        at = len(mcap.MAGIC)
+        at = len(MAGIC)
         while at < self._end:
-            piece, at = self._next(at)
-            if piece is not None:
-                if piece.opcode == mcap.DATA_END:
+            record, at = self._next(at)
+            if record is not None:
+                if record.opcode == Opcode.DATA_END:
                     return
-                self._learn(piece)
-                yield piece
+                self._learn(record)
+                yield record
 
     def raw(self, start: int, end: int) -> bytes:
         """Return the file's bytes from one place to another."""
         return self._data[start:end]
 
-    def _next(self, at: int) -> tuple[Piece | None, int]:
+    def _next(self, at: int) -> tuple[LogRecord | None, int]:
         """Return the record at a place, if it can be read, and where to go on."""
-        if self._end - at < mcap.PREFIX.size:
+        if self._end - at < PREFIX.size:
             return None, self._lost(at, self._end)
-        opcode, length = mcap.PREFIX.unpack(self._data[at : at + mcap.PREFIX.size])
-        start, end = at + mcap.PREFIX.size, at + mcap.PREFIX.size + length
+        opcode, length = PREFIX.unpack(self._data[at : at + PREFIX.size])
+        start, end = at + PREFIX.size, at + PREFIX.size + length
         if end > self._end:
             following = self._chunk_after(at + 1)
-            if following is None and opcode == mcap.CHUNK and not self.finished:
+            if following is None and opcode == Opcode.CHUNK and not self.finished:
                 return self._cut_chunk(at, start), self._end
             return None, self._lost(at, following)
         try:
-            return self._piece(opcode, at, start, end), end
+            return self._record(opcode, at, start, end), end
         except Malformed:
             # Either its content is wrong, or its length: then no record follows it.
             following = end if self._plausible(end) else self._chunk_after(at + 1)
             return None, self._lost(at, following, *_times(self._data[start:end], opcode))
 
-    def _piece(self, opcode: int, at: int, start: int, end: int) -> Piece:
+    def _record(self, opcode: int, at: int, start: int, end: int) -> LogRecord:
         body = self._data[start:end]
-        if opcode == mcap.CHUNK:
-            head = mcap.chunk(body)
-            content = mcap.inflated(head)
-            rows, others = mcap.contents(content)
-            return Piece(opcode, at, end, content, head, rows, others)
-        if opcode == mcap.MESSAGE:
+        if opcode == Opcode.CHUNK:
+            chunk = decode_chunk(body)
+            content = decompressed(chunk)
+            rows, others = split_chunk(content)
+            return LogRecord(opcode, at, end, content, chunk, rows, _definitions(others))
+        if opcode == Opcode.MESSAGE:
             if len(body) < _LOOSE_HEAD.size:
                 raise Malformed
             row = ChunkMessage._make((*_LOOSE_HEAD.unpack_from(body), _LOOSE_HEAD.size, len(body)))
             if row.channel_id not in self._encodings:
                 raise Malformed
-            return Piece(opcode, at, end, body, rows=(row,))
-        check = _CHECKS.get(opcode)
-        if check is None:
-            raise Malformed
-        check(body)
-        return Piece(opcode, at, end, body)
+            return LogRecord(opcode, at, end, body, rows=(row,))
+        return LogRecord(opcode, at, end, body, decode(opcode, body))
 
-    def _cut_chunk(self, at: int, start: int) -> Piece | None:
+    def _cut_chunk(self, at: int, start: int) -> LogRecord | None:
         """Return the messages at the start of the chunk in which the file ends."""
         self.cut = LostBytes(at, self.size)
         body = self._data[start : self.size]
         try:
-            head = mcap.chunk(body, cut=True)
-            content = mcap.inflated_start(head)
+            chunk = decode_chunk(body, cut=True)
+            content = decompressed_start(chunk)
         except Malformed:
             return None
-        rows, others = mcap.contents(content)
-        self._learn(Piece(mcap.CHUNK, at, self.size, b"", None, (), others))
+        first_ns, end_ns = chunk.message_start_time, chunk.message_end_time
+        rows, others = split_chunk(content)
+        definitions = _definitions(others)
+        for definition in definitions:
+            self._learn(definition)
         good = []
         for row in rows:
-            if not (self._sound(content, row) and head.first_ns <= row.log_ns <= head.last_ns):
+            if not (self._is_sound(content, row) and first_ns <= row.log_ns <= end_ns):
                 break
             good.append(row)
-        last_ns = good[-1].log_ns if good else head.first_ns
-        self.cut = LostBytes(at, self.size, last_ns, head.last_ns)
-        return Piece(mcap.CHUNK, at, self.size, content, head, good, others, whole=False)
+        last_ns = good[-1].log_ns if good else first_ns
+        self.cut = LostBytes(at, self.size, last_ns, end_ns)
+        return LogRecord(
+            Opcode.CHUNK, at, self.size, content, chunk, good, definitions, whole=False
+        )
 
-    def _sound(self, content: bytes, row: ChunkMessage) -> bool:
+    def _is_sound(self, content: bytes, row: ChunkMessage) -> bool:
         """Return False for a payload that is not what its channel says; no CRC vouches for it."""
         encoding = self._encodings.get(row.channel_id)
         if encoding != "json":
@@ -165,15 +187,10 @@ class Salvage:
             return False
         return True
 
-    def _learn(self, piece: Piece) -> None:
-        records = [*piece.others]
-        if piece.opcode == mcap.CHANNEL:
-            records.append((piece.opcode, piece.body))
-        for opcode, body in records:
-            if opcode == mcap.CHANNEL:
-                with contextlib.suppress(Malformed):
-                    channel = mcap.channel(body)
-                    self._encodings[channel.id] = channel.encoding
+    def _learn(self, record: LogRecord) -> None:
+        for value in record.values():
+            if isinstance(value, Channel):
+                self._encodings[value.id] = value.message_encoding
 
     def _lost(self, start: int, following: int | None, first_ns: int = 0, last_ns: int = 0) -> int:
         """Note that bytes are lost, up to the next readable ones; return where those are."""
@@ -187,12 +204,11 @@ class Salvage:
 
     def _plausible(self, at: int) -> bool:
         """Return True if a record may begin here, or the data ends here."""
-        head = self._data[at : at + mcap.PREFIX.size]
-        if at >= self._end or len(head) < mcap.PREFIX.size:
+        head = self._data[at : at + PREFIX.size]
+        if at >= self._end or len(head) < PREFIX.size:
             return at <= self._end
-        opcode, length = mcap.PREFIX.unpack(head)
-        known = opcode in _CHECKS or opcode in (mcap.CHUNK, mcap.MESSAGE)
-        return known and length <= mcap.INFLATED_MAX
+        opcode, length = PREFIX.unpack(head)
+        return opcode in KNOWN and length <= DECOMPRESSED_MAX
 
     def _chunk_after(self, at: int) -> int | None:
         """Return where the next chunk is that is whole and right, or None."""
@@ -202,63 +218,61 @@ class Salvage:
             if not self._marks:
                 return None
             at = min(marks[mark] for mark in self._marks) - _MARK_AT
-            opcode, length = mcap.PREFIX.unpack(self._data[at : at + mcap.PREFIX.size])
-            start, end = at + mcap.PREFIX.size, at + mcap.PREFIX.size + length
-            if opcode == mcap.CHUNK and end <= self._end:
+            opcode, length = PREFIX.unpack(self._data[at : at + PREFIX.size])
+            start, end = at + PREFIX.size, at + PREFIX.size + length
+            if opcode == Opcode.CHUNK and end <= self._end:
                 with contextlib.suppress(Malformed):
-                    self._piece(opcode, at, start, end)
+                    self._record(opcode, at, start, end)
                     return at
             at += 1
 
     def _find_summary(self) -> int:
         """Look for the end of a finished file; return where its summary starts."""
         tail = self._data[max(0, self.size - _TAIL) : self.size]
-        if len(tail) < _TAIL or not tail.endswith(mcap.MAGIC):
+        if len(tail) < _TAIL or not tail.endswith(MAGIC):
             return 0
-        opcode, length = mcap.PREFIX.unpack(tail[: mcap.PREFIX.size])
-        if (opcode, length) != (mcap.FOOTER, _FOOTER_LENGTH):
+        opcode, length = PREFIX.unpack(tail[: PREFIX.size])
+        if (opcode, length) != (Opcode.FOOTER, _FOOTER_LENGTH):
             return 0
         self.finished = True
         self._end = self.size - _TAIL
-        start = int.from_bytes(tail[mcap.PREFIX.size : mcap.PREFIX.size + 8], "little")
-        if not len(mcap.MAGIC) < start < self._end:
+        start = int.from_bytes(tail[PREFIX.size : PREFIX.size + 8], "little")
+        if not len(MAGIC) < start < self._end:
             return 0
         self._end = start
         return start
 
-    def _summary(self) -> Iterator[Piece]:
+    def _summary(self) -> Iterator[LogRecord]:
         at, end = self._summary_start, self.size - _TAIL
-        while 0 < at <= end - mcap.PREFIX.size:
-            opcode, length = mcap.PREFIX.unpack(self._data[at : at + mcap.PREFIX.size])
-            start, at = at, at + mcap.PREFIX.size + length
+        while 0 < at <= end - PREFIX.size:
+            opcode, length = PREFIX.unpack(self._data[at : at + PREFIX.size])
+            start, at = at, at + PREFIX.size + length
             if at > end:
                 return
-            if opcode in (mcap.SCHEMA, mcap.CHANNEL):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 with contextlib.suppress(Malformed):
-                    yield self._piece(opcode, start, start + mcap.PREFIX.size, at)
+                    yield self._record(opcode, start, start + PREFIX.size, at)
 
 
-_CHECKS: Final[dict[int, Callable[[bytes], object]]] = {
-    mcap.HEADER: mcap.header,
-    mcap.SCHEMA: mcap.schema,
-    mcap.CHANNEL: mcap.channel,
-    mcap.METADATA: mcap.metadata,
-    mcap.ATTACHMENT: mcap.attachment,
-    mcap.MESSAGE_INDEX: mcap.message_index,
-    mcap.DATA_END: mcap.data_end,
-}
-"""Records that may stand beside chunks and messages; others are damage."""
+def _definitions(records: Sequence[tuple[int, bytes]]) -> tuple[LogRecord, ...]:
+    """Return the schemas and channels among a chunk's records; a malformed one is left out."""
+    found = []
+    for opcode, body in records:
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            with contextlib.suppress(Malformed):
+                found.append(LogRecord(opcode, 0, 0, body, decode(opcode, body)))
+    return tuple(found)
 
 
 def _times(body: bytes, opcode: int) -> tuple[int, int]:
-    if opcode != mcap.CHUNK or len(body) < mcap.CHUNK_TIMES.size:
+    if opcode != Opcode.CHUNK or len(body) < CHUNK_TIMES.size:
         return 0, 0
-    first_ns, last_ns, _, _ = mcap.CHUNK_TIMES.unpack_from(body)
+    first_ns, last_ns, _, _ = CHUNK_TIMES.unpack_from(body)
     return first_ns, last_ns
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[Salvage]:
+def open_log(path: Path) -> Iterator[LogReader]:
     """Open a file to read what can be read of it.
 
     Raises:
@@ -278,6 +292,6 @@ def opened(path: Path) -> Iterator[Salvage]:
         except OSError as error:
             found = f"cannot be read: {error.strerror}"
             raise RunError(f"{path}: {found}; give an MCAP file") from None
-        if data[: len(mcap.MAGIC)] != mcap.MAGIC:
+        if data[: len(MAGIC)] != MAGIC:
             raise RunError(f"{path}: is no MCAP file (wrong first bytes)")
-        yield Salvage(data)
+        yield LogReader(data)

@@ -1,7 +1,7 @@
-"""Gives a file that was never finished its end, so that every reader opens it.
+"""Recovers a file that was never finished: a copy with the index that every reader needs.
 
-Chunks are taken over as they are. The original stays until the copy is complete and on
-the disk; a recovery that is killed leaves it as it was, and the next one begins anew.
+Chunks are copied as they are. The original stays until the copy is complete and on the disk; a
+recovery that is killed leaves the original as it was, and the next one starts over.
 """
 
 from __future__ import annotations
@@ -14,28 +14,29 @@ from pathlib import Path
 from typing import BinaryIO, Final, TypeAlias
 
 import msgspec
+from mcap.records import Metadata
 
-from services.recorder.reader import LostBytes, Salvage, opened
-from services.recorder.recovered_copy import Copy
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
+from shared.mcap_log.reader import LogReader, LostBytes, open_log
+from shared.mcap_log.recovered_copy import LogCopy
 
 Stop: TypeAlias = Callable[[], bool]
 
-_LINE_MAX: Final = 3  # places of damage that are told one by one
+_LINE_MAX: Final = 3  # damaged places that get a line each
 
 
 class Interrupted(Exception):  # noqa: N818 - not an error: the recorder is to stop
-    """The recovery was asked to stop; the original is as it was."""
+    """The recovery was interrupted; the original is unchanged."""
 
 
 class RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What a recovery kept, and what it had to leave."""
+    """Outcome of a recovery: what it kept and what it lost."""
 
     source: Path
     out: Path
     finished: bool
-    """The file had its end already."""
+    """The file was finished already."""
     messages: int
     channels: int
     attachments: int
@@ -43,19 +44,19 @@ class RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
     """Log time of the first and the last message kept; 0 without any."""
     last_ns: int
     orphans: int
-    """Messages of channels that are nowhere described; left out."""
+    """Messages of undefined channels; left out."""
     cut: LostBytes | None
     damage: tuple[LostBytes, ...]
 
 
 def is_finished(path: Path) -> bool:
-    """Return True if an MCAP file has its end.
+    """Return True if an MCAP file is finished.
 
     Raises:
         RunError: it cannot be read.
     """
-    with opened(path) as salvage:
-        return salvage.finished
+    with open_log(path) as reader:
+        return reader.finished
 
 
 def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult:
@@ -64,18 +65,18 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
     Args:
         path: an MCAP file; not touched, unless `out` is the same.
         out: the file to write; one of that name is replaced when the copy is complete.
-        stop: asked between chunks.
+        stop: called between chunks; True interrupts.
 
     Raises:
         RunError: the file cannot be read, or the copy cannot be written.
-        Interrupted: `stop` said so.
+        Interrupted: `stop` returned True.
     """
     part = out.with_name(f".{out.name}.part")
-    with opened(path) as salvage:
+    with open_log(path) as reader:
         try:
             with part.open("wb") as file:
-                copy = _copied(salvage, file, stop)
-                copy.finish(path.name, _lost_bytes(salvage))
+                copy = _copied(reader, file, stop)
+                copy.finish(_note(path, copy, reader))
                 file.flush()
                 os.fsync(file.fileno())
             part.replace(out)
@@ -92,20 +93,20 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
     return RecoveryResult(
         source=path,
         out=out,
-        finished=salvage.finished,
+        finished=reader.finished,
         messages=copy.messages,
         channels=len(copy.channels),
         attachments=copy.attachments,
         first_ns=copy.first_ns,
         last_ns=copy.last_ns,
         orphans=copy.orphans,
-        cut=salvage.cut,
-        damage=tuple(salvage.damage),
+        cut=reader.cut,
+        damage=tuple(reader.damage),
     )
 
 
 def describe(outcome: RecoveryResult) -> list[str]:
-    """Return what was kept and what was lost, in one line each."""
+    """Return one line for what was kept and one for each loss."""
     kept = f"{outcome.messages} messages"
     if outcome.messages:
         seconds = (outcome.last_ns - outcome.first_ns) / NS_PER_S
@@ -113,7 +114,7 @@ def describe(outcome: RecoveryResult) -> list[str]:
     lines = [f"kept: {kept}; {outcome.attachments} attachments"]
     lines += describe_lost(outcome.cut, outcome.damage, finished=outcome.finished)
     if outcome.orphans:
-        lines.append(f"lost: {outcome.orphans} messages of channels that are nowhere described")
+        lines.append(f"lost: {outcome.orphans} messages of undefined channels")
     return lines
 
 
@@ -148,18 +149,20 @@ def clock_time(time_ns: int) -> str:
     return date.isoformat(sep=" ", timespec="milliseconds")
 
 
-def _copied(salvage: Salvage, file: BinaryIO, stop: Stop) -> Copy:
-    copy = Copy(file, salvage.raw)
-    for piece in salvage:
+def _copied(reader: LogReader, file: BinaryIO, stop: Stop) -> LogCopy:
+    copy = LogCopy(file, reader.raw)
+    for record in reader:
         if stop():
             raise Interrupted
-        copy.take(piece)
+        copy.take(record)
     return copy
 
 
-def _lost_bytes(salvage: Salvage) -> int:
-    losses = [*salvage.damage, *([salvage.cut] if salvage.cut else [])]
-    return sum(loss.end - loss.start for loss in losses)
+def _note(path: Path, copy: LogCopy, reader: LogReader) -> Metadata:
+    losses = [*reader.damage, *([reader.cut] if reader.cut else [])]
+    lost = sum(loss.end - loss.start for loss in losses)
+    note = {"from": path.name, "messages": str(copy.messages), "lost_bytes": str(lost)}
+    return Metadata(name="recovered", metadata=note)
 
 
 def _when(loss: LostBytes) -> str:
@@ -170,7 +173,7 @@ def _when(loss: LostBytes) -> str:
 
 
 def _sync_directory(directory: Path) -> None:
-    """Make the new name last: it is in the directory, not in the file."""
+    """Write the new name to the disk: the directory holds it, not the file."""
     with contextlib.suppress(OSError):  # not every file system can
         descriptor = os.open(directory, os.O_RDONLY)
         try:

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from services.recorder.mcap_log import SCHEMA_VERSION
 from shared.bus import codec, topics
 from shared.bus.messages import Wrench
 from shared.exceptions import RunError
-from tests.recorder import runs
-from tests.recorder.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Queue, item
+from shared.mcap_log.writer import SCHEMA_VERSION
+from tests.shared.mcap_log import runs
+from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Queue, item
 from tools.runs.run_log import read_run
 
 WRENCH_KEY = topics.WRENCH.key(ROBOT)

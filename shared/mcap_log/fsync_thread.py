@@ -10,7 +10,7 @@ import os
 import threading
 
 
-class Syncer:
+class FsyncThread:
     """One thread, started by the first request, that makes files last."""
 
     def __init__(self) -> None:

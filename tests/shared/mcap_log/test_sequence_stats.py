@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.recorder.sequence_stats import KeyCount
+from shared.mcap_log.sequence_stats import KeyCount
 
 
 def fed(numbers: Iterable[int]) -> KeyCount:

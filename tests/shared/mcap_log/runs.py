@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec import inspect
 
-from services.recorder.mcap_log import SCHEMA_VERSION, RunWriter
 from shared.bus import codec, topics
 from shared.bus.messages import JointState, Message
 from shared.bus.topics import Topic
+from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 
 ROBOT = "lab"
 OFFSET_NS = 1_700_000_000_000_000_000

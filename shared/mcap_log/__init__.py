@@ -1,0 +1,1 @@
+"""Logs: MCAP files written, read though cut off or damaged, recovered, and extended."""

@@ -1,0 +1,259 @@
+"""MCAP records as bytes, decoded without trusting one of them. Pure.
+
+The records are the classes of the mcap package; its own readers trust each length: a wrong one
+makes them read on, allocate or raise (docs/logs.md). Here a record counts only if it fits its
+length to the byte; everything else is `Malformed`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from io import BytesIO
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    DataEnd,
+    Header,
+    McapRecord,
+    Metadata,
+    Schema,
+)
+
+__all__ = ["Attachment", "Channel", "Chunk", "Header", "McapRecord", "Metadata", "Schema"]
+"""The mcap package's classes that `decode` returns."""
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+
+PREFIX: Final = struct.Struct("<BQ")
+"""Every record: opcode, length of what follows."""
+MESSAGE_RECORD: Final = struct.Struct("<BQHIQQ")
+"""Opcode, length, channel, sequence, log time, publish time; then the payload."""
+CHUNK_TIMES: Final = struct.Struct("<QQQI")
+"""First log time, last log time, size and CRC before compression."""
+
+DECOMPRESSED_MAX: Final = 1 << 28
+"""Larger chunks are refused: a flipped bit in a size asks for exabytes."""
+_WINDOW_MAX: Final = 1 << 27
+_STEP: Final = 1 << 16
+
+_TYPES: Final[Mapping[int, type[McapRecord]]] = MappingProxyType(
+    {
+        Opcode.HEADER: Header,
+        Opcode.SCHEMA: Schema,
+        Opcode.CHANNEL: Channel,
+        Opcode.METADATA: Metadata,
+        Opcode.ATTACHMENT: Attachment,
+        Opcode.DATA_END: DataEnd,
+    }
+)
+KNOWN: Final = frozenset({*_TYPES, Opcode.MESSAGE_INDEX, Opcode.CHUNK, Opcode.MESSAGE})
+"""Records of a file's data section; others are damage."""
+
+
+class Malformed(Exception):  # noqa: N818 - a finding about a file, never shown as an error
+    """A record's bytes are not what its opcode and length say."""
+
+
+class _Fields(ReadDataStream):
+    """Reads a record's fields, never beyond its end."""
+
+    def __init__(self, body: bytes) -> None:
+        super().__init__(BytesIO(body))
+        self._size = len(body)
+
+    def read(self, length: int) -> bytes:
+        if length > self._size - self.count:
+            raise Malformed
+        return super().read(length)
+
+
+def encode(record: McapRecord) -> bytes:
+    """Return a record's bytes, with opcode and length."""
+    builder = RecordBuilder()
+    record.write(builder)
+    end: Callable[[], bytes] = builder.end  # mcap leaves it without annotations
+    return end()
+
+
+def with_prefix(opcode: int, body: bytes) -> bytes:
+    """Return a record's bytes from its content."""
+    return PREFIX.pack(opcode, len(body)) + body
+
+
+def decode(opcode: int, body: bytes) -> McapRecord | None:
+    """Decode a record of the data section that is neither chunk nor message.
+
+    Args:
+        opcode: of the record.
+        body: its content.
+
+    Returns:
+        The record; None for a message index, of which only the length is checked.
+
+    Raises:
+        Malformed: the content does not fit the opcode or the length, or its CRC is wrong.
+    """
+    if opcode == Opcode.MESSAGE_INDEX:
+        if len(body) < 6 or len(body) - 6 != int.from_bytes(body[2:6], "little"):
+            raise Malformed
+        return None
+    kind = _TYPES.get(opcode)
+    if kind is None:
+        raise Malformed
+    fields = _Fields(body)
+    try:
+        found: McapRecord = kind.read(fields)  # type: ignore[attr-defined]
+    except UnicodeDecodeError:
+        raise Malformed from None
+    if isinstance(found, Attachment):
+        crc = int.from_bytes(body[-4:], "little")
+        if fields.count != len(body) or crc not in (0, zlib.crc32(body[:-4])):
+            raise Malformed
+    elif not isinstance(found, Header) and encode(found) != with_prefix(opcode, body):
+        raise Malformed  # bytes behind the last field, or a map's length that its pairs do not have
+    return found
+
+
+def decode_chunk(body: bytes, *, cut: bool = False) -> Chunk:
+    """Decode a chunk's head; its data stays compressed.
+
+    Args:
+        body: content of the record.
+        cut: the file ends inside the chunk, so `data` is only its start.
+
+    Raises:
+        Malformed: the data does not have the length that the head gives.
+    """
+    fields = _Fields(body)
+    first_ns, last_ns, size, crc = CHUNK_TIMES.unpack(fields.read(CHUNK_TIMES.size))
+    try:
+        compression = fields.read_prefixed_string()
+    except UnicodeDecodeError:
+        raise Malformed from None
+    length = fields.read8()
+    data = body[fields.count :]
+    if length < len(data) or (length > len(data) and not cut):
+        raise Malformed
+    return Chunk(
+        compression=compression,
+        data=data,
+        message_start_time=first_ns,
+        message_end_time=last_ns,
+        uncompressed_size=size,
+        uncompressed_crc=crc,
+    )
+
+
+def decompressed(chunk: Chunk) -> bytes:
+    """Return a chunk's records.
+
+    Raises:
+        Malformed: size or CRC are not as the head gives them, or nothing here reads the
+            compression.
+    """
+    if chunk.uncompressed_size > DECOMPRESSED_MAX:
+        raise Malformed
+    if chunk.compression == "":
+        data = bytes(chunk.data)
+    elif chunk.compression == "zstd":
+        data = _from_zstd(chunk)
+    elif chunk.compression == "lz4":
+        data = _from_lz4(chunk)
+    else:
+        raise Malformed
+    crc = chunk.uncompressed_crc
+    if len(data) != chunk.uncompressed_size or (crc and zlib.crc32(data) != crc):
+        raise Malformed
+    return data
+
+
+def decompressed_start(chunk: Chunk) -> bytes:
+    """Return what can be read of a chunk whose end is missing; no CRC vouches for it.
+
+    zstd decompresses by blocks of up to 128 KiB: what follows the last whole block is lost. Of lz4,
+    which this project does not write, nothing is read.
+    """
+    size = chunk.uncompressed_size
+    if size > DECOMPRESSED_MAX or chunk.compression not in ("", "zstd"):
+        raise Malformed
+    if chunk.compression == "":
+        return bytes(chunk.data[:size])
+    reader = zstandard.ZstdDecompressor(max_window_size=_WINDOW_MAX).stream_reader(chunk.data)
+    pieces, left = [], size
+    with contextlib.suppress(zstandard.ZstdError):
+        while left > 0 and (piece := reader.read(min(left, _STEP))):
+            pieces.append(piece)
+            left -= len(piece)
+    return b"".join(pieces)
+
+
+def _from_zstd(chunk: Chunk) -> bytes:
+    try:
+        stated = zstandard.get_frame_parameters(chunk.data).content_size
+        if stated not in (chunk.uncompressed_size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise Malformed
+        decompressor = zstandard.ZstdDecompressor(max_window_size=_WINDOW_MAX)
+        return decompressor.decompress(chunk.data, max_output_size=chunk.uncompressed_size)
+    except zstandard.ZstdError:
+        raise Malformed from None
+
+
+def _from_lz4(chunk: Chunk) -> bytes:
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    try:
+        data: bytes = decompressor.decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
+    except (RuntimeError, EOFError):
+        raise Malformed from None
+    if not decompressor.eof:
+        raise Malformed
+    return data
+
+
+class ChunkMessage(NamedTuple):
+    """One message of a chunk: its head, and where its payload is in the decompressed data."""
+
+    channel_id: int
+    seq: int
+    log_ns: int
+    publish_ns: int
+    start: int
+    end: int
+
+
+def split_chunk(data: bytes) -> tuple[list[ChunkMessage], list[tuple[int, bytes]]]:
+    """Split a chunk's decompressed data into its messages and its other records.
+
+    An incomplete record at the end is left out, so this reads the start of a cut chunk too.
+
+    Returns:
+        The messages, and (opcode, body) of each other record.
+    """
+    rows: list[ChunkMessage] = []
+    others: list[tuple[int, bytes]] = []
+    at, size, new, message = 0, len(data), ChunkMessage._make, int(Opcode.MESSAGE)
+    head, prefix = MESSAGE_RECORD, PREFIX
+    while at + prefix.size <= size:
+        if data[at] == message and at + head.size <= size:
+            _, length, *fields = head.unpack_from(data, at)
+            start, at = at + head.size, at + prefix.size + length
+            if at > size or start > at:
+                break
+            rows.append(new((*fields, start, at)))
+        else:
+            opcode, length = prefix.unpack_from(data, at)
+            start, at = at + prefix.size, at + prefix.size + length
+            if at > size:
+                break
+            others.append((opcode, data[start:at]))
+    return rows, others

@@ -1,0 +1,1 @@
+"""Tests of the logs: written, damaged, recovered, extended, read by other tools."""
