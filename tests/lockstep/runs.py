@@ -112,7 +112,7 @@ def run(
     lockstep = Lockstep(robot, scenario, Impairment(delay_ms=delay_ms), plant=plant)
     if stands and delay_ms == BASE.delay_ms:
         start = standing(robot, lockstep.plant)
-        lockstep.go_on(start.state, start.modules, start.planner)
+        lockstep.resume(start.state, start.modules, start.planner)
     rows = []
     for row in lockstep.run():
         if row.scenario_s >= 0.0:

@@ -164,7 +164,7 @@ def put_again(fleet: Fleet, module: int, sent: JointCommand) -> None:
 def gone_on(robot: RobotConfig, start: PartialStart, *, led: bool, again: Run | None) -> Fleet:
     """Go on for 0.6 s, with or without a planner, with a record's commands played on top."""
     fleet = Fleet(robot, SQUAT)
-    fleet.go_on(start.state, start.modules, start.planner if led else None)
+    fleet.resume(start.state, start.modules, start.planner if led else None)
     records = again.by_module if again is not None else {name: [] for name in MODULES}
     rows = [itertools.cycle(records[name] or [None]) for name in MODULES]
     for ms in range(600):

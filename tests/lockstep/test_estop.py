@@ -210,6 +210,6 @@ def test_a_stop_that_not_all_hear_tips_nothing(robot: RobotConfig) -> None:
     for truth in fleet.run():
         if truth.scenario_s >= 4.0:
             fleet.world.let_go()
-            for name, module in zip(MODULES, fleet._modules, strict=True):
-                module._estop = name != "knee_left"
+            for joint in fleet.joints:
+                joint.manager._estop = joint.name != "knee_left"
         assert not truth.fallen

@@ -82,7 +82,7 @@ def end(robot: RobotConfig, moment: Begin, name: str) -> End:
     at = moment.at
     pushed = (push(at + 0.8, 0.0, 30.0, 0.0),)
     fleet = Fleet(robot, variant(moment.name, duration=at + WRONG_S, kill=(), push=pushed), BASE)
-    fleet.go_on(moment.state, moment.modules, moment.planner)
+    fleet.resume(moment.state, moment.modules, moment.planner)
     fell, outside = False, set()
     for row in fleet.run():
         fell = row.fallen

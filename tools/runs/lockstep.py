@@ -1,8 +1,9 @@
-"""Lockstep: the same objects as live, in one process under virtual time (docs/architecture.md).
+"""Lockstep: deterministic simulation in virtual time, in one process (docs/architecture.md).
 
-World, twelve emulated axes, six joint controllers, the harness sensor and the planner step
-in a fixed order; messages between them pass a modelled network. No process, clock or bus:
-bit-identical from run to run with the same seed.
+World, twelve emulated axes, six joint services, harness, IMU and planner step in a fixed order.
+Messages between them pass a modelled network. They are the objects of the live services, without
+process, clock or
+bus: two runs with one seed are equal to the last bit.
 """
 
 from __future__ import annotations
@@ -13,8 +14,6 @@ from typing import ClassVar
 from services.joint.controller import JointController
 from services.joint.drive_manager import DriveManager
 from services.joint.snapshots import DriveManagerState
-from services.joint.tracer import Tracer
-from services.planner.checkpoint import Checkpoints
 from services.planner.intents import Wish
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
@@ -25,15 +24,7 @@ from services.simulator.plant import PlantConfig
 from services.simulator.state import restored, taken
 from services.simulator.world import World
 from shared.bus import topics
-from shared.bus.messages import (
-    JointEvent,
-    Message,
-    Mode,
-    PlannerStatus,
-    RunEvent,
-    RunEventKind,
-    SimTruth,
-)
+from shared.bus.messages import JointEvent, Message, Mode, RunEvent, RunEventKind, SimTruth
 from shared.bus.topics import Topic
 from shared.bus.traces import SimState
 from shared.clock import NS_PER_S
@@ -47,13 +38,14 @@ from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
 from tools.runs.virtual_imu import VirtualImu
-from tools.runs.virtual_neighbours import near_to
+from tools.runs.virtual_joint import VirtualJoint, view_from
 from tools.runs.virtual_network import VirtualNetwork
+from tools.runs.virtual_planner import VirtualPlanner
 
 SETTLE_NS = NS_PER_S
-"""The scenario starts this long after all six modules track."""
+"""The scenario starts this long after all six modules track, ns."""
 READY_NS = 20 * NS_PER_S
-"""They have so long to do it."""
+"""Time in which all six modules must track, ns; the run ends if they do not."""
 
 Record = Callable[[Topic, str, Message], None]
 """Takes what live would be on the bus: topic, module or "", message."""
@@ -66,12 +58,19 @@ def forget(_topic: Topic, _module: str, _message: Message) -> None:
 
 
 class Lockstep:
-    """A whole fleet in virtual time; a subclass may be made of other parts."""
+    """A whole fleet in virtual time; a subclass may use other planners or joint services.
+
+    Attributes:
+        joints: the six joint services, in the order of `MODULES`.
+        events: each change of mode, with its module.
+        estop: set it to stop every module.
+        now_ns: virtual time.
+    """
 
     planner_type: ClassVar[type[Planner]] = Planner
     module_type: ClassVar[type[DriveManager]] = DriveManager
     traced: ClassVar[bool] = True
-    """What is recorded has all that it takes to execute the services again."""
+    """Record all that re-execution of the services needs."""
 
     def __init__(
         self,
@@ -87,73 +86,49 @@ class Lockstep:
         """Put the robot on the hoist, drives idle.
 
         Args:
-            config: the robot as its controllers take it to be.
-            scenario: what happens; kills and restarts of the planner and, with the onboard
-                loop, of joint services.
-            network: what every link does by itself, each way; None is 1 ms. What the
-                scenario injects comes on top.
+            config: the robot as its controllers know it.
+            scenario: what happens; it may kill and restart the planner and, with the onboard loop,
+                joint services.
+            network: of every link, each way; None is 1 ms. The scenario's impairments come on top.
             seed: of the network and of the harness sensor's noise.
             record: takes every message.
             clocks: by service, of a host whose clock is not virtual time; not the simulator's.
             plant: how the true robot differs from `config`; None: the realistic default.
 
         Raises:
-            RunError: the scenario kills what has no process here.
+            RunError: the scenario kills a service that has no process here.
         """
-        killable = ("planner", *(MODULES if config.joint_service.loop == "onboard" else ()))
-        named = [(row.service, row.at) for row in scenario.kill]
-        for service, at in named + [(row.service, row.at) for row in scenario.restart]:
-            if service not in killable:
-                raise RunError(
-                    f"{service}@{at:g}: in lockstep only the planner can be killed, and joint "
-                    "services with the onboard loop; use `xrl demo` for the others"
-                )
-        self.config = config
-        self.scenario = scenario
+        self._check_kills(config, scenario)
+        self.config, self.scenario = config, scenario
         self.plant = plant or PlantConfig()
         self.world = World(body_of(config, self.plant), scenario)
-        self._modules = [self.module_type(config, module) for module in MODULES]
-        self._traces = self.traced and record is not forget
-        self._tracers = [Tracer(module) for module in self._modules]
-        self._remembrance = Checkpoints(config.planner.rate_hz)
-        self.planner: Planner | None = self.planner_type(config, session=1)
         self.events: list[tuple[str, JointEvent]] = []
         self.estop = False
-        """Set it to stop every module."""
         self.now_ns = NS_PER_S
         self._record = record
-        self._frozen: set[str] = set()
-        """Services that are stopped or dead."""
-        self._dead: set[str] = set()
-        self._sessions = 1
+        self._traces = self.traced and record is not forget
         self.network = VirtualNetwork(
             network or BASE,
             scenario.inject,
             seed,
             lambda event: record(topics.LINK_EVENT, "", event),
         )
-        self._states, self._commands = self.network.states(), self.network.commands()
-        self._wrenches = self.network.wrenches()
-        clock_of = clocks or {}
-        self._clocks = [clock_of.get(module, HostClock()) for module in MODULES]
-        self._planner_clock = clock_of.get("planner", HostClock())
-        clock = clock_of.get("harness", HostClock())
-        self.harness = VirtualHarness(config, self._wrenches, record, seed, clock)
-        self._attitudes = self.network.attitudes()
-        clock = clock_of.get("imu", HostClock())
-        self._imu = VirtualImu(config, self.plant.imu, self._attitudes, record, seed, clock)
-        self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
-        joint = config.joint_service
-        self._state_every = round(joint.rate_hz / joint.state_rate_hz)
-        self._step_ns = round(config.simulation.timestep * NS_PER_S)
-        self._truth_ns = round(NS_PER_S / config.simulation.truth_rate_hz)
-        self._sim_state_ns = round(NS_PER_S / topics.SIM_STATE.rate_hz)
-        self._sim_states = 0
-        self._tracked_since_ns = 0
-        self._todo: list[Kill | Restart | Push] = sorted(
-            (*scenario.kill, *scenario.restart, *scenario.push), key=lambda row: row.at
+        clock_of = {name: HostClock() for name in ("planner", "harness", "imu", *MODULES)}
+        clock_of |= clocks or {}
+        self.harness = VirtualHarness(
+            config, self.network.wrenches(), record, seed, clock_of["harness"]
         )
-        self._said = 0
+        self._imu = VirtualImu(
+            config, self.plant.imu, self.network.attitudes(), record, seed, clock_of["imu"]
+        )
+        self._planner = VirtualPlanner(
+            lambda session: self.planner_type(config, session),
+            self.network,
+            record,
+            rate_hz=config.planner.rate_hz,
+            clock=clock_of["planner"],
+            traced=self._traces,
+        )
         self.bank = AxisBank(
             config.drive,
             encoder_counts_per_turn=config.joint.encoder_counts_per_turn,
@@ -167,53 +142,67 @@ class Lockstep:
             )
             for index, name in enumerate(MODULES)
         ]
+        self.joints = [self._joint(index, clock_of[name]) for index, name in enumerate(MODULES)]
+        self._cycle_ns = round(NS_PER_S / config.joint_service.rate_hz)
+        self._step_ns = round(config.simulation.timestep * NS_PER_S)
+        self._truth_ns = round(NS_PER_S / config.simulation.truth_rate_hz)
+        self._sim_state_ns = round(NS_PER_S / topics.SIM_STATE.rate_hz)
+        self._sim_states = 0
+        self._tracked_since_ns = 0
+        self._todo: list[Kill | Restart | Push] = sorted(
+            (*scenario.kill, *scenario.restart, *scenario.push), key=lambda row: row.at
+        )
+        self._run_events = 0
+
+    @property
+    def planner(self) -> Planner | None:
+        """The planner; set it to None for a robot without one."""
+        return self._planner.planner
+
+    @planner.setter
+    def planner(self, planner: Planner | None) -> None:
+        self._planner.planner = planner
 
     @property
     def controllers(self) -> list[JointController]:
         """Each module's control law."""
-        return [module.controller for module in self._modules]
+        return [joint.manager.controller for joint in self.joints]
 
     def snapshot_of(self, module: str) -> DriveManagerState:
-        """Return what a joint service knows now, for `go_on`; it shares what still changes."""
-        return self._modules[MODULE_INDEX[module]].snapshot()
+        """Return a joint service's state, for `resume`; it shares what still changes."""
+        return self.joints[MODULE_INDEX[module]].manager.snapshot()
 
-    def go_on(
+    def resume(
         self,
         state: SimState,
         modules: Mapping[str, DriveManagerState],
         planner: tuple[int, TickState] | None,
     ) -> None:
-        """Go on from a moment of another run, before the first step; links are empty then.
+        """Continue from a moment of another run, before the first step; links are empty then.
 
         Args:
             state: world and drives.
-            modules: what each joint service knew; one that is not named is dead.
-            planner: session and what the planner knew; None: it is dead.
+            modules: state of each joint service; one that is not named is dead.
+            planner: session and state of the planner; None: it is dead.
         """
         self.now_ns = -(-state.t_ns // self._step_ns) * self._step_ns
         restored(self.world, self.bank, state)
-        for index, name in enumerate(MODULES):
-            if name in modules:
-                self._modules[index].restore(modules[name])
+        for joint in self.joints:
+            if joint.name in modules:
+                joint.manager.restore(modules[joint.name])
             else:
-                self._frozen.add(name)
-                self._dead.add(name)
-        if planner is None:
-            self.planner = None
-        else:
-            self._sessions = planner[0]
-            self.planner = self.planner_type(self.config, planner[0])
-            self.planner.restore(planner[1])
+                joint.kill(for_good=True)
+        self._planner.resume(planner)
         for drive in self._drives:
-            drive.heard(self.now_ns)
-        self.harness.go_on()
+            drive.assume_heard(self.now_ns)
+        self.harness.assume_tared()
         self._todo = [row for row in self._todo if row.at >= self.world.scenario_s]
 
     def run(self) -> Iterator[SimTruth]:
         """Run to the scenario's end; yield the truth at its rate.
 
-        Before the scenario begins its time is negative. Ends early if the robot falls
-        or never comes to track.
+        Before the scenario starts its time is negative. Ends early if by then the robot has fallen
+        or does not track within `READY_NS`.
         """
         while self.world.scenario_s < self.scenario.duration:
             while self._todo and self.world.scenario_s >= self._todo[0].at:
@@ -231,58 +220,68 @@ class Lockstep:
                     return
 
     def advance(self) -> None:
-        """Move virtual time on by one step of the world."""
+        """Advance virtual time by one step of the world."""
         now = self.now_ns
         self.network.advance(self.world.scenario_s, now)
         if now % self._cycle_ns == 0:
             for fault in self._faults.advance(self.world.scenario_s):
-                self._say(RunEventKind.FAULTED, fault.module, fault.kind)
+                self._put_event(RunEventKind.FAULTED, fault.module, fault.kind)
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
             self._cycle_joints(now)
         elif self.bank.regulates:
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
         self.harness.advance(self.world, now)
         self._imu.advance(self.world, now)
-        if self.planner is not None and "planner" not in self._frozen:
-            self._advance_planner(self.planner, now)
-        self._begin_when_tracking(now)
+        self._planner.advance(now, self._wish)
+        self._start_when_tracking(now)
         self.world.step(self._torque)
         self.now_ns += self._step_ns
 
+    def _wish(self) -> Wish:
+        wanted = self.world.lead()
+        return Wish(wanted.assist, wanted.shift, SCENARIO)
+
+    def _cycle_joints(self, now: int) -> None:
+        for index, joint in enumerate(self.joints):
+            if joint.frozen:
+                continue
+            near = view_from(index, now, self.joints)
+            event = joint.cycle(now, estop=self.estop, near=near)
+            if event is not None:
+                self.events.append((joint.name, event))
+
     def _act(self, row: Kill | Restart | Push) -> None:
-        """Do what the scenario asks for, and say so."""
-        if isinstance(row, Kill):
-            self._say(RunEventKind.KILLED, row.service, row.signal)
-            self._frozen.add(row.service)
-            if row.signal != "STOP":
-                self._dead.add(row.service)
-        elif isinstance(row, Restart):
-            self._say(RunEventKind.RESTARTED, row.service, "")
-            self._frozen.discard(row.service)
-            if row.service in self._dead:
-                self._dead.discard(row.service)
-                self._begin_anew(row.service)
-        else:
+        """Do what the scenario says, and record it."""
+        if isinstance(row, Push):
             x, y, z = row.force
-            self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
-
-    def _begin_anew(self, service: str) -> None:
-        """Start a service that was dead; a module's takes over what its drive carries."""
-        if service == "planner":
-            self._sessions += 1
-            self.planner = self.planner_type(self.config, self._sessions)
-            self._remembrance = Checkpoints(self.config.planner.rate_hz)
+            detail = f"{x:g},{y:g},{z:g} N for {row.duration:g} s"
+            self._put_event(RunEventKind.PUSHED, "torso", detail)
             return
-        index = MODULE_INDEX[service]
-        self._modules[index] = self.module_type(self.config, service)
-        self._tracers[index] = Tracer(self._modules[index])
-        self._drives[index].serve_anew()
+        service = self._planner if row.service == "planner" else self._joint_named(row.service)
+        if isinstance(row, Kill):
+            self._put_event(RunEventKind.KILLED, row.service, row.signal)
+            service.kill(for_good=row.signal != "STOP")
+        else:
+            self._put_event(RunEventKind.RESTARTED, row.service, "")
+            service.restart()
 
-    def _say(self, kind: RunEventKind, subject: str, detail: str) -> None:
-        self._said += 1
+    def _start_when_tracking(self, now: int) -> None:
+        if self.world.scenario_s >= 0.0:
+            return
+        modes = [controller.failsafe.mode for controller in self.controllers]
+        if Mode.DISARMED not in modes:
+            self.world.release_hoist()
+        if self.world.hoist > 0.0 or any(mode is not Mode.TRACK for mode in modes):
+            self._tracked_since_ns = now
+        elif now - self._tracked_since_ns >= SETTLE_NS:
+            self.world.start()
+            self._put_event(RunEventKind.STARTED, self.scenario.name, "")
+
+    def _put_event(self, kind: RunEventKind, subject: str, detail: str) -> None:
+        self._run_events += 1
         event = RunEvent(
             t_ns=self.now_ns,
-            seq=self._said,
+            seq=self._run_events,
             kind=int(kind),
             subject=subject,
             detail=detail,
@@ -290,61 +289,30 @@ class Lockstep:
         )
         self._record(topics.RUN_EVENT, "", event)
 
-    def _cycle_joints(self, now: int) -> None:
-        for index, (name, module) in enumerate(zip(MODULES, self._modules, strict=True)):
-            if name in self._frozen:
-                continue
-            drive, host_ns = self._drives[index], self._clocks[index].read(now)
-            given = (host_ns, drive.read(host_ns), self._commands[index].take(now), self.estop)
-            near = near_to(index, now, self._modules, self._clocks, self._dead)
-            step = module.step(*given, near)
-            drive.carry_out(step, onboard=module.onboard)
-            if step.event is not None:
-                self.events.append((name, step.event))
-                self._record(topics.JOINT_EVENT, name, step.event)
-            if module.controller.cycle % self._state_every == 0:
-                state = module.controller.state(host_ns)
-                self._states[index].put(now, state)
-                self._record(topics.JOINT_STATE, name, state)
-            if self._traces:
-                trace = self._tracers[index].after(*given, step, near)
-                if trace is not None:
-                    self._record(topics.JOINT_TRACE, name, trace)
+    def _joint(self, index: int, clock: HostClock) -> VirtualJoint:
+        name, joint = MODULES[index], self.config.joint_service
+        return VirtualJoint(
+            name,
+            lambda: self.module_type(self.config, name),
+            self._drives[index],
+            self.network.commands()[index],
+            self.network.states()[index],
+            self._record,
+            clock=clock,
+            state_every=round(joint.rate_hz / joint.state_rate_hz),
+            traced=self._traces,
+        )
 
-    def _advance_planner(self, planner: Planner, now: int) -> None:
-        """Hand over what has arrived, and tick as the live loop does."""
-        host_ns = self._planner_clock.read(now)
-        for index, link in enumerate(self._states):
-            state = link.take(now)
-            if state is not None:
-                planner.receive_state(index, state, host_ns)
-        if not planner.is_due(host_ns):
-            return
-        wrench = self._wrenches.take(now)
-        if wrench is not None:
-            planner.receive_wrench(wrench, host_ns)
-        attitude = self._attitudes.take(now)
-        if attitude is not None:
-            planner.receive_attitude(attitude, host_ns)
-        wanted = self.world.lead()
-        planner.receive_wish(Wish(wanted.assist, wanted.shift, SCENARIO))
-        for index, command in enumerate(planner.tick(host_ns)):
-            self._commands[index].put(now, command)
-            self._record(topics.JOINT_COMMAND, MODULES[index], command)
-        status: PlannerStatus = planner.status(host_ns, 0.0)
-        self._record(topics.PLANNER_STATUS, "", status)
-        memory = self._remembrance.after(planner, host_ns) if self._traces else None
-        if memory is not None:
-            self._record(topics.PLANNER_CHECKPOINT, "", memory)
+    def _joint_named(self, name: str) -> VirtualJoint:
+        return self.joints[MODULE_INDEX[name]]
 
-    def _begin_when_tracking(self, now: int) -> None:
-        if self.world.scenario_s >= 0.0:
-            return
-        modes = [module.controller.failsafe.mode for module in self._modules]
-        if Mode.DISARMED not in modes:
-            self.world.release_hoist()
-        if self.world.hoist > 0.0 or any(mode is not Mode.TRACK for mode in modes):
-            self._tracked_since_ns = now
-        elif now - self._tracked_since_ns >= SETTLE_NS:
-            self.world.start()
-            self._say(RunEventKind.STARTED, self.scenario.name, "")
+    @staticmethod
+    def _check_kills(config: RobotConfig, scenario: Scenario) -> None:
+        killable = ("planner", *(MODULES if config.joint_service.loop == "onboard" else ()))
+        named = [(row.service, row.at) for row in scenario.kill]
+        for service, at in named + [(row.service, row.at) for row in scenario.restart]:
+            if service not in killable:
+                raise RunError(
+                    f"{service}@{at:g}: in lockstep only the planner can be killed, and "
+                    "joint services with the onboard loop; use `xrl demo` for the others"
+                )

@@ -197,7 +197,7 @@ def run_case(case: PartialCase, robot: RobotConfig, start: PartialStart) -> Part
             statuses.append(message)
 
     fleet = PartialFleet(robot, scenario_of(case), record=receive)
-    fleet.go_on(start.state, start.modules, start.planner)
+    fleet.resume(start.state, start.modules, start.planner)
     begin_ns = fleet.now_ns - round(fleet.world.scenario_s * NS_PER_S)
     rows: list[SimTruth] = []
     led_ns = None

@@ -1,4 +1,4 @@
-"""A module's drive in lockstep: what a driver and its bus do, on the emulated axes at once."""
+"""A module's drive in lockstep: driver and bus in one, directly on the emulated axes."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ class VirtualDrive:
         self._lost_after_ns = round((drive.watchdog_timeout or LOST_MS * 1e-3) * NS_PER_S)
         self._sampled_ns = now_ns
         self._written = True
-        """False: the service is new, and asks for the torques of a drive that it finds armed."""
+        """False: the service is new, and reads the torques of a drive that it finds armed."""
 
-    def heard(self, now_ns: int) -> None:
-        """Take it that the drive was heard just now."""
+    def assume_heard(self, now_ns: int) -> None:
+        """Take a virtual time for that of the drive's last sample."""
         self._sampled_ns = now_ns
 
-    def serve_anew(self) -> None:
-        """Begin with a new service."""
+    def start_service(self) -> None:
+        """Start with a new service, which reads the torques that an armed drive carries."""
         self._written = False
 
     def read(self, now_ns: int) -> DriveReading | None:
-        """Return what a driver would: None while silence may pass, then LOST."""
+        """Return what a driver would: None during a short silence, then LOST."""
         bank, (a, b) = self._bank, self._axes
         talks = bank.talks(a)
         if talks:
@@ -63,7 +63,7 @@ class VirtualDrive:
         return self._frame.from_drive(reading)
 
     def carry_out(self, step: DriveAction, *, onboard: bool) -> None:
-        """Do what a cycle asks for, if the drive can hear it; any word feeds its watchdog."""
+        """Carry out a cycle's action, if the drive receives it; each frame feeds its watchdog."""
         bank, (a, b) = self._bank, self._axes
         if step.order is DriveCommand.NOTHING or not bank.talks(a):
             return
@@ -93,7 +93,7 @@ class VirtualDrive:
         bank.vel_gain[module] = target.vel_gain
 
     def _arm(self, *, onboard: bool) -> None:
-        """Do what the drivers' frames for arming do."""
+        """Do what the drivers' arming frames do."""
         bank, module = self._bank, self._module
         for axis in self._axes:
             bank.clear_errors(axis)

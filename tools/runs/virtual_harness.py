@@ -72,8 +72,8 @@ class VirtualHarness:
         self._front.send(world.harness_force, world.harness_moment)
         self._loop.cycle(self._clock.read(now_ns))
 
-    def go_on(self) -> None:
-        """Take it that the tare is done: in the middle of a run the operator's load is on it."""
+    def assume_tared(self) -> None:
+        """Set the tare as done: in the middle of a run the operator's load is on the cells."""
         self._loop.state = tared_state(self._front.bias)
 
     def tare(self, request: TareRequest) -> None:

@@ -61,7 +61,7 @@ def counterfactual_of(task: Task) -> Counterfactual:
     moment = task.moment
     scenario = scenario_from(task.scenario, moment.at_s, task.kill, task.for_s)
     fleet = Lockstep(task.robot, scenario, BASE, plant=task.plant)
-    fleet.go_on(moment.state, moment.modules, moment.planner)
+    fleet.resume(moment.state, moment.modules, moment.planner)
     fell_at_s = None
     rows: list[SimTruth] = []
     for truth in fleet.run():

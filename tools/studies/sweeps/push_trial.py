@@ -170,7 +170,7 @@ def _stands(
 ) -> bool:
     scenario = scenario_of(trial, force_n)
     fleet = Lockstep(robot, msgspec.structs.replace(scenario, kill=()), BASE, plant=plant)
-    fleet.go_on(start.state, start.modules, start.planner)
+    fleet.resume(start.state, start.modules, start.planner)
     rows = list(_until_down(fleet.run()))
     return bool(rows) and ending_of(rows[-1], scenario.duration, robot) is Ending.STOOD
 
