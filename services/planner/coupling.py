@@ -71,7 +71,7 @@ class UncoupledGains:
         return K_c, B_c
 
 
-def follow(bandwidth_hz: float, dt: float) -> float:
+def pole_gain(bandwidth_hz: float, dt: float) -> float:
     """Return the step of a first-order pole towards its input in dt (s), as a fraction 0 .. 1."""
     return 1.0 - math.exp(-2.0 * math.pi * bandwidth_hz * dt)
 
@@ -92,7 +92,7 @@ class CouplingFilter:
             tau: unfiltered (12,), N m.
             dt: time since the last tick, s.
         """
-        gain = follow(self._bandwidth_hz, dt)
+        gain = pole_gain(self._bandwidth_hz, dt)
         self._first += gain * (tau - self._first)
         self._second += gain * (self._first - self._second)
         return self._second.copy()

@@ -61,16 +61,15 @@ def choose(
         if not verdict.stable:
             raise RunError(f"no stable gains found: {verdict.words()}; lower {lower}")
     checked = _sample_nodes(nodes)
-    best = START
     while True:
         reduced = DynamicCertificate(_with_few_drivetrains(config), checked)
-        found = _descend(reduced, best, progress)
+        found = _descend(reduced, START, progress)
         progress("checking every pose and drivetrain")
         verdict = full.worst_in_track(found, stop_above=0.0)
         if verdict.stable:
             return found
         if any(node is verdict.condition.node for node in checked):
-            return best  # only a drivetrain in between fails: fall back to the stable start
+            return START  # only a drivetrain between the sampled ones fails, and START has none
         checked.append(verdict.condition.node)
 
 

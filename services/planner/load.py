@@ -88,10 +88,12 @@ class Load:
     def refusal(self) -> str:
         """Return why the load is refused and how to fix it, as text; "" if it is accepted."""
         if not self._refused:
-            return "its load is weighed" if self._weighing_s > 0.0 else ""
+            return "its load is being weighed" if self._weighing_s > 0.0 else ""
         if self._is_hung:
-            less = f"carries {-self.kg:.0f} kg less than its file says"
-            return f"it hangs, or {less}: lower it until its feet bear its weight"
+            return (
+                "it hangs: lower it until its feet bear its weight; or, on its feet, it carries "
+                f"{-self.kg:.0f} kg less than its file says: set mass.payload, then `xrl gains`"
+            )
         reasons = []
         if abs(self.kg) > RESUME_FRACTION * self._kg_max:
             more = "more" if self.kg > 0.0 else "less"

@@ -7,13 +7,13 @@ log.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import Overload, force_up
-from services.planner.commands import CommandHeader, commands_of
 from services.planner.engagement_fsm import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.intents import Wish
@@ -27,6 +27,7 @@ from shared.bus.messages import (
     JointCommand,
     JointState,
     Mode,
+    Pair,
     PlannerMode,
     PlannerStatus,
     SplitSource,
@@ -36,7 +37,7 @@ from shared.bus.messages import (
 )
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.robot.joints import N_JOINTS, N_MODULES
+from shared.robot.joints import MODULES, N_JOINTS, N_MODULES
 from shared.robot.limp_leg_support import Support
 
 Array = NDArray[np.float64]
@@ -182,10 +183,7 @@ class Planner:
         values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)
         self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
-        header = CommandHeader(
-            now_ns, self._seq, self.session, self._hold(), self._output.local.margins
-        )
-        return commands_of(header, states, self._output, self._support)
+        return self._commands(now_ns, states, self._output)
 
     def snapshot(self) -> TickState:
         """Return the state between two ticks; `restore` continues from it."""
@@ -227,6 +225,47 @@ class Planner:
         self._overload.restore(m.overload)
         self._law.restore(m.law)
         self._trips.restore(m.trips)
+
+    def _commands(
+        self, now_ns: int, states: Sequence[JointState], output: LawOutput
+    ) -> list[JointCommand]:
+        """Return the tick's six commands; each echoes the stamp of its module's state."""
+        local, hold = output.local, self._hold()
+        rows = np.array(
+            (
+                output.q_ref,
+                output.v_ref,
+                output.tau_ff,
+                output.dtau_ff,
+                output.tau_coupled,
+                local.D,
+                local.D_B,
+            )
+        ).reshape(7, N_MODULES, 2)
+        commands = []
+        for module, state, row in zip(
+            MODULES, states, rows.transpose(1, 0, 2).tolist(), strict=True
+        ):
+            q_ref, v_ref, tau_ff, dtau_ff, tau_coupled, k_p, k_d = map(_pair, row)
+            command = JointCommand(
+                t_ns=now_ns,
+                seq=self._seq,
+                session=self.session,
+                echo_t_ns=state.t_ns,
+                hold=hold,
+                q_ref=q_ref,
+                v_ref=v_ref,
+                tau_ff=tau_ff,
+                dtau_ff=dtau_ff,
+                tau_coupled=tau_coupled,
+                k_p=k_p,
+                k_d=k_d,
+                margin=local.margins.service,
+                margin_onboard=local.margins.onboard,
+                stiffen=self._support.includes(module),
+            )
+            commands.append(command)
+        return commands
 
     def _usable_wrench(self, now_ns: int) -> Wrench | None:
         """Return the newest wrench, or None if it is invalid or too old."""
@@ -325,6 +364,10 @@ class Planner:
             why=self._law.stance_refusal() or self._law.load_refusal() or self._trips.why,
             trip=int(self._trips.tripped),
         )
+
+
+def _pair(row: list[float]) -> Pair:
+    return row[0], row[1]
 
 
 def _vector6(values: Array) -> Vector6:

@@ -30,6 +30,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from services.planner.coupling import pole_gain
 from shared.robot.joints import N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
@@ -329,12 +330,12 @@ class SampledLoop:
         r, rate = self._J_open @ q, self._J_open @ v
         e_q, e_v = self._T_open @ r - q, self._T_open @ rate - v
         raw = self._C_q @ e_q + self._C_v @ e_v
-        pole_gain = follow(self._feedback.bandwidth_hz, self._timing.planner_period)
-        f_1 = f_1 + pole_gain * (raw - f_1)
-        f_2 = f_2 + pole_gain * (f_1 - f_2)
-        pole_gain = follow(self._feedback.easing_bandwidth_hz, self._timing.planner_period)
+        gain = pole_gain(self._feedback.bandwidth_hz, self._timing.planner_period)
+        f_1 = f_1 + gain * (raw - f_1)
+        f_2 = f_2 + gain * (f_1 - f_2)
+        gain = pole_gain(self._feedback.easing_bandwidth_hz, self._timing.planner_period)
         felt = self._ease_p @ x[self._p] + self._ease_v @ x[self._pd]
-        eased = eased + pole_gain * (felt - eased)
+        eased = eased + gain * (felt - eased)
         return f_1, f_2, eased, np.vstack((r, rate, f_2 + eased))
 
     def _target(self, x: Array, entry: Array, age: float, gains: Gains) -> Array:
@@ -346,11 +347,6 @@ class SampledLoop:
         # a gain on all feedback does not scale the weight's feedforward
         tau = tau + self._H @ q_ref / gains.torque
         return np.asarray(self._served @ (tau + self._D_m @ q + self._D_Bm @ v), float)
-
-
-def follow(bandwidth_hz: float, period: float) -> float:
-    """Return the step of a first-order pole towards its input in a period, as a fraction 0 .. 1."""
-    return 1.0 - math.exp(-2.0 * math.pi * bandwidth_hz * period)
 
 
 def _repeated(F: Array, G: Array, G_f: Array, times: int) -> tuple[Array, Array, Array]:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.coupling import CouplingFilter, UncoupledGains, follow
+from services.planner.coupling import CouplingFilter, UncoupledGains, pole_gain
 
 K_P = np.array([2810.0, 2810.0, 0.0, 800.0, 0.0, 400.0])
 B_P = np.array([300.0, 300.0, 0.0, 60.0, 0.0, 40.0])
@@ -58,12 +58,12 @@ def test_with_it_the_closed_rows_are_as_stiff_as_asked(seed: int, scale: float) 
 
 def test_a_pole_follows_as_its_bandwidth_says() -> None:
     """1 - exp(-2 pi f dt): after the time constant 63 % of a step."""
-    assert follow(2.0, 1.0 / (2.0 * np.pi * 2.0)) == pytest.approx(1.0 - np.exp(-1.0))
-    assert follow(0.0, 1.0) == 0.0
+    assert pole_gain(2.0, 1.0 / (2.0 * np.pi * 2.0)) == pytest.approx(1.0 - np.exp(-1.0))
+    assert pole_gain(0.0, 1.0) == 0.0
 
 
 def test_a_step_comes_through_two_poles_and_all_of_it() -> None:
-    filtered, share = CouplingFilter(4.0), follow(4.0, 0.004)
+    filtered, share = CouplingFilter(4.0), pole_gain(4.0, 0.004)
     course = [filtered.advance(np.ones(12), 0.004)[0] for _ in range(250)]
     assert course[0] == share * share
     assert (np.diff(course) > 0.0).all()

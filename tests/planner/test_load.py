@@ -163,7 +163,7 @@ def test_while_it_is_weighed_it_says_so(load: Load) -> None:
     while load.kg < -RESUME_FRACTION * LARGEST[0]:
         bears(load, 1.0, DT)
     bears(load, 1.0, DT)
-    assert load.refusal() == "its load is weighed"
+    assert load.refusal() == "its load is being weighed"
 
 
 def test_one_that_is_taken_up_while_it_holds_is_weighed_again(load: Load) -> None:
