@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,11 @@ from hypothesis import Phase, settings
 
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+
+# A shell without job control starts its background with SIGINT ignored, and every program that a test
+# starts would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A busy machine is no failed claim: no time limit for one example.
 settings.register_profile("no_deadline", deadline=None)

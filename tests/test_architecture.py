@@ -88,6 +88,7 @@ LAWS = [
     "services/joint/drivers/wired_drive.py",
     "services/joint/setpoint_law.py",
     "shared/can/can_load.py",
+    "shared/robot/dropouts.py",
     "shared/robot/fault_table.py",
     "tools/bringup/jogging.py",
     "services/planner/assist.py",

@@ -181,7 +181,7 @@ class JointController:
             command_seq=command.seq if command is not None else -1,
             cycle=s.cycle,
             late=s.late,
-            dropouts=failsafe.dropouts,
+            dropouts=failsafe.dropouts.count,
             refused=failsafe.refused,
             drive=int(estimate.status),
             drive_error=estimate.error,

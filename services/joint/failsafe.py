@@ -18,6 +18,7 @@ import msgspec
 from shared.bus.messages import Cause, JointCommand, Mode, Outside
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.robot.dropouts import Dropouts
 
 
 class Event(IntEnum):
@@ -133,10 +134,8 @@ class Failsafe(msgspec.Struct):
     """Earlier sessions; their commands are refused for good."""
     fresh_since_ns: int = -1
     """Start of the unbroken time with usable commands; -1 if there is none."""
-    dropouts: int = 0
-    """Recent drop-outs; each doubles the wait before TRACK."""
-    steady_since_ns: int = 0
-    """Time of the last drop-out, or of the last one forgotten."""
+    dropouts: Dropouts = msgspec.field(default_factory=Dropouts)
+    """Recent drop-outs of commands; each doubles the wait before TRACK."""
     refused: int = 0
     outside: Outside = Outside.NOTHING
     """Part of the newest usable command that lies outside the envelope."""
@@ -174,6 +173,10 @@ class Failsafe(msgspec.Struct):
         self.command = command
         return refusal
 
+    def copied(self) -> Failsafe:
+        """Return a copy that does not change with this one."""
+        return msgspec.structs.replace(self, dropouts=msgspec.structs.replace(self.dropouts))
+
     @property
     def asks_to_stiffen(self) -> bool:
         """True in HOLD if the newest accepted command says that another module may be limp."""
@@ -197,7 +200,7 @@ class Failsafe(msgspec.Struct):
 
     def engage_after_ns(self, timing: Timing) -> int:
         """Return the time of fresh commands before TRACK, ns; each drop-out doubles it."""
-        return min(timing.engage_after_ns << self.dropouts, timing.engage_after_max_ns)
+        return min(timing.engage_after_ns << self.dropouts.count, timing.engage_after_max_ns)
 
     def ready(self, now_ns: int, timing: Timing) -> bool:
         """Return True if this module can track and accepted commands for long enough."""
@@ -238,7 +241,13 @@ class Failsafe(msgspec.Struct):
             event = trip
             self.fresh_since_ns = now_ns  # after a trip it waits as after a drop-out
         row = TRANSITIONS[self.mode].get(event)
-        self._count_dropouts(now_ns, timing, event)
+        self.dropouts.advance(
+            now_ns,
+            engaged=self.mode is Mode.TRACK,
+            dropped=event is Event.COMMAND_STALE or event in TRIPS,
+            count_max=timing.dropouts_max,
+            forget_ns=timing.dropout_forget_ns,
+        )
         if row is None:
             return None
         self.mode = row[0]
@@ -258,16 +267,6 @@ class Failsafe(msgspec.Struct):
         if self.command is not None and self.command.hold:
             return Event.HOLD_ASKED
         return Event.READY if self.ready(now_ns, timing) else Event.NONE
-
-    def _count_dropouts(self, now_ns: int, timing: Timing, event: Event) -> None:
-        if self.mode is Mode.TRACK and (event is Event.COMMAND_STALE or event in TRIPS):
-            self.dropouts = min(self.dropouts + 1, timing.dropouts_max)
-            self.steady_since_ns = now_ns
-        elif self.mode is not Mode.TRACK:
-            self.steady_since_ns = now_ns
-        elif self.dropouts and now_ns - self.steady_since_ns >= timing.dropout_forget_ns:
-            self.dropouts -= 1
-            self.steady_since_ns = now_ns
 
     def _judge(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
         age = now_ns - command.echo_t_ns

@@ -40,7 +40,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
         return replace(
             self,
             estimate=replace(self.estimate),
-            failsafe=replace(self.failsafe),
+            failsafe=self.failsafe.copied(),
             trips=replace(self.trips),
         )
 

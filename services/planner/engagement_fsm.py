@@ -19,6 +19,7 @@ import msgspec
 
 from shared.bus.messages import Mode, PlannerMode
 from shared.clock import NS_PER_S
+from shared.robot.dropouts import Dropouts
 
 GRACE_NS = 150_000_000
 """ns; after `hold` is lifted, modules may take this long to report TRACK."""
@@ -32,6 +33,8 @@ would fit into a minute."""
 
 _NOT_TRACKABLE: Final = (Mode.FAULT, Mode.DAMP)
 """Modes from which no module returns to TRACK, so that waiting is useless."""
+_DROPPED: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED)
+"""Modes after LEADING that count as a drop-out."""
 
 
 class Engagement(msgspec.Struct):
@@ -40,12 +43,8 @@ class Engagement(msgspec.Struct):
     mode: PlannerMode = PlannerMode.WAITING
     since_ns: int = 0
     """Time at which the mode was entered."""
-    dropouts: int = 0
-    """Drop-outs counted and not yet forgotten; an index of `WAITS_NS`."""
-    dropped_ns: int = 0
-    """Time of the last drop-out."""
-    steady_since_ns: int = 0
-    """Time since which the planner is engaged without a drop-out, or since one was forgotten."""
+    dropouts: Dropouts = msgspec.field(default_factory=Dropouts)
+    """Recent drop-outs of modules; the count is an index of `WAITS_NS`."""
 
     def advance(
         self,
@@ -66,15 +65,25 @@ class Engagement(msgspec.Struct):
                 may.
         """
         next_mode = self._next(now_ns, fresh, ready, modes, inhibit)
-        self._count_dropouts(now_ns, next_mode)
+        self.dropouts.advance(
+            now_ns,
+            engaged=self.mode is PlannerMode.LEADING,
+            dropped=next_mode in _DROPPED,
+            count_max=len(WAITS_NS) - 1,
+            forget_ns=FORGET_NS,
+        )
         changed = next_mode is not self.mode
         if changed:
             self.mode, self.since_ns = next_mode, now_ns
         return changed
 
+    def copied(self) -> Engagement:
+        """Return a copy that does not change with this one."""
+        return msgspec.structs.replace(self, dropouts=msgspec.structs.replace(self.dropouts))
+
     def wait_ns(self, now_ns: int) -> int:
         """Return the rest of the wait after drop-outs, ns; 0 if the planner may engage."""
-        return max(0, self.dropped_ns + WAITS_NS[self.dropouts] - now_ns)
+        return max(0, self.dropouts.last_ns + WAITS_NS[self.dropouts.count] - now_ns)
 
     def _next(
         self,
@@ -97,17 +106,6 @@ class Engagement(msgspec.Struct):
         if self.mode is PlannerMode.ALIGNING and not self.wait_ns(now_ns) and all(ready):
             return PlannerMode.LEADING
         return PlannerMode.ALIGNING
-
-    def _count_dropouts(self, now_ns: int, next_mode: PlannerMode) -> None:
-        """Count a drop-out, or forget one after `FORGET_NS` without any."""
-        if self.mode is not PlannerMode.LEADING:
-            self.steady_since_ns = now_ns
-        elif next_mode in (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED):
-            self.dropouts = min(self.dropouts + 1, len(WAITS_NS) - 1)
-            self.dropped_ns = now_ns
-        elif self.dropouts and now_ns - self.steady_since_ns >= FORGET_NS:
-            self.dropouts -= 1
-            self.steady_since_ns = now_ns
 
     @property
     def hold(self) -> bool:

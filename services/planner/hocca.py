@@ -19,6 +19,7 @@ Pure: no clock, bus or thread.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -74,6 +75,63 @@ class LawOutput(NamedTuple):
     ik_residual: float
 
 
+class LawTerms(NamedTuple):
+    """One tick's torques (12,), N m, and gains before any filter; `xrl explain` prints them."""
+
+    gravity: Array
+    """F_O^T J: holds the body's weight."""
+    assist: Array
+    """F_assist^T J_harness: carries part of the person."""
+    hessian_O: Array
+    """Change of gravity and assist torque with the joints (12, 12), N m/rad."""
+    body_gains: Callable[[], JointGains]
+    """Computes K_q and B_q of all the body; the certified split does not need them."""
+    local: LocalGains
+    """D and D_B, certified."""
+    coupled: Array
+    """J^T [K_c e_p + B_c e_pdot]: what the planner adds to the local gains."""
+
+
+class LawAtReference:
+    """The law's terms at a pose, without state (paper, section IV)."""
+
+    def __init__(self, gains: GainLaw, split: GainSplit) -> None:
+        """Take the body's gains and how they are split."""
+        self._gains, self._split = gains, split
+        self._uncoupled = UncoupledGains(gains.K_p, gains.B_p, gains.S, split.coupling.damping)
+
+    def evaluate(
+        self, at_ref: Kinematics, T: Array, F_O: Array, F_assist: Array, e_p: Array, e_pdot: Array
+    ) -> LawTerms:
+        """Return the terms.
+
+        Args:
+            at_ref: kinematics at the reference pose.
+            T: joint rates per unit of p along the closed chain (12, 6).
+            F_O: force and moment that hold the body (6,), N and N m, world.
+            F_assist: force at the harness (3,), N, world.
+            e_p: p_ref - p (6,), m and rad.
+            e_pdot: pdot_ref - pdot (6,), m/s and rad/s.
+        """
+        hessian_O = at_ref.hessian_times(F_O, F_assist).copy()
+
+        def body_gains() -> JointGains:
+            F = self._gains.K_p * e_p + self._gains.B_p * e_pdot + F_O
+            return self._gains.gains(at_ref, at_ref.hessian_times(F, F_assist))
+
+        local = self._split.split(body_gains, at_ref.p[2], at_ref.p[4], T, hessian_O)
+        K_fail = self._split.certificate.failsafe_stiffness(local.D)
+        K_c, B_c = self._uncoupled.at(K_fail, (T.T * local.D_B) @ T)
+        return LawTerms(
+            gravity=F_O @ at_ref.J,
+            assist=F_assist @ at_ref.J_harness,
+            hessian_O=hessian_O,
+            body_gains=body_gains,
+            local=local,
+            coupled=(K_c @ e_p + B_c @ e_pdot) @ at_ref.J,
+        )
+
+
 class Hocca:
     """The law and its state, such as the closed-loop reference p_C and the assist."""
 
@@ -86,7 +144,7 @@ class Hocca:
         self._split = GainSplit(config)
         self._S = self._gains.S
         coupling = self._split.coupling
-        self._coupled = UncoupledGains(self._gains.K_p, self._gains.B_p, self._S, coupling.damping)
+        self._terms = LawAtReference(self._gains, self._split)
         self._coupling = CouplingFilter(coupling.bandwidth_hz)
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
@@ -208,21 +266,12 @@ class Hocca:
 
         at_ref = ik.kinematics
         self._F_assist[:] = (self._assist.assist + self._load.force()) * up
-        gains = self._gains
-        tau_ff = self._F_O @ at_ref.J + self._F_assist @ at_ref.J_harness
-        hessian_O = at_ref.hessian_times(self._F_O, self._F_assist).copy()
-        dtau_ff = hessian_O @ v_ref + (up @ at_ref.J_harness) * assist_rate
-        e_p, e_pdot = p_ref - measured.p, pdot_ref - pdot
-
-        def body_gains() -> JointGains:
-            F = gains.K_p * e_p + gains.B_p * e_pdot + self._F_O
-            return gains.gains(at_ref, at_ref.hessian_times(F, self._F_assist))
-
-        local = self._split.split(body_gains, at_ref.p[2], at_ref.p[4], T, hessian_O)
-        K_fail = self._split.certificate.failsafe_stiffness(local.D)
-        K_c, B_c = self._coupled.at(K_fail, (T.T * local.D_B) @ T)
-        tau_unfiltered = (K_c @ e_p + B_c @ e_pdot) @ at_ref.J
-        tau_coupled = self._coupling.advance(tau_unfiltered, dt)
+        terms = self._terms.evaluate(
+            at_ref, T, self._F_O, self._F_assist, p_ref - measured.p, pdot_ref - pdot
+        )
+        tau_ff = terms.gravity + terms.assist
+        dtau_ff = terms.hessian_O @ v_ref + (up @ at_ref.J_harness) * assist_rate
+        tau_coupled = self._coupling.advance(terms.coupled, dt)
         # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive the
         # hand. It is a force fed forward, not fed-back joint rates, so the harness filter is enough
         tau_coupled += ease_z * at_ref.J_harness[2] + ease_pitch * at_ref.J[4]
@@ -232,8 +281,8 @@ class Hocca:
             tau_ff,
             dtau_ff,
             tau_coupled,
-            tau_unfiltered,
-            local,
+            terms.coupled,
+            terms.local,
             measured.p.copy(),
             pdot,
             p_ref,

@@ -196,7 +196,7 @@ class Planner:
             self._last_ns,
             self._seq,
             self._source,
-            msgspec.structs.replace(self._engagement),
+            self._engagement.copied(),
             self._overload.snapshot(),
             self._law.snapshot(),
             msgspec.structs.replace(self._limp_legs),
@@ -220,7 +220,7 @@ class Planner:
         self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
         self._attitude_seq = m.attitude_seq
         self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
-        self._engagement = msgspec.structs.replace(m.engagement)
+        self._engagement = m.engagement.copied()
         self._limp_legs = msgspec.structs.replace(m.limp_legs)
         self._overload.restore(m.overload)
         self._law.restore(m.law)

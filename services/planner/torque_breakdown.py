@@ -1,7 +1,7 @@
 """Breaks one planner tick down: gains, margins, and each joint's torque by origin. Pure.
 
-`Hocca.tick` computes these matrices and does not keep them. This module computes them again from
-the log: the joints, the references and the assist (docs/law.md).
+`LawAtReference` is the function that the planner's tick runs. Here it runs on what the log holds:
+the joints, the references and the assist (docs/law.md).
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.certificate import Certificate, Weakest, motor_mean
-from services.planner.coupling import UncoupledGains
+from services.planner.certificate import Weakest, motor_mean
 from services.planner.gains import GainLaw
+from services.planner.hocca import LawAtReference
 from services.planner.kinematics import Kinematics
 from services.planner.levelling import up_of
 from services.planner.push_limit import PushLimits, limits_at
@@ -96,22 +96,16 @@ def torque_breakdown(
     up = np.array(up_of(slope))
     F_O, F_assist = np.zeros(6), assist * up
     F_O[:3] = config.total_mass * GRAVITY * up
-    F = law.K_p * (at_ref.p - measured.p) + law.B_p * (at_ref.J @ v_ref - pdot) + F_O
-    hessian_O = at_ref.hessian_times(F_O, F_assist).copy()
     hessian_weight = at_ref.hessian_times(F_O, np.zeros(3)).copy()
-    body = law.gains(at_ref, at_ref.hessian_times(F, F_assist))
     T = per_unit_of_p(at_ref)
-    local = split.split(lambda: body, float(at_ref.p[2]), float(at_ref.p[4]), T, hessian_O)
-    certificate: Certificate = split.certificate
-    uncoupled = UncoupledGains(law.K_p, law.B_p, law.S, split.coupling.damping)
-    K_fail = certificate.failsafe_stiffness(local.D)
-    K_c, B_c = uncoupled.at(K_fail, (T.T * local.D_B) @ T)
-    e_q, e_v, e_pdot = q_ref - q, v_ref - v, at_ref.J @ v_ref - pdot
+    e_p, e_pdot = at_ref.p - measured.p, at_ref.J @ v_ref - pdot
+    terms = LawAtReference(law, split).evaluate(at_ref, T, F_O, F_assist, e_p, e_pdot)
+    body, local, certificate = terms.body_gains(), terms.local, split.certificate
     return TorqueBreakdown(
         p=measured.p,
         pdot=pdot,
         p_ref=at_ref.p,
-        F=F,
+        F=law.K_p * e_p + law.B_p * e_pdot + F_O,
         singular_values=np.asarray(np.linalg.svd(at_ref.J, compute_uv=False), float),
         K_q=body.K_q,
         B_q=body.B_q,
@@ -119,10 +113,10 @@ def torque_breakdown(
         weakest=certificate.weakest(local.D),
         weakest_onboard=certificate.weakest(motor_mean(local.D)),
         pushes=limits_at(config, at_ref, T, hessian_weight, local.D, local.D_B),
-        gravity=F_O @ at_ref.J,
-        assist=F_assist @ at_ref.J_harness,
-        local_pd=local.D * e_q + local.D_B * e_v,
-        coupled=(K_c @ (at_ref.p - measured.p) + B_c @ e_pdot) @ at_ref.J,
+        gravity=terms.gravity,
+        assist=terms.assist,
+        local_pd=local.D * (q_ref - q) + local.D_B * (v_ref - v),
+        coupled=terms.coupled,
         eased=np.zeros(12),
     )
 

@@ -38,7 +38,7 @@ from shared.mcap_log import files, schema
 from shared.mcap_log.fsync_thread import FsyncThread
 from shared.mcap_log.sequence_stats import KeyCount
 
-SCHEMA_VERSION: Final = "5"
+SCHEMA_VERSION: Final = "6"
 """Version of the layout above and of the messages in `shared/bus/messages.py`."""
 
 FILE_NAME: Final = files.FIRST

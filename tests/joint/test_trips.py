@@ -138,7 +138,7 @@ def test_a_module_that_shakes_holds_and_is_led_again_after_a_wait(tracking: Benc
         if event is not None:
             causes.append(event.cause)
     assert causes[0] == Cause.SHAKING
-    assert failsafe.dropouts >= 1
+    assert failsafe.dropouts.count >= 1
     tracking.v = (0.0, 0.0)
     events = [result.event for result in tracking.run(2000, fresh=True)]
     assert [event.cause for event in events if event is not None][-1] == Cause.COMMANDS_FRESH

@@ -82,7 +82,7 @@ def test_after_long_good_times_the_wait_is_short_again() -> None:
     for _ in range(4):
         led.drop_out()
     led.lead_for(3 * FORGET_NS + 4 * TICK_NS)
-    assert led.engagement.dropouts == 1
+    assert led.engagement.dropouts.count == 1
     assert led.drop_out() == pytest.approx(WAITS_NS[2], abs=TICK_NS)
 
 
@@ -93,7 +93,7 @@ def test_time_in_hold_forgets_nothing() -> None:
     for _ in range(2 * FORGET_NS // TICK_NS):
         led.tick(cut=True)
     led.until_led()
-    assert led.engagement.dropouts == 2
+    assert led.engagement.dropouts.count == 2
 
 
 def test_a_module_that_drops_out_by_itself_counts_and_what_is_forbidden_does_not() -> None:
@@ -102,7 +102,7 @@ def test_a_module_that_drops_out_by_itself_counts_and_what_is_forbidden_does_not
     lost, kept = (Engagement(PlannerMode.LEADING, since) for _ in range(2))
     lost.advance(T0, YES, YES, one_holds)
     kept.advance(T0, YES, YES, TRACK, PlannerMode.OVERLOADED)
-    assert (lost.dropouts, kept.dropouts) == (1, 0)
+    assert (lost.dropouts.count, kept.dropouts.count) == (1, 0)
 
 
 def test_a_new_planner_has_no_wait() -> None:

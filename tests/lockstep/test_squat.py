@@ -87,7 +87,7 @@ def test_a_restarted_planner_takes_over_without_a_step(robot: RobotConfig) -> No
     )
     assert outcome.stood
     assert all(c.failsafe.mode is Mode.TRACK for c in outcome.lockstep.controllers)
-    assert all(c.failsafe.dropouts == 1 for c in outcome.lockstep.controllers)
+    assert all(c.failsafe.dropouts.count == 1 for c in outcome.lockstep.controllers)
     for _, event in outcome.lockstep.events:
         step = np.abs(np.subtract(event.tau_after, event.tau_before)).max()
         assert step <= 5.0 or event.mode_before == Mode.DISARMED

@@ -9,6 +9,7 @@ from services.planner.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engag
 from shared.bus.messages import JointCommand, Mode, PlannerMode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.robot.dropouts import Dropouts
 from shared.robot.joints import MODULES
 from tests.joint.helpers import Bench
 
@@ -91,7 +92,7 @@ def test_a_module_that_can_not_come_to_track_is_not_waited_for(mode: Mode, since
     engagement = Engagement(PlannerMode.LEADING, T0)
     assert engagement.advance(T0 + since_ns, YES, YES, but(HOLD, 3, int(mode)))
     assert engagement.hold
-    assert engagement.dropouts == 1
+    assert engagement.dropouts.count == 1
 
 
 def test_it_goes_on_leading_while_all_six_track() -> None:
@@ -182,7 +183,7 @@ def test_a_silent_module_counts_before_what_is_forbidden(inhibit: PlannerMode) -
 
 @pytest.mark.parametrize("dropouts", range(len(WAITS_NS)))
 def test_it_tells_how_long_it_waits_and_leads_when_that_is_over(dropouts: int) -> None:
-    engagement = Engagement(PlannerMode.ALIGNING, T0, dropouts=dropouts, dropped_ns=T0)
+    engagement = Engagement(PlannerMode.ALIGNING, T0, dropouts=Dropouts(dropouts, last_ns=T0))
     assert engagement.wait_ns(T0) == WAITS_NS[dropouts]
     for now_ns in (T0 + WAITS_NS[dropouts] - 1, T0 + WAITS_NS[dropouts]):
         left_ns = engagement.wait_ns(now_ns)
@@ -201,15 +202,15 @@ def test_drop_outs_are_counted_up_to_the_longest_wait() -> None:
     for count in range(1, len(WAITS_NS) + 3):
         now_ns = T0 + count * NS_PER_S
         drop_out(engagement, now_ns)
-        assert engagement.dropouts == min(count, len(WAITS_NS) - 1)
-        assert engagement.dropped_ns == now_ns
+        assert engagement.dropouts.count == min(count, len(WAITS_NS) - 1)
+        assert engagement.dropouts.last_ns == now_ns
 
 
 def test_each_good_while_makes_one_drop_out_forgotten() -> None:
     engagement = leading()
     for _ in range(3):
         drop_out(engagement, T0)
-    engagement.steady_since_ns = T0
+    engagement.dropouts.steady_since_ns = T0
     for now_ns, left in (
         (T0 + FORGET_NS - 1, 3),
         (T0 + FORGET_NS, 2),
@@ -219,4 +220,4 @@ def test_each_good_while_makes_one_drop_out_forgotten() -> None:
         (T0 + 4 * FORGET_NS, 0),
     ):
         engagement.advance(now_ns, YES, YES, TRACK)
-        assert engagement.dropouts == left, now_ns - T0
+        assert engagement.dropouts.count == left, now_ns - T0

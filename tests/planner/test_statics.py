@@ -125,7 +125,7 @@ def test_pushed_by_the_operator_the_feet_carry_the_push_too(
         output = law.tick(pushed, STILL, assist, 0.0)
     T = oracle.feasible(robot, pushed)
     K_fail = law._split.certificate.failsafe_stiffness(output.local.D)
-    K_c, _ = law._coupled.at(K_fail, (T.T * output.local.D_B) @ T)
+    K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * output.local.D_B) @ T)
     along_p = (K_fail + K_c) @ moved
     torso_per_p = oracle.leg_jacobian(robot, RIGHT, pushed) @ T[oracle.LEG[RIGHT]]
     operator = np.linalg.solve(torso_per_p.T, along_p)
@@ -206,7 +206,7 @@ def test_along_the_closed_chain_the_law_feels_like_k_p_or_more_where_it_balances
     T, D = oracle.feasible(robot, q), at_ref.local.D
     # T_ref has them at the law's own damping of its inverse
     K_fail = law._split.certificate.failsafe_stiffness(D)
-    K_c, _ = law._coupled.at(K_fail, (T.T * at_ref.local.D_B) @ T)
+    K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * at_ref.local.D_B) @ T)
     wanted = (K_fail + K_c) @ S_perp
     np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=3.0)
     closed = np.flatnonzero(np.diag(S_perp))
@@ -225,6 +225,6 @@ def test_along_the_closed_chain_motion_is_damped_where_it_balances_and_free_else
     S_perp = np.diag(1.0 - np.array(robot.law.S))
     local = law.tick(q, STILL, 0.0, 0.0).local
     B_local = (T.T * local.D_B) @ T
-    _, B_c = law._coupled.at(law._split.certificate.failsafe_stiffness(local.D), B_local)
+    _, B_c = law._terms._uncoupled.at(law._split.certificate.failsafe_stiffness(local.D), B_local)
     wanted = (B_local + B_c) @ S_perp
     np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=0.5)

@@ -11,6 +11,7 @@ from services.joint.failsafe import Event, Failsafe, Timing, timing_of
 from shared.bus.messages import Cause, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.robot.dropouts import Dropouts
 from tests.joint.helpers import T0, command
 
 CYCLE_NS = 2 * NS_PER_MS
@@ -73,7 +74,7 @@ def test_each_drop_out_doubles_the_wait_up_to_its_maximum(timing: Timing) -> Non
 
 def test_no_number_of_drop_outs_makes_the_wait_overflow_or_shrink(timing: Timing) -> None:
     for dropouts in (5, 16, 17, 63, 64, 10_000):
-        failsafe = Failsafe(dropouts=dropouts)
+        failsafe = Failsafe(dropouts=Dropouts(count=dropouts))
         assert failsafe.engage_after_ns(timing) == timing.engage_after_max_ns
 
 
@@ -82,9 +83,9 @@ def test_a_drop_out_is_forgotten_after_steady_tracking(timing: Timing) -> None:
     module.drop_out()
     module.until(Mode.TRACK, fresh=True)
     module.track_for(timing.dropout_forget_ns - CYCLE_NS)
-    assert module.failsafe.dropouts == 1
+    assert module.failsafe.dropouts.count == 1
     module.track_for(CYCLE_NS)
-    assert module.failsafe.dropouts == 0
+    assert module.failsafe.dropouts.count == 0
     assert module.failsafe.engage_after_ns(timing) == timing.engage_after_ns
 
 
@@ -96,7 +97,7 @@ def test_drop_outs_are_forgotten_one_at_a_time(timing: Timing) -> None:
     left = []
     for _ in range(4):
         module.track_for(timing.dropout_forget_ns)
-        left.append(module.failsafe.dropouts)
+        left.append(module.failsafe.dropouts.count)
     assert left == [2, 1, 0, 0]
 
 
@@ -118,14 +119,14 @@ def test_time_outside_track_forgets_nothing(timing: Timing) -> None:
     module.drop_out()
     for _ in range(2 * timing.dropout_forget_ns // CYCLE_NS):
         module.cycle(fresh=False)
-    assert module.failsafe.dropouts == 1
+    assert module.failsafe.dropouts.count == 1
 
 
 def test_hold_asked_by_the_planner_is_no_drop_out(timing: Timing) -> None:
     module = Module(timing)
     module.until(Mode.TRACK, fresh=True)
     assert module.cycle(fresh=True, hold=True) is Cause.HOLD_ALL
-    assert module.failsafe.dropouts == 0
+    assert module.failsafe.dropouts.count == 0
 
 
 def test_ready_is_told_while_hold_is_asked_so_that_all_six_can_start_together(

@@ -205,21 +205,6 @@ def test_the_failsafes_times_and_limits_are_the_robot_files(robot: RobotConfig) 
     )
 
 
-def test_each_good_while_makes_a_module_forget_one_drop_out(timing: Timing) -> None:
-    failsafe = Failsafe(mode=Mode.HOLD, dropouts=2, steady_since_ns=T0 - 10**12)
-    failsafe._count_dropouts(T0, timing, Event.NONE)
-    failsafe.mode = Mode.TRACK  # only what is tracked without one counts
-    for after_ns, left in (
-        (timing.dropout_forget_ns - 1, 2),
-        (timing.dropout_forget_ns, 1),
-        (2 * timing.dropout_forget_ns - 1, 1),
-        (2 * timing.dropout_forget_ns, 0),
-        (4 * timing.dropout_forget_ns, 0),
-    ):
-        failsafe._count_dropouts(T0 + after_ns, timing, Event.NONE)
-        assert failsafe.dropouts == left, after_ns
-
-
 def test_at_the_first_instant_of_a_clock_commands_are_fresh_as_at_any_other(
     timing: Timing,
 ) -> None:

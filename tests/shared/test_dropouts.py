@@ -1,0 +1,57 @@
+"""Drop-outs are counted up to a maximum, and each steady time forgets one."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.robot.dropouts import Dropouts
+
+COUNT_MAX, FORGET_NS, T0 = 3, 1000, 50_000
+
+
+def advance(dropouts: Dropouts, now_ns: int, *, engaged: bool = True, dropped: bool = False) -> int:
+    dropouts.advance(
+        now_ns, engaged=engaged, dropped=dropped, count_max=COUNT_MAX, forget_ns=FORGET_NS
+    )
+    return dropouts.count
+
+
+def test_each_steady_time_forgets_one_drop_out() -> None:
+    dropouts = Dropouts(count=2, steady_since_ns=T0 - 10**12)
+    advance(dropouts, T0, engaged=False)  # only time engaged counts
+    for after_ns, left in (
+        (FORGET_NS - 1, 2),
+        (FORGET_NS, 1),
+        (2 * FORGET_NS - 1, 1),
+        (2 * FORGET_NS, 0),
+        (4 * FORGET_NS, 0),
+    ):
+        assert advance(dropouts, T0 + after_ns) == left, after_ns
+
+
+def test_a_drop_out_restarts_the_steady_time() -> None:
+    dropouts = Dropouts(count=1, steady_since_ns=T0)
+    assert advance(dropouts, T0 + FORGET_NS - 1, dropped=True) == 2
+    assert dropouts.last_ns == T0 + FORGET_NS - 1
+    assert advance(dropouts, T0 + 2 * FORGET_NS - 2) == 2
+    assert advance(dropouts, T0 + 2 * FORGET_NS - 1) == 1
+
+
+def test_no_drop_out_is_counted_while_not_engaged() -> None:
+    dropouts = Dropouts()
+    assert advance(dropouts, T0, engaged=False, dropped=True) == 0
+    assert dropouts.last_ns == 0
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(0, 3 * FORGET_NS))))
+def test_the_count_stays_between_zero_and_its_maximum_and_changes_by_one(
+    steps: list[tuple[bool, bool, int]],
+) -> None:
+    dropouts, now_ns, before = Dropouts(), T0, 0
+    for engaged, dropped, pause_ns in steps:
+        now_ns += pause_ns
+        count = advance(dropouts, now_ns, engaged=engaged, dropped=dropped)
+        assert 0 <= count <= COUNT_MAX
+        assert abs(count - before) <= 1
+        before = count
