@@ -1,9 +1,9 @@
 """The fleet's clock, in one place so that laws never read it.
 
 CLOCK_MONOTONIC, one for all processes of a host. A simulated fleet may run in slow motion
-(`keep_pace`): on cores that do not carry ten services in real time the clock of all of them goes
-slower, and control, physics and log are what they would be on a faster machine. Only what waits
-has to know (`machine_s`, `sleep_until`).
+(`keep_pace`): on cores too slow for ten services in real time, the clock of all of them runs
+slower. Control, physics and log are those of a faster machine. Only code that waits needs to know
+(`machine_s`, `sleep_until`).
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ def pace() -> float:
 
 
 def keep_pace(run_dir: Path) -> None:
-    """Go by the clock of the fleet in a run directory from now on; before any time is read.
+    """Use the clock of the fleet in a run directory from now on; call it before any time is read.
 
     Raises:
-        FleetError: the file that tells its pace tells none.
+        FleetError: the file with its pace is malformed.
     """
     global _pace  # noqa: PLW0603 - a process has one clock, as it has one CLOCK_MONOTONIC
     path = run_dir / PACE_FILE

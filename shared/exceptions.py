@@ -8,10 +8,10 @@ from __future__ import annotations
 
 
 class XrlError(Exception):
-    """Root of every error this project raises on purpose.
+    """Root of the errors that this project raises.
 
-    The message says what was wrong, where, and what would be right. Command line
-    tools print it as one line and exit with `exit_code`.
+    The message says what was wrong, where, and what to do. Command line tools print it as one line
+    and exit with `exit_code`.
     """
 
     exit_code = 2

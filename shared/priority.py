@@ -1,6 +1,6 @@
-"""How a process gets the processor in time, with privilege and without (docs/networks.md).
+"""Raises a process's scheduling priority, with privilege or without (docs/networks.md).
 
-Call it before the bus is opened: the bus's threads inherit what was granted.
+Call it before the bus is opened: the bus's threads inherit it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ TIMER_SLACK_NS: Final = 1_000
 
 
 def raise_priority(fifo_priority: int) -> str:
-    """Ask for SCHED_FIFO, else for what needs no privilege; return what was granted."""
+    """Set SCHED_FIFO, or what needs no privilege; return what was granted."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo_priority))
     except (OSError, AttributeError):
@@ -31,7 +31,7 @@ def raise_priority(fifo_priority: int) -> str:
 
 
 def short_slice() -> str:
-    """Take a short scheduling slice and exact timers; return what was granted."""
+    """Set a short scheduling slice and exact timers; return what was granted."""
     libc = ctypes.CDLL(None, use_errno=True)
     granted = []
     if libc.prctl(_PR_SET_TIMERSLACK, TIMER_SLACK_NS, 0, 0, 0) == 0:

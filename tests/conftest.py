@@ -9,8 +9,8 @@ from hypothesis import Phase, settings
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 
-# A shell without job control starts its background with SIGINT ignored, and every program that a test
-# starts would inherit that.
+# A shell without job control starts its background with SIGINT ignored, and every program that a
+# test starts would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

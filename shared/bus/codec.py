@@ -1,4 +1,4 @@
-"""Messages to bytes and back, refusing what is not finite (docs/networks.md)."""
+"""Encodes and decodes messages; refuses numbers that are not finite (docs/networks.md)."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class Decoder(Generic[M]):
         self.refused = 0
 
     def decode(self, payload: bytes) -> M | None:
-        """Return the message, or None if the payload is not one (refused and counted).
+        """Return the message, or None if the payload is malformed, which is counted.
 
-        null, NaN and infinities fail the type check: a null is no float, and JSON has
-        no word for the others.
+        null, NaN and infinities fail the type check: null is no float, and JSON has no literal for
+        the others.
         """
         try:
             return self._decoder.decode(payload)

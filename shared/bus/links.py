@@ -1,7 +1,7 @@
-"""The links whose traffic can be impaired: those that control and states pass. Data.
+"""Table of the links whose traffic can be impaired: commands, states, wrenches and attitudes.
 
-Each is a pair of processes with a link of its own (`shared.bus.session.peers_of`), one direction of
-which is named `SENDER->RECEIVER`.
+Each link is a pair of processes with a connection of its own (`shared.bus.session.peers_of`); one
+direction of it is named `SENDER->RECEIVER`.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ class DriveStatus(IntEnum):
 
 
 class PlannerMode(IntEnum):
-    """Mode of the planner: what it asks of the six modules."""
+    """Mode of the planner: its request to the six modules."""
 
     WAITING = 0
     """Some module's state is stale: all hold."""

@@ -1,12 +1,12 @@
 """The bus: publishers, subscribers and the links between processes (docs/networks.md).
 
-The only file that knows Zenoh. Every process is a peer with a fixed endpoint; there is
-no router, no scouting and no gossip, and a peer does not pass on what is not for it, so
-each pair of processes that share a key has a link of its own (`peers_of`).
+The only file that knows Zenoh. Every process is a peer with a fixed endpoint. There is no router,
+no scouting and no gossip, and a peer forwards nothing: each pair of processes that share a key has
+a link of its own (`peers_of`).
 
-On the control path (`Publisher.put`, `Latest.take`) nothing blocks, logs or raises: a
-message that cannot be sent or understood is counted, and its absence shows in its age.
-Set RUST_LOG=info to hear Zenoh itself.
+On the control path (`Publisher.put`, `Latest.take`) nothing blocks, logs or raises. A message that
+cannot be sent or decoded is counted, and its absence shows as age. RUST_LOG=info shows Zenoh's own
+log.
 """
 
 from __future__ import annotations
@@ -241,18 +241,18 @@ class Session:
         return Publisher(publisher)
 
     def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
-        """Declare a publisher of ready payloads on any key.
+        """Declare a publisher of encoded payloads on any key.
 
-        All of them have one priority: what is put first arrives first, on all keys together.
+        All such publishers have one priority: payloads arrive in the order of `put`, over all keys.
 
         Args:
             key: a full key, without wildcards.
             patient: `put` waits for a slow subscriber, up to `wait_before_close` (5 s) and then
-                drops the link, in place of dropping the message. Only where nothing waits for
-                the caller.
+                drops the link, instead of dropping the message. Only for a caller that nothing
+                waits for.
 
         Raises:
-            BusError: it is no key.
+            BusError: the key is malformed.
         """
         control = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
         try:
@@ -322,11 +322,11 @@ def open_session(
     connect: Sequence[str] = (),
     injected: bool = False,
 ) -> Session:
-    """Join the bus and return without waiting for anybody; links form as peers come up.
+    """Join the bus and return at once; links form as peers come up.
 
-    Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the
-    priority of the process before: Zenoh's thread inherits it. From then on the process goes by
-    the clock of the fleet in `run_dir` (`shared.clock.keep_pace`).
+    Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the priority of the
+    process before: Zenoh's thread inherits it. From then on the process uses the clock of the fleet
+    in `run_dir` (`shared.clock.keep_pace`).
 
     Args:
         config: the robot; `config.bus` holds the endpoints and the lease.
@@ -335,7 +335,8 @@ def open_session(
         run_dir: replaces `{run}` in endpoints; made if it is not there.
         listen: further endpoints to listen on: with them a tool serves other tools.
         connect: further endpoints to dial: those of such a tool.
-        injected: dial through the network proxy where it stands (`shared.bus.links.PAIRS`).
+        injected: dial through the network proxy on the links that it serves
+            (`shared.bus.links.PAIRS`).
 
     Raises:
         BusError: the name cannot be used, or the endpoint is taken, too long or not
@@ -377,11 +378,10 @@ def open_session(
 
 
 def _meet_link(event: zenoh.LinkEvent) -> None:
-    """Have the socket of a new TCP link closed at once when the link is given up.
+    """Make the socket of a new TCP link close at once when the link is given up.
 
-    Zenoh sets SO_LINGER to 10 s and closes from its only thread: after a cable was cut for
-    longer than the lease, all links of the process stood still for up to 10 s for each link
-    that was lost.
+    Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut for longer
+    than the lease, all links of the process stalled for up to 10 s for each lost link.
     """
     link = event.link
     if event.kind == zenoh.SampleKind.PUT and link.src.startswith(_TCP):
@@ -389,7 +389,7 @@ def _meet_link(event: zenoh.LinkEvent) -> None:
 
 
 def _address(locator: str) -> socket_linger.Address:
-    """Return host and port of tcp/HOST:PORT, as Zenoh tells them of a link: numeric."""
+    """Return the numeric host and port of tcp/HOST:PORT, as Zenoh reports them for a link."""
     address = re.split("[?#]", locator.partition("/")[2])[0]
     host, _, port = address.rpartition(":")
     return host.strip("[]"), int(port)
@@ -401,7 +401,7 @@ def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
 
 
 def _endpoint(text: str, run_dir: Path) -> str:
-    """Return an endpoint with `{run}` filled in, checked for what a UNIX socket can take."""
+    """Return an endpoint with `{run}` filled in; a path too long for a UNIX socket is refused."""
     endpoint = expand(text, run_dir)
     length = len(os.fsencode(endpoint.removeprefix(_UNIX)))
     if endpoint.startswith(_UNIX) and length > SOCKET_PATH_MAX:

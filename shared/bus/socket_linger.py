@@ -20,11 +20,11 @@ _OFF: Final = struct.pack("ii", 0, 0)
 def turn_off(local: Address, remote: Address) -> bool:
     """Turn SO_LINGER off on this process's TCP connection between two addresses.
 
-    With it, `close` keeps its thread waiting until the other side has everything, or the time
-    is over. What is still to be sent is sent without it too.
+    With it, `close` blocks its thread until the other side has received everything or the time is
+    over. Without it, unsent data is still sent.
 
     Returns:
-        False if there is no such connection, or none any more.
+        False if there is no such connection.
     """
     for entry in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):  # closed meanwhile, or no socket with a peer

@@ -1,4 +1,4 @@
-"""How much of a CAN bus the drives on it take, at 1 Mbit/s (docs/drives.md). Pure.
+"""Computes the load that drives put on a CAN bus at 1 Mbit/s (docs/drives.md). Pure.
 
 A standard data frame with n bytes is 47 + 8n bits long, the gap after it included. After five
 equal bits the sender stuffs one more; up to the end of the checksum, over 34 + 8n bits, that is
@@ -22,8 +22,9 @@ heartbeats at 10 Hz, are 82 %."""
 STUFFING: Final = 0.06
 """Stuff bits for each bit that can be stuffed: 0.05 while the robot stands."""
 BLEND_MAX: Final = 0.98
-"""Share of a bus that may be taken while gains blend, for tenths of a second: what is more queues
-up, and joints are led on samples of before."""
+"""Highest load of a bus while gains blend, for tenths of a second. Above it frames queue up, and
+joints are controlled on old samples.
+"""
 GAINS_HZ: Final = 10.0
 """How often the onboard loop's gains go out even if they stand still."""
 BLEND_HZ: Final = 125.0
@@ -33,7 +34,7 @@ LOADCELL_FRAMES: Final = 3
 
 
 class BusLoad(NamedTuple):
-    """What the devices on a bus send and are sent, bit/s."""
+    """Traffic of the devices on a bus, bit/s."""
 
     cyclic: float
     """By each axis for each Hz of the control rate: estimate and target, bit."""
@@ -106,7 +107,7 @@ def check_buses(file: str, config: RobotConfig) -> None:
     """Refuse a bus that cannot carry the modules on it.
 
     Raises:
-        ConfigError: naming the bus, its load and what it would carry.
+        ConfigError: names the bus, its load and the load that it can carry.
     """
     if config.joint_service.driver != "odrive_can":
         return

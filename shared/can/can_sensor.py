@@ -54,9 +54,9 @@ class CanSensor(Generic[S]):
             interface: python-can's name of the interface.
             channel: as that interface takes it.
             assembler: makes samples of its frames.
-            pause_ns: after a longer time between two reads, what waited on the link is
-                of unknown age (this process was stopped, and a full queue keeps the
-                oldest frames) and is thrown away.
+            pause_ns: after a longer time between two reads, frames that waited on the link have an
+                unknown age (this process was stopped, and a full queue keeps the oldest frames) and
+                are discarded.
 
         Raises:
             ConfigError: python-can knows no such interface.

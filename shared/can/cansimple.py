@@ -98,8 +98,8 @@ class InputMode(IntEnum):
 class AxisError(IntFlag):
     """`axis.error`.
 
-    From 0.5.5 on it says that the motor, the encoder or the controller has failed; up to 0.5.4
-    it stayed 0 then, and it still does where an axis is idle for no error of its own.
+    From 0.5.5 on it is set when motor, encoder or controller failed; up to 0.5.4 it stayed 0 then.
+    In every version it is 0 for an axis that is idle without an error of its own.
     """
 
     NONE = 0

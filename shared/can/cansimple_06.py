@@ -1,4 +1,4 @@
-"""What CANSimple of ODrive firmware 0.6 has otherwise than 0.5 (`shared.can.cansimple`).
+"""CANSimple of ODrive firmware 0.6, where it differs from 0.5 (`shared.can.cansimple`).
 
 Heartbeat bytes 5 to 7, 0x000 (version), 0x003 (one pair of error words for the axis), 0x004 and
 0x005 (any endpoint, read and written), 0x019 (position in turns as a float, where 0.5 takes
@@ -58,7 +58,7 @@ class DriveError06(IntFlag):
 
 
 class ProcedureResult(IntEnum):
-    """The outcome of the last state that was asked for."""
+    """Outcome of the last requested state."""
 
     SUCCESS = 0
     BUSY = 1

@@ -1,11 +1,11 @@
-"""What this robot wants of its ODrives: one table, by the names of firmware 0.5.6.
+"""Settings that this robot needs on its ODrives: one table, by the names of firmware 0.5.6.
 
 With factory settings an ODrive disarms, limits or answers in ways that make this robot fall
 (docs/drives.md#traps). The simulator's drives are set by this table, `xrl doctor` compares a drive
 with it and `xrl configure` writes it, so the three cannot disagree.
 
-What the joint services write at arming or in every cycle (modes, gains, limits) stands here
-too where a drive that was armed by somebody else would be wrong without it.
+Modes, gains and limits that the joint services write at arming or in every cycle are listed too,
+where a drive that somebody else armed would be wrong without them.
 """
 
 from __future__ import annotations
@@ -28,11 +28,13 @@ AXES: Final = ("axis0", "axis1")
 
 CAN_BAUD_RATE: Final = 1_000_000
 OVERVOLTAGE_MAX: Final = 59.92
-"""V; what the firmware ships on a 56 V board. Above it the output stage is not protected."""
+"""V; the firmware's default on a 56 V board. Above it the output stage is not protected."""
 OVERSPEED_TOLERANCE: Final = 1.2
-"""What the firmware ships; closer to 1, a noisy estimate at vel_limit disarms."""
+"""The firmware's default; closer to 1, a noisy estimate at vel_limit disarms."""
 CURRENT_RANGE: Final = 60.0
-"""A; `motor.config.requested_current_range` as the firmware ships it: what a drive can measure."""
+"""A; the firmware's default of `motor.config.requested_current_range`: the largest current that a
+drive measures.
+"""
 SPINOUT_POWER: Final = 100.0
 """W; 10 as shipped. A motor that brakes with more than this, and takes more than this beyond the
 copper loss of its calibrated resistance, disarms: its encoder has slipped. A winding at 100 C has
@@ -43,7 +45,7 @@ _RELATIVE: Final = 1e-6
 
 
 class Compare(Enum):
-    """How a setting must compare with what is wanted."""
+    """How a setting is compared with its wanted value."""
 
     EQUAL = ""
     AT_LEAST = ">= "
@@ -51,7 +53,7 @@ class Compare(Enum):
 
 
 class Need(NamedTuple):
-    """What the wanted values are worked out from."""
+    """Parameters from which the wanted values are computed."""
 
     drive: DriveConfig
     encoder_counts_per_turn: int
@@ -89,7 +91,7 @@ class WantedSetting(NamedTuple):
         return same(found, self.value)
 
     def describe(self) -> str:
-        """Return what is wanted: "60", ">= 1.2"."""
+        """Return the wanted value as text: "60", ">= 1.2"."""
         return f"{self.compare.value}{describe_value(self.value)}"
 
 
@@ -248,7 +250,7 @@ def of_module(robot: RobotConfig, module: str) -> tuple[WantedSetting, ...]:
 
 
 def of_every_drive(need: Need) -> dict[str, Value]:
-    """Return what is wanted of all drives alike, by the tables' names."""
+    """Return the settings that all drives share, by the tables' names."""
     values = {setting.name: setting.wanted(need) for setting in (*DRIVE_TABLE, *AXIS_TABLE)}
     return {name: value for name, value in values.items() if value is not None}
 

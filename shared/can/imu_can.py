@@ -1,6 +1,6 @@
-"""CAN frames of the IMU: those of an Xsens MTi 600, as far as they are needed.
+"""CAN frames of the IMU: the part of an Xsens MTi 600's protocol that is used.
 
-An AHRS that fuses by itself, with CAN on board: its orientation is good to 0.2 .. 0.5 degrees in
+The MTi is an AHRS with CAN: its orientation is good to 0.2 .. 0.5 degrees in
 roll and pitch. In the MT Manager's CAN output, StatusWord, Quaternion and RateOfTurn are switched
 on, with standard identifiers and the same rate; all is big-endian (MT CAN protocol, MT1604P).
 
@@ -38,7 +38,7 @@ IDS: Final = tuple(can_id for can_id, _ in _FRAMES)
 
 
 class ImuSample(msgspec.Struct, frozen=True, gc=False):
-    """What the IMU says at one moment."""
+    """One sample of the IMU."""
 
     quaternion: Vector4
     """w, x, y, z: turns sensor axes into axes whose z is up."""
@@ -50,7 +50,7 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
 def pack(
     quaternion: Sequence[float], rate: Sequence[float], *, valid: bool
 ) -> list[tuple[int, bytes]]:
-    """Return the three frames (id, data) of a sample; what is out of range is clipped.
+    """Return the three frames (id, data) of a sample; values out of range are clipped.
 
     Args:
         quaternion: w, x, y, z of unit length.

@@ -7,9 +7,9 @@ CAN amplifier could have; a real one needs this file changed and nothing else.
     id 0x301   leg 2, leg 3
     id 0x302   leg 4, leg 5
 
-A sample is its three frames in this order with no other of them in between. There is no
-sample counter, as the frames are full: a gap inside a sample is seen by its order, while
-the loss of exactly three frames that straddle two samples would go unseen.
+A sample is its three frames in this order with no other of them in between. The frames are full, so
+there is no sample counter. A gap inside a sample breaks its order; the loss of exactly three frames
+that straddle two samples is not detected.
 """
 
 from __future__ import annotations

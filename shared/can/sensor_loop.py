@@ -31,7 +31,7 @@ def next_deadline(deadline_ns: int, period_ns: int, now_ns: int) -> tuple[int, i
 
 
 def run(loop: Loop, rate_hz: float, stop: Stop) -> None:
-    """Run cycles at `rate_hz` until told to stop; missed ones are skipped, not piled up."""
+    """Run cycles at `rate_hz` until stopped; missed cycles are skipped."""
     period_ns = round(NS_PER_S / rate_hz)
     deadline_ns = now_ns()
     while not stop:

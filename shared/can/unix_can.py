@@ -4,10 +4,10 @@
 `services.simulator.unix_can_hub.UnixCanHub`, held by the simulator. The code that drives a real bus
 through socketcan drives this one unchanged.
 
-On the wire: SOCK_SEQPACKET; a packet carries one or several 16-byte frames in the layout
-of SocketCAN's `struct can_frame` (id and flags, length, three pad bytes, eight data
-bytes), little-endian. Several frames in one packet cost one system call. Neither side
-ever blocks in sending: what does not fit into a socket is dropped and counted.
+On the wire: SOCK_SEQPACKET; a packet carries one or several 16-byte frames in the layout of
+SocketCAN's `struct can_frame` (id and flags, length, three pad bytes, eight data bytes),
+little-endian. Several frames in one packet cost one system call. Sending never blocks: a packet
+that does not fit into a socket is dropped and counted.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def pack_frames(frames: Iterable[Frame]) -> bytes:
 
 
 def unpack_frames(packet: bytes) -> list[Frame]:
-    """Return the frames of a packet; one that is no row of whole frames holds none."""
+    """Return the frames of a packet; none if it is not a whole number of frames."""
     if len(packet) % _FRAME.size:
         return []
     return [(can_id, data[:length]) for can_id, length, data in _FRAME.iter_unpack(packet)]
@@ -52,8 +52,8 @@ def unpack_frames(packet: bytes) -> list[Frame]:
 class UnixCanBus(can.BusABC):
     """Client of a `UnixCanHub`, declared to python-can as interface `xrl_unix`.
 
-    Unlike most interfaces, `send` drops and counts a frame for which there is no room
-    instead of raising: a control loop has a newer one in a millisecond.
+    Unlike most interfaces, `send` drops and counts a frame when the socket is full, and does not
+    raise: a control loop has a newer one in a millisecond.
 
     Attributes:
         dropped: frames that were not sent because the socket was full.

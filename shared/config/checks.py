@@ -1,4 +1,4 @@
-"""What a robot file must make sense of as a whole; see `shared.config.robot_config`."""
+"""Checks that the values of a robot file fit each other (`shared.config.robot_config`)."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _check_imu(file: str, config: RobotConfig) -> None:
 
 
 def _check_serial_numbers(file: str, config: RobotConfig) -> None:
-    """Check what is given, whichever the driver: a drive has USB and CAN at the same time."""
+    """Check USB and CAN settings, whichever driver is used: a drive has both."""
     wanted = config.joint_service.driver == "odrive_usb"
     seen: set[str] = set()
     for index, module in enumerate(config.module):
@@ -183,7 +183,7 @@ def _check_interfaces(file: str, config: RobotConfig) -> None:
 
 
 def _check_drive(file: str, config: RobotConfig) -> None:
-    """Check what the drives are told against what the joints need of them."""
+    """Check the drives' limits against the joints' needs."""
     drive, turns_per_rad = config.drive, config.joint.gear_ratio / (2 * math.pi)
     tau_per_ampere = 2 * config.joint.gear_ratio * drive.torque_constant
     if tau_per_ampere * drive.current_lim < config.joint.tau_module_max:
@@ -194,7 +194,7 @@ def _check_drive(file: str, config: RobotConfig) -> None:
         found = f"{drive.current_lim:g} A is more than an ODrive v3 measures"
         right = f"at most {CURRENT_RANGE:g} A, its requested_current_range"
         raise ConfigError(file, "drive.current_lim", found, right)
-    # Up to vel_limit_tolerance times vel_limit are left for what the other axis adds.
+    # Up to vel_limit_tolerance times vel_limit remain for the other axis.
     speed = config.joint_service.v_max * turns_per_rad
     if drive.vel_limit < speed:
         found = f"{drive.vel_limit:g} turn/s is slower than joint_service.v_max"

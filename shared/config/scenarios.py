@@ -29,7 +29,7 @@ ShiftLength = Annotated[float, Range(-0.1, 0.1, "m")]
 ShiftAngle = Annotated[float, Range(-0.3, 0.3, "rad")]
 
 SIGNALS = ("KILL", "STOP", "TERM", "INT")
-"""What a kill can send; STOP freezes the process instead."""
+"""Signals of a kill; STOP freezes the process instead."""
 
 
 class Keyframe(Section, frozen=True):
@@ -80,7 +80,7 @@ FaultKind = Literal[
 
 
 class FaultTraits(NamedTuple):
-    """What a kind of fault is like."""
+    """Properties of a kind of fault."""
 
     about: str
     duration: float | None
@@ -109,13 +109,13 @@ class Fault(Section, frozen=True):
     kind: FaultKind
     at: Time
     axis: int | None = None
-    """Which of its two axes; by default 0. Not for what is of the whole ODrive."""
+    """Axis 0 or 1 of the ODrive; by default 0. Not for a fault of the whole ODrive."""
     duration: float | None = None
-    """s; by default `FAULT_KINDS`'s. Not for what is of a moment."""
+    """s; by default that of `FAULT_KINDS`. Not for a momentary fault."""
 
     @property
     def lasts_s(self) -> float:
-        """How long it lasts, s; 0 for what is of a moment."""
+        """Duration, s; 0 for a momentary fault."""
         return self.duration or FAULT_KINDS[self.kind].duration or 0.0
 
 
@@ -155,7 +155,7 @@ SCENARIO: Final = "the scenario"
 
 
 class Lead(NamedTuple):
-    """What the operator wants at a moment."""
+    """The operator's request at a time."""
 
     height: float
     """m, torso origin above the ankles."""

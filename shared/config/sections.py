@@ -143,7 +143,7 @@ class CertificateConfig(Section, frozen=True):
 
 
 class RobustnessConfig(Section, frozen=True):
-    """What the loop must be stable with (the dynamic certificate)."""
+    """Errors that the loop must be stable with (the dynamic certificate)."""
 
     stiffness: tuple[Annotated[float, Range(500.0, 1e6, "N m/rad")], ...]
     """Stiffnesses of the drivetrain between motor and joint that the loop must be stable with; 1e6

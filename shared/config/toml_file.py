@@ -30,7 +30,7 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 class Range(NamedTuple):
-    """What a number may be, in words that an error can use."""
+    """Range of a number, with text for an error."""
 
     low: float
     high: float
@@ -130,7 +130,7 @@ def check_ranges(file: str, config: msgspec.Struct) -> None:
     """Check each number of a struct against the `Range` of its type hint.
 
     Raises:
-        ConfigError: naming the file, the key, the value and what is allowed.
+        ConfigError: names the file, the key, the value and the range.
     """
     _check_ranges(file, "", config, type(config))
 

@@ -1,9 +1,9 @@
 """Names and locks of a run's files.
 
 A run is `run.mcap`, `run_1.mcap`, `run_2.mcap`, ...; the next run in the same directory is
-`run-1.mcap`, `run-1_1.mcap`, .... What was recovered of a damaged file is
-`run.recovered.mcap`. A file is locked by its recorder while it is written, and the kernel
-takes the lock off when that dies: what has no end and no lock is to be recovered.
+`run-1.mcap`, `run-1_1.mcap`, .... The recovered copy of a damaged file is `run.recovered.mcap`. A
+recorder locks its file while it writes, and the kernel releases the lock when the recorder dies. An
+unfinished file without a lock is to be recovered.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ RECOVERED: Final = ".recovered" + SUFFIX
 
 
 def free_stem(directory: Path) -> str:
-    """Return the first of run, run-1, ... of which there is no file: none is ever replaced."""
+    """Return the first of run, run-1, ... without a file: no file is ever replaced."""
     stem = first = FIRST.removesuffix(SUFFIX)
     number = 0
     while any(directory.glob(f"{stem}.*mcap")) or any(directory.glob(f"{stem}_*{SUFFIX}")):

@@ -1,7 +1,8 @@
-"""Waits for the disk beside the loop that empties the queue.
+"""Syncs files to the disk in a thread beside the loop that empties the queue.
 
-A disk under load answers an fsync late: 0.1 s was seen on a machine with four busy
-processes, and cards take seconds. The loop would stamp what came meanwhile too late.
+A disk under load answers an fsync late: 0.1 s was measured on a machine with four busy processes,
+and memory cards take seconds. In the loop, that wait would make the reception times of messages
+late.
 """
 
 from __future__ import annotations
@@ -17,21 +18,21 @@ class FsyncThread:
         self._thread: threading.Thread | None = None
         self._wake = threading.Condition()
         self._waiting: list[int] = []
-        """Descriptors of its own, so that their files may be closed meanwhile."""
+        """Duplicated descriptors, so that their files may be closed before the sync."""
         self._busy = False
         self._closed = False
         self._error: OSError | None = None
 
     def request(self, descriptor: int, *, last: bool = False) -> None:
-        """Have a file synced, and return at once.
+        """Request the sync of a file and return at once.
 
         Args:
             descriptor: of the file; it may be closed after this.
-            last: nothing more is written to this file. Other requests are passed over
-                while one waits already: the next will do for both.
+            last: nothing more is written to this file. Another request is skipped while one waits:
+                that one covers both.
 
         Raises:
-            OSError: an earlier sync failed: what was written may not be on the disk.
+            OSError: an earlier sync failed: written data may not be on the disk.
         """
         with self._wake:
             self._raise()
@@ -54,7 +55,7 @@ class FsyncThread:
             self._raise()
 
     def close(self) -> None:
-        """End the thread when it has done what was requested; never raises."""
+        """Finish the requested syncs and end the thread; never raises."""
         with self._wake:
             self._closed = True
             self._wake.notify_all()

@@ -22,7 +22,7 @@ THREAD_VARIABLES: Final = (
     "MKL_NUM_THREADS",
     "ZENOH_RUNTIME",
 )
-"""Environment that changes what the numeric libraries and the bus do."""
+"""Environment variables that change the behaviour of numeric libraries and the bus."""
 
 UNKNOWN: Final = "unknown"
 
@@ -69,7 +69,7 @@ def packages() -> dict[str, str]:
 
 
 def cpu_model(cpuinfo: Path) -> str:
-    """Return the CPU's name as Linux gives it, or what the platform module knows."""
+    """Return the CPU's name as Linux gives it, or the platform module's."""
     try:
         lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

@@ -80,7 +80,7 @@ class LostBytes(NamedTuple):
 
 
 class LogReader:
-    """Reads one file; iterate over it once, then look at what was lost."""
+    """Reads one file. Iterate over it once; then `cut` and `damage` say what was lost."""
 
     def __init__(self, data: bytes | mmap.mmap) -> None:
         """Take the file's bytes, which begin with the magic."""
@@ -98,10 +98,10 @@ class LogReader:
         self._summary_start = self._find_summary()
 
     def __iter__(self) -> Iterator[LogRecord]:
-        """Give every record up to the end of the data; the summary's channels come first.
+        """Yield every record up to the end of the data, the summary's channels first.
 
-        The channels and schemas at the end of a finished file are copies of those in its
-        first chunk, and stand in for them if that is the chunk that is damaged.
+        The channels and schemas at the end of a finished file are copies of those in its first
+        chunk. They replace them if that chunk is damaged.
         """
         yield from self._summary()
         at = len(MAGIC)
@@ -177,7 +177,7 @@ class LogReader:
         )
 
     def _is_sound(self, content: bytes, row: ChunkMessage) -> bool:
-        """Return False for a payload that is not what its channel says; no CRC vouches for it."""
+        """Return False for a payload that does not fit its channel's encoding; no CRC covers it."""
         encoding = self._encodings.get(row.channel_id)
         if encoding != "json":
             return encoding is not None

@@ -62,7 +62,7 @@ KNOWN: Final = frozenset({*_TYPES, Opcode.MESSAGE_INDEX, Opcode.CHUNK, Opcode.ME
 
 
 class Malformed(Exception):  # noqa: N818 - a finding about a file, never shown as an error
-    """A record's bytes are not what its opcode and length say."""
+    """The bytes of a record do not fit its opcode and length."""
 
 
 class _Fields(ReadDataStream):

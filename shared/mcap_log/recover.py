@@ -139,7 +139,7 @@ def describe_lost(
 
 
 def clock_time(time_ns: int) -> str:
-    """Return a log time as local time of day, or as seconds where it is no date."""
+    """Return a log time as local time of day, or as seconds if it is no date."""
     if time_ns < 10**17:  # lockstep: virtual time from 0
         return f"{time_ns / NS_PER_S:.3f} s"
     try:

@@ -1,4 +1,4 @@
-"""Lost messages, told by the sequence numbers of one key. Pure."""
+"""Counts lost messages by the sequence numbers of one key. Pure."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class KeyCount(msgspec.Struct, gc=False, kw_only=True):
     def feed(self, seq: int) -> None:
         """Take the sequence number of the next message.
 
-        What a sender said before its first message got here is not counted as lost:
-        a subscriber connects after the sender's start, or after its own.
+        Messages before the first one received are not counted as lost: a subscriber connects after
+        the sender's start, or after its own.
         """
         step = seq - self.last_seq
         if step != 1 and self.count:

@@ -1,10 +1,10 @@
-"""The run's MCAP files: the one place of the services that writes this format.
+"""Writes a run's MCAP files.
 
-A run is `run.mcap`, and `run_1.mcap`, `run_2.mcap`, ... if it is split; each stands for
-itself. Layout of each: metadata `run`, `clock`, `packages` and `split`, the attachments,
-all schemas and channels, then zstd chunks with the messages as they came (JSON), at the
-end metadata `counts` (of this file) and the summary. The first chunk holds schemas and
-channels again, as the mcap package writes them: damage to one leaves the other.
+A run is `run.mcap`, and `run_1.mcap`, `run_2.mcap`, ... if it is split; each can be read alone.
+Layout of each: metadata `run`, `clock`, `packages` and `split`, the attachments, all schemas and
+channels, then zstd chunks with the messages as they came (JSON), at the end metadata `counts` (of
+this file) and the summary. The first chunk holds schemas and channels again, as the mcap package
+writes them: damage to one leaves the other.
 
 Time: `log_time` is when the recorder took a message off its queue (at most one drain
 period after it came), `publish_time` the message's own `t_ns`. Both are monotonic
@@ -104,7 +104,7 @@ class RunWriter:
         self.path = directory / FILE_NAME
         """The file being written, or the last one."""
         self.begun = 0
-        """Files begun so far."""
+        """Files started so far."""
         self.counts: dict[str, KeyCount] = {key: KeyCount() for key in topics}
         """Counts of the whole run."""
         self.unknown: dict[str, int] = {}
@@ -120,7 +120,7 @@ class RunWriter:
         self._stem = ""
         self._channels: dict[str, tuple[int, KeyCount]] = {}
         self._before: dict[str, KeyCount] = {}
-        """Counts when the file was begun."""
+        """Counts at the start of the file."""
         self._decode = msgspec.json.Decoder(_Head).decode
         self._file: BinaryIO | None = None
         self._syncer = FsyncThread()
@@ -167,10 +167,10 @@ class RunWriter:
         return self._file.tell() if self._file is not None else 0
 
     def begin(self, note: Mapping[str, str] | None = None) -> None:
-        """Begin the run's next file, with all metadata and attachments.
+        """Start the run's next file, with all metadata and attachments.
 
         Args:
-            note: what else its metadata `split` is to say: why it was begun.
+            note: added to its metadata `split`: why it was started.
 
         Raises:
             RunError: the file cannot be created or written.
@@ -195,7 +195,7 @@ class RunWriter:
         self._before = copy.deepcopy(self.counts)
 
     def take_from(self, source: MessageSource, at_most: int) -> int:
-        """Write what has come, until the source is empty; return the number taken.
+        """Write messages until the source is empty; return their number.
 
         While no file is open, messages are only counted as left out.
 

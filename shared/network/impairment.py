@@ -1,9 +1,9 @@
-"""What a bad network does to messages: delay, jitter, loss, partitions; seeded. Pure.
+"""Models a bad network: delay, jitter, loss, partitions; seeded. Pure.
 
-The words are those of tc-netem where it has them. One object decides for the modelled network
-of lockstep and for the network proxy on the wire, so that both mean the same
-(docs/networks.md). In lockstep it acts on messages; on the wire it acts on Zenoh's batches: what is
-sent at once travels, and is lost, as one.
+Terms are those of tc-netem where it has them. One class serves the modelled network of lockstep and
+the network proxy on the wire, so that both behave alike (docs/networks.md). In lockstep it acts on
+messages; on the wire it acts on Zenoh's batches: messages that are sent at once travel, and are
+lost, together.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ QUEUE_MAX: Final = 1000
 
 
 class Impairment(Section, frozen=True, kw_only=True):
-    """What one direction of a link does to what passes it; by default nothing."""
+    """Impairment of one direction of a link; by default none."""
 
     delay_ms: Ms = 0.0
     jitter_ms: Ms = 0.0
@@ -41,7 +41,7 @@ class Impairment(Section, frozen=True, kw_only=True):
     burst: Annotated[float, Range(1.0, 10_000.0, "messages")] = 1.0
     """Mean length of a row of losses (a Gilbert chain); 1: each by itself."""
     duplicate: Share = 0.0
-    """Probability that a message comes twice, each with a delay of its own."""
+    """Probability that a message is duplicated; each copy has a delay of its own."""
     reorder: Share = 0.0
     """Probability that a message has no delay and so overtakes those before it."""
     rate: Annotated[float, Range(0.0, 1e10, "bytes/s")] = 0.0
@@ -54,7 +54,7 @@ class Impairment(Section, frozen=True, kw_only=True):
     """Nothing passes."""
 
     def describe(self) -> str:
-        """Return what is done, as `--inject` takes it: `delay=30ms loss=20%`; `nothing`."""
+        """Return the impairment as `--inject` takes it: `delay=30ms loss=20%`; `nothing`."""
         words = [
             f"{name}={_digits(value, places)}{unit}"
             for name, value, standard, places, unit in (
@@ -74,10 +74,7 @@ class Impairment(Section, frozen=True, kw_only=True):
         return " ".join(words) or "nothing"
 
     def fault(self) -> str:
-        """Return what does not go together, or is without effect; empty if nothing is.
-
-        What is amiss, `; ` and what would be right.
-        """
+        """Return a contradiction or a setting without effect, with its remedy; empty if none."""
         late = self.delay_ms or self.jitter_ms
         alone = Impairment(partition=self.partition, ordered=self.ordered).describe()
         if self.partition and self.describe() != alone:
@@ -111,7 +108,9 @@ class Impairer:
         """Begin; the same seed decides the same."""
         self.what = what
         self.passed = self.lost = 0
-        """Messages that came out, or will; and those that never do. What is doubled counts once."""
+        """Messages that came out, or will; and messages that were lost. A duplicated message counts
+        once.
+        """
         self._random = random.Random(seed)
         self._in_burst = False
         self._line_free_ns = 0
@@ -136,10 +135,10 @@ class Impairer:
         return tuple(self._release_ns(now_ns, size) for _ in range(copies))
 
     def delays(self, now_ns: int) -> int:
-        """Return when what must not be lost comes out, ns: in order, after the mean delay.
+        """Return when a link's own traffic comes out, ns: in order, never lost.
 
-        For what a link says for itself: opening, declaring, keeping alive. `HELD` in a
-        partition.
+        Such traffic opens, declares and keeps alive; it takes the mean
+        delay. `HELD` in a partition.
         """
         if self.what.partition:
             return HELD
@@ -192,11 +191,11 @@ class Impairer:
 
 
 class Direction:
-    """One direction of a link, and what is done to it at the moment.
+    """One direction of a link, and its present impairment.
 
-    Several impairments may be asked for at once; one is in force: a partition before all else,
-    otherwise the one that began last. When it ends, the next by that rule is. That a stream keeps
-    its order over such a change is for the one to see to that has its queue.
+    Several impairments may be requested at once; one is active: a partition before all others,
+    otherwise the one that started last. When it ends, the next by that rule is active. The owner of
+    the queue keeps a stream in order over such a change.
     """
 
     def __init__(self, name: str, seed: int) -> None:
@@ -213,7 +212,7 @@ class Direction:
         self._asked: dict[int, Impairer] = {}
 
     def begin(self, number: int, what: Impairment) -> None:
-        """Take an impairment in; `number` tells it from all others, for `end`."""
+        """Add an impairment; `end` removes it by its number."""
         self._asked[number] = Impairer(what, f"{self._seed} {number}")
         self._choose()
 
@@ -224,7 +223,7 @@ class Direction:
         return ended
 
     def requested(self, number: int) -> Impairer | None:
-        """Return what was asked for under a number, in force or not; None if it is over."""
+        """Return the impairment with a number, active or not; None if it is over."""
         return self._asked.get(number)
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:

@@ -1,6 +1,6 @@
-"""What is done to links at the moment, and until when; told as events. Pure.
+"""Keeps which impairments are active, and until when; records each change as an event. Pure.
 
-Lockstep and the network proxy both keep it so.
+Lockstep and the network proxy use it.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from shared.network.impairment import Direction, Impairer, Impairment
 
 
 class PendingImpairment(NamedTuple):
-    """One impairment that is not over, begun or not."""
+    """One impairment that is not over, started or not."""
 
     begins: float
-    """On the owner's clock; minus infinite: it began when it was asked for."""
+    """On the owner's clock; minus infinite: it started with the request."""
     until: float
     """On the owner's clock; infinite: it does not end by itself."""
     link: str
@@ -44,15 +44,15 @@ class ImpairmentSchedule:
         self._directions = directions
         self._tell = tell
         self._coming: list[int] = []
-        """Those that have not begun, as they were asked for."""
+        """Those that have not started, in the order of the requests."""
         self._count = self._told = 0
 
     def begin(self, link: str, what: Impairment, until: float, now_ns: int) -> int:
-        """Begin an impairment now; return its number.
+        """Start an impairment now; return its number.
 
         Args:
             link: of `shared.bus.links`.
-            what: is done.
+            what: the impairment.
             until: when it ends, on the owner's clock.
             now_ns: stamp of the events.
 
@@ -65,13 +65,13 @@ class ImpairmentSchedule:
         return number
 
     def plan(self, link: str, what: Impairment, begins: float, until: float) -> int:
-        """Take an impairment in that `advance` begins when it is due; return its number.
+        """Plan an impairment that `advance` starts when it is due; return its number.
 
         Args:
             link: of `shared.bus.links`.
-            what: will be done.
-            begins: when, on the owner's clock.
-            until: when it ends, on the same.
+            what: the impairment.
+            begins: its start, on the owner's clock.
+            until: its end, on the same.
 
         Raises:
             ConfigError: there is no such link.
@@ -97,9 +97,9 @@ class ImpairmentSchedule:
         self._find_next()
 
     def advance(self, clock: float, now_ns: int) -> bool:
-        """End and begin what is due by the owner's clock; return whether there was anything.
+        """End and start what is due by the owner's clock; return True if anything was.
 
-        What would be over before it has begun never begins.
+        An impairment that would be over before its start never starts.
         """
         if clock < self.next_due:
             return False
@@ -112,7 +112,7 @@ class ImpairmentSchedule:
         return True
 
     def clear(self, link: str, now_ns: int) -> int:
-        """End all that touches a link, wholly, begun or not; return how many.
+        """End every impairment of a link, started or not; return their number.
 
         Raises:
             ConfigError: there is no such link.
@@ -130,7 +130,7 @@ class ImpairmentSchedule:
         return sum(one.passed for one in counted), sum(one.lost for one in counted)
 
     def hidden(self, number: int) -> tuple[str, ...]:
-        """Return the directions on which another one is in force, though this one has begun."""
+        """Return the directions on which another impairment is active in place of this one."""
         found = []
         for name, direction in self._directions.items():
             impairer = direction.requested(number)

@@ -1,4 +1,4 @@
-"""What is said to the network proxy on its socket, and what it answers: one JSON line each."""
+"""Requests to the network proxy on its socket, and its replies: one JSON line each."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
 
 
 class Clear(msgspec.Struct, frozen=True, tag="clear"):
-    """End what is done to a link, or would be."""
+    """Request: end the impairments of a link, started or planned."""
 
     link: str = "all"
 
 
 class List(msgspec.Struct, frozen=True, tag="list"):
-    """Tell what is done."""
+    """Request: list the impairments."""
 
 
 Request: TypeAlias = Begin | Clear | List
 
 
 class RequestedImpairment(msgspec.Struct, frozen=True):
-    """One impairment that was asked for and is not over."""
+    """One requested impairment that is not over."""
 
     number: int
     link: str
     detail: str
-    """What is done, as `--inject` takes it."""
+    """The impairment, as `--inject` takes it."""
     left_s: float | None
     """Until it ends, s from now; None: it does not by itself."""
     passed: int
@@ -73,4 +73,4 @@ class Reply(msgspec.Struct, frozen=True):
 
     error: str = ""
     requested: tuple[RequestedImpairment, ...] = ()
-    """What is asked for after the request was carried out, the newest last."""
+    """Impairments after the request was carried out, the newest last."""

@@ -187,7 +187,7 @@ LOSSES: Final[dict[str, LossRow]] = {
         "automatic, after the harness has been released for a while",
     ),
 }
-"""By what is lost."""
+"""Rows by what is lost."""
 
 
 def recovery_of(cause: Cause) -> str:

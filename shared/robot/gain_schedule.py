@@ -1,7 +1,8 @@
 """The certified gain schedule: a file beside the robot's, made offline by `xrl gains`.
 
-Local joint stiffnesses over COM height and torso pitch (docs/law.md#gain-split). The file
-holds what it was made from; a robot that differs is refused until it is made again.
+Local joint stiffnesses over COM height and torso pitch (docs/law.md#gain-split). The file holds the
+parameters from which it was computed; a robot that differs is refused until `xrl gains` has run
+again.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def path_beside(robot_file: Path) -> Path:
 
 
 def read(path: Path) -> GainSchedule | None:
-    """Read a schedule; None if there is no such file.
+    """Read a schedule; return None if there is no such file.
 
     Raises:
         ConfigError: the file cannot be read, or its tables do not fit together.
@@ -168,9 +169,9 @@ def why_stale(config: RobotConfig) -> str:
 
 
 def believing(config: RobotConfig) -> RobotConfig:
-    """Return the robot whose joint services believe any command within their limits.
+    """Return the robot with joint services that accept any command within their limits.
 
-    For what the shipped law never sends: another control, or gains that are tried.
+    For commands that the shipped law never sends: another control, or gains under study.
     """
     if config.gain_schedule is None:
         return config

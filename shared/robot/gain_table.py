@@ -33,7 +33,7 @@ class ModuleBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     tau_ff: tuple[Bounds, ...]
     """N m, by theta; both legs: phi is as far on one side as on the other."""
     v_ref: tuple[float, float]
-    """rad/s, either way: what the body's fastest motions ask of the joint (`BODY_RATES`)."""
+    """rad/s, either way: joint rate in the body's fastest motions (`BODY_RATES`)."""
 
 
 class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -43,7 +43,7 @@ class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     digest: str
     """SHA-256 of the inputs."""
     inputs: dict[str, Any]
-    """What the robot was when this was made, by dotted key."""
+    """The robot's parameters when this was computed, by dotted key."""
     z: tuple[float, ...]
     """COM heights of the nodes, m above the ankles, rising."""
     pitch: tuple[float, ...]
@@ -59,5 +59,6 @@ class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]
     """What tau_coupled fills the damping up to, in shares of B_p."""
     bounds: dict[str, ModuleBounds] | None = None
-    """By kind of module; what a joint service believes (`services.joint.envelope`). None: made by
-    an older `xrl gains`, and not checked."""
+    """By kind of module: the envelope of commands that a joint service accepts
+    (`services.joint.envelope`). None: computed by an older `xrl gains`, and not checked.
+    """

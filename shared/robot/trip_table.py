@@ -24,7 +24,7 @@ class TripRow(NamedTuple):
     measured: str
     unit: str
     recovery: str
-    """What a person does about it."""
+    """Remedy."""
     least: bool = False
     """Trips below its limit, not above."""
 
@@ -91,9 +91,10 @@ def limits_of(config: RobotConfig) -> TripsConfig:
 
 
 def untripped(config: RobotConfig) -> RobotConfig:
-    """Return the robot on which nothing trips: what a comparison is made with, and no robot.
+    """Return the robot without trips, as a baseline for studies only.
 
-    Nor is a load looked for: what shakes is taken for one, and not led.
+    Its load is not estimated either: shaking would be taken for a load, and the robot would not be
+    led.
     """
     law = msgspec.structs.replace(config.law, load_correction=(0.0, 0.0))
     return msgspec.structs.replace(config, trips=_NEVER, law=law)

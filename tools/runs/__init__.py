@@ -1,1 +1,1 @@
-"""One run: what it is to be, who leads it, its log, its verdict and its picture."""
+"""One run: its inputs, scenario runner, log, verdict and pictures; live or in virtual time."""

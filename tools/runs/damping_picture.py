@@ -25,7 +25,7 @@ mpl.use("Agg")
 STIFFNESSES: Final = tuple(float(k) for k in np.geomspace(2e3, 2e5, 25))
 DELAYS_MS: Final = (2.0, 20.0)
 FREQUENCY_HZ: Final = (0.1, 125.0)
-"""Up to half of the planner's rate: what a period can tell apart."""
+"""Hz; half of the planner's rate, the highest frequency that its samples show."""
 
 
 def draw(robot: RobotConfig, nodes: list[StiffnessNode], design: Design, path: Path) -> None:

@@ -24,7 +24,7 @@ class Number(NamedTuple):
     field: str
     """Field of `Inject`."""
     units: Mapping[str, str]
-    """What may stand behind the number, and what it is then multiplied by."""
+    """Unit after a number, and the factor to SI."""
     like: str
     """What would be right."""
 
@@ -61,10 +61,10 @@ _FILE: Final = "--inject"
 
 
 def parse_inject(text: str) -> Inject:
-    """Read `LINK key=value ...`, for argparse; without `at` from the beginning.
+    """Parse `LINK key=value ...` for argparse; without `at` it starts with the scenario.
 
     Raises:
-        argparse.ArgumentTypeError: it is none; the message says what is.
+        argparse.ArgumentTypeError: the text is malformed; the message says what is right.
     """
     words = text.replace(",", " ").split()
     link = words.pop(0) if words else ""
@@ -114,7 +114,7 @@ def make(link: str, words: Mapping[str, str], dash: str = "") -> Inject:
 
 
 def check_link(link: str, dash: str = "") -> None:
-    """Refuse what is no link, with the one that was meant.
+    """Refuse an unknown link, and name the closest one.
 
     Raises:
         ConfigError: there is no such link.
@@ -129,10 +129,10 @@ def check_link(link: str, dash: str = "") -> None:
 
 
 def _split(words: Iterable[str]) -> dict[str, str]:
-    """Return words of `--inject` with their values.
+    """Return the keys of `--inject` with their values.
 
     Raises:
-        ConfigError: there is no such word, or it comes twice.
+        ConfigError: a key is unknown or comes twice.
     """
     found: dict[str, str] = {}
     for word in words:
@@ -169,6 +169,6 @@ def _distribution(text: str, dash: str) -> str:
 
 
 def in_words_of(inject: Inject) -> str:
-    """Return what is done, where and when."""
+    """Return an impairment as text: what, on which link, when."""
     lasts = "" if inject.duration is None else f" for {inject.duration:g} s"
     return f"{inject.link} {inject.describe()} at {inject.at:g} s{lasts}"

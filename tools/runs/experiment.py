@@ -51,7 +51,7 @@ _NUMBER = r"\d+(?:\.\d*)?"
 
 
 def choices(field: str) -> tuple[str, ...]:
-    """Return what a `[law]` key may be, for the flag of the same name."""
+    """Return the values of a `[law]` key, for the flag of the same name."""
     return get_args(get_type_hints(LawConfig)[field])
 
 
@@ -217,13 +217,13 @@ def scenario_file(name: str) -> Path:
 
 
 def make_scenario(args: argparse.Namespace) -> Scenario:
-    """Return the scenario with the flags laid over it.
+    """Return the scenario with the flags applied.
 
-    A shorter duration leaves out what the file has beyond it; what a flag names beyond
-    it is refused.
+    A shorter duration drops the file's rows beyond it; a flag that names a time beyond it is
+    refused.
 
     Raises:
-        ConfigError: the file or the flags make no scenario.
+        ConfigError: file and flags make no valid scenario.
     """
     path = scenario_file(args.scenario)
     scenario = scenarios.load(path)
@@ -253,7 +253,7 @@ def _inside(rows: tuple[E, ...], duration: float) -> tuple[E, ...]:
 
 
 def describe(scenario: Scenario) -> str:
-    """Return what is done to the run, as a clause for its first line."""
+    """Return kills, faults and impairments as a clause for the run's first line."""
     done = [f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill]
     done += [f"{row.service} back at {row.at:g} s" for row in scenario.restart]
     done += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
@@ -274,7 +274,7 @@ def make_robot(args: argparse.Namespace) -> RobotConfig:
         if value is not None
     }
     if changes.get("jacobian") == "average" and "split" not in changes:
-        changes["split"] = "diagonal"  # no local gains certify it: there is no schedule
+        changes["split"] = "diagonal"  # no local gains certify it, so there is no schedule
     return load_robot(args.config, imu=args.imu, **changes)
 
 
@@ -317,7 +317,7 @@ def make_out(out: Path | None, verb: str) -> Path:
 def write_inputs(
     out: Path, robot: RobotConfig, scenario: Scenario, true_plant: PlantConfig
 ) -> tuple[Path, ...]:
-    """Write what the run is made from beside its results.
+    """Write the run's inputs beside its results.
 
     Returns:
         The files: robot, scenario, plant and, if the robot has one, its gain schedule.

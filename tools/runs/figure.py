@@ -46,7 +46,7 @@ EVENT_COLOURS: Final = {
 AGE_MOST_MS: Final = 50.0
 """If the log does not tell its robot's greatest usable age."""
 AGE_REACH: Final = 1.2
-"""Times that age: the panel ends there; what is older is not used."""
+"""Top of the panel of ages, ms: older commands are not used."""
 SILENT_S: Final = 0.1
 """A service that says nothing for so long has a gap in the picture."""
 LANES_MAX: Final = 8
@@ -173,7 +173,7 @@ def _modes(axis: Any, log: RunLog, start_ns: int, end_s: float) -> None:
 
 
 def _bars(axis: Any, place: int, times: Sequence[float], colours: Sequence[str]) -> None:
-    """Draw one row of coloured bars; nothing where the colour is empty, or none was told."""
+    """Draw one row of coloured bars; no bar where the colour is empty or unknown."""
     begin, colour, last = 0.0, "", 0.0
     spans: dict[str, list[tuple[float, float]]] = {}
     for t, now in zip(times, colours, strict=True):
@@ -209,7 +209,7 @@ def _events(axes: Any, events: list[RunEvent]) -> None:
 
 
 def _shade(axes: Any, network: Sequence[Impaired], zero_ns: int, end_s: float) -> None:
-    """Shade what was done to the network: darker where two overlap, a line where each begins."""
+    """Shade impairments of the network: darker where two overlap, a line at the start of each."""
     for row in network:
         begin, end = _extent(row, zero_ns, end_s)
         for axis in axes:

@@ -1,4 +1,4 @@
-"""Clocks of hosts in virtual time: each counts from somewhere else, and at its own pace. Pure.
+"""Clocks of hosts in virtual time: each has its own zero and rate. Pure.
 
 Live, a service reads its host's monotonic clock. That one cannot step, whatever is done to the
 time of day, but no two hosts agree on it: an age is measured on one clock
@@ -16,7 +16,7 @@ M = TypeVar("M", bound=Message)
 
 
 class HostClock:
-    """What one host takes for the time."""
+    """The monotonic clock of one host."""
 
     def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
         """Begin.
@@ -29,11 +29,11 @@ class HostClock:
         self.drift_ppm = drift_ppm
 
     def read(self, now_ns: int) -> int:
-        """Return what it says at a virtual time, ns."""
+        """Return the host's time at a virtual time, ns."""
         return now_ns + self.offset_ns + round(now_ns * self.drift_ppm * 1e-6)
 
     def step(self, by_ns: int) -> None:
-        """Put it on or back: what a monotonic clock never does."""
+        """Step the clock, which a monotonic clock never does."""
         self.offset_ns += by_ns
 
 

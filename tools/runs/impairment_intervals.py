@@ -1,4 +1,4 @@
-"""What was done to the network in a run, from the link events in its log."""
+"""Intervals in which a run's network was impaired, from the link events in its log."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Impaired(NamedTuple):
     """One impairment, over all its directions."""
 
     link: str
-    """As it was asked for: a direction, or a group of them."""
+    """As requested: a direction, or a group of them."""
     words: str
-    """What was done, as `--inject` takes it."""
+    """The impairment, as `--inject` takes it."""
     directions: frozenset[str]
     """Directions, as named in `shared.bus.links`."""
     begin_ns: int
@@ -55,7 +55,7 @@ class Impaired(NamedTuple):
         return f"from {begin:.2f} s on" if end is None else f"{begin:.2f} to {end:.2f} s"
 
     def counts(self) -> str:
-        """Return what passed and what was lost, in words."""
+        """Return the counts of passed and lost messages as text."""
         if self.passed is None:
             return "its end is not in the log"
         return f"{self.passed} messages passed, {self.lost} lost"
@@ -74,13 +74,13 @@ class Impaired(NamedTuple):
 
 
 def impairments(events: Iterable[LinkEvent]) -> list[Impaired]:
-    """Return all impairments in the order in which they began.
+    """Return all impairments in the order of their start.
 
-    A network proxy that was killed tells no end, and its successor counts from 1 again: a number
-    that begins again ends what it stood for.
+    A network proxy that was killed records no end, and its successor counts from 1 again: a number
+    that starts again ends the earlier impairment of that number.
 
     Args:
-        events: as they are in the log.
+        events: from the log.
     """
     found: list[list[LinkEvent]] = []
     ends: list[list[LinkEvent]] = []

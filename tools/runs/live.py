@@ -1,4 +1,4 @@
-"""A live run: a fleet in a run directory of its own, led by a tool and stopped again."""
+"""A live run: a fleet in a run directory of its own, led by a tool and then stopped."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def run_live(
     pace: float | None = None,
     tell: Callable[[str], None] = lambda _text: None,
 ) -> T:
-    """Start a fleet, have it led, stop it; return what `lead` returns.
+    """Start a fleet, call `lead`, stop the fleet; return what `lead` returns.
 
     However it ends, no process and no run directory is left, and the logs are in `out`.
 
     Args:
-        out: for the log of the run, what it is made from, and the services' logs.
+        out: folder for the run's log, its inputs and the services' logs.
         robot: the robot.
         scenario: what the simulated operator and the drives do; kills are for `lead` to do.
         lead: leads the run; it is given the fleet and a session on its bus.

@@ -251,7 +251,7 @@ class Lockstep:
                 self.events.append((joint.name, event))
 
     def _act(self, row: Kill | Restart | Push) -> None:
-        """Do what the scenario says, and record it."""
+        """Carry out a row of the scenario, and record it."""
         if isinstance(row, Push):
             x, y, z = row.force
             detail = f"{x:g},{y:g},{z:g} N for {row.duration:g} s"

@@ -49,7 +49,7 @@ MODE_INK: Final = {
 
 
 class Caption(NamedTuple):
-    """What the picture says from a moment on."""
+    """Caption of the picture from a time on."""
 
     t_ns: int
     text: str

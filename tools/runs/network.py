@@ -1,9 +1,8 @@
 """A modelled network link, seeded (docs/architecture.md). Pure.
 
-What a link does by itself, and what is done to it meanwhile (`xrl sim --inject`), are both
-`shared.network.impairment`: the network proxy of a live fleet decides with the same objects. A link
-here is never given up: there is neither lease nor dialling again, and a stream delivers all that a
-partition held back, however long it was.
+Its own impairment and those of `xrl sim --inject` are both `shared.network.impairment`: the network
+proxy of a live fleet uses the same class. A link here is never given up. There is neither lease nor
+dialling, and a stream delivers everything that a partition held back, however long it lasted.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from shared.network.impairment import HELD, Direction, Impairer, Impairment
 M = TypeVar("M", bound=Message)
 
 BASE: Final = Impairment(delay_ms=1.0)
-"""What every link does by itself, each way, unless something else is asked for."""
+"""Impairment of every link, each way, by default."""
 OVERHEAD_BYTES: Final = 40
 """Key and header that travel with a payload."""
 
@@ -31,12 +30,12 @@ class VirtualLink(Generic[M]):
     """
 
     def __init__(self, base: Impairment, name: str, seed: int) -> None:
-        """Begin.
+        """Prepare.
 
         Args:
-            base: what it does by itself.
+            base: the link's own impairment.
             name: of `shared.bus.links`.
-            seed: of all that is decided here.
+            seed: of all random draws.
         """
         self.direction = Direction(name, seed)
         self.overtaken = 0
@@ -69,7 +68,7 @@ class VirtualLink(Generic[M]):
         return newest
 
     def release(self, now_ns: int) -> None:
-        """Let out what a partition has held back, if it is over: in order, and as late as all."""
+        """Release what a partition held back, if it is over: in order, each with its delay."""
         if not self._held:
             return
         impairer = self.direction.active

@@ -133,10 +133,10 @@ def _links(kind: FailureKind, module: str) -> tuple[str, ...]:
 
 
 class PartialFleet(Lockstep):
-    """Records for the verdict alone, and watches the drives as modes change.
+    """Records for the verdict alone, and compares the drives' torques around each change of mode.
 
-    A service that was frozen knows nothing of what its drive did meanwhile: the torque before
-    the change is the drive's, not what the service sent last.
+    A service that was frozen does not know its drive's torque: the torque before the change is the
+    drive's, not the last one that the service sent.
     """
 
     traced = False
@@ -226,7 +226,7 @@ def _measure(
         for name, event in fleet.events
         if event.mode_before == Mode.TRACK and cut_ns <= event.t_ns < heal_ns
     }
-    # a frozen service changes no mode: what it did last goes on, on its drive
+    # a frozen service changes no mode: its drive keeps the last target
     awake = set(MODULES) - set(case.modules if case.kind == "frozen" else ())
     all_left = bool(left) and awake <= set(left)
     last_s = rows[-1].scenario_s - LAST_S

@@ -34,9 +34,9 @@ class Series:
 
 
 class RunLog:
-    """A run, in memory: about 2.5 MB for each second of the whole fleet.
+    """A run in memory: about 2.5 MB for each second of the whole fleet.
 
-    Messages are decoded when they are asked for, once for each key.
+    Messages are decoded on request, once for each key.
     """
 
     def __init__(self, path: Path) -> None:
@@ -48,7 +48,7 @@ class RunLog:
         """
         self.path = path
         self.files = files_in(path) if path.is_dir() else [path]
-        """What was read, in order: several if the run was split."""
+        """The files read, in order: several if the run was split."""
         self.metadata: dict[str, dict[str, str]] = {}
         """Metadata records by name: `run`, `clock`, `packages`, at the end `counts`."""
         self.attachments: dict[str, bytes] = {}

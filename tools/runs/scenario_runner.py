@@ -1,7 +1,7 @@
 """Leads a live run through its scenario: start, kills, restarts, end.
 
-It watches the simulated truth on the bus and acts by scenario time; what it does is put
-on the bus as run events, so that the log alone tells the whole story.
+It watches the simulated truth on the bus and acts by scenario time. Each action is published as a
+run event, so that the log alone shows all of them.
 """
 
 from __future__ import annotations
@@ -45,26 +45,26 @@ AFTER_FALL_S: Final = 1.0
 SILENT_S: Final = 3.0
 """The simulated world says nothing for so long: the run is over."""
 LAST_WORDS_S: Final = 0.3
-"""What was said last reaches the recorder in this time."""
+"""s; the last messages reach the recorder in this time."""
 POLL_S: Final = 0.004
 UNHEARD_S: Final = 0.5
 """A module that says nothing for so long is shown as silent."""
 PIDS_EVERY_S: Final = 1.0
 ENDING_S: Final = 3.0
-"""A service that was asked to end has done so by then, or was killed by its supervisor."""
+"""s; a service that was told to end has done so by then, or was killed by its supervisor."""
 
 
 class LiveSnapshot(NamedTuple):
-    """What the live display shows."""
+    """Contents of the live display."""
 
     truth: SimTruth | None
     modes: tuple[str, ...]
-    """One letter for each module: D, H, T, damp, FAULT; `-` if never heard."""
+    """One letter for each module: D, H, T, damp, FAULT; `-` for one that never sent a state."""
     note: str
 
 
 class Chase(NamedTuple):
-    """A kill at a moment that no clock tells: as modules track again after a drop-out."""
+    """A kill at no fixed time: when modules track again after a drop-out."""
 
     service: str
     modules: int
@@ -107,7 +107,7 @@ class ScenarioRunner:
         show: Callable[[LiveSnapshot], None],
         chase: Chase | None = None,
     ) -> None:
-        """Take the scenario's kills, and perhaps one that follows what the modules do."""
+        """Take the scenario's kills, and perhaps one that the modules' modes trigger."""
         self._fleet = fleet
         self._scenario = scenario
         self._show = show
@@ -115,7 +115,7 @@ class ScenarioRunner:
         self._dropped_out = False
         self._chase_at_s = math.inf
         self.said: list[RunEvent] = []
-        """What was done to the run so far."""
+        """Actions on the run so far."""
         self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
         self._states = {
             module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
@@ -259,7 +259,7 @@ class ScenarioRunner:
         self._say(RunEventKind.STARTED, self._scenario.name, "")
 
     def _listen(self) -> None:
-        """Take in what is new and show it."""
+        """Receive new messages and show them."""
         for module, latest in self._states.items():
             state = latest.take()
             if state is not None:
@@ -279,7 +279,7 @@ class ScenarioRunner:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
-        """Do what is due; pushes and faults are the simulator's doing, and only said."""
+        """Do what is due; the simulator does pushes and faults, and they are only recorded here."""
         if isinstance(row, Kill):
             self._say(RunEventKind.KILLED, row.service, row.signal)
             number = signal.Signals[f"SIG{row.signal}"]
@@ -305,7 +305,7 @@ class ScenarioRunner:
             self._say(RunEventKind.PUSHED, "torso", f"{x:g},{y:g},{z:g} N for {row.duration:g} s")
 
     def _follow(self, scenario_s: float) -> None:
-        """Kill what is chased, once its moment has come."""
+        """Kill the triggered service when its time has come."""
         if self._chase is None:
             return
         now_s = time.monotonic()

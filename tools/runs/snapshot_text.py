@@ -36,9 +36,9 @@ def describe_modules(states: Sequence[JointState | None]) -> str:
 
 
 def describe_network(log: RunLog, at_ns: int, zero_ns: int) -> str:
-    """Return what is done to the network at a monotonic time, told in s after a stamp.
+    """Return the active impairments at a monotonic time, with times in s after a stamp.
 
-    Empty for a run in which nothing was done to it.
+    Empty for a run without impairments.
     """
     done = impairments(log.messages(topics.LINK_EVENT))
     now = [f"{row.title}, {row.when(zero_ns)}" for row in done if row.at(at_ns)]

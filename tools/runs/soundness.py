@@ -28,12 +28,12 @@ _HELD: Final = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
 
 
 def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dict[str, Any]:
-    """Return the figures of a run, from the row where it begins on; None where it tells nothing.
+    """Return the figures of a run from its first row on; None where the log has no data.
 
     Args:
         log: the run.
         truth: its world, in order.
-        robot: that it was made with.
+        robot: of the run.
     """
     start_ns = truth[0].t_ns
     longest, shaking = [], []
@@ -57,7 +57,7 @@ def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> dic
 
 
 def why_not_sound(figures: Mapping[str, Any]) -> str:
-    """Return in words what is over its limit; "": the robot stood soundly, as far as is known."""
+    """Return the exceeded limits as text; "" if none is."""
     rows = (row for row in LIMITS if row.key in SOUND)
     over = [row for row in rows if (figures.get(row.key) or 0.0) > row.limit]
     return "; ".join(

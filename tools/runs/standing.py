@@ -1,4 +1,4 @@
-"""What it is to stand: one rule for `demo`, `sim`, `crashtest` and the sweeps."""
+"""Definition of standing: one rule for `demo`, `sim`, `crashtest` and the sweeps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.config.robot_config import RobotConfig
 SOLE_TILT_MAX: Final = 0.05
 """rad; a sole tilted more than this does not lie down again by itself."""
 TURNED_MAX: Final = 0.3
-"""rad, roll and yaw of the torso: asked for are 0.12 at most."""
+"""rad, roll and yaw of the torso; requests are 0.12 at most."""
 PITCH: Final = (-0.5, 1.6)
 """rad: led are 0 to 1.2, a hand of 60 N m moves a torso that holds by 0.3."""
 
@@ -37,5 +37,5 @@ def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
 
 
 def is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
-    """Return True if the robot does not stand, or is beyond what it can come back from."""
+    """Return True if the robot does not stand, or cannot recover."""
     return bool(why_not_standing(row, robot))

@@ -1,4 +1,4 @@
-"""What a run was worth: figures from its log alone, beside their limits.
+"""Judges a run by figures from its log alone, beside their limits.
 
 Everything is read from the MCAP file, so that a run can be judged again at any time.
 """
@@ -45,7 +45,9 @@ class Course(NamedTuple):
     """The simulated world over a run."""
 
     t: Array
-    """Time of each row, s: the scenario's, or since the hoist let go if it never began."""
+    """Time of each row, s: scenario time, or since the hoist's release if the scenario never
+    started.
+    """
     rows: list[SimTruth]
     began: bool
     """False if the robot fell before the scenario could begin."""
@@ -146,7 +148,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
 
 
 def _robot_of(log: RunLog) -> RobotConfig | None:
-    """Return the robot of a log; None if it does not tell, or tells one of another version."""
+    """Return the robot of a log; None if the log has none, or one of another version."""
     try:
         return robot_of(log)
     except (RunError, ConfigError):
@@ -164,9 +166,10 @@ def _extent(prefix: str, poses: Array) -> Summary:
 
 
 def _asked(log: RunLog, truth: Sequence[SimTruth]) -> Array:
-    """Return where the operator asked the closed directions to be, as the planner's reference went.
+    """Return the closed directions that the operator requested, at the planner's rate of reference.
 
-    (n, 6) COM x, y over the floor by gravity, z, roll, pitch, yaw; zeros where nothing was asked.
+    (n, 6): COM x, y over the floor along gravity, z, roll, pitch, yaw; zeros where none was
+    requested.
     """
     asked = np.zeros((len(truth), 6))
     rows: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
@@ -201,10 +204,10 @@ def _transitions(log: RunLog, module: str) -> list[JointEvent]:
 
 
 def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return, for each time, whether the planner is taken to lead: what is judged by its limits.
+    """Return, for each time, True if the run is judged by the limits of a leading planner.
 
-    Until the first kill. Where the network was impaired on purpose, while all six modules track:
-    HOLD is then what is to be expected. A module that drops out otherwise is no excuse.
+    True until the first kill. While the network is impaired on purpose, only while all six modules
+    track: HOLD is expected then. A module that drops out at any other time is judged.
 
     Args:
         log: the run.
@@ -314,7 +317,7 @@ def _hold_entries(log: RunLog, start_ns: int) -> int:
 
 
 def _late_share(log: RunLog, start_ns: int) -> float | None:
-    """Return the share of PD cycles that came late, %; a service that restarts counts anew."""
+    """Return the fraction of late PD cycles, %; a service that restarts counts from 0."""
     late = cycles = 0
     for module in MODULES:
         states: list[JointState] = [

@@ -54,7 +54,7 @@ def show(summary: Summary, console: Console) -> None:
 
 
 def mark(row: VerdictLimit, summary: Summary) -> str:
-    """Return what a figure that is there is worth: `ok`, or `over` and perhaps why."""
+    """Return the verdict on a figure: `ok`, or `over` and perhaps why."""
     if summary[row.key] <= row.limit:
         return OK
     if row.key == "sequence_gaps" and summary["stopped"]:
@@ -64,9 +64,9 @@ def mark(row: VerdictLimit, summary: Summary) -> str:
 
 
 def network(summary: Summary) -> list[str]:
-    """Return a line for each impairment: where, what, when, what passed and what was lost.
+    """Return a line for each impairment: where, what, when, messages passed and lost.
 
-    With any of them, one of the commands' ages meanwhile and otherwise.
+    If there is any, one more line compares the commands' ages during impairments and outside.
     """
     lines = [str(row["said"]) for row in summary.get("impairments", ())]
     ages = [

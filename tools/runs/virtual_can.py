@@ -1,4 +1,4 @@
-"""A sensor's CAN bus in lockstep: what its simulated front sends, its service reads at once."""
+"""A sensor's CAN bus in lockstep: a frame is received as soon as it is sent."""
 
 from __future__ import annotations
 

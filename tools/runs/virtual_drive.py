@@ -93,7 +93,7 @@ class VirtualDrive:
         bank.vel_gain[module] = target.vel_gain
 
     def _arm(self, *, onboard: bool) -> None:
-        """Do what the drivers' arming frames do."""
+        """Apply the settings of the drivers' arming frames."""
         bank, module = self._bank, self._module
         for axis in self._axes:
             bank.clear_errors(axis)

@@ -1,7 +1,7 @@
-"""The harness sensor of lockstep: the simulated cells and the live loop, without a bus.
+"""The harness sensor of lockstep: simulated cells and the live loop, without a bus.
 
-The frames of the simulated load cells go to the live service's own loop, and what that
-publishes to a modelled link and to the log (docs/architecture.md).
+The frames of the simulated load cells go to the live service's own loop. Its messages go to a
+modelled link and to the log (docs/architecture.md).
 """
 
 from __future__ import annotations

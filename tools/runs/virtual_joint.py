@@ -18,7 +18,7 @@ from tools.runs.virtual_drive import VirtualDrive
 
 
 class VirtualJoint:
-    """What a joint service's process does in a cycle, without process, bus or clock.
+    """A joint service's cycle, without process, bus or clock.
 
     Attributes:
         manager: the service itself.
@@ -102,7 +102,7 @@ class VirtualJoint:
 
 
 def view_from(index: int, now_ns: int, joints: Sequence[VirtualJoint]) -> NeighbourView:
-    """Return what a module reads of the others in shared memory (`services.joint.neighbours`).
+    """Return a module's view of the others, as from shared memory (`services.joint.neighbours`).
 
     Args:
         index: of the module that reads.

@@ -1,4 +1,4 @@
-"""The links of lockstep, and what a scenario does to them (docs/architecture.md)."""
+"""The links of lockstep, with the scenario's impairments (docs/architecture.md)."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class VirtualNetwork:
         seed: int,
         record: Callable[[LinkEvent], None],
     ) -> None:
-        """Begin with what every link does by itself.
+        """Start with every link's own impairment.
 
         Args:
-            base: that.
-            injects: what is done to them, and when.
-            seed: of all that is decided.
-            record: takes an event whenever something begins or ends.
+            base: the link's own impairment.
+            injects: further impairments, with their times.
+            seed: of all random draws.
+            record: takes an event whenever an impairment starts or ends.
         """
         self._links: dict[str, VirtualLink[Any]] = {
             name: VirtualLink(base, name, seed) for name in DIRECTIONS
@@ -59,11 +59,11 @@ class VirtualNetwork:
         return self._links[ATTITUDES]
 
     def advance(self, scenario_s: float, now_ns: int) -> None:
-        """Begin and end what is due, and let out what was held until then."""
+        """Start and end what is due, and release the messages held until then."""
         if self._injections.advance(scenario_s, now_ns):
             for link in self._links.values():
                 link.release(now_ns)
 
     def end(self, now_ns: int) -> None:
-        """End all that is done, so that its counts are told: the run is over."""
+        """End all impairments, so that their counts are recorded: the run is over."""
         self._injections.clear("all", now_ns)

@@ -17,7 +17,7 @@ from tools.runs.virtual_network import VirtualNetwork
 
 
 class VirtualPlanner:
-    """What the planner's process does, without process, bus or clock.
+    """The planner's cycle, without process, bus or clock.
 
     Attributes:
         planner: the service itself; None: there is none.

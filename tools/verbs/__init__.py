@@ -1,1 +1,1 @@
-"""The verbs of `xrl`, one file each: flags, calls, what is printed. Nobody imports a verb."""
+"""The verbs of `xrl`, one file each: flags, calls, output. No verb imports another."""

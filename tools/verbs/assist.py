@@ -28,7 +28,7 @@ from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 REPEAT_S: Final = 0.02
 HEARD_S: Final = 3.0
-"""Longest wait for the planner, and for it to take what is asked."""
+"""Longest wait for the planner, and for it to accept the request, s."""
 SHIFT_UNITS: Final = (("x", "m"), ("y", "m"), ("roll", "rad"), ("yaw", "rad"))
 
 
@@ -82,7 +82,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask until told to stop."""
+    """Publish the request until stopped."""
     fleet = SupervisedFleet.attach(args.run_dir)
     robot = load(Path(fleet.manifest.config))
     refuse_beyond_limits(robot, args.assist, args.shift)
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def refuse_beyond_limits(robot: RobotConfig, assist: float, shift: Vector4) -> None:
-    """Refuse what the planner would not give.
+    """Refuse a request that the planner would limit.
 
     Raises:
         FleetError: the assist or a part of the shift is beyond the robot file's limit.
@@ -129,18 +129,19 @@ def ask(
     *,
     for_s: float | None = None,
 ) -> float:
-    """Say it again and again; return what is given at the end, N.
+    """Publish the request repeatedly; return the assist given at the end, N.
 
     Args:
         intents: to the planner.
         statuses: from it.
-        wish: what to say; time and number are made anew each time.
-        stop: asked whether to end.
-        shown: where to show what is given.
-        for_s: end by itself after so long.
+        wish: the request; stamp and number are set at each repetition.
+        stop: True ends it.
+        shown: shows the assist given.
+        for_s: duration, s; None: until stopped.
 
     Raises:
-        FleetError: the planner is not heard, somebody else asks already, or it takes nothing.
+        FleetError: the planner is silent, another operator has a request, or the planner accepts
+            none.
     """
     status = _first(statuses, stop)
     if status is None:
@@ -175,7 +176,7 @@ def ask(
 
 
 def describe(wish: OperatorIntent, status: PlannerStatus) -> str:
-    """Return what is asked for and what is given, in a line."""
+    """Return request and response as one line."""
     words = f"asked for {wish.assist_n:.0f} N, given {status.assist_n:.0f} N"
     if any(wish.shift):
         pairs = zip(SHIFT_UNITS, wish.shift, strict=True)

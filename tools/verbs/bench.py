@@ -163,7 +163,7 @@ def tick_times(robot: RobotConfig, inputs: Sequence[tuple[int, list[JointState]]
 
 
 def lockstep_speed(robot: RobotConfig, scenario: Scenario) -> float:
-    """Return how many times faster than real time a squat runs on a core of its own, no log."""
+    """Return how many times faster than real time a squat runs on one core, without a log."""
     fleet = Lockstep(robot, scenario)
     begin, started_ns = time.process_time(), fleet.now_ns
     for truth in fleet.run():
@@ -173,7 +173,7 @@ def lockstep_speed(robot: RobotConfig, scenario: Scenario) -> float:
 
 
 def yardstick_s() -> float:
-    """Return the time of the yardstick, s: the least of a few, so that a stall is no unit."""
+    """Return the time of the yardstick, s: the least of a few, so that a stall does not count."""
     A = np.eye(12) + 0.01 * np.arange(144.0).reshape(12, 12) / 144.0
     b = np.ones(12)
 

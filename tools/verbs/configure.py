@@ -76,7 +76,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show the difference, and close it if told to; 0 if the drives are as wanted now."""
+    """Show the differences, and write them if told to; return 0 if the drives are as wanted."""
     console = Console()
     path = bench.robot_file(args)
     robot = config_file.load_without_schedule(path)
@@ -249,10 +249,10 @@ def apply(
     difference: Sequence[SettingChange],
     interrupts: Interrupts,
 ) -> list[ChangeResult]:
-    """Write, save and read back, board after board; one that fails does not stop the others.
+    """Write, save and read back one board after the other; one that fails does not stop the others.
 
-    A board that was begun is finished before an interrupt is heeded: half of its settings would be
-    in force and none saved.
+    A board is finished before an interrupt takes effect: otherwise half of its settings would be
+    active and none saved.
     """
     outcomes: list[ChangeResult] = []
     for module, board in boards.items():

@@ -29,9 +29,9 @@ from tools.verb_table import Subparsers, add_config, add_verb
 EXIT_FELL: Final = 1
 EXIT_UNJUDGED: Final = 2
 CASE_S: Final = 14.0
-"""What a case takes, s, until some have told."""
+"""First estimate of a case's duration, s, until some have run."""
 UNJUDGED_MAX: Final = 3
-"""So many cases in a row that cannot be judged: what is wrong is not the robot."""
+"""After this many cases in a row that cannot be judged, the machine is at fault, not the robot."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
 def select(
     cases: Sequence[CrashCase], *, quick: bool, only: Sequence[str] | None
 ) -> list[CrashCase]:
-    """Return the cases that are asked for, in their order.
+    """Return the selected cases, in their order.
 
     Args:
         cases: the matrix.
@@ -194,7 +194,7 @@ def _minutes(seconds: float) -> str:
 
 
 def _about(robot: RobotConfig) -> dict[str, str]:
-    """Return what the results were made from."""
+    """Return the origin of the results: robot, code, machine."""
     run = {
         "robot": robot.name,
         "loop": robot.joint_service.loop,

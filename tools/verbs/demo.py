@@ -81,8 +81,8 @@ def lead_run(
 ) -> float | None:
     """Run the scenario on a fleet of its own, and show it.
 
-    Returns the CPU use of all processes together, %: 100 is one core; None if
-    the scenario never began.
+    Returns:
+        CPU use of all processes together, %: 100 is one core; None if the scenario never started.
     """
     console.print(
         f"starting {len(robot.services)} services; modes below: right ankle, knee, hip, then left; "

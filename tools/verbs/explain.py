@@ -36,7 +36,7 @@ from tools.verb_table import RUN_HELP, Subparsers, add_config, add_verb
 Array = NDArray[np.float64]
 
 AWAY_S = 0.1
-"""A tick so long before the time that was asked for is not what the robot did then."""
+"""s; a tick that much older than the requested time does not describe the robot then."""
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 SPLIT_IN_WORDS = {
     SplitSource.DIAGONAL: "diag(K_q)",
@@ -138,10 +138,10 @@ def parse(flag: str, text: str, count: int) -> Array:
 
 
 def at_pose(robot: RobotConfig, text: str) -> Array:
-    """Return joint angles (12,), rad, at a pose p written as a text.
+    """Return the joint angles (12,), rad, at a pose p given as text.
 
     Raises:
-        RunError: it is no pose, or one that the robot cannot reach; says why.
+        RunError: the text is no pose, or the robot cannot reach it; says why.
     """
     p_ref = parse("--p", text, 6)
     limits = np.array(robot.joint_limits())
@@ -157,7 +157,7 @@ def tick_at(log: RunLog, at_s: float | None) -> Tick:
     """Return the planner's last tick at or before a scenario time; by default the last.
 
     Raises:
-        RunError: the planner did not tick there, or the log lacks what it was made from.
+        RunError: the planner did not tick there, or the log lacks its inputs.
     """
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
     led = [row for row in statuses if row.mode != PlannerMode.WAITING]

@@ -71,7 +71,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write what was asked for."""
+    """Write the requested files."""
     if not args.scene and args.layout is None and args.gif is None:
         raise RunError("say what to write: --scene, --layout FILE, --gif FILE, or several of them")
     path: Path = args.file

@@ -167,7 +167,7 @@ def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -
 
 
 def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
-    """Print what was chosen by the dynamic certificate, and what it leaves in hand."""
+    """Print the design chosen with the dynamic certificate, and its margins."""
     from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
     from services.planner.dynamic_certificate import DynamicCertificate  # noqa: PLC0415
     from services.planner.stability_room import room_of  # noqa: PLC0415

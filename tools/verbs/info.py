@@ -1,4 +1,4 @@
-"""`xrl info`: what is in a log, finished or not."""
+"""`xrl info`: shows the contents of a log, finished or not."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def _injected(survey: Survey) -> list[str]:
 
 
 def _zero(log: RunLog) -> tuple[int, str]:
-    """Return the stamp that impairments are told from, and what it is if not the scenario's."""
+    """Return time zero of the listed impairments, and its name if not the scenario's start."""
     try:
         return verdict.course(log).zero_ns, ""
     except XrlError:

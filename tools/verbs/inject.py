@@ -102,7 +102,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do it, or end it, and show what is done then."""
+    """Start or end an impairment, and show those that are active."""
     console = Console()
     client = ProxyClient(args.run_dir)
     if args.list:
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _clear(client: ProxyClient, link: str, console: Console) -> None:
-    """End what touches a link; show what it was, and what is left."""
+    """End the impairments of a link; show them and those that remain."""
     try:
         check_link(link, "--")
     except ConfigError as error:
@@ -134,10 +134,10 @@ def _clear(client: ProxyClient, link: str, console: Console) -> None:
 
 
 def inject_of(args: argparse.Namespace) -> Inject:
-    """Return what the flags ask for; `at` of it is from now.
+    """Return the requested impairment; its `at` counts from now.
 
     Raises:
-        RunError: a flag is not understood or out of its range, or they do not go together.
+        RunError: a flag is malformed or out of its range, or two contradict each other.
     """
     if args.words is not None:
         _refuse(args, WORDS, "link")
@@ -158,10 +158,10 @@ def _given(args: argparse.Namespace) -> dict[str, str]:
 
 
 def _refuse(args: argparse.Namespace, flag: str, *others: str) -> None:
-    """Refuse what a flag leaves no room for.
+    """Refuse flags that would have no effect.
 
     Raises:
-        RunError: something that would be without effect was given.
+        RunError: such a flag was given.
     """
     given = [f"--{word}" for word in _given(args)]
     given += [
@@ -173,7 +173,7 @@ def _refuse(args: argparse.Namespace, flag: str, *others: str) -> None:
 
 
 def show(asked: Sequence[RequestedImpairment], console: Console) -> None:
-    """Print what is done and what will be, the newest last."""
+    """Print active and planned impairments, the newest last."""
     if not asked:
         console.print("nothing is done to any link")
         return

@@ -150,7 +150,7 @@ def look_ask_move(
 
 
 def plan_of(args: argparse.Namespace) -> JogPlan:
-    """Return what is asked for.
+    """Return the requested motion.
 
     Raises:
         DriveError: it is out of range.
@@ -227,7 +227,7 @@ def _give_limits_back(robot: RobotConfig, args: argparse.Namespace, console: Con
 
 
 def _introduce(robot: RobotConfig, module: str, plan: JogPlan, console: Console) -> None:
-    """Say what is going to happen."""
+    """Print what is about to move."""
     console.print(
         f"{module} {AXES[plan.axis]}: {plan.by:+g} rad and back, {plan.cycles} times in "
         f"{plan.period_s:g} s each, with at most {plan.torque_limit:g} N m "

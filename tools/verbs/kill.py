@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     """Send the signal."""
     fleet = SupervisedFleet.attach(args.run_dir)
     if args.signal in ("KILL", "TERM") and args.service in MODULES:
-        fleet.forget(args.service)  # its next process is asked for: it may arm the drive
+        fleet.forget(args.service)  # a person asked for its next process: it may arm the drive
     pid = fleet.kill(args.service, SIGNALS[args.signal])
     print(f"{args.service} (pid {pid}): {args.signal} sent")
     return 0

@@ -32,7 +32,7 @@ from tools.verb_table import Subparsers, add_verb
 
 _POLL_S: Final = 0.01
 _FLUSH_S: Final = 1.0
-"""A session that closes gives what is still queued a quarter of a second, then drops it."""
+"""A closing session gives queued messages a quarter of a second, then drops them."""
 
 
 class Bus(NamedTuple):
@@ -40,7 +40,7 @@ class Bus(NamedTuple):
 
     robot: RobotConfig
     note: str
-    """What a person should know about how it was found; else empty."""
+    """A note for the person on how the bus was chosen; else empty."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -189,7 +189,7 @@ def _play(
         alarm()
         display.show(player)
 
-    gc.freeze()  # the log is no garbage: a collector that walks it makes messages late
+    gc.freeze()  # the log is not garbage: a collector that walks it makes messages late
     player = Player(
         schedule,
         Playhead(now_ns(), args.rate, paused=args.start_paused),

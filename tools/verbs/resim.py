@@ -1,4 +1,4 @@
-"""`xrl resim`: a run's services executed again from its log, and held to what they did."""
+"""`xrl resim`: runs a log's services again and compares their outputs with the recorded ones."""
 
 from __future__ import annotations
 

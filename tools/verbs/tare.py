@@ -23,7 +23,7 @@ from tools.verb_table import Subparsers, add_run_dir, add_verb
 LOADED_N: Final = 30.0
 """A harness that reads more is taken for one that is held; drift is less."""
 REPEAT_S: Final = 0.02
-"""The bus may drop a message: it is said again until the tare has begun."""
+"""The bus may drop a message: the request is repeated until the tare has started."""
 HEARD_S: Final = 3.0
 """Longest wait for the first wrench."""
 GIVE_UP_S: Final = 10.0
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
-    """Ask until the tare has begun, and wait until it is done.
+    """Request the tare until it has started, and wait until it is done.
 
     Args:
         requests: to the harness service.
@@ -83,10 +83,10 @@ def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
         anyway: also if the harness seems to be held.
 
     Returns:
-        What the harness said before.
+        The harness's reading before.
 
     Raises:
-        FleetError: it is not heard, is held, or finds no zero.
+        FleetError: the harness is silent, is held, or finds no zero.
     """
     before = newest = _first(wrenches)
     if before.valid and math.hypot(*before.force) > LOADED_N and not anyway:

@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:
-    """Return what the arguments add to the services' own."""
+    """Return the arguments that the flags add to the services' own."""
     overrides = {"recorder": ["--out", str(out.absolute())]}
     if args.snapshot is not None:
         overrides["recorder"] += ["--snapshot", f"{args.snapshot:g}"]

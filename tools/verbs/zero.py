@@ -100,10 +100,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) -> dict[str, Pair]:
-    """Return where each module that is meant is, (phi, theta), rad.
+    """Return the position (phi, theta), rad, of each selected module.
 
     Raises:
-        DriveError: it is not two angles, or one is outside of the limits.
+        DriveError: the value is not two angles, or one is outside the limits.
         RunError: there is no such stand.
     """
     modules = MODULES if args.all else (args.module,)
@@ -163,7 +163,7 @@ def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | 
 
 
 def plan_table(wanted: Mapping[str, Pair], before: Mapping[str, DriveLook]) -> Table:
-    """Return what is to be changed, for the terminal."""
+    """Return the changes as a table for the terminal."""
     table = _table("before, rad", "after, rad", "change, rad")
     for module, q in wanted.items():
         seen = before[module]
@@ -184,7 +184,7 @@ def _set_all(
     for module, q in wanted.items():
         try:
             back = zero(drives[module], q, robot)
-        except DriveError as error:  # the others are told all the same
+        except DriveError as error:  # one that fails does not stop the others
             console.print(f"[bold red]{module}[/]: {escape(str(error))}")
             back = None
         good = is_right(back, q)
@@ -234,7 +234,7 @@ def _warn(
 def _states(
     robot: RobotConfig, fleet: SupervisedFleet, modules: list[str]
 ) -> dict[str, JointState]:
-    """Return a state of each of a fleet's modules that is heard."""
+    """Return one state of each module of a fleet that sends any."""
     heard: dict[str, JointState] = {}
     with open_session(robot, "zero", fleet.run.path) as session:
         ends = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in modules}

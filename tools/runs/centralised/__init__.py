@@ -1,5 +1,5 @@
-"""A baseline to compare with: every torque computed by the planner, none by the joint services.
+"""A baseline to compare with: the planner computes every torque, the joint services none.
 
-A study object of virtual time. No service imports it and no robot file names it: it can only be
-asked for by name, in `xrl sim --control` and `xrl sweep latency --control`.
+It runs in virtual time only. No service imports it and no robot file names it: `xrl sim --control`
+and `xrl sweep latency --control` select it by name.
 """

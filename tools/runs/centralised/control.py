@@ -1,11 +1,11 @@
 """Planner and joint modules of the centralised control.
 
-The planner's law is the shipped one. What its commands leave to the joint services
+The planner's law is the shipped one. The planner also computes the joint services' part,
 
     tau = D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled
 
-is worked out by the planner too, with the states that it has, into one torque for each joint.
-The modules hand it to the drives unchanged until the next one comes. Pure.
+with the states that it has, as one torque for each joint. The modules pass it to the drives
+unchanged until the next one comes. Pure.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from shared.config.robot_config import RobotConfig
 
 
 class LeadsOn(Engagement):
-    """Engages as shipped, and then leads whatever it hears: nothing stands below it to hold."""
+    """Engages as shipped, and then leads with any states: no tier below it could hold."""
 
     def advance(
         self,
@@ -60,7 +60,7 @@ class CentralPlanner(Planner):
         return [_whole(*pair) for pair in zip(commands, states, strict=True)] if commands else []
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
-        """Return what the last tick saw and decided; no margin, for nothing stands alone."""
+        """Return inputs and decisions of the last tick; no margin, because no part stands alone."""
         status = super().status(now_ns, tick_us)
         return msgspec.structs.replace(status, margin=0.0, margin_onboard=0.0)
 

@@ -18,9 +18,9 @@ from tools.runs.lockstep import Lockstep, Record, forget
 
 
 def torques_only(config: RobotConfig) -> RobotConfig:
-    """Return the robot with drives that are sent torques and hold nothing by themselves.
+    """Return the robot with drives that take torques and hold nothing by themselves.
 
-    Its joint services believe any command: gains of zero are what the planner sends here.
+    Its joint services accept any command, because this planner sends gains of zero.
     """
     service = msgspec.structs.replace(config.joint_service, loop="service")
     return msgspec.structs.replace(untripped(believing(config)), joint_service=service)

@@ -12,10 +12,9 @@ from services.planner.certificate import DIRECTIONS
 from services.simulator.plant import IDEAL, PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
 from tools.studies.sweeps import certificate_study, study
 from tools.studies.sweeps.certificate_study import CertificateCases, CertificateResult
-from tools.studies.sweeps.table import CaseTable, code_digest, code_of
+from tools.studies.sweeps.table import code_of
 from tools.verb_table import add_config
 
 N: Final = 200
@@ -61,25 +60,34 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if a case fell that was said to stand."""
     study.check_least(("--n", args.n, 1))
-    crew = study.executor_of(args, CODE)
+    executor = study.executor_of(args, CODE)
     robot = config_file.load(args.config)
     plant = IDEAL if args.friction else certificate_study.FRICTIONLESS
     console = Console()
-    out = study.folder(args.out, "certificate")
     first = row_of(
         certificate_study.run(
             robot, CertificateCases(robot).draw(args.seed, 0), rigid=args.rigid, plant=plant
         )
     )
-    with CaseTable(out, TABLE, tuple(first), _inputs(args, robot), WORDS) as table:
-        missing = [number for number in range(args.n) if number not in table.numbers]
-        batches = [
+
+    def batches(done: set[int]) -> list[CaseBatch]:
+        missing = [number for number in range(args.n) if number not in done]
+        return [
             CaseBatch(robot, args.seed, tuple(missing[start : start + BATCH]), args.rigid, plant)
             for start in range(0, len(missing), BATCH)
         ]
-        with study.resumable(table, out, _command(args), crew, console):
-            study.fill(table, JOB, batches, crew, args.n, console)
-    rows = table.rows(args.n)
+
+    inputs = study.inputs(
+        "certificate", robot, CODE, seed=str(args.seed), rigid=str(args.rigid),
+        friction=str(args.friction),
+    )  # fmt: skip
+    switches = [f"--{name}" for name in ("rigid", "friction") if getattr(args, name)]
+    command = study.command("certificate", args, f"--n {args.n}", f"--seed {args.seed}", *switches)
+    finished = study.run(
+        study.Study("certificate", TABLE, tuple(first), WORDS, inputs, (), args.n, JOB, command),
+        batches, args.out, executor, console,
+    )  # fmt: skip
+    rows = finished.rows
     said = [(float(row["margin"]), row["stood"] == "True") for row in rows]
     found = certificate_study.confusion(said)
     console.print(
@@ -95,8 +103,8 @@ def run(args: argparse.Namespace) -> int:
                 style="dim",
             )
     title = f"{len(rows)} random postures and gains, seed {args.seed}"
-    certificate_study.draw_picture(rows, title, out / PICTURE)
-    console.print(f"{out / TABLE}, {PICTURE}", style="dim", soft_wrap=True)
+    certificate_study.draw_picture(rows, title, finished.out / PICTURE)
+    finished.show_files(f"{TABLE}, {PICTURE}", "case", console)
     return 1 if found.stand_fell else 0
 
 
@@ -146,23 +154,3 @@ def _fell(row: Mapping[str, object]) -> bool:
 
 
 JOB: Final = study.Job(_run_batch, _name, _rows, _fell)
-
-
-def _command(args: argparse.Namespace) -> str:
-    """Return the command of this study, but for --out."""
-    flags = [f"--n {args.n}", f"--seed {args.seed}"]
-    if args.config != DEFAULT_CONFIG:
-        flags.append(f"--config {args.config}")
-    flags += [f"--{name}" for name in ("rigid", "friction") if getattr(args, name)]
-    return " ".join(["xrl sweep certificate", *flags])
-
-
-def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
-    return {
-        "study": "certificate",
-        "seed": str(args.seed),
-        "rigid": str(args.rigid),
-        "friction": str(args.friction),
-        "robot": study.digest_of(robot),
-        "code": code_digest(CODE),
-    }

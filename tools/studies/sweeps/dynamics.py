@@ -14,7 +14,6 @@ from rich.console import Console
 
 from services.planner.dynamic_certificate import HALF_NAMES
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.dynamics_trial import (
@@ -24,7 +23,7 @@ from tools.studies.sweeps.dynamics_trial import (
     draw,
     run_trial,
 )
-from tools.studies.sweeps.table import CaseTable, Row, code_digest, code_of
+from tools.studies.sweeps.table import Row, code_of
 from tools.verb_table import add_config
 
 mpl.use("Agg")
@@ -59,7 +58,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if anything grew that was said to fade."""
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
-    crew = study.executor_of(args, CODE)
+    executor = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config)
     console = Console()
     if args.only is not None:
@@ -68,17 +67,22 @@ def run(args: argparse.Namespace) -> int:
         outcome = run_trial(trial, robot)
         study.show("came out", _row((trial, robot), outcome), console)
         return 1 if outcome.said_stable and outcome.grew else 0
-    out = study.folder(args.out, "dynamics")
     trials = [draw(args.seed, number) for number in range(args.n)]
     begins = [_begin(trial) for trial in trials]
     columns = [*begins[0], *DynamicsResult.__struct_fields__, "said_stable", "grew"]
-    with CaseTable(out, TABLE, columns, _inputs(args, robot), WORDS, begins) as table:
-        missing = [(trial, robot) for trial in trials if trial.number not in table.numbers]
-        with study.resumable(table, out, f"{_command(args)} --n {args.n}", crew, console):
-            study.fill(table, JOB, missing, crew, args.n, console)
-    rows = table.rows(args.n)
+    inputs = study.inputs("dynamics", robot, CODE, seed=str(args.seed))
+    command = study.command("dynamics", args, f"--seed {args.seed}")
+    finished = study.run(
+        study.Study(
+            "dynamics", TABLE, columns, WORDS, inputs, begins, args.n, JOB,
+            f"{command} --n {args.n}",
+        ),
+        lambda done: [(trial, robot) for trial in trials if trial.number not in done],
+        args.out, executor, console,
+    )  # fmt: skip
+    rows = finished.rows
     draw_picture(rows, f"{len(rows)} random gains, poses and drivetrains, seed {args.seed}",
-                 out / PICTURE)  # fmt: skip
+                 finished.out / PICTURE)  # fmt: skip
     counts = {
         (said, grew): sum(
             row["said_stable"] == str(said) and row["grew"] == str(grew) for row in rows
@@ -99,11 +103,11 @@ def run(args: argparse.Namespace) -> int:
                 f"  case {row['number']}: said {float(row['rate']):.2f}/s at "
                 f"{float(row['frequency_hz']):.1f} Hz, {row['mode']}: {row['ended']}, "
                 f"{float(row['early_rad_s']):.3f} to {float(row['late_rad_s']):.3f} rad/s: "
-                f"{_command(args)} --only {row['number']}",
+                f"{command} --only {row['number']}",
                 highlight=False,
                 soft_wrap=True,
             )
-    console.print(f"{out / TABLE}, {PICTURE}", style="dim", soft_wrap=True)
+    finished.show_files(f"{TABLE}, {PICTURE}", "case", console)
     return 1 if counts[True, True] else 0
 
 
@@ -156,20 +160,3 @@ def _grew(row: Mapping[str, object]) -> bool:
 
 
 JOB: Final = study.Job(_run_task, _name, _rows, _grew)
-
-
-def _command(args: argparse.Namespace) -> str:
-    """Return the command of this study, but for --n, --only and --out."""
-    flags = [f"--seed {args.seed}"]
-    if args.config != DEFAULT_CONFIG:
-        flags.append(f"--config {args.config}")
-    return " ".join(["xrl sweep dynamics", *flags])
-
-
-def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
-    return {
-        "study": "dynamics",
-        "seed": str(args.seed),
-        "robot": study.digest_of(robot),
-        "code": code_digest(CODE),
-    }

@@ -10,14 +10,13 @@ import msgspec
 from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.studies.sweeps import cases, picture, plants, push_range, report, study
 from tools.studies.sweeps.figures import ENDINGS, Ending
 from tools.studies.sweeps.outcome import KillResult, plant_of, run_case
 from tools.studies.sweeps.prepare import needs_schedule, prepare
 from tools.studies.sweeps.record import run_alone
-from tools.studies.sweeps.table import CaseTable, code_digest, code_of
+from tools.studies.sweeps.table import code_of
 from tools.verb_table import add_config
 
 N: Final = 500
@@ -63,36 +62,44 @@ def run(args: argparse.Namespace) -> int:
     """Run the study, or one case of it; 1 if any fell."""
     study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
     push_range.check(args)
-    crew = study.executor_of(args, CODE)
+    executor = study.executor_of(args, CODE)
     robot = experiment.make_robot(args)
     console = Console()
     if args.only is not None:
         return _run_one(args, robot, console)
-    return _run_all(args, robot, crew, console)
+    return _run_all(args, robot, executor, console)
 
 
 def _run_all(
-    args: argparse.Namespace, robot: RobotConfig, crew: study.Executor, console: Console
+    args: argparse.Namespace, robot: RobotConfig, executor: study.Executor, console: Console
 ) -> int:
-    out = study.folder(args.out, "kill")
     study_of = cases.KillCases(robot, args.push)
     drawn = [study_of.draw(args.seed, number) for number in range(args.n)]
     rows_begin = [cases.row_of(case) for case in drawn]
     columns = [*rows_begin[0], *COLUMNS_OUT]
-    with CaseTable(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
-        missing = [case for case in drawn if case.number not in table.numbers]
-        with study.resumable(table, out, f"{_command(args)} --n {args.n}", crew, console):
-            robots = _robots({case.payload_kg for case in missing}, robot, crew.workers, console)
-            tasks = [(case, robots[case.payload_kg]) for case in missing]
-            seconds = study.fill(table, JOB, tasks, crew, args.n, console)
-    rows = table.rows(args.n)
+
+    def tasks(done: set[int]) -> list[Task]:
+        missing = [case for case in drawn if case.number not in done]
+        robots = _robots({case.payload_kg for case in missing}, robot, executor.workers, console)
+        return [(case, robots[case.payload_kg]) for case in missing]
+
+    inputs = study.inputs(
+        "kill", robot, CODE, seed=str(args.seed), push=f"{args.push:g}", ranges=plants.digest()
+    )
+    finished = study.run(
+        study.Study(
+            "kill", TABLE, columns, WORDS, inputs, rows_begin, args.n, JOB,
+            f"{_command(args)} --n {args.n}",
+        ),
+        tasks, args.out, executor, console,
+    )  # fmt: skip
+    rows = finished.rows
     fallen = report.falls(rows)
     title = f"Planner killed, {len(rows)} random cases, seed {args.seed}, "
     title += f"{push_range.describe(args)}: {len(fallen)} fell"
-    picture.draw(rows, robot, title, out / PICTURE)
+    picture.draw(rows, robot, title, finished.out / PICTURE)
     report.show(rows, _command(args), console)
-    pace = f"; {seconds:.2f} s a case" if missing else ""
-    console.print(f"{out / TABLE}, {PICTURE}{pace}", style="dim", soft_wrap=True)
+    finished.show_files(f"{TABLE}, {PICTURE}", "case", console)
     return 1 if fallen else 0
 
 
@@ -146,24 +153,10 @@ def _rows(task: Task, outcome: KillResult) -> list[dict[str, object]]:
 JOB: Final = study.Job(_run_task, _name, _rows, lambda row: row["ending"] != Ending.STOOD)
 
 
-def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
-    return {
-        "study": "kill",
-        "seed": str(args.seed),
-        "push": f"{args.push:g}",
-        "robot": study.digest_of(robot),
-        "ranges": plants.digest(),
-        "code": code_digest(CODE),
-    }
-
-
 def _command(args: argparse.Namespace) -> str:
     """Return the command of this study, but for --n, --only and --out."""
     flags = [f"--seed {args.seed}", *push_range.flags(args)]
-    if args.config != DEFAULT_CONFIG:
-        flags.append(f"--config {args.config}")
     flags += [
         f"--{name} {getattr(args, name)}" for name in ("split", "jacobian") if getattr(args, name)
     ]
-    flags += ["--imu"] if args.imu else []
-    return " ".join(["xrl sweep kill", *flags])
+    return study.command("kill", args, *flags, *(["--imu"] if args.imu else []))

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
 from shared.config.toml_file import check_ranges
-from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.studies.sweeps import latency_picture, latency_report, plants, study
 from tools.studies.sweeps.figures import ENDINGS, Ending
@@ -30,7 +29,7 @@ from tools.studies.sweeps.latency_trial import (
     run_trial,
 )
 from tools.studies.sweeps.record import run_alone
-from tools.studies.sweeps.table import CaseTable, code_digest, code_of
+from tools.studies.sweeps.table import code_of
 from tools.verb_table import add_config
 
 DELAYS_MS: Final = "0,10,20,30,50,100,200"
@@ -157,7 +156,7 @@ def trials_of(args: argparse.Namespace) -> list[LatencyTrial]:
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one trial of it; 1 if the shipped control fell."""
     study.check_least(("--trials", args.trials, 1), ("--only", args.only or 0, 0))
-    crew = study.executor_of(args, CODE)
+    executor = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config)
     if args.lead_easing is not None:
         law = msgspec.structs.replace(robot.law, lead_easing=args.lead_easing)
@@ -167,32 +166,38 @@ def run(args: argparse.Namespace) -> int:
     trials = trials_of(args)
     if args.only is not None:
         return _run_one(args, trials, robot, console)
-    return _run_all(args, trials, robot, crew, console)
+    return _run_all(args, trials, robot, executor, console)
 
 
 def _run_all(
     args: argparse.Namespace,
     trials: list[LatencyTrial],
     robot: RobotConfig,
-    crew: study.Executor,
+    executor: study.Executor,
     console: Console,
 ) -> int:
-    out = study.folder(args.out, "latency")
     drawn = [row_of(trial) for trial in trials]
     columns = [*drawn[0], *COLUMNS_OUT]
-    with CaseTable(out, TABLE, columns, _inputs(args, robot), WORDS, drawn) as table:
-        robots = {name: robot_of(robot, name) for name in args.control}
-        tasks = [(t, robots[t.control]) for t in trials if t.number not in table.numbers]
-        again = f"{_command(args)} --trials {args.trials}"
-        with study.resumable(table, out, again, crew, console):
-            seconds = study.fill(table, JOB, tasks, crew, len(trials), console)
-    rows = table.rows(len(trials))
+    robots = {name: robot_of(robot, name) for name in args.control}
+    inputs = study.inputs(
+        "latency", robot, CODE, seed=str(args.seed), delay=_joined(args.delay),
+        jitter=_joined(args.jitter), loss=_joined(args.loss), control=",".join(args.control),
+        ranges=plants.digest(),
+    )  # fmt: skip
+    finished = study.run(
+        study.Study(
+            "latency", TABLE, columns, WORDS, inputs, drawn, len(trials), JOB,
+            f"{_command(args)} --trials {args.trials}",
+        ),
+        lambda done: [(t, robots[t.control]) for t in trials if t.number not in done],
+        args.out, executor, console,
+    )  # fmt: skip
+    rows = finished.rows
     force_max = robot.simulation.operator.force_max
-    pictures = latency_picture.draw(rows, force_max, f"seed {args.seed}", out)
+    pictures = latency_picture.draw(rows, force_max, f"seed {args.seed}", finished.out)
     latency_report.show(rows, _command(args), console)
-    pace = f"; {seconds:.2f} s a trial" if tasks else ""
-    files = ", ".join(path.name for path in pictures)
-    console.print(f"{out / TABLE}, {files}{pace}", style="dim", soft_wrap=True)
+    files = ", ".join((TABLE, *(path.name for path in pictures)))
+    finished.show_files(files, "trial", console)
     fallen = [row for row in rows if row["ending"] != Ending.STOOD]
     return 1 if any(row["control"] == "distributed" for row in fallen) else 0
 
@@ -250,20 +255,6 @@ def _rows(task: Task, outcome: LatencyResult) -> list[dict[str, object]]:
 JOB: Final = study.Job(_run_task, _name, _rows, lambda row: row["ending"] != Ending.STOOD)
 
 
-def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
-    return {
-        "study": "latency",
-        "seed": str(args.seed),
-        "delay": _joined(args.delay),
-        "jitter": _joined(args.jitter),
-        "loss": _joined(args.loss),
-        "control": ",".join(args.control),
-        "robot": study.digest_of(robot),
-        "ranges": plants.digest(),
-        "code": code_digest(CODE),
-    }
-
-
 def _joined(values: tuple[float, ...]) -> str:
     return ",".join(map(plain, values))
 
@@ -278,6 +269,4 @@ def _command(args: argparse.Namespace) -> str:
         flags.append(f"--control {','.join(args.control)}")
     if args.lead_easing is not None:
         flags.append(f"--lead-easing {args.lead_easing}")
-    if args.config != DEFAULT_CONFIG:
-        flags.append(f"--config {args.config}")
-    return " ".join(["xrl sweep latency", *flags])
+    return study.command("latency", args, *flags)

@@ -20,11 +20,10 @@ from services.simulator import plant as plants
 from services.simulator.plant import PlantConfig, plant_from
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial, run_trial
-from tools.studies.sweeps.table import CaseTable, Row, code_digest, code_of
+from tools.studies.sweeps.table import Row, code_of
 from tools.verb_table import add_config
 
 mpl.use("Agg")
@@ -75,23 +74,27 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study; 0 once it is done."""
-    crew = study.executor_of(args, CODE)
+    executor = study.executor_of(args, CODE)
     robot, plant = experiment.load_robot(args.config), plant_from(args.plant)
     trials = trials_of(args)
     console = Console()
-    out = study.folder(args.out, "push")
     rows_begin = [msgspec.structs.asdict(trial) for trial in trials]
     columns = [*PushTrial.__struct_fields__, *PushResult.__struct_fields__]
-    with CaseTable(out, TABLE, columns, _inputs(args, robot, plant), WORDS, rows_begin) as table:
-        missing = [trial for trial in trials if trial.number not in table.numbers]
-        with study.resumable(table, out, _command(args), crew, console):
-            tasks = [(trial, robot, plant) for trial in missing]
-            seconds = study.fill(table, JOB, tasks, crew, len(trials), console)
-    rows = table.rows(len(trials))
-    draw(rows, out / PICTURE)
+    inputs = study.inputs(
+        "push", robot, CODE, plant=plants.to_toml(plant),
+        grid=repr([msgspec.structs.astuple(trial) for trial in trials]),
+    )  # fmt: skip
+    finished = study.run(
+        study.Study(
+            "push", TABLE, columns, WORDS, inputs, rows_begin, len(trials), JOB, _command(args)
+        ),
+        lambda done: [(trial, robot, plant) for trial in trials if trial.number not in done],
+        args.out, executor, console,
+    )  # fmt: skip
+    rows = finished.rows
+    draw(rows, finished.out / PICTURE)
     _show(rows, console)
-    pace = f"; {seconds:.1f} s a point" if missing else ""
-    console.print(f"{out / TABLE}, {PICTURE}{pace}", style="dim", soft_wrap=True)
+    finished.show_files(f"{TABLE}, {PICTURE}", "point", console)
     return 0
 
 
@@ -208,21 +211,11 @@ WORDS: Final = {
 JOB: Final = study.Job(_run_task, _name, _rows, lambda _row: False)
 
 
-def _inputs(args: argparse.Namespace, robot: RobotConfig, plant: PlantConfig) -> dict[str, str]:
-    return {
-        "study": "push",
-        "grid": repr([msgspec.structs.astuple(trial) for trial in trials_of(args)]),
-        "robot": study.digest_of(robot),
-        "plant": plants.to_toml(plant),
-        "code": code_digest(CODE),
-    }
-
-
 def _command(args: argparse.Namespace) -> str:
     """Return the command of this study, but for `--out`."""
-    words = ["xrl sweep push"]
-    if args.config != DEFAULT_CONFIG:
-        words.append(f"--config {args.config}")
-    for flag in ("pose", "angle", "duration", "plant"):
-        words += [f"--{flag} {value}" for value in getattr(args, flag) or ()]
-    return " ".join(words)
+    flags = [
+        f"--{flag} {value}"
+        for flag in ("pose", "angle", "duration", "plant")
+        for value in getattr(args, flag) or ()
+    ]
+    return study.command("push", args, *flags)

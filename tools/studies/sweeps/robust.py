@@ -18,7 +18,6 @@ from scipy.stats import spearmanr
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.studies.sweeps import plants, push_range, study
 from tools.studies.sweeps.figures import ENDINGS, Ending
@@ -33,7 +32,7 @@ from tools.studies.sweeps.robust_trial import (
     run_trial,
     scenario_of,
 )
-from tools.studies.sweeps.table import CaseTable, Row, code_digest, code_of
+from tools.studies.sweeps.table import Row, code_of
 from tools.studies.sweeps.wilson import wilson
 from tools.verb_table import add_config
 
@@ -102,27 +101,32 @@ def run(args: argparse.Namespace) -> int:
     if not 0.0 <= args.slope <= SLOPE_MAX_DEG:
         raise RunError(f"--slope {args.slope:g}: 0 to {SLOPE_MAX_DEG:g} degrees")
     push_range.check(args)
-    crew = study.executor_of(args, CODE)
+    executor = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config, imu=args.imu)
     plants.draw("check", beyond=args.beyond)
     console = Console()
     if args.only is not None:
         return _run_one(args, robot, console)
-    out = study.folder(args.out, "robust")
     pushes = PushRange(robot, args.push)
     drawn = [draw(pushes, args.seed, number, args.beyond, args.slope) for number in range(args.n)]
     rows_begin = [row_of(trial) for trial in drawn]
     columns = [*rows_begin[0], *RobustResult.__struct_fields__]
-    with CaseTable(out, TABLE, columns, _inputs(args, robot), WORDS, rows_begin) as table:
-        missing = [trial for trial in drawn if trial.number not in table.numbers]
-        with study.resumable(table, out, f"{_command(args)} --n {args.n}", crew, console):
-            tasks = [(trial, robot) for trial in missing]
-            seconds = study.fill(table, JOB, tasks, crew, args.n, console)
-    rows = table.rows(args.n)
-    _draw(rows, args, out / PICTURE)
+    inputs = study.inputs(
+        "robust", robot, CODE, seed=str(args.seed), beyond=f"{args.beyond:g}",
+        slope=f"{args.slope:g}", push=f"{args.push:g}", ranges=plants.digest(),
+    )  # fmt: skip
+    finished = study.run(
+        study.Study(
+            "robust", TABLE, columns, WORDS, inputs, rows_begin, args.n, JOB,
+            f"{_command(args)} --n {args.n}",
+        ),
+        lambda done: [(trial, robot) for trial in drawn if trial.number not in done],
+        args.out, executor, console,
+    )  # fmt: skip
+    rows = finished.rows
+    _draw(rows, args, finished.out / PICTURE)
     fell = _show(rows, _command(args), console)
-    pace = f"; {seconds:.2f} s a trial" if missing else ""
-    console.print(f"{out / TABLE}, {PICTURE}{pace}", style="dim", soft_wrap=True)
+    finished.show_files(f"{TABLE}, {PICTURE}", "trial", console)
     return 1 if fell else 0
 
 
@@ -238,19 +242,6 @@ WORDS: Final = {"ending": ENDINGS, "kind": frozenset(("squat", "crawl", "lean"))
 JOB: Final = study.Job(_run_task, _name, _rows, lambda row: row["ending"] != Ending.STOOD)
 
 
-def _inputs(args: argparse.Namespace, robot: RobotConfig) -> dict[str, str]:
-    return {
-        "study": "robust",
-        "seed": str(args.seed),
-        "beyond": f"{args.beyond:g}",
-        "slope": f"{args.slope:g}",
-        "push": f"{args.push:g}",
-        "robot": study.digest_of(robot),
-        "ranges": plants.digest(),
-        "code": code_digest(CODE),
-    }
-
-
 def _command(args: argparse.Namespace) -> str:
     """Return the command of this study, but for --n, --only and --out."""
     flags = [f"--seed {args.seed}", *push_range.flags(args)]
@@ -260,6 +251,4 @@ def _command(args: argparse.Namespace) -> str:
         flags.append(f"--slope {args.slope:g}")
     if args.imu:
         flags.append("--imu")
-    if args.config != DEFAULT_CONFIG:
-        flags.append(f"--config {args.config}")
-    return " ".join(["xrl sweep robust", *flags])
+    return study.command("robust", args, *flags)

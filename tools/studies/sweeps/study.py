@@ -1,4 +1,4 @@
-"""What all studies have in common: their flags, where results go, who runs them, the bar."""
+"""The frame of every study: flags, workers, the table of cases, resuming, the progress bar."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import hashlib
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
@@ -18,8 +17,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.process import DEFAULT_CONFIG
 from tools.studies.sweeps import cluster, pool
-from tools.studies.sweeps.table import CaseTable
+from tools.studies.sweeps.table import CaseTable, Row, Words, code_digest
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -37,16 +37,58 @@ class Executor(NamedTuple):
 
 
 class Job(NamedTuple, Generic[T, R]):
-    """What is to be done with each task."""
+    """How a task is done."""
 
     work: Callable[[T], R]
     """A function of a module; it runs in the workers."""
     name: Callable[[T], str]
-    """What a task is called in an error."""
+    """Name of a task in an error."""
     rows: Callable[[T, R], Sequence[Mapping[str, object]]]
     """Its rows of the table."""
     fell: Callable[[Mapping[str, object]], bool]
-    """Whether a row is of a fall."""
+    """True for the row of a fall."""
+
+
+class Study(NamedTuple, Generic[T, R]):
+    """A study to run: one row per case, appended on completion; an interrupted study resumes."""
+
+    name: str
+    """Its name after `xrl sweep`."""
+    table: str
+    """File name of the table."""
+    columns: Sequence[str]
+    """The first is the case's number."""
+    words: Words
+    """Columns that hold words, and the words that each may hold."""
+    inputs: Mapping[str, str]
+    """What the rows depend on; a folder with other inputs is refused."""
+    drawn: Sequence[Mapping[str, object]]
+    """By case: the start of its row, known before it runs."""
+    total: int
+    """Number of cases."""
+    job: Job[T, R]
+    command: str
+    """Resumes it, but for `--out`."""
+
+
+class Finished(NamedTuple):
+    """A study that has run."""
+
+    rows: list[Row]
+    out: Path
+    case_s: float
+    """Wall time for each new case, s; 0 if there was none."""
+
+    def show_files(self, files: str, case: str, console: Console) -> None:
+        """Print where the results are and the time that a case took.
+
+        Args:
+            files: the table and the pictures, as text.
+            case: what a case is called, such as "trial".
+            console: to print on.
+        """
+        pace = f"; {self.case_s:.2f} s a {case}" if self.case_s else ""
+        console.print(f"{self.out}/{files}{pace}", style="dim", soft_wrap=True)
 
 
 def add_flags(parser: argparse.ArgumentParser, name: str, files: str, more: str = "") -> None:
@@ -72,8 +114,8 @@ def add_flags(parser: argparse.ArgumentParser, name: str, files: str, more: str 
         "--out",
         type=Path,
         metavar="DIR",
-        help=f"where {files} go (default: out/sweep-{name}-<time>); a study that was stopped is "
-        f"gone on with{more}",
+        help=f"where {files} go (default: out/sweep-{name}-<time>); an interrupted study resumes "
+        f"there{more}",
     )
 
 
@@ -109,82 +151,81 @@ def digest_of(robot: RobotConfig) -> str:
     return hashlib.sha256(config_file.to_toml(robot).encode() + schedule).hexdigest()
 
 
-def folder(out: Path | None, name: str) -> Path:
-    """Return where the results go."""
-    return out or Path("out") / time.strftime(f"sweep-{name}-%Y%m%d-%H%M%S")
+def inputs(name: str, robot: RobotConfig, code: tuple[str, ...], **more: str) -> dict[str, str]:
+    """Return what a study's rows depend on: robot, code, and what else is given."""
+    return {"study": name, **more, "robot": digest_of(robot), "code": code_digest(code)}
 
 
-def results(job: Job[T, R], tasks: Sequence[T], crew: Executor) -> Iterator[tuple[T, R]]:
-    """Yield each task with its result as it is done; as `pool.results`."""
-    if crew.cluster is None:
-        return pool.results(job.work, tasks, crew.workers, job.name)
-    return cluster.results(job.work, tasks, crew.cluster, job.name, crew.code)
+def command(name: str, args: argparse.Namespace, *flags: str) -> str:
+    """Return the command of a study, with `--config` if it is not the shipped robot's."""
+    config = [] if args.config == DEFAULT_CONFIG else [f"--config {args.config}"]
+    return " ".join([f"xrl sweep {name}", *flags, *config])
 
 
-def fill(
-    table: CaseTable,
-    job: Job[T, R],
-    tasks: Sequence[T],
-    crew: Executor,
-    total: int,
+def run(
+    study: Study[T, R],
+    tasks_but: Callable[[set[int]], Sequence[T]],
+    out: Path | None,
+    executor: Executor,
     console: Console,
-) -> float:
-    """Run tasks into a table under a progress bar.
+) -> Finished:
+    """Run the cases that the table lacks; at an interruption, print how to resume.
 
     Args:
-        table: takes the rows as they come.
-        job: what to do with each task.
-        tasks: those that are not done yet.
-        crew: who does it.
-        total: rows that the table is to have.
+        study: what to run.
+        tasks_but: returns the tasks, but for those of cases that are done.
+        out: folder of the results; None: a new one.
+        executor: who runs the tasks.
         console: for the bar.
 
-    Returns:
-        Wall time for each row, s; 0 if none was missing.
-
     Raises:
-        RunError: as `pool.results` and `cluster.results`.
+        RunError: the folder holds another study, a task failed, or a worker was lost.
     """
-    there = table.rows(total)
-    if there:
-        console.print(f"{len(there)} of {total} cases are done already")
-    begin, new = time.monotonic(), 0
-    fallen = sum(job.fell(row) for row in there)
-    with bar(
-        "{task.completed} of {task.total} cases, {task.fields[fallen]} fell", console
-    ) as shown:
-        line = shown.add_task("", total=total, completed=len(there), fallen=fallen)
-        for task, result in results(job, tasks, crew):
+    folder = out or Path("out") / time.strftime(f"sweep-{study.name}-%Y%m%d-%H%M%S")
+    with CaseTable(
+        folder, study.table, study.columns, study.inputs, study.words, study.drawn
+    ) as table:
+        try:
+            case_s = _fill(table, study, tasks_but(table.numbers), executor, console)
+        except (KeyboardInterrupt, SystemExit, RunError):
+            if done := len(table.numbers):
+                flag = f" --cluster {executor.cluster}" if executor.cluster else ""
+                again = f"{study.command}{flag} --out {shlex.quote(str(folder))}"
+                console.print(f"{done} cases are in {folder}; resume with: {again}", soft_wrap=True)
+            raise
+    return Finished(table.rows(study.total), folder, case_s)
+
+
+def _fill(
+    table: CaseTable,
+    study: Study[T, R],
+    tasks: Sequence[T],
+    executor: Executor,
+    console: Console,
+) -> float:
+    """Run tasks into a table; return the wall time for each new row, s."""
+    job, done = study.job, table.rows(study.total)
+    if done:
+        console.print(f"{len(done)} of {study.total} cases are done already")
+    start, new = time.monotonic(), 0
+    fallen = sum(job.fell(row) for row in done)
+    text = "{task.completed} of {task.total} cases, {task.fields[fallen]} fell"
+    with bar(text, console) as shown:
+        line = shown.add_task("", total=study.total, completed=len(done), fallen=fallen)
+        for task, result in _results(job, tasks, executor):
             rows = job.rows(task, result)
             for row in rows:
                 table.add(row)
                 fallen += job.fell(row)
             new += len(rows)
             shown.update(line, advance=len(rows), fallen=fallen)
-    return (time.monotonic() - begin) / new if new else 0.0
+    return (time.monotonic() - start) / new if new else 0.0
 
 
-@contextmanager
-def resumable(
-    table: CaseTable, out: Path, command: str, crew: Executor, console: Console
-) -> Iterator[None]:
-    """Say what is kept, and how to go on, at Ctrl-C, SIGTERM and when a worker is lost.
-
-    Args:
-        table: the study's.
-        out: its folder.
-        command: of the study, but for who runs it and `--out`.
-        crew: who runs it.
-        console: to print on.
-    """
-    try:
-        yield
-    except (KeyboardInterrupt, SystemExit, RunError):
-        if done := len(table.numbers):
-            cluster_flag = f" --cluster {crew.cluster}" if crew.cluster else ""
-            again = f"{command}{cluster_flag} --out {shlex.quote(str(out))}"
-            console.print(f"{done} cases are in {out}; go on with: {again}", soft_wrap=True)
-        raise
+def _results(job: Job[T, R], tasks: Sequence[T], executor: Executor) -> Iterator[tuple[T, R]]:
+    if executor.cluster is None:
+        return pool.results(job.work, tasks, executor.workers, job.name)
+    return cluster.results(job.work, tasks, executor.cluster, job.name, executor.code)
 
 
 def bar(text: str, console: Console) -> Progress:

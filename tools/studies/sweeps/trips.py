@@ -14,10 +14,9 @@ from rich.table import Table as Printed
 from shared.bus.messages import Cause, Trip
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.process import DEFAULT_CONFIG
 from tools.runs import experiment
 from tools.studies.sweeps import study
-from tools.studies.sweeps.table import CaseTable, Row, code_digest, code_of
+from tools.studies.sweeps.table import Row, code_of
 from tools.studies.sweeps.trips_trial import PLANTS, TROUBLES, TripResult, run_trial
 from tools.verb_table import add_config
 
@@ -49,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         RunError: on this robot nothing trips.
     """
-    crew = study.executor_of(args, CODE)
+    executor = study.executor_of(args, CODE)
     robot = experiment.load_robot(args.config)
     if robot.gain_schedule is None:
         raise RunError(
@@ -61,17 +60,20 @@ def run(args: argparse.Namespace) -> int:
         {"number": number, "trouble": trouble, "on": plant}
         for number, (trouble, plant) in enumerate(grid)
     ]
-    out = study.folder(args.out, "trips")
     columns = [*begins[0], *TripResult.__struct_fields__]
-    with CaseTable(out, TABLE, columns, _inputs(args, robot, grid), WORDS, begins) as table:
-        missing = [
+    inputs = study.inputs("trips", robot, CODE, grid=repr(grid), seed=str(args.seed))
+    finished = study.run(
+        study.Study(
+            "trips", TABLE, columns, WORDS, inputs, begins, len(grid), JOB, _command(args)
+        ),
+        lambda done: [
             (number, trouble, plant, robot, args.seed)
             for number, (trouble, plant) in enumerate(grid)
-            if number not in table.numbers
-        ]
-        with study.resumable(table, out, _command(args), crew, console):
-            study.fill(table, JOB, missing, crew, len(grid), console)
-    rows = table.rows(len(grid))
+            if number not in done
+        ],
+        args.out, executor, console,
+    )  # fmt: skip
+    rows = finished.rows
     _show(rows, console)
     wrong = [row for row in rows if wrong_with(row)]
     for row in wrong:
@@ -80,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         )
     if not wrong:
         console.print("what was to trip did, and stood; nothing tripped for nothing", style="green")
-    console.print(f"{out / TABLE}", style="dim", soft_wrap=True)
+    finished.show_files(TABLE, "case", console)
     return 1 if wrong else 0
 
 
@@ -163,23 +165,9 @@ WORDS: Final = {
 JOB: Final = study.Job(_run_task, _name, _rows, lambda row: bool(row["fell_at_s"]))
 
 
-def _inputs(
-    args: argparse.Namespace, robot: RobotConfig, grid: Sequence[tuple[str, str]]
-) -> dict[str, str]:
-    return {
-        "study": "trips",
-        "grid": repr(grid),
-        "seed": str(args.seed),
-        "robot": study.digest_of(robot),
-        "code": code_digest(CODE),
-    }
-
-
 def _command(args: argparse.Namespace) -> str:
     """Return the command of this study, but for `--out`."""
-    words = [f"xrl sweep trips --seed {args.seed}"]
-    if args.config != DEFAULT_CONFIG:
-        words.append(f"--config {args.config}")
-    for flag in ("trouble", "on"):
-        words += [f"--{flag} {value!r}" for value in getattr(args, flag) or ()]
-    return " ".join(words)
+    flags = [
+        f"--{flag} {value!r}" for flag in ("trouble", "on") for value in getattr(args, flag) or ()
+    ]
+    return study.command("trips", args, f"--seed {args.seed}", *flags)

@@ -168,7 +168,7 @@ def test_the_command_is_of_this_study_whatever_its_numbers_are(robot: RobotConfi
     again = parser.parse_args(command.split()[3:])
     assert latency.trials_of(again) == latency.trials_of(args)
     assert again.lead_easing == args.lead_easing
-    assert latency._inputs(args, robot)["loss"] == "0.1234567,0.1234568"
+    assert latency._joined(args.loss) == "0.1234567,0.1234568"
     assert len({(t.draw, t.repeat) for t in latency.trials_of(args)}) == 2 * 4
     assert {latency.row_of(t)["delay_ms"] for t in latency.trials_of(args)} == {
         "0.00001",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -136,18 +137,29 @@ def test_two_studies_do_not_write_into_one_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [RunError("a worker was killed"), KeyboardInterrupt()])
-def test_a_study_that_loses_its_workers_says_how_to_go_on(
-    tmp_path: Path, error: BaseException, capsys: pytest.CaptureFixture[str]
+def test_an_interrupted_study_prints_how_to_resume(
+    tmp_path: Path,
+    error: BaseException,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    crew = study.Executor(2, "tcp://host:8786", ())
-    with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as table:
-        table.add({"number": 1, "value": 0.5})
-        again = study.resumable(table, tmp_path / "a b", "xrl sweep kill", crew, Console())
-        with pytest.raises(type(error)), again:
-            raise error
-    said = capsys.readouterr().out
-    words = f"xrl sweep kill --cluster tcp://host:8786 --out '{tmp_path / 'a b'}'"
-    assert f"1 cases are in {tmp_path / 'a b'}; go on with: {words}\n" in said
+    def one_and_stop(*_args: object) -> Iterator[tuple[int, float]]:
+        yield 1, 0.5
+        raise error
+
+    monkeypatch.setattr(study.cluster, "results", one_and_stop)
+    job = study.Job(
+        float, str, lambda n, value: [{"number": n, "value": value}], lambda _row: False
+    )
+    plan = study.Study("kill", "t.csv", COLUMNS, {}, INPUTS, (), 2, job, "xrl sweep kill")
+    executor = study.Executor(2, "tcp://host:8786", ())
+    out = tmp_path / "a b"
+    with pytest.raises(type(error)):
+        study.run(plan, lambda _done: [1, 2], out, executor, Console())
+    words = f"xrl sweep kill --cluster tcp://host:8786 --out '{out}'"
+    assert f"1 cases are in {out}; resume with: {words}\n" in capsys.readouterr().out
+    with CaseTable(out, "t.csv", COLUMNS, INPUTS) as table:
+        assert table.numbers == {1}
 
 
 def test_another_gain_schedule_is_another_robot(robot: RobotConfig) -> None:
