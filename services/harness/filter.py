@@ -1,16 +1,15 @@
-"""From leg forces to a wrench that can be trusted: tare, low-pass, saturation, staleness.
+"""Computes a valid wrench from leg forces: tare, low-pass, saturation, staleness.
 
-Pure: a state, the time and a sample go in, the next state and a reading come out
-(docs/law.md#harness). The rules:
+Pure: state, time and sample in, next state and reading out (docs/law.md#harness).
 
 - *Tare*: the mean leg forces over `tare_s` become the zero. A saturated cell, a gap
-  longer than `stale_ms`, or forces that moved too much begin it anew. Nothing is valid
-  until it is done. A load that rests still cannot be told from a zero.
-- *Low-pass*: first order at `low_pass_hz`, exact for any time between samples. After a
-  gap it therefore weighs the new sample as much as the gap was long.
+  longer than `stale_ms`, or forces that moved too much restart it. Nothing is valid until it is
+  done. A load at rest cannot be distinguished from a zero.
+- *Low-pass*: first order at `low_pass_hz`, exact for any time between samples. So after a gap the
+new sample's weight grows with the gap.
 - *Saturation*: a sample with any raw leg force at or beyond `leg_force_max` is not used.
 - *Staleness*: a sample is fresh while its age is at most `stale_ms`.
-- A sample with a number that is not finite is refused and counted, as if it never came.
+- A sample with a number that is not finite is refused and counted.
 """
 
 from __future__ import annotations
@@ -69,7 +68,7 @@ class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
 
 
 class FilteredWrench(msgspec.Struct, frozen=True, gc=False, kw_only=True):
-    """What the filter says at one moment."""
+    """Output of the filter."""
 
     wrench: Array
     """(6,) [force in N; moment in N m], torso axes, about the harness point."""
@@ -104,7 +103,7 @@ def tared_state(offset: Array) -> FilterState:
 
 
 def start_tare(state: FilterState) -> FilterState:
-    """Return the state with the tare begun, unless it runs already."""
+    """Return the state with the tare started, unless it runs already."""
     return state if state.tare is not Tare.DONE else _begin_tare(state, Tare.RUNNING)
 
 

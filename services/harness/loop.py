@@ -1,4 +1,4 @@
-"""The loop of the harness service: read, tare if asked to, filter, publish."""
+"""The loop of the harness service: read, tare on request, filter, publish."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class HarnessLoop:
         self._requests = requests
 
     def cycle(self, now_ns: int) -> Wrench:
-        """Read, tare if asked to, filter, publish; return what was published.
+        """Read, tare on request, filter, publish; return the published message.
 
-        The wrench is in torso axes: the sensor is fixed to the torso and knows no other.
+        The wrench is in torso axes: the sensor is fixed to the torso.
         """
         sample = self._sensor.read(now_ns)
         if self._requests.take() is not None:

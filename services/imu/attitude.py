@@ -1,11 +1,11 @@
-"""From the IMU's orientation to which way is up, seen from the torso. Pure.
+"""Computes the unit vector up in torso axes from the IMU's orientation. Pure.
 
 A quaternion that turns sensor axes into axes whose z is up has, as the third row of its rotation,
-up in sensor axes; the heading, which a magnet beside steel gets wrong, drops out. The mounting
+up in sensor axes; the heading, which is wrong beside steel, drops out. The mounting
 turns sensor axes into torso axes.
 
-A sample is refused and counted, as if it never came, if its quaternion is not of unit length: then
-the frames do not mean what they are taken for.
+A sample whose quaternion is not of unit length is refused and counted: then the frames have another
+meaning.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Rotation = tuple[Vector3, Vector3, Vector3]
 
 
 class AttitudeReading(NamedTuple):
-    """What is known at one moment."""
+    """Output of the attitude filter."""
 
     up: Vector3
     """Unit vector against gravity, torso axes."""

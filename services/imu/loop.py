@@ -37,7 +37,7 @@ class ImuLoop:
         self._sensor, self._law, self._publisher = sensor, law, publisher
 
     def cycle(self, now_ns: int) -> Attitude:
-        """Read, and publish which way is up; return what was published."""
+        """Read, publish the vector up; return the published message."""
         reading = self._law.step(now_ns, self._sensor.newest(now_ns))
         message = Attitude(
             t_ns=now_ns,

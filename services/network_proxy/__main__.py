@@ -1,6 +1,6 @@
-"""`python -m services.network_proxy`: a bad network on purpose.
+"""`python -m services.network_proxy`: impairs the network between the services on purpose.
 
-They dial it (`--injected`) in place of one another; `xrl inject` says what it is to do.
+Services dial it (`--injected`) in place of one another; `xrl inject` controls it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from shared.network.proxy_protocol import SOCKET
 from shared.priority import raise_priority
 
 FIFO_PRIORITY = 15
-"""With those whose messages it passes on: what it delays by itself is not asked for."""
+"""Priority of the services whose messages it forwards: its own delay must be small."""
 _UNIX = "unixsock-stream/"
 
 

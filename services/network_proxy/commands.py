@@ -1,4 +1,4 @@
-"""Carries out what is asked on the control socket."""
+"""Carries out the requests of the control socket."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Orders:
         """Take where it is kept."""
         self._injections = impairments
         self.changed = False
-        """Something has begun or ended; the loop clears it."""
+        """An impairment has started or ended; the loop clears it."""
 
     def obey(self, request: Request) -> Reply:
-        """Carry a request out and tell what is asked for now."""
+        """Carry a request out and reply with the impairments."""
         at_ns = now_ns()
         try:
             if isinstance(request, Begin):

@@ -21,13 +21,13 @@ class Connection:
         watch: SocketWatch,
         taken: Callable[[Connection, Flow, list[Waiting], int], None],
     ) -> None:
-        """Begin to watch both ends.
+        """Start to watch both ends.
 
         Args:
-            ends: of the one that dialled, and of the other; they do not block.
+            ends: sockets of the dialling side and of the other; they do not block.
             directions: from the first to the second, and back.
             watch: of the loop.
-            taken: is given what a flow has read, at what time, ns.
+            taken: called with what a flow has read, and the time, ns.
         """
         first, second = ends
         there, back = Flow(first, second, directions[0]), Flow(second, first, directions[1])
@@ -49,15 +49,15 @@ class Connection:
 
     @property
     def over(self) -> bool:
-        """True once an end has come through, or both have left: then nobody hears the rest.
+        """True once an end has received everything, or both have left: nobody receives the rest.
 
-        Zenoh closes both ways at once: who speaks no more does not listen either.
+        Zenoh closes both ways at once: an end that sends no more does not receive either.
         """
         there, back = self.flows
         return there.over or back.over or (there.ended and back.ended)
 
     def look(self) -> None:
-        """Watch the ends for what the flows want of them now."""
+        """Watch the ends for the events that the flows need now."""
         there, back = self.flows
         wanted = (
             (READ if there.reads else 0) | (WRITE if back.writes else 0),
@@ -70,7 +70,7 @@ class Connection:
             self._watch.want(flow.source, events, ready)
 
     def part(self) -> None:
-        """Close both ends; what is held is lost."""
+        """Close both ends; held messages are lost."""
         self.parted = True
         for flow, ready in zip(self.flows, self._ready, strict=True):
             self._watch.want(flow.source, 0, ready)
@@ -78,7 +78,7 @@ class Connection:
             flow.drop()
 
     def _is_ready(self, says: Flow, hears: Flow, events: int, now_ns: int) -> None:
-        """Go on at an end: what one flow reads, and the other writes."""
+        """Continue at an end: one flow reads there, the other writes."""
         if self.parted:
             return  # in this same turn
         if events & WRITE:

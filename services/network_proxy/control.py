@@ -20,7 +20,7 @@ _decode = msgspec.json.Decoder(Request).decode
 
 
 class _Asker:
-    """One who asks: what came of its next requests, and what is left of the last answer."""
+    """A client: the rest of its next request, and of the last reply."""
 
     def __init__(self, end: socket.socket) -> None:
         self.end = end
@@ -67,12 +67,12 @@ class ControlSocket:
         """Listen.
 
         Args:
-            path: of the socket; what a killed network proxy left there is removed.
+            path: of the socket; the file of a killed network proxy is removed.
             obey: carries a request out.
             watch: of the loop.
 
         Raises:
-            BusError: it is not possible there.
+            BusError: no socket can be made there.
         """
         self._obey, self._watch = obey, watch
         self._askers: list[_Asker] = []

@@ -10,8 +10,9 @@ from services.network_proxy.wire import Splitter, carries_messages
 from shared.network.impairment import HELD, Direction, Impairer
 
 PENDING_MAX: Final = 262_144
-"""Bytes that are due and wait for a receiver that takes none: then the sender is read no
-more, as on a link of its own."""
+"""Due bytes that wait for a slow receiver. Above it the sender is no longer read, as on a direct
+link.
+"""
 WAITING_MAX: Final = 4_194_304
 """Bytes that are not due yet: then, too, the sender is read no more. Ten seconds of states."""
 _READ: Final = 65_536
@@ -39,9 +40,9 @@ class Flow:
         """Take two connected sockets that do not block.
 
         Args:
-            source: where batches come from.
-            sink: where they go.
-            direction: what is done to them.
+            source: batches are read from it.
+            sink: batches are written to it.
+            direction: its impairments.
         """
         self.source, self.sink, self.direction = source, sink, direction
         self.ended = False
@@ -57,7 +58,7 @@ class Flow:
         self._sent = 0
         self._since_ns: int | None = None
         self._own_ns = 0
-        """When the last of what the link says for itself comes out."""
+        """Release time of the newest batch of the link's own traffic."""
         self._stream_ns = 0
         """When the last comes out that nothing may overtake."""
 
@@ -97,7 +98,7 @@ class Flow:
         return found + self._keep(rows)
 
     def release(self, now_ns: int) -> list[Waiting]:
-        """Return what a partition that is over has held back; it comes out as what comes now."""
+        """Release what a partition that is over has held back; it comes out like new batches."""
         impairer = self.direction.active
         if not self._held or (impairer is not None and impairer.what.partition):
             return []
@@ -105,7 +106,7 @@ class Flow:
         return [self._resumed(row, now_ns) for row in found]
 
     def put(self, row: Waiting) -> None:
-        """Write a batch that is due, or keep what the sink does not take."""
+        """Write a due batch, and keep the part that the sink does not take."""
         self._waits -= len(row.batch)
         if self.broken:
             row.lose()
@@ -117,7 +118,7 @@ class Flow:
             self._send(row)
 
     def flush(self) -> None:
-        """Write what the sink takes."""
+        """Write as much as the sink takes."""
         try:
             sent = self.sink.send(self._pending)
         except BlockingIOError:
@@ -146,7 +147,7 @@ class Flow:
         return 0 if self._since_ns is None else now_ns - self._since_ns
 
     def drop(self) -> None:
-        """Count as lost what is held or not yet written: the connection is gone."""
+        """Count held and unwritten messages as lost: the connection is gone."""
         self._break()
         for row in self._held:
             row.lose()
@@ -176,7 +177,7 @@ class Flow:
             self._put_off(row, row.batch[sent:])
 
     def _keep(self, rows: list[Waiting]) -> list[Waiting]:
-        """Hold back what a partition holds; return the rest."""
+        """Hold back the messages of a partition; return the rest."""
         found: list[Waiting] = []
         for row in rows:
             self._waits += len(row.batch)
@@ -206,9 +207,9 @@ class Flow:
         return release_ns
 
     def _not_before(self, release_ns: int) -> int:
-        """Return a message's release; never before what is on a stream and went before it.
+        """Return a message's release time, never before an earlier message on the same stream.
 
-        Also once that impairment is over: what it has delayed still stands before it.
+        This holds after an impairment has ended too: messages that it delayed still come first.
         """
         if release_ns == HELD:
             return HELD

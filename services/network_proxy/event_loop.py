@@ -12,7 +12,7 @@ READ: Final = selectors.EVENT_READ
 WRITE: Final = selectors.EVENT_WRITE
 
 Ready: TypeAlias = Callable[[int, int], None]
-"""Called with what a socket is ready for (READ, WRITE) and the time, ns."""
+"""Called with a socket's readiness (READ, WRITE) and the time, ns."""
 
 
 class SocketWatch:
@@ -39,10 +39,10 @@ class SocketWatch:
             self._selector.register(end, events, ready)
 
     def wait(self, patience_s: float) -> list[tuple[Ready, int]]:
-        """Wait for the first to be ready; return whom to call with what, after `patience_s` none.
+        """Wait until a socket is ready; return callbacks and readiness, none after `patience_s`.
 
-        The selector itself would round the patience up to a whole millisecond, and delay by
-        that what is asked to be late by less. So it is waited for, as one socket.
+        The selector itself would round the patience up to a whole millisecond, longer than some
+        requested delays. So its epoll is waited for, as one socket.
         """
         if not select.select([self._selector], [], [], patience_s)[0]:
             return []

@@ -15,10 +15,10 @@ class SocketListener:
     """Accepts without ever waiting."""
 
     def __init__(self, path: Path) -> None:
-        """Listen on a path; what a killed process left there is removed.
+        """Listen on a path; the file of a killed process is removed.
 
         Raises:
-            BusError: it is not possible there.
+            BusError: no socket can be made there.
         """
         self.turned_away = 0
         """Connections for which there was no descriptor."""

@@ -12,8 +12,9 @@ from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.process import StopFlag
 
 LOOK_S: Final = 0.02
-"""Longest wait: the stop flag is looked at so often. What is told then still has to find the
-recorder, which listens for 0.1 s after its own stop."""
+"""Longest wait, s: period of the look at the stop flag. The last events must still reach the
+recorder, which listens for 0.1 s after its own stop.
+"""
 
 
 def run(

@@ -13,7 +13,7 @@ from shared.exceptions import BusError
 
 
 class Address(NamedTuple):
-    """Where a process listens, looked up already: to dial it, nobody is asked."""
+    """A resolved endpoint of a process: dialling it needs no name lookup."""
 
     family: socket.AddressFamily
     where: Any
@@ -61,10 +61,10 @@ class Place:
 
 
 def address_of(endpoint: str) -> Address:
-    """Return where a Zenoh endpoint is. Looks names up, so it may block: at the start only.
+    """Resolve a Zenoh endpoint. A name lookup may block: at the start only.
 
     Raises:
-        BusError: it is neither a UNIX socket nor TCP, or there is no such host.
+        BusError: the endpoint is neither a UNIX socket nor TCP, or the host is unknown.
     """
     kind, _, place = endpoint.partition("/")
     if kind == "unixsock-stream":

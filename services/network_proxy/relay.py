@@ -39,13 +39,13 @@ class Relay:
         watch: SocketWatch,
         lease_ns: int,
     ) -> None:
-        """Begin to listen.
+        """Start to listen.
 
         Args:
             places: one for each pair.
-            directions: what is done to each direction, by name; others pass at once.
+            directions: impairments by the direction's name; others forward at once.
             watch: of the loop.
-            lease_ns: after which Zenoh gives up a link that is silent.
+            lease_ns: time after which Zenoh gives up a silent link.
         """
         self._directions, self._watch, self._lease_ns = directions, watch, lease_ns
         self._links: dict[Place, list[Connection]] = {place: [] for place in places}
@@ -125,7 +125,7 @@ class Relay:
     def _pass_on(
         self, connection: Connection, flow: Flow, rows: list[Waiting], now_ns: int
     ) -> None:
-        """Let out what is due, and keep the rest until it is."""
+        """Release what is due, and keep the rest."""
         for row in rows:
             if row.release_ns <= now_ns:
                 flow.put(row)

@@ -1,10 +1,10 @@
-"""What passes a link of Zenoh: batches on a stream, and which of them carry messages.
+"""Zenoh's wire format: batches on a stream, and which of them carry messages.
 
-On a stream each batch is a length of two bytes, little endian, and so many bytes after it.
-A batch holds frames; a frame a header, a sequence number, extensions and network messages
-(zenoh-protocol, wire version 9). Messages of the application are PUSH; all else (opening a
-link, declaring what one subscribes to, keeping alive) is the link's own affair: a datagram
-network would have it sent again, a stream does not, so it may come late but never be lost.
+On a stream each batch is a length of two bytes, little endian, then as many bytes. A batch holds
+frames; a frame a header, a sequence number, extensions and network messages (zenoh-protocol, wire
+version 9). Messages of the application are PUSH; all else (opening a link, declaring subscriptions,
+keeping alive) is the link's own traffic. A datagram network would retransmit it and a stream does
+not, so it may be late but never lost.
 """
 
 from __future__ import annotations

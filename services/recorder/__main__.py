@@ -1,10 +1,10 @@
 """Recorder: `python -m services.recorder --out DIR` writes DIR/run.mcap until stopped.
 
-An existing file is never replaced by a new run: that is then run-1.mcap, run-2.mcap, ...
-A long run is split into run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says.
-What an earlier recorder did not finish in DIR is recovered meanwhile. With --snapshot
-nothing is written until there is a fault. SIGTERM and SIGINT finish the file; after
-SIGKILL what was flushed is recovered by the next recorder, or by `xrl recover`.
+A new run never replaces a file: it is then run-1.mcap, run-2.mcap, ... A long run is split into
+run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says. Unfinished files of earlier
+recorders in DIR are recovered meanwhile. With --snapshot nothing is written until a fault. SIGTERM
+and SIGINT finish the file; after SIGKILL the next recorder, or `xrl recover`, recovers what was
+flushed.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class SnapshotRequest:
         self._asked = True
 
     def take(self) -> bool:
-        """Return True if it was asked for since the last call."""
+        """Return True if a snapshot was requested since the last call."""
         asked, self._asked = self._asked, False
         return asked
 
@@ -108,7 +108,7 @@ def main() -> int:
 
 
 def _record(recording: Recorder, stop: StopFlag, asked: SnapshotRequest) -> None:
-    """Record until `stop`, then what is left.
+    """Record until `stop`, then the queued rest.
 
     Raises:
         RunError: the file cannot be written.

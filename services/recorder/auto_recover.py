@@ -1,7 +1,7 @@
-"""Recovers what earlier recorders did not finish, while this one records.
+"""Recovers unfinished files of earlier recorders while this one records.
 
-A thread, for what is happening now must not wait for what happened before: a file of an
-hour takes a minute. It leaves half of its time to the recorder's loop.
+It is a thread, because recording must not wait: a file of an hour takes a minute. It leaves half of
+its time to the recorder's loop.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class AutoRecovery(threading.Thread):
 
         Args:
             directory: of the runs.
-            keep_free: bytes that are to stay free beside a copy.
-            logger: for what was recovered.
+            keep_free: bytes to leave free beside a copy.
+            logger: for the outcomes.
         """
         super().__init__(name="auto_recovery", daemon=True)
         self._directory, self._keep_free = directory, keep_free
@@ -68,12 +68,12 @@ def recover_in_place(
 ) -> None:
     """Recover one file, if it is unfinished and nobody writes it.
 
-    What was only cut off is replaced by its recovered copy once that is on the disk. If
+    A file that was only cut off is replaced by its recovered copy once that is on the disk. If
     there is damage in the middle as well, the original stays and the copy goes beside it.
 
     Raises:
         RunError: it cannot be read, or the copy cannot be written.
-        Interrupted: `stop` said so.
+        Interrupted: `stop` returned True.
         OSError: it cannot be opened.
     """
     beside = recovered_name(path)

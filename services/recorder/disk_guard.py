@@ -21,7 +21,7 @@ CALM: Final = 2.5
 
 
 class DiskChange(Enum):
-    """What the newest look at the disk has changed."""
+    """Change at the newest look at the disk."""
 
     NONE = 0
     LOW = 1

@@ -1,4 +1,4 @@
-"""What the recorder does from cycle to cycle: write, flush, sync, split, watch the disk."""
+"""Cycles of the recorder: write, flush, sync, split, watch the disk."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ class Recorder:
         now_ns: int,
         snapshot: SnapshotRing | None = None,
     ) -> None:
-        """Begin with a look at the disk, and the first file unless there is a snapshot.
+        """Look at the disk, and start the first file unless there is a snapshot.
 
         Args:
             source: the bus.
-            writer: of the run, with no file begun.
+            writer: of the run, with no file started.
             config: periods and limits.
-            logger: for what is worth a line.
-            free_bytes: tells the free space where the run is written.
+            logger: for notable changes.
+            free_bytes: returns the free space where the run is written.
             now_ns: monotonic.
-            snapshot: write only what belongs to a fault.
+            snapshot: write only the messages around a fault.
 
         Raises:
             RunError: the first file cannot be written.
@@ -81,7 +81,7 @@ class Recorder:
             self._begin(now_ns, {})
 
     def cycle(self, now_ns: int) -> None:
-        """Take what has come, and do what is due.
+        """Write new messages, and do what is due.
 
         Raises:
             RunError: the file cannot be written.
@@ -168,7 +168,7 @@ class Recorder:
                 pass
 
     def close(self) -> None:
-        """Take what is left; the writer finishes the file.
+        """Write the queued rest; the writer finishes the file.
 
         Raises:
             RunError: the file cannot be written.
@@ -185,7 +185,7 @@ def free_bytes_at(directory: Path) -> int:
     """Return the free space where a directory is or will be.
 
     Raises:
-        OSError: it cannot be told.
+        OSError: it cannot be read.
     """
     while not directory.exists() and directory != directory.parent:
         directory = directory.parent

@@ -1,9 +1,8 @@
 """`--snapshot SECONDS`: the last seconds in memory, written only when there is a fault.
 
-A fault is: a module goes to FAULT or DAMP, an emergency stop, a steady sender that falls
-silent (a service that died says nothing), or a word from outside (SIGUSR1). What came up
-to SECONDS before it and for SECONDS after it is written; another fault meanwhile makes
-it longer. Memory is bounded: what does not fit is dropped from the old end.
+A fault is: a module goes to FAULT or DAMP, an emergency stop, a steady sender that falls silent (a
+dead service publishes no fault), or SIGUSR1. Messages from SECONDS before it to SECONDS after it
+are written; another fault extends that. Memory is bounded: the oldest messages are dropped first.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ FAULTS: Final = frozenset((Mode.FAULT, Mode.DAMP))
 """Modes of a joint service that are worth a file."""
 
 STEADY: Final = (topics.JOINT_STATE, topics.PLANNER_STATUS, topics.WRENCH)
-"""Senders that are missed when they fall silent, once they were heard."""
+"""Senders whose silence is a fault, once they have sent."""
 
 SILENT_NS: Final = NS_PER_S
 """At their rates, 250 messages."""
@@ -38,7 +37,7 @@ class _Event(msgspec.Struct, gc=False):
 
 
 class SnapshotRing:
-    """A ring of messages, and whether it is to be written; a `MessageSource` of what is."""
+    """A ring of messages; a `MessageSource` of those to be written."""
 
     def __init__(self, seconds: float, most_bytes: int, keys: Mapping[str, Topic]) -> None:
         """Keep the messages of some keys.
@@ -51,7 +50,7 @@ class SnapshotRing:
         self.dropped = 0
         """Messages younger than `seconds` that memory had no room for."""
         self.reason = ""
-        """What the newest fault was."""
+        """Description of the newest fault."""
         self._ring: deque[tuple[str, bytes, int]] = deque()
         self._bytes = 0
         self._most = most_bytes
@@ -81,7 +80,7 @@ class SnapshotRing:
         return self._until_ns is not None
 
     def take_from(self, source: MessageSource, at_most: int) -> int:
-        """Keep what has come; return the number of messages."""
+        """Store new messages; return their number."""
         taken = 0
         ring, special = self._ring, self._special
         while taken < at_most and (item := source.take()) is not None:
@@ -107,10 +106,10 @@ class SnapshotRing:
         return news
 
     def pass_time(self, now_ns: int) -> None:
-        """Look for who fell silent, and forget what is older than the ring is long."""
+        """Detect silent senders, and drop messages older than the ring's length."""
         for key, heard_ns in list(self._heard.items()):
             if now_ns - heard_ns > SILENT_NS:
-                del self._heard[key]  # until it is heard again
+                del self._heard[key]  # until it sends again
                 self.trigger(f"{key} is silent", now_ns)
         if self._until_ns is None:
             self._forget_before(now_ns - self._span_ns)

@@ -79,7 +79,7 @@ class Actuation:
         return acting if self.flexible is None else self.flexible.step(acting, q, v)
 
     def encoders(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return what the encoders tell: motor angles (12,), turns, and true rates, turn/s."""
+        """Return the encoders' motor angles (12,), turns, and the true rates, turn/s."""
         if self.flexible is not None:
             q, v = self.flexible.theta, self.flexible.rate
         turns = self._turns @ q

@@ -1,10 +1,10 @@
 """Twelve emulated ODrive axes: state machine, watchdogs, checks and errors (docs/drives.md).
 
-Firmware 0.5.6; the traps are kept on purpose: OVERSPEED disarms in torque mode too, a
-disarmed axis floats while its sibling keeps its torque, the watchdog runs in IDLE as well,
-re-arming does not zero `input_torque`, a mode that is set moves `input_pos` to the motor, an
-axis can be in IDLE with `axis_error` 0, an encoder that is lost goes on reading what it did and
-is back without the turns made meanwhile, and a restart brings back what was saved of the settings.
+Firmware 0.5.6; the traps are kept on purpose: OVERSPEED disarms in torque mode too, a disarmed axis
+floats while its sibling keeps its torque, the watchdog runs in IDLE as well, re-arming does not
+zero `input_torque`, setting a mode moves `input_pos` to the motor, an axis can be in IDLE with
+`axis_error` 0, a lost encoder keeps its last reading and returns without the turns made meanwhile,
+and a restart restores the saved settings.
 
 Pure: no clock, no I/O. Axes 2i and 2i + 1 are axis0 and axis1 of module i, one ODrive.
 Units at the motor: turns, turn/s, N m, A.
@@ -69,11 +69,11 @@ class AxisBank:
         Args:
             drive: the robot file's `[drive]`.
             encoder_counts_per_turn: of the encoders themselves.
-            watchdog: whether the drives' watchdogs run.
-            settings: of the drives; None: as the services want them (`configured`).
-            zeroed: whether they have been told where their motors are (`drive.zero_mark_turns`);
-                else they know it within a turn, as after any loss of power.
-            motor_signs: which way each motor counts; so does its mark.
+            watchdog: True if the drives' watchdogs run.
+            settings: of the drives; None: as the services need them (`configured`).
+            zeroed: True if their zero was written (`drive.zero_mark_turns`). Else they know the
+                motor's angle within a turn only, as after any loss of power.
+            motor_signs: sign of each motor's count and of its zero mark.
         """
         self.settings = settings or configured(
             drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
@@ -140,7 +140,7 @@ class AxisBank:
                 self._fail(axis, BUS_FAULTS[why])
         return self.torque
 
-    # ---- what a front asks for
+    # ---- requests of a front
 
     def feed(self, axis: int) -> None:
         """Feed an axis's watchdog: any CAN frame to it does."""
@@ -193,7 +193,7 @@ class AxisBank:
     def clear_errors(self, axis: int) -> None:
         """Clear all errors of the axis's ODrive: the firmware clears both axes.
 
-        What is still so (heat, a lost encoder, the bus) is an error again at the next step.
+        A cause that lasts (heat, a lost encoder, the bus) sets its error again at the next step.
         """
         for each in _both(axis):
             self.faults[each] = AxisErrors()
@@ -222,11 +222,11 @@ class AxisBank:
         self.conditions.boot(drive, self.now_s)
 
     def talks(self, axis: int) -> bool:
-        """Return True if the axis's ODrive can be heard and can hear: powered, up, plugged in."""
+        """Return True if the axis's ODrive communicates: powered, started, plugged in."""
         return axis not in self.conditions.silent
 
     def heartbeat(self, axis: int) -> Heartbeat:
-        """Return what the axis reports of itself."""
+        """Return the axis's heartbeat."""
         fault = self.faults[axis]
         return Heartbeat(
             fault.axis,
@@ -264,7 +264,7 @@ class AxisBank:
     # ---- within a step
 
     def _live_with_conditions(self) -> None:
-        """Do what is rare: drives that come up, conditions, calibrations."""
+        """Handle rare changes: drives that start, conditions, calibrations."""
         for drive in self.conditions.come_up(self.now_s):
             for axis in _both(2 * drive):
                 self.state[axis] = AxisState.IDLE
@@ -276,7 +276,7 @@ class AxisBank:
             self._become(axis, self.calibration.advance(axis, self.now_s, turns))
 
     def _check_watchdogs(self) -> None:
-        """Disarm what has not been fed."""
+        """Disarm axes whose watchdog was not fed."""
         if self._seen != self.settings.version:
             self._seen = self.settings.version
             enabled = self.settings.axis("config.enable_watchdog") > 0.0

@@ -1,7 +1,7 @@
-"""Calibration of the emulated axes: what is calibrated, and the sequences that make it so.
+"""Calibration of the emulated axes: what each has, and the sequences that calibrate.
 
-The shaft is not turned here. An encoder's calibration fails where the shaft moves by itself,
-as under a load: the firmware finds that it did not go where it was driven.
+The shaft is not turned here. An encoder's calibration fails if the shaft moves by itself, as under
+a load: the firmware finds that it did not follow.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Calibration:
     """Which axes are calibrated, and which are at it."""
 
     def __init__(self, settings: Settings) -> None:
-        """Begin with what is `pre_calibrated`."""
+        """Start with what is `pre_calibrated`."""
         self._settings = settings
         self.motor = [False] * N_JOINTS
         """`motor.is_calibrated`"""
@@ -53,7 +53,7 @@ class Calibration:
             self.restart(axis)
 
     def restart(self, axis: int) -> None:
-        """Forget an axis's calibration but for what its settings keep."""
+        """Reset an axis's calibration to what its settings keep."""
         column = self._settings.axis
         self.motor[axis] = bool(column("motor.config.pre_calibrated")[axis])
         self.encoder[axis] = bool(column("encoder.config.pre_calibrated")[axis])

@@ -1,7 +1,7 @@
-"""What the emulated drives are in: power, cables, heat, encoders. Set by faults, not by fronts.
+"""Conditions of the emulated drives: power, cables, heat, encoders. Set by faults, not by fronts.
 
-A condition stays until it is ended, and what it does to an axis comes again at every step:
-errors that are cleared in the heat are back at once.
+A condition lasts until it is ended, and acts again at every step: errors that are cleared in the
+heat return at once.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Conditions:
 
     Attributes:
         down: the drives (0 .. 5) that are without power or starting up.
-        silent: the axes (0 .. 11) that neither hear nor are heard: down, or the cable out.
+        silent: the axes (0 .. 11) without communication: down, or the cable out.
         blind: the axes (0 .. 11) whose encoder is lost.
         temperature: of each axis's output stage (12,), C.
     """
@@ -60,7 +60,7 @@ class Conditions:
         self._hush()
 
     def power_off(self, drive: int) -> None:
-        """Keep a drive down until it is told to boot."""
+        """Keep a drive down until `boot`."""
         self.down.add(drive)
         self._up_s[drive] = math.inf
         self._hush()
@@ -81,7 +81,7 @@ class Conditions:
         """Take an axis's encoder away, or bring it back."""
         if lost:
             self.blind.add(axis)
-            self._control.blind(axis)  # what it says now it goes on saying
+            self._control.blind(axis)  # it keeps its last reading
         elif axis in self.blind:
             self.blind.remove(axis)
             self._control.see_again(axis)

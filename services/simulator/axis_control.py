@@ -5,9 +5,9 @@ pos_gain (input_pos - pos)) - vel) + integrator, clamped to current_lim; input_v
 input_torque are each clamped to the same limits first. The firmware runs its loop at 8 kHz;
 here it is evaluated once a step, with filters discretised exactly for the step's length.
 
-Left out, each below what a joint feels: the firmware's estimate moves in quanta (one count in
-position, 0.0076 turn/s in velocity, which snaps to 0 below half of that), and the current
-follows its set-point with the current loop's 1 ms; here a step's torque is at once there.
+Two effects are left out; neither changes a joint's motion. The firmware's estimate moves in quanta
+(one count in position, 0.0076 turn/s in velocity, which snaps to 0 below half of that). The current
+follows its setpoint with the current loop's 1 ms; here a step's torque acts at once.
 
 Pure: no clock, no I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns,
 turn/s, N m, A.
@@ -33,12 +33,12 @@ INTEGRATOR_DECAY: Final = 0.99
 
 
 class _LostEncoder(NamedTuple):
-    """What is left of an encoder that has stopped answering."""
+    """State of an encoder that has stopped answering."""
 
     at: int
     """Its count then."""
     said: int | None
-    """What it counts from when it is back; None: from its place within a turn."""
+    """Its count when it returns; None: its angle within a turn."""
     pos: float
     vel: float
     """The last estimates, turns and turn/s."""
@@ -123,7 +123,7 @@ class AxisControl:
         self._rows[:2, axis] = lost.pos, lost.vel
 
     def see_again(self, axis: int) -> None:
-        """Start an axis's estimates anew; turns that it made meanwhile nobody has counted."""
+        """Restart an axis's estimates; turns made meanwhile are not counted."""
         lost = self._lost.pop(axis, None)
         if lost is None:
             return
@@ -242,7 +242,7 @@ class AxisControl:
         self._integrator_limit = axis("controller.config.vel_integrator_limit").copy()
 
     def _discretise(self, dt_s: float) -> None:
-        """Work out the PLLs' transition over a step.
+        """Compute the PLLs' transition over a step.
 
         With s = (count now - count before) / dt the errors e = (count - position,
         s - velocity) follow e' = [[-2w, 1], [-w^2, 0]] e, a double pole at the bandwidth w.

@@ -43,7 +43,7 @@ def _motor(error: MotorError) -> AxisErrors:
 
 
 def controller_fault(error: ControllerError) -> AxisErrors:
-    """Return what is left of a controller that fails: it gives no torque."""
+    """Return the torque of a failed controller: none."""
     no_command = MotorError.UNKNOWN_TORQUE | MotorError.UNKNOWN_VOLTAGE_COMMAND
     axis = AxisError.CONTROLLER_FAILED | AxisError.MOTOR_FAILED
     return AxisErrors(axis, motor=no_command, controller=error)

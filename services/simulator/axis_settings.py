@@ -157,8 +157,8 @@ class Settings:
     def current(self, axis: int, torque: float) -> float:
         """Return the current that an axis (0 .. 11) reports for a motor torque, A.
 
-        The firmware turns the torque round where the encoder's calibration has found that the
-        phases are wired the other way (Motor::update), so the current has that sign.
+        The firmware reverses the torque where the encoder's calibration found reversed phases
+        (Motor::update), so the current has that sign.
         """
         amperes = float(torque / self._axes["motor.config.torque_constant"][axis])
         return -amperes if self._axes["encoder.config.direction"][axis] < 0.0 else amperes
@@ -172,7 +172,7 @@ class Settings:
         self._saved[drive] = self.table(drive)
 
     def restore(self, drive: int) -> None:
-        """Take a drive's settings back to what was saved, as a restart does."""
+        """Restore a drive's saved settings, as a restart does."""
         for name, value in self._saved[drive].items():
             self.set(drive, name, value)
 
@@ -210,7 +210,7 @@ def configured(
 
 
 def plant(settings: Settings, words: str) -> None:
-    """Set and save one setting of one drive, as somebody may have left it.
+    """Set and save one setting of one drive, as a person may have left it.
 
     Args:
         settings: of all drives.

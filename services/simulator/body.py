@@ -1,8 +1,8 @@
-"""The true robot: what the robot file says, with the plant's errors laid over it.
+"""The true robot: the robot file with the plant's errors applied.
 
-The world steps this and nothing else: it holds no robot file, so what a controller believes and
-what is true can differ in every number. The one generated model (`shared.robot.robot_model`) is the
-nominal one; masses, friction, floor and feet are changed on it here.
+The world steps this and holds no robot file, so a controller's model and the truth can differ in
+every number. The generated model (`shared.robot.robot_model`) is the nominal one; masses, friction,
+floor and feet are changed on it here.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def body_of(config: RobotConfig, plant: PlantConfig) -> Body:
     """Return the true robot.
 
     Args:
-        config: what the controllers believe.
+        config: the robot as its controllers know it.
         plant: how the truth differs.
     """
     spec = mujoco.MjSpec.from_string(mjcf(config))
@@ -170,7 +170,7 @@ def _set_floor(spec: mujoco.MjSpec, config: RobotConfig, plant: PlantConfig, ank
         )  # fmt: skip
         grounds.append(block)
     for sole in soles:
-        sole.contype = sole.conaffinity = 0  # it touches what is named here, and nothing else
+        sole.contype = sole.conaffinity = 0  # only the pairs named here touch
         for ground in grounds:
             torsional, rolling = MINOR_FRICTION
             spec.add_pair(

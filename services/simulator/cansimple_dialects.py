@@ -68,13 +68,13 @@ _ERRORS_06: Final[tuple[tuple[str, int, DriveError06], ...]] = (
 SDO_ENDPOINTS: Final[Mapping[int, str]] = dict(
     enumerate(("vbus_voltage", "ibus", *DRIVE_SETTINGS, *AXIS_SETTINGS), start=1)
 )
-"""Endpoint ids of the emulated 0.6 drive; an axis's settings are those of the node asked."""
+"""Endpoint ids of the emulated 0.6 drive; an axis's settings are those of the addressed node."""
 
 _READINGS: Final = ("vbus_voltage", "ibus")
 
 
 class Dialect(NamedTuple):
-    """What a firmware reports and takes in its own way."""
+    """Frames that a firmware encodes in its own way."""
 
     heartbeat: Answer
     estimates: Callable[[AxisBank], tuple[Vector, Vector]]
@@ -118,7 +118,7 @@ def _heartbeat_06(bank: AxisBank, axis: int) -> bytes:
 
 
 def _estimates_05(bank: AxisBank) -> tuple[Vector, Vector]:
-    """Return what the controllers see: 0.5.6 asks them, and they see nothing before they ran."""
+    """Return the controllers' estimates, which 0.5.6 reports: zero before they have run."""
     connected = bank.connected > 0.0
     return np.where(connected, bank.pos_estimate, 0.0), np.where(connected, bank.vel_estimate, 0.0)
 

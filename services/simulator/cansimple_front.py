@@ -32,8 +32,8 @@ class CanSimpleFront:
     """Applies received frames to the bank and sends its estimates and heartbeats.
 
     `nodes[i]` maps the CAN node ids on `hubs[i]` to axes of the bank. A drive that does not
-    talk (no power, starting up, cable out) neither hears nor sends. How often an axis sends is
-    its settings' matter: `config.can.encoder_rate_ms`, `config.can.heartbeat_rate_ms`.
+    communicate (no power, starting up, cable out) neither receives nor sends. An axis's settings
+    give its rates: `config.can.encoder_rate_ms`, `config.can.heartbeat_rate_ms`.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ def _periods_s(periods_ms: NDArray[np.float64]) -> list[float]:
 
 
 class _Bus:
-    """A hub with its axes, and what is worked out once."""
+    """A hub with its axes, and values computed once."""
 
     def __init__(
         self, hub: UnixCanHub, nodes: Mapping[int, int], setters: Mapping[int, Setter]

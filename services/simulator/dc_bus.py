@@ -1,10 +1,9 @@
-"""The DC bus of each emulated ODrive: what its motors draw, and what they push back.
+"""The DC bus of each emulated ODrive: current of its motors and of regeneration.
 
-A supply of constant voltage behind a resistance that takes current both ways, as a battery
-does. The current is that of the mechanical power and the copper losses:
-I_bus = sum(torque 2 pi vel + 1.5 R Iq^2) / V_bus, Iq = torque / torque_constant; the 1.5 is
-of the firmware's amplitude-invariant currents. A brake resistor takes what is pushed back
-beyond `max_regen_current`.
+The supply is a constant voltage behind a resistance and takes current both ways, as a battery does.
+The current is that of the mechanical power and the copper losses: I_bus = sum(torque 2 pi vel + 1.5
+R Iq^2) / V_bus, Iq = torque / torque_constant; the 1.5 is due to the firmware's amplitude-invariant
+currents. A brake resistor takes regenerated current beyond `max_regen_current`.
 """
 
 from __future__ import annotations
@@ -93,7 +92,7 @@ class DcBus:
         brake = settings.drive("config.brake_resistance")
         self._brake_max = np.where(braking, BRAKE_DUTY_MAX / brake, 0.0)  # A per V
         self._regen_free = settings.drive("config.max_regen_current").copy()
-        # Each axis may do half of what a drive may, less a half for the voltage's own change.
+        # Each axis may do half of a drive's limit, less a half for the voltage's own change.
         resistance = np.maximum(self.resistance, 1e-6)
         push = np.minimum(-self._negative, (self._highest - self.supply) / resistance)
         draw = np.minimum(self._positive, (self.supply - self._lowest) / resistance)

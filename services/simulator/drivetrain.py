@@ -6,9 +6,9 @@ Each of the 12 joint axes has a rotor of its own behind a spring with damping an
     tau_spring = k dead(theta - q) + b (w - q')        where the play is taken up
     dead(x) = x - clip(x, -play/2, play/2)
 
-theta, w: the rotor's angle and rate at the joint; both motors of a module are alike, so rotor
-inertia is diagonal in the joints' (phi, theta) as well. The joint's share of the damping, b q',
-is left to the body's own integrator, which is implicit in it. The encoders see theta.
+theta, w: the rotor's angle and rate at the joint; both motors of a module are equal, so rotor
+inertia is diagonal in the joints' (phi, theta) too. The joint's share of the damping, b q', is left
+to the body's own integrator, which is implicit in it. The encoders see theta.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class FlexibleDrivetrain:
         self.rate[:] = 0.0
 
     def step(self, tau_motor: Array, q: Array, v: Array) -> Array:
-        """Move the rotors on by one step; return what the springs give the joints (12,), N m.
+        """Advance the rotors by one step; return the springs' torques on the joints (12,), N m.
 
-        Without `damping` times v, which is for the body's integrator. Overwritten by the next.
+        `damping` times v is left to the body's integrator. The next call overwrites the result.
 
         Args:
             tau_motor: motor torques at the joints (12,), N m.
@@ -83,7 +83,7 @@ def _step_graph(config: Drivetrain, motor_from_joint: Array, dt: float) -> ca.Fu
     # backward Euler in the dampers: (1 + dt b / I + dt d / I) w_new = w + dt / I (...)
     driven = rate + per_inertia * (tau_motor - k * stretch - cogging + damping * v)
     free = driven / (1.0 + per_inertia * (damping + config.motor_damping))
-    # dry friction takes off what it can and stops there
+    # dry friction can stop a rotor but not reverse it
     most = config.motor_friction * per_inertia
     rate_next = free - ca.fmin(ca.fmax(free, -most), most)
     tau = k * stretch + damping * rate_next

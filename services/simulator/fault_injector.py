@@ -19,7 +19,7 @@ _ABOVE: Final = 5.0
 
 
 class FaultInjector:
-    """The faults of a run, and which of them have begun."""
+    """The faults of a run, and which of them have started."""
 
     def __init__(self, faults: Sequence[Fault], bank: AxisBank) -> None:
         """Take the faults in any order."""
@@ -28,7 +28,7 @@ class FaultInjector:
         self._lasting: list[Fault] = []
 
     def advance(self, scenario_s: float) -> list[Fault]:
-        """Begin what is due at scenario time, end what is over; return what has begun."""
+        """Start and end what is due at scenario time; return the faults that started."""
         if not self._coming and not self._lasting:
             return []
         for fault in [row for row in self._lasting if scenario_s >= row.at + row.lasts_s]:

@@ -1,7 +1,7 @@
-"""What an emulated ODrive v3 shows over its native (Fibre) protocol: a table of endpoints.
+"""Table of endpoints that an emulated ODrive v3 shows over its native (Fibre) protocol.
 
-The part of firmware 0.5.6's tree that this project touches: all settings that the bank has,
-by the firmware's names, and what the drive measures and can be asked for. Units at the
+It is the part of firmware 0.5.6's tree that this project uses: all settings of the bank by the
+firmware's names, measurements, and functions. Units at the
 motor: turns, turn/s, N m, A, V, C.
 
 Source: odriverobotics/ODrive, Firmware/odrive-interface.yaml.
@@ -79,7 +79,7 @@ class Property(NamedTuple):
 
 
 class Argument(NamedTuple):
-    """An argument of a function: an endpoint of its own, which a client writes before it calls."""
+    """An argument of a function: an endpoint of its own, written before the call."""
 
     name: str
     type: str

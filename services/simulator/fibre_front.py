@@ -28,7 +28,7 @@ from shared.exceptions import DriveError
 
 PROTOCOL_VERSION: Final = 1
 ANSWER_BYTES: Final = 62
-"""What a packet of 64 bytes carries behind the sequence number; a longer answer is cut."""
+"""Bytes after the sequence number in a packet of 64 bytes; a longer reply is cut."""
 
 _CRC16_POLYNOMIAL = 0x3D65
 _ANSWER = 0x8000
@@ -53,9 +53,9 @@ class FibreFront:
     """The protocol of one board.
 
     Attributes:
-        descriptor: the JSON that tells clients the endpoints and their ids.
-        ignored: packets that were no valid request, on which the firmware is silent too, and
-            values that no setting can have.
+        descriptor: the JSON with endpoints and ids, for clients.
+        ignored: packets that are no valid request, which the firmware ignores too, and values that
+            no setting can have.
     """
 
     def __init__(self, board: EmulatedBoard) -> None:
@@ -88,7 +88,7 @@ class FibreFront:
         return _U16.pack(sequence | _ANSWER) + result
 
     def _operate(self, number: int, payload: bytes) -> bytes:
-        """Return what the endpoint held; then write to it, or call it."""
+        """Return the endpoint's value; then write to it, or call it."""
         if number == 0:
             return self._describe(payload)
         row = self._rows[number - 1]

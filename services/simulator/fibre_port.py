@@ -1,8 +1,8 @@
 """The USB plugs of the emulated drives: UNIX sockets, one packet per bulk transfer.
 
-A plug is a listening socket whose file name is the drive's serial number; the stand-in for
-libusb (`libusb_standin.c`) is the other end. `FibreHub` is all plugs of one simulator: it looks
-for what has come on all of them at once.
+A plug is a listening socket whose file name is the drive's serial number; the stand-in for libusb
+(`libusb_standin.c`) is the other end. `FibreHub` is all plugs of one simulator; it polls them
+together.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class FibrePort:
         return client
 
     def serve(self, client: socket.socket) -> bool:
-        """Answer what a client has sent, as far as it is here; return False if it has gone."""
+        """Answer the client's packets that have arrived; return False if the client is gone."""
         answer = self.front.answer
         try:
             for _ in range(_PACKETS):
@@ -168,7 +168,7 @@ class FibreHub:
             return
         for descriptor in port.clients:
             self._talking.pop(descriptor, None)
-        port.unplug()  # what is closed leaves the epoll by itself
+        port.unplug()  # a closed socket leaves the epoll by itself
 
     def _listen(self, port: FibrePort) -> None:
         if port.listener is not None:

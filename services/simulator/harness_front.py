@@ -46,7 +46,7 @@ class HarnessFront:
         force_torso: Sequence[float] | npt.NDArray[np.float64],
         moment_torso: Sequence[float] | npt.NDArray[np.float64],
     ) -> None:
-        """Send one sample of what the operator does to the torso.
+        """Send one sample of the operator's force and moment on the torso.
 
         Args:
             force_torso: (3,) in N, torso axes.
@@ -56,5 +56,5 @@ class HarnessFront:
         forces += self.bias
         forces += self._noise * self._random.standard_normal(stewart.N_LEGS)
         np.clip(forces, -self._leg_force_max, self._leg_force_max, out=forces)
-        self._hub.poll()  # nobody tells a load cell anything, but who listens must be let in
+        self._hub.poll()  # a load cell takes no requests, but clients that listen must be admitted
         self._hub.broadcast(loadcell_can.pack(forces.tolist()))

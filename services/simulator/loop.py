@@ -43,8 +43,8 @@ class SimulatorPorts(msgspec.Struct, frozen=True):
 class SimulatorLoop:
     """Steps twelve emulated axes and the world, and paces them by the clock.
 
-    The drives hear and are heard at the rate of their encoder frames. In torque mode they hold
-    their torque between; where one has its own loop they step with the world.
+    The drives receive and send at the rate of their encoder frames. In torque mode they hold their
+    torque between frames; with a loop of their own they step with the world.
     """
 
     def __init__(
@@ -85,10 +85,10 @@ class SimulatorLoop:
         self._lost_at_start_ns = 0
 
     def run(self, stop: StopFlag) -> None:
-        """Run until told to stop.
+        """Run until stopped.
 
-        A step that comes late is followed at once by the next; time further behind than
-        `late_slip_ms` is given up and counted, for the services must not be fed a burst.
+        A late step is followed at once by the next. Time further behind than `late_slip_ms` is
+        skipped and counted, because the services must not receive a burst.
         """
         due = now_ns()
         while not stop:
@@ -101,7 +101,7 @@ class SimulatorLoop:
             sleep_until(due)
 
     def step(self) -> None:
-        """Take the drives' frames, move the world on by one step, send what is due."""
+        """Take the drives' frames, advance the world by one step, send what is due."""
         world, front, ports = self._world, self._front, self._ports
         if self._steps % self._encoder_every == 0:
             self._faults.advance(world.scenario_s)
@@ -129,7 +129,7 @@ class SimulatorLoop:
             self._ask()
 
     def _ask(self) -> None:
-        """Ask for what the scenario says, unless somebody else asks: then the person rests that."""
+        """Publish the scenario's request; if another operator publishes one, rest that much."""
         world, other = self._world, self._ports.asked.take()
         if other is not None and other.source != SCENARIO:
             self._unasked = 0

@@ -16,7 +16,7 @@ from shared.config.sections import OperatorConfig
 
 
 class HandForce(NamedTuple):
-    """What the hand does to the torso."""
+    """The hand's force and moment on the torso."""
 
     force_z: float
     """N, world, at the harness point."""
@@ -25,14 +25,14 @@ class HandForce(NamedTuple):
 
 
 REACH_S: Final = 0.4
-"""Time constant with which a person who takes hold goes over to the path."""
+"""Time constant with which a hand that grips the robot joins the path."""
 
 
 class Wearer:
-    """The person's own mass behind the hand: it gives way to what the hand meets.
+    """The person's own mass behind the hand, which yields to the robot's force.
 
-    It takes hold of the robot where that is, and goes over to the path. From then on d is how far
-    it is above the path:  m d'' = -m w^2 d - 2 zeta m w d' - f
+    It grips the robot where that is and joins the path. From then on d is its height above the
+    path:  m d'' = -m w^2 d - 2 zeta m w d' - f
     """
 
     def __init__(self, person: Person) -> None:
@@ -52,7 +52,7 @@ class Wearer:
         """What rests on the harness, N."""
 
     def take_hold(self, above: float) -> None:
-        """Take hold of the robot where it is, `above` the path, m; one who has, goes on."""
+        """Grip the robot where it is, `above` the path, m, unless the hand grips already."""
         if not self._holds:
             self._holds, self.reach = True, above
 
@@ -66,12 +66,12 @@ class Wearer:
         return self.above + self.reach, self.rate - self.reach / REACH_S
 
     def step(self, dt: float, force_on_robot: float, assist: float) -> None:
-        """Move on.
+        """Advance by one step.
 
         Args:
             dt: step, s.
             force_on_robot: of the hand, N, up.
-            assist: that the person asked for, N: rested later, and not all of it.
+            assist: requested by the person, N; the person rests part of it, with a delay.
         """
         if self._per_mass:
             acceleration = -self._per_mass * force_on_robot - self._k * self.above

@@ -1,9 +1,9 @@
-"""The plant: how the simulated robot differs from what its controllers believe.
+"""The plant: how the simulated robot differs from its controllers' model.
 
-A controller knows the robot file. The world is built from the robot file *and* a plant: joints
-that flex and play, friction, cogging, late torque, encoder noise, wrong zeros, wrong masses, a
-floor that slopes, feet that stand elsewhere, a person with a mass of its own. No controller can
-see it: only the simulator reads it (`tests/test_architecture.py`).
+A controller knows the robot file. The world is built from the robot file *and* a plant: joints that
+flex and play, friction, cogging, late torque, encoder noise, wrong zeros, wrong masses, a sloped
+floor, displaced feet, a person with a mass. No controller can see it: only the simulator reads it
+(`tests/test_architecture.py`).
 
 `PlantConfig()` is the default, realistic; `IDEAL` is the controllers' own model. A TOML file or
 `--plant KEY=VALUE` (`plant_from`) changes single values. SI units.
@@ -66,24 +66,25 @@ class DriveErrors(Section, frozen=True):
     delay_s: Annotated[float, Range(0.0, 0.02, "s")] = 0.0
     """Pure delay besides; the frames' own delay is the bus's."""
     torque_scale: Scale = 1.0
-    """What acts, of what is wanted: a wrong torque constant."""
+    """Actual over wanted torque: a wrong torque constant."""
 
 
 class EncoderErrors(Section, frozen=True):
-    """What the encoders tell wrongly."""
+    """Errors of the encoders."""
 
     noise_counts: Annotated[float, Range(0.0, 100.0, "counts")] = 0.5
     """Standard deviation; a capacitive encoder of 16384 counts moves by one count at rest."""
     zero_errors: tuple[Angle, ...] = (0.0,) * N_JOINTS
-    """Told less true angle, each of the 12 joints, rad."""
+    """Reported less true angle, each of the 12 joints, rad."""
 
 
 class ImuErrors(Section, frozen=True):
-    """What the IMU tells wrongly, where one is fitted."""
+    """Errors of the IMU, where one is fitted."""
 
     tilt: tuple[Angle, Angle] = (0.005, -0.005)
-    """Roll and pitch of what it tells against the truth, rad: its own error (0.2 to 0.5 degrees of
-    an MTi 630) and its mounting's."""
+    """Roll and pitch, reported less true, rad: the sensor's error (0.2 to 0.5 degrees of an MTi
+    630) and its mounting's.
+    """
     noise: Annotated[float, Range(0.0, 0.1, "rad")] = 0.001
     """Standard deviation about each axis."""
 
@@ -99,7 +100,7 @@ class BodyErrors(Section, frozen=True):
 
 
 class Floor(Section, frozen=True):
-    """What the robot stands on. The world's z is the floor's normal, and gravity leans."""
+    """The floor. The world's z is the floor's normal, and gravity leans."""
 
     slope: tuple[Angle, Angle] = (0.0, 0.0)
     """Rise along x and along y, rad: (0.05, 0) is uphill in front."""
@@ -123,7 +124,7 @@ class Feet(Section, frozen=True):
 
 
 class Person(Section, frozen=True):
-    """The person behind the hand: a mass on legs of its own, that follows the scenario's path."""
+    """The person behind the hand: a mass on legs that follows the scenario's path."""
 
     mass: Annotated[float, Range(0.0, 200.0, "kg")] = 80.0
     """0: the hand follows the path exactly, whatever it meets."""
@@ -132,7 +133,7 @@ class Person(Section, frozen=True):
     (whole-body vibration)."""
     leg_damping_ratio: Annotated[float, Range(0.0, 2.0, "1")] = 0.4
     load_scale: Annotated[float, Range(0.0, 3.0, "1")] = 0.9
-    """What the person rests on the harness, of the assist that was asked for."""
+    """Fraction of the requested assist that the person rests on the harness."""
     load_lag_s: Annotated[float, Range(0.0, 2.0, "s")] = 0.2
     """And how late: nobody shifts weight at once."""
 
@@ -162,16 +163,16 @@ IDEAL: Final = PlantConfig(
     floor=Floor(friction=0.9),
     person=Person(mass=0.0, load_scale=1.0, load_lag_s=0.0),
 )
-"""The controllers' own model: proves that the code does what the equations say, nothing more."""
+"""The controllers' own model: proves that the code follows the equations, nothing more."""
 
 NAMED: Final[Mapping[str, PlantConfig]] = {"realistic": PlantConfig(), "ideal": IDEAL}
 
 
 def load(path: Path) -> PlantConfig:
-    """Read a plant file; what it does not name keeps its default.
+    """Read a plant file; a key that it lacks keeps its default.
 
     Raises:
-        ConfigError: a key or value is not as it should be.
+        ConfigError: a key is unknown, or a value out of range.
     """
     plant = read_toml(path, PlantConfig)
     _check(str(path), plant)
@@ -204,7 +205,7 @@ def plant_from(words: Iterable[str]) -> PlantConfig:
 
 
 def changed(plant: PlantConfig, values: Mapping[str, Any]) -> PlantConfig:
-    """Return a plant with values set by dotted key; a text is read as TOML.
+    """Return a plant with values set by dotted key; text is parsed as TOML.
 
     Raises:
         ConfigError: there is no such key, or it cannot have that value.

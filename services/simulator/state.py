@@ -1,4 +1,4 @@
-"""The simulated world and its drives taken down, and gone on with. Pure."""
+"""Snapshots of the simulated world and its drives, taken and restored. Pure."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class UnixCanHub:
         except BlockingIOError:
             return []
         except ConnectionResetError:
-            return []  # it left frames unread, says the kernel, once; what it sent comes next
+            return []  # once: it left frames unread; its own frames come next
         except OSError:
             packet = b""
         if not packet:
@@ -128,9 +128,9 @@ class UnixCanHub:
         return unpack_frames(packet)
 
     def _hand(self, client: socket.socket, packet: bytes) -> None:
-        """Send without waiting; drop what a slow client has no room for.
+        """Send without waiting; drop packets for which a slow client has no room.
 
-        A client that has gone is parted with in `_take`, once what it sent has been read.
+        A client that is gone is removed in `_take`, after its last frames have been read.
         """
         try:
             client.send(packet)
@@ -147,7 +147,7 @@ class UnixCanHub:
 
 
 def _listen(path: Path) -> socket.socket:
-    """Listen on a path; clear away the file of a hub that is no more."""
+    """Listen on a path; remove the file of a hub that is gone."""
     if len(os.fsencode(path)) > _PATH_BYTES:
         raise FleetError(
             f"CAN hub: {path} is longer than the {_PATH_BYTES} bytes of a UNIX socket's path; "

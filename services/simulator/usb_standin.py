@@ -3,7 +3,7 @@
 The genuine `odrive` package finds the emulated drives when the stand-in takes the place of
 the system's libusb-1.0 and `XRL_USB` names the folder of the plugs (`FOLDER` in the run
 directory): in another process by its environment (`prepare`), in this one by `load`.
-`libusb_standin.c` says what the stand-in does.
+`libusb_standin.c` describes the stand-in.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _COMPILE_S = 60.0
 def build(folder: Path) -> Path:
     """Return the stand-in in this folder, compiled if it is not there or older than its source.
 
-    Several processes may do so at once: the library is put in its place in one step.
+    Several processes may do so at once: the library is renamed into place.
 
     Raises:
         FleetError: there is no C compiler, it fails, or the folder cannot be written.

@@ -75,7 +75,7 @@ class World:
         """Assist, N, and shift that somebody asks for in place of the scenario."""
         self.push: Vector3 = (0.0, 0.0, 0.0)
         self.harness_force: Vector3 = (0.0, 0.0, 0.0)
-        """What the operator does to the torso at the harness point, N, torso axes."""
+        """The operator's force on the torso at the harness point, N, torso axes."""
         self.harness_moment: Vector3 = (0.0, 0.0, 0.0)
         """N m, torso axes."""
         self._truths = 0
@@ -130,14 +130,14 @@ class World:
         hoist: float,
         hidden: Sequence[float],
     ) -> None:
-        """Go on from the state of another world of the same robot, plant and scenario.
+        """Continue from the state of another world of the same robot, plant and scenario.
 
         Args:
             qpos: MuJoCo's position.
             qvel: its velocity.
             warmstart: its qacc_warmstart.
-            scenario_s: scenario time; negative: it has not begun.
-            hoist: share of its support.
+            scenario_s: scenario time; negative: it has not started.
+            hoist: fraction of its support.
             hidden: as `hidden` returned it.
         """
         data = self.data
@@ -240,7 +240,7 @@ class World:
             self.time += self._dt
 
     def lead(self) -> Lead:
-        """Return what the operator wants now."""
+        """Return the operator's present request."""
         wanted = lead(self._scenario, self.scenario_s)
         return wanted if self.asked is None else Lead(*wanted[:4], *self.asked)
 
