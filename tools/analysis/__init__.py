@@ -1,1 +1,1 @@
-"""What is read out of a log afterwards: survey, reports, playback, re-execution."""
+"""Analysis of logs: survey, reports, playback, re-execution."""

@@ -1,4 +1,4 @@
-"""What boards had been told to keep, in a file: written before anything is changed."""
+"""Backups of boards' settings in a file, written before anything is changed."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFlee
         manifest = RunDir(path).read_manifest()
         if manifest is None:
             continue
-        with contextlib.suppress(XrlError):  # a file that has been broken since tells nothing
+        with contextlib.suppress(XrlError):  # a file that has become unreadable since is ignored
             other = config_file.load_without_schedule(Path(manifest.config))
             services = [name for name in manifest.services if name in MODULES]
             if any(_drive_of(other, name, path) == drive for name in services):
@@ -111,7 +111,7 @@ def confirm(question: str, *, yes: bool) -> bool:
 
 
 def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]:
-    """Return what tells a drive from all others; an emulated one by its run directory too."""
+    """Return a unique id of a drive; of an emulated one with its run directory."""
     wiring = robot.module_named(module)
     place = str(run_dir) if process_table.is_simulated(robot) else ""
     if robot.joint_service.driver == "odrive_usb":

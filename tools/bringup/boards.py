@@ -13,7 +13,7 @@ Value = bool | int | float | str | None
 """A value of any endpoint; text: the name of another endpoint, or none at all."""
 
 FIRMWARE: Final = (0, 5, 6)
-"""What the settings' names and the drivers are made for."""
+"""Firmware that the settings' names and the drivers are made for."""
 OLDEST: Final = (0, 5, 4)
 """Before it, the CAN settings, the board's error register and the heartbeat are other ones."""
 
@@ -33,7 +33,7 @@ STATUS: Final = (
     "brake_resistor_armed",
     *(f"{axis}.{name}" for axis in AXES for name in _AXIS_STATUS),
 )
-"""What a board shows of how it is, besides its settings."""
+"""A board's state, besides its settings."""
 
 
 class Board(Protocol):
@@ -53,7 +53,7 @@ class Board(Protocol):
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Names of everything that this board can be told to keep."""
+        """Names of all settings that this board saves."""
 
     def read(self, names: Iterable[str]) -> dict[str, Value]:
         """Return the values of these endpoints; those that the board does not have are left out."""
@@ -69,14 +69,14 @@ class Board(Protocol):
 
 
 class FoundBoards(NamedTuple):
-    """What is on a way to the boards."""
+    """The boards on one way of access."""
 
     boards: dict[str, Board]
-    """By serial number; those that were asked for and answered."""
+    """By serial number; the requested ones that answered."""
     troubles: dict[str, str]
-    """By serial number: why one that was asked for is not among them."""
+    """By serial number: why a requested one is missing."""
     strangers: tuple[str, ...]
-    """Serial numbers that are there and were not asked for."""
+    """Serial numbers found that were not requested."""
 
 
 def equal(one: Value, other: Value) -> bool:

@@ -1,8 +1,8 @@
-"""What a CAN bus of the robot says of itself in a moment: drives' heartbeats, load cells.
+"""Monitors a CAN bus of the robot for a moment: drives' heartbeats, load cells.
 
-Nothing is sent to a bus whose services are up: any frame feeds a drive's watchdog, and would
-hide that its service is dead. Else three questions are asked of each axis: its version, which
-only firmware 0.6 answers, its encoder's count, which only 0.5 does, and its supply's voltage.
+Nothing is sent to a bus whose services are up: any frame feeds a drive's watchdog, and would hide a
+dead service. Else each axis gets three requests: its version, which only firmware 0.6 answers, its
+encoder's count, which only 0.5 does, and its supply's voltage.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _GAPS_MIN = 3
 
 
 class NodeHeard(msgspec.Struct):
-    """What one axis said."""
+    """Frames of one axis."""
 
     heartbeat: Heartbeat | None = None
     """The newest, as firmware 0.5 means it."""
@@ -53,7 +53,7 @@ class NodeHeard(msgspec.Struct):
 
 
 class BusHeard(msgspec.Struct):
-    """What one bus said."""
+    """Traffic of one bus."""
 
     trouble: str = ""
     """Why it could not be listened to."""
@@ -111,10 +111,10 @@ def long_enough(heartbeat_period_ms: int) -> float:
 
 
 def period_ms(times_s: Sequence[float], wanted_ms: float) -> float | None:
-    """Return the period at which frames came, ms; None if there are too few.
+    """Return the period of frames, ms; None if there are too few.
 
-    The median gap or the mean, whichever is nearer to what is wanted: a reader that stalls shifts
-    the mean, a sender that catches up the median, another setting both.
+    It is the median gap or the mean, whichever is nearer to the wanted one: a reader that stalls
+    shifts the mean, a sender that catches up the median, another setting both.
     """
     gaps = [after - before for before, after in pairwise(times_s)]
     if len(gaps) < _GAPS_MIN:

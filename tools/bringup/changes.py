@@ -1,4 +1,4 @@
-"""The difference between what a board keeps and what it should keep, and how it is closed."""
+"""Differences between a board's settings and the wanted ones, and how they are written."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ _FOUND = (
     "encoder.config.phase_offset",
     "encoder.config.phase_offset_float",
 )
-"""What the encoder's calibration finds by how the phases are wired now: with other values than
-these the motor has no torque, or runs away."""
+"""Results of the encoder's calibration with the present wiring. With other values the motor has no
+torque, or runs away.
+"""
 
 
 class SettingChange(NamedTuple):

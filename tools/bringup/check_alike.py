@@ -1,8 +1,8 @@
-"""What the robot file does not say and all boards should share: the one that differs. Pure.
+"""Finds the board whose settings differ from the others', where the robot file has none. Pure.
 
-Six boards are set up by hand, one after the other (pole pairs, brake resistor, encoder mode): what
-was forgotten or mistyped on one shows against the others, whatever it is. Nobody need know all of
-the firmware's settings for that.
+Six boards are set up by hand, one after the other (pole pairs, brake resistor, encoder mode). A
+forgotten or mistyped setting on one differs from the others, and nobody needs to know all of the
+firmware's settings to find it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Boards = Mapping[str, Mapping[str, Value]]
 BOARDS_MIN: Final = 3
 """With fewer nobody knows which one is the odd one."""
 MEASURED: Final = ("motor.config.phase_resistance", "motor.config.phase_inductance")
-"""What a calibration finds; alike for motors of one kind."""
+"""Calibration results; similar for motors of one kind."""
 MEASURED_SHARE: Final = 0.3
 """Fraction of the median by which a value may differ: copper at 100 C has 30 % more than at 20
 C."""
@@ -45,7 +45,7 @@ _OWN: Final = frozenset(
 
 
 def alike_rows(boards: Boards) -> list[Finding]:
-    """Return what one board or few have otherwise than most, and what no motor can have."""
+    """Return the settings in which few boards differ from most, and values that no motor has."""
     if len(boards) < BOARDS_MIN:
         return []
     names = dict.fromkeys(name for values in boards.values() for name in values)

@@ -1,4 +1,4 @@
-"""Checks of one module's ODrive, by what its board says of itself. Pure."""
+"""Checks of one module's ODrive, from its board's settings and state. Pure."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
 
 
 def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values) -> list[Finding]:
-    """Compare a board's settings with what is wanted of them; all that fit are one row."""
+    """Compare a board's settings with the wanted ones; all that fit make one row."""
     rows = []
     fix = f"`xrl configure --apply --module {module}`"
     for setting in wanted:
@@ -112,9 +112,9 @@ def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Find
 
 
 def error_rows(module: str, values: Values) -> list[Finding]:
-    """Return what the board's error registers hold; one row if nothing.
+    """Return rows for the board's error registers; one row if there is no error.
 
-    Arming clears them all, so a watchdog that ran out while nobody wrote is no fault.
+    Arming clears them all, so a watchdog that expired while no service ran is no fault.
     """
     fix = "find what caused it; `xrl up` clears it at arming, power off and on does too"
     rows = []

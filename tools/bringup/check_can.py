@@ -1,4 +1,4 @@
-"""Checks of what the CAN buses carry: both axes of each module, and the load cells. Pure."""
+"""Checks of the CAN buses' traffic: both axes of each module, and the load cells. Pure."""
 
 from __future__ import annotations
 
@@ -116,9 +116,9 @@ def _lost_frames(subject: str, heard: BusHeard) -> list[Finding]:
 
 
 def positions(robot: RobotConfig, module: str, heard: BusHeard) -> tuple[float, float] | None:
-    """Return both motors' positions in turns, as the drive counts them; None if not heard.
+    """Return both motors' positions in turns, as the drive counts them; None without a reply.
 
-    By the count where the estimate is 0: so firmware 0.5.6 has it until its first closed loop.
+    From the count where the estimate is 0, as in firmware 0.5.6 until its first closed loop.
     """
     first, second = (
         _turns(heard.nodes.get(node, NodeHeard()), robot.joint.encoder_counts_per_turn)

@@ -1,7 +1,7 @@
 """Checks of the computer: processors, clock, real-time permission, USB, CAN interfaces.
 
-Where the robot is emulated, what a sandbox or a laptop cannot give is ok as long as the services
-have their documented way to do without (`shared.priority`); the row says so.
+For an emulated robot, a missing capability of a sandbox or a laptop is ok if the services can do
+without it (`shared.priority`); the row says so.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def _libusb() -> Finding:
 
 
 def _text(path: Path) -> str:
-    """Return what a small file of the kernel says; "" if it is not there."""
+    """Return the contents of a small file of the kernel; "" if it does not exist."""
     try:
         return path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):

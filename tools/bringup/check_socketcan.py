@@ -1,7 +1,7 @@
-"""Checks of the kernel's CAN interfaces: there, up, and set as the drives and services need them.
+"""Checks of the kernel's CAN interfaces: present, up, and set as the drives and services need.
 
-What sysfs does not tell (bit rate, state, restart) is asked of `ip`, which asks the kernel; it
-needs no privilege and changes nothing.
+Bit rate, state and restart are not in sysfs and come from `ip`, which needs no privilege and
+changes nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _OFF: Final = ("BUS-OFF", "STOPPED", "SLEEPING")
 
 
 def ask_ip() -> Links:
-    """Return what `ip` says of the CAN interfaces; nothing where there is no such command."""
+    """Return the output of `ip` for the CAN interfaces; nothing without that command."""
     try:
         said = subprocess.run(_IP, capture_output=True, timeout=_IP_S, check=True).stdout
         return {link["ifname"]: link for link in json.loads(said or "[]") if "ifname" in link}
@@ -68,7 +68,7 @@ def up_command(name: str) -> str:
 
 
 def _details(name: str, link: Mapping[str, Any]) -> list[Finding]:
-    """Judge an interface that is up by what `ip` says; what it does not say is not judged."""
+    """Judge an interface that is up by the output of `ip`; a missing value is not judged."""
     data = link.get("linkinfo", {}).get("info_data", {})
     again = f"`sudo ip link set {name} down`, then {up_command(name)}"
     rows = []

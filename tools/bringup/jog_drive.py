@@ -109,11 +109,11 @@ def jog_drive(
     Args:
         drive: idle, opened with the limits of `gentle`.
         robot: as `gentle` made it.
-        module: which.
-        plan: what to do.
-        q_seen: where the joint was when the person said yes, rad.
-        interrupts: looked at in every cycle.
-        progress: told a sample now and then.
+        module: its name.
+        plan: the motion.
+        q_seen: joint angles when the person agreed, rad.
+        interrupts: read in every cycle.
+        progress: receives a sample now and then.
         clock: monotonic, ns.
     """
     samples: list[Sample] = []

@@ -1,9 +1,8 @@
 """Moving one axis of one module a little and back, by the drive's own loop: law and judgement.
 
-The law, the gate and the drive's targets are the joint service's, so a sign that is right here
-is right there. What differs is the force: the drive's own current limit is set so that no motor
-gives more than the torque asked for allows, whatever happens to this process. Pure; `jog_drive`
-has the clock and the drive.
+The law, the gate and the drive's targets are the joint service's, so a sign that is right here is
+right there. Only the force differs: the drive's own current limit keeps every motor below the
+requested torque, whatever happens to this process. Pure; `jog_drive` has the clock and the drive.
 """
 
 from __future__ import annotations
@@ -42,13 +41,13 @@ STRAYED_MAX: Final = 0.05
 TRAVEL_SHARE: Final = 0.25
 """Fraction of the requested travel by which the travel may differ."""
 LAG_MAX: Final = 0.02
-"""rad between reference and joint, beyond what its load bends it at rest."""
+"""rad between reference and joint, beyond the deflection by its load at rest."""
 SIBLING_MAX: Final = 0.02
 """rad that the other axis may move."""
 
 
 class JogPlan(NamedTuple):
-    """What is to be done."""
+    """The motion."""
 
     axis: int
     """0: phi, 1: theta."""
@@ -69,7 +68,7 @@ class Sample(NamedTuple):
     q_ref: Pair
     q: Pair
     tau: Pair
-    """What the drive was asked for at this sample, N m at the joint."""
+    """Requested torque at this sample, N m at the joint."""
 
 
 class JogCheck(NamedTuple):
@@ -78,7 +77,7 @@ class JogCheck(NamedTuple):
     what: str
     value: str
     wanted: str
-    """"" if it is told only."""
+    """Remedy; "" if there is none."""
     good: bool
 
 
@@ -125,10 +124,10 @@ def outside(robot: RobotConfig, module: str, plan: JogPlan, q: Pair) -> str:
 
 
 def what_to_see(module: str, axis: int, by: float) -> str:
-    """Return what a person sees if the joint turns the right way.
+    """Return a description of the right motion, for a person who watches.
 
     A positive angle leans the part above the joint forward (theta) or to the right (phi)
-    against the part below; below a torso that hangs, the lower part swings the same way.
+    against the part below; below a hanging torso, the lower part swings the same way.
     """
     kind, positive = kind_of(module), by > 0.0
     upper = {"ankle": "shin", "knee": "thigh", "hip": "torso"}[kind]
@@ -143,12 +142,12 @@ def what_to_see(module: str, axis: int, by: float) -> str:
 
 
 class Jog:
-    """The law of one jog and its memory, cycle by cycle.
+    """The law of one jog and its state, cycle by cycle.
 
     Attributes:
-        trouble: why it was stopped; "" while all is well.
+        trouble: why it was stopped; "" if it was not.
         done: the motion is over.
-        samples: what has been.
+        samples: recorded so far.
     """
 
     def __init__(
@@ -180,7 +179,7 @@ class Jog:
         self.samples: list[Sample] = []
 
     def step(self, now_ns: int, reading: DriveReading | None) -> MotorTarget | None:
-        """Return what the drive is to do now; None where it is left as it is, or to be idled.
+        """Return the drive's next target; None to leave it as it is, or to idle it.
 
         Args:
             now_ns: monotonic time.
@@ -286,9 +285,9 @@ def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
 
 
 def friction(moving: list[Sample], plan: JogPlan) -> float:
-    """Return half of what the way there takes more than the way back, N m.
+    """Return half the difference of torque between the way there and the way back, N m.
 
-    Where it is fast; gravity and springs, the same on both ways, cancel.
+    Only where the motion is fast; gravity and springs are the same on both ways and cancel.
     """
     omega = 2.0 * math.pi / plan.period_s
     sign = math.copysign(1.0, plan.by)

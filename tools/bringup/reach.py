@@ -48,7 +48,7 @@ def add_plant(parser: argparse.ArgumentParser) -> None:
 
 
 def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> None:
-    """Refuse planted settings that no emulated drive can be started with.
+    """Refuse planted settings with which no emulated drive can start.
 
     Raises:
         FleetError: the robot is a real one, or its fleet is up already.
@@ -206,7 +206,7 @@ def emulated_usb(run_dir: Path) -> Iterator[None]:
 def boards_on_usb(
     robot: RobotConfig, run_dir: Path, modules: Iterable[str]
 ) -> Iterator[FoundBoards]:
-    """Connect to the boards of these modules over USB, the emulated ones if they are.
+    """Connect to the boards of these modules over USB, or to the emulated ones.
 
     Modules without a serial number have none.
 

@@ -89,7 +89,7 @@ def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
 
 
 def _notes(rows: list[Finding], *, wide: bool) -> list[str]:
-    """Return what is said below the table; the same about several is said once."""
+    """Return the lines below the table; a text that several rows share appears once."""
     subjects: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if note := _note(row, wide=wide):
@@ -106,7 +106,7 @@ def _broken(name: str) -> str:
 
 
 def _note(row: Finding, *, wide: bool) -> str:
-    """Return what is said of a row below the table: why, and what to do if it has no column."""
+    """Return the text on a row below the table: why, and the remedy if it has no column."""
     fix = "" if wide else row.fix
     return f"{fix} ({row.why})" if fix and row.why else fix or row.why
 
@@ -119,7 +119,7 @@ def _names(rows: Iterable[Finding]) -> str:
 
 
 def _short(name: str) -> str:
-    """Return a setting's own name, without what it is below; any other name as it is."""
+    """Return the last part of a setting's name; any other name unchanged."""
     return name.rpartition(".")[2] if "config." in name else name
 
 

@@ -13,7 +13,7 @@ from shared.robot.joints import MODULES
 
 
 class FindingKind(StrEnum):
-    """What a row means."""
+    """Verdict of a row."""
 
     OK = "ok"
     WARNING = "warning"
@@ -82,12 +82,12 @@ def count(rows: Iterable[Finding], verdict: FindingKind) -> int:
 
 
 def merged(rows: Iterable[Finding]) -> list[Finding]:
-    """Return the rows with those about the same matter put into one.
+    """Return the rows with those on the same subject merged.
 
-    What is ok becomes one row, from the smallest to the largest. What is not ok does where all
-    six modules, all twelve axes, or both axes of a module are alike: boards as shipped, or one of
-    them, are not told setting by setting and axis by axis. Else it stays as it is. What is ok comes
-    first, in the order of the first of each.
+    Rows that are ok become one, from the smallest to the largest value. Rows that are not ok merge
+    where all six modules, all twelve axes, or both axes of a module are equal, so boards with
+    factory settings do not fill the table. Rows that are ok come first, in the order of the first
+    of each.
     """
     alike: dict[str, list[Finding]] = {}
     others: dict[tuple[str, ...], list[Finding]] = {}

@@ -34,14 +34,14 @@ GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS, IMU)
 def survey(
     robot: RobotConfig, config_path: Path, run_dir: Path, plants: Sequence[str], say: Say
 ) -> Groups:
-    """Check everything and return what was found.
+    """Check everything and return the rows.
 
     Args:
-        robot: what stands in the robot file.
+        robot: from the robot file.
         config_path: the robot file.
         run_dir: of the fleet; if none is up, an emulated robot's simulator runs there meanwhile.
         plants: settings that the emulated drives have kept.
-        say: is told what is being looked at.
+        say: receives the subject of each check.
 
     Raises:
         FleetError: the simulator cannot be started.
@@ -127,7 +127,7 @@ def _module(
     *,
     services_up: bool,
 ) -> list[Finding]:
-    """Check a module's board, and put what was read from it into `read`."""
+    """Check a module's board, and add its settings to `read`."""
     serial = robot.module_named(module).serial_number.upper()
     board = found.boards.get(serial)
     if board is None:

@@ -60,7 +60,7 @@ class UsbBus:
                 f"USB: {error}; the odrive package needs the system's libusb-1.0: {LIBUSB_FIX}"
             ) from error
         self._present: dict[str, Any] = {}
-        """What is plugged in now, by serial number; written by the package's loop."""
+        """Boards that are plugged in now, by serial number; written by the package's loop."""
         self._boards: list[UsbBoard] = []
         self._subscription: Subscription = self.run(self._watch(), TRANSFER_S)
 
@@ -90,10 +90,10 @@ class UsbBus:
             self.run(self._leave(), TRANSFER_S)
 
     def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float) -> T:
-        """Return what a coroutine on the package's loop returns.
+        """Run a coroutine on the package's loop and return its result.
 
         Raises:
-            DriveError: it fails, or not in this time.
+            DriveError: it fails, or times out.
         """
         task = asyncio.run_coroutine_threadsafe(coroutine, self._manager.loop)
         try:
@@ -264,6 +264,6 @@ class UsbBoard:
 
 
 def describe(error: BaseException) -> str:
-    """Return one line of what the package raised."""
+    """Return an exception of the package as one line."""
     said = str(error).strip().splitlines()
     return f"{type(error).__name__}: {said[0]}" if said else type(error).__name__

@@ -1,8 +1,8 @@
-"""Telling a drive where its joint is: look, judge, set, read back.
+"""Writes a joint's position to its drive: observe, judge, write, read back.
 
-Positions here are as the drive itself counts them; `services.joint.drivers.wired_drive` says why
-a motor at q = 0 is told a mark and not 0. The functions take a `Drive` that is not wrapped:
-behind the mark an armed drive that has lost its zero would only look unzeroed.
+Positions here are in the drive's own count; `services.joint.drivers.wired_drive` says why a motor
+at q = 0 gets a mark and not 0. The functions take a `Drive` without that wrapper: behind the mark
+an armed drive that lost its zero would only look unzeroed.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ STILL: Final = 0.05
 MOVED_MAX: Final = 0.005
 """rad in `LOOK_S`."""
 WITHIN: Final = 0.002
-"""rad; what is read back may differ by this from what was told."""
+"""rad; largest difference between the position read back and the one written."""
 HELD_WITHIN: Final = 0.03
 """rad; the same where its joint service has armed it meanwhile: the joint sags a little."""
 TAKEN_S: Final = 0.1
-"""Samples this soon after a drive was told may be of the time before."""
+"""s; samples this soon after a write may be older than it."""
 SET_S: Final = 0.5
 """Time for one attempt to read back right; frames may get lost, so there are some."""
 ATTEMPTS: Final = 4
@@ -40,16 +40,16 @@ _READ_S: Final = 0.05
 
 
 class Back(NamedTuple):
-    """What was read back."""
+    """Position read back."""
 
     q: Pair
     """(phi, theta), rad."""
     armed: bool
-    """Its joint service has armed it: it is not told again."""
+    """Its joint service has armed it: it is not written again."""
 
 
 class DriveLook(NamedTuple):
-    """What a drive says of itself, over a moment."""
+    """A drive's samples over a moment."""
 
     status: DriveStatus
     """As the drive is, its zero not considered: ARMED if it is in closed loop."""
@@ -65,11 +65,11 @@ class DriveLook(NamedTuple):
 
 
 def look(drive: Drive, mark_turns: float, gear_ratio: float) -> DriveLook:
-    """Watch a drive for `LOOK_S`, once it answers.
+    """Observe a drive for `LOOK_S`, once it answers.
 
     Args:
-        drive: as it counts itself.
-        mark_turns: what a motor reads at q = 0.
+        drive: in its own count.
+        mark_turns: a motor's reading at q = 0.
         gear_ratio: N of the differential.
     """
     answer_by = time.monotonic() + ANSWER_S
@@ -130,18 +130,18 @@ def outside(robot: RobotConfig, module: str, q: Pair) -> str:
 
 
 def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
-    """Tell both motors where they are; return what the drive then says.
+    """Write both motors' positions; return the drive's reading.
 
     Args:
-        drive: idle, and as it counts itself.
-        q: where the joint is, (phi, theta), rad.
+        drive: idle, in its own count.
+        q: joint angles (phi, theta), rad.
         robot: its mark and gear ratio.
 
     Returns:
-        What was read back, whether it is right or not (`is_right`); None if nothing was.
+        The position read back, right or not (`is_right`); None if none came.
 
     Raises:
-        DriveError: the drive cannot be told.
+        DriveError: the drive cannot be written.
     """
     mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
     m1, m2 = motor_from_joint(q, gear_ratio)
@@ -163,7 +163,7 @@ def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
 
 
 def is_right(back: Back | None, q: Pair) -> bool:
-    """Return True if what was read back is what was told."""
+    """Return True if the position read back is the one written."""
     if back is None:
         return False
     within = HELD_WITHIN if back.armed else WITHIN

@@ -1,1 +1,1 @@
-"""The fleet as processes: what is started, by which supervisor, and how it ends."""
+"""The fleet as processes: process table, supervisor, start and stop, status."""

@@ -26,7 +26,7 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
     """Request a stop by shared memory from the services on this host.
 
     Returns:
-        The modules that were asked, and one line for each that cannot be.
+        The modules that received it, and one line for each that could not.
     """
     here, errors = [], []
     for module in MODULES:

@@ -66,7 +66,7 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """One module, by the newest state of its joint service."""
 
     mode: str | None
-    """Name of its `Mode`; None if its joint service is not heard now."""
+    """Name of its `Mode`; None if its joint service sends nothing now."""
     tier: int | None
     """See `TIERS`; None in every other mode."""
     cause: str | None
@@ -76,22 +76,22 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     q: Pair | None
     """(phi, theta), rad; None if its drive does not know."""
     way_out: str
-    """What a person does to have it track again; empty if nothing has to be done."""
+    """Remedy that lets it track again; empty if none is needed."""
     stiffened: bool = False
     """It holds with all of its stand gains, for another may be limp."""
     outside: str = ""
-    """Name of what it does not believe of the newest command (`Outside`); empty if it does."""
+    """Name of the refused part of the newest command (`Outside`); empty if it is accepted."""
 
 
 class LeadStatus(msgspec.Struct, frozen=True):
-    """What the planner does, by its newest status."""
+    """The planner's state, from its newest status."""
 
     mode: str
     """Name of its `PlannerMode`."""
     wait_s: float
     """Until it may lead again after drop-outs, s."""
     margin: float
-    """Failsafe certificate of the gains; 1 is what is required."""
+    """Margin of the gains by the failsafe certificate; 1 is required."""
     why: str = ""
     """Why it does not lead, in words, where the mode does not say it all."""
 
@@ -104,9 +104,9 @@ class FleetStatus(msgspec.Struct, frozen=True):
     services: dict[str, ServiceStatus]
     modules: dict[str, ModuleStatus]
     lead: LeadStatus | None = None
-    """None if no planner is heard now."""
+    """None if no planner sends a status now."""
     network: tuple[str, ...] = ()
-    """What the network proxy does to links now, in words."""
+    """Active impairments of the network proxy, as text."""
     pace: float = 1.0
     """How fast the fleet's clock goes; below 1 it is in slow motion."""
 
@@ -120,7 +120,7 @@ class RateMonitor:
         self.newest: Message | None = None
 
     def listen(self) -> None:
-        """Take what has come."""
+        """Receive new messages."""
         message = self._latest.take()
         if message is None:
             return
@@ -178,7 +178,7 @@ def look(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> FleetStatus
     for ear in ears.values():
         ear.new_window()
     _listen(ears, _WINDOW_S)
-    # Before the supervisor is asked: on a busy machine that takes a while.
+    # before the call to the supervisor, which takes a while on a busy machine
     heard = {name: (ear.age_s(), ear.rate_hz()) for name, ear in ears.items()}
     fresh = {name for name, ear in ears.items() if ear.is_fresh()}
     services = {}
@@ -204,7 +204,7 @@ def look(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> FleetStatus
 
 
 def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
-    """Return what is done to the network now, in words; nothing where there is no network proxy."""
+    """Return the active impairments as text; empty without a network proxy."""
     if "network_proxy" not in fleet.manifest.services:
         return ()
     try:
@@ -243,7 +243,7 @@ def module_status(state: Message | None) -> ModuleStatus:
 
 
 def lead_status(message: Message | None) -> LeadStatus | None:
-    """Return what the planner does, from its newest status."""
+    """Return the planner's state from its newest status."""
     if not isinstance(message, PlannerStatus):
         return None
     mode = PlannerMode(message.mode).name

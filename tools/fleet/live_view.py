@@ -1,4 +1,4 @@
-"""What a person sees while a run goes on: one line, renewed."""
+"""Display of a live run: one line that is rewritten."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tools.runs.scenario_runner import LiveSnapshot
 PERIOD_S = 0.1
 PLAIN_PERIOD_S = 1.0
 UNHEARD_S = 0.5
-"""What a planner said that is silent for so long is not shown."""
+"""s; an older status of the planner is not shown."""
 
 
 class PlannerNews(Protocol):
-    """Gives what the planner said last (`shared.bus.session.Latest`)."""
+    """Gives the planner's newest status (`shared.bus.session.Latest`)."""
 
     def take(self) -> PlannerStatus | None:
         """Return the newest message if it was not taken before, else None."""
@@ -33,12 +33,12 @@ class LiveView:
     def __init__(
         self, console: Console, injects: Sequence[Inject] = (), planner: PlannerNews | None = None
     ) -> None:
-        """Begin.
+        """Start.
 
         Args:
-            console: where the line goes.
-            injects: what the scenario does to the network.
-            planner: says how long it waits after drop-outs; None: that is not shown.
+            console: shows the line.
+            injects: the scenario's impairments.
+            planner: its wait after drop-outs is shown; None: it is not.
         """
         self._console = console
         self._injects = injects
@@ -79,7 +79,7 @@ class LiveView:
             self._console.print(line, highlight=False, soft_wrap=True)
 
     def _hear(self, now_s: float) -> PlannerStatus | None:
-        """Return what the planner says of itself; None if it says nothing."""
+        """Return the planner's state as text; None if it is silent."""
         status = None if self._planner is None else self._planner.take()
         if status is not None:
             self._status, self._heard_s = status, now_s
@@ -87,7 +87,7 @@ class LiveView:
 
 
 def active(injects: Sequence[Inject], scenario_s: float) -> str:
-    """Return what a scenario does to the network at a time, in words; empty if nothing."""
+    """Return a scenario's impairments at a time as text; empty if none."""
     found = [row for row in injects if row.at <= scenario_s < row.until]
     return ", ".join(f"{row.link} {row.describe()}" for row in found)
 

@@ -1,8 +1,8 @@
 """supervisord under PR_SET_PDEATHSIG: no service outlives its supervisor, whatever kills it.
 
-`python -m tools.fleet.parent_death [--parent PID] -- SUPERVISORD ARGUMENTS`. The kernel ends
-each service with SIGKILL when the supervisor dies (PR_SET_PDEATHSIG), and, with `--parent`,
-asks the supervisor to stop the fleet when that process dies.
+`python -m tools.fleet.parent_death [--parent PID] -- SUPERVISORD ARGUMENTS`. The kernel kills each
+service (SIGKILL) when the supervisor dies. With `--parent`, it signals the supervisor to stop the
+fleet when that process dies.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class LeashedOptions(ServerOptions):  # type: ignore[misc]  # supervisor has no 
 
 
 def main() -> None:
-    """Run supervisord in this process until it is told to stop."""
+    """Run supervisord in this process until it is stopped."""
     # The tool that starts us blocks signals meanwhile, and a mask is inherited.
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     parser = argparse.ArgumentParser(description=__doc__)

@@ -35,7 +35,7 @@ SUPERVISOR_SOCKET = "supervisor.sock"
 """Name of the supervisor's own socket in the run directory."""
 
 UNIX = "unixsock-stream/"
-"""What a bus endpoint on a UNIX socket begins with."""
+"""Prefix of a bus endpoint on a UNIX socket."""
 
 
 class Process(Section, frozen=True):
@@ -105,7 +105,7 @@ def make_plan(
     injected: bool = False,
     table_path: Path,
 ) -> FleetPlan:
-    """Return what is to be started; the arguments are those of `SupervisedFleet.start`.
+    """Return the processes to start; arguments as for `SupervisedFleet.start`.
 
     Raises:
         ConfigError: the robot file or the table cannot be used.

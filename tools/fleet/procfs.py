@@ -1,7 +1,7 @@
-"""What the kernel knows of a fleet's processes (Linux /proc).
+"""Finds a fleet's processes in Linux's /proc.
 
 Every process of a fleet has the run directory in `FLEET_VARIABLE` of its environment, so
-it can be found without its supervisor, and a process id used again is never mistaken.
+it can be found without its supervisor, and a reused process id is never mistaken.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def wait_until_gone(run_dir: Path, timeout_s: float) -> set[int]:
 
 
 def _state(pid: int) -> str:
-    """Return the kernel's letter for a process's state; empty if there is no such process."""
+    """Return the kernel's letter for a process's state; empty if the process is gone."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:

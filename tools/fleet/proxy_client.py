@@ -33,26 +33,26 @@ class ProxyClient:
         self._path = run_dir / SOCKET
 
     def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[RequestedImpairment, ...]:
-        """Put an impairment in force, in so many s; return all that is asked for then.
+        """Start an impairment after a delay, s; return all impairments then.
 
         Raises:
-            FleetError: the network proxy is not there, or refuses.
+            FleetError: there is no network proxy, or it refuses.
         """
         return self._ask(Begin(inject, in_s))
 
     def clear(self, link: str) -> tuple[RequestedImpairment, ...]:
-        """End all that touches a link; return what is left.
+        """End every impairment of a link; return those that remain.
 
         Raises:
-            FleetError: the network proxy is not there, or knows no such link.
+            FleetError: there is no network proxy, or the link is unknown.
         """
         return self._ask(Clear(link))
 
     def list(self) -> tuple[RequestedImpairment, ...]:
-        """Return what is asked for.
+        """Return all impairments.
 
         Raises:
-            FleetError: the network proxy is not there.
+            FleetError: there is no network proxy.
         """
         return self._ask(List())
 

@@ -23,7 +23,7 @@ _NEVER_GIVE_UP = 1_000_000
 
 
 class Manifest(msgspec.Struct, frozen=True):
-    """What a later command needs to know of a fleet that is up."""
+    """Facts of a running fleet that later commands need."""
 
     config: str
     """The robot file, absolute."""
@@ -114,7 +114,7 @@ class RunDir:
         self._remove_shared_memory()
 
     def _remove_shared_memory(self) -> None:
-        """Forget what joint services of another time have left: a fleet is asked for anew."""
+        """Remove the rearm guards of an earlier fleet: a person has started a new one."""
         for module in MODULES:
             rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
         neighbours.path_of(self.path).unlink(missing_ok=True)
@@ -127,7 +127,7 @@ class RunDir:
             return None
 
     def clear(self, *, keep_logs: bool) -> None:
-        """Remove what a fleet has made here, and the directory itself if it is then empty."""
+        """Remove the fleet's files, and the directory itself if it is then empty."""
         manifest = self.read_manifest()
         for path in manifest.sockets if manifest else ():
             _remove_socket(Path(path))
@@ -146,7 +146,7 @@ def supervisor_config(run: RunDir, plan: FleetPlan, no_restart: Collection[str])
 
     Args:
         run: the run directory.
-        plan: what is to be started, in the order of the start.
+        plan: the processes, in the order of the start.
         no_restart: services that stay down when they end.
     """
     sections: list[tuple[str, Mapping[str, object]]] = [

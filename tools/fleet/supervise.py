@@ -58,19 +58,18 @@ class SupervisedFleet:
     ) -> Self:
         """Start the services and wait until every one is up.
 
-        Interrupted or failed, it stops what it has started; the logs of a failure stay.
+        If it is interrupted or fails, it stops the started services; the logs of a failure stay.
 
         Args:
             config_path: the robot file.
             run_dir: for sockets and logs; made if it is not there.
             overrides: further arguments for some services.
             no_restart: services that stay down when they end.
-            services: which to start; None for all that the table starts by itself.
-            asleep: of these, which wait for `start_service`.
+            services: to start; None for all that the table starts by default.
+            asleep: those that wait for `start_service`.
             simulation: False leaves the simulator out; where all drives are real it always is.
             injected: with the network proxy on the links of planner, joints and sensors.
-            pace: how fast the clock of a simulated fleet goes; None: `usual_pace` where it is
-                simulated, else as the machine's.
+            pace: clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1.
             leashed: stop the fleet if this process dies.
             table_path: the process table.
             timeout_s: time in which every service has to be up.
@@ -131,7 +130,7 @@ class SupervisedFleet:
 
     @property
     def manifest(self) -> Manifest:
-        """What was started: robot file, services, topics."""
+        """Facts of the start: robot file, services, topics."""
         manifest = self.run.read_manifest()
         if manifest is None:
             raise FleetError(f"no fleet is up in {self.run.path}; `xrl up` starts one")
@@ -166,10 +165,11 @@ class SupervisedFleet:
         rearm_guard.clear(self.run.path, service)
 
     def start_service(self, service: str) -> None:
-        """Start a service that is down, without waiting for a restart that is delayed.
+        """Start a service that is down, before any delayed restart.
 
-        It is asked for: a drive that has let go is armed again (`services.joint.rearm_guard`).
-        One that is suspended is continued; one that runs is left alone.
+        A person has requested it, so a drive that lost torque is armed again
+        (`services.joint.rearm_guard`). A suspended service is continued; a running one is left
+        alone.
 
         Raises:
             FleetError: the service is unknown, or cannot be started.
@@ -188,14 +188,14 @@ class SupervisedFleet:
             os.kill(pid, signal.SIGCONT)
 
     def stop(self, *, keep_logs: bool = False) -> None:
-        """Stop every service and the supervisor, and remove what they have made.
+        """Stop every service and the supervisor, and remove their files.
 
-        Each by its own signal first, suspended ones too; SIGKILL for what does not end in
-        its time. Does nothing where no fleet is. Nothing is left in the run directory but the
-        logs, if they are wanted, and files that are not the fleet's.
+        Each gets its own signal first, a suspended one too, and SIGKILL if it does not end in its
+        time. Without a fleet it does nothing. Only the logs, if wanted, and files that are not the
+        fleet's remain in the run directory.
 
         Raises:
-            FleetError: a process is left that even SIGKILL did not end.
+            FleetError: a process survived SIGKILL.
         """
         self._end()
         try:
@@ -208,7 +208,7 @@ class SupervisedFleet:
             os.close(lock)
 
     def _clear(self, *, keep_logs: bool) -> None:
-        """Remove what the fleet has made in the run directory."""
+        """Remove the fleet's files from the run directory."""
         usb_standin.clear(self.run.path)
         self.run.clear(keep_logs=keep_logs)
 
@@ -220,8 +220,8 @@ class SupervisedFleet:
             self._supervisor.call("stopAllProcesses", False)  # all at once,
             self._supervisor.call("shutdown")  # which by itself goes one by one
         except FleetError:
-            # no supervisor, or none that answers: whatever is there is told directly
-            # (SIGINT: a joint service told so leaves its drive idle)
+            # no supervisor, or none that answers: the processes are signalled directly
+            # (SIGINT: a joint service then leaves its drive idle)
             procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGINT)
         patience_s = (manifest.stop_s if manifest else 0.0) + 2.0
         left = procfs.wait_until_gone(self.run.path, patience_s)
@@ -309,7 +309,7 @@ class SupervisedFleet:
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Hold back interrupts while what was started is being stopped."""
+    """Hold back interrupts while the started services are stopped."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
     try:
         yield

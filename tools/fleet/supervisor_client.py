@@ -40,7 +40,7 @@ class ServiceInfo(msgspec.Struct, frozen=True):
 
 
 class RefusedError(FleetError):
-    """The supervisor answers, and does not do what it was asked."""
+    """The supervisor answered and refused the request."""
 
 
 class Supervisor:
@@ -66,7 +66,7 @@ class Supervisor:
 
         Raises:
             FleetError: it does not answer.
-            RefusedError: it does not do what it is asked.
+            RefusedError: it refuses the request.
         """
         transport = _Transport(self._run.supervisor_socket)
         try:

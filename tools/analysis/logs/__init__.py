@@ -1,1 +1,1 @@
-"""What is in a log, without holding it in memory."""
+"""Surveys of logs, without holding them in memory."""

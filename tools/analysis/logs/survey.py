@@ -1,4 +1,4 @@
-"""Counts what is in MCAP files: by file and by topic, finished or not, ours or foreign."""
+"""Counts the contents of MCAP files: by file and by topic, finished or not, ours or foreign."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class TopicFacts(msgspec.Struct, kw_only=True):
 
     schema: str
     nominal_hz: float
-    """As the table of topics had it when it was recorded; 0: events, or unknown."""
+    """From the table of topics at the recording; 0: events, or unknown."""
     bytes: int = 0
     """Size of the payload before compression, bytes."""
     first_ns: int = _NEVER

@@ -1,1 +1,1 @@
-"""Parts of `xrl play`: what is read, what of it is put where, and when."""
+"""Parts of `xrl play`: reading, selection of keys, schedule, player, keyboard."""

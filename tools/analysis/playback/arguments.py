@@ -1,4 +1,4 @@
-"""The arguments of `xrl play`, and what its help says."""
+"""The arguments of `xrl play`, and its help."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Exit code: 0 played; 1 messages could not be sent; 2 refused; 130 Ctrl-C.
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Add every argument, and what a person has to know."""
+    """Add every argument, with the warnings for a person."""
     parser.description = f"{parser.description}\n{ABOUT.rstrip()}"
     parser.add_argument(
         "files",

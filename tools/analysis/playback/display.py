@@ -1,4 +1,4 @@
-"""What a person sees of a play: before it, while it goes on, and after it."""
+"""Output of a playback: before, during and after it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tools.analysis.playback.schedule import Window
 
 
 def introduce(recording: Recording, paths: list[Path], note: str, console: Console) -> None:
-    """Print what a person should know of a log before it is played."""
+    """Print the facts of a log that a person needs before playing it."""
     if note:
         console.print(escape(note), style="dim", soft_wrap=True)
     for path in recording.unfinished:
@@ -34,12 +34,12 @@ def introduce(recording: Recording, paths: list[Path], note: str, console: Conso
 
 
 def where(keys: Sequence[str], robot: str, part: Window, listening: str) -> str:
-    """Return in one line what goes where.
+    """Return one line: what is played, onto which keys.
 
     Args:
         keys: on the bus.
         robot: of the log.
-        part: what is played.
+        part: the part that is played.
         listening: endpoint; empty if there is none.
     """
     common = keys[0] if len(keys) == 1 else f"{_common(keys)}**"
@@ -70,7 +70,7 @@ def summary(player: Player, took_s: float, *, heard: bool) -> str:
 
 
 class Display:
-    """One line on a terminal that is written anew; nothing on a pipe."""
+    """One line on a terminal that is rewritten; nothing on a pipe."""
 
     def __init__(self, ports: Sequence[RawPublisher]) -> None:
         self.heard = False

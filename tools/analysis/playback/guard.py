@@ -21,11 +21,12 @@ from tools.fleet.process_table import is_listening
 from tools.fleet.supervise import SupervisedFleet
 
 IN_THE_LOOP: Final = (topics.JOINT_STATE, topics.JOINT_COMMAND, topics.WRENCH, topics.ATTITUDE)
-"""What makes a robot move by itself: never put beside a live drive, whatever is forced.
+"""Topics that move a robot: never published beside a live drive, even with --force.
 
-A recorded command is too old for a joint service, until after a restart of the machine its
-clock passes the moment of the recording again. Of recorded states and wrenches the planner
-makes fresh commands."""
+A recorded command is too old for a joint service, unless the machine has restarted and its clock
+passes the time of the recording again. From recorded states and wrenches the planner makes fresh
+commands.
+"""
 
 ACTED_ON: Final = (
     *IN_THE_LOOP,
@@ -34,7 +35,7 @@ ACTED_ON: Final = (
     topics.HARNESS_TARE,
     topics.SIM_CONTROL,
 )
-"""What a live service, other than the recorder, takes from the bus."""
+"""Topics to which live services subscribe, but for the recorder."""
 
 LISTEN_S: Final = 1.0
 """So long a joint service is listened for: it says its state 250 times a second."""
@@ -49,7 +50,7 @@ def those_of(rows: Iterable[Topic], keys: Iterable[str]) -> list[str]:
 
 
 class LiveRobotWatch:
-    """Listens for a live robot, in a session of its own: it does not hear the player."""
+    """Listens for a live robot in a session of its own, which does not receive the player."""
 
     def __init__(self, robot: RobotConfig, run_dir: Path) -> None:
         self._robot, self._run_dir = robot, run_dir
@@ -93,7 +94,7 @@ class LiveRobotWatch:
         return ""
 
     def heard(self) -> str:
-        """Return which joint service has been heard since the last call, in words."""
+        """Return the joint services that have sent since the last call, as text."""
         for module, states in self._states.items():
             if states.take() is not None or states.refused:
                 return f"the joint service {module} is heard"
@@ -101,15 +102,15 @@ class LiveRobotWatch:
 
 
 def allowed(targets: Mapping[str, str], live: str, *, force: bool) -> dict[str, str]:
-    """Return what may be put on the bus.
+    """Return the keys that may be published.
 
     Args:
         targets: key on the bus of each key of the log.
         live: from `LiveRobotWatch.look`.
-        force: also what a live robot acts on, but for what moves it by itself.
+        force: also topics that a live robot acts on, but for those that move it.
 
     Raises:
-        FleetError: something is refused, or nothing is left.
+        FleetError: a key is refused, or none is left.
     """
     refused = set(those_of(IN_THE_LOOP if force else ACTED_ON, targets.values()))
     if not live or not refused:

@@ -1,4 +1,4 @@
-"""The keys of a terminal while something plays; nothing where there is no terminal."""
+"""The keys of a terminal during playback; no keys without a terminal."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Keyboard:
             self._descriptor = -1
 
     def wait(self, timeout_s: float) -> list[Press]:
-        """Return what was pressed, at the latest after so long."""
+        """Return the pressed keys, after a timeout at the latest."""
         if not self.present:
             time.sleep(timeout_s)
             return []
@@ -92,7 +92,7 @@ class Keyboard:
 
 
 def understood(text: bytes) -> tuple[list[Press], bytes]:
-    """Return the keys in what a terminal sent, and the start of one that is not yet whole."""
+    """Split a terminal's bytes into keys and the start of an incomplete one."""
     presses = []
     while text:
         for code, press in _PRESSES.items():

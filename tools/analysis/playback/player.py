@@ -1,4 +1,4 @@
-"""Plays a schedule: waits, puts what is due, obeys keys, tells the time."""
+"""Plays a schedule: waits, publishes what is due, obeys keys, reports the time."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Port(Protocol):
 
 
 class KeyboardClock(Protocol):
-    """Passes the time and tells what was pressed."""
+    """Waits, and returns the keys that were pressed."""
 
     def wait(self, timeout_s: float) -> list[Press]:
         """Return at the latest after so long."""
 
 
 class PlaybackStats(msgspec.Struct):
-    """What has been played."""
+    """Counts of what has been played."""
 
     put: int = 0
     failed: int = 0
@@ -72,14 +72,14 @@ class Player:
         """Prepare.
 
         Args:
-            schedule: what to play.
-            head: where it stands; begins now.
+            schedule: the messages.
+            head: the position; it starts now.
             ports: by `Entry.key`.
-            hand: passes the time.
+            hand: waits and returns keys.
             now_ns: the clock of `head`.
-            show: called five times a second; what it raises ends the play.
-            clock: where the recorded time goes; None: nowhere.
-            clock_hz: so often, also while paused.
+            show: called five times a second; an exception from it ends the playback.
+            clock: receives the recorded time; None: not published.
+            clock_hz: rate of that, also while paused.
         """
         self.schedule, self.head = schedule, head
         self.tally = PlaybackStats(counts=[0] * len(ports))
@@ -108,7 +108,7 @@ class Player:
         self._show()
 
     def _put_due(self) -> None:
-        """Put what is due; what is late goes at once, in order."""
+        """Publish what is due; late messages go at once, in order."""
         schedule, head, tally = self.schedule, self.head, self.tally
         for _ in range(BURST):
             position = schedule.next_ns()

@@ -1,4 +1,4 @@
-"""What is to be played: files of a run, read in the order in which messages were recorded."""
+"""Reads the files of a run for playback, in the order of the recording."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class _File:
             self.damaged = bool(reader.damage)
 
     def check(self) -> None:
-        """Refuse what is no run of this project.
+        """Refuse a file that is no run of this project.
 
         Raises:
             RunError: it is none.

@@ -1,9 +1,9 @@
-"""When which message goes out. Pure: moments in, messages out.
+"""Schedules messages for playback. Pure: times in, messages out.
 
-Two times: the clock's (monotonic, ns) and the position in the log (ns since the start of
-what is played, counted on from pass to pass when it loops). A `Playhead` maps one to the
-other by a line that is laid anew only when somebody pauses, steps or changes the rate: no
-error adds up. A `Schedule` says at which position which message goes.
+Two times: the clock's (monotonic, ns) and the position in the log (ns since the start of the played
+part; it keeps counting when playback loops). A `Playhead` maps one to the other by a line that
+changes only at a pause, a step or a change of rate, so no error adds up. A `Schedule` gives the
+position of each message.
 """
 
 from __future__ import annotations
@@ -112,12 +112,12 @@ class Schedule:
     """The messages of a window in order, once or for ever."""
 
     def __init__(self, entries: Sequence[Entry], part: Window, *, loop: bool) -> None:
-        """Take messages in the order in which they are to go.
+        """Take messages in the order of playback.
 
         Args:
-            entries: sorted by time; those outside of the window are left out.
+            entries: sorted by time; those outside the window are left out.
             part: the window.
-            loop: begin anew at its end.
+            loop: restart at its end.
         """
         self._entries = entries
         self._first = bisect_left(entries, part.start_ns, key=_time)
@@ -145,7 +145,7 @@ class Schedule:
         return self.passes * self._period_ns + self._entries[self._next].time_ns - self._start_ns
 
     def pop(self) -> Entry:
-        """Return the next message, whose position `next_ns` has just told."""
+        """Return the next message, whose position `next_ns` has returned."""
         entry = self._entries[self._next]
         self._next += 1
         return entry

@@ -59,10 +59,10 @@ def choose(
 
 
 def check_prefix(prefix: str) -> str:
-    """Return a prefix that can stand before a key, without slashes at its ends.
+    """Return a prefix of keys, without slashes at its ends.
 
     Raises:
-        RunError: it is no section of a key, or lies where live keys are.
+        RunError: it is malformed, or would make live keys.
     """
     stripped = prefix.strip("/")
     sections = stripped.split("/") if stripped else []
@@ -168,7 +168,7 @@ def _fits(name: str, key: str) -> bool:
 
 
 def _subject(name: str, key: str) -> str:
-    """Return what a name is held against: the whole key if it is a whole key."""
+    """Return the text that a name is matched against: the whole key if the name is one."""
     return key if name.partition("/")[0] == LIVE else short(key)
 
 

@@ -47,7 +47,7 @@ class Difference(msgspec.Struct, frozen=True):
 
 
 class Comparison:
-    """Compares messages, and keeps what is first and largest of what differs.
+    """Compares messages, and keeps the first and the largest differences.
 
     Attributes:
         compared: messages that were compared.
@@ -106,7 +106,7 @@ def _short(value: Any) -> str:
 
 
 def ulp(a: Any, b: Any) -> int | None:
-    """Return how many floating-point numbers lie from a to b; None if one is no float."""
+    """Return the number of floats between a and b; None if one is no float."""
     if not (isinstance(a, float) and isinstance(b, float)):
         return None
     return abs(_ordered(a) - _ordered(b))

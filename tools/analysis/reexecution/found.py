@@ -1,4 +1,4 @@
-"""Messages of a log, found again by what a service noted of them."""
+"""Finds the messages that a service consumed, by the numbers in its trace."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ M = TypeVar("M", bound=Message)
 
 
 class BySeq(Generic[M]):
-    """Finds a sender's message by its number; a sender that was started anew counts anew."""
+    """Finds a sender's message by its number; a restarted sender counts from the start again."""
 
     def __init__(self, messages: Iterable[M]) -> None:
         """Take the messages of one key, in the order of the log."""

@@ -47,7 +47,7 @@ class JointExecution:
         expected = 0
         for trace in self._traces:
             if trace.seq != expected:
-                self._module = None  # the log lacks what came between, or it was started anew
+                self._module = None  # the log lacks traces in between, or the service restarted
             expected = trace.seq + 1
             if trace.snapshot:
                 self._remember(trace)
@@ -58,7 +58,7 @@ class JointExecution:
                     yield from self._cycle(self._module, cycle)
 
     def snapshot(self) -> DriveManagerState | None:
-        """Return what the service knows now; None while it cannot be executed."""
+        """Return the service's present state; None while it cannot be executed."""
         return None if self._module is None else self._module.snapshot()
 
     def _remember(self, trace: JointTrace) -> None:

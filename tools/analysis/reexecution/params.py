@@ -46,7 +46,7 @@ def with_params(robot: RobotConfig, texts: Sequence[str], file: str) -> RobotCon
 
 
 def _kept(robot: RobotConfig, changed: RobotConfig) -> GainSchedule | None:
-    """Return the recorded schedule as one for the changed robot: what changes is asked of it."""
+    """Return the recorded schedule for the changed robot, whose changes then take effect."""
     if robot.gain_schedule is None:
         return None
     inputs = gain_schedule.inputs_of(changed)
@@ -89,7 +89,7 @@ def _resolved(table: dict[str, Any], name: str, file: str) -> Iterator[Any]:
 
 
 def _value(before: Any, text: str, name: str, file: str) -> Any:
-    """Return a text as a value of the type of what it replaces."""
+    """Parse a text as a value of the type that it replaces."""
     try:
         if isinstance(before, bool):
             return {"true": True, "false": False}[text.lower()]

@@ -24,7 +24,7 @@ _encode: Final = msgspec.json.Encoder().encode
 
 
 class PlannerExecution:
-    """The planner, from its statuses: each says what its tick took."""
+    """The planner, re-executed from its statuses: each lists the inputs of its tick."""
 
     def __init__(self, log: RunLog, robot: RobotConfig, outcome: ReexecutionResult) -> None:
         """Take the log, the robot to execute with and what to fill in."""
@@ -60,7 +60,7 @@ class PlannerExecution:
             yield from self._tick(self._planner, status)
 
     def snapshot(self) -> tuple[int, TickState] | None:
-        """Return session and what the planner knows now; None while it cannot be executed."""
+        """Return the planner's session and present state; None while it cannot be executed."""
         planner = self._planner
         return None if planner is None else (planner.session, planner.snapshot())
 

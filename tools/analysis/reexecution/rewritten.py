@@ -23,16 +23,16 @@ _SEQUENCE_MASK: Final = 0xFFFFFFFF
 def write(
     log: RunLog, path: Path, replaced: Mapping[str, Collection[Message]], note: Mapping[str, str]
 ) -> int:
-    """Write a run anew; return the number of its messages.
+    """Write a run with replaced messages; return the number of messages.
 
     Args:
-        log: the recorded run: what is not replaced is copied, metadata and attachments too.
-        path: of the new file; it must not be there yet.
-        replaced: by full key, the messages that stand there instead.
-        note: metadata `resim`: what was changed.
+        log: the recorded run; all else is copied, metadata and attachments too.
+        path: of the new file, which must not exist.
+        replaced: by full key, the new messages.
+        note: metadata `resim`: the changes.
 
     Raises:
-        RunError: the file is there already, or cannot be written.
+        RunError: the file exists, or cannot be written.
     """
     rows: list[tuple[int, str, bytes, int, int]] = []
     encode = msgspec.json.Encoder().encode
