@@ -1,4 +1,4 @@
-"""The moments of a recorded run from which it can be gone on with in another way."""
+"""Moments of a recorded run from which a different run can continue."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Moment(msgspec.Struct):
     modules: dict[str, DriveManagerState] = msgspec.field(default_factory=dict)
     """What each joint service that was alive knew."""
     planner: tuple[int, TickState] | None = None
-    """Session, and what the planner knew, if it was alive."""
+    """Session and state of the planner, if it was alive."""
     margin: float | None = None
     """Margin of the failsafe certificate, as last published."""
 
@@ -87,7 +87,7 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
 
 
 def _copy(execution: JointExecution) -> DriveManagerState | None:
-    """Return a copy of what a service knows now: its own goes on changing."""
+    """Return a copy of a service's present state: its own keeps changing."""
     snapshot = execution.snapshot()
     if snapshot is None:
         return None
@@ -97,12 +97,12 @@ def _copy(execution: JointExecution) -> DriveManagerState | None:
 def _at(
     moments: Sequence[Moment], rows: Iterable[tuple[int, R]], take: Callable[[R], T]
 ) -> Iterator[tuple[Moment, T]]:
-    """Yield moments with what is taken of the last row before each, if it lies near.
+    """Yield moments with the last row before each, if it is near.
 
     Args:
         moments: in their order.
-        rows: time and what there is then, in its order; good only until the next is asked for.
-        take: what is to be kept of it.
+        rows: times and rows, in order; a row is valid only until the next one.
+        take: returns the part of a row to keep.
     """
     index = 0
     last: list[T] = []

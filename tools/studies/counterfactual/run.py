@@ -18,7 +18,7 @@ KILL_AFTER_S: Final = 1e-3
 
 
 class Task(msgspec.Struct, frozen=True):
-    """What a worker is given."""
+    """Task of a worker."""
 
     robot: RobotConfig
     scenario: Scenario
@@ -26,7 +26,7 @@ class Task(msgspec.Struct, frozen=True):
     moment: Moment
     kill: tuple[str, ...]
     for_s: float
-    """So long it is gone on with."""
+    """Duration of the continued run, s."""
 
 
 class Counterfactual(msgspec.Struct, frozen=True):

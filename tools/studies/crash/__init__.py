@@ -1,1 +1,1 @@
-"""The crash matrix: what dies in a case, what is expected of the robot, what came of it."""
+"""The crash matrix: which service dies, the expected outcome, and the judgement."""

@@ -1,7 +1,7 @@
-"""The crash matrix as data: what dies, what has to be left of the robot, and why.
+"""The crash matrix as data: which service dies, the expected state of the robot, and why.
 
-In every case the operator leads a squat; the crash comes on the way down, at about 1.0 m.
-Two pushes follow, then what was lost is brought back by a request, and he leads on.
+In every case the operator leads a squat; the crash comes on the way down, at about 1.0 m. Two
+pushes follow, then the lost services are restarted on request, and the operator leads again.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tools.runs.scenario_runner import Chase
 
 CRASH_S: Final = 2.4
 REQUEST_S: Final = 5.0
-"""Here somebody asks for what is in FAULT: its service is ended,"""
+"""here a person requests a module in FAULT: its service is ended,"""
 BACK_S: Final = 5.2
 """and here it is started again, as is every service that was killed or stopped."""
 FAULT_LASTS_S: Final = 2.0
@@ -80,7 +80,7 @@ class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
     before: tuple[Kill | Restart, ...] = ()
     """What leads up to the crash."""
     chase: Chase | None = None
-    """A crash that follows what the modules do."""
+    """A crash that a change of the modules' modes triggers."""
     holds: bool = True
     """The modules that are not hit go to HOLD; False: they go on tracking."""
     leads_again: bool = True
@@ -100,7 +100,7 @@ class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def scenario_of(case: CrashCase) -> Scenario:
-    """Return the case as a scenario, with the requests that bring back what was lost."""
+    """Return the case as a scenario, with the requests that restart what was lost."""
     kills = [row for row in (*case.before, *case.crash) if isinstance(row, Kill)]
     down = [row.service for row in case.crash if isinstance(row, Kill)]
     down += [case.chase.service] if case.chase else []
@@ -167,7 +167,7 @@ LIMP: Final = {
     ),
     "hip": (CrashVerdict.STOOD, "the other hip carries the torso's pitch alone"),
 }
-"""What a robot with one limp module may come to, by the kind of module, and why."""
+"""Allowed outcomes of a robot with one limp module, by the kind of module, and why."""
 
 
 def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = "") -> CrashCase:

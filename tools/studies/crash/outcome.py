@@ -1,6 +1,6 @@
-"""What came of a case: the verdict and its figures, from what was heard on the bus live.
+"""Outcome of a case: the verdict and its figures, from the live bus.
 
-Not from the log: the recorder may be what was lost.
+Not from the log: the recorder may be the service that died.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ UNSAFE: Final = (Mode.FAULT, Mode.DAMP, Mode.DISARMED)
 
 
 class Heard(NamedTuple):
-    """What was on the bus in a run."""
+    """Messages of a run."""
 
     truth: Sequence[SimTruth]
     events: Sequence[tuple[str, JointEvent]]
     """With the module, in the order of each module."""
     said: Sequence[RunEvent]
-    """What was done to the run."""
+    """Actions on the run."""
     modes: Sequence[str]
     """The modules at the end, as in `conductor.Snapshot`."""
     died: Sequence[str] = ()
-    """Services that ended without being told to."""
+    """Services that ended without a request."""
 
 
 class CrashResult(msgspec.Struct, frozen=True, kw_only=True):
     """The figures of a case; None where there is nothing to measure.
 
-    What "before" and "after" are is told by the crash; what is brought back comes later.
+    "Before" and "after" refer to the crash; restarts come later.
     """
 
     verdict: CrashVerdict
@@ -67,7 +67,7 @@ class CrashResult(msgspec.Struct, frozen=True, kw_only=True):
     in_real_time: bool = True
     """False: the machine was too slow, and the figures are not those of a robot."""
     remarks: tuple[str, ...] = ()
-    """What was not as it should be, in words."""
+    """Deviations from the expected outcome, as text."""
     tries: int = 1
     wall_s: float = 0.0
     """Start and stop of the fleet included."""
@@ -185,7 +185,7 @@ def _safe_ms(
 def _remarks(
     case: CrashCase, safe_ms: float | None, reaction: Sequence[tuple[str, JointEvent]]
 ) -> list[str]:
-    """Return what the modules that were not hit did and should not have done, in words."""
+    """Return the unexpected changes of mode of modules that were not hit, as text."""
     words = []
     changed = sorted({name for name, _ in reaction if name in case.others})
     if case.holds and case.others and safe_ms is None:

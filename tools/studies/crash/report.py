@@ -47,7 +47,7 @@ class Result(NamedTuple):
 
 
 def describe(case: CrashCase) -> str:
-    """Return what is done in a case."""
+    """Return the actions of a case."""
     scenario = scenario_of(case)
     words = [
         f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill if row.at <= CRASH_S
@@ -132,20 +132,20 @@ def tally(results: Sequence[Result]) -> dict[str, int]:
 
 
 def write(results: Sequence[Result], out: Path, about: Mapping[str, str], *, planned: int) -> None:
-    """Write JSON and JUnit anew; each file is whole, or the old one.
+    """Rewrite JSON and JUnit atomically.
 
     Args:
         results: so far.
         out: the folder.
         about: code, machine and robot.
-        planned: cases that were to be run.
+        planned: the selected cases.
     """
     _replace(out / RESULTS, as_json(results, about, planned=planned))
     _replace(out / JUNIT, as_junit(results, about))
 
 
 def as_json(results: Sequence[Result], about: Mapping[str, str], *, planned: int) -> bytes:
-    """Return the results as JSON; None is null, what a machine reads is not rounded."""
+    """Return the results as JSON, with null for None and unrounded numbers."""
     rows = [
         {
             "name": case.name,

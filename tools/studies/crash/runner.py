@@ -33,7 +33,7 @@ which the robot fell: a fall stays a fall, and its log is kept."""
 
 
 class Witness:
-    """Keeps what the verdict needs of what is on the bus, beside the recorder."""
+    """Keeps the bus messages that the verdict needs, beside the recorder."""
 
     def __init__(self, session: Session, show: Show) -> None:
         self.truth: list[SimTruth] = []
@@ -123,17 +123,17 @@ def _run_once(
             no_restart=down,
         )
     except (RunError, FleetError) as error:
-        lines = str(error).splitlines()  # a service's log ends with what was wrong
+        lines = str(error).splitlines()  # a service's log ends with its error
         return unjudged(": ".join(dict.fromkeys((lines[0], lines[-1].strip()))))
     return measure(case, heard, robot)
 
 
 def died_of(services: Sequence[ServiceInfo], said: Sequence[RunEvent]) -> list[str]:
-    """Return the services that have ended, now or before, without being told to.
+    """Return the services that have ended, now or before, without a request.
 
     Args:
-        services: as they are at the end of the run.
-        said: what was done to them.
+        services: their states at the end of the run.
+        said: the actions on them.
     """
     last = {row.subject: row.kind for row in said}
     return [

@@ -14,7 +14,7 @@ from shared.robot.robot_model import stand_pose
 from tools.studies.sweeps.push_range import SHARE, PushRange
 
 PAYLOADS: Final = 5
-"""Evenly spaced from none to `mass.payload_max`: each needs a gain schedule of its own."""
+"""kg, evenly spaced from none to `mass.payload_max`: each needs a gain schedule of its own."""
 HEIGHT: Final = (0.79, 1.2)
 """m, torso above the ankles: from the crawl to standing."""
 HEIGHT_UPRIGHT: Final = (0.85, 1.2)
@@ -46,7 +46,7 @@ AFTER_LEAD_S: Final = 2.0
 operator who leads on against a robot that holds tips it slowly."""
 DELAY_MAX_MS: Final = 20.0
 DIGITS: Final = 3
-"""What is drawn is rounded to these: it can be read, typed in again, and is what was run."""
+"""Rounding of drawn values: a table then holds exactly the values that were run."""
 
 
 class LeadPose(msgspec.Struct, frozen=True):
@@ -58,7 +58,7 @@ class LeadPose(msgspec.Struct, frozen=True):
 
 
 class KillCase(msgspec.Struct, frozen=True, kw_only=True):
-    """What was drawn. SI units; times are the scenario's."""
+    """A drawn case. SI units; times are the scenario's."""
 
     number: int
     seed: int

@@ -1,4 +1,4 @@
-"""`xrl sweep certificate`: is the sign of K_fail right? Said against what the simulation does."""
+"""`xrl sweep certificate`: compares the sign of K_fail with falls in simulation."""
 
 from __future__ import annotations
 

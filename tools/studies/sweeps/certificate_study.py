@@ -1,12 +1,12 @@
-"""The certificate on trial: the sign of K_fail against a simulated fall or stand.
+"""Tests the certificate: the sign of K_fail against a simulated fall or stand.
 
 A case is a random posture, payload, assist and set of local gains. The robot starts in the
-posture, on free feet, with what is left without a planner (docs/law.md#certificate):
+posture, on free feet, with the law that remains without a planner (docs/law.md#certificate):
 
     tau = D (q_ref - q) - D_B v + tau_ff
 
-sampled as the joint services do, through their gate. It is nudged; then it stands, or it
-goes. A margin above zero says that it stands.
+sampled as the joint services do, through their torque limiter. It is nudged, and then stands or
+falls. A margin above zero predicts that it stands.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ FACTORS: Final = (0.15, 5.0)
 """Factors on diag(K_q): each joint its own, log-uniform, the legs alike. About half do not
 stand."""
 DAMPING_S: Final = 0.04
-"""s; D_B is so much of D, as in the stand gains, up to the largest of theirs."""
+"""s; D_B over D, as in the stand gains, up to the largest of theirs."""
 DAMPING_MAX: Final = 60.0
 """N m s/rad"""
 NUDGES: Final = (3.0, 10.0)
@@ -67,7 +67,7 @@ DURATION_S: Final = 12.0
 SAMPLE_EVERY: Final = 10
 """Ticks of the joint services."""
 LIMIT_MARGIN: Final = 0.1
-"""rad inside the joint limits: a soft stop would hold what the gains do not."""
+"""rad inside the joint limits: a soft stop would support gains that are too soft."""
 TORQUE_SHARE_MAX: Final = 0.8
 """Fraction of a module's torque that a posture may need to carry itself."""
 DRAWS_MAX: Final = 100
@@ -119,7 +119,7 @@ class CertificateCase(NamedTuple):
 
 
 class CertificateResult(NamedTuple):
-    """What the simulation did."""
+    """Result of the simulation."""
 
     case: CertificateCase
     stood: bool
@@ -135,12 +135,12 @@ class CertificateResult(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """What the certificate said: above 0 it stands."""
+        """Margin of the certificate: above 0 it predicts a stand."""
         return self.case.weakest.margin
 
 
 class Confusion(NamedTuple):
-    """How often what was said came about."""
+    """Counts of predictions and results."""
 
     stand_stood: int
     stand_fell: int
@@ -152,7 +152,7 @@ class Confusion(NamedTuple):
 FRICTIONLESS: Final = changed(
     IDEAL, {"drivetrain.motor_friction": 0.0, "drivetrain.joint_friction": 0.0}
 )
-"""Dry friction holds up what is but a little too soft."""
+"""Falls predicted, stood: dry friction holds a robot that is slightly too soft."""
 
 
 def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
@@ -324,7 +324,7 @@ def judge(case: CertificateCase, rows: Sequence[SimTruth]) -> CertificateResult:
 
 
 def confusion(said: Sequence[tuple[float, bool]]) -> Confusion:
-    """Count what was said against what came about: pairs of a margin and whether it stood."""
+    """Count predictions and results from pairs of a margin and whether the robot stood."""
     pairs = [(margin > 0.0, stood) for margin, stood in said]
     return Confusion(*(pairs.count((says, was)) for says in (True, False) for was in (True, False)))
 

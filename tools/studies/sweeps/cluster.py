@@ -40,13 +40,13 @@ def results(
 ) -> Iterator[tuple[T, R]]:
     """Yield each task with its result as it is done, in no order.
 
-    Leaving the loop early cancels what is not done.
+    Leaving the loop early cancels the rest.
 
     Args:
         work: a function of a module that the workers can import.
-        tasks: what it is given, one after the other.
+        tasks: its arguments, one after the other.
         address: of the scheduler: tcp://HOST:PORT, or dask://HOST:PORT.
-        name: what a task is called in an error.
+        name: returns a task's name for an error.
         code: files that decide a result, as for `code_digest`.
 
     Raises:

@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def draw_picture(rows: Sequence[Row], title: str, path: Path) -> None:
-    """Draw what was said against what happened into a PNG file; rows as in the table."""
+    """Draw predictions against results into a PNG file; rows as in the table."""
     figure = Figure(figsize=(9, 5.5), dpi=110, layout="constrained")
     axis = figure.subplots()
     for grew, colour in (("False", "#4c9f70"), ("True", "#c0392b")):

@@ -1,12 +1,13 @@
-"""One case of the dynamic certificate's trial: drawn gains take over a robot that stands.
+"""One test case of the dynamic certificate: drawn gains replace those of a standing robot.
 
-The robot is stood up and led to a pose with the shipped gains. Then the planner goes on with drawn
-ones (damping, bandwidth and damping of tau_coupled), the robot is tapped, and the joints' motion
-after the tap is compared with that some seconds later. The certificate is asked about the very
+The robot stands up and is led to a pose with the shipped gains. Then the planner continues with
+drawn ones (damping, bandwidth and damping of tau_coupled) and the robot is tapped. The joints'
+motion after the tap is compared with that some seconds later. The certificate is evaluated for this
 pose, stiffness, drivetrain, delay and hand.
 
-The plant is what the linear model has: no play, dry friction, cogging or noise, a hard floor, a
-hand that follows its path. But the encoders count, and rounding can keep going what hardly fades.
+The plant is that of the linear model: no play, dry friction, cogging or noise, a hard floor, a hand
+that follows its path. But the encoders count, and their rounding can sustain a motion that hardly
+decays.
 """
 
 from __future__ import annotations
@@ -60,14 +61,14 @@ DURATION_S: Final = 4.5
 GREW: Final = 1.3
 """Motion late over motion early."""
 STILL_RAD_S: Final = 0.02
-"""Less than this is what the encoders' counts make of standing still."""
+"""rad/s; the encoders' counts alone cause this much at rest."""
 SHAKES_RAD_S: Final = 0.1
 """More than this, long after the tap, has grown at once and is held by the torque limits."""
 ENDINGS: Final = frozenset(("tracked", "left", "fell", "unready"))
 
 
 class DynamicsTrial(msgspec.Struct, frozen=True, kw_only=True):
-    """What is drawn."""
+    """A drawn case."""
 
     number: int
     seed: int
@@ -83,19 +84,20 @@ class DynamicsTrial(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DynamicsResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What was said, and what happened."""
+    """Prediction and result."""
 
     rate: float
     """1/s, of the motion that the certificate calls the slowest to fade, less a drift's share."""
     frequency_hz: float
     mode: str
-    """fore and aft, or sideways; empty: not asked."""
+    """fore and aft, or sideways; empty: not evaluated."""
     early_rad_s: float
     """Root mean square of the joints' rates after the tap."""
     late_rad_s: float
     ended: str
-    """tracked, left (a module left TRACK), fell, or unready: it did not stand and track with the
-    shipped gains where the certificate could be asked, and nothing was tried."""
+    """tracked, left (a module left TRACK), fell, or unready: with the shipped gains it did not
+    stand and track in a pose for which the certificate can be evaluated, and nothing was tried.
+    """
 
     @property
     def said_stable(self) -> bool:

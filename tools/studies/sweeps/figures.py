@@ -1,4 +1,4 @@
-"""What the kill and the latency study share of a case: which rows count, how it ends, figures."""
+"""Shared by kill and latency study: which rows count, how a case ends, figures."""
 
 from __future__ import annotations
 

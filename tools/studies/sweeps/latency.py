@@ -142,8 +142,8 @@ def parse_controls(text: str) -> tuple[str, ...]:
 def trials_of(args: argparse.Namespace) -> list[LatencyTrial]:
     """Return all trials, in the order of their numbers.
 
-    The whole grid once, then once more: a study that is stopped has something of each network,
-    and one that is gone on with may have more trials.
+    The whole grid comes once, then again: an interrupted study has trials of each network, and a
+    resumed one may have more trials.
     """
     networks = [Network(d, j, p) for p, j, d in product(args.loss, args.jitter, args.delay)]
     grid = list(product(range(args.trials), networks, args.control))
@@ -224,7 +224,7 @@ def _run_one(
 
 
 def row_of(trial: LatencyTrial) -> dict[str, object]:
-    """Return what a trial is, by column."""
+    """Return a trial by column."""
     row: dict[str, object] = {
         "number": trial.number,
         "repeat": trial.repeat,

@@ -1,4 +1,4 @@
-"""The pictures of the latency study: who fell where, and what the hand had to do."""
+"""The pictures of the latency study: falls, and the hand's effort."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ COUNTS_COLUMNS: Final = 24
 
 
 class LineStyle(NamedTuple):
-    """How a control is drawn; told apart without colour as well."""
+    """Line style of a control; distinguishable without colour."""
 
     colour: str
     marker: str

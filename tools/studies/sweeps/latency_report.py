@@ -1,4 +1,4 @@
-"""The latency study in words, and what its pictures are drawn from."""
+"""The latency study as text, and the data of its pictures."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def controls_in(rows: Sequence[Row]) -> list[str]:
 
 
 def values_in(rows: Sequence[Row], column: str) -> list[float]:
-    """Return what a column holds, rising."""
+    """Return the values of a column, sorted."""
     return sorted({float(row[column]) for row in rows})
 
 
@@ -80,7 +80,7 @@ def figures(rows: Sequence[Row], column: str) -> list[float]:
 
 
 def mix(rows: Sequence[Row]) -> str:
-    """Return in words what trials at one delay differ in, but for what is left to chance."""
+    """Return the differences of trials at one delay as text, apart from random draws."""
     losses = [100 * loss for loss in values_in(rows, "loss")]
     words = f"{_listed(losses)} % lost"
     jitters = values_in(rows, "jitter_ms")
@@ -123,9 +123,9 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
 
 
 def _worst_delay(rows: Sequence[Row]) -> tuple[float, Falls]:
-    """Return the delay with the largest share of falls, and its falls.
+    """Return the delay with the largest fraction of falls, and its falls.
 
-    Its bounds would be too narrow: it was chosen for what was seen there.
+    Its confidence bounds would be too narrow, because the delay was selected by its falls.
     """
     found = [
         (delay, falls([row for row in rows if float(row["delay_ms"]) == delay]))
@@ -146,7 +146,7 @@ def _falls_table(rows: Sequence[Row]) -> Table:
 
 
 def _lead_table(rows: Sequence[Row]) -> Table:
-    """Return what the hand met at each delay, with the least that is lost."""
+    """Return the hand's effort at each delay, with the smallest loss."""
     quiet = without_loss(rows)
     what = f"Hand's peak force, time in HOLD; medians; {mix(quiet)}"
 

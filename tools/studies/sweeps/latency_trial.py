@@ -1,9 +1,9 @@
 """One trial of the latency study: a squat led by hand under pushes, over a bad network.
 
-The fleet comes up and is led over a good network; at some moment every link gets bad, both
-ways, and stays so. What is left to chance, that moment, the pushes, and which messages are lost,
-is the same for every delay and every control, and another for each repeat, loss and jitter: a
-control's trials at one delay are independent.
+The fleet starts and is led over a good network; at a random time every link is impaired, both ways,
+to the end. That time, the pushes and the lost messages are random. They are the same for every
+delay and control, and differ for each repeat, loss and jitter: a control's trials at one delay are
+independent.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Shove(NamedTuple):
 
 
 class Draw(msgspec.Struct, frozen=True):
-    """What is left to chance."""
+    """Random draws of a trial."""
 
     impaired_from_s: float
     shoves: tuple[Shove, ...]
@@ -123,7 +123,7 @@ class Draw(msgspec.Struct, frozen=True):
 
 
 class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
-    """What is run."""
+    """A trial."""
 
     number: int
     """Number of the row."""
@@ -134,7 +134,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def draw(self) -> Draw:
-        """What is left to chance, whatever the delay and the control are."""
+        """Random draws, the same for every delay and control."""
         jitter, loss = plain(self.network.jitter_ms), plain(self.network.loss)
         dice = random.Random(f"latency {self.seed} {self.repeat} {jitter} {loss}")
         begin = round(dice.uniform(*IMPAIRED_FROM_S), DIGITS)
@@ -171,7 +171,9 @@ class LatencyResult(Ended, frozen=True, kw_only=True):
     """Largest horizontal distance of the COM from the middle of the ankles."""
     hold_share: float | None = None
     """Fraction of the time in which a module held, so that the robot did not follow the hand.
-    Always 0 where every torque is the planner's: there is no HOLD."""
+
+    Always 0 for the centralised control, which has no HOLD.
+    """
     holds: int | None = None
     """Changes from TRACK to HOLD of the busiest module."""
     torque_step_nm: float | None = None
@@ -190,15 +192,15 @@ def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
 
 
 class LatencyRecorder:
-    """Hears what the figures need of what would be on the bus, and passes all of it on."""
+    """Collects from the messages what the figures need, and passes all of them on."""
 
     def __init__(self, on_to: Record | None, impaired_from_s: float) -> None:
-        """Take who hears it too, and from when on it matters, scenario time."""
+        """Take the next receiver, and the scenario time from which messages count."""
         self._on_to = on_to
         self._tau: dict[str, Pair] = {}
         self._after_ns = round(impaired_from_s * NS_PER_S)
         self.from_ns: int | None = None
-        """When the network gets bad; None before the scenario has begun."""
+        """Time at which the network is impaired; None before the scenario has started."""
         self.fallen = False
         """From then on nothing counts."""
         self.torque_step = 0.0
@@ -253,11 +255,11 @@ def run_trial(
     """Run a trial to its end or to the fall.
 
     Args:
-        trial: what happens.
+        trial: the trial.
         robot: as `robot_of` gives it.
         record: takes every message.
         watch: sees the world at its rate.
-        after_fall_s: how long to go on after a fall; what is measured ends with it.
+        after_fall_s: time to continue after a fall; measurement ends with the fall.
     """
     impaired_from_s = trial.draw.impaired_from_s
     ear = LatencyRecorder(record, impaired_from_s)
@@ -278,9 +280,9 @@ def measure(
     """Return the figures of a run.
 
     Args:
-        rows: the world since the network got bad, to the fall if there was one.
+        rows: the world since the impairment began, to the fall if there was one.
         events: every change of mode since the start, by module.
-        ear: what else was heard.
+        ear: the other messages.
         robot: for the size of its feet.
     """
     if not rows or ear.from_ns is None:

@@ -71,7 +71,7 @@ class KillResult(Ended, frozen=True, kw_only=True):
 
 
 class KillRecorder:
-    """Hears what the verdict needs of what would be on the bus, and passes all of it on."""
+    """Collects from the messages what the verdict needs, and passes all of them on."""
 
     def __init__(self, on_to: Record | None) -> None:
         self._on_to = on_to
@@ -105,11 +105,11 @@ def run_case(
     """Run a case to its end or to the fall.
 
     Args:
-        case: what happens.
+        case: the case.
         robot: with the case's payload, ready to run (`tools.studies.sweeps.prepare`).
         record: takes every message.
         watch: sees the world at its rate.
-        after_fall_s: how long to go on after a fall; what is measured ends with it.
+        after_fall_s: time to continue after a fall; measurement ends with the fall.
     """
     ear = KillRecorder(record)
     fleet = Lockstep(
@@ -170,11 +170,11 @@ def measure(
     """Return the figures of a run.
 
     Args:
-        case: what was run.
+        case: the case.
         rows: the world since the scenario's start, or the fall before it.
         loads: of the lighter foot, at each row, N.
         events: every change of mode, by module.
-        ear: what else was heard.
+        ear: the other messages.
         robot: for the size of its feet.
     """
     if not rows or rows[0].scenario_s < 0.0:

@@ -35,9 +35,9 @@ def results(
 
     Args:
         work: a function of a module; it runs in the workers.
-        tasks: what it is given, one after the other.
+        tasks: its arguments, one after the other.
         workers: processes, at least 1.
-        name: what a task is called in an error.
+        name: returns a task's name for an error.
 
     Raises:
         RunError: the work failed on a task, or a worker died.

@@ -1,6 +1,6 @@
-"""What a robot needs before any run of it: its certified gain schedule.
+"""Computes the certified gain schedule of each robot of a study.
 
-It depends on the payload, and takes seconds: one for each robot, over processes.
+It depends on the payload and takes seconds: one for each robot, over processes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from shared.robot.gain_table import GainSchedule
 from tools.studies.sweeps import pool
 
 Progress = Callable[[int, int], None]
-"""Told how many schedules are made, of how many."""
+"""Receives the number of finished schedules, and of all."""
 Task: TypeAlias = "tuple[int, RobotConfig]"
 
 

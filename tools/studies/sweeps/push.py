@@ -31,7 +31,7 @@ mpl.use("Agg")
 ANGLES_DEG: Final = (0, 45, 90, 135, 180)
 """Left and right are alike."""
 SIDES_DEG: Final = ("0", "45", "90", "135", "180", "-135", "-90", "-45")
-"""As a push to the right is told."""
+"""Degrees of a push to the right."""
 DURATIONS_S: Final = (0.3, 3.0)
 TABLE: Final = "pushes.csv"
 PICTURE: Final = "pushes.png"
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def trials_of(args: argparse.Namespace) -> list[PushTrial]:
-    """Return the points that are asked for.
+    """Return the selected points.
 
     Raises:
         RunError: a duration is not positive.

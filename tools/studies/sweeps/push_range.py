@@ -16,7 +16,7 @@ from shared.exceptions import RunError
 DIGITS: Final = 3
 REACHED_M: Final = 1e-4
 SHARE: Final = 0.75
-"""Up to this share of the limit the studies push unless told otherwise."""
+"""Default of --push: the largest push as a fraction of the limit."""
 SHARE_MAX: Final = 3.0
 
 

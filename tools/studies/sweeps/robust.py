@@ -45,7 +45,7 @@ PICTURE: Final = "trials.png"
 CODE: Final = code_of("tools.studies.sweeps.robust_trial")
 FALLS_SHOWN: Final = 10
 MARGIN: Final = "com_led_max_mm"
-"""What the ranking goes by: how far the COM strays while the planner leads and it is pushed."""
+"""Columns of the ranking: the COM's excursion while the planner leads and the robot is pushed."""
 FIGURES: Final = (
     ("operator_peak_n", "operator's force, led", "N"),
     ("com_led_max_mm", "COM, led", "mm"),

@@ -43,7 +43,7 @@ DIGITS: Final = 3
 
 
 class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
-    """What is run; the plant follows from seed, number and `beyond`."""
+    """A trial; the plant follows from seed, number and `beyond`."""
 
     number: int
     seed: int
@@ -165,7 +165,7 @@ def measure(
     """Return the figures of a run.
 
     Args:
-        trial: what was run.
+        trial: the trial.
         rows: the world since the scenario's start, or the fall before it.
         fleet: at its end.
         robot: for the size of its feet.

@@ -61,7 +61,7 @@ class Study(NamedTuple, Generic[T, R]):
     words: Words
     """Columns that hold words, and the words that each may hold."""
     inputs: Mapping[str, str]
-    """What the rows depend on; a folder with other inputs is refused."""
+    """Parameters of the rows; a folder with others is refused."""
     drawn: Sequence[Mapping[str, object]]
     """By case: the start of its row, known before it runs."""
     total: int
@@ -84,7 +84,7 @@ class Finished(NamedTuple):
 
         Args:
             files: the table and the pictures, as text.
-            case: what a case is called, such as "trial".
+            case: name of a case, such as "trial".
             console: to print on.
         """
         pace = f"; {self.case_s:.2f} s a {case}" if self.case_s else ""
@@ -152,7 +152,7 @@ def digest_of(robot: RobotConfig) -> str:
 
 
 def inputs(name: str, robot: RobotConfig, code: tuple[str, ...], **more: str) -> dict[str, str]:
-    """Return what a study's rows depend on: robot, code, and what else is given."""
+    """Return the parameters of a study's rows: robot, code, and those given."""
     return {"study": name, **more, "robot": digest_of(robot), "code": code_digest(code)}
 
 

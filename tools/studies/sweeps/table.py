@@ -1,8 +1,8 @@
-"""A study's table: one CSV row a case, written as it is done, gone on with after a stop.
+"""A study's table: one row per case, appended on completion; an interrupted study resumes.
 
-Beside the table, `inputs.json` says what it was made from; a folder of other inputs is
-refused, and so is one that another study is writing to. A finished table is sorted by case: the
-same inputs give the same file.
+Beside the table, `inputs.json` holds its parameters; a folder with others is refused, and so is one
+that another study is writing to. A finished table is sorted by case: equal inputs give an equal
+file.
 """
 
 from __future__ import annotations
@@ -75,21 +75,21 @@ class CaseTable:
         words: Words = NO_WORDS,
         drawn: Iterable[Mapping[str, object]] = (),
     ) -> None:
-        """Open or go on with a table; its first column is the case's number.
+        """Open a table, new or to resume; its first column is the case's number.
 
-        Rows that are not whole, cut off or damaged, are left out: their cases are run again.
+        Incomplete or damaged rows are left out: their cases are run again.
 
         Args:
             folder: of the results; made if it is not there.
             name: of the CSV file.
             columns: of the table.
-            inputs: what the rows depend on, by name.
-            words: what is no number.
-            drawn: of each case, what the row of its number says first.
+            inputs: parameters of the rows, by name.
+            words: columns that hold words, and which.
+            drawn: by case, the start of its row.
 
         Raises:
-            RunError: the folder cannot be used, another study is writing to it, or it is not
-                known to be of these inputs.
+            RunError: the folder cannot be used, another study is writing to it, or its parameters
+                are others or unknown.
         """
         self._path, self._columns = folder / name, tuple(columns)
         try:
@@ -150,7 +150,7 @@ class CaseTable:
             del self._rows[number]
 
     def _write(self) -> None:
-        """Write all rows anew; the file is whole or the old one."""
+        """Rewrite all rows atomically."""
         temporary = self._path.with_suffix(".tmp")
         with temporary.open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
@@ -224,7 +224,7 @@ def _whole_rows(path: Path, columns: Sequence[str], words: Words) -> dict[int, R
     if not path.exists():
         return {}
     text = path.read_text(encoding="utf-8", errors="replace")
-    lines = map(_cells, text.split("\n")[:-1])  # what has no end is not whole
+    lines = map(_cells, text.split("\n")[:-1])  # a line without an end is incomplete
     if next(lines, list(columns)) != list(columns):
         raise RunError(f"{path}: has other columns; choose another --out")
     return {int(row[columns[0]]): row for row in _whole(lines, columns, words)}
@@ -245,7 +245,7 @@ def _whole(lines: Iterator[list[str]], columns: Sequence[str], words: Words) -> 
 
 
 def _cells(line: str) -> list[str]:
-    """Return what is between the commas; nothing if it is no line of a CSV file."""
+    """Return the cells of a line; none if it is malformed."""
     try:
         return next(csv.reader([line], strict=True), [])
     except csv.Error:

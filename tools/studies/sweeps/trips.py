@@ -87,9 +87,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def wrong_with(row: Mapping[str, str]) -> str:
-    """Return what is wrong with a row of the table in words; empty: nothing.
+    """Return the fault of a row as text; empty: none.
 
-    Any trip will do: a robot that tips over may be caught by the one or by the other.
+    Any trip is right: different trips may detect a robot that tips over.
     """
     wanted = TROUBLES[row["trouble"]].trip
     if row["fell_at_s"]:
@@ -149,7 +149,7 @@ def _rows(task: Task, outcome: TripResult) -> list[dict[str, object]]:
 
 
 class _TripNames(frozenset[str]):
-    """What the column of trips may hold: names of trips and causes, in any number."""
+    """Words of the column of trips: names of trips and causes, in any number."""
 
     def __contains__(self, text: object) -> bool:
         known = {trip.name for trip in Trip} | {cause.name for cause in Cause}

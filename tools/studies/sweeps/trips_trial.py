@@ -45,7 +45,7 @@ PLANTS: Final[Mapping[str, PlantConfig]] = {
 """Stiffness of the drivetrains in N m/rad."""
 
 BEGINS_S: Final = 1.0
-"""Scenario time at which what is to trip begins."""
+"""Scenario time at which the trouble begins, s."""
 UP: Final = 1.188
 """Torso height at which a scenario begins, m."""
 
@@ -55,7 +55,7 @@ class Trouble(NamedTuple):
 
     about: str
     trip: Trip | Cause | None
-    """What it is to trip; None: nothing."""
+    """Trip that it must cause; None: none."""
     told: Scenario
     errors: Mapping[str, Any] = {}
     """Errors of the plant that come with it."""
@@ -87,10 +87,10 @@ class TripResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def unfiltered(robot: RobotConfig) -> RobotConfig:
-    """Return the robot without what the dynamic certificate brought; its joints believe anything.
+    """Return the robot without the dynamic certificate; its joints accept any command.
 
-    The coupling unfiltered, a third of the local damping; no load is looked for, for what shakes
-    looks heavy.
+    The coupling is unfiltered and the local damping a third. The load is not estimated, because
+    shaking looks like a load.
 
     Raises:
         RunError: it has no gain schedule.
@@ -152,7 +152,7 @@ TROUBLES: Final[Mapping[str, Trouble]] = {
 
 
 class _Seen:
-    """What a run shows."""
+    """Result of a run."""
 
     def __init__(self, robot: RobotConfig, trouble: Trouble, plant: PlantConfig, seed: int) -> None:
         self.trips: dict[str, int] = {}
@@ -199,7 +199,7 @@ class _Seen:
         return (first_ns - began_ns) / NS_PER_S
 
     def _joints(self) -> None:
-        """Add what the joint services tripped on."""
+        """Add the joint services' trips."""
         for _, event in self.fleet.events:
             if event.mode_before == Mode.TRACK and event.cause in JOINT_TRIPS:
                 self.trips.setdefault(Cause(event.cause).name, event.t_ns)
