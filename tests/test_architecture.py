@@ -49,7 +49,11 @@ IMPORTS = {file: imports_in(source) for file, source in SOURCES.items()}
 
 VENDORS = {
     "zenoh": ["shared/bus/session.py"],
-    "mujoco": ["services/simulator/world.py", "services/simulator/body.py"],
+    "mujoco": [
+        "services/simulator/world.py",
+        "services/simulator/body.py",
+        "services/simulator/foot_placement.py",
+    ],
     "pinocchio": ["services/planner/model.py"],
     "cvxpy": ["services/planner/split_program.py"],
     "casadi": [
@@ -123,6 +127,7 @@ LAWS = [
     "tools/analysis/reexecution/params.py",
     "services/simulator/axis_bank.py",
     "services/simulator/axis_control.py",
+    "services/simulator/axis_encoders.py",
     "services/simulator/axis_conditions.py",
     "services/simulator/axis_faults.py",
     "services/simulator/axis_settings.py",
@@ -131,6 +136,8 @@ LAWS = [
     "services/simulator/operator.py",
     "services/simulator/actuation.py",
     "services/simulator/body.py",
+    "services/simulator/foot_placement.py",
+    "services/simulator/posture.py",
     "services/simulator/drivetrain.py",
     "services/simulator/plant.py",
     "services/simulator/world.py",

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from services.simulator.axis_calibration import SEQUENCES, Calibration
 from services.simulator.axis_conditions import Conditions
 from services.simulator.axis_control import AxisControl
+from services.simulator.axis_encoders import AxisEncoders
 from services.simulator.axis_faults import (
     AXIS_NAMES,
     BUS_FAULTS,
@@ -79,10 +80,11 @@ class AxisBank:
             drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
         )
         n = N_JOINTS
-        self._control = control = AxisControl(self.settings, encoder_counts_per_turn)
+        self._encoders = encoders = AxisEncoders(self.settings, encoder_counts_per_turn)
+        self._control = control = AxisControl(self.settings, encoders)
         self._zeroed = zeroed
         mark = round(drive.zero_mark_turns * encoder_counts_per_turn)
-        self.counts_from = control.counts_from
+        self.counts_from = encoders.counts_from
         self.counts_from[:] = mark * np.array(motor_signs)
         self.bus = DcBus(self.settings)
         self.state = [AxisState.IDLE] * n
@@ -94,11 +96,11 @@ class AxisBank:
         self.pos_gain, self.vel_gain = control.pos_gain, control.vel_gain
         self.vel_integrator_gain = control.vel_integrator_gain
         self.vel_limit, self.current_lim = control.vel_limit, control.current_lim
-        self.pos_estimate, self.vel_estimate = control.pos_estimate, control.vel_estimate
-        self.encoder_turns, self.connected = control.turns, control.connected
+        self.pos_estimate, self.vel_estimate = encoders.pos_estimate, encoders.vel_estimate
+        self.encoder_turns, self.connected = encoders.turns, control.connected
         self.now_s = -math.inf
         self.calibration = Calibration(self.settings)
-        self.conditions = Conditions(self.settings, control)
+        self.conditions = Conditions(self.settings, control, encoders)
         self._fed_s = [0.0] * n
         self._timeouts_s = [math.inf] * n
         self._shortest_s = math.inf
@@ -119,15 +121,15 @@ class AxisBank:
         if self.now_s == -math.inf:
             self.now_s = now_s
             self._fed_s = [now_s] * N_JOINTS
-            control.start(pos_turns, vel_turns)
+            self._encoders.start(pos_turns, vel_turns)
             if not self._zeroed:
                 for axis in range(N_JOINTS):
-                    control.lose_turns(axis)
+                    self._encoders.lose_turns(axis)
         else:
             dt_s = now_s - self.now_s
             self.now_s = now_s
             if dt_s > 0.0:
-                control.estimate(dt_s, pos_turns)
+                self._encoders.estimate(dt_s, pos_turns)
         if self.calibration.running or not self.conditions.all_well:
             self._live_with_conditions()
         if control.too_fast():
@@ -188,7 +190,7 @@ class AxisBank:
 
     def set_count(self, axis: int, count: float) -> None:
         """Tell an axis that its encoder reads so many counts here; `input_pos` stays."""
-        self._control.set_count(axis, count)
+        self._encoders.set_count(axis, count)
 
     def clear_errors(self, axis: int) -> None:
         """Clear all errors of the axis's ODrive: the firmware clears both axes.
@@ -218,7 +220,7 @@ class AxisBank:
         self.settings.restore(drive)
         for each in _both(axis):
             self.calibration.restart(each)
-            self._control.lose_turns(each)
+            self._encoders.lose_turns(each)
         self.conditions.boot(drive, self.now_s)
 
     def talks(self, axis: int) -> bool:

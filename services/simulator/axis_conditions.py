@@ -10,6 +10,7 @@ import math
 from typing import Final
 
 from services.simulator.axis_control import AxisControl
+from services.simulator.axis_encoders import AxisEncoders
 from services.simulator.axis_faults import FAULTS, AxisErrors
 from services.simulator.axis_settings import N_DRIVES, Settings
 from shared.robot.joints import N_JOINTS
@@ -32,9 +33,9 @@ class Conditions:
         temperature: of each axis's output stage (12,), C.
     """
 
-    def __init__(self, settings: Settings, control: AxisControl) -> None:
-        """Begin with all well."""
-        self._settings, self._control = settings, control
+    def __init__(self, settings: Settings, control: AxisControl, encoders: AxisEncoders) -> None:
+        """Start without any condition."""
+        self._settings, self._control, self._encoders = settings, control, encoders
         self.down: set[int] = set()
         self.silent: set[int] = set()
         self.blind: set[int] = set()
@@ -81,10 +82,10 @@ class Conditions:
         """Take an axis's encoder away, or bring it back."""
         if lost:
             self.blind.add(axis)
-            self._control.blind(axis)  # it keeps its last reading
+            self._encoders.blind(axis)  # it keeps its last reading
         elif axis in self.blind:
             self.blind.remove(axis)
-            self._control.see_again(axis)
+            self._encoders.see_again(axis)
 
     def heat(self, axis: int, celsius: float) -> None:
         """Bring an axis's output stage to a temperature; near its limit the current is less."""
@@ -102,7 +103,7 @@ class Conditions:
     def failing(self) -> list[tuple[int, AxisErrors]]:
         """Return the axes that a condition disarms, and with what; blind ones stand still."""
         for axis in self.blind:
-            self._control.blind(axis)
+            self._encoders.blind(axis)
         failing = [(axis, FAULTS["ENCODER"]) for axis in sorted(self.blind)]
         return failing + [(axis, FAULTS["OVER_TEMP"]) for axis in sorted(self._hot)]
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -16,22 +15,14 @@ from numpy.typing import NDArray
 
 from services.simulator.actuation import Actuation
 from services.simulator.body import Body
+from services.simulator.foot_placement import FootPlacement
 from services.simulator.hoist import Hoist
 from services.simulator.operator import HandForce, Operator, Wearer
+from services.simulator.posture import as_vector, measure_posture
 from shared.bus.messages import SimTruth, Vector3, Vector4
 from shared.config.scenarios import Lead, Scenario, lead, push_at
-from shared.robot.joints import JOINTS, N_LEG, SIDES
 
 Array = NDArray[np.float64]
-
-FALLEN_HEIGHT: Final = 0.60
-"""m; a crawl goes down to 0.79."""
-FALLEN_ANGLE: Final = 0.6
-"""rad of roll or yaw."""
-FALLEN_TILT: Final = 0.6
-"""rad of a sole against the floor."""
-STAND_ITERATIONS: Final = 8
-"""Newton steps from `stand_pose` to soles that are flat to rounding."""
 
 
 class World:
@@ -46,13 +37,11 @@ class World:
         self._steps = body.steps
         self.operator = Operator(body.hand, body.harness_point)
         self._wearer = Wearer(body.person)
-        joints = [self.model.joint(name) for name in JOINTS]
-        self._q_index = np.array([joint.qposadr[0] for joint in joints])
-        self._v_index = np.array([joint.dofadr[0] for joint in joints])
+        self._placement = FootPlacement(self.model, self.data, body)
+        self._q_index, self._v_index = self._placement.q_index, self._placement.v_index
         self._actuation = Actuation(body, self.model.opt.timestep)
         self._joint_damping = self.model.dof_damping[self._v_index].copy()
         self._torso = self.model.body("torso").id
-        self._feet = [self.model.body(f"foot_{side}").id for side in SIDES]
         data = self.data  # views of its memory: to ask it for an array costs a microsecond
         self._qpos, self._qvel, self._applied = data.qpos, data.qvel, data.qfrc_applied
         self._torso_rotation, self._torso_wrench = (
@@ -63,7 +52,6 @@ class World:
         self._damping = self.model.dof_damping
         self._dt: float = self.model.opt.timestep
         self._harness_point = body.harness_point
-        self._ankles_wanted, self._foot_yaws = body.ankles, body.foot_yaws
         self._hoist = Hoist(body.weight, body.hoist_s)
         self.time = 0.0
         self._start_time = math.inf
@@ -83,42 +71,18 @@ class World:
         """Quaternion: turns the floor's axes into axes whose z is up."""
         x, y, z = self.model.opt.gravity.tolist()
         self._lean = (x / z, y / z)
-        self._place(body)
-
-    def _place(self, body: Body) -> None:
-        """Stand the robot: soles flat, torso along the floor, COM over the ankles by gravity.
-
-        The hoist hangs from above: on a slope it holds the torso aside of the floor's normal.
-        """
-        data, model = self.data, self.model
-        data.qpos[self._q_index] = body.stand_q
-        mujoco.mj_kinematics(model, data)
-        data.qpos[0] -= data.xpos[self._feet[0]][0]
-        self._flatten_soles()
-        level = data.subtree_com[0][:2].copy()
-        for _ in range(STAND_ITERATIONS if any(self._lean) else 0):
-            com = data.subtree_com[0]  # the legs go less far than the torso
-            data.qpos[:2] += level + np.array(self._lean) * com[2] - com[:2]
-            self._flatten_soles()
-        self._actuation.settle(data.qpos[self._q_index])
-        self._hoist.position = data.qpos[:3].copy()
+        # the hoist hangs from above: on a slope it holds the torso aside of the floor's normal
+        self._placement.stand_up(body.stand_q, self._lean)
+        self._actuation.settle(self.data.qpos[self._q_index])
+        self._hoist.position = self.data.qpos[:3].copy()
 
     def stand_at(self, q: Array) -> None:
         """Stand the robot still, soles flat, at joint angles q (12,), rad; no hoist.
 
         The two legs must agree on the torso, as `InverseKinematics` makes them.
         """
-        data = self.data
-        data.qpos[:7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-        data.qpos[self._q_index] = q
-        mujoco.mj_kinematics(self.model, data)
-        foot = self._feet[0]
-        rotation_sole_torso = data.xmat[foot].reshape(3, 3).T.copy()
-        data.qpos[:3] = self._ankles_wanted[0] - rotation_sole_torso @ data.xpos[foot]
-        mujoco.mju_mat2Quat(data.qpos[3:7], rotation_sole_torso.ravel())
-        data.qvel[:] = 0.0
-        self._flatten_soles()
-        self._actuation.settle(data.qpos[self._q_index])
+        self._placement.stand_at(q)
+        self._actuation.settle(self.data.qpos[self._q_index])
         self.let_off_hoist()
 
     def go_on(
@@ -155,25 +119,6 @@ class World:
         """Return what MuJoCo does not hold: the person, the drivetrain, torques on their way."""
         wearer = self._wearer
         return (wearer.above, wearer.rate, wearer.load_n, *self._actuation.state())
-
-    def _flatten_soles(self) -> None:
-        """Move the legs until both ankles are in their places, soles flat."""
-        data, model, wanted = self.data, self.model, self._ankles_wanted
-        jacobian = np.zeros((6, model.nv))
-        for _ in range(STAND_ITERATIONS):
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            for leg, foot in enumerate(self._feet):
-                columns = self._v_index[leg * N_LEG : (leg + 1) * N_LEG]
-                mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], foot)
-                r = data.xmat[foot].reshape(3, 3)
-                r = _turned_back(r, self._foot_yaws[leg])
-                turn = 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-                error = np.concatenate((wanted[leg] - data.xpos[foot], -turn))
-                step = np.linalg.solve(jacobian[:, columns], error)
-                data.qpos[self._q_index[leg * N_LEG : (leg + 1) * N_LEG]] += step
-        mujoco.mj_forward(model, data)
-        self._ankles = np.array([data.xpos[foot] for foot in self._feet])
 
     @property
     def scenario(self) -> Scenario:
@@ -289,38 +234,26 @@ class World:
 
     def truth(self, t_ns: int, real_time_factor: float, late_s: float) -> SimTruth:
         """Return the world as it is, for the log and the verdict."""
-        data = self.data
-        rotation = data.xmat[self._torso].reshape(3, 3)
-        roll = math.asin(min(1.0, max(-1.0, rotation[2, 1])))
-        pitch = math.atan2(-rotation[2, 0], rotation[2, 2])
-        yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
-        tilts = [math.acos(min(1.0, data.xmat[foot][8])) for foot in self._feet]
-        positions = np.array([data.xpos[foot] for foot in self._feet])
-        slip = float(np.linalg.norm(positions - self._ankles, axis=1).max())
-        torso, com = data.xpos[self._torso], data.subtree_com[0]
-        self._fallen |= bool(
-            torso[2] < FALLEN_HEIGHT
-            or max(abs(roll), abs(yaw)) > FALLEN_ANGLE
-            or max(tilts) > FALLEN_TILT
-            or not np.isfinite(torso).all()
-        )
-        moment = rotation[:, 1] * self.hand.moment_pitch
+        placement = self._placement
+        posture = measure_posture(self.data, self._torso, placement.feet, placement.ankles)
+        self._fallen |= posture.fallen
+        moment = self.data.xmat[self._torso].reshape(3, 3)[:, 1] * self.hand.moment_pitch
         self._truths += 1
         return SimTruth(
             t_ns=t_ns,
             seq=self._truths,
             scenario_s=self.scenario_s,
-            com=_vector(com),
-            torso=_vector(torso),
-            angles=(roll, pitch, yaw),
+            com=posture.com,
+            torso=posture.torso,
+            angles=posture.angles,
             operator_force=(0.0, 0.0, self.hand.force_z),
-            operator_moment=_vector(moment),
+            operator_moment=as_vector(moment),
             load_n=self.load_n,
             harness_force_z=self.load_n - self.hand.force_z,
             push=self.push,
-            foot_right_tilt=tilts[0],
-            foot_left_tilt=tilts[1],
-            feet_slip=slip,
+            foot_right_tilt=posture.tilts[0],
+            foot_left_tilt=posture.tilts[1],
+            feet_slip=posture.slip,
             hoist=self._hoist.share,
             fallen=self._fallen,
             real_time_factor=real_time_factor,
@@ -329,20 +262,8 @@ class World:
         )
 
 
-def _turned_back(rotation: Array, yaw: float) -> Array:
-    """Return Rz(yaw)^T rotation: how a foot is turned against its place, small."""
-    if yaw == 0.0:
-        return rotation
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.asarray(np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotation, float)
-
-
 def _turn_between(start: Array, end: Array) -> Array:
     """Return the quaternion (w, x, y, z) of the shortest turn of one direction into another."""
     a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
     turn = np.concatenate(([1.0 + a @ b], np.cross(a, b)))
     return np.asarray(turn / np.linalg.norm(turn), float)
-
-
-def _vector(values: Array) -> Vector3:
-    return float(values[0]), float(values[1]), float(values[2])

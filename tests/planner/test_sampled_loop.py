@@ -223,7 +223,7 @@ def test_inertia_along_p_is_that_of_the_simulated_body(robot: RobotConfig) -> No
     rates = np.zeros((18, 6))
     rates[world._v_index] = stand.T
     foot = np.zeros((6, 18))
-    mujoco.mj_jacBody(world.model, world.data, foot[:3], foot[3:], world._feet[0])
+    mujoco.mj_jacBody(world.model, world.data, foot[:3], foot[3:], world._placement.feet[0])
     rates[:6] = -np.linalg.solve(foot[:, :6], foot[:, 6:] @ rates[6:])
     np.testing.assert_allclose(rates.T @ M @ rates, stand.M, rtol=2e-3, atol=2e-2)
 
