@@ -256,12 +256,6 @@ def pack_motor_error(error: int) -> bytes:
     return _U64.pack(error)
 
 
-def unpack_motor_error(data: bytes) -> int:
-    """Unpack 0x003: 64 bits in firmware 0.5.6."""
-    value: int = _U64.unpack_from(data)[0]
-    return value
-
-
 def pack_two_floats(first: float, second: float) -> bytes:
     """Pack two numbers.
 

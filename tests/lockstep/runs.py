@@ -19,9 +19,9 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
 from shared.network.impairment import Impairment
 from shared.robot.joints import MODULES
+from tests.lockstep.partial import PartialStart
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
-from tools.runs.partial import PartialStart
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 

@@ -20,10 +20,10 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
-from tools.runs import partial
+from tests.lockstep import partial
+from tests.lockstep.partial import PartialCase, PartialStart
 from tools.runs.host_clock import HostClock
 from tools.runs.lockstep import Lockstep
-from tools.runs.partial import PartialCase, PartialStart
 
 HOUR_NS = 3600 * NS_PER_S
 HOSTS = ("planner", "harness", *MODULES)

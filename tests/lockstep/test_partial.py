@@ -22,9 +22,9 @@ from shared.bus.messages import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES, SIDES
+from tests.lockstep import partial
+from tests.lockstep.partial import KINDS, SUBSETS, PartialCase, PartialStart, run_case
 from tests.shared.mcap_log.runs import sample as sample_of
-from tools.runs import partial
-from tools.runs.partial import KINDS, SUBSETS, PartialCase, PartialStart, run_case
 
 LEGS = [tuple(module for module in MODULES if module.endswith(side)) for side in SIDES]
 ALWAYS = {"links": [*((module,) for module in MODULES), *LEGS]}

@@ -31,8 +31,6 @@ class TopicFacts(msgspec.Struct, kw_only=True):
     last_ns: int = _NEVER
     longest_gap_ns: int = 0
     """Between two messages after each other; by the sender's clock in our logs."""
-    gap_at_ns: int = 0
-    """When it began."""
     sequence: KeyCount = msgspec.field(default_factory=KeyCount)
 
     @property
@@ -165,7 +163,7 @@ class _Reading:
             if topic.last_ns == _NEVER:
                 topic.first_ns = time_ns
             elif gap_ns > topic.longest_gap_ns:
-                topic.longest_gap_ns, topic.gap_at_ns = gap_ns, topic.last_ns
+                topic.longest_gap_ns = gap_ns
             topic.last_ns = time_ns
 
 

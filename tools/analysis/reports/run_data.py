@@ -96,10 +96,6 @@ class RunData:
             found.append(float(self.times(topics.JOINT_STATE, module)[armed[0]]))
         return max(found)
 
-    def has(self, topic: Topic, module: str = "") -> bool:
-        """Return True if there is at least one message."""
-        return self.log.count(topic.key(self.log.robot, module)) > 0
-
     def _span(self) -> Span:
         received = [
             times

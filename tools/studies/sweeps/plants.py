@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import random
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -99,11 +98,6 @@ def errors_of(plant: PlantConfig) -> dict[str, float]:
         several = isinstance(value, (list, tuple))
         found[row.key] = max(abs(x) for x in value) if several else float(value)
     return found
-
-
-def ranges_words(ranges: Mapping[str, float]) -> str:
-    """Return errors in words, for a person who looks for what made a case fall."""
-    return ", ".join(f"{key} {value:.3g}" for key, value in ranges.items())
 
 
 def _drawn(dice: random.Random, row: ErrorRange, beyond: float) -> float:

@@ -84,7 +84,6 @@ def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
 def test_errors_are_told_as_one_number_each() -> None:
     errors = plants.errors_of(plants.draw("one"))
     assert set(errors) == {row.key for row in plants.shipped().error}
-    assert "drivetrain.stiffness" in plants.ranges_words(errors)
 
 
 def test_an_impossible_slope_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
