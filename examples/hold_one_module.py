@@ -22,7 +22,7 @@ def main() -> None:
         drive.load = (0.0, 20.0) if 250 <= cycle < 750 else (0.0, 0.0)
         reading = drive.read(0.01)
         step = knee.step(drive.now_ns, reading, command=None, estop=False)
-        if step.order is DriveCommand.ARM:
+        if step.command is DriveCommand.ARM:
             drive.arm(onboard=knee.onboard)
         elif step.target is not None:
             drive.write(step.target)

@@ -102,7 +102,7 @@ LAWS = [
     "services/planner/dynamic_certificate.py",
     "services/planner/poses.py",
     "services/planner/sampled_loop.py",
-    "services/planner/stability_room.py",
+    "services/planner/stability_margins.py",
     "services/planner/certificate.py",
     "services/planner/engagement_fsm.py",
     "services/planner/gains.py",

@@ -186,7 +186,7 @@ class JointController:
             drive=int(estimate.status),
             drive_error=estimate.error,
             stiffened=self._law.stiffened,
-            outside=int(failsafe.disbelieves(now_ns, self.timing)),
+            outside=int(failsafe.current_outside(now_ns, self.timing)),
         )
 
     def snapshot(self) -> ControllerSnapshot:

@@ -46,7 +46,7 @@ class DriveCommand(Enum):
     TARGET = 2
     IDLE = 3
     ARM = 4
-    FORGET_ZERO = 5
+    CLEAR_ZERO = 5
 
 
 class ArmingInhibit(Enum):
@@ -57,7 +57,7 @@ class ArmingInhibit(Enum):
     OUTSIDE_LIMITS = 2
     WILL_NOT = 3
     LET_GO = 4
-    """The drive lost torque after it held the robot; it is re-armed when a person asks for it."""
+    """The drive lost torque after it held the robot; a person must request re-arming."""
     WAITING = 5
     """The drive holds by its own loop; it is taken over once a planner is there."""
 
@@ -66,12 +66,12 @@ class DriveAction(NamedTuple):
     """Outcome of a cycle."""
 
     event: JointEvent | None
-    order: DriveCommand
+    command: DriveCommand
     torque: Pair
     """Motor torques of `DriveCommand.TORQUE`, N m."""
     target: MotorTarget | None
     """Target of `DriveCommand.TARGET`."""
-    obstacle: ArmingInhibit
+    inhibit: ArmingInhibit
 
 
 _NO_TORQUE: Pair = (0.0, 0.0)
@@ -159,10 +159,10 @@ class DriveManager:
                     )
                 self._listen_until_ns = 0
         if mode is Mode.DISARMED and now_ns >= self._arm_at_ns:
-            obstacle = self._obstacle(now_ns, reading)
-            if obstacle is not None:
-                order = DriveCommand.ARM if obstacle is ArmingInhibit.NONE else DriveCommand.NOTHING
-                return DriveAction(result.event, order, _NO_TORQUE, None, obstacle)
+            inhibit = self._inhibit(now_ns, reading)
+            if inhibit is not None:
+                order = DriveCommand.ARM if inhibit is ArmingInhibit.NONE else DriveCommand.NOTHING
+                return DriveAction(result.event, order, _NO_TORQUE, None, inhibit)
         order, torque, target = DriveCommand.NOTHING, _NO_TORQUE, None
         if mode is Mode.FAULT:
             order = self._in_fault(now_ns)
@@ -233,7 +233,7 @@ class DriveManager:
         astray = cause is Cause.POSITION_LOST or samples.error & AxisError.ENCODER_FAILED
         if self._forgets and astray:
             self._forgets = False
-            return DriveCommand.FORGET_ZERO
+            return DriveCommand.CLEAR_ZERO
         return DriveCommand.NOTHING
 
     def _found_armed(self, now_ns: int, reading: DriveReading) -> DriveReading:
@@ -270,7 +270,7 @@ class DriveManager:
             return self.last_state
         return LastState.DAMP if mode is Mode.DAMP or self._estop else LastState.HELD
 
-    def _obstacle(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
+    def _inhibit(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
         """Return what inhibits arming now; None if the drive is silent."""
         if reading is None or reading.status is DriveStatus.LOST:
             return None

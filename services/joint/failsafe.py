@@ -33,7 +33,7 @@ class Event(IntEnum):
     TOO_FAST = 6
     DRIVE_ARMED = 7
     COMMAND_STALE = 8
-    HOLD_ASKED = 9
+    HOLD_REQUESTED = 9
     READY = 10
     NONE = 11
 
@@ -63,7 +63,7 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
         Event.TORQUE_LIMIT: (Mode.HOLD, Cause.TORQUE_LIMIT),
         Event.TOO_FAST: (Mode.HOLD, Cause.TOO_FAST),
         Event.COMMAND_STALE: (Mode.HOLD, Cause.COMMAND_STALE),
-        Event.HOLD_ASKED: (Mode.HOLD, Cause.HOLD_ALL),
+        Event.HOLD_REQUESTED: (Mode.HOLD, Cause.HOLD_ALL),
     },
     Mode.DAMP: {
         Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
@@ -178,7 +178,7 @@ class Failsafe(msgspec.Struct):
         return msgspec.structs.replace(self, dropouts=msgspec.structs.replace(self.dropouts))
 
     @property
-    def asks_to_stiffen(self) -> bool:
+    def stiffen_requested(self) -> bool:
         """True in HOLD if the newest accepted command says that another module may be limp."""
         return self.mode is Mode.HOLD and self.command is not None and self.command.stiffen
 
@@ -186,7 +186,7 @@ class Failsafe(msgspec.Struct):
         """Return the age of the newest accepted command on this module's clock; -1 if none."""
         return now_ns - self.command.echo_t_ns if self.command is not None else -1
 
-    def disbelieves(self, now_ns: int, timing: Timing) -> Outside:
+    def current_outside(self, now_ns: int, timing: Timing) -> Outside:
         """Return the part of the newest command outside the envelope, while that is recent."""
         old = now_ns - self.judged_ns > timing.max_command_age_ns
         return Outside.NOTHING if old else self.outside
@@ -265,7 +265,7 @@ class Failsafe(msgspec.Struct):
         if not fresh:
             return Event.COMMAND_STALE
         if self.command is not None and self.command.hold:
-            return Event.HOLD_ASKED
+            return Event.HOLD_REQUESTED
         return Event.READY if self.ready(now_ns, timing) else Event.NONE
 
     def _judge(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:

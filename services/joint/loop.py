@@ -133,7 +133,7 @@ class JointLoop:
         trace = tracer.after(now, reading, command, estop, step, near)
         if trace is not None:
             ports.traces.put(trace)
-        if step.event is not None or step.obstacle is not ArmingInhibit.NONE:
+        if step.event is not None or step.inhibit is not ArmingInhibit.NONE:
             self._report(now, step)
 
     def _is_stopped_here(self, now: int) -> bool:
@@ -141,11 +141,11 @@ class JointLoop:
         last_state = self._last_state
         if last_state is None:
             return False
-        return self._pendant.is_lost(now, last_state.beats) or last_state.stop_asked
+        return self._pendant.is_lost(now, last_state.beats) or last_state.stop_requested
 
     def _write(self, step: DriveAction) -> None:
         """Send this cycle's command to the drive."""
-        drive, order = self._drive, step.order
+        drive, order = self._drive, step.command
         if step.target is not None:
             drive.write(step.target)
         elif order is DriveCommand.TORQUE:
@@ -154,7 +154,7 @@ class JointLoop:
             drive.arm(onboard=self._module.onboard)
         elif order is DriveCommand.IDLE:
             drive.idle()
-        elif order is DriveCommand.FORGET_ZERO:
+        elif order is DriveCommand.CLEAR_ZERO:
             with suppress(DriveError):  # the drive is gone, and its zero with it
                 drive.set_position(self._nowhere)
 
@@ -169,8 +169,8 @@ class JointLoop:
                 Cause(step.event.cause).name,
                 samples.error,
             )
-        reported = step.obstacle is self._reported and now < self._report_at_ns
-        if step.obstacle is not ArmingInhibit.NONE and not reported:
-            self._reported, self._report_at_ns = step.obstacle, now + REPORT_EVERY_NS
-            why = _WHY_NOT[step.obstacle].format(q=samples.q, error=samples.error)
+        reported = step.inhibit is self._reported and now < self._report_at_ns
+        if step.inhibit is not ArmingInhibit.NONE and not reported:
+            self._reported, self._report_at_ns = step.inhibit, now + REPORT_EVERY_NS
+            why = _WHY_NOT[step.inhibit].format(q=samples.q, error=samples.error)
             log.get("xrl").error("not armed: %s", why)

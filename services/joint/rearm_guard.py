@@ -73,7 +73,7 @@ class RearmGuard:
             self._memory[_LAST_STATE] = self._written = last_state
 
     @property
-    def stop_asked(self) -> bool:
+    def stop_requested(self) -> bool:
         """True if someone on this host has set the emergency stop."""
         return self._memory[_STOP] != 0
 
@@ -92,7 +92,7 @@ def clear(run_dir: Path, module: str) -> None:
         file.write(_NEW)
 
 
-def ask_stop(run_dir: Path, module: str) -> bool:
+def request_stop(run_dir: Path, module: str) -> bool:
     """Stop a module, with or without a bus; return False if it has no service on this host.
 
     Raises:

@@ -98,7 +98,7 @@ class SetpointLaw:
         """
         mode = failsafe.mode
         limp = near.stiffen and mode in (Mode.HOLD, Mode.DAMP)
-        if not self._stiffened_ns and (limp or failsafe.asks_to_stiffen):
+        if not self._stiffened_ns and (limp or failsafe.stiffen_requested):
             self._stiffened_ns = now_ns
         since_ns = now_ns - self._changed_ns
         if mode is Mode.TRACK:

@@ -61,7 +61,7 @@ class Tracer:
                 0 if command is None else command.session,
                 -1 if command is None else command.seq,
                 estop,
-                step.order.value,
+                step.command.value,
                 self._module.controller.tau,
                 near.below or _NOTHING,
                 near.below is not None,

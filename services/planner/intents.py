@@ -3,8 +3,8 @@
 An intent that is not repeated goes stale: an operator who requested 100 N and left must not be
 lifted forever. It fades out slowly, because somebody may still lean on the robot:
 
-    wish = intent                                       younger than `assist.stale_ms`
-    wish = intent max(0, 1 - (age - stale) / fade)      older
+    request = intent                                       younger than `assist.stale_ms`
+    request = intent max(0, 1 - (age - stale) / fade)      older
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import AssistConfig
 
 
-class Wish(NamedTuple):
+class OperatorRequest(NamedTuple):
     """Assist force and shift that the operator requests."""
 
     assist_n: float = 0.0
@@ -34,21 +34,21 @@ class Intents:
         """Set the age at which an intent is stale, and the time of its fade."""
         self._stale_ns = round(config.stale_ms * NS_PER_MS)
         self._fade_ns = round(config.fade_s * NS_PER_S)
-        self._wish = Wish()
+        self._request = OperatorRequest()
         self._received_ns = 0
 
     def receive(self, intent: OperatorIntent, now_ns: int) -> None:
         """Store an intent that has arrived; ignore one with a value that is not finite."""
         if all(map(math.isfinite, (intent.assist_n, *intent.shift))):
-            self._wish = Wish(intent.assist_n, intent.shift, intent.source)
+            self._request = OperatorRequest(intent.assist_n, intent.shift, intent.source)
             self._received_ns = now_ns
 
-    def wish(self, now_ns: int) -> Wish:
+    def request(self, now_ns: int) -> OperatorRequest:
         """Return the assist and shift that are requested now."""
         late_ns = now_ns - self._received_ns - self._stale_ns
         if late_ns <= 0:
-            return self._wish
+            return self._request
         scale = max(0.0, 1.0 - late_ns / self._fade_ns)
-        x, y, roll, yaw = self._wish.shift
+        x, y, roll, yaw = self._request.shift
         shift = scale * x, scale * y, scale * roll, scale * yaw
-        return Wish(scale * self._wish.assist_n, shift)
+        return OperatorRequest(scale * self._request.assist_n, shift)

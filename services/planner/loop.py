@@ -83,7 +83,7 @@ class PlannerLoop:
         intent = ports.intent.take()
         if intent is not None:
             self._intents.receive(intent, now)
-        planner.receive_wish(self._intents.wish(now))
+        planner.receive_request(self._intents.request(now))
         for publisher, command in zip(ports.commands, planner.tick(now), strict=False):
             publisher.put(command)
         ports.status.put(planner.status(now, (now_ns() - now) / NS_PER_US))

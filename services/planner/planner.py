@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from services.planner.assist import Overload, force_up
 from services.planner.engagement_fsm import Engagement
 from services.planner.hocca import Hocca, LawOutput
-from services.planner.intents import Wish
+from services.planner.intents import OperatorRequest
 from services.planner.limp_leg_watch import LimpLegWatch
 from services.planner.plausible import Plausible
 from services.planner.snapshots import TickState
@@ -73,7 +73,7 @@ class Planner:
         self._q: Array = np.zeros(N_JOINTS)
         self._v: Array = np.zeros(N_JOINTS)
         self._tau: Array = np.zeros(N_JOINTS)
-        self._wish = Wish()
+        self._request = OperatorRequest()
         self._wrench: Wrench | None = None
         self._wrench_ns = 0
         self._wrench_stale_ns = round(config.harness.stale_ms * NS_PER_MS)
@@ -116,9 +116,9 @@ class Planner:
         self._attitude_seq = attitude.seq
         self._attitude, self._attitude_ns = attitude, now_ns
 
-    def receive_wish(self, wish: Wish) -> None:
+    def receive_request(self, request: OperatorRequest) -> None:
         """Store the operator's current request (`services.planner.intents`)."""
-        self._wish = wish
+        self._request = request
 
     def is_due(self, now_ns: int) -> bool:
         """Return True if a tick is due: as soon as all six modules have a new state.
@@ -161,9 +161,9 @@ class Planner:
         self._output = self._law.tick(
             self._q,
             self._v,
-            self._wish.assist_n,
+            self._request.assist_n,
             dt,
-            shift_requested=self._wish.shift,
+            shift_requested=self._request.shift,
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -204,7 +204,7 @@ class Planner:
             self._attitude_ns,
             self._attitude_seq,
             self._trips.snapshot(),
-            self._wish,
+            self._request,
             self._unattended.snapshot(),
         )
 
@@ -214,7 +214,7 @@ class Planner:
         for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
             if state is not None:
                 self.receive_state(module, state, arrived_ns)
-        self._wish = m.wish
+        self._request = m.request
         self._unattended.restore(m.unattended)
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
         self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
@@ -352,14 +352,14 @@ class Planner:
             tick_us=tick_us,
             state_seq=(seqs[0], seqs[1], seqs[2], seqs[3], seqs[4], seqs[5]),
             wrench_seq=self._wrench_seq,
-            assist_requested_n=self._wish.assist_n,
+            assist_requested_n=self._request.assist_n,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
             wait_s=0.0 if leads else self._engagement.wait_ns(now_ns) / NS_PER_S,
             attitude_seq=self._attitude_seq,
             slope=output.slope if output is not None else (0.0, 0.0),
-            shift_requested=self._wish.shift,
+            shift_requested=self._request.shift,
             load=self._law.load,
-            requested_by=self._wish.source,
+            requested_by=self._request.source,
             stance=stance,
             why=self._law.stance_refusal() or self._law.load_refusal() or self._trips.why,
             trip=int(self._trips.tripped),

@@ -264,7 +264,7 @@ def limits_along(
     )
 
 
-def slope_pulling(config: RobotConfig, force_n: float) -> float:
+def equivalent_slope(config: RobotConfig, force_n: float) -> float:
     """Return the floor slope, rad, that pulls the weight downhill as hard as a push (N).
 
     Without an IMU the planner stands along the floor's normal, and the weight loads the gains like

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from services.planner.engagement_fsm import Engagement
-from services.planner.intents import Wish
+from services.planner.intents import OperatorRequest
 from services.planner.limp_leg_watch import LimpLegWatch
 from shared.bus.messages import (
     AS_CONFIGURED,
@@ -130,5 +130,5 @@ class TickState(msgspec.Struct, frozen=True):
     attitude_ns: int = 0
     attitude_seq: int = -1
     trips: TripsState = TripsState()
-    wish: Wish = Wish()
+    request: OperatorRequest = OperatorRequest()
     unattended: UnattendedState = UnattendedState()

@@ -33,8 +33,8 @@ def test_a_drive_that_never_arms_is_asked_so_often_and_told_of_once(robot: Robot
         step = bench.cycle()
         bench.status = DriveStatus.IDLE  # it does not do it
         assert step.torque == (0.0, 0.0)
-        if step.order is DriveCommand.ARM or step.obstacle is not ArmingInhibit.NONE:
-            told.append((bench.now_ns, step.order, step.obstacle))
+        if step.command is DriveCommand.ARM or step.inhibit is not ArmingInhibit.NONE:
+            told.append((bench.now_ns, step.command, step.inhibit))
     assert [row[1:] for row in told] == [
         *[(DriveCommand.ARM, ArmingInhibit.NONE)] * ARM_TRIES,
         (DriveCommand.NOTHING, ArmingInhibit.WILL_NOT),
@@ -51,8 +51,8 @@ def test_after_a_freeze_the_change_of_mode_is_told_with_the_torques_that_were_ca
     bench.freeze(2 * NS_PER_S, MOVED)
     carried = bench.carried()
     step = bench.cycle()
-    assert step.order is DriveCommand.NOTHING, "it listens first"
-    assert (step.torque, step.target, step.obstacle) == ((0.0, 0.0), None, ArmingInhibit.NONE)
+    assert step.command is DriveCommand.NOTHING, "it listens first"
+    assert (step.torque, step.target, step.inhibit) == ((0.0, 0.0), None, ArmingInhibit.NONE)
     event = step.event
     assert event is not None
     assert (event.mode_before, event.mode_after) == (Mode.TRACK, Mode.HOLD)
@@ -104,7 +104,7 @@ def test_a_module_that_found_nothing_or_what_let_go_leaves_nothing_holding(
 
 def test_a_drive_of_unknown_torques_is_no_reason_to_wait_for_a_planner(robot: RobotConfig) -> None:
     service = Successor(robot, LastState.NOTHING, DriveStatus.ARMED)
-    assert {step.obstacle for step in service.run(3 * ARM_EVERY_NS)} == {ArmingInhibit.NONE}
+    assert {step.inhibit for step in service.run(3 * ARM_EVERY_NS)} == {ArmingInhibit.NONE}
 
 
 @pytest.mark.parametrize(("mark_turns", "forgets"), [(0.0, False), (0.5, True), (40.0, True)])
@@ -115,9 +115,9 @@ def test_only_a_drive_with_a_mark_for_no_zero_is_made_to_forget_its_zero(
     bench = Bench(msgspec.structs.replace(robot, drive=drive), "onboard")
     bench.to(Mode.HOLD)
     bench.status = DriveStatus.UNZEROED
-    orders = [bench.cycle().order for _ in range(1000)]
+    orders = [bench.cycle().command for _ in range(1000)]
     assert bench.mode is Mode.FAULT
-    assert orders.count(DriveCommand.FORGET_ZERO) == int(forgets)
+    assert orders.count(DriveCommand.CLEAR_ZERO) == int(forgets)
 
 
 def test_a_module_goes_on_from_all_that_it_remembers(robot: RobotConfig) -> None:

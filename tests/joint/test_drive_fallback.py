@@ -97,12 +97,12 @@ def test_both_axes_of_a_drive_that_was_lost_go_idle_if_it_comes_back_with_one_di
     bench = Bench(robot, "onboard")
     bench.to(Mode.HOLD)
     bench.status = DriveStatus.LOST
-    orders = [bench.cycle().order for _ in range(200)]
+    orders = [bench.cycle().command for _ in range(200)]
     assert bench.mode is Mode.FAULT
     assert set(orders) == {DriveCommand.NOTHING}, "it may hold still"
     bench.status = back
-    assert bench.cycle().order is DriveCommand.IDLE
-    again = [bench.cycle().order for _ in range(3 * IDLE_EVERY_NS // bench.cycle_ns)]
+    assert bench.cycle().command is DriveCommand.IDLE
+    again = [bench.cycle().command for _ in range(3 * IDLE_EVERY_NS // bench.cycle_ns)]
     assert again.count(DriveCommand.IDLE) == 3, "the frame may have been lost"
     assert bench.mode is Mode.FAULT
 
@@ -115,7 +115,7 @@ def test_a_drive_that_was_lost_and_comes_back_holding_is_left_alone(
     bench.to(Mode.HOLD)
     for status in (DriveStatus.LOST, back):
         bench.status = status
-        orders = [bench.cycle().order for _ in range(2000)]
+        orders = [bench.cycle().command for _ in range(2000)]
         assert set(orders) == {DriveCommand.NOTHING}
     assert bench.mode is Mode.FAULT
     assert bench.module.leaves_holding, "nor does ending its service idle it"

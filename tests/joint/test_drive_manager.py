@@ -67,11 +67,11 @@ class Bench:
         pos, vel = motor_from_joint(self.q, ratio), motor_from_joint(self.v, ratio)
         reading = DriveReading(self.now_ns, pos, vel, self.status, 0)
         step = self.module.step(self.now_ns, None if silent else reading, sent, estop)
-        if step.order is DriveCommand.ARM:
+        if step.command is DriveCommand.ARM:
             self.status = DriveStatus.ARMED
-        elif step.order is DriveCommand.TARGET:
+        elif step.command is DriveCommand.TARGET:
             self.target = step.target
-        elif step.order is DriveCommand.TORQUE:
+        elif step.command is DriveCommand.TORQUE:
             self.torque = step.torque
         return step
 
@@ -113,7 +113,7 @@ def test_after_a_freeze_the_drives_torque_goes_on_without_a_step(
     last = bench.carried()
     orders = []
     for _ in range(round(robot.joint_service.blend_ms * NS_PER_MS / bench.cycle_ns) + 30):
-        orders.append(bench.cycle().order)
+        orders.append(bench.cycle().command)
         now = bench.carried()
         assert max(abs(b - a) for a, b in zip(last, now, strict=True)) < 0.6
         last = now
@@ -155,17 +155,17 @@ def test_shorter_gaps_are_no_freeze(robot: RobotConfig) -> None:
     bench = Bench(robot, "onboard")
     bench.to(Mode.HOLD)
     bench.freeze(GAP_NS - bench.cycle_ns, bench.q)
-    assert bench.cycle().order is DriveCommand.TARGET
+    assert bench.cycle().command is DriveCommand.TARGET
 
 
 def test_it_does_not_speak_before_it_has_heard_the_drive(robot: RobotConfig) -> None:
     bench = Bench(robot, "onboard")
     bench.to(Mode.HOLD)
     bench.freeze(NS_PER_S, MOVED)
-    silent = [bench.cycle(silent=True).order for _ in range(20)]
+    silent = [bench.cycle(silent=True).command for _ in range(20)]
     assert silent == [DriveCommand.NOTHING] * 20
     before = bench.carried()
-    assert bench.cycle().order is DriveCommand.TARGET
+    assert bench.cycle().command is DriveCommand.TARGET
     assert bench.carried() == pytest.approx(before, abs=1e-6)
 
 
@@ -174,7 +174,7 @@ def test_a_drive_that_disarmed_meanwhile_is_a_fault_at_once(robot: RobotConfig) 
     bench.to(Mode.HOLD)
     bench.freeze(NS_PER_S, MOVED)
     bench.status = DriveStatus.IDLE
-    assert bench.cycle().order is DriveCommand.IDLE
+    assert bench.cycle().command is DriveCommand.IDLE
     assert bench.mode is Mode.FAULT
 
 

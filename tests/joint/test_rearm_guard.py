@@ -70,7 +70,7 @@ class Successor:
 def test_the_first_service_leaves_what_it_does(robot: RobotConfig) -> None:
     service = Successor(robot, LastState.NOTHING, DriveStatus.IDLE)
     left = [service.module.last_state]
-    assert service.cycle().order is DriveCommand.ARM
+    assert service.cycle().command is DriveCommand.ARM
     left.append(service.module.last_state)  # asked for, but it may not come to hold
     service.status = DriveStatus.ARMED
     service.cycle()
@@ -113,8 +113,8 @@ def test_a_drive_that_held_and_has_let_go_is_not_armed_by_a_service_that_was_not
     """The supervisor starts what crashes: it armed under load, with a step of 28 N m."""
     service = Successor(robot, LastState.HELD, status)
     steps = [service.lead() if led else service.cycle() for _ in range(2000)]
-    assert {step.order for step in steps} == {DriveCommand.NOTHING}
-    assert ArmingInhibit.LET_GO in {step.obstacle for step in steps}
+    assert {step.command for step in steps} == {DriveCommand.NOTHING}
+    assert ArmingInhibit.LET_GO in {step.inhibit for step in steps}
     assert service.mode is Mode.DISARMED
     assert service.module.last_state is LastState.HELD, "nor by the next"
 
@@ -124,7 +124,7 @@ def test_after_an_emergency_stop_a_drive_that_has_let_go_is_not_armed(
     robot: RobotConfig, status: DriveStatus
 ) -> None:
     service = Successor(robot, LastState.DAMP, status)
-    orders = {step.order for step in service.run(2 * NS_PER_S)}
+    orders = {step.command for step in service.run(2 * NS_PER_S)}
     assert DriveCommand.ARM not in orders
     assert service.module.last_state is LastState.DAMP
 
@@ -137,8 +137,8 @@ def test_a_drive_that_holds_is_left_alone_until_a_planner_is_heard(
     service = Successor(robot, last_state, DriveStatus.ARMED)
     service.carries = CARRIED
     steps = service.run(2 * NS_PER_S)
-    assert {step.order for step in steps} == {DriveCommand.NOTHING}
-    assert {step.obstacle for step in steps} == {ArmingInhibit.NONE, ArmingInhibit.WAITING}
+    assert {step.command for step in steps} == {DriveCommand.NOTHING}
+    assert {step.inhibit for step in steps} == {ArmingInhibit.NONE, ArmingInhibit.WAITING}
     assert service.mode is Mode.DISARMED
     assert service.module.controller.state(service.now_ns).drive == DriveStatus.HOLDING
     assert service.module.leaves_holding, "should it end before it has taken the drive over"
@@ -211,7 +211,7 @@ def test_an_emergency_stop_waits_until_the_drive_is_known(robot: RobotConfig, un
     steps = [service.cycle(estop=True, silent=silent)]
     steps += [service.cycle(silent=silent) for _ in range(100)]
     assert service.mode is Mode.DISARMED
-    assert {step.order for step in steps} == {DriveCommand.NOTHING}
+    assert {step.command for step in steps} == {DriveCommand.NOTHING}
     service.status, service.carries = DriveStatus.ARMED, CARRIED
     for _ in range(2):
         service.cycle()
@@ -224,9 +224,9 @@ def test_an_emergency_stop_waits_until_the_drive_is_known(robot: RobotConfig, un
 
 def test_whoever_zeroes_a_drive_asks_for_it(robot: RobotConfig) -> None:
     service = Successor(robot, LastState.HELD, DriveStatus.UNZEROED)
-    assert DriveCommand.ARM not in {step.order for step in service.run(NS_PER_S)}
+    assert DriveCommand.ARM not in {step.command for step in service.run(NS_PER_S)}
     service.status = DriveStatus.IDLE
-    assert DriveCommand.ARM in {step.order for step in service.run(ARM_EVERY_NS + 10 * NS_PER_MS)}
+    assert DriveCommand.ARM in {step.command for step in service.run(ARM_EVERY_NS + 10 * NS_PER_MS)}
 
 
 class Process:

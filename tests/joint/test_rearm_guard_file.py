@@ -9,7 +9,7 @@ from typing import cast
 import pytest
 
 from services.joint import neighbours
-from services.joint.rearm_guard import LastState, Pendant, RearmGuard, ask_stop, clear, path_of
+from services.joint.rearm_guard import LastState, Pendant, RearmGuard, clear, path_of, request_stop
 from shared.robot.joints import MODULES
 from tools.fleet import process_table, procfs, supervise
 from tools.fleet.run_dir import RunDir
@@ -100,18 +100,18 @@ def fleet_of(
 def test_a_stop_is_seen_by_a_process_that_has_it_mapped_until_it_is_forgotten(
     tmp_path: Path, file: RearmGuard
 ) -> None:
-    assert not file.stop_asked
-    assert ask_stop(tmp_path, MODULE)
-    assert file.stop_asked
-    assert RearmGuard(tmp_path, MODULE).stop_asked, "and by whoever is started in its stead"
+    assert not file.stop_requested
+    assert request_stop(tmp_path, MODULE)
+    assert file.stop_requested
+    assert RearmGuard(tmp_path, MODULE).stop_requested, "and by whoever is started in its stead"
     file.write(LastState.HELD)
-    assert file.stop_asked, "what the service leaves does not undo it"
+    assert file.stop_requested, "what the service leaves does not undo it"
     clear(tmp_path, MODULE)
-    assert not file.stop_asked
+    assert not file.stop_requested
 
 
 def test_where_no_service_is_nothing_is_stopped(tmp_path: Path) -> None:
-    assert not ask_stop(tmp_path, MODULE)
+    assert not request_stop(tmp_path, MODULE)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -123,7 +123,7 @@ def test_a_pendant_is_heard_by_those_that_are_there(tmp_path: Path, file: RearmG
     for beats in range(1, 300):
         pendant.beat()
         assert (file.beats, other.beats) == (beats, beats)
-    assert (file.read(), file.stop_asked) == (LastState.NOTHING, False)
+    assert (file.read(), file.stop_requested) == (LastState.NOTHING, False)
     pendant.lay_down()
     assert (file.beats, other.beats) == (0, 0)
 
@@ -138,13 +138,13 @@ def test_a_pendant_is_heard_through_a_file_of_before_pendants(tmp_path: Path) ->
     path_of(tmp_path, MODULE).write_bytes(bytes([LastState.HELD, 0]))
     Pendant(tmp_path, MODULES).beat()
     found = RearmGuard(tmp_path, MODULE)
-    assert (found.read(), found.stop_asked, found.beats) == (LastState.HELD, False, 1)
+    assert (found.read(), found.stop_requested, found.beats) == (LastState.HELD, False, 1)
 
 
 def test_the_file_does_not_grow_and_a_stop_is_one_byte_of_it(tmp_path: Path) -> None:
     for _ in range(3):
         RearmGuard(tmp_path, MODULE)
-        ask_stop(tmp_path, MODULE)
+        request_stop(tmp_path, MODULE)
     assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14)
 
 
@@ -158,7 +158,7 @@ def test_what_was_found_is_not_said_again(tmp_path: Path, left: RearmGuard) -> N
 def test_a_file_of_one_byte_is_read_as_before(tmp_path: Path) -> None:
     path_of(tmp_path, MODULE).write_bytes(bytes([LastState.HELD]))
     old = RearmGuard(tmp_path, MODULE)
-    assert (old.read(), old.stop_asked) == (LastState.HELD, False)
+    assert (old.read(), old.stop_requested) == (LastState.HELD, False)
 
 
 def test_a_service_that_is_down_is_started_as_if_none_had_been_before(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.rearm_guard import RearmGuard, ask_stop, clear
+from services.joint.rearm_guard import RearmGuard, clear, request_stop
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
 from tests.joint.test_loop import Rig
@@ -18,7 +18,7 @@ def test_a_stop_by_shared_memory_is_heard_in_the_next_cycle_by_a_service_without
     rig = Rig(robot, monkeypatch, RearmGuard(tmp_path, "knee_right"))
     rig.run(20)
     assert rig.controller.failsafe.mode is Mode.HOLD
-    ask_stop(tmp_path, "knee_right")
+    request_stop(tmp_path, "knee_right")
     rig.run(1)
     assert rig.controller.failsafe.mode is Mode.DAMP
     crashed = Rig(robot, monkeypatch, RearmGuard(tmp_path, "knee_right"))

@@ -143,12 +143,12 @@ def test_no_wish_no_integral() -> None:
     assert law.assist == 0.0
 
 
-@pytest.mark.parametrize("stop", ["wish", "lead", "reading"])
+@pytest.mark.parametrize("stop", ["request", "lead", "reading"])
 def test_the_assist_makes_no_step_when_the_integral_starts_or_stops(stop: str) -> None:
     law, last = make_law(), 100.0
     for tick in range(3000):
         on = tick // 500 % 2 == 0
-        wanted = 0.0 if stop == "wish" and not on else 100.0
+        wanted = 0.0 if stop == "request" and not on else 100.0
         measured = None if stop == "reading" and not on else -500.0
         law.advance(wanted, measured, DT, still=on or stop != "lead")
         step_max = (RATE_MAX + 700.0 / INTEGRAL_S) * DT

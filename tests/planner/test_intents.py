@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from services.planner.intents import Intents, Wish
+from services.planner.intents import Intents, OperatorRequest
 from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
@@ -25,25 +25,25 @@ def late_ns(robot: RobotConfig, share: float) -> int:
 
 
 def test_nobody_heard_is_nothing_asked(robot: RobotConfig) -> None:
-    assert Intents(robot.assist).wish(T0) == Wish(0.0, STRAIGHT, "")
+    assert Intents(robot.assist).request(T0) == OperatorRequest(0.0, STRAIGHT, "")
 
 
 def test_what_is_heard_is_given_until_it_is_stale(robot: RobotConfig) -> None:
     intents = Intents(robot.assist)
     intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02)), T0)
     for now in (T0, T0 + 1, late_ns(robot, 0.0)):
-        assert intents.wish(now) == Wish(80.0, (0.01, 0.0, 0.0, -0.02), "a test")
+        assert intents.request(now) == OperatorRequest(80.0, (0.01, 0.0, 0.0, -0.02), "a test")
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0, 1.5, 1000.0])
 def test_then_it_fades_to_nothing_and_stays_there(robot: RobotConfig, share: float) -> None:
     intents = Intents(robot.assist)
     intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02)), T0)
-    wish = intents.wish(late_ns(robot, share))
+    request = intents.request(late_ns(robot, share))
     left = max(0.0, 1.0 - share)
-    assert wish.assist_n == pytest.approx(80.0 * left)
-    assert wish.shift == pytest.approx((0.01 * left, 0.0, 0.0, -0.02 * left))
-    assert wish.source == ""
+    assert request.assist_n == pytest.approx(80.0 * left)
+    assert request.shift == pytest.approx((0.01 * left, 0.0, 0.0, -0.02 * left))
+    assert request.source == ""
 
 
 def test_the_fade_is_slower_than_the_assist_may_fall(robot: RobotConfig) -> None:
@@ -54,7 +54,7 @@ def test_heard_again_it_is_given_again(robot: RobotConfig) -> None:
     intents = Intents(robot.assist)
     intents.receive(intent(80.0), T0)
     intents.receive(intent(60.0), late_ns(robot, 0.9))
-    assert intents.wish(late_ns(robot, 0.95)).assist_n == 60.0
+    assert intents.request(late_ns(robot, 0.95)).assist_n == 60.0
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -63,4 +63,4 @@ def test_what_is_no_number_is_no_intent(robot: RobotConfig, bad: float) -> None:
     intents.receive(intent(80.0), T0)
     intents.receive(intent(bad), T0 + 1)
     intents.receive(intent(1.0, (0.0, bad, 0.0, 0.0)), T0 + 2)
-    assert intents.wish(T0 + 3).assist_n == 80.0
+    assert intents.request(T0 + 3).assist_n == 80.0

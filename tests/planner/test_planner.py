@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from services.planner.certificate import Margins
-from services.planner.intents import Wish
+from services.planner.intents import OperatorRequest
 from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX_S, Planner
 from shared.bus.messages import (
     DriveStatus,
@@ -206,7 +206,7 @@ def test_a_tick_uses_states_up(planner: Planner, q: Array) -> None:
 def test_a_long_gap_is_not_integrated(robot: RobotConfig, planner: Planner, q: Array) -> None:
     """A planner stopped for 5 s raises the assist by one bounded step only."""
     last = lead(planner, q)
-    planner.receive_wish(Wish(200.0))
+    planner.receive_request(OperatorRequest(200.0))
     now = last + 5 * NS_PER_S
     receive_all(planner, q, now, seq=50)
     planner.tick(now)
@@ -218,7 +218,7 @@ def test_assist_rises_by_the_time_between_ticks(
     robot: RobotConfig, planner: Planner, q: Array
 ) -> None:
     last = lead(planner, q)
-    planner.receive_wish(Wish(200.0))
+    planner.receive_request(OperatorRequest(200.0))
     for tick in range(1, 11):
         now = last + tick * 4 * NS_PER_MS
         receive_all(planner, q, now, seq=50 + tick)

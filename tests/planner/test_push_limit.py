@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.planner.poses import Poses
-from services.planner.push_limit import DIRECTIONS, LoadedStand, slope_pulling
+from services.planner.push_limit import DIRECTIONS, LoadedStand, equivalent_slope
 from services.simulator.body import body_of
 from services.simulator.plant import NAMED, changed
 from services.simulator.world import World
@@ -126,5 +126,5 @@ def test_the_planner_adds_to_what_is_held(robot: RobotConfig, poses: dict[float,
 
 def test_a_slope_pulls_by_its_sine_of_the_weight(robot: RobotConfig) -> None:
     weight = robot.total_mass * GRAVITY
-    assert slope_pulling(robot, weight * math.sin(0.07)) == pytest.approx(0.07)
-    assert slope_pulling(robot, 2.0 * weight) == pytest.approx(math.pi / 2)
+    assert equivalent_slope(robot, weight * math.sin(0.07)) == pytest.approx(0.07)
+    assert equivalent_slope(robot, 2.0 * weight) == pytest.approx(math.pi / 2)

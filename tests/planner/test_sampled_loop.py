@@ -29,7 +29,7 @@ from services.planner.sampled_loop import (
 )
 from services.planner.split import ScheduledGains
 from services.planner.split_program import design_of
-from services.planner.stability_room import room_of
+from services.planner.stability_margins import stability_margins_of
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL, PlantConfig, changed
 from services.simulator.world import World
@@ -291,7 +291,7 @@ def test_what_is_in_hand_is_at_least_what_was_asked_for(
     wanted = robot.robustness
     softest = msgspec.structs.replace(wanted, stiffness=wanted.stiffness[:1])
     certificate = DynamicCertificate(msgspec.structs.replace(robot, robustness=softest), nodes[:2])
-    (room,) = room_of(certificate, design_of(robot.gain_schedule))
+    (room,) = stability_margins_of(certificate, design_of(robot.gain_schedule))
     assert room.torque >= wanted.gain_margin
     assert room.coupling >= wanted.gain_margin
     assert room.delay_s >= wanted.delay_margin * wanted.delay_ms / 1e3

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.planner.intents import Wish
+from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner
 from services.planner.shift import ROWS, SHIFT_S, ShiftReference
 from services.planner.snapshots import ShiftState
@@ -91,7 +91,7 @@ def test_a_follower_that_goes_on_from_its_memory_goes_on_bit_for_bit() -> None:
 
 def test_a_planner_goes_on_with_the_wish_it_had(robot: RobotConfig) -> None:
     planner = Planner(robot, 1)
-    planner.receive_wish(Wish(0.0, (0.01, 0.0, 0.0, 0.02)))
+    planner.receive_request(OperatorRequest(0.0, (0.01, 0.0, 0.0, 0.02)))
     assert planner.status(0, 0.0).shift_requested == (0.01, 0.0, 0.0, 0.02)
     twin = Planner(robot, 1)
     twin.restore(planner.snapshot())

@@ -178,7 +178,7 @@ SAGGING = TRIPS.index(Trip.SAGGING)
 def test_in_hold_only_a_load_beyond_what_was_asked_or_a_pull_upwards_counts(
     lifted: float, assist: float, leads: bool, found: float
 ) -> None:
-    """A wish of 200 N with nobody there tripped for ever."""
+    """A request of 200 N with nobody there tripped for ever."""
     values = values_of(
         output_of(assist), np.zeros(12), (200.0, 200.0), lifted, 0.0, 0.0, leads=leads
     )

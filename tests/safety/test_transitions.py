@@ -88,7 +88,7 @@ def test_the_sweep_knows_every_state_and_every_event() -> None:
     assert {*DRIVE_EVENTS, *TRIPS} | {
         Event.ESTOP,
         Event.COMMAND_STALE,
-        Event.HOLD_ASKED,
+        Event.HOLD_REQUESTED,
         Event.READY,
     } == set(Event)
     assert len(SITUATIONS) == 5 * 5 * 4 * 2**4
@@ -112,7 +112,7 @@ def test_advance_follows_the_table_for_every_state_and_event(
         drive=event if event in DRIVE_EVENTS else Event.NONE,
         estop=event is Event.ESTOP,
         fresh=event is not Event.COMMAND_STALE,
-        hold=event is Event.HOLD_ASKED,
+        hold=event is Event.HOLD_REQUESTED,
         waited=event is Event.READY,
         trip=event if event in TRIPS else Event.NONE,
     )

@@ -33,7 +33,7 @@ class SettingChange(NamedTuple):
     after: Value
     """As it should be written."""
     why: str
-    obstacle: str = ""
+    inhibit: str = ""
     """Why it cannot be written; "" if it can."""
     fits: Callable[[Value], bool] = bool
     """Whether a value that is read back is as it should be."""
@@ -121,7 +121,7 @@ def apply(board: Board, changes: Sequence[SettingChange]) -> list[ChangeResult]:
     Raises:
         DriveError: the board does not answer, or does not restart.
     """
-    to_write = [change for change in changes if not change.obstacle]
+    to_write = [change for change in changes if not change.inhibit]
     if to_write:
         board.write({change.name: change.after for change in to_write})
         board.save()

@@ -32,7 +32,7 @@ def shown(difference: Sequence[SettingChange]) -> Group:
         )
         if change.why:
             reasons.setdefault(f"{tail}: {change.why}")
-        if change.obstacle:
-            obstacle = f"{change.module} {change.name} cannot be written: {change.obstacle}"
+        if change.inhibit:
+            obstacle = f"{change.module} {change.name} cannot be written: {change.inhibit}"
             reasons.setdefault(obstacle)
     return Group(rows, *(Padding(Text(reason), (0, 1, 0, 2)) for reason in reasons))

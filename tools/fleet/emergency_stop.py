@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from services.joint.neighbours import Neighbours
-from services.joint.rearm_guard import ask_stop
+from services.joint.rearm_guard import request_stop
 from shared.bus import topics
 from shared.bus.messages import Estop, JointState, Mode
 from shared.bus.session import open_session
@@ -31,7 +31,7 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
     here, errors = [], []
     for module in MODULES:
         try:
-            if ask_stop(run_dir, module):
+            if request_stop(run_dir, module):
                 here.append(module)
         except OSError as error:
             errors.append(f"{module}: no stop by shared memory: {error.strerror}")

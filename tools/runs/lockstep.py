@@ -14,7 +14,7 @@ from typing import ClassVar
 from services.joint.controller import JointController
 from services.joint.drive_manager import DriveManager
 from services.joint.snapshots import DriveManagerState
-from services.planner.intents import Wish
+from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
 from services.simulator.axis_bank import AxisBank
@@ -232,14 +232,14 @@ class Lockstep:
             self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
         self.harness.advance(self.world, now)
         self._imu.advance(self.world, now)
-        self._planner.advance(now, self._wish)
+        self._planner.advance(now, self._request)
         self._start_when_tracking(now)
         self.world.step(self._torque)
         self.now_ns += self._step_ns
 
-    def _wish(self) -> Wish:
+    def _request(self) -> OperatorRequest:
         wanted = self.world.lead()
-        return Wish(wanted.assist, wanted.shift, SCENARIO)
+        return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
 
     def _cycle_joints(self, now: int) -> None:
         for index, joint in enumerate(self.joints):

@@ -65,16 +65,16 @@ class VirtualDrive:
     def carry_out(self, step: DriveAction, *, onboard: bool) -> None:
         """Carry out a cycle's action, if the drive receives it; each frame feeds its watchdog."""
         bank, (a, b) = self._bank, self._axes
-        if step.order is DriveCommand.NOTHING or not bank.talks(a):
+        if step.command is DriveCommand.NOTHING or not bank.talks(a):
             return
         self._written = True
         if step.target is not None:
             self._aim(self._frame.target(step.target))
-        elif step.order is DriveCommand.TORQUE:
+        elif step.command is DriveCommand.TORQUE:
             bank.input_torque[self._module] = self._frame.torque(step.torque)
-        elif step.order is DriveCommand.ARM:
+        elif step.command is DriveCommand.ARM:
             self._arm(onboard=onboard)
-        elif step.order is DriveCommand.FORGET_ZERO:
+        elif step.command is DriveCommand.CLEAR_ZERO:
             for axis in self._axes:
                 bank.set_count(axis, 0.0)
         else:

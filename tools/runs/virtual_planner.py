@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from services.planner.checkpoint import Checkpoints
-from services.planner.intents import Wish
+from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
 from shared.bus import topics
@@ -54,12 +54,12 @@ class VirtualPlanner:
         self._rate_hz, self._traced = rate_hz, traced
         self._checkpoints = Checkpoints(rate_hz)
 
-    def advance(self, now_ns: int, wish: Callable[[], Wish]) -> None:
+    def advance(self, now_ns: int, request: Callable[[], OperatorRequest]) -> None:
         """Receive what has arrived by a virtual time, and tick if a tick is due.
 
         Args:
             now_ns: virtual time.
-            wish: returns what the operator requests.
+            request: returns what the operator requests.
         """
         planner = self.planner
         if planner is None or self.frozen:
@@ -77,7 +77,7 @@ class VirtualPlanner:
         attitude = self._attitudes.take(now_ns)
         if attitude is not None:
             planner.receive_attitude(attitude, host_ns)
-        planner.receive_wish(wish())
+        planner.receive_request(request())
         for index, command in enumerate(planner.tick(host_ns)):
             self._commands[index].put(now_ns, command)
             self._record(topics.JOINT_COMMAND, MODULES[index], command)

@@ -94,10 +94,10 @@ def run(args: argparse.Namespace) -> int:
         intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         with Live(console=Console(), refresh_per_second=4, transient=True) as shown:
-            wish = OperatorIntent(
+            request = OperatorIntent(
                 t_ns=now_ns(), seq=0, assist_n=args.assist, shift=args.shift, source=source
             )
-            given = ask(intents, statuses, wish, lambda: bool(stop), shown, for_s=args.for_s)
+            given = ask(intents, statuses, request, lambda: bool(stop), shown, for_s=args.for_s)
     fade_s = robot.assist.fade_s
     Console().print(f"no longer asked for: {given:.0f} N were given; they fade out in {fade_s:g} s")
     return 0
@@ -123,7 +123,7 @@ def refuse_beyond_limits(robot: RobotConfig, assist: float, shift: Vector4) -> N
 def ask(
     intents: IntentClient,
     statuses: Statuses,
-    wish: OperatorIntent,
+    request: OperatorIntent,
     stop: Stop,
     shown: Shown,
     *,
@@ -134,7 +134,7 @@ def ask(
     Args:
         intents: to the planner.
         statuses: from it.
-        wish: the request; stamp and number are set at each repetition.
+        request: the request; stamp and number are set at each repetition.
         stop: True ends it.
         shown: shows the assist given.
         for_s: duration, s; None: until stopped.
@@ -155,16 +155,16 @@ def ask(
             OperatorIntent(
                 t_ns=now_ns(),
                 seq=round((now - start) / REPEAT_S),
-                assist_n=wish.assist_n,
-                shift=wish.shift,
-                source=wish.source,
+                assist_n=request.assist_n,
+                shift=request.shift,
+                source=request.source,
             )
         )
         newest = statuses.take()
         if newest is not None:
             status = newest
-            shown.update(Text(describe(wish, status)))
-            if status.requested_by == wish.source:
+            shown.update(Text(describe(request, status)))
+            if status.requested_by == request.source:
                 heard = now
         if now - heard > HEARD_S:
             taken = (
@@ -175,11 +175,11 @@ def ask(
     return status.assist_n
 
 
-def describe(wish: OperatorIntent, status: PlannerStatus) -> str:
+def describe(request: OperatorIntent, status: PlannerStatus) -> str:
     """Return request and response as one line."""
-    words = f"asked for {wish.assist_n:.0f} N, given {status.assist_n:.0f} N"
-    if any(wish.shift):
-        pairs = zip(SHIFT_UNITS, wish.shift, strict=True)
+    words = f"asked for {request.assist_n:.0f} N, given {status.assist_n:.0f} N"
+    if any(request.shift):
+        pairs = zip(SHIFT_UNITS, request.shift, strict=True)
         words += ", shift " + ", ".join(f"{name} {at:g} {unit}" for (name, unit), at in pairs if at)
     mode = PlannerMode(status.mode)
     if mode is not PlannerMode.LEADING:

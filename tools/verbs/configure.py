@@ -274,12 +274,12 @@ def conclude(
     """Say what came of it and return the exit code."""
     bad = [outcome for outcome in outcomes if not outcome.good]
     for change, now, _ in bad:
-        what = change.obstacle or f"it is {changes.describe(now)} after the restart"
+        what = change.inhibit or f"it is {changes.describe(now)} after the restart"
         console.print(f"[bold red]not as wanted[/]: {change.module} {change.name}: {escape(what)}")
     done = len(outcomes) - len(bad)
     console.print(f"{done} settings written, saved, and read back after the restart")
     if done and robot.drive.zero_mark_turns > 0.0:
-        written = (outcome.change for outcome in outcomes if not outcome.change.obstacle)
+        written = (outcome.change for outcome in outcomes if not outcome.change.inhibit)
         restarted = dict.fromkeys(change.module for change in written)
         console.print(f"restarted, and so without a zero: {', '.join(restarted)}; `xrl zero`")
     if emulated and is_simulated(robot):

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from services.planner.push_limit import DIRECTIONS, slope_pulling
+from services.planner.push_limit import DIRECTIONS, equivalent_slope
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
@@ -157,7 +157,7 @@ def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -
     first = ", ".join(dict.fromkeys(parts))
     console.print(f"gives way first, with the planner dead: {first}", style="dim")
     slopes = ", ".join(
-        f"{math.degrees(slope_pulling(robot, force_n)):.1f} degrees {name}"
+        f"{math.degrees(equivalent_slope(robot, force_n)):.1f} degrees {name}"
         for name, force_n in least.items()
     )
     console.print(f"slope without an IMU, planner dead or led: {slopes}", style="dim")
@@ -170,7 +170,7 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     """Print the design chosen with the dynamic certificate, and its margins."""
     from services.planner import split_program  # noqa: PLC0415 - cvxpy takes a second to load
     from services.planner.dynamic_certificate import DynamicCertificate  # noqa: PLC0415
-    from services.planner.stability_room import room_of  # noqa: PLC0415
+    from services.planner.stability_margins import stability_margins_of  # noqa: PLC0415
 
     D_B = ", ".join(f"{value:.1f}" for value in schedule.D_B)
     console.print(
@@ -183,7 +183,7 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     table = Table(title="In hand before any motion grows (TRACK, HOLD, drives alone)")
     for heading in ("drivetrain N m/rad", "all feedback", "tau_coupled", "delay ms"):
         table.add_column(heading, justify="right")
-    for room in room_of(certificate, design):
+    for room in stability_margins_of(certificate, design):
         name = "rigid" if room.stiffness >= RIGID_FROM else f"{room.stiffness:g}"
         table.add_row(
             name, _decibels(room.torque), _decibels(room.coupling), f">= {1e3 * room.delay_s:.0f}"

@@ -66,7 +66,7 @@ def test_pre_calibrated_is_written_to_an_axis_only_once_it_is_calibrated(
 ) -> None:
     raw = BoardInMemory(as_wanted() | {PRE_CALIBRATED: False}, **{"axis1.encoder.is_ready": False})
     (change,) = changes.against_wanted(MODULE, wanted, raw)
-    assert "CALIBRATION" in change.obstacle
+    assert "CALIBRATION" in change.inhibit
     (outcome,) = changes.apply(raw, [change])
     assert not outcome.good
     assert (raw.writes, raw.saves) == ([], 0)
@@ -82,7 +82,7 @@ def test_a_setting_that_is_not_in_this_firmware_is_a_row_and_no_crash(
     board = BoardInMemory(settings)
     (change,) = changes.against_wanted(MODULE, wanted, board)
     assert (change.before, change.name) == (None, PERIOD)
-    assert "firmware" in change.obstacle
+    assert "firmware" in change.inhibit
     assert not changes.apply(board, [change])[0].good
 
 

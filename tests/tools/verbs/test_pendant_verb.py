@@ -90,7 +90,7 @@ def test_ctrl_c_is_the_stop_and_says_who_has_not_stopped(
     assert process.returncode == 2
     assert "hip_left" in error
     assert "knee_left" not in error
-    assert all(file.stop_asked for file in files), "at once, and not by silence"
+    assert all(file.stop_requested for file in files), "at once, and not by silence"
 
 
 def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[RearmGuard]) -> None:
@@ -101,7 +101,7 @@ def test_a_terminal_that_is_cut_is_the_stop(tmp_path: Path, files: list[RearmGua
         wait_for(lambda: files[0].beats > 3)
         os.close(terminal)
         os.close(person)
-        wait_for(lambda: all(file.stop_asked for file in files))
+        wait_for(lambda: all(file.stop_requested for file in files))
         process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()

@@ -88,7 +88,7 @@ class JointExecution:
         step = module.step(c.now_ns, _reading(c), command, c.estop, near)
         controller = module.controller
         outcome.ticks += 1
-        mine = msgspec.structs.replace(cycle, drive_command=step.order.value, tau=controller.tau)
+        mine = msgspec.structs.replace(cycle, drive_command=step.command.value, tau=controller.tau)
         if mine != cycle:
             self._compare("trace", controller.cycle, _single(cycle), _single(mine))
         if controller.cycle % self._state_every == 0:

@@ -7,7 +7,7 @@ from typing import Final
 
 import msgspec
 
-from services.planner.intents import Wish
+from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
 from shared.bus import topics
@@ -103,8 +103,10 @@ class PlannerExecution:
                 return False
             planner.receive_attitude(attitude, status.t_ns)
             self._attitude_seq = status.attitude_seq
-        wish = Wish(status.assist_requested_n, status.shift_requested, status.requested_by)
-        planner.receive_wish(wish)
+        request = OperatorRequest(
+            status.assist_requested_n, status.shift_requested, status.requested_by
+        )
+        planner.receive_request(request)
         return True
 
     def _tick(self, planner: Planner, status: PlannerStatus) -> Iterator[tuple[str, Message]]:

@@ -19,7 +19,7 @@ DELAYS: Final = (1.0, 5.0, 10.0, 15.0, 20.0, 24.0)
 """Multiples of `DELAY_MIN_S`, up to the age at which a command is refused."""
 
 
-class Room(NamedTuple):
+class StabilityMargins(NamedTuple):
     """Largest factors that keep one drivetrain stable in every condition; 0 if not even 1 does."""
 
     stiffness: float
@@ -32,7 +32,7 @@ class Room(NamedTuple):
     """From a sample to the use of its command, s."""
 
 
-def room_of(certificate: DynamicCertificate, design: Design) -> list[Room]:
+def stability_margins_of(certificate: DynamicCertificate, design: Design) -> list[StabilityMargins]:
     """Return the room that each drivetrain leaves, over all poses, hands and modes."""
 
     def highest_stable(
@@ -53,7 +53,7 @@ def room_of(certificate: DynamicCertificate, design: Design) -> list[Room]:
         led = [c for c in nominal if c.mode == "TRACK"]
         least_delayed = [c for c in led if c.delay_s == DELAY_MIN_S]
         rooms.append(
-            Room(
+            StabilityMargins(
                 stiffness,
                 highest_stable(nominal, LADDER, lambda c, f: c._replace(gains=Gains(torque=f))),
                 highest_stable(led, LADDER, lambda c, f: c._replace(gains=Gains(coupling=f))),
