@@ -1,4 +1,4 @@
-"""Acts on a scenario's faults: brings the emulated drives into what each kind is, and out again."""
+"""Injects a scenario's faults into the emulated drives, and ends them."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from services.simulator.axis_conditions import OVER_TEMP_MARGIN, ROOM_TEMPERATUR
 from services.simulator.axis_faults import AXIS_NAMES
 from services.simulator.dc_bus import SUPPLY_VOLTAGE
 from shared.config.scenarios import Fault
+from shared.exceptions import DriveError
 from shared.robot.joints import MODULE_INDEX
 
 _AT_ONCE: Final = {"watchdog": "WATCHDOG", "disarmed": "DISARM", "overspeed": "OVERSPEED"}
-"""Kinds that are of a moment, and the fault of the bank that each is."""
+"""Momentary kinds, with the bank's fault."""
 _ABOVE: Final = 5.0
-"""V and C beyond the limit that is passed."""
+"""V or C beyond the limit."""
 
 
 class FaultInjector:
@@ -48,19 +49,22 @@ class FaultInjector:
         """Bring a drive into a lasting fault, or out of it."""
         bank, axis = self._bank, axis_of(fault)
         drive = axis >> 1
-        if fault.kind == "over_temperature":
-            limit = bank.settings.axis("motor.fet_thermistor.config.temp_limit_upper")[axis]
-            hot = float(limit) + OVER_TEMP_MARGIN + _ABOVE
-            bank.conditions.heat(axis, hot if begins else ROOM_TEMPERATURE)
-        elif fault.kind == "encoder":
-            bank.conditions.lose_encoder(axis, lost=begins)
-        elif fault.kind == "link_lost":
-            bank.conditions.link(drive, up=not begins)
-        elif fault.kind == "over_voltage":
-            limit = bank.settings.drive("config.dc_bus_overvoltage_trip_level")[drive]
-            bank.supply(drive, float(limit) + _ABOVE if begins else SUPPLY_VOLTAGE)
-        else:
-            bank.supply(drive, 0.0 if begins else SUPPLY_VOLTAGE)
+        match fault.kind:
+            case "over_temperature":
+                limit = bank.settings.axis("motor.fet_thermistor.config.temp_limit_upper")[axis]
+                hot = float(limit) + OVER_TEMP_MARGIN + _ABOVE
+                bank.conditions.heat(axis, hot if begins else ROOM_TEMPERATURE)
+            case "encoder":
+                bank.conditions.lose_encoder(axis, lost=begins)
+            case "link_lost":
+                bank.conditions.link(drive, up=not begins)
+            case "over_voltage":
+                limit = bank.settings.drive("config.dc_bus_overvoltage_trip_level")[drive]
+                bank.supply(drive, float(limit) + _ABOVE if begins else SUPPLY_VOLTAGE)
+            case "brown_out":
+                bank.supply(drive, 0.0 if begins else SUPPLY_VOLTAGE)
+            case _:
+                raise DriveError(f"{fault.kind}: no lasting fault of the emulated drives")
 
 
 def axis_of(fault: Fault) -> int:

@@ -84,9 +84,9 @@ class FaultTraits(NamedTuple):
 
     about: str
     duration: float | None
-    """s if the scenario gives none; None: it is of a moment."""
+    """Default, s; None: momentary."""
     whole: bool
-    """It is of the whole ODrive, and not of one of its axes."""
+    """True if it affects the whole ODrive, not one of its axes."""
 
 
 FAULT_KINDS: Final[Mapping[str, FaultTraits]] = {

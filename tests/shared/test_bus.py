@@ -488,7 +488,7 @@ def linked(one: str, other: str) -> bool:
 
 
 def test_every_publisher_has_a_link_to_every_subscriber() -> None:
-    assert set(TALK) == set(topics.TOPICS)
+    assert set(TALK) == set(topics.TOPICS), "each topic has a row in TALK, above"
     for topic, (publishers, subscribers) in TALK.items():
         for publisher in publishers:
             for subscriber in subscribers:
