@@ -137,7 +137,7 @@ class Bench:
         return self.module.controller.failsafe.mode
 
     def torque_of(self, step: DriveAction) -> Pair:
-        assert step.order is DriveCommand.TORQUE
+        assert step.command is DriveCommand.TORQUE
         return joint_torque(step.torque, self.gear_ratio)
 
 
@@ -185,7 +185,7 @@ def test_an_estop_and_a_lost_drive_are_as_shipped(robot: RobotConfig, bench: Ben
     other.status = DriveStatus.LOST
     other.cycle(TAU)
     assert other.mode is Mode.FAULT
-    assert other.cycle(TAU).order is not DriveCommand.TORQUE
+    assert other.cycle(TAU).command is not DriveCommand.TORQUE
 
 
 def states(robot: RobotConfig, now_ns: int, seq: int) -> list[JointState]:
