@@ -84,7 +84,12 @@ def test_what_keeps_shaking_is_led_ever_more_rarely(robot: RobotConfig) -> None:
     fleet, _, fell = run(unfiltered(robot), still(12.0), PLANTS["k 5000"])
     assert not fell
     tracked = [(enters.t_ns, (leaves.t_ns - enters.t_ns) / 1e9) for enters, leaves in _led(fleet)]
-    assert sum(led_s for _, led_s in tracked) / 6 < 1.5, "seconds led, of 14"
+    starts = sorted({enters_ns // 10**8 for enters_ns, _ in tracked})  # tenths of a second
+    waits = [later - earlier for earlier, later in pairwise(starts)]
+    assert len(waits) >= 3
+    assert all(later > 1.5 * earlier for earlier, later in pairwise(waits)), waits
+    # 1.52 on one processor, under 1.5 on another: shaking amplifies a product's last bit
+    assert sum(led_s for _, led_s in tracked) / 6 < 2.0, "seconds led, of 18"
     assert fleet.planner is not None
     assert fleet.planner.status(fleet.now_ns, 0.0).wait_s > 2.0
 
