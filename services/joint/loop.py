@@ -44,7 +44,7 @@ _WHY_NOT: Final = {
     "error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
     ArmingInhibit.WAITING: "the drive holds by its own loop; it is taken over once a planner is "
     "there",
-    ArmingInhibit.WILL_NOT: f"asked for {ARM_TRIES} times: drive error 0x{{error:x}}",
+    ArmingInhibit.WILL_NOT: f"requested {ARM_TRIES} times: drive error 0x{{error:x}}",
 }
 
 

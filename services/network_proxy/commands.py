@@ -51,7 +51,9 @@ class Orders:
         if not 0.0 <= request.in_s <= WAIT_MAX_S:
             return f"in {request.in_s:g} s; from now to {WAIT_MAX_S:g} s on"
         if len(self._injections.requested) >= ASKED_MAX:
-            return f"{ASKED_MAX} impairments are asked for already; clear some of them first"
+            return (
+                f"{ASKED_MAX} impairments are active or planned already; clear some of them first"
+            )
         return request.inject.fault()
 
     def _begin(self, request: Begin, at_ns: int) -> None:

@@ -69,7 +69,7 @@ def choose(
         if verdict.stable:
             return found
         if any(node is verdict.condition.node for node in checked):
-            return START  # only a drivetrain between the sampled ones fails, and START has none
+            return START  # a drivetrain between the sampled ones fails; START is stable with all
         checked.append(verdict.condition.node)
 
 

@@ -115,7 +115,7 @@ def _record(recording: Recorder, stop: StopFlag, asked: SnapshotRequest) -> None
     """
     while not stop:
         if asked.take():
-            recording.trigger("asked for by SIGUSR1", now_ns())
+            recording.trigger("requested by SIGUSR1", now_ns())
         recording.cycle(now_ns())
         time.sleep(DRAIN_PERIOD_S)
     recording.close()
@@ -181,7 +181,7 @@ def _arguments() -> argparse.Namespace:
         type=float,
         metavar="SECONDS",
         help="write nothing until a module goes to FAULT or DAMP, a steady sender falls silent, "
-        "an emergency stop or SIGUSR1; then so much before and after it",
+        "an emergency stop or SIGUSR1; then SECONDS before and after it",
     )
     return parser.parse_args()
 

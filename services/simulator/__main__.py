@@ -54,7 +54,7 @@ def main() -> int:
         "--autostart",
         type=float,
         metavar="S",
-        help="start the scenario so long after the hoist is down (default: when told on the bus)",
+        help="start the scenario S seconds after the hoist is down (default: at a bus message)",
     )
     parser.add_argument(
         "--drive-setting",

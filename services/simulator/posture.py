@@ -31,7 +31,7 @@ class MeasuredPosture(NamedTuple):
     angles: Vector3
     """Roll, pitch, yaw of the torso, rad."""
     tilts: list[float]
-    """Of the right and the left sole against the floor, rad."""
+    """Tilt of the right and the left sole against the floor, rad."""
     slip: float
     """Largest distance of a foot from its place, m."""
 

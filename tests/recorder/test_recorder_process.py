@@ -202,7 +202,7 @@ def test_a_snapshot_is_written_when_asked_for_and_holds_what_was_before() -> Non
         found = [m.seq for m in log.messages(topics.JOINT_STATE, "knee_right")]
         assert found == list(range(found[0], rig.sent))
         assert len(found) > target // 2
-        assert log.metadata["split"]["snapshot"] == "asked for by SIGUSR1"
+        assert log.metadata["split"]["snapshot"] == "requested by SIGUSR1"
 
 
 def test_a_recorder_that_saw_no_fault_leaves_nothing() -> None:

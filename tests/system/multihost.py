@@ -34,6 +34,7 @@ from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.system.namespaces import Network
 from tools.fleet import process_table
+from tools.fleet.pace import run_at_fitting_pace
 from tools.fleet.parent_death import die_with_parent
 from tools.fleet.supervise import SupervisedFleet
 from tools.runs import experiment
@@ -169,7 +170,7 @@ def scenario() -> Scenario:
     )
 
 
-def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
+def lead(out: Path, run_dir: Path, network: Network, report: Report, pace: float) -> None:
     """Start the fleet, cut and mend, stop the fleet.
 
     Args:
@@ -177,6 +178,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
         run_dir: for sockets; short.
         network: of the hosts.
         report: what to cut; when, and whether the robot led again, is written into it.
+        pace: clock rate of the fleet.
     """
     # Before it starts a service, the supervisor tries whether its endpoint can be bound.
     network.allow_foreign_addresses()
@@ -191,6 +193,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
             "simulator": ["--scenario", str(scenario_path)],
         },
         leashed=True,
+        pace=pace,
         table_path=write_table(out / "processes.toml", network),
     )
     try:
@@ -201,7 +204,7 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report) -> None:
                 return
     finally:
         started.stop(keep_logs=True)
-        shutil.copytree(started.run.logs, out / "logs")
+        shutil.copytree(started.run.logs, out / "logs", dirs_exist_ok=True)
 
 
 def main() -> None:
@@ -209,11 +212,17 @@ def main() -> None:
     out, run_dir, parent_pid = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     signal.signal(signal.SIGTERM, _leave)
     die_with_parent(parent_pid, signal.SIGTERM)
+
+    def again(text: str) -> None:
+        for record in out.glob("run*.mcap"):
+            record.unlink()  # of a robot that stood and waited
+        sys.stdout.write(f"{text}\n")
+
     with Network((BODY, *LEGS)) as network:
         report = Report(network.namespaces(), cuts())
         (out / REPORT).write_bytes(msgspec.json.encode(report))
         try:
-            lead(out, run_dir, network, report)
+            run_at_fitting_pace(lambda pace: lead(out, run_dir, network, report, pace), again)
         finally:
             (out / REPORT).write_bytes(msgspec.json.encode(report))
 

@@ -28,7 +28,7 @@ from tools.fleet.supervise import SupervisedFleet
 SETTLE_S: Final = 1.5
 """Until an emulated robot hangs still in its hoist."""
 GONE: Final = (
-    "the drives were emulated for the while, and are gone with what they were told; "
+    "the drives were emulated for this command only, and the written values are gone; "
     "`xrl up --only simulator` keeps them"
 )
 

@@ -90,7 +90,7 @@ def _governor(root: Path, *, emulated: bool) -> Finding:
     files = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     found = sorted({_text(file) for file in files} - {""})
     if not found:
-        return ok(SUBJECT, "frequency governor", "not told here", "performance")
+        return ok(SUBJECT, "frequency governor", "unknown here", "performance")
     return judged(
         found == ["performance"] or emulated,
         SUBJECT,
@@ -109,7 +109,7 @@ def _clock(root: Path, *, emulated: bool) -> Finding:
         found in CLOCKS or not found or emulated,
         SUBJECT,
         "clock source",
-        found or "not told here",
+        found or "unknown here",
         f"{CLOCKS[0]} or alike",
         "look in the kernel's log why it was given up",
         "every look at the clock costs a system call",

@@ -233,8 +233,8 @@ def module_status(state: Message | None) -> ModuleStatus:
         way_out = f"by itself, after a wait; if again: {JOINT_TRIPS[cause].recovery}"
     outside = Outside(state.outside).name if state.outside else ""
     if outside and not way_out:
-        told = f"the planner's {outside.lower()} is not believed"
-        way_out = f"{told}: by itself after a push or a stall; if it lasts, xrl kill planner"
+        refused = f"the planner's {outside.lower()} is refused"
+        way_out = f"{refused}: by itself after a push or a stall; if it lasts, xrl kill planner"
     knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
     q = state.q if knows else None
     stiffened = state.stiffened and mode in (Mode.HOLD, Mode.DAMP)

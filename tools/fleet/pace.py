@@ -6,10 +6,13 @@ import argparse
 import os
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from shared.exceptions import FleetError
+
+T = TypeVar("T")
 
 PACE_VARIABLE: Final = "XRL_PACE"
 """Environment variable: default pace of a simulated fleet."""
@@ -57,6 +60,31 @@ def check_pace(pace: float, *, simulated: bool) -> None:
         raise FleetError(f"--pace {pace:g}: {PACE_MIN:g} to 1 is right")
     if pace != 1.0 and not simulated:
         raise FleetError(f"--pace {pace:g}: only a simulated fleet has slow motion; leave it out")
+
+
+def run_at_fitting_pace(run: Callable[[float], T], tell: Callable[[str], None]) -> T:
+    """Run at the default pace, and again at a slower one while the cores are full.
+
+    Args:
+        run: runs a fleet at a pace.
+        tell: takes a line of text each time the pace is lowered.
+
+    Returns:
+        The result of `run`. The pace found becomes the default of this process.
+
+    Raises:
+        CoresFullError: the cores do not carry the fleet at any pace.
+    """
+    while True:
+        pace = usual_pace()
+        try:
+            return run(pace)
+        except CoresFullError as error:
+            slower = round(SLOWER * pace, 2)
+            if slower < PACE_MIN:
+                raise
+            os.environ[PACE_VARIABLE] = f"{slower:g}"
+            tell(f"{error}; again in slow motion, at {slower:g}")
 
 
 class IdleMeter:

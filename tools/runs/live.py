@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Mapping
@@ -14,7 +13,7 @@ from shared.bus.session import Session, open_session
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.robot.robot_model import mjcf
-from tools.fleet.pace import PACE_MIN, PACE_VARIABLE, SLOWER, CoresFullError, usual_pace
+from tools.fleet.pace import run_at_fitting_pace
 from tools.fleet.supervise import SupervisedFleet
 from tools.runs import experiment
 from tools.runs.experiment import PLANT_FILE
@@ -56,21 +55,19 @@ def run_live(
         CoresFullError: they do not carry it at any pace, or at the one asked for.
         FleetError: the fleet cannot be started or stopped.
     """
-    while True:
-        at_pace = pace if pace is not None else usual_pace()
-        try:
-            return _run_once(
-                out, robot, scenario, lead,
-                verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, pace=at_pace,
-            )  # fmt: skip
-        except CoresFullError as error:
-            slower = round(SLOWER * at_pace, 2)
-            if pace is not None or slower < PACE_MIN:
-                raise
-            for record in out.glob("run*.mcap"):
-                record.unlink()  # of a robot that stood and waited
-            os.environ[PACE_VARIABLE] = f"{slower:g}"
-            tell(f"{error}; again in slow motion, at {slower:g}")
+
+    def at(pace: float) -> T:
+        return _run_once(
+            out, robot, scenario, lead,
+            verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, pace=pace,
+        )  # fmt: skip
+
+    def again(text: str) -> None:
+        for record in out.glob("run*.mcap"):
+            record.unlink()  # of a robot that stood and waited
+        tell(text)
+
+    return at(pace) if pace is not None else run_at_fitting_pace(at, again)
 
 
 def _run_once(

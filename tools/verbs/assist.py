@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
             )
             given = ask(intents, statuses, request, lambda: bool(stop), shown, for_s=args.for_s)
     fade_s = robot.assist.fade_s
-    Console().print(f"no longer asked for: {given:.0f} N were given; they fade out in {fade_s:g} s")
+    Console().print(f"request ended: {given:.0f} N were given; they fade out in {fade_s:g} s")
     return 0
 
 
@@ -111,7 +111,7 @@ def refuse_beyond_limits(robot: RobotConfig, assist: float, shift: Vector4) -> N
     """
     most = robot.assist.force_max
     if not 0.0 <= assist <= most:
-        raise FleetError(f"{assist:g} N: 0 to {most:g} N can be asked for (assist.force_max)")
+        raise FleetError(f"{assist:g} N: 0 to {most:g} N can be requested (assist.force_max)")
     for (name, unit), asked, limit in zip(SHIFT_UNITS, shift, robot.law.shift_max, strict=True):
         if not abs(asked) <= limit:
             raise FleetError(
@@ -177,7 +177,7 @@ def ask(
 
 def describe(request: OperatorIntent, status: PlannerStatus) -> str:
     """Return request and response as one line."""
-    words = f"asked for {request.assist_n:.0f} N, given {status.assist_n:.0f} N"
+    words = f"requested {request.assist_n:.0f} N, given {status.assist_n:.0f} N"
     if any(request.shift):
         pairs = zip(SHIFT_UNITS, request.shift, strict=True)
         words += ", shift " + ", ".join(f"{name} {at:g} {unit}" for (name, unit), at in pairs if at)
@@ -194,7 +194,7 @@ def _first(statuses: Statuses, stop: Stop) -> PlannerStatus | None:
         if status is not None:
             return status
         if time.monotonic() > deadline:
-            raise FleetError("the planner is not heard; see `xrl status`")
+            raise FleetError("the planner is silent; see `xrl status`")
         time.sleep(REPEAT_S)
     return None
 

@@ -63,36 +63,38 @@ def add_parser(subparsers: Subparsers) -> None:
         "TIME: 30, 30ms, 0.03s or 500us. SHARE: a probability, 0.2 or 20%.\n"
         f"{RULE[0].upper()}{RULE[1:]};\nwhen that is over, the others count again.",
     )
-    what.add_argument("--delay", metavar="TIME", help="so much later")
+    what.add_argument("--delay", metavar="TIME", help="delay of each message")
     what.add_argument(
         "--jitter",
         metavar="TIME",
-        help="uniform: +- so much; others: its standard deviation; with less delay than that, the "
-        "share that would come before it was sent has no delay",
+        help="half the width if uniform, else the standard deviation; a message that this would "
+        "deliver before it is sent has no delay",
     )
     what.add_argument(
         "--distribution", metavar="KIND", help="of the jitter: uniform (default), normal, pareto"
     )
-    what.add_argument("--loss", metavar="SHARE", help="never comes; 1 is all, and not 1%%")
-    what.add_argument("--burst", metavar="N", help="mean length of a row of losses (1: none)")
-    what.add_argument("--duplicate", metavar="SHARE", help="comes twice")
-    what.add_argument("--reorder", metavar="SHARE", help="has no delay: it overtakes the others")
+    what.add_argument("--loss", metavar="SHARE", help="messages lost; 1 is all, and not 1%%")
+    what.add_argument("--burst", metavar="N", help="mean number of losses in a row (1)")
+    what.add_argument("--duplicate", metavar="SHARE", help="messages that arrive twice")
+    what.add_argument("--reorder", metavar="SHARE", help="messages without delay")
     what.add_argument("--rate", metavar="BYTES", help="bytes (not bits) a second on the line")
     what.add_argument("--partition", action="store_true", help="nothing passes")
     what.add_argument(
         "--ordered",
         action="store_true",
-        help="as on a stream: what is late holds up what is behind it, a partition holds all back "
-        "until its end; what --loss takes is gone, nothing is sent again. Without it, as "
-        "datagrams: what is overtaken, or meets a partition, is lost",
+        help="as on a stream: a late message delays those behind it, and a partition holds all "
+        "back until its end; --loss still loses messages, nothing is sent again. Without it, as "
+        "datagrams: an overtaken message, or one in a partition, is lost",
     )
     when = parser.add_argument_group("when")
-    when.add_argument("--at", metavar="T", help="in so many s, from now (default: 0)")
+    when.add_argument("--at", metavar="T", help="start in T seconds from now (default: 0)")
     when.add_argument(
-        "--for", metavar="T", help="for so many s (default: until --clear, or the fleet's end)"
+        "--for",
+        metavar="T",
+        help="duration in seconds (default: until --clear, or the fleet's end)",
     )
     other = parser.add_argument_group("in place of that").add_mutually_exclusive_group()
-    other.add_argument("--list", action="store_true", help="show what is done now, or will be")
+    other.add_argument("--list", action="store_true", help="list active and planned impairments")
     other.add_argument(
         "--clear",
         action="store_true",

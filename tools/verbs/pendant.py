@@ -34,7 +34,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_run_dir(parser)
     parser.add_argument(
-        "--for", dest="for_s", type=float, metavar="S", help="lay it down after so long, seconds"
+        "--for", dest="for_s", type=float, metavar="S", help="lay it down after S seconds"
     )
 
 

@@ -71,7 +71,7 @@ def add_parser(subparsers: Subparsers) -> None:
         type=float,
         default=0.0,
         metavar="T",
-        help="numbers may differ by so much (default 0: not in one bit)",
+        help="largest accepted difference of numbers (default 0: equal to the last bit)",
     )
     parser.add_argument(
         "--out",

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 def describe_lead(lead: LeadStatus | None) -> str:
     """Return one line on the planner."""
     if lead is None:
-        return "planner not heard: each module holds by itself"
+        return "planner silent: each module holds by itself"
     words = f"planner {lead.mode}, margin {lead.margin:.2f}"
     if lead.wait_s > 0.0:
         words += f"; leads again in {lead.wait_s:.0f} s at the earliest, for links have dropped out"
@@ -112,7 +112,7 @@ def tables(status: FleetStatus) -> Group:
     for heading in ("module", "mode", "tier", "because", "drive", "phi", "theta", "way out"):
         modules.add_column(heading, no_wrap=heading != "way out")
     for name, module in status.modules.items():
-        mode = module.mode or "not heard"
+        mode = module.mode or "silent"
         if module.stiffened:
             mode = f"{mode}, stiffened"
         drive = module.drive or "-"

@@ -122,7 +122,7 @@ def _first(wrenches: Wrenches) -> Wrench:
         if wrench is not None:
             return wrench
         time.sleep(REPEAT_S)
-    raise FleetError("the harness service is not heard; see `xrl status`")
+    raise FleetError("the harness service is silent; see `xrl status`")
 
 
 def _why_not(newest: Wrench, *, begun: bool) -> str:

@@ -67,7 +67,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--snapshot",
         type=float,
         metavar="SECONDS",
-        help="record nothing until something goes wrong, then so much before and after it",
+        help="record nothing until a fault, then SECONDS before and after it",
     )
     parser.add_argument(
         "--no-planner",

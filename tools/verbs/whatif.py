@@ -59,7 +59,7 @@ def add_parser(subparsers: Subparsers) -> None:
         type=float,
         default=4.0,
         metavar="S",
-        help="so long it is gone on with, pushes and hand as in the run (4 s)",
+        help="duration of each continued run; pushes and hand as recorded (4 s)",
     )
     parser.add_argument("--workers", type=int, default=cores(), metavar="N", help="processes")
     parser.add_argument(
@@ -151,7 +151,7 @@ def show(counterfactuals: list[Counterfactual], names: str, for_s: float, consol
         counterfactuals, key=lambda one: (not one.stood, max(one.com_x_max_mm, one.com_y_max_mm))
     )
     console.print(
-        f"{names} killed at {len(counterfactuals)} moments, each gone on with for {for_s:g} s: "
+        f"{names} killed at {len(counterfactuals)} moments, each continued for {for_s:g} s: "
         f"{len(counterfactuals) - len(fell)} stood, {len(fell)} fell"
     )
     if fell:

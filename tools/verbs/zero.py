@@ -155,7 +155,7 @@ def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | 
             state = heard.get(module)
             if state is None:
                 raise FleetError(
-                    f"{module}: its joint service in {fleet.run.path} is up, but not heard; "
+                    f"{module}: its joint service in {fleet.run.path} is up, but sends no state; "
                     "see `xrl status`, or `xrl down` first"
                 )
             if state.mode != Mode.DISARMED:
@@ -179,7 +179,7 @@ def _set_all(
     robot: RobotConfig, drives: Mapping[str, Drive], wanted: Mapping[str, Pair], console: Console
 ) -> int:
     """Set all, read all back, show it; return the exit code."""
-    table = _table("told, rad", "read back, rad", "")
+    table = _table("written, rad", "read back, rad", "")
     code = 0
     for module, q in wanted.items():
         try:

@@ -144,7 +144,7 @@ def positions(
             "wait until the drive reports a state"
         )
     if dialect == "0.5" and counts_per_turn is None:
-        raise DriveError(f"{who}: firmware 0.5 is told counts; give the encoder's to a turn")
+        raise DriveError(f"{who}: firmware 0.5 takes counts; give the encoder's to a turn")
     scale = counts_per_turn if dialect == "0.5" and counts_per_turn is not None else 1
     if not all(abs(turn * scale) < (1 << 31) - 1 for turn in turns):
         raise DriveError(f"{who}: {turns[0]:g} and {turns[1]:g} turns are more than 32 bits hold")

@@ -190,7 +190,7 @@ class OdriveUsb:
             DriveError: it is lost now.
         """
         if not self._connected:
-            raise DriveError(f"ODrive {self._serial_number}: not there to be told its position")
+            raise DriveError(f"ODrive {self._serial_number}: lost; its position cannot be written")
         self._position = turns
 
     def close(self) -> None:

@@ -62,7 +62,7 @@ def test_it_asks_until_it_is_told_to_stop_and_says_what_is_given(robot: RobotCon
     }
     numbers = [each.seq for each in planner.heard]
     assert numbers == sorted(set(numbers))
-    assert "asked for 80 N, given 80 N, shift x 0.02 m" in planner.lines[-1]
+    assert "requested 80 N, given 80 N, shift x 0.02 m" in planner.lines[-1]
 
 
 def test_it_ends_by_itself_after_the_time_it_was_given(robot: RobotConfig) -> None:
@@ -85,7 +85,7 @@ def test_a_planner_that_does_not_take_it_is_told(robot: RobotConfig) -> None:
 
 def test_no_planner_is_told() -> None:
     planner = FakePlanner(lambda _: None)
-    with pytest.raises(FleetError, match="the planner is not heard"):
+    with pytest.raises(FleetError, match="the planner is silent"):
         assist.ask(planner, planner, WISH, lambda: False, planner)
 
 

@@ -81,7 +81,7 @@ def test_a_harness_that_is_held_is_not_tared(up: float, refused: bool) -> None:
 @pytest.mark.parametrize(
     ("said", "words"),
     [
-        (None, "not heard"),
+        (None, "silent"),
         (wrench(), "did not begin"),
         (wrench(0.0, Tare.UNSTEADY), "the forces move"),
         (wrench(0.0, Tare.RUNNING, saturated=True), "end of its range"),

@@ -114,8 +114,8 @@ def _add_what(parser: argparse.ArgumentParser) -> None:
 def _add_when(parser: argparse.ArgumentParser) -> None:
     numbers = (
         ("--rate", "-r", 1.0, "R", "recorded seconds for each second (default: %(default)g)"),
-        ("--start-offset", "-s", 0.0, "S", "begin so long after the first message of the log, s"),
-        ("--duration", "-d", None, "S", "play so much of the log, in recorded seconds"),
+        ("--start-offset", "-s", 0.0, "S", "start S seconds after the first message of the log"),
+        ("--duration", "-d", None, "S", "length of the part to play, in recorded seconds"),
     )
     for flag, short, default, metavar, words in numbers:
         parser.add_argument(flag, short, type=float, default=default, metavar=metavar, help=words)
@@ -126,21 +126,21 @@ def _add_when(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--clock",
         action="store_true",
-        help=f"put the recorded time onto PREFIX/{CLOCK}, as {{t_ns, seq}}",
+        help=f"publish the recorded time on PREFIX/{CLOCK}, as {{t_ns, seq}}",
     )
     parser.add_argument(
         "--clock-hz",
         type=float,
         default=CLOCK_HZ,
         metavar="HZ",
-        help="so often, on the wall (default: %(default)g)",
+        help="its rate, in real time (default: %(default)g)",
     )
     parser.add_argument(
         "--wait",
         type=float,
         default=WAIT_S,
         metavar="S",
-        help="wait up to so long for the first subscriber (default: %(default)g)",
+        help="longest wait for the first subscriber, seconds (default: %(default)g)",
     )
 
 

@@ -174,7 +174,7 @@ def _of_drive(module: str, kind: FaultKind, *, quick: bool = False, sort: str = 
     """Return the case of one drive's fault; `sort` of crash, if it is not its own."""
     if kind == "link_lost":
         expected = CrashVerdict.STOOD
-        why = "the drive holds what it was told last; its service does not know it any more"
+        why = "the drive holds its last target; its service has lost contact"
     else:
         expected, reason = LIMP[kind_of(module)]
         why = f"limp ({FAULT_KINDS[kind].about}): {reason}"

@@ -69,7 +69,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         type=delays,
         default=(0.0,),
         metavar="MS",
-        help="uniform, +- so much; several as for --delay (0)",
+        help="half the width of a uniform spread; several as for --delay (0)",
     )
     shares = values_in(0.0, 1.0)
     parser.add_argument(

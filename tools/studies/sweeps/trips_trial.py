@@ -130,11 +130,11 @@ TROUBLES: Final[Mapping[str, Trouble]] = {
         _told(4.0, push=(_SHOVE,)), unfiltered=True,
     ),
     "sags": Trouble(
-        "a person rests 200 N where 100 were asked for, and lets go", Trip.SAGGING,
+        "a person rests 200 N where 100 were requested, and lets go", Trip.SAGGING,
         _told(5.0, _at(1.2, assist=100.0)), {"person.load_scale": 2.0}, let_go_s=0.9,
     ),
     "sags slowly": Trouble(
-        "300 N within 4 s where 100 were asked for, hand off", Trip.SAGGING,
+        "300 N within 4 s where 100 were requested, hand off", Trip.SAGGING,
         _told(7.0, _at(5.0, assist=100.0)), {"person.load_scale": 3.0}, let_go_s=0.8,
     ),
     "drops": Trouble("led down by 0.39 m in 0.3 s", Trip.SAGGING, _told(3.0, _at(1.3, 0.8))),
