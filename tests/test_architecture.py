@@ -211,6 +211,24 @@ def test_nobody_imports_a_verb() -> None:
     assert importers == set(), "what two verbs share belongs beside them, not in one of them"
 
 
+TOOL_ROOMS = ("fleet", "runs", "analysis", "studies")
+"""Each may import those before it; bringup stands beside them, on the fleet."""
+
+
+@pytest.mark.parametrize("room", [*TOOL_ROOMS, "bringup"])
+def test_a_room_of_the_tools_imports_only_those_below_it(room: str) -> None:
+    below = ("fleet",) if room == "bringup" else TOOL_ROOMS[: TOOL_ROOMS.index(room)]
+    above = {*TOOL_ROOMS, "bringup", "verbs"} - {room, *below}
+    wrong = {
+        (file, imported.full)
+        for file, found in IMPORTS.items()
+        if file.startswith(f"tools/{room}/")
+        for imported in found
+        if any(f"{imported.full}.".startswith(f"tools.{other}.") for other in above)
+    }
+    assert wrong == set()
+
+
 @pytest.mark.parametrize("vendor", VENDORS)
 def test_a_vendor_package_has_its_owner_and_no_other(vendor: str) -> None:
     users = {file for file, found in IMPORTS.items() if any(i.top == vendor for i in found)}

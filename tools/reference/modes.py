@@ -95,10 +95,13 @@ def _arrow(before: Mode, after: Mode, events: list[Event]) -> str:
     lines = _wrapped([event.name.lower().replace("_", " ") for event in events])
     if uy == 0.0:
         tx, top = (sx + ex) / 2, sy + 14 if ux > 0.0 else sy - 6 - 13 * (len(lines) - 1)
+    elif ux != 0.0 and len(lines) > 1:  # below the crossing of the diagonals, where there is room
+        tx, top = (sx + ex) / 2, (sy + ey) / 2 + 54
     else:
         along = 0.5 if ux == 0.0 else 0.25
-        tx, top = sx + along * (ex - sx) + 14, sy + along * (ey - sy) - 6.5 * (len(lines) - 1)
-    anchor = "middle" if uy == 0.0 else "start"
+        tx, top = sx + along * (ex - sx) + 14, sy + along * (ey - sy)
+        top -= 6.5 * (len(lines) - 1)
+    anchor = "middle" if uy == 0.0 or (ux != 0.0 and len(lines) > 1) else "start"
     texts = "".join(
         f'<text class="event" style="text-anchor:{anchor}" x="{tx:.0f}" y="{top + 13 * i:.0f}">'
         f"{line}</text>"

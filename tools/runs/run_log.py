@@ -19,7 +19,7 @@ from shared.mcap_log.reader import LogRecord, LostBytes, open_log
 from shared.mcap_log.records import Attachment, Channel, Metadata
 from shared.mcap_log.sequence_stats import KeyCount
 from shared.mcap_log.writer import SCHEMA_VERSION
-from tools.analysis.logs.files import files_in
+from tools.runs.run_files import files_in
 
 
 class Series:

@@ -15,11 +15,11 @@ from shared.bus.session import Session
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from tools.fleet import procfs
-from tools.fleet.live_view import LiveView
 from tools.fleet.pace import add_pace
 from tools.fleet.supervise import SupervisedFleet
 from tools.runs import experiment, figure, verdict, verdict_table
 from tools.runs.live import run_live
+from tools.runs.live_view import LiveView
 from tools.runs.run_log import read_run
 from tools.runs.scenario_runner import ScenarioRunner
 from tools.verb_table import Subparsers, add_verb

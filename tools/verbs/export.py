@@ -17,8 +17,8 @@ from shared.mcap_log.extended_copy import write_extended
 from shared.mcap_log.files import SUFFIX
 from shared.process import DEFAULT_CONFIG
 from tools.analysis.reports import scene
+from tools.analysis.reports.moving_picture import write_gif
 from tools.output import write_atomically
-from tools.runs.moving_picture import write_gif
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.verb_table import Subparsers, add_verb

@@ -18,11 +18,11 @@ from shared.exceptions import XrlError
 from shared.mcap_log.reader import LostBytes
 from shared.mcap_log.recover import clock_time, describe_lost
 from shared.mcap_log.writer import SCHEMA_VERSION
-from tools.analysis.logs.files import files_of_run
 from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
 from tools.output import printable
 from tools.runs import verdict
 from tools.runs.impairment_intervals import impairments
+from tools.runs.run_files import files_of_run
 from tools.runs.run_log import RunLog, read_run
 from tools.verb_table import Subparsers, add_verb
 

@@ -11,8 +11,8 @@ from shared.exceptions import RunError
 from shared.mcap_log import recover
 from shared.mcap_log.files import in_use, recovered_name
 from shared.mcap_log.reader import open_log
-from tools.analysis.logs.files import MetadataByName, head_of
 from tools.output import printable
+from tools.runs.run_files import MetadataByName, head_of
 from tools.verb_table import Subparsers, add_verb
 
 

@@ -16,9 +16,9 @@ from shared.config.scenarios import Inject
 from shared.network.impairment import Direction, Impairment
 from shared.network.impairment_schedule import ImpairmentSchedule
 from tests.shared.mcap_log.runs import sample
-from tools.fleet.live_view import LiveView, active, waiting
 from tools.runs import verdict_table
 from tools.runs.impairment_intervals import impairments, touches
+from tools.runs.live_view import LiveView, active, waiting
 from tools.runs.scenario_runner import LiveSnapshot
 from tools.runs.verdict import Summary
 from tools.runs.verdict_limits import LIMITS

@@ -14,7 +14,7 @@ from shared.mcap_log.reader import LogReader, LogRecord, LostBytes, open_log
 from shared.mcap_log.records import Attachment, Channel, Header, McapRecord, Metadata, Schema
 from shared.mcap_log.sequence_stats import KeyCount
 from shared.mcap_log.writer import PROFILE
-from tools.analysis.logs.files import MetadataByName
+from tools.runs.run_files import MetadataByName
 
 _NEVER: Final = -1
 

@@ -11,10 +11,10 @@ from rich.markup import escape
 
 from shared.bus.session import RawPublisher
 from shared.clock import NS_PER_MS, NS_PER_S
-from tools.analysis.logs.files import further_files
 from tools.analysis.playback.player import Player
 from tools.analysis.playback.reading import Recording
 from tools.analysis.playback.schedule import Window
+from tools.runs.run_files import further_files
 
 
 def introduce(recording: Recording, paths: list[Path], note: str, console: Console) -> None:

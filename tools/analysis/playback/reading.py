@@ -13,8 +13,8 @@ from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.reader import LogReader, LogRecord, open_log
 from shared.mcap_log.records import Attachment, Channel, Metadata
-from tools.analysis.logs.files import MetadataByName, files_in
 from tools.analysis.playback.schedule import Entry
+from tools.runs.run_files import MetadataByName, files_in
 
 ROBOT_FILE: Final = "robot.toml"
 

@@ -11,9 +11,9 @@ from shared.bus import codec, topics
 from shared.exceptions import RunError
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import STATE_KEY, Queue, item, killed_file, write, writer
-from tools.analysis.logs.files import further_files
 from tools.analysis.playback import reading
 from tools.analysis.playback.reading import files_named, read
+from tools.runs.run_files import further_files
 
 WRENCH_KEY = topics.WRENCH.key(runs.ROBOT)
 

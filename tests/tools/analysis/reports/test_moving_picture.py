@@ -15,7 +15,7 @@ from shared.robot.robot_model import ankle_positions
 from tests.tools.analysis.reports.runs import Made
 from tools import cli
 from tools.analysis.reports import scene
-from tools.runs.moving_picture import FRAMES_S, MODE_INK, SIZE, world_frames
+from tools.analysis.reports.moving_picture import FRAMES_S, MODE_INK, SIZE, world_frames
 from tools.runs.run_log import RunLog
 
 
