@@ -1,7 +1,7 @@
 """The one exception tree.
 
-Exceptions are for start-up, tools and files. On the control path a fault is a state
-and an event (docs/architecture.md#age-rule), never an exception.
+Exceptions are for start-up, tools and files. On the control path a fault is a state and an event
+(docs/architecture.md#age-rule), never an exception.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The two dialects of CANSimple as the emulated drives speak them.
 
 Firmware 0.5 and 0.6 share set-points, limits and gains; `DIALECTS` holds what differs. A trap of
-0.5.6: its encoder frames say 0, 0 from each start-up until the first closed loop.
-Endpoint ids of 0.6 come with each firmware's `flat_endpoints.json`; the emulation's
-are `SDO_ENDPOINTS`.
+0.5.6: its encoder frames say 0, 0 from each start-up until the first closed loop. Endpoint ids of
+0.6 come with each firmware's `flat_endpoints.json`; the emulation's are `SDO_ENDPOINTS`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Every message on the bus (docs/networks.md).
 
-Payloads are JSON by msgspec. SI units; times are integers in ns; enumerations are
-integers. No field is optional: a `null` in a payload can then only be a number that
-was not finite, and `shared.bus.codec` refuses it at both ends.
+Payloads are JSON by msgspec. SI units; times are integers in ns; enumerations are integers. No
+field is optional: a `null` in a payload can then only be a number that was not finite, and
+`shared.bus.codec` refuses it at both ends.
 """
 
 from __future__ import annotations

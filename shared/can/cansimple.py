@@ -1,8 +1,8 @@
 """CANSimple, the CAN protocol of ODrive firmware 0.5.6 (docs/drives.md).
 
-Pure packing and unpacking of frame payloads; no bus, no state. A frame's arbitration
-id is `node_id << 5 | command`; payloads are little-endian. Positions are in motor
-turns, velocities in turn/s, torques in N m, currents in A.
+Pure packing and unpacking of frame payloads; no bus, no state. A frame's arbitration id is `node_id
+<< 5 | command`; payloads are little-endian. Positions are in motor turns, velocities in turn/s,
+torques in N m, currents in A.
 
 Source: odriverobotics/ODrive, docs/can-protocol and
 Firmware/communication/can/can_simple.cpp. Firmware 0.6 differs in 0x003 to 0x005, 0x019

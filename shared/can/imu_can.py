@@ -1,8 +1,8 @@
 """CAN frames of the IMU: the part of an Xsens MTi 600's protocol that is used.
 
-The MTi is an AHRS with CAN: its orientation is good to 0.2 .. 0.5 degrees in
-roll and pitch. In the MT Manager's CAN output, StatusWord, Quaternion and RateOfTurn are switched
-on, with standard identifiers and the same rate; all is big-endian (MT CAN protocol, MT1604P).
+The MTi is an AHRS with CAN: its orientation is good to 0.2 .. 0.5 degrees in roll and pitch. In the
+MT Manager's CAN output, StatusWord, Quaternion and RateOfTurn are switched on, with standard
+identifiers and the same rate; all is big-endian (MT CAN protocol, MT1604P).
 
     id 0x11   uint32      status; bit 1: the orientation is valid
     id 0x21   4 int16     quaternion w, x, y, z in 2^-15: sensor axes to (east, north, up)

@@ -1,7 +1,7 @@
 """Reads and writes a robot file, `deploy/robot.toml`, with the gain schedule beside it.
 
-Unknown keys, wrong sizes and impossible values are refused with the file, the key,
-the value and what would be right (`shared.exceptions.ConfigError`).
+Unknown keys, wrong sizes and impossible values are refused with the file, the key, the value and
+what would be right (`shared.exceptions.ConfigError`).
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """JSON schemas of the messages, flat enough for Foxglove and PlotJuggler.
 
-Foxglove reads an object whose properties are booleans, strings, numbers, integers,
-objects, or arrays of one of these: no `$ref`, no unions, no null, no tuples and no
-array in an array. msgspec's own schemas have most of these (docs/logs.md), so
-these are made from the types themselves.
+Foxglove reads an object whose properties are booleans, strings, numbers, integers, objects, or
+arrays of one of these: no `$ref`, no unions, no null, no tuples and no array in an array. msgspec's
+own schemas have most of these (docs/logs.md), so these are made from the types themselves.
 """
 
 from __future__ import annotations

@@ -72,8 +72,8 @@ class _Head(msgspec.Struct, gc=False):
 class RunWriter:
     """One run being written; leaving the `with` block finishes its file.
 
-    If the block is left by an exception the file is closed as it is: a readable
-    file without a summary.
+    If the block is left by an exception the file is closed as it is: a readable file without a
+    summary.
     """
 
     def __init__(

@@ -137,8 +137,8 @@ class Impairer:
     def delays(self, now_ns: int) -> int:
         """Return when a link's own traffic comes out, ns: in order, never lost.
 
-        Such traffic opens, declares and keeps alive; it takes the mean
-        delay. `HELD` in a partition.
+        Such traffic opens, declares and keeps alive; it takes the mean delay. `HELD` in a
+        partition.
         """
         if self.what.partition:
             return HELD

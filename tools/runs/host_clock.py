@@ -1,8 +1,8 @@
 """Clocks of hosts in virtual time: each has its own zero and rate. Pure.
 
-Live, a service reads its host's monotonic clock. That one cannot step, whatever is done to the
-time of day, but no two hosts agree on it: an age is measured on one clock
-only (docs/architecture.md#age-rule).
+Live, a service reads its host's monotonic clock. That one cannot step, whatever is done to the time
+of day, but no two hosts agree on it: an age is measured on one clock only
+(docs/architecture.md#age-rule).
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 World, twelve emulated axes, six joint services, harness, IMU and planner step in a fixed order.
 Messages between them pass a modelled network. They are the objects of the live services, without
-process, clock or
-bus: two runs with one seed are equal to the last bit.
+process, clock or bus: two runs with one seed are equal to the last bit.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Reads a run's MCAP file, or all of its files, into memory: finished or killed.
 
-A killed file has no summary, and may end in the middle of a record; the readers of
-the mcap package find nothing in the first and may stumble over the second (docs/logs.md).
-`shared.mcap_log.reader` walks the records from the start and keeps every whole one; here they are
-sorted by key.
+A killed file has no summary, and may end in the middle of a record; the readers of the mcap package
+find nothing in the first and may stumble over the second (docs/logs.md). `shared.mcap_log.reader`
+walks the records from the start and keeps every whole one; here they are sorted by key.
 """
 
 from __future__ import annotations

@@ -50,8 +50,7 @@ class Drive(Protocol):
     def read(self, timeout_s: float) -> DriveReading | None:
         """Wait for the next encoder sample of both axes; None if none came in time.
 
-        Never raises for a lost link: that is `DriveStatus.LOST` in the next reading,
-        or None.
+        Never raises for a lost link: that is `DriveStatus.LOST` in the next reading, or None.
         """
 
     def write_torque(self, torque: Pair) -> None:

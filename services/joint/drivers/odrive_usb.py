@@ -7,9 +7,9 @@ control thread only swaps: it takes the newest sample and leaves the newest targ
 references to frozen objects cross, each written by one side.
 
 An exchange is a sample, and at once the control thread's target for it: with a target that was a
-period late the robot shook. There are at most 200 a second. Every four
-endpoints cost a round trip, so only what is new is written, and the states are read less often.
-That is for the drives' own loops; at 1 kHz use CAN.
+period late the robot shook. There are at most 200 a second. Every four endpoints cost a round trip,
+so only what is new is written, and the states are read less often. That is for the drives' own
+loops; at 1 kHz use CAN.
 """
 
 from __future__ import annotations
@@ -153,8 +153,8 @@ class OdriveUsb:
     def write(self, target: MotorTarget) -> None:
         """Leave a target for the next exchange; the newest wins.
 
-        The feedforward is at most `current_lim`'s worth. A target that is not finite
-        is not sent: the drive keeps the last one.
+        The feedforward is at most `current_lim`'s worth. A target that is not finite is not sent:
+        the drive keeps the last one.
         """
         fields = (*target.pos_turns, *target.vel_turns, *target.pos_gain, *target.vel_gain)
         if not self._connected or not all(map(isfinite, (*fields, *target.torque))):
