@@ -32,9 +32,9 @@ NODE, AXIS = 5, 3  # axis1 of knee_right
 class Bench:
     """Two axes of a bank on a bus, and a client on it."""
 
-    def __init__(self, path: Path, dialect: DialectName) -> None:
+    def __init__(self, path: Path, dialect: DialectName, turns: float = 0.0) -> None:
         self.hub = UnixCanHub(path)
-        self.bank = make_bank()
+        self.bank = make_bank(turns=turns)
         self.front = CanSimpleFront(self.bank, [self.hub], [{4: 2, NODE: AXIS}], dialect=dialect)
         self.client = UnixCanBus(str(path))
         self.front.receive()  # admits the client
@@ -91,10 +91,35 @@ def new(directory: Path) -> Iterator[Bench]:
     yield from bench(directory, "0.6")
 
 
+# ---- frames
+
+
+def test_requests_are_answered_from_the_registers(directory: Path) -> None:
+    old = Bench(directory / "old.sock", "0.5", turns=-0.25)
+    old.bank.inject("knee_right.axis1", "OVERSPEED")
+    for connected, estimate in ((0.0, (0.0, 0.0)), (1.0, (-0.25, 0.0))):
+        old.bank.connected[:] = connected  # 0.5.6 reports zeros until a first closed loop
+        assert old.ask(Command.GET_ENCODER_ESTIMATES) == struct.pack("<ff", *estimate)
+    assert old.ask(Command.GET_ENCODER_COUNT) == struct.pack("<ii", -4096, 12288)
+    assert old.ask(Command.GET_MOTOR_ERROR) == struct.pack("<Q", 0x1_1000_0000)
+    assert old.ask(Command.GET_CONTROLLER_ERROR) == struct.pack("<II", 1, 0)
+    assert old.ask(Command.GET_VBUS) == struct.pack("<ff", 48.0, 0.0)
+    old.client.shutdown()
+    old.hub.close()
+
+
+def test_a_frame_of_another_node_changes_nothing(old: Bench) -> None:
+    can_id = arbitration_id(NODE + 4, Command.SET_INPUT_TORQUE)
+    data = struct.pack("<f", 9.0)
+    old.client.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+    old.front.receive()
+    assert not old.bank.input_torque.any()
+
+
 # ---- dialects
 
 
-def test_a_drive_of_0_6_tells_its_version_and_one_of_0_5_says_nothing(
+def test_a_drive_of_0_6_replies_with_its_version_and_one_of_0_5_not_at_all(
     new: Bench, directory: Path
 ) -> None:
     assert cansimple_06.unpack_version(new.ask(Command06.GET_VERSION)) == VERSION_06
@@ -105,15 +130,15 @@ def test_a_drive_of_0_6_tells_its_version_and_one_of_0_5_says_nothing(
     old.hub.close()
 
 
-def test_the_same_fault_is_told_in_each_dialects_own_bits(old: Bench, directory: Path) -> None:
+def test_a_fault_has_each_dialects_own_bits(old: Bench, directory: Path) -> None:
     new = Bench(directory / "new.sock", "0.6")
     for each in (old, new):
         each.bank.inject("knee_right.axis1", "WATCHDOG")
-    said = cansimple.unpack_heartbeat(old.heartbeat())
-    assert (said.axis_error, said.axis_state) == (0x800, AxisState.IDLE)
-    said_06 = cansimple_06.unpack_heartbeat(new.heartbeat())
-    assert (said_06.axis_error, said_06.axis_state) == (0x0100_0000, AxisState.IDLE)
-    assert said_06.procedure_result == ProcedureResult.DISARMED
+    heartbeat = cansimple.unpack_heartbeat(old.heartbeat())
+    assert (heartbeat.axis_error, heartbeat.axis_state) == (0x800, AxisState.IDLE)
+    heartbeat_06 = cansimple_06.unpack_heartbeat(new.heartbeat())
+    assert (heartbeat_06.axis_error, heartbeat_06.axis_state) == (0x0100_0000, AxisState.IDLE)
+    assert heartbeat_06.procedure_result == ProcedureResult.DISARMED
     assert cansimple_06.unpack_error(new.ask(Command06.GET_ERROR)) == (0x0100_0000, 0x0100_0000)
     new.client.shutdown()
     new.hub.close()
@@ -129,9 +154,9 @@ def test_a_heartbeat_of_0_6_is_busy_in_closed_loop_and_a_success_in_idle(new: Be
     assert cansimple_06.unpack_heartbeat(new.heartbeat()).procedure_result == ProcedureResult.BUSY
     new.bank.request_state(AXIS, AxisState.IDLE)
     new.step(0.2)
-    said = cansimple_06.unpack_heartbeat(new.heartbeat())
-    assert said.procedure_result == ProcedureResult.SUCCESS
-    assert said.trajectory_done
+    heartbeat = cansimple_06.unpack_heartbeat(new.heartbeat())
+    assert heartbeat.procedure_result == ProcedureResult.SUCCESS
+    assert heartbeat.trajectory_done
 
 
 def test_set_points_and_gains_are_taken_alike_in_both_dialects(old: Bench, directory: Path) -> None:

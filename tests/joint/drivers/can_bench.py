@@ -5,13 +5,12 @@ from __future__ import annotations
 import errno
 import time
 from collections import deque
-from collections.abc import Iterator
 
 import can
 import pytest
 
 from services.joint.drivers import can_link, odrive_can
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.drivers.can_link import BUS_OFF
 from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
 from shared.can.cansimple import (
@@ -24,10 +23,10 @@ from shared.can.cansimple import (
     split_id,
 )
 from shared.config.sections import CanConfig
-from tests.joint.drivers.test_odrive_can import DRIVE, NODES
+from tests.joint.drivers.rig import DRIVE, NODES
 
-TARGET = MotorTarget((0.25, -0.5), (1.0, -2.0), (0.5, -0.25), (30.0, 40.0), (0.05, 0.06))
 FULL = can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
+DOWN = OSError(errno.ENETDOWN, "Network is down")
 
 
 class FakeBus(can.BusABC):
@@ -113,8 +112,8 @@ class Bench:
         """Have both axes send an estimate, and a heartbeat if there is a state, and read them."""
         for node in NODES:
             if state is not None:
-                said = Heartbeat(error, state, False, False, False, trajectory_done=True)
-                self.bus.waiting.append(frame(node, Command.HEARTBEAT, pack_heartbeat(said)))
+                heartbeat = Heartbeat(error, state, False, False, False, trajectory_done=True)
+                self.bus.waiting.append(frame(node, Command.HEARTBEAT, pack_heartbeat(heartbeat)))
             self.bus.waiting.append(
                 frame(node, Command.GET_ENCODER_ESTIMATES, pack_two_floats(node, 0.0))
             )
@@ -147,13 +146,18 @@ def error_frame(error_class: int, data: bytes = bytes(8)) -> can.Message:
     )
 
 
-@pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    bench = Bench(monkeypatch)
-    yield bench
-    bench.driver.close()
-    assert all(bus.closed == 1 for bus in bench.buses)
-
-
 def error_on_the_wire(bench: Bench) -> None:
     bench.bus.waiting.append(error_frame(BUS_OFF))
+
+
+def error_state(bench: Bench) -> None:
+    bench.bus.shown = can.BusState.ERROR
+
+
+def interface_down(bench: Bench) -> None:
+    bench.bus.waiting.append(DOWN)
+    bench.bus.room, bench.bus.when_full = 0, DOWN
+
+
+def receiving_fails(bench: Bench) -> None:
+    bench.bus.waiting.append(can.CanOperationError("Failed to receive: Network is down"))

@@ -17,15 +17,12 @@ from services.simulator.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, ControlMode
 from shared.can.unix_can import Frame
 from shared.clock import NS_PER_MS
-from tests.joint.drivers.test_odrive_can import AXES, DRIVE, MS, Rig, make_driver, path
-
-__all__ = ["path"]  # fixtures
+from tests.joint.drivers.rig import AXES, DRIVE, MS, TARGET, Rig, make_driver
 
 LOSS = 0.3
 STEP_MS = 4
 ASK_EVERY_MS = 500
 """How often a joint service repeats a request that has shown no effect."""
-TARGET = MotorTarget((0.25, -0.5), (1.0, -2.0), (0.5, -0.25), (30.0, 40.0), (0.05, 0.06))
 
 
 class LossyHub(UnixCanHub):
@@ -112,7 +109,7 @@ def bench(
     bench.hub.close()
 
 
-def test_the_drive_is_armed_with_the_modes_limits_gains_and_targets_that_it_was_told(
+def test_modes_limits_gains_and_targets_arrive(
     bench: Bench,
 ) -> None:
     bench.run(100)
@@ -130,7 +127,7 @@ def test_the_drive_is_armed_with_the_modes_limits_gains_and_targets_that_it_was_
     assert bench.status is DriveStatus.ARMED
 
 
-def test_with_torques_too_modes_and_limits_arrive(bench: Bench) -> None:
+def test_modes_and_limits_arrive_with_torques_too(bench: Bench) -> None:
     bench.rig.bank.control_mode[:] = ControlMode.POSITION
     bench.run(100)
     assert bench.until_armed(onboard=False)
@@ -143,7 +140,7 @@ def test_with_torques_too_modes_and_limits_arrive(bench: Bench) -> None:
     assert list(bank.input_torque[axes]) == [0.25, -0.5]
 
 
-def test_a_drive_that_is_told_to_go_idle_until_it_is_goes_idle(bench: Bench) -> None:
+def test_a_drive_that_is_idled_until_it_is_idle_ends_idle(bench: Bench) -> None:
     bench.run(100)
     bench.until_armed(onboard=True)
     bench.run(300, TARGET)

@@ -22,7 +22,7 @@ from services.simulator.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState
 from shared.can.unix_can import Frame
 from shared.clock import NS_PER_MS
-from tests.joint.drivers.test_odrive_can import AXES, Rig, make_driver
+from tests.joint.drivers.rig import AXES, Rig, make_driver
 
 HERE = (0.1, -0.2)
 HOLD = MotorTarget((0.15, -0.15), (0.0, 0.0), (0.2, -0.1), (60.0, 40.0), (0.2, 0.3))

@@ -18,7 +18,7 @@ from services.simulator.cansimple_front import CanSimpleFront
 from services.simulator.unix_can_hub import UnixCanHub
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.config.sections import CanConfig
-from tests.joint.drivers.test_odrive_can import DRIVE, MS
+from tests.joint.drivers.rig import DRIVE, MS
 
 MODULES = 3
 NODES = [(0, 1), (2, 3), (4, 5)]

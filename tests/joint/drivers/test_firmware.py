@@ -36,7 +36,7 @@ def new(
     return cansimple_06.pack_heartbeat(Heartbeat06(error, state, result, trajectory_done=done))
 
 
-def heard(*pairs: tuple[int, bytes], armed: bool = False) -> AxesReport:
+def report_of(*pairs: tuple[int, bytes], armed: bool = False) -> AxesReport:
     report = AxesReport()
     report.requested(armed=armed)
     for axis, heartbeat in pairs:
@@ -67,14 +67,14 @@ def test_a_heartbeat_shows_its_dialect_only_where_the_other_could_not_have_sent_
     assert dialect_of(heartbeat) == dialect
 
 
-def test_a_version_is_an_answer_of_0_6_and_tells_the_firmware() -> None:
-    report = heard((0, new(IDLE)))
+def test_a_version_is_an_answer_of_0_6_and_names_the_firmware() -> None:
+    report = report_of((0, new(IDLE)))
     assert (report.dialect, report.firmware) == ("", None)
     report.receive_version(VERSION)
     assert (report.dialect, report.firmware) == ("0.6", (0, 6, 10))
 
 
-def test_a_drive_that_never_answers_is_taken_for_0_5_after_many_requests() -> None:
+def test_a_drive_that_never_replies_counts_as_0_5_after_many_requests() -> None:
     report = AxesReport()
     for _ in range(UNANSWERED):
         report.receive(0, old(IDLE, done=False))
@@ -95,7 +95,7 @@ def test_0_6_taken_for_0_5_looks_like_an_error_until_its_answer_comes() -> None:
 
 
 def test_what_is_forgotten_is_found_out_anew() -> None:
-    report = heard((0, old(IDLE)), (1, old(IDLE)))
+    report = report_of((0, old(IDLE)), (1, old(IDLE)))
     report.forget()
     assert (report.dialect, report.status) == ("", DriveStatus.LOST)
     for axis in (0, 1):
@@ -109,7 +109,9 @@ def test_what_is_forgotten_is_found_out_anew() -> None:
 @pytest.mark.parametrize("bit", range(32))
 def test_no_error_of_0_6_looks_like_none(bit: int) -> None:
     assert errors_from_06(1 << bit) != 0
-    report = heard((0, new(IDLE, 1 << bit, ProcedureResult.DISARMED)), (1, new(IDLE)), armed=True)
+    report = report_of(
+        (0, new(IDLE, 1 << bit, ProcedureResult.DISARMED)), (1, new(IDLE)), armed=True
+    )
     assert report.dialect == "0.6"
     assert report.status is DriveStatus.ERROR
     assert report.errors != 0
@@ -119,7 +121,7 @@ def test_no_error_of_0_6_is_none_of_ours() -> None:
     assert errors_from_06(0) == 0
 
 
-def test_every_error_of_0_6_that_has_a_name_is_told_by_one_of_0_5() -> None:
+def test_every_named_error_of_0_6_has_one_of_0_5() -> None:
     for error in DriveError06:
         assert errors_from_06(error) < OTHER_ERROR
     assert errors_from_06(0x8000_0000) == OTHER_ERROR
@@ -155,14 +157,14 @@ def test_while_the_dialect_is_not_known_any_error_is_one_and_has_no_name(error: 
 
 def test_while_the_dialect_is_not_known_the_state_is_believed() -> None:
     busy = new(CLOSED, result=ProcedureResult.BUSY)
-    report = heard((0, busy), (1, busy))
+    report = report_of((0, busy), (1, busy))
     assert (report.dialect, report.status, report.errors) == ("", DriveStatus.ARMED, 0)
 
 
 def test_a_failed_motor_of_0_5_is_an_error_even_before_its_dialect_is_known() -> None:
     failed = old(IDLE, motor=True, done=False)
     assert dialect_of(failed) == ""
-    assert heard((0, failed), (1, old(IDLE, done=False))).status is DriveStatus.ERROR
+    assert report_of((0, failed), (1, old(IDLE, done=False))).status is DriveStatus.ERROR
 
 
 @pytest.mark.parametrize("result", [ProcedureResult.NOT_CALIBRATED, ProcedureResult.INVALID_STATE])
@@ -186,7 +188,7 @@ def test_closed_loop_that_0_6_refuses_is_an_error_only_if_it_was_asked_for(
 def test_an_axis_that_left_closed_loop_without_an_error_bit_is_an_error(
     closed: bytes, left: bytes
 ) -> None:
-    report = heard((0, closed), (1, closed))
+    report = report_of((0, closed), (1, closed))
     statuses = [report.status]
     report.receive(1, left)
     statuses.append(report.status)

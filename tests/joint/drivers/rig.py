@@ -1,0 +1,98 @@
+"""An emulated ODrive on a CAN bus over sockets, with time made by the test on its side."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.odrive_can import ARM_GRACE_MS, OdriveCan
+from services.simulator.axis_bank import AxisBank
+from services.simulator.cansimple_dialects import DialectName
+from services.simulator.cansimple_front import CanSimpleFront
+from services.simulator.unix_can_hub import UnixCanHub
+from shared.config.sections import CanConfig, DriveConfig
+
+DRIVE = DriveConfig(
+    torque_constant=0.0827,
+    current_lim=60.0,
+    vel_limit=60.0,
+    dc_max_negative_current=-30.0,
+    watchdog_timeout=0.1,
+    encoder_period_ms=1,
+    heartbeat_period_ms=1,  # so that a state is known one step later
+    zero_mark_turns=0.0,
+)
+NODES = (4, 5)
+AXES = (4, 5)
+MS = 1e-3
+
+
+TARGET = MotorTarget((0.25, -0.5), (1.0, -2.0), (0.5, -0.25), (30.0, 40.0), (0.05, 0.06))
+
+
+class Rig:
+    """An emulated ODrive, hip_right of the bank, on a hub; `step` is one millisecond of it."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        watchdog: bool = False,
+        dialect: DialectName = "0.5",
+        hub: type[UnixCanHub] = UnixCanHub,
+    ) -> None:
+        self.hub = hub(path)
+        self.bank = AxisBank(DRIVE, encoder_counts_per_turn=16384, watchdog=watchdog)
+        self.front = CanSimpleFront(
+            self.bank,
+            [self.hub],
+            [dict(zip(NODES, AXES, strict=True))],
+            heartbeat_period_ms=1,
+            dialect=dialect,
+        )
+        self.pos = np.zeros(12)
+        self.vel = np.zeros(12)
+        self.now_s = 0.0
+
+    def step(self) -> np.ndarray:
+        self.front.receive()
+        torque = self.bank.step(self.now_s, self.pos, self.vel)
+        self.front.send_encoders()
+        self.front.send_heartbeats(self.now_s)
+        self.now_s += MS
+        return torque
+
+    def cycle(self, driver: OdriveCan) -> DriveReading:
+        """Step, read twice what the step sent, so that its heartbeats are in, and return it."""
+        self.step()
+        first = driver.read(0.5)
+        assert first is not None
+        self.step()
+        second = driver.read(0.5)
+        assert second is not None
+        return second
+
+
+def make_driver(path: Path) -> OdriveCan:
+    """Return a driver of the bus at a socket, which need not be there."""
+    config = CanConfig(interface="xrl_unix", channel=str(path))
+    return OdriveCan(config, NODES, DRIVE, encoder_counts_per_turn=16384)
+
+
+def arm(rig: Rig, driver: OdriveCan, *, onboard: bool = False) -> None:
+    """Arm and wait out the time in which heartbeats are not believed."""
+    driver.arm(onboard=onboard)
+    time.sleep((ARM_GRACE_MS + 5) * MS)
+    reading = rig.cycle(driver)
+    assert reading.status == DriveStatus.ARMED
+    assert reading.error == 0
+
+
+def connected(rig: Rig, path: Path) -> OdriveCan:
+    """Return a driver that has found the drive."""
+    driver = make_driver(path)
+    assert rig.cycle(driver).status == DriveStatus.IDLE
+    return driver

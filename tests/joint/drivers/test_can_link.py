@@ -1,0 +1,347 @@
+"""The link to a CAN bus that fails, is full, or is flooded; and what the kernel filters."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from services.joint.drivers.base import DriveStatus
+from services.joint.drivers.can_link import FRAMES_PER_READ, RETRY_MS, receiver
+from services.joint.drivers.odrive_can import (
+    OdriveCan,
+)
+from services.simulator.unix_can_hub import UnixCanHub
+from shared.can.cansimple import (
+    AxisState,
+    Command,
+    arbitration_id,
+    pack_two_floats,
+)
+from shared.can.cansimple_06 import Command06
+from shared.clock import NS_PER_MS
+from shared.config.sections import CanConfig
+from shared.exceptions import DriveError
+from tests.joint.drivers.can_bench import (
+    DOWN,
+    Bench,
+    FakeBus,
+    error_frame,
+    error_on_the_wire,
+    error_state,
+    frame,
+    interface_down,
+    receiving_fails,
+)
+from tests.joint.drivers.rig import DRIVE, MS, NODES, TARGET, Rig, arm, connected, make_driver
+
+TROUBLES = pytest.mark.parametrize(
+    ("trouble", "counted"),
+    [(error_on_the_wire, 1), (error_state, 1), (interface_down, 0), (receiving_fails, 0)],
+)
+
+
+@TROUBLES
+def test_a_bus_that_fails_is_silence_then_a_lost_drive_and_is_opened_again(
+    bench: Bench, trouble: Callable[[Bench], None], counted: int
+) -> None:
+    bench.armed()
+    failed = bench.bus
+    trouble(bench)
+    assert bench.after(1) is None, "silence, not yet lost"
+    assert failed.closed == 1
+    assert bench.driver.bus_offs == counted
+    assert bench.after(0.5e3 * DRIVE.watchdog_timeout) is None
+    reading = bench.after(1e3 * DRIVE.watchdog_timeout)
+    assert reading is not None
+    assert reading.status is DriveStatus.LOST
+    bench.after(RETRY_MS)
+    assert bench.driver.connections == 2
+    reading = bench.receive(AxisState.CLOSED_LOOP_CONTROL)
+    assert reading is not None
+    assert reading.status is DriveStatus.ARMED, "the drive has held on all the while"
+
+
+@TROUBLES
+def test_a_bus_that_fails_at_each_attempt_is_tried_now_and_then_and_nothing_raises(
+    bench: Bench, trouble: Callable[[Bench], None], counted: int
+) -> None:
+    bench.armed()
+    for _ in range(1000):
+        if bench.driver._link.is_open:
+            trouble(bench)
+        bench.driver.write(TARGET)
+        bench.driver.write_torque((1.0, 1.0))
+        bench.after(2)
+    assert 5 <= len(bench.buses) <= 2000 / RETRY_MS + 2
+    assert bench.driver.bus_offs == counted * len([bus for bus in bench.buses if bus.closed])
+    assert bench.driver.write_failures > 1000
+
+
+@pytest.mark.parametrize("error", [DOWN, can.CanInitializationError("no such device")])
+def test_a_bus_that_cannot_be_opened_is_tried_again(bench: Bench, error: Exception) -> None:
+    interface_down(bench)
+    bench.after(1)
+    bench.refuses = error
+    for _ in range(10):
+        assert bench.driver.read(0.05) is not None
+    assert bench.driver.connections == 1
+    bench.refuses = None
+    bench.after(RETRY_MS)
+    assert bench.driver.connections == 2
+
+
+def test_reading_without_a_bus_takes_the_time_that_it_was_given(bench: Bench) -> None:
+    error_on_the_wire(bench)
+    bench.after(1)
+    before = bench.now_ns
+    bench.driver.read(0.005)
+    assert bench.now_ns - before == 5 * NS_PER_MS
+
+
+def test_a_bus_that_is_back_at_once_is_gone_on_with_before_the_next_heartbeat(
+    bench: Bench,
+) -> None:
+    bench.wait(1e-3 * RETRY_MS)
+    bench.armed()
+    receiving_fails(bench)
+    assert bench.after(1) is None
+    bench.after(1)
+    assert bench.driver.connections == 2
+    reading = bench.receive(None)
+    assert reading is not None
+    assert (reading.status, bench.driver.dialect) == (DriveStatus.ARMED, "0.5")
+
+
+@pytest.mark.parametrize("data", [b"", b"\x02", bytes(7)])
+def test_a_request_for_a_version_by_somebody_else_is_no_version(bench: Bench, data: bytes) -> None:
+    bench.bus.waiting.append(frame(NODES[0], Command06.GET_VERSION, data))
+    bench.after(1)
+    assert bench.driver.dialect == ""
+
+
+def test_trouble_on_the_wire_that_leaves_the_controller_on_it_is_counted_only(bench: Bench) -> None:
+    bench.armed()
+    passive = error_frame(0x04, bytes((0, 0x20, 0, 0, 0, 0, 0, 0)))
+    bench.bus.waiting.extend([passive, passive])
+    reading = bench.receive(AxisState.CLOSED_LOOP_CONTROL)
+    assert reading is not None
+    assert reading.status is DriveStatus.ARMED
+    assert bench.driver._link.error_frames == 2
+    assert (bench.driver.bus_offs, bench.driver.connections) == (0, 1)
+
+
+def test_an_error_frame_is_not_taken_for_a_frame_of_a_node(bench: Bench) -> None:
+    """Class 0x80 (an error on the bus) has the number of node 4's version."""
+    bench.receive()
+    bench.bus.waiting.append(error_frame(arbitration_id(NODES[0], 0)))
+    bench.after(1)
+    assert bench.driver.dialect == "0.5"
+
+
+def test_extended_and_remote_frames_of_the_same_number_are_not_ours(bench: Bench) -> None:
+    bench.receive()
+    estimate = pack_two_floats(99.0, 0.0)
+    for node in NODES:
+        bench.bus.waiting.append(
+            frame(node, Command.GET_ENCODER_ESTIMATES, estimate, is_extended_id=True)
+        )
+        bench.bus.waiting.append(frame(node, Command.GET_ENCODER_ESTIMATES, is_remote_frame=True))
+    assert bench.after(1) is None
+
+
+def test_a_flooded_bus_does_not_hold_up_the_loop(bench: Bench) -> None:
+    """What is there is taken without waiting for more, and not all of it at once."""
+    timeouts = []
+
+    def flood(timeout: float | None) -> tuple[can.Message | None, bool]:
+        timeouts.append(timeout)
+        return frame(NODES[0], Command.GET_IQ, is_remote_frame=True), True
+
+    bench.bus._recv_internal = flood  # type: ignore[method-assign]
+    assert list(receiver(bench.bus, in_kernel=False)(0.5)) == []
+    assert timeouts == [0.5] + [0.0] * (FRAMES_PER_READ - 1)
+
+
+# ---- a bus over sockets
+
+
+def test_driver_starts_without_a_bus_and_finds_it_later(path: Path) -> None:
+    driver = make_driver(path)
+    reading = driver.read(0.001)
+    assert reading is not None
+    assert reading.status == DriveStatus.LOST
+    driver.write_torque((1.0, 1.0))
+    driver.arm(onboard=False)
+    driver.idle()
+    assert driver.write_failures == 1
+    rig = Rig(path)
+    time.sleep(RETRY_MS * MS)
+    driver.read(0.0)
+    assert rig.cycle(driver).status == DriveStatus.IDLE
+    arm(rig, driver)
+    driver.close()
+    rig.hub.close()
+
+
+def test_driver_is_lost_with_its_hub_and_arms_again_with_a_new_one(path: Path) -> None:
+    old = Rig(path)
+    driver = connected(old, path)
+    arm(old, driver)
+    time.sleep(RETRY_MS * MS)
+    old.hub.close()
+    reading = driver.read(0.01)
+    assert reading is not None
+    assert reading.status == DriveStatus.LOST
+    driver.write_torque((1.0, 1.0))
+    new = Rig(path)
+    time.sleep(RETRY_MS * MS)
+    driver.read(0.0)
+    assert driver.connections == 2
+    # The new drive is in IDLE without having been asked: that is no state to go on from.
+    assert new.cycle(driver).status == DriveStatus.ERROR
+    arm(new, driver)
+    driver.write_torque((0.5, 0.25))
+    torque = new.step().copy()
+    driver.close()
+    new.hub.close()
+    assert list(torque[[4, 5]]) == [0.5, 0.25]
+
+
+def test_reading_from_a_silent_bus_is_none_at_first_and_lost_later(
+    rig: Rig, driver: OdriveCan
+) -> None:
+    statuses = []
+    for _ in range(20):
+        reading = driver.read(0.004)
+        statuses.append(None if reading is None else reading.status)
+    assert statuses[0] is None
+    assert statuses[-1] == DriveStatus.LOST
+
+
+def test_writing_to_a_hub_that_does_not_read_never_blocks_or_raises(
+    rig: Rig, driver: OdriveCan
+) -> None:
+    for _ in range(5000):
+        driver.write_torque((1.0, 2.0))
+    rig.front.receive()
+    assert list(rig.bank.input_torque[[4, 5]]) == [1.0, 2.0]
+
+
+def test_unknown_interface_is_refused_at_the_start() -> None:
+    with pytest.raises(DriveError, match="no_such_bus"):
+        OdriveCan(CanConfig(interface="no_such_bus", channel="x"), NODES, DRIVE)
+
+
+def test_driver_runs_on_a_bus_with_nothing_but_the_api_of_python_can() -> None:
+    config = CanConfig(interface="virtual", channel="test_odrive_can")
+    driver = OdriveCan(config, NODES, DRIVE)
+    with can.Bus(interface="virtual", channel="test_odrive_can", ignore_config=True) as drive_side:
+        for node, pos in zip(NODES, (1.0, 2.0), strict=True):
+            for command, data in (
+                (Command.HEARTBEAT, struct.pack("<IBBBB", 0, 1, 0, 0, 0x80)),
+                (Command.GET_ENCODER_ESTIMATES, struct.pack("<ff", pos, -pos)),
+            ):
+                can_id = arbitration_id(node, command)
+                drive_side.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        reading = driver.read(0.5)
+        driver.write_torque((0.5, -0.5))
+        sent = [drive_side.recv(0.5), drive_side.recv(0.5)]
+    driver.close()
+    assert reading is not None
+    assert reading.status == DriveStatus.IDLE
+    assert reading.pos_turns == (1.0, 2.0)
+    assert [message and (message.arbitration_id, bytes(message.data)) for message in sent] == [
+        (0x08E, bytes.fromhex("0000003f")),
+        (0x0AE, bytes.fromhex("000000bf")),
+    ]
+
+
+def test_a_link_that_fails_and_comes_back_at_once_is_no_lost_drive(path: Path) -> None:
+    """An interface that restarts: the drive has held its last torque all the while."""
+    rig = Rig(path)
+    driver = connected(rig, path)
+    arm(rig, driver)
+    rig.hub.close()
+    assert driver.read(0.0) is None, "silence, not yet lost"
+    rig.hub = UnixCanHub(path)
+    reading = driver.read(0.0)
+    assert reading is None or reading.status != DriveStatus.LOST
+    driver.close()
+    rig.hub.close()
+
+
+# ---- filters
+
+
+def test_the_kernel_is_told_which_nodes_to_wake_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(monkeypatch, "socketcan")
+    found = bench.bus.options["can_filters"]
+    assert isinstance(found, list)
+    passing = {
+        can_id
+        for can_id in range(1 << 11)
+        for each in found
+        if can_id & each["can_mask"] == each["can_id"] & each["can_mask"]
+    }
+    assert passing == {arbitration_id(node, command) for node in NODES for command in range(32)}
+    assert all(each["extended"] is False for each in found)
+    bench.driver.close()
+
+
+def test_other_interfaces_filter_nothing(bench: Bench) -> None:
+    """In software a filter saves nothing, and would keep error frames away."""
+    assert "can_filters" not in bench.bus.options
+
+
+# ---- a wall clock that is set back
+
+
+class QuietBus(FakeBus):
+    """A bus on a file descriptor, as socketcan's, with nothing on it."""
+
+    def __init__(self) -> None:
+        self.ends = os.pipe()
+        super().__init__("can7")
+
+    def fileno(self) -> int:
+        return self.ends[0]
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        assert timeout is not None
+        assert timeout < 1.0, "the wait is by the wall clock"
+        os.read(self.ends[0], 1)
+        return super()._recv_internal(timeout)
+
+
+@pytest.fixture
+def quiet() -> Iterator[QuietBus]:
+    bus = QuietBus()
+    yield bus
+    for end in bus.ends:
+        os.close(end)
+    with pytest.raises(OSError, match="closed twice"):
+        bus.shutdown()
+
+
+def test_a_wall_clock_set_back_does_not_hold_up_reading_a_silent_bus(
+    quiet: QuietBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backwards = iter(range(10**9, 0, -3600))
+    monkeypatch.setattr("can.bus.time", lambda: next(backwards))
+    receive = receiver(quiet, in_kernel=True)
+    before = time.monotonic()
+    assert list(receive(0.01)) == []
+    assert time.monotonic() - before > 0.009
+    assert next(backwards) == 10**9, "python-can was not asked"
+
+
+def test_a_frame_on_a_bus_in_the_kernel_is_read_at_once(quiet: QuietBus) -> None:
+    quiet.waiting.append(frame(NODES[0], Command.HEARTBEAT, bytes(8)))
+    os.write(quiet.ends[1], b"12")
+    assert len(receiver(quiet, in_kernel=True)(5.0)) == 1

@@ -1,0 +1,171 @@
+"""Which modes, limits and gains go to a drive along with its targets, how often, in which order."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from services.joint.drivers.base import MotorTarget
+from services.joint.drivers.odrive_can import OdriveCan
+from services.joint.drivers.resend_policy import DRIFT_MS, GAINS_MS, SETTLE_MS
+from shared.can.cansimple import AxisState, Command, split_id
+from tests.joint.drivers.can_bench import Bench
+from tests.joint.drivers.rig import AXES, MS, NODES, TARGET, Rig, arm
+
+GAINS: list[int] = [Command.SET_POS_GAIN, Command.SET_VEL_GAINS, Command.SET_INPUT_POS]
+INPUTS: list[int] = [Command.SET_INPUT_POS]
+
+
+def with_gain(pos_gain: float) -> MotorTarget:
+    return MotorTarget(
+        TARGET.pos_turns, TARGET.vel_turns, TARGET.torque, (pos_gain,) * 2, TARGET.vel_gain
+    )
+
+
+def settled(bench: Bench) -> None:
+    bench.armed()
+    for _ in range(SETTLE_MS // GAINS_MS + 1):
+        bench.driver.write(TARGET)
+        bench.wait(1.1e-3 * GAINS_MS)
+    bench.driver.write(TARGET)
+    bench.wait(2e-3 * DRIFT_MS)
+    bench.commands()
+
+
+def written(bench: Bench, target: MotorTarget, ms: float = 2.0) -> list[int]:
+    """Write a target and return the commands to the second node."""
+    bench.driver.write(target)
+    bench.wait(1e-3 * ms)
+    ids = [split_id(message.arbitration_id) for message in bench.bus.sent]
+    bench.bus.sent.clear()
+    return [command for node, command in ids if node == NODES[1]]
+
+
+def test_changed_gains_are_sent_twice_and_then_now_and_then(bench: Bench) -> None:
+    settled(bench)
+    sent = [written(bench, with_gain(10.0)) for _ in range(GAINS_MS // 2 + 4)]
+    assert sent[:3] == [GAINS, GAINS, INPUTS]
+    assert 3 <= sent.count(GAINS) <= 4
+
+
+def test_gains_that_drift_are_not_sent_twice_as_often(bench: Bench) -> None:
+    """A blend changes them every few cycles: one bus of all six modules would be full of them."""
+    settled(bench)
+    sent = [written(bench, with_gain(10.0 + step // 3)) for step in range(60)]
+    assert 20 <= sent.count(GAINS) <= 22
+
+
+def test_an_axis_gets_its_gains_right_before_the_target_they_belong_to(bench: Bench) -> None:
+    settled(bench)
+    bench.driver.write(with_gain(10.0))
+    ids = [split_id(message.arbitration_id) for message in bench.bus.sent]
+    assert ids == [(node, command) for node in NODES for command in GAINS]
+
+
+def test_gains_that_change_while_the_drive_settles_are_sent_without_the_mode(bench: Bench) -> None:
+    """Each mode that is set takes a 0.5 drive's target away, until the next frame."""
+    bench.armed()
+    sent = [written(bench, with_gain(10.0 + step)) for step in range(SETTLE_MS // 2)]
+    modes = sum(Command.SET_CONTROLLER_MODE in row for row in sent)
+    assert modes == SETTLE_MS // GAINS_MS
+
+
+def test_targets_that_a_full_queue_cuts_off_reach_both_axes_in_turn(bench: Bench) -> None:
+    settled(bench)
+    heard = dict.fromkeys(NODES, 0)
+    for step in range(40):
+        bench.bus.room = 3
+        bench.driver.write(with_gain(10.0 + step))
+        bench.wait(0.002)
+        for message in bench.bus.sent:
+            node, command = split_id(message.arbitration_id)
+            heard[node] += command == Command.SET_INPUT_POS
+        bench.bus.sent.clear()
+    assert list(heard.values()) == [20, 20]
+
+
+def test_targets_that_were_cut_off_are_not_followed_by_gains(bench: Bench) -> None:
+    """A queue that is full for two frames is not helped by six."""
+    settled(bench)
+    bench.bus.room = 1
+    bench.driver.write(TARGET)
+    bench.wait(0.002)
+    bench.bus.sent.clear()
+    bench.bus.room = 100
+    assert written(bench, TARGET) == INPUTS
+
+
+def test_gains_that_the_queue_had_no_room_for_are_sent_again(bench: Bench) -> None:
+    bench.armed()
+    bench.bus.room = 3
+    bench.driver.write(TARGET)
+    assert bench.driver.write_failures == 1
+    bench.commands()
+    bench.bus.room = 100
+    bench.driver.write(TARGET)
+    assert bench.commands().count(Command.SET_POS_GAIN) == 2
+
+
+def test_limits_and_modes_are_sent_for_a_while_after_arming_and_then_no_more(
+    bench: Bench,
+) -> None:
+    bench.armed()
+    modes = []
+    for _ in range(0, 3 * SETTLE_MS, 10):
+        bench.wait(0.01)
+        bench.driver.write(TARGET)
+        sent = bench.commands()
+        modes.append(sent.count(Command.SET_CONTROLLER_MODE))
+        assert sent.count(Command.SET_LIMITS) == modes[-1]
+    assert sum(modes) == pytest.approx(2 * SETTLE_MS / GAINS_MS, abs=2)
+    assert not any(modes[-100:])
+
+
+def test_a_drive_found_armed_is_sent_its_limits_and_modes(bench: Bench) -> None:
+    bench.receive(AxisState.CLOSED_LOOP_CONTROL)
+    bench.commands()
+    bench.driver.write(TARGET)
+    sent = bench.commands()
+    assert sent.count(Command.SET_CONTROLLER_MODE) == sent.count(Command.SET_LIMITS) == 2
+    bench.wait(2e-3 * GAINS_MS)
+    bench.driver.write(TARGET)
+    assert bench.commands().count(Command.SET_CONTROLLER_MODE) == 2, "the first may have been lost"
+
+
+def test_modes_are_sent_again_with_torques_too(bench: Bench) -> None:
+    bench.armed(onboard=False)
+    bench.driver.write_torque((0.0, 0.0))
+    modes = [m for m in bench.bus.sent if split_id(m.arbitration_id)[1] == 0x00B]
+    assert [bytes(mode.data) for mode in modes] == [bytes((1, 0, 0, 0, 1, 0, 0, 0))] * 2
+    bench.wait(1e-3 * SETTLE_MS)
+    bench.commands()
+    bench.driver.write_torque((0.0, 0.0))
+    assert bench.commands() == [Command.SET_INPUT_TORQUE] * 2
+
+
+def test_an_axis_gets_its_target_right_after_its_mode(bench: Bench) -> None:
+    """Firmware 0.5 takes where the motor is for the target when a mode is set."""
+    bench.armed()
+    bench.driver.write(TARGET)
+    ids = [split_id(message.arbitration_id) for message in bench.bus.sent]
+    for node in NODES:
+        at = ids.index((node, Command.SET_CONTROLLER_MODE))
+        assert ids[at + 1] == (node, Command.SET_INPUT_POS)
+
+
+# ---- on an emulated drive
+
+
+def test_gains_that_were_lost_are_sent_again(rig: Rig, driver: OdriveCan) -> None:
+    arm(rig, driver, onboard=True)
+    driver.write(TARGET)
+    rig.step()
+    axes = list(AXES)
+    for wait_ms in (DRIFT_MS, GAINS_MS):
+        rig.bank.pos_gain[axes] = 1.0  # as if the frames had been lost
+        time.sleep((wait_ms + 5) * MS)
+        driver.write(TARGET)
+        rig.step()
+        np.testing.assert_allclose(rig.bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
