@@ -202,7 +202,7 @@ def test_a_tool_imports_no_test(file: str) -> None:
     assert [i.full for i in IMPORTS[file] if i.top == "tests"] == []
 
 
-def test_nobody_imports_a_verb() -> None:
+def test_no_module_imports_a_verb() -> None:
     importers = {
         file
         for file, found in IMPORTS.items()
@@ -253,7 +253,7 @@ def test_a_law_takes_from_the_clock_its_units_only(file: str) -> None:
     assert [name for name in taken if not name.startswith("NS_PER_")] == []
 
 
-def test_only_tools_speak_to_the_terminal() -> None:
+def test_only_tools_write_to_the_terminal() -> None:
     printing = {
         file
         for file, source in SOURCES.items()
@@ -266,7 +266,7 @@ def test_only_tools_speak_to_the_terminal() -> None:
     assert printing <= {"shared/process.py"}, "errors at the start go through run_service"
 
 
-def test_every_package_says_what_it_is() -> None:
+def test_every_package_describes_itself() -> None:
     silent = [file for file, source in SOURCES.items() if not ast.get_docstring(ast.parse(source))]
     assert silent == []
 

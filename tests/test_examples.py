@@ -71,7 +71,7 @@ def test_a_run_is_read_into_numpy(tmp_path: Path) -> None:
     assert "states, age 4." in lines[1]
 
 
-def test_without_a_log_the_reader_says_how_to_call_it() -> None:
+def test_without_a_log_the_reader_names_its_usage() -> None:
     done = subprocess.run(
         [sys.executable, EXAMPLES / "read_a_run.py"], capture_output=True, text=True, check=False
     )

@@ -12,7 +12,7 @@ TEXT = (ROOT / "docs" / "hazards.md").read_text(encoding="utf-8")
 CITED = sorted(set(re.findall(r"`(tests/[^`]+)`", TEXT)))
 
 
-def test_every_kind_of_hazard_is_told() -> None:
+def test_every_kind_of_hazard_is_reported() -> None:
     kinds = re.findall(r"^## (.+)$", TEXT, flags=re.MULTILINE)
     assert [kind.split(",")[0] for kind in kinds] == [
         "It falls",

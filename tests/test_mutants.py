@@ -85,7 +85,7 @@ def test_those_with_a_reason_may_live_up_to_one_in_twenty() -> None:
     assert (code, "at least 95%" in text) == (1, True)
 
 
-def test_one_that_is_listed_and_dies_is_told_when_all_ran() -> None:
+def test_a_listed_mutant_that_dies_is_reported_when_all_ran() -> None:
     code, text = judged(0, (LIVES,))
     assert (code, "listed, and does not live" in text) == (1, True)
     assert judged(0, (LIVES,), sample=True)[0] == 0

@@ -91,13 +91,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
     console = Console(highlight=False)
     try:
-        told = read_toml(FILE, MutantsFile)
-        known = {group.name: group for group in told.group}
-        names = args.group or ([told.group[0].name] if args.sample else list(known))
+        listed = read_toml(FILE, MutantsFile)
+        known = {group.name: group for group in listed.group}
+        names = args.group or ([listed.group[0].name] if args.sample else list(known))
         for name in names:
             if name not in known:
                 raise RunError(f"--group {name}: there are {', '.join(known)}")
-        return _judge([_run(known[name], args, console) for name in names], told, args, console)
+        return _judge([_run(known[name], args, console) for name in names], listed, args, console)
     except XrlError as error:
         console.print(f"mutants: {error}", style="red")
         return 2

@@ -30,8 +30,8 @@ class SocketListener:
             self.socket.listen()
         except OSError as error:
             self.socket.close()
-            said = f"{path}: {error.strerror or error}; an endpoint it may use is needed"
-            raise BusError(said) from None
+            text = f"{path}: {error.strerror or error}; an endpoint it may use is needed"
+            raise BusError(text) from None
         self.socket.setblocking(False)
         self._spare: int | None = None
         self._keep_spare()

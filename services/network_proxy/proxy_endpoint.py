@@ -71,8 +71,8 @@ def address_of(endpoint: str) -> Address:
         return Address(socket.AF_UNIX, place)
     host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
     if kind != "tcp" or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
-        said = "cannot be stood before; unixsock-stream/PATH or tcp/HOST:PORT can"
-        raise BusError(f"{endpoint}: {said}")
+        text = "cannot be stood before; unixsock-stream/PATH or tcp/HOST:PORT can"
+        raise BusError(f"{endpoint}: {text}")
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:

@@ -123,8 +123,8 @@ class CanSimpleFront:
                         frames.append((can_id, self._dialect.heartbeat(bank, axis)))
             if frames:
                 bus.hub.broadcast(frames)
-        heard = (due_s[axis] for bus in self._buses for axis in bus.axes)
-        self._heartbeat_from_s = min(heard, default=math.inf)
+        due = (due_s[axis] for bus in self._buses for axis in bus.axes)
+        self._heartbeat_from_s = min(due, default=math.inf)
 
     def _read_periods(self) -> None:
         """Take the periods from the settings, if these have changed; 0 is never."""

@@ -1,4 +1,4 @@
-"""The simulated harness sensor: the operator's wrench as load-cell frames (section 3 f)."""
+"""The simulated harness sensor: the operator's wrench as load-cell frames (docs/law.md#harness)."""
 
 from __future__ import annotations
 

@@ -39,12 +39,12 @@ class ImuFront:
         """Send one sample of how the torso stands against gravity, and turns."""
         noise = self._errors.noise * self._random.standard_normal(2)
         turned = _product(world.torso_against_gravity(), self._sits)
-        told = _product(turned, _product(_about(0, noise[0]), _about(1, noise[1])))
+        measured = _product(turned, _product(_about(0, noise[0]), _about(1, noise[1])))
         w, x, y, z = self._sits
         back = (w, -x, -y, -z)
         _, *rate = _product(back, _product((0.0, *world.torso_rates()), self._sits))
         self._hub.poll()
-        self._hub.broadcast(imu_can.pack(told, rate, valid=True))
+        self._hub.broadcast(imu_can.pack(measured, rate, valid=True))
 
 
 def _about(axis: int, angle: float) -> list[float]:

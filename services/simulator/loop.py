@@ -158,8 +158,8 @@ class SimulatorLoop:
             self._hoisted_step = self._steps
         down_s = (self._steps - self._hoisted_step) * world.timestep
         by_itself = self.autostart_s is not None and down_s > self.autostart_s
-        told = control is not None and control.start
-        if (told or by_itself) and world.scenario_s < 0.0:
+        requested = control is not None and control.start
+        if (requested or by_itself) and world.scenario_s < 0.0:
             world.start()
             self._start_ns, self._start_step = now, self._steps
             self._lost_at_start_ns = self._lost_ns

@@ -162,9 +162,9 @@ class World:
 
     def torso_against_gravity(self) -> list[float]:
         """Return the quaternion (w, x, y, z) that turns torso axes into axes whose z is up."""
-        told = np.zeros(4)
-        mujoco.mju_mulQuat(told, self._level, self._qpos[3:7])
-        quaternion: list[float] = told.tolist()
+        measured = np.zeros(4)
+        mujoco.mju_mulQuat(measured, self._level, self._qpos[3:7])
+        quaternion: list[float] = measured.tolist()
         return quaternion
 
     def torso_rates(self) -> list[float]:

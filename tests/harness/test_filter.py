@@ -198,7 +198,7 @@ LEVELS = (
 @pytest.mark.parametrize("leg", range(6))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("level", "saturated"), LEVELS)
-def test_saturation_is_told_of_any_leg_at_the_limit_and_not_below(
+def test_saturation_is_reported_of_any_leg_at_the_limit_and_not_below(
     leg: int, sign: float, level: float, saturated: bool
 ) -> None:
     state, t_ns = tared()

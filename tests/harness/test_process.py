@@ -34,7 +34,7 @@ def retared(taken: list[Wrench]) -> bool:
     return Tare.DONE in states and Tare.RUNNING in states[states.index(Tare.DONE) :]
 
 
-def test_the_service_publishes_the_operators_wrench_tares_when_asked_and_stops_when_told(
+def test_the_service_publishes_the_operators_wrench_tares_on_request_and_stops_on_request(
     run_dir: Path,
 ) -> None:
     command = [sys.executable, "-m", "services.harness", "--run-dir", str(run_dir)]

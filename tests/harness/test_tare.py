@@ -39,7 +39,9 @@ def test_a_tare_is_taken_up_to_the_limit_of_the_forces_deviation(leg: int, share
     assert state.tare is (Tare.DONE if share < 1.0 else Tare.UNSTEADY)
 
 
-def test_a_tare_on_request_makes_what_acts_the_zero_and_is_told_until_it_is_done() -> None:
+def test_a_tare_on_request_makes_the_present_wrench_the_zero_and_is_reported_until_it_is_done() -> (
+    None
+):
     asked = Asked()
     loop, sensor, _ = make_loop(asked)
     _, t_ns = cycles(loop, T0, TARE_CYCLES + 1)
@@ -55,7 +57,7 @@ def test_a_tare_on_request_makes_what_acts_the_zero_and_is_told_until_it_is_done
     np.testing.assert_allclose([*message.force, *message.moment], 0.0, atol=1e-9)
 
 
-def test_a_request_said_again_while_the_tare_runs_does_not_put_it_off() -> None:
+def test_a_repeated_request_does_not_delay_the_running_tare() -> None:
     asked = Asked()
     loop, _, _ = make_loop(asked)
     t_ns = T0
@@ -65,7 +67,7 @@ def test_a_request_said_again_while_the_tare_runs_does_not_put_it_off() -> None:
     assert message.valid
 
 
-def test_a_tare_that_shakes_says_so_and_stays_invalid_until_it_is_still() -> None:
+def test_a_tare_that_shakes_is_reported_and_stays_invalid_until_it_is_still() -> None:
     loop, sensor, _ = make_loop()
     t_ns, tares = T0, []
     for n in range(3 * TARE_CYCLES):

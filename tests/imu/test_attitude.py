@@ -34,9 +34,9 @@ def test_up_is_the_vertical_in_torso_axes_whatever_the_heading(
     """By scipy: the torso is turned, the mounting and the sensor's own yaw drop out."""
     torso = Rotation.from_euler("ZXY", (0.0, roll, pitch))
     mounted = Rotation.from_euler("ZXY", (0.3, -0.2, 0.5))  # sensor axes to torso axes
-    told = Rotation.from_euler("Z", heading) * torso * mounted
+    measured = Rotation.from_euler("Z", heading) * torso * mounted
     law = AttitudeLaw(msgspec.structs.replace(ROBOT_IMU, mounting=(-0.2, 0.5, 0.3)))
-    reading = law.step(T0, sample(told))
+    reading = law.step(T0, sample(measured))
     assert reading.valid
     np.testing.assert_allclose(reading.up, torso.inv().apply((0.0, 0.0, 1.0)), atol=1e-12)
     np.testing.assert_allclose(reading.rate, mounted.apply((0.1, 0.2, 0.3)), atol=1e-12)
@@ -64,7 +64,7 @@ def test_before_the_first_sample_nothing_is_known() -> None:
     assert reading.age_ns == -1
 
 
-def test_a_sensor_that_says_it_does_not_know_is_believed_and_its_numbers_are_not() -> None:
+def test_a_sensor_that_reports_invalid_is_believed_and_its_numbers_are_not() -> None:
     law = AttitudeLaw(ROBOT_IMU)
     first = law.step(T0, sample(Rotation.identity()))
     lost = law.step(T0 + 1, sample(Rotation.from_euler("X", 1.0), valid=False))

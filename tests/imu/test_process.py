@@ -29,7 +29,7 @@ def run_dir() -> Iterator[Path]:
         yield Path(directory)
 
 
-def test_the_service_says_which_way_is_up_and_that_it_does_not_know_once_the_sensor_is_silent(
+def test_the_service_publishes_which_way_is_up_and_invalid_once_the_sensor_is_silent(
     robot: RobotConfig, run_dir: Path
 ) -> None:
     fitted, file = with_imu(robot), run_dir / "robot.toml"
@@ -55,7 +55,7 @@ def test_the_service_says_which_way_is_up_and_that_it_does_not_know_once_the_sen
                 hub.broadcast(imu_can.pack(tilted, (0.0, 0.0, 0.0), valid=True))
                 taken += filter(None, [attitudes.take()])
                 time.sleep(0.01)
-            told = taken[-1]
+            attitude = taken[-1]
             while taken[-1].valid:
                 assert time.monotonic() < give_up
                 taken += filter(None, [attitudes.take()])
@@ -66,5 +66,5 @@ def test_the_service_says_which_way_is_up_and_that_it_does_not_know_once_the_sen
             service.kill()
     assert service.returncode == 0, log
     assert "stopped:" in log
-    assert told.up == pytest.approx((0.0, math.sin(0.1), math.cos(0.1)), abs=1e-3)
-    assert taken[-1].up == told.up, "the last good one"
+    assert attitude.up == pytest.approx((0.0, math.sin(0.1), math.cos(0.1)), abs=1e-3)
+    assert taken[-1].up == attitude.up, "the last good one"

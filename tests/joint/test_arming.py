@@ -27,7 +27,7 @@ from tests.joint.test_drive_manager import MOVED, Bench
 from tests.joint.test_rearm_guard import CARRIED, Successor
 
 
-def test_a_drive_that_never_arms_is_asked_so_often_and_told_of_once(robot: RobotConfig) -> None:
+def test_a_drive_that_never_arms_is_asked_so_often_and_reported_once(robot: RobotConfig) -> None:
     bench, told = Bench(robot, "onboard"), []
     for _ in range((ARM_TRIES + 4) * ARM_EVERY_NS // bench.cycle_ns):
         step = bench.cycle()
@@ -43,7 +43,7 @@ def test_a_drive_that_never_arms_is_asked_so_often_and_told_of_once(robot: Robot
     assert {later - sooner for sooner, later in pairwise(times)} == {ARM_EVERY_NS}
 
 
-def test_after_a_freeze_the_change_of_mode_is_told_with_the_torques_that_were_carried(
+def test_after_a_freeze_the_change_of_mode_is_published_with_the_torques_that_were_carried(
     robot: RobotConfig,
 ) -> None:
     bench = Bench(robot, "onboard")

@@ -262,7 +262,7 @@ def test_a_reading_that_is_no_number_lets_out_no_torque_that_is_none(
     assert bench.controller.step(bench.now_ns, reading, None, False).tau == before
 
 
-def test_state_tells_what_the_cycle_saw_and_did(bench: Bench) -> None:
+def test_a_state_holds_what_the_cycle_saw_and_did(bench: Bench) -> None:
     bench.to_track()
     bench.v = (0.1, -0.1)
     sent = bench.fresh(seq=5_000)
@@ -286,7 +286,7 @@ def test_states_count_up_by_one(bench: Bench) -> None:
     assert seqs == [1, 2, 3]
 
 
-def test_state_before_any_command_says_so(bench: Bench) -> None:
+def test_a_state_before_any_command_is_marked_so(bench: Bench) -> None:
     bench.to_hold()
     state = bench.controller.state(bench.now_ns)
     assert (state.age_ns, state.session, state.command_seq) == (-1, 0, -1)
@@ -294,7 +294,7 @@ def test_state_before_any_command_says_so(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("mode", [Mode.DISARMED, Mode.DAMP, Mode.FAULT])
-def test_a_module_that_cannot_track_does_not_say_it_is_ready(bench: Bench, mode: Mode) -> None:
+def test_a_module_that_cannot_track_does_not_report_ready(bench: Bench, mode: Mode) -> None:
     """JointState.ready: fresh for long enough to track, were `hold` lifted."""
     bench.to(mode)
     bench.run(100, fresh=True, hold=True)
@@ -302,7 +302,7 @@ def test_a_module_that_cannot_track_does_not_say_it_is_ready(bench: Bench, mode:
     assert not bench.controller.state(bench.now_ns).ready
 
 
-def test_drive_error_bits_are_told(bench: Bench) -> None:
+def test_drive_error_bits_are_reported(bench: Bench) -> None:
     bench.to_hold()
     at = bench.now_ns + bench.cycle_ns
     reading = DriveReading(at, (0.0, 0.0), (0.0, 0.0), DriveStatus.ERROR, 0x40)
@@ -310,7 +310,7 @@ def test_drive_error_bits_are_told(bench: Bench) -> None:
     assert bench.controller.state(at).drive_error == 0x40
 
 
-def test_event_tells_the_torque_on_both_sides_of_the_change(bench: Bench) -> None:
+def test_an_event_holds_the_torque_on_both_sides_of_the_change(bench: Bench) -> None:
     bench.to_track(tau_coupled=COUPLED)
     before = bench.controller.tau
     result = bench.cycle(bench.fresh(hold=True))

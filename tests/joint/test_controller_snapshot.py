@@ -82,7 +82,7 @@ def test_a_joint_at_its_soft_stop_is_inside_and_beyond_it_is_not(
         assert controller.inside_limits() is inside
 
 
-def test_neighbours_are_told_where_the_joint_is_and_how_it_does(bench: Bench) -> None:
+def test_neighbours_are_given_the_joints_position_and_state(bench: Bench) -> None:
     bench.v = (0.3, -0.2)
     bench.to_hold()
     row = row_of(bench.controller)
@@ -107,7 +107,7 @@ def test_cycles_are_counted_one_by_one_and_before_any_change_there_is_no_cause(
         assert bench.controller.cycle == count
 
 
-def test_one_that_holds_with_all_it_has_says_so_from_the_first_instant(bench: Bench) -> None:
+def test_a_module_that_holds_with_all_it_has_reports_it_from_the_first_cycle(bench: Bench) -> None:
     taken = bench.controller.snapshot()
     for stiffened_ns, stiffened in ((0, False), (1, True)):
         law = msgspec.structs.replace(taken.law, stiffened_ns=stiffened_ns)

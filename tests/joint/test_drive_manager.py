@@ -117,9 +117,11 @@ def test_after_a_freeze_the_drives_torque_goes_on_without_a_step(
         now = bench.carried()
         assert max(abs(b - a) for a, b in zip(last, now, strict=True)) < 0.6
         last = now
-    heard = round(LISTEN_NS / bench.cycle_ns)
-    assert orders[:heard] == [DriveCommand.NOTHING] * heard, "what the link has queued is old"
-    assert DriveCommand.NOTHING not in orders[heard:]
+    listening = round(LISTEN_NS / bench.cycle_ns)
+    assert orders[:listening] == [DriveCommand.NOTHING] * listening, (
+        "what the link has queued is old"
+    )
+    assert DriveCommand.NOTHING not in orders[listening:]
 
 
 @pytest.mark.parametrize("loop", LOOPS)
@@ -158,7 +160,7 @@ def test_shorter_gaps_are_no_freeze(robot: RobotConfig) -> None:
     assert bench.cycle().command is DriveCommand.TARGET
 
 
-def test_it_does_not_speak_before_it_has_heard_the_drive(robot: RobotConfig) -> None:
+def test_it_sends_nothing_before_the_drive_has_sent(robot: RobotConfig) -> None:
     bench = Bench(robot, "onboard")
     bench.to(Mode.HOLD)
     bench.freeze(NS_PER_S, MOVED)

@@ -147,7 +147,7 @@ def test_gains_that_change_after_a_pause_change_at_once() -> None:
     assert law.gains[0] == 0.0
 
 
-def test_changing_gains_come_sooner_than_a_drive_on_can_is_told_drifting_ones_again() -> None:
+def test_changing_gains_come_sooner_than_drifting_ones_are_sent_again() -> None:
     """Else each change would go out twice."""
     assert FOLLOW_MS < DRIFT_MS
 
@@ -202,9 +202,7 @@ def test_targets_within_the_firmwares_clamp_are_the_ones_without_it(
 
 @pytest.mark.parametrize("phi_off", [0.0, 0.05])
 @pytest.mark.parametrize("off", [-0.35, -0.3, 0.3])
-def test_a_hip_far_off_its_reference_stays_as_soft_as_it_is_told(
-    off: float, phi_off: float
-) -> None:
+def test_a_hip_far_off_its_reference_stays_as_soft_as_commanded(off: float, phi_off: float) -> None:
     """HOLD's (900, 26) N m/rad is 463 on both motors: its theta was 463 stiff from 0.25 rad on."""
     hip = Setpoint(ZERO, ZERO, (0.0, -10.0), ZERO, (900.0, 26.0), (30.0, 4.0))
     law = DriveSetpointLaw(N, VEL_LIMIT, TORQUE_MAX)

@@ -228,7 +228,7 @@ def test_the_step_is_from_what_this_planner_led_with(
 
 
 @pytest.mark.parametrize("name", ["k_p", "k_d", "q_ref", "tau_ff"])
-def test_who_asks_for_hold_is_obeyed_and_by_numbers_that_are_not_believed_nobody_is_ready(
+def test_a_request_for_hold_is_obeyed_and_implausible_numbers_make_no_module_ready(
     robot: RobotConfig, name: str
 ) -> None:
     failsafe, timing = Failsafe(mode=Mode.HOLD), timing_of(robot)
@@ -281,7 +281,7 @@ def test_without_bounds_everything_is_believed(robot: RobotConfig) -> None:
     assert judge(msgspec.structs.replace(robot, law=law), wild) is Outside.NOTHING
 
 
-def test_what_is_not_believed_is_refused_counted_and_told(robot: RobotConfig) -> None:
+def test_an_implausible_command_is_refused_counted_and_reported(robot: RobotConfig) -> None:
     failsafe, timing = Failsafe(), timing_of(robot)
     told = middle(robot)
     assert failsafe.offer(told, T0, timing, Outside.K_P) is Refusal.OUT_OF_ENVELOPE
@@ -298,14 +298,14 @@ def test_what_no_service_takes_is_named_too(robot: RobotConfig) -> None:
     assert failsafe.outside is Outside.K_P
 
 
-def test_what_is_refused_for_another_reason_says_nothing_of_belief(robot: RobotConfig) -> None:
+def test_a_refusal_for_another_reason_does_not_mention_belief(robot: RobotConfig) -> None:
     failsafe, timing = Failsafe(), timing_of(robot)
     old = middle(robot, echo_t_ns=T0 - timing.max_command_age_ns - 1)
     assert failsafe.offer(old, T0, timing, Outside.K_P) is Refusal.TOO_OLD
     assert failsafe.outside is Outside.NOTHING
 
 
-def test_a_state_tells_what_is_not_believed(robot: RobotConfig) -> None:
+def test_a_state_reports_what_is_not_believed(robot: RobotConfig) -> None:
     """Until 50 ms have passed in which nothing came: the planner that said it is gone."""
     controller = JointController(robot, MODULE)
     controller.step(T0, None, middle(robot, k_p=(0.0, 0.0)), estop=False)

@@ -75,7 +75,7 @@ def test_odd_samples_that_are_not_in_a_row_are_only_left_out(samples: JointEstim
     assert samples.pos == (1.0, -2.0)
 
 
-def test_an_axis_that_disarms_is_told_even_by_an_odd_sample(samples: JointEstimate) -> None:
+def test_an_axis_that_disarms_is_reported_even_by_an_odd_sample(samples: JointEstimate) -> None:
     rejected_count = reading(T0 + PERIOD, (0.0, 0.0), status=DriveStatus.ERROR)
     assert samples.take(rejected_count, armed=True) is Event.DRIVE_DISARMED
     assert samples.pos == (1.0, -2.0)

@@ -156,7 +156,7 @@ def test_a_drive_that_answers_is_armed_with_its_latched_errors(
     assert rig.mode is Mode.HOLD
 
 
-def test_a_torque_drive_that_somebody_else_armed_is_armed_by_us_before_it_is_held(
+def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held(
     robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = Rig(with_service(robot, loop="service"), monkeypatch)

@@ -57,7 +57,7 @@ def test_what_is_being_written_or_never_was_is_not_known(kind: str) -> None:
     )
 
 
-def test_who_holds_beside_whom() -> None:
+def test_which_module_holds_beside_which() -> None:
     """Each module against each other's mode, age and whether it is caught."""
     ages = (-STALE_NS, -1, 0, GONE_NS, GONE_NS + 1)
     for asks, other, mode, age_ns, caught in product(MODULES, MODULES, Mode, ages, (0, 1)):
@@ -74,7 +74,7 @@ def test_who_holds_beside_whom() -> None:
         assert found.stiffen is stiffens, (asks, other, mode, age_ns)
 
 
-def test_a_drive_that_was_never_heard_of_is_not_limp() -> None:
+def test_a_drive_that_never_sent_a_state_is_not_limp() -> None:
     for asks, other in (("hip_right", "knee_left"), ("knee_right", "ankle_left")):
         assert not view_of(asks, rows(**{other: NeighbourRow(0, 0.0, 0.0, Mode.FAULT)}), T0).stiffen
         assert view_of(asks, rows(**{other: NeighbourRow(1, 0.0, 0.0, Mode.FAULT)}), T0).stiffen

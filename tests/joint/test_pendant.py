@@ -30,7 +30,7 @@ def test_it_is_lost_once_it_has_been_silent_for_longer_than_it_may() -> None:
     assert not watch.lost, "laid down"
 
 
-def test_where_the_whole_machine_stood_still_nobody_was_silent() -> None:
+def test_where_the_whole_machine_stood_still_no_process_was_silent() -> None:
     watch = PendantWatch(100.0)
     now_ns = silent(watch, 1, 10**12, 10)
     assert not watch.is_lost(now_ns + 10**10, 1)

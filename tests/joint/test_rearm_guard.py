@@ -130,7 +130,7 @@ def test_after_an_emergency_stop_a_drive_that_has_let_go_is_not_armed(
 
 
 @pytest.mark.parametrize("last_state", [LastState.NOTHING, LastState.HELD])
-def test_a_drive_that_holds_is_left_alone_until_a_planner_is_heard(
+def test_a_drive_that_holds_is_left_alone_until_a_planner_sends(
     robot: RobotConfig, last_state: LastState
 ) -> None:
     """Taken over with stand gains, beside a knee on soft ones, it tipped the robot."""
@@ -222,7 +222,7 @@ def test_an_emergency_stop_waits_until_the_drive_is_known(robot: RobotConfig, un
     )
 
 
-def test_whoever_zeroes_a_drive_asks_for_it(robot: RobotConfig) -> None:
+def test_zeroing_a_drive_needs_a_request(robot: RobotConfig) -> None:
     service = Successor(robot, LastState.HELD, DriveStatus.UNZEROED)
     assert DriveCommand.ARM not in {step.command for step in service.run(NS_PER_S)}
     service.status = DriveStatus.IDLE

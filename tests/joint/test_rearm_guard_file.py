@@ -33,7 +33,7 @@ def file(tmp_path: Path) -> RearmGuard:
     return RearmGuard(tmp_path, MODULE)
 
 
-def test_where_nobody_was_nothing_is_left(file: RearmGuard) -> None:
+def test_without_a_predecessor_there_is_no_last_state(file: RearmGuard) -> None:
     assert file.read() is LastState.NOTHING
 
 
@@ -45,7 +45,7 @@ def test_what_a_process_leaves_the_next_one_reads(tmp_path: Path, last_state: La
 
 
 @pytest.mark.parametrize("byte", [3, 0x20, 0xFF])
-def test_what_is_no_will_counts_as_held(tmp_path: Path, byte: int) -> None:
+def test_an_unreadable_last_state_counts_as_held(tmp_path: Path, byte: int) -> None:
     path_of(tmp_path, MODULE).write_bytes(bytes([byte]))
     assert RearmGuard(tmp_path, MODULE).read() is LastState.HELD
 
@@ -115,7 +115,7 @@ def test_where_no_service_is_nothing_is_stopped(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_pendant_is_heard_by_those_that_are_there(tmp_path: Path, file: RearmGuard) -> None:
+def test_a_pendant_reaches_the_services_that_run(tmp_path: Path, file: RearmGuard) -> None:
     other = RearmGuard(tmp_path, "hip_left")
     pendant = Pendant(tmp_path, MODULES)
     assert set(pendant.modules) == {MODULE, "hip_left"}
@@ -134,7 +134,7 @@ def test_a_pendant_from_before_is_forgotten_with_the_rest(tmp_path: Path, file: 
     assert file.beats == 0
 
 
-def test_a_pendant_is_heard_through_a_file_of_before_pendants(tmp_path: Path) -> None:
+def test_a_pendant_reaches_a_service_through_a_file_older_than_pendants(tmp_path: Path) -> None:
     path_of(tmp_path, MODULE).write_bytes(bytes([LastState.HELD, 0]))
     Pendant(tmp_path, MODULES).beat()
     found = RearmGuard(tmp_path, MODULE)
@@ -148,7 +148,7 @@ def test_the_file_does_not_grow_and_a_stop_is_one_byte_of_it(tmp_path: Path) -> 
     assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14)
 
 
-def test_what_was_found_is_not_said_again(tmp_path: Path, left: RearmGuard) -> None:
+def test_a_found_error_is_not_reported_again(tmp_path: Path, left: RearmGuard) -> None:
     successor = RearmGuard(tmp_path, MODULE)
     clear(tmp_path, MODULE)
     successor.write(LastState.HELD)

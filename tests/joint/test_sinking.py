@@ -61,7 +61,7 @@ def test_a_hip_levels_as_softly_as_its_stiffness_has_risen(robot: RobotConfig) -
         assert found.k_p[1] == pytest.approx(share * most)
 
 
-def test_a_hip_that_never_heard_of_its_leg_damps(robot: RobotConfig) -> None:
+def test_a_hip_that_never_received_its_legs_states_damps(robot: RobotConfig) -> None:
     sinking, frozen_setpoint = begun(robot, "hip_right")
     found = sinking.law(frozen_setpoint, LONG_NS, Q, UNKNOWN)
     assert found.k_p[1] == 0.0
@@ -70,7 +70,7 @@ def test_a_hip_that_never_heard_of_its_leg_damps(robot: RobotConfig) -> None:
     assert sinking.upright is None
 
 
-def test_a_leg_that_is_not_heard_of_any_more_is_taken_to_stay(robot: RobotConfig) -> None:
+def test_a_leg_without_fresh_states_is_taken_to_stay(robot: RobotConfig) -> None:
     sinking, frozen_setpoint = begun(robot, "hip_right")
     sinking.law(frozen_setpoint, 0, Q, NeighbourView((0.3, 0.05)))
     sinking.law(frozen_setpoint, 1, Q, NeighbourView((0.35, 0.05)))

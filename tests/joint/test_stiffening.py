@@ -52,7 +52,7 @@ def at_least(robot: RobotConfig, module: str, k_p: Pair, k_d: Pair) -> tuple[Pai
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_told_to_it_rises_to_its_support_gains_within_the_blend_time(
+def test_on_request_it_rises_to_its_support_gains_within_the_blend_time(
     robot: RobotConfig, module: str
 ) -> None:
     bench = holding(robot, module)
@@ -68,7 +68,7 @@ def test_told_to_it_rises_to_its_support_gains_within_the_blend_time(
     assert (stiffened.q_ref, stiffened.v_ref, stiffened.tau_ff, stiffened.tau_coupled) == frozen
 
 
-def test_a_hip_that_is_not_told_to_stays_as_soft_as_the_hand_needs_it(robot: RobotConfig) -> None:
+def test_a_hip_without_the_flag_stays_as_soft_as_the_hand_needs_it(robot: RobotConfig) -> None:
     bench = holding(robot, "hip_left")
     bench.run(1000, fresh=True, hold=True)
     assert bench.controller.setpoint.k_p[1] == SOFT_P[1]

@@ -12,7 +12,7 @@ from shared.config.robot_config import RobotConfig
 from tests.joint.test_loop import Rig
 
 
-def test_a_stop_by_shared_memory_is_heard_in_the_next_cycle_by_a_service_without_a_bus(
+def test_a_stop_by_shared_memory_acts_in_the_next_cycle_of_a_service_without_a_bus(
     robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     rig = Rig(robot, monkeypatch, RearmGuard(tmp_path, "knee_right"))

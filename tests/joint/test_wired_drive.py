@@ -116,7 +116,7 @@ def test_a_read_only_drive_is_sent_nothing_at_all(inner: Recorder) -> None:
 
 
 @pytest.mark.parametrize("status", DriveStatus)
-def test_a_read_only_drive_tells_all_but_that_somebody_armed_it(
+def test_a_read_only_drive_reports_all_but_a_foreign_arming(
     inner: Recorder, status: DriveStatus
 ) -> None:
     inner.reading = at((1.0, 2.0), status)
@@ -136,9 +136,9 @@ def test_a_motor_that_counts_down_is_the_same_joint(pos: Pair, signs: tuple[int,
     inner = Recorder()
     drive: Drive = WiredDrive(inner, MotorFrame(MARK, signs))
     drive.set_position(pos)
-    told = inner.sent.pop()
-    assert told == (signs[0] * (pos[0] + MARK), signs[1] * (pos[1] + MARK))
-    inner.reading = DriveReading(7, told, (0.5, -0.5), DriveStatus.ARMED, 0, (0.1, 0.2))  # type: ignore[arg-type]
+    target = inner.sent.pop()
+    assert target == (signs[0] * (pos[0] + MARK), signs[1] * (pos[1] + MARK))
+    inner.reading = DriveReading(7, target, (0.5, -0.5), DriveStatus.ARMED, 0, (0.1, 0.2))  # type: ignore[arg-type]
     reading = drive.read(0.0)
     assert reading is not None
     assert reading.status is DriveStatus.ARMED

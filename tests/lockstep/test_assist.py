@@ -47,8 +47,8 @@ def test_the_assist_comes_true_with_a_payload_the_planner_does_not_know(
 
 def test_with_the_load_found_it_comes_true_without_the_integral(robot: RobotConfig) -> None:
     off = msgspec.structs.replace(robot.assist, integral_max=0.0)
-    heard = truths(msgspec.structs.replace(robot, assist=off), RESTING, -2.0)
-    given = np.mean([t.harness_force_z for t in heard if t.scenario_s > 17.0])
+    with_mass = truths(msgspec.structs.replace(robot, assist=off), RESTING, -2.0)
+    given = np.mean([t.harness_force_z for t in with_mass if t.scenario_s > 17.0])
     assert given == pytest.approx(200.0, abs=10.0)
 
 

@@ -216,11 +216,11 @@ def test_a_command_is_all_that_the_shipped_planner_asks_for_as_one_torque(
     now = NS_PER_S
     for seq in range(1, 4):
         now += 4 * NS_PER_MS
-        heard = states(robot, now, seq)
-        for index, state in enumerate(heard):
+        received = states(robot, now, seq)
+        for index, state in enumerate(received):
             shipped.receive_state(index, state, now)
             central.receive_state(index, state, now)
-        for state, whole, parts in zip(heard, central.tick(now), shipped.tick(now), strict=True):
+        for state, whole, parts in zip(received, central.tick(now), shipped.tick(now), strict=True):
             wanted = pd_law.torque(pd_law.extrapolate(parts, 0.0), state.q, state.v)
             assert whole.tau_ff == pytest.approx(wanted, abs=1e-12)
             assert whole.k_p == whole.k_d == whole.tau_coupled == whole.dtau_ff == pd_law.ZERO
@@ -229,12 +229,12 @@ def test_a_command_is_all_that_the_shipped_planner_asks_for_as_one_torque(
             assert whole.echo_t_ns == parts.echo_t_ns
 
 
-def test_once_it_leads_the_planner_leads_whatever_it_hears(robot: RobotConfig) -> None:
+def test_once_it_leads_the_planner_leads_whatever_it_receives(robot: RobotConfig) -> None:
     planners = Planner(robot, 1), CentralPlanner(robot, 1)
-    heard = states(robot, NS_PER_S, 1)
+    received = states(robot, NS_PER_S, 1)
     modes = []
     for planner in planners:
-        for index, state in enumerate(heard):
+        for index, state in enumerate(received):
             planner.receive_state(index, state, NS_PER_S)
         for tick in range(3):
             planner.tick(NS_PER_S + tick * 4 * NS_PER_MS)
@@ -258,7 +258,7 @@ def knows_it(imports: list[Import]) -> bool:
         "def f():\n    import tools.runs.centralised.control as c",
     ],
 )
-def test_whoever_imports_it_is_seen_however_it_is_written(source: str) -> None:
+def test_every_importer_is_seen_however_it_is_written(source: str) -> None:
     assert knows_it(imports_in(source))
     assert not knows_it(imports_in(source.replace("centralised", "centralised_else")))
 
@@ -276,7 +276,7 @@ def test_nothing_but_two_tools_knows_it_and_no_file_names_it() -> None:
     assert CONTROLS[SHIPPED] is Lockstep
 
 
-def test_a_run_of_it_says_so_and_cannot_be_taken_for_the_services_own(
+def test_a_run_of_it_is_marked_and_cannot_be_mistaken_for_the_services_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = ("--duration", "0.2", "--kill", "planner@0.1", "--control", "centralised")

@@ -36,8 +36,8 @@ def margin_of(case: CertificateCase) -> float:
 def outcome(
     case: CertificateCase, *, stood: bool, margin: float | None = None
 ) -> CertificateResult:
-    told = case.weakest.margin if margin is None else margin
-    case = case._replace(weakest=case.weakest._replace(margin=told))
+    predicted = case.weakest.margin if margin is None else margin
+    case = case._replace(weakest=case.weakest._replace(margin=predicted))
     return CertificateResult(case, stood, not stood, 1.0, 0.01, 0.01, 0.5)
 
 
@@ -118,7 +118,14 @@ def test_the_same_number_is_the_same_case_whatever_was_drawn_before(
     assert again.nudge == case.nudge
 
 
-def test_confusion_counts_what_was_said_against_what_came() -> None:
-    said = [(0.5, True), (0.2, True), (0.1, False), (-0.3, False), (-0.4, False), (-0.5, False)]
-    assert study.confusion(said) == (2, 1, 0, 3)
-    assert study.threshold(said) == pytest.approx(0.15)
+def test_confusion_counts_predictions_against_outcomes() -> None:
+    predicted = [
+        (0.5, True),
+        (0.2, True),
+        (0.1, False),
+        (-0.3, False),
+        (-0.4, False),
+        (-0.5, False),
+    ]
+    assert study.confusion(predicted) == (2, 1, 0, 3)
+    assert study.threshold(predicted) == pytest.approx(0.15)

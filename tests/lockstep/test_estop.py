@@ -92,10 +92,10 @@ def stop(
 ) -> Stopped:
     """Lead to a pose in 3 s, let go and stop at 3.8 s; go on for 10 s."""
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=3.0, height=height, pitch=pitch))
-    told = still(14.0, kill=kills, restart=restarts, fault=faults, push=())
-    told = msgspec.structs.replace(told, keyframe=frames)
+    scenario = still(14.0, kill=kills, restart=restarts, fault=faults, push=())
+    scenario = msgspec.structs.replace(scenario, keyframe=frames)
     law = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))  # led whatever it carries
-    fleet = Lockstep(msgspec.structs.replace(robot, law=law), told, plant=plant)
+    fleet = Lockstep(msgspec.structs.replace(robot, law=law), scenario, plant=plant)
     pitches, heights = [], []
     for truth in fleet.run():
         if truth.scenario_s >= 3.8 and not fleet.estop:
@@ -112,7 +112,7 @@ def stop(
 
 
 @pytest.mark.parametrize(("height", "pitch", "errors"), STOPPED)
-def test_with_nobody_holding_on_the_torso_stays_as_it_stood(
+def test_without_a_holder_the_torso_stays_as_it_stood(
     robot: RobotConfig, height: float, pitch: float, errors: dict[str, Any]
 ) -> None:
     """It turned back by 1.5 to 2.5 rad, and fell with the COM 5 cm back and 10 cm up."""

@@ -67,7 +67,7 @@ def test_a_faulted_module_goes_to_fault_for_the_cause_in_its_row_and_the_other_f
 
 
 @pytest.mark.parametrize("kind", FAULT_KINDS)
-def test_both_axes_of_a_module_are_limp_or_neither_is_as_its_row_says(
+def test_both_axes_of_a_module_are_limp_or_neither_is_by_its_row(
     robot: RobotConfig, kind: FaultKind
 ) -> None:
     bank = run_with(robot, kind).lockstep.bank

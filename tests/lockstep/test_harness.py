@@ -29,16 +29,16 @@ def record(
     robot: RobotConfig, scenario: Scenario, delay_ms: float = 1.0, seed: int = 0
 ) -> tuple[Lockstep, list[Message]]:
     """Run a scenario; return every wrench, status and truth in the order of the log."""
-    heard: list[Message] = []
+    received: list[Message] = []
 
     def take(_topic: Topic, _module: str, message: Message) -> None:
         if isinstance(message, Wrench | PlannerStatus | SimTruth):
-            heard.append(message)
+            received.append(message)
 
     fleet = Lockstep(robot, scenario, Impairment(delay_ms=delay_ms), seed=seed, record=take)
     for _ in fleet.run():
         pass
-    return fleet, heard
+    return fleet, received
 
 
 def of(kind: type[Message], heard: list[Message]) -> list[Message]:
@@ -77,7 +77,7 @@ def test_the_tare_is_done_on_the_hoist_before_anything_loads_the_harness(
     assert all(m.hoist > 0.5 and m.harness_force_z == 0.0 for m in hoisted)
 
 
-def test_the_planner_hears_the_wrench_after_the_links_delay(robot: RobotConfig) -> None:
+def test_the_planner_receives_the_wrench_after_the_links_delay(robot: RobotConfig) -> None:
     _, heard = record(robot, still(0.5), delay_ms=8.0)
     sent = {m.seq: m.t_ns for m in heard if isinstance(m, Wrench)}
     ages_ms = [
@@ -117,25 +117,25 @@ def test_the_sensors_noise_reaches_the_robot_through_the_law_only(robot: RobotCo
 def test_a_tare_on_request_takes_what_rests_on_the_harness_for_its_zero(
     robot: RobotConfig,
 ) -> None:
-    heard: list[Wrench] = []
+    received: list[Wrench] = []
 
     def take(_topic: Topic, _module: str, message: Message) -> None:
         if isinstance(message, Wrench):
-            heard.append(message)
+            received.append(message)
 
     fleet = Lockstep(unheeded(robot), leaning(150.0), record=take)
     loaded: Wrench | None = None
     for truth in fleet.run():
         if loaded is None and truth.scenario_s >= 2.7:
-            loaded = heard[-1]
+            loaded = received[-1]
             fleet.harness.tare(TareRequest(t_ns=fleet.now_ns, seq=1, source="a test"))
     assert loaded is not None
     assert loaded.valid
     assert np.linalg.norm(loaded.force) > 100.0
-    after = heard[heard.index(loaded) + 1 :]
+    after = received[received.index(loaded) + 1 :]
     assert {m.tare for m in after if not m.valid} == {Tare.RUNNING}
-    assert heard[-1].valid
-    assert np.linalg.norm(heard[-1].force) < 10.0
+    assert received[-1].valid
+    assert np.linalg.norm(received[-1].force) < 10.0
 
 
 def test_the_topic_of_the_wrench_is_recorded(robot: RobotConfig) -> None:

@@ -27,9 +27,9 @@ def run(
 ) -> tuple[Lockstep, list[tuple[float, float, float]]]:
     """Return the fleet after 8 s, and (time, torso's height, pitch) from letting go on."""
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.0, height=height))
-    told = variant("stand", duration=8.0, keyframe=frames, kill=(), push=())
+    scenario = variant("stand", duration=8.0, keyframe=frames, kill=(), push=())
     plant = changed(PlantConfig(), errors)
-    fleet = Lockstep(robot, told, Impairment(delay_ms=1.0), plant=plant)
+    fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0), plant=plant)
     poses = []
     for row in fleet.run():
         assert not row.fallen

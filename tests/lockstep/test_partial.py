@@ -70,7 +70,7 @@ def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_
     assert outcome.operator_end_n < 75.0, "44 to 50 measured: it leads, and is not at its limit"
 
 
-def test_with_nothing_failed_nobody_holds(robot: RobotConfig, start: PartialStart) -> None:
+def test_with_nothing_failed_no_module_holds(robot: RobotConfig, start: PartialStart) -> None:
     outcome = run_case(PartialCase("links", ()), robot, start)
     assert outcome.stood
     assert outcome.hold_shown_ms is None
@@ -110,7 +110,7 @@ def test_of_links_and_services_the_sample_has_each_module_and_each_leg() -> None
         assert {*LEGS, *((m,) for m in MODULES)} < {case.modules for case in sample(kind)}
 
 
-def test_there_are_64_subsets_and_each_kind_fails_what_it_says() -> None:
+def test_there_are_64_subsets_and_each_kind_fails_as_named() -> None:
     assert len(SUBSETS) == len(set(SUBSETS)) == 64
     assert len(list(partial.cases())) == 64 * len(KINDS)
     cut = {

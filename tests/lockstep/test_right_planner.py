@@ -86,8 +86,8 @@ def test_while_the_hand_leads(robot: RobotConfig, judged: Judged, name: str) -> 
 
 
 def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: Judged) -> None:
-    told = variant("squat", duration=5.0, kill=kill(1.0), restart=restart(1.6), push=())
-    fleet = run(robot, told, Impairment(delay_ms=1.0))
+    scenario = variant("squat", duration=5.0, kill=kill(1.0), restart=restart(1.6), push=())
+    fleet = run(robot, scenario, Impairment(delay_ms=1.0))
     believed(judged)
     assert fleet.planner is not None
     assert fleet.planner.status(fleet.now_ns, 0.0).mode == PlannerMode.LEADING
@@ -103,8 +103,8 @@ def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: 
     ids=lambda network: f"{network.delay_ms:g}-{network.jitter_ms:g}-{network.loss:g}",
 )
 def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairment) -> None:
-    told = variant("stand", duration=4.0, keyframe=DOWN, push=(push(1.0, 0.0, 40.0, 0.0),))
-    run(robot, told, network)
+    scenario = variant("stand", duration=4.0, keyframe=DOWN, push=(push(1.0, 0.0, 40.0, 0.0),))
+    run(robot, scenario, network)
     believed(judged)
 
 
@@ -123,8 +123,8 @@ def test_at_the_corners_of_a_stance(
     robot: RobotConfig, judged: Judged, right: tuple[float, float, float]
 ) -> None:
     plant = changed(PlantConfig(), {"feet.offset_right": list(right)})
-    told = variant("stand", duration=4.0, keyframe=DOWN, push=())
-    run(robot, told, Impairment(delay_ms=1.0), plant)
+    scenario = variant("stand", duration=4.0, keyframe=DOWN, push=())
+    run(robot, scenario, Impairment(delay_ms=1.0), plant)
     believed(judged)
 
 
@@ -135,8 +135,8 @@ def test_on_drawn_plants_under_pushes_of_three_quarters_of_the_physical_limit(
     pushes = PushRange(robot)
     angles = (0.0, math.pi, math.pi / 2, -2.0)
     hard: tuple[Push, ...] = (pushes.push(2.0, 0.3, 0.75, angles[number]),)
-    told = variant("stand", duration=4.5, keyframe=DOWN, push=hard)
-    run(robot, told, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
+    scenario = variant("stand", duration=4.5, keyframe=DOWN, push=hard)
+    run(robot, scenario, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
     believed(judged)
 
 
@@ -146,13 +146,13 @@ def test_held_off_centre_it_is_believed_and_leads_again(
 ) -> None:
     """Cut off as a push has moved it, it holds there; led again it begins from the middle."""
     x, y = (50.0 * part for part in direction)
-    told = variant(
+    scenario = variant(
         "stand",
         duration=7.0,
         push=(Push(at=0.5, duration=0.4, force=(x, y, 0.0)),),
         inject=(Inject(link="planner->joints", at=0.8, partition=True, duration=1.0),),
     )
-    fleet = Lockstep(robot, told, Impairment(delay_ms=1.0))
+    fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0))
     held = []
     for row in fleet.run():
         assert not row.fallen

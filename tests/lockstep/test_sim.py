@@ -80,11 +80,11 @@ def test_bad_input_is_one_clear_line(
     assert words in capsys.readouterr().err
 
 
-def test_a_stance_that_is_not_led_is_told_in_words(
+def test_a_stance_that_is_not_led_is_reported_in_words(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     far = ("--plant", "feet.offset_right=[0.2,0,0]")
     assert sim(tmp_path, "--duration", "1", *far) == 2
-    said = capsys.readouterr().err
-    assert "the planner did not lead" in said
-    assert "ahead of the left" in said
+    output = capsys.readouterr().err
+    assert "the planner did not lead" in output
+    assert "ahead of the left" in output

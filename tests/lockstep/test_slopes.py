@@ -31,13 +31,13 @@ def over_mm(outcome: Run) -> float:
 def test_with_an_imu_it_squats_on_five_degrees_is_pushed_and_stands_when_the_planner_dies(
     robot: RobotConfig, slope: tuple[float, float]
 ) -> None:
-    told = variant(
+    scenario = variant(
         "squat",
         duration=6.0,
         kill=(Kill(service="planner", at=4.0),),
         push=(push(1.0, 30.0, 0.0, 0.0), push(2.5, 0.0, 30.0, 0.0), push(4.5, -25.0, -25.0, 0.0)),
     )
-    outcome = run(with_imu(robot), told, plant=sloping(*slope))
+    outcome = run(with_imu(robot), scenario, plant=sloping(*slope))
     assert outcome.stood
     assert over_mm(outcome) < 50.0
     assert np.abs(outcome.operator_n[outcome.t < 4.0]).max() < 30.0
@@ -48,8 +48,8 @@ def test_when_the_imu_falls_silent_the_last_slope_stands(robot: RobotConfig) -> 
     cut = (Inject(link="imu->planner", at=0.5, partition=True),)
     leans = (Keyframe(at=0.5, height=1.188), Keyframe(at=2.5, height=1.0, pitch=0.4))
     pushed = (push(2.8, 0.0, 30.0, 0.0),)
-    told = variant("stand", duration=4.0, keyframe=leans, inject=cut, push=pushed)
-    outcome = run(with_imu(robot), told, plant=sloping(5.0, 0.0))
+    scenario = variant("stand", duration=4.0, keyframe=leans, inject=cut, push=pushed)
+    outcome = run(with_imu(robot), scenario, plant=sloping(5.0, 0.0))
     assert outcome.stood
     assert over_mm(outcome) < 30.0
     assert outcome.lockstep.planner is not None
@@ -58,8 +58,8 @@ def test_when_the_imu_falls_silent_the_last_slope_stands(robot: RobotConfig) -> 
 
 
 def test_on_a_level_floor_an_imu_changes_little_that_the_hand_feels(robot: RobotConfig) -> None:
-    told = variant("squat", duration=4.0, kill=(), push=())
-    outcome = run(with_imu(robot), told, plant=sloping(0.0, 0.0))
+    scenario = variant("squat", duration=4.0, kill=(), push=())
+    outcome = run(with_imu(robot), scenario, plant=sloping(0.0, 0.0))
     assert outcome.stood
     assert np.abs(outcome.operator_n).max() < 26.0, "23 N measured, 19 without an IMU"
     assert over_mm(outcome) < 20.0

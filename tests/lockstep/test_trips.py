@@ -55,10 +55,10 @@ def causes(fleet: Lockstep) -> set[Cause]:
 @pytest.mark.parametrize("name", SHAKEN)
 def test_a_robot_that_shook_itself_down_stands_in_hold(robot: RobotConfig, name: str) -> None:
     shaky = unfiltered(robot)
-    told = still(4.0, push=(Push(at=3.0, duration=0.3, force=(40.0, 0.0, 0.0)),))
-    _, _, fell = run(untripped(shaky), told, PLANTS[name])
+    scenario = still(4.0, push=(Push(at=3.0, duration=0.3, force=(40.0, 0.0, 0.0)),))
+    _, _, fell = run(untripped(shaky), scenario, PLANTS[name])
     assert fell, "nothing is proved by a robot that would have stood"
-    fleet, _, fell = run(shaky, told, PLANTS[name])
+    fleet, _, fell = run(shaky, scenario, PLANTS[name])
     assert not fell
     assert Cause.SHAKING in causes(fleet)
     led_s = [
@@ -171,7 +171,7 @@ def test_a_fast_lead_and_one_beyond_what_legs_reach_are_followed(
         Keyframe(at=1.0, height=1.188),
         Keyframe(at=1.0 + ways_s, height=height, pitch=pitch),
     )
-    told = variant("stand", duration=4.0, keyframe=frames, kill=(), push=())
-    fleet, _, fell = run(robot, told, PlantConfig())
+    scenario = variant("stand", duration=4.0, keyframe=frames, kill=(), push=())
+    fleet, _, fell = run(robot, scenario, PlantConfig())
     assert not fell
     assert causes(fleet) == {Cause.DRIVE_ARMED, Cause.COMMANDS_FRESH}

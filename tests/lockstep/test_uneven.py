@@ -53,14 +53,16 @@ def assert_it_stood_and_tracked(result: Run) -> None:
 def test_it_stands_through_pushes_while_all_six_track(
     robot: RobotConfig, network: str, pushes: tuple[Push, ...]
 ) -> None:
-    told = variant("squat", duration=7.0, kill=(), push=pushes, inject=UNEVEN[network])
-    assert_it_stood_and_tracked(run(robot, told))
+    scenario = variant("squat", duration=7.0, kill=(), push=pushes, inject=UNEVEN[network])
+    assert_it_stood_and_tracked(run(robot, scenario))
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "hip_left"])
 def test_so_it_does_with_any_other_module_late(robot: RobotConfig, module: str) -> None:
-    told = still(5.0, height=1.0, push=(push(2.4, 0.0, 60.0, 0.0),), inject=one_late(module, 22.0))
-    assert_it_stood_and_tracked(run(robot, told))
+    scenario = still(
+        5.0, height=1.0, push=(push(2.4, 0.0, 60.0, 0.0),), inject=one_late(module, 22.0)
+    )
+    assert_it_stood_and_tracked(run(robot, scenario))
 
 
 class Steps(Lockstep):
@@ -98,14 +100,14 @@ def test_two_hips_a_little_late_do_not_make_the_legs_shake(
 def test_a_drop_out_in_the_middle_of_a_sway_is_not_held_off_centre(robot: RobotConfig) -> None:
     """Led from where the sway was, and lost again, HOLD stood 25 mm to the side, and fell."""
     frames = tuple(Keyframe(at=t, height=h) for t, h in ((0.0, 1.188), (1.0, 1.188), (3.0, 0.948)))
-    told = variant(
+    scenario = variant(
         "stand",
         duration=6.0,
         keyframe=frames,
         push=tuple(push(t, 0.0, 40.0, 0.0) for t in (1.6, 3.1, 4.6)),
         inject=(Inject(link="ankle_left->planner", at=0.3, loss=0.7, burst=5),),
     )
-    fleet = Lockstep(robot, told, Impairment(delay_ms=1.0), seed=2038)
+    fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0), seed=2038)
     rows = list(fleet.run())
     assert not any(row.fallen for row in rows)
     assert max(abs(row.com[1]) for row in rows) < 0.055

@@ -100,7 +100,7 @@ def test_there_are_300_wrong_planners() -> None:
 
 
 @pytest.mark.parametrize("number", range(0, len(NAMES), EVERY))
-def test_it_stands_whatever_its_planner_says(
+def test_it_stands_whatever_its_planner_sends(
     robot: RobotConfig, begins: list[Begin], number: int
 ) -> None:
     ended = end(robot, begins[number // EVERY % len(begins)], NAMES[number])
@@ -119,7 +119,7 @@ def test_it_stands_whatever_its_planner_says(
         ("margin 0", Outside.MARGIN),
     ],
 )
-def test_it_holds_and_says_what_it_does_not_believe(
+def test_it_holds_and_reports_what_it_does_not_believe(
     robot: RobotConfig, begins: list[Begin], name: str, outside: Outside
 ) -> None:
     ended = end(robot, begins[0], name)

@@ -28,13 +28,13 @@ def batch(body: bytes, number: int = 0) -> bytes:
     return struct.pack("<H", len(whole)) + whole
 
 
-def numbers_in(heard: bytes) -> list[int]:
+def numbers_in(rest: bytes) -> list[int]:
     """Return the number of each whole batch."""
     found = []
-    while heard:
-        end = 2 + struct.unpack_from("<H", heard)[0]
-        found.append(struct.unpack_from("<I", heard, end - 4)[0])
-        heard = heard[end:]
+    while rest:
+        end = 2 + struct.unpack_from("<H", rest)[0]
+        found.append(struct.unpack_from("<I", rest, end - 4)[0])
+        rest = rest[end:]
     return found
 
 

@@ -41,7 +41,7 @@ def rig() -> Rig:
     return Rig()
 
 
-def test_what_begins_is_in_force_on_every_direction_of_the_link_and_told(rig: Rig) -> None:
+def test_what_begins_is_active_in_both_directions_of_the_link_and_reported(rig: Rig) -> None:
     reply = rig.orders.obey(Begin(DELAY))
     assert [row.link for row in reply.requested] == ["planner->joints"]
     assert reply.requested[0].left_s is None
@@ -53,7 +53,7 @@ def test_what_begins_is_in_force_on_every_direction_of_the_link_and_told(rig: Ri
     assert [e.seq for e in rig.told] == list(range(1, 7))
 
 
-def test_what_has_its_time_ends_by_itself_and_tells_what_it_took(rig: Rig) -> None:
+def test_an_impairment_with_a_duration_ends_by_itself_and_reports_its_counts(rig: Rig) -> None:
     rig.orders.obey(Begin(LOSS))
     for number in range(100):
         rig.directions["knee_left->planner"].passes(number, 10)
@@ -74,7 +74,7 @@ def test_clearing_a_link_ends_what_touches_it_and_leaves_the_rest(rig: Rig) -> N
     assert rig.orders.obey(Clear()).requested == ()
 
 
-def test_counts_are_told_while_it_lasts(rig: Rig) -> None:
+def test_counts_are_reported_while_it_lasts(rig: Rig) -> None:
     rig.orders.obey(Begin(LOSS))
     for number in range(50):
         rig.directions["planner->knee_left"].passes(number, 10)
@@ -118,7 +118,7 @@ def test_what_is_asked_for_later_begins_and_ends_when_it_is_due(rig: Rig) -> Non
     assert rig.orders.obey(List()).requested[0].hidden == ()
 
 
-def test_what_another_one_hides_is_told(rig: Rig) -> None:
+def test_a_hidden_impairment_is_reported(rig: Rig) -> None:
     rig.orders.obey(Begin(LOSS))
     first, second = rig.orders.obey(Begin(DELAY)).requested
     assert first.hidden == COMMANDS
@@ -163,7 +163,7 @@ def test_the_client_asks_and_is_answered(served: tuple[Rig, Path]) -> None:
         client.clear("elbow")
 
 
-def test_rubbish_is_answered_with_an_error_and_the_next_is_heard(
+def test_rubbish_is_answered_with_an_error_and_the_next_request_is_served(
     served: tuple[Rig, Path],
 ) -> None:
     with socket.socket(socket.AF_UNIX) as asking:
@@ -177,7 +177,7 @@ def test_rubbish_is_answered_with_an_error_and_the_next_is_heard(
     assert ProxyClient(served[1]).list() == ()
 
 
-def test_without_an_injector_the_client_says_how_to_get_one(tmp_path: Path) -> None:
+def test_without_an_injector_the_client_names_how_to_get_one(tmp_path: Path) -> None:
     with pytest.raises(FleetError, match="xrl up --injectable"):
         ProxyClient(tmp_path).list()
 
@@ -254,7 +254,7 @@ def test_for_one_who_asks_and_never_reads_one_answer_is_kept(tmp_path: Path) -> 
         served.control.close()
 
 
-def test_those_who_ask_nothing_keep_nobody_else_out(tmp_path: Path) -> None:
+def test_idle_clients_keep_no_other_out(tmp_path: Path) -> None:
     served = Served(tmp_path)
     idle = [served.ask() for _ in range(2 * ASKERS_MAX)]
     assert len(served.control._askers) == ASKERS_MAX
@@ -268,7 +268,7 @@ def test_those_who_ask_nothing_keep_nobody_else_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "answer", [b"nonsense\n", b'{"requested": 3}\n', b"\xff\n", b'{"requested": [\n']
 )
-def test_an_answer_that_is_none_is_told_as_such(tmp_path: Path, answer: bytes) -> None:
+def test_an_invalid_answer_is_reported_as_such(tmp_path: Path, answer: bytes) -> None:
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(tmp_path / SOCKET))
         listener.listen()

@@ -14,7 +14,7 @@ CUT = Impairment(partition=True)
 CUT_STREAM = Impairment(partition=True, ordered=True)
 
 
-def test_the_end_of_a_link_is_seen_as_late_as_what_was_said_before_it(rig: Rig) -> None:
+def test_the_end_of_a_link_is_seen_as_late_as_the_messages_before_it(rig: Rig) -> None:
     planner, knee = rig.link()
     rig.there.begin(1, Impairment(delay_ms=10.0))
     rig.say(planner, 1)
@@ -45,7 +45,7 @@ def test_a_process_that_dials_again_is_linked_again(rig: Rig) -> None:
     assert rig.relay.links == 1
 
 
-def test_who_has_said_all_and_left_is_heard_to_the_end_by_one_who_is_slow(rig: Rig) -> None:
+def test_the_last_messages_of_a_sender_that_left_reach_a_slow_receiver(rig: Rig) -> None:
     planner, knee = rig.link()
     sent = 75 * batch(MESSAGE + bytes(4000))  # more than the kernel keeps for one socket
     assert rig.push(planner, sent) == b""
@@ -59,7 +59,7 @@ def test_who_has_said_all_and_left_is_heard_to_the_end_by_one_who_is_slow(rig: R
     assert rig.relay.links == 0
 
 
-def test_a_death_behind_a_partition_is_not_seen_by_one_who_speaks_to_it(rig: Rig) -> None:
+def test_a_death_behind_a_partition_is_not_seen_by_a_connected_peer(rig: Rig) -> None:
     planner, knee = rig.link()
     rig.there.begin(1, CUT)
     planner.close()
@@ -161,7 +161,7 @@ def test_what_a_link_takes_with_it_is_lost_and_has_not_passed(rig: Rig) -> None:
     assert (ended.passed, ended.lost) == (0, 100)
 
 
-def test_what_is_late_and_comes_to_nobody_is_lost_once_though_it_was_doubled(rig: Rig) -> None:
+def test_a_late_message_without_a_receiver_is_lost_once_though_it_was_doubled(rig: Rig) -> None:
     planner, knee = rig.link()
     rig.there.begin(1, Impairment(delay_ms=50.0, duplicate=1.0))
     rig.say(planner, 1, 2, 3)

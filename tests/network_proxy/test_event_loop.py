@@ -19,7 +19,7 @@ def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
         end.close()
 
 
-def test_it_calls_whom_it_was_told_for_what_it_was_told(
+def test_each_socket_calls_its_own_function_for_its_own_events(
     pair: tuple[socket.socket, socket.socket],
 ) -> None:
     near, far = pair

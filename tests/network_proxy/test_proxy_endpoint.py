@@ -29,7 +29,7 @@ def test_an_endpoint_is_an_address(endpoint: str, address: object) -> None:
     assert address_of(endpoint) == address
 
 
-def test_a_host_name_is_looked_up_once_before_anybody_dials() -> None:
+def test_a_host_name_is_looked_up_once_before_any_link() -> None:
     found = address_of("tcp/localhost:7447")
     socket.inet_pton(found.family, found.where[0])
 
@@ -158,7 +158,7 @@ def test_with_a_descriptor_for_one_end_only_neither_is_kept(rig: Rig) -> None:
     assert dialling.recv(1) == b""
 
 
-def test_a_place_dials_where_it_was_told(tmp_path: Path) -> None:
+def test_a_place_dials_its_own_endpoint(tmp_path: Path) -> None:
     where = str(tmp_path / "b")
     with listening(socket.AF_UNIX, where) as beyond:
         place = Place(PAIR, SocketListener(tmp_path / "t"), Address(socket.AF_UNIX, where))

@@ -26,7 +26,7 @@ def batch(text: str) -> bytes:
 
 
 @pytest.mark.parametrize("text", [INIT, OPEN, KEEP_ALIVE, CLOSE, DECLARE])
-def test_what_the_link_says_for_itself_must_not_be_lost(text: str) -> None:
+def test_control_messages_of_the_link_must_not_be_lost(text: str) -> None:
     assert not carries_messages(batch(text))
 
 

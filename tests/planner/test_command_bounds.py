@@ -25,12 +25,12 @@ def test_what_the_law_sends_in_a_stand_is_believed(
         two = slice(2 * index, 2 * index + 2)
         rows = (output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled)
         pairs = [tuple(row[two].tolist()) for row in (*rows, output.local.D, output.local.D_B)]
-        told = JointCommand(
+        command = JointCommand(
             t_ns=1, seq=1, session=1, echo_t_ns=1, hold=False, q_ref=pairs[0], v_ref=pairs[1],
             tau_ff=pairs[2], dtau_ff=pairs[3], tau_coupled=pairs[4], k_p=pairs[5], k_d=pairs[6],
             margin=output.local.margins.service, margin_onboard=output.local.margins.onboard,
         )  # fmt: skip
-        judged = Envelope(robot, module).judge(told, None, pairs[0], (0.0, 0.0))
+        judged = Envelope(robot, module).judge(command, None, pairs[0], (0.0, 0.0))
         assert judged is Outside.NOTHING, module
 
 

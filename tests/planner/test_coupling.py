@@ -56,7 +56,7 @@ def test_with_it_the_closed_rows_are_as_stiff_as_asked(seed: int, scale: float) 
     assert np.linalg.eigvalsh(left).min() > -1e-6 * max(scale, 1e4)
 
 
-def test_a_pole_follows_as_its_bandwidth_says() -> None:
+def test_a_pole_follows_its_bandwidth() -> None:
     """1 - exp(-2 pi f dt): after the time constant 63 % of a step."""
     assert pole_gain(2.0, 1.0 / (2.0 * np.pi * 2.0)) == pytest.approx(1.0 - np.exp(-1.0))
     assert pole_gain(0.0, 1.0) == 0.0

@@ -34,11 +34,11 @@ def leading() -> Engagement:
 def test_it_waits_aligns_and_leads_in_three_steps() -> None:
     engagement = Engagement()
     ready = but(YES, 4, False)
-    told = []
+    reported = []
     for fresh, modules_ready in ((but(YES, 2, False), ready), (YES, ready), (YES, ready)):
         engagement.advance(T0, fresh, modules_ready, HOLD)
-        told.append((engagement.mode, engagement.hold))
-    assert told == [
+        reported.append((engagement.mode, engagement.hold))
+    assert reported == [
         (PlannerMode.WAITING, True),
         (PlannerMode.ALIGNING, True),
         (PlannerMode.ALIGNING, True),
@@ -182,7 +182,7 @@ def test_a_silent_module_counts_before_what_is_forbidden(inhibit: PlannerMode) -
 
 
 @pytest.mark.parametrize("dropouts", range(len(WAITS_NS)))
-def test_it_tells_how_long_it_waits_and_leads_when_that_is_over(dropouts: int) -> None:
+def test_it_reports_how_long_it_waits_and_leads_when_that_is_over(dropouts: int) -> None:
     engagement = Engagement(PlannerMode.ALIGNING, T0, dropouts=Dropouts(dropouts, last_ns=T0))
     assert engagement.wait_ns(T0) == WAITS_NS[dropouts]
     for now_ns in (T0 + WAITS_NS[dropouts] - 1, T0 + WAITS_NS[dropouts]):

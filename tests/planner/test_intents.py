@@ -24,11 +24,11 @@ def late_ns(robot: RobotConfig, share: float) -> int:
     return T0 + round(assist.stale_ms * NS_PER_MS + share * assist.fade_s * 1e9)
 
 
-def test_nobody_heard_is_nothing_asked(robot: RobotConfig) -> None:
+def test_without_an_intent_nothing_is_requested(robot: RobotConfig) -> None:
     assert Intents(robot.assist).request(T0) == OperatorRequest(0.0, STRAIGHT, "")
 
 
-def test_what_is_heard_is_given_until_it_is_stale(robot: RobotConfig) -> None:
+def test_a_message_is_given_until_it_is_stale(robot: RobotConfig) -> None:
     intents = Intents(robot.assist)
     intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02)), T0)
     for now in (T0, T0 + 1, late_ns(robot, 0.0)):
@@ -50,7 +50,7 @@ def test_the_fade_is_slower_than_the_assist_may_fall(robot: RobotConfig) -> None
     assert robot.assist.force_max / robot.assist.fade_s < robot.assist.rate_max
 
 
-def test_heard_again_it_is_given_again(robot: RobotConfig) -> None:
+def test_an_intent_received_again_is_given_again(robot: RobotConfig) -> None:
     intents = Intents(robot.assist)
     intents.receive(intent(80.0), T0)
     intents.receive(intent(60.0), late_ns(robot, 0.9))

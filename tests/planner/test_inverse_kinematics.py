@@ -105,7 +105,7 @@ def test_a_tick_computes_the_kinematics_twice_in_a_squat_and_three_times_out_of_
             assert count[0] - before <= most
 
 
-def test_an_unreachable_pose_keeps_the_limits_and_says_so(
+def test_an_unreachable_pose_keeps_the_limits_and_is_reported(
     robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
 ) -> None:
     ik.q[:] = closed(1.188)
@@ -291,7 +291,7 @@ def test_out_of_reach_it_is_not_worse_than_where_it_started(
     assert np.linalg.norm(ik.solve_from_anywhere(p_ref).error) <= at_start
 
 
-def test_too_high_says_how_far_it_goes_and_which_joints_stop_it(
+def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(
     robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
 ) -> None:
     p_ref = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
@@ -331,7 +331,7 @@ def test_a_configuration_on_the_way_is_not_called_the_nearest(
     assert set(reach.stopped) == {0}
 
 
-def test_a_reached_pose_is_said_to_be_reached(
+def test_a_reached_pose_is_reported_reached(
     robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
 ) -> None:
     ik.q[:] = closed(1.188)

@@ -55,7 +55,7 @@ def test_closure_is_the_legs_disagreement_when_they_are_open(
     np.testing.assert_allclose(kinematics.closure, oracle.closure(robot, q_open), atol=1e-9)
 
 
-def test_an_open_pose_lies_between_what_the_legs_say(
+def test_an_open_pose_lies_between_the_poses_of_the_legs(
     robot: RobotConfig, averaging: Kinematics, q: Array
 ) -> None:
     q_open = q + 1e-3 * np.random.default_rng(5).normal(size=12)

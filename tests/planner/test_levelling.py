@@ -51,7 +51,7 @@ def test_what_no_floor_is_like_is_left_out(up: Vector3) -> None:
     assert levelling.slope == pytest.approx((0.05, 0.0))
 
 
-def test_the_first_word_of_the_imu_is_taken_as_it_is_while_nobody_is_led() -> None:
+def test_the_first_attitude_is_taken_as_it_is_while_the_robot_is_not_led() -> None:
     levelling = Levelling(1.0)
     levelling.advance(told((0.05, -0.02)), LEVEL, DT, jump=True)
     assert levelling.slope == pytest.approx((0.05, -0.02))
@@ -61,7 +61,7 @@ def test_the_first_word_of_the_imu_is_taken_as_it_is_while_nobody_is_led() -> No
     assert levelling.up == pytest.approx(up_of(levelling.slope))
 
 
-def test_an_imu_first_heard_while_the_robot_is_led_is_followed_slowly() -> None:
+def test_an_imu_that_joins_while_the_robot_is_led_is_followed_slowly() -> None:
     levelling = Levelling(1.0)
     levelling.advance(told((0.05, 0.0)), LEVEL, DT)
     assert 0.0 < levelling.slope[0] < 0.05 * 1.1 * DT

@@ -41,12 +41,12 @@ def states(q: Array, module: str, mode: Mode, drive: DriveStatus) -> list[JointS
 
 @pytest.mark.parametrize("module", MODULES)
 @pytest.mark.parametrize("drive", list(DriveStatus))
-def test_a_module_in_fault_is_stiffened_for_at_once_whatever_its_drive_says(
+def test_the_leg_is_stiffened_at_once_for_a_module_in_fault_whatever_its_drive_reports(
     q: Array, module: str, drive: DriveStatus
 ) -> None:
     """One that is silent may hold or have no power."""
-    told = LimpLegWatch().advance(START_NS, states(q, module, Mode.FAULT, drive))
-    assert told is FOR[kind_of(module)]
+    decided = LimpLegWatch().advance(START_NS, states(q, module, Mode.FAULT, drive))
+    assert decided is FOR[kind_of(module)]
 
 
 @pytest.mark.parametrize("module", BRACED_FOR)
@@ -55,8 +55,10 @@ def test_one_that_stays_disarmed_is_stiffened_for_after_the_time_a_takeover_may_
     q: Array, module: str, drive: DriveStatus
 ) -> None:
     limp_legs, rows = LimpLegWatch(), states(q, module, Mode.DISARMED, drive)
-    told = [limp_legs.advance(START_NS + off, rows) for off in range(0, DISARMED_NS + 1, TICK_NS)]
-    assert told == [Support.NONE] * (DISARMED_NS // TICK_NS) + [FOR[kind_of(module)]]
+    decided = [
+        limp_legs.advance(START_NS + off, rows) for off in range(0, DISARMED_NS + 1, TICK_NS)
+    ]
+    assert decided == [Support.NONE] * (DISARMED_NS // TICK_NS) + [FOR[kind_of(module)]]
     well = states(q, module, Mode.HOLD, DriveStatus.ARMED)
     assert not limp_legs.advance(START_NS + 2 * DISARMED_NS, well)
     assert not limp_legs.advance(START_NS + 3 * DISARMED_NS, rows), "the count starts again"
@@ -87,7 +89,7 @@ def test_a_restarted_service_that_knows_its_drive_in_time_is_not_stiffened_for(
 
 @pytest.mark.parametrize("module", HIPS)
 @pytest.mark.parametrize("mode", [Mode.FAULT, Mode.DISARMED])
-def test_nobody_braces_for_a_hip(q: Array, module: str, mode: Mode) -> None:
+def test_no_leg_is_stiffened_for_a_hip(q: Array, module: str, mode: Mode) -> None:
     limp_legs = LimpLegWatch()
     for tick, drive in itertools.product(range(300), DriveStatus):
         now_ns = START_NS + tick * TICK_NS
@@ -132,9 +134,9 @@ def test_the_commands_of_those_that_are_to_brace_carry_it_with_the_hold(
     index = MODULE_INDEX[module]
     gone = state(index, q, 9, mode=int(Mode.FAULT), drive=int(DriveStatus.ERROR))
     planner.receive_state(index, gone, now_ns)
-    told = [(command.hold, command.stiffen) for command in planner.tick(now_ns)]
+    decided = [(command.hold, command.stiffen) for command in planner.tick(now_ns)]
     asked = FOR[kind_of(module)]
-    assert told == [(True, asked.includes(name)) for name in MODULES]
+    assert decided == [(True, asked.includes(name)) for name in MODULES]
 
 
 def test_knees_are_knees() -> None:
@@ -156,7 +158,7 @@ def test_a_planner_that_goes_on_from_its_memory_goes_on_counting(
     text = msgspec.json.encode(planner.snapshot())
     twin = Planner(robot, SESSION)
     twin.restore(msgspec.json.decode(text, type=TickState))
-    told = []
+    decided = []
     for tick in range(40, 60):
         now_ns += TICK_NS
         for each in (planner, twin):
@@ -165,5 +167,5 @@ def test_a_planner_that_goes_on_from_its_memory_goes_on_counting(
             )
         both = [each.tick(now_ns)[0].stiffen for each in (planner, twin)]
         assert both[0] is both[1]
-        told.append(both[0])
-    assert (told[0], told[-1]) == (False, True)
+        decided.append(both[0])
+    assert (decided[0], decided[-1]) == (False, True)

@@ -60,7 +60,7 @@ def test_how_high_it_lies_shows_as_the_torso_pitches(load: Load) -> None:
     assert (load.a, load.b) == pytest.approx((10.0, -8.0), abs=0.3)
 
 
-def test_a_robot_that_falls_freely_upwards_tells_it_too(load: Load) -> None:
+def test_a_robot_that_falls_freely_upwards_shows_it_too(load: Load) -> None:
     """Torques that hold the file's weight look right: the motion gives it away."""
     kg, v = -5.0, 0.0
     for _ in range(500):
@@ -108,7 +108,7 @@ def test_without_a_harness_what_was_found_stands(
     assert law.load == (0.0, 0.0, 0.0)
 
 
-def test_a_torso_that_turns_freely_tells_it_too(load: Load) -> None:
+def test_a_torso_that_turns_freely_shows_it_too(load: Load) -> None:
     """Torques that hold the file's moment look right: the motion gives it away."""
     a, rate = 6.0, 0.0
     for _ in range(500):
@@ -140,7 +140,7 @@ def bears(load: Load, share: float, seconds: float, *, led: bool = False) -> Non
         load.advance(F, STRAIGHT_UP, 0.0, (0.0, 0.0), DT, led=led)
 
 
-def test_one_that_is_led_and_falls_tells_nothing(load: Load) -> None:
+def test_a_robot_that_is_led_and_falls_shows_nothing(load: Load) -> None:
     bears(load, 1.0, 1.0)
     bears(load, 0.2, 4.0, led=True)
     assert (load.kg, load.a, load.b) == pytest.approx((0.0, 0.0, 0.0))
@@ -158,7 +158,7 @@ def test_one_that_hangs_is_refused_at_once_and_weighed_before_it_is_led(load: Lo
     assert load.kg == pytest.approx(0.0, abs=0.5)
 
 
-def test_while_it_is_weighed_it_says_so(load: Load) -> None:
+def test_weighing_is_reported_while_it_lasts(load: Load) -> None:
     bears(load, 0.3, DT)
     while load.kg < -RESUME_FRACTION * LARGEST[0]:
         bears(load, 1.0, DT)
@@ -207,7 +207,9 @@ def test_a_memory_of_one_that_hangs_is_gone_on_with(load: Load) -> None:
 
 
 @pytest.mark.parametrize("rates", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.11), (0.0, -0.11)])
-def test_in_motion_it_is_looked_for_only_while_nobody_is_led(load: Load, rates: Pair) -> None:
+def test_in_motion_it_is_looked_for_only_while_the_robot_is_not_led(
+    load: Load, rates: Pair
+) -> None:
     F = (WEIGHT + 50.0) * STRAIGHT_UP
     for _ in range(1000):
         load.advance(F, STRAIGHT_UP, 0.0, rates, DT, led=True)
@@ -276,14 +278,14 @@ def test_it_goes_on_from_a_memory(load: Load) -> None:
         (6.0, 17.0, 0.5, ["too far behind, by 17 N m"]),
     ],
 )
-def test_each_reason_is_told_and_none_that_is_none(
+def test_each_reason_is_reported_and_no_other(
     load: Load, kg: float, a: float, b: float, words: list[str]
 ) -> None:
     load.restore(LoadState(kg, a, b, None, refused=True))
-    told = load.refusal()
-    assert told.count("carries") + told.count("lies") == len(words)
-    assert [told.index(said) for said in words] == sorted(told.index(said) for said in words)
-    assert "; the load" in told or len(words) == 1
+    reason = load.refusal()
+    assert reason.count("carries") + reason.count("lies") == len(words)
+    assert [reason.index(said) for said in words] == sorted(reason.index(said) for said in words)
+    assert "; the load" in reason or len(words) == 1
 
 
 def test_what_was_refused_stays_refused_in_a_memory(load: Load) -> None:

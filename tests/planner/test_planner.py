@@ -84,7 +84,7 @@ def joined(commands: list[JointCommand], name: str) -> Array:
     return np.concatenate([getattr(command, name) for command in commands])
 
 
-def test_no_commands_before_all_six_were_heard(planner: Planner, q: Array) -> None:
+def test_no_commands_before_the_states_of_all_six(planner: Planner, q: Array) -> None:
     for module in range(N_MODULES - 1):
         planner.receive_state(module, state(module, q), START_NS)
         assert planner.tick(START_NS + module) == []
@@ -106,7 +106,7 @@ def test_each_command_echoes_its_own_modules_stamp(planner: Planner, q: Array) -
     assert stamps == [1001, 2001, 3001, 4007, 5001, 6001]
 
 
-def test_commands_count_up_and_tell_the_session(planner: Planner, q: Array) -> None:
+def test_commands_count_up_and_name_the_session(planner: Planner, q: Array) -> None:
     seen = []
     for tick in range(5):
         now = START_NS + tick * 4 * NS_PER_MS
@@ -226,7 +226,7 @@ def test_assist_rises_by_the_time_between_ticks(
     assert planner.status(now, 0.0).assist_n == pytest.approx(robot.assist.rate_max * 0.04)
 
 
-def test_status_tells_what_the_tick_saw(planner: Planner, q: Array) -> None:
+def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
     receive_all(planner, q, START_NS, seq=7)
     planner.receive_wrench(
         Wrench(
@@ -259,7 +259,7 @@ def test_status_tells_what_the_tick_saw(planner: Planner, q: Array) -> None:
     assert status.ik_residual < 1e-6
 
 
-def test_commands_and_status_tell_both_margins_and_where_the_gains_come_from(
+def test_commands_and_status_hold_both_margins_and_where_the_gains_come_from(
     robot: RobotConfig, planner: Planner, q: Array
 ) -> None:
     now = lead(planner, q)
@@ -329,7 +329,7 @@ def test_a_stale_state_counts_before_uncertified_gains(
     assert planner.status(now, 0.0).mode == PlannerMode.WAITING
 
 
-def test_status_before_anything_was_heard_is_finite(planner: Planner) -> None:
+def test_a_status_before_any_state_is_finite(planner: Planner) -> None:
     status = planner.status(START_NS, 0.0)
     assert status.mode == PlannerMode.WAITING
     assert status.hold

@@ -45,8 +45,8 @@ def test_at_its_very_bounds_a_state_is_still_one(robot: RobotConfig) -> None:
         for angle in (low - BEYOND_RAD, high + BEYOND_RAD):
             q = np.zeros(N_JOINTS)
             q[index] = angle
-            told = state(index // 2, q, v=(SPEED_MAX, -SPEED_MAX))
-            assert plausible.is_state(index // 2, told)
+            fast = state(index // 2, q, v=(SPEED_MAX, -SPEED_MAX))
+            assert plausible.is_state(index // 2, fast)
 
 
 @pytest.mark.parametrize("speed", [math.nan, math.inf, -math.inf, 1e300, -101.0])
@@ -56,7 +56,7 @@ def test_a_speed_that_is_none_is_no_state(robot: RobotConfig, speed: float) -> N
 
 
 @pytest.mark.parametrize("angle", [math.nan, 1e308, 64.0])
-def test_a_module_that_tells_only_such_angles_goes_stale_and_the_planner_holds(
+def test_a_module_that_sends_only_such_angles_goes_stale_and_the_planner_holds(
     robot: RobotConfig, closed: Closed, angle: float
 ) -> None:
     planner, q = Planner(robot, SESSION), closed(1.188)

@@ -66,7 +66,7 @@ def test_a_robot_file_without_limits_stands_straight() -> None:
     assert not rate.any()
 
 
-def test_it_rests_where_it_is_while_nobody_is_led() -> None:
+def test_it_rests_where_it_is_while_it_is_not_led() -> None:
     follower = ShiftReference(LARGEST)
     for _ in range(100):
         there, _ = advanced(follower, (0.03, 0.0, 0.0, 0.1), DT)

@@ -174,7 +174,7 @@ def test_off_centre_leaning_and_twisted_the_schedule_is_still_enough(
     assert local.source is SplitSource.SCHEDULE
 
 
-def test_the_margins_told_are_the_certificates_of_what_is_sent(
+def test_the_published_margins_are_the_certificates_of_what_is_sent(
     robot: RobotConfig, stand: Stand
 ) -> None:
     for changed in (robot, with_table(robot, 0.0), with_law(robot, split="diagonal")):
@@ -237,7 +237,7 @@ def test_either_margin_alone_is_enough_to_be_stiffened(robot: RobotConfig, stand
             assert local.margins.onboard >= least.onboard_margin_min
 
 
-def test_where_nothing_stands_the_split_says_so(robot: RobotConfig, stand: Stand) -> None:
+def test_a_split_without_a_foot_on_the_ground_is_reported(robot: RobotConfig, stand: Stand) -> None:
     impossible = requiring(robot, K_required=(1e5,) * 6)
     local = stand.split(GainSplit(impossible))
     assert local.source is SplitSource.UNCERTIFIED

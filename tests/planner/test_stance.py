@@ -240,7 +240,7 @@ def test_an_encoder_that_is_half_a_turn_off_is_no_stance(
         (5, 0.5, "29 deg turned inwards against the left: at most 19 deg"),
     ],
 )
-def test_a_refusal_says_which_foot_is_where(row: int, value: float, words: str) -> None:
+def test_a_refusal_names_which_foot_is_where(row: int, value: float, words: str) -> None:
     held = Stance(LARGEST)
     measured = np.zeros(6)
     measured[row] = value

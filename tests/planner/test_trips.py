@@ -145,7 +145,7 @@ def _closure(kinematics: Kinematics, q: np.ndarray) -> np.ndarray:
     return kinematics.closure.copy()
 
 
-def test_a_straight_leg_tells_nothing() -> None:
+def test_a_straight_leg_measures_nothing() -> None:
     C = np.zeros((6, 12))
     C[:, 6:] = np.eye(6)
     right, left = leg_loads(C, np.arange(12.0))
@@ -269,7 +269,7 @@ def test_both_legs_have_borne_it_once_each_bears_three_times_the_least(robot: Ro
         assert trips.tripped is tripped
 
 
-def test_what_tripped_first_is_told(robot: RobotConfig) -> None:
+def test_the_first_trip_is_reported(robot: RobotConfig) -> None:
     trips = led(robot)
     for tick in range(100):
         trips.advance(T0 + tick * TICK_NS, beyond(robot, Trip.LEGS), leads=True)
@@ -281,14 +281,14 @@ def test_what_tripped_first_is_told(robot: RobotConfig) -> None:
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("joint", range(12))
-def test_each_value_is_what_the_table_says(joint: int, sign: float) -> None:
+def test_each_value_is_the_tables(joint: int, sign: float) -> None:
     q = np.zeros(12)
     q[joint] = 0.2 * sign
     pdot = np.array((0.1, 0.2, 0.3 * sign, 0.4, 0.5 * sign, 0.6))
-    said = output_of(0.0)._replace(
+    output = output_of(0.0)._replace(
         closure=np.array((0.01, -0.02, 0.02, 9.0, 9.0, 9.0)), ik_residual=0.004, pdot=pdot
     )
-    values = values_of(said, q, (90.0, 80.0), None, 0.0, 0.07, leads=True)
+    values = values_of(output, q, (90.0, 80.0), None, 0.0, 0.07, leads=True)
     by_name = dict(zip(TRIPS, values, strict=True))
     assert by_name[Trip.LEGS] == pytest.approx(0.03)
     assert by_name[Trip.REACH] == 0.004

@@ -25,7 +25,7 @@ def left(at: Pair = HERE) -> Unattended:
     ("pose", "drift"),
     [((0.83, 0.1), 0.03), ((0.75, 0.1), 0.05), ((0.8, 0.3), 0.2 * ARM), ((0.79, -1.9), 2.0 * ARM)],
 )
-def test_it_is_told_from_where_the_hand_left_it(pose: Pair, drift: float) -> None:
+def test_drift_is_measured_from_where_the_hand_left_it(pose: Pair, drift: float) -> None:
     assert left().drift(T0 + HAND_LOST_NS + 1, pose, 0.0, 0.0) == pytest.approx(drift)
 
 

@@ -17,7 +17,7 @@ def test_it_warns_once_before_it_stops() -> None:
     ]  # fmt: skip
 
 
-def test_it_stops_below_the_limit_and_says_so_once() -> None:
+def test_it_stops_below_the_limit_and_reports_it_once() -> None:
     assert changes(100, 99, 50, 0) == [DiskChange.FULL, DiskChange.NONE, DiskChange.NONE]
 
 
@@ -27,7 +27,7 @@ def test_it_goes_on_only_when_there_is_clearly_more() -> None:
     ]  # fmt: skip
 
 
-def test_a_disk_that_hovers_at_the_warning_is_told_once() -> None:
+def test_a_disk_that_hovers_at_the_warning_is_reported_once() -> None:
     assert changes(100, 199, 201, 199, 240, 199).count(DiskChange.LOW) == 1
     assert changes(100, 199, 300, 199).count(DiskChange.LOW) == 2
 

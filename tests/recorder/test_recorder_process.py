@@ -120,8 +120,8 @@ def rig() -> Iterator[Rig]:
 
 def test_sigterm_writes_what_is_queued_and_finishes_the_file(rig: Rig) -> None:
     rig.send(2000)
-    said = rig.stop(signal.SIGTERM)
-    assert rig.process.returncode == 0, said
+    output = rig.stop(signal.SIGTERM)
+    assert rig.process.returncode == 0, output
     log = read_run(rig.path)
     messages = log.messages(topics.JOINT_STATE, "knee_right")
     assert log.complete
@@ -178,9 +178,9 @@ def test_sigkill_loses_less_than_a_second_and_the_next_recorder_recovers_the_res
         assert rig.sent_at[last] > killed_at - 1.0
         with path.open("rb") as file:
             assert sum(1 for _ in make_reader(file).iter_messages()) == log.count(KEY)
-    said = rig.stop(signal.SIGTERM)
-    assert rig.process.returncode == 0, said
-    assert f"{rig.path} was not finished; recovered to run.mcap" in said
+    output = rig.stop(signal.SIGTERM)
+    assert rig.process.returncode == 0, output
+    assert f"{rig.path} was not finished; recovered to run.mcap" in output
     assert [p.name for p in sorted(rig.out.iterdir())] == ["run-1.mcap", "run.mcap"]
 
 
@@ -195,8 +195,8 @@ def test_a_snapshot_is_written_when_asked_for_and_holds_what_was_before() -> Non
         wait_for(rig.hears)
         target = rig.sent
         rig.send(100)
-        said = rig.stop(signal.SIGTERM)
-        assert rig.process.returncode == 0, said
+        output = rig.stop(signal.SIGTERM)
+        assert rig.process.returncode == 0, output
         log = read_run(rig.path)
         assert log.complete
         found = [m.seq for m in log.messages(topics.JOINT_STATE, "knee_right")]
@@ -208,9 +208,9 @@ def test_a_snapshot_is_written_when_asked_for_and_holds_what_was_before() -> Non
 def test_a_recorder_that_saw_no_fault_leaves_nothing() -> None:
     with rig_with("--snapshot", "5") as rig:
         wait_for((rig.run_dir / "recorder.zenoh").exists)
-        said = rig.stop(signal.SIGTERM)
-        assert rig.process.returncode == 0, said
-        assert "nothing written" in said
+        output = rig.stop(signal.SIGTERM)
+        assert rig.process.returncode == 0, output
+        assert "nothing written" in output
         assert not rig.out.exists()
 
 
@@ -230,11 +230,11 @@ def test_a_write_error_ends_with_exit_code_1_and_one_line(rig: Rig) -> None:
     resource.prlimit(rig.process.pid, resource.RLIMIT_FSIZE, (limit, limit))
     wait_for(lambda: rig.process.poll() is not None, doing=lambda: rig.send(200))
     assert rig.process.stderr
-    said = rig.process.stderr.read()
+    output = rig.process.stderr.read()
     assert rig.process.returncode == 1
-    assert "Traceback" not in said
-    assert "Exception ignored" not in said
-    (error,) = [line for line in said.splitlines() if "ERROR" in line]
+    assert "Traceback" not in output
+    assert "Exception ignored" not in output
+    (error,) = [line for line in output.splitlines() if "ERROR" in line]
     assert "run.mcap: cannot be written: File too large" in error
     log = read_run(rig.path)
     assert not log.complete

@@ -75,7 +75,7 @@ def test_a_steady_sender_that_falls_silent_is_a_fault_once() -> None:
     assert not snapshot.writing
 
 
-def test_a_sender_that_was_never_heard_or_has_no_steady_rate_is_not_missed() -> None:
+def test_a_sender_that_never_sent_or_has_no_steady_rate_is_not_missed() -> None:
     snapshot = ring()
     feed(snapshot, at(0), at(0, topics.SIM_CONTROL.key(ROBOT)), at(9))
     assert not snapshot.writing

@@ -87,7 +87,7 @@ def test_a_spring_may_pull_harder_while_track_blends_in_and_not_after(wary: Wary
     assert found is Outside.Q_REF
 
 
-def test_hold_stiffens_about_the_joint_and_track_about_what_it_is_told(robot: RobotConfig) -> None:
+def test_hold_stiffens_about_the_joint_and_track_about_the_reference(robot: RobotConfig) -> None:
     """A knee 0.2 rad off its reference, with a tenth of HOLD's stiffness."""
     bench = Bench(robot)
     soft = {"k_p": (300.0, 300.0), "q_ref": (bench.q[0], bench.q[1] + 0.2)}
@@ -100,7 +100,7 @@ def test_hold_stiffens_about_the_joint_and_track_about_what_it_is_told(robot: Ro
     assert bench.controller.tau == pytest.approx(before, abs=1.0)
 
 
-def test_a_step_that_says_nothing_of_it_does_not_listen(robot: RobotConfig) -> None:
+def test_a_step_without_the_flag_does_not_listen(robot: RobotConfig) -> None:
     """Listening, a joint that jumps is where it is found; else the sample is not believed."""
     bench = Bench(robot)
     bench.to_hold()

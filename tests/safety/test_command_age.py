@@ -78,7 +78,7 @@ def test_a_stamp_this_module_has_not_given_yet_is_refused(
     assert Failsafe().offer(command(echo_t_ns=T0 + ahead_ns), T0, timing) is refusal
 
 
-def test_only_the_echoed_stamp_tells_the_age_and_not_the_planners_clock(timing: Timing) -> None:
+def test_only_the_echoed_stamp_gives_the_age_and_not_the_planners_clock(timing: Timing) -> None:
     for t_ns in (0, T0 - NS_PER_S, T0 + 10 * NS_PER_S):
         assert Failsafe().offer(command(t_ns=t_ns), T0, timing) is Refusal.NONE
 

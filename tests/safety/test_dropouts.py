@@ -129,7 +129,7 @@ def test_hold_asked_by_the_planner_is_no_drop_out(timing: Timing) -> None:
     assert module.failsafe.dropouts.count == 0
 
 
-def test_ready_is_told_while_hold_is_asked_so_that_all_six_can_start_together(
+def test_ready_is_reported_in_hold_so_that_all_six_can_start_together(
     timing: Timing,
 ) -> None:
     module = Module(timing)
@@ -200,7 +200,7 @@ streams = st.lists(st.tuples(gaps, ages, st.sampled_from([False] * 19 + [True]))
 @example(stream=[(1, 0, False)] * 30)
 @example(stream=[(1, 0, False)] * 15 + [(9, 0, False)] + [(1, 0, False)] * 40)
 @settings(max_examples=200)
-def test_track_is_entered_and_left_as_a_slow_model_says(
+def test_track_is_entered_and_left_as_in_a_slow_model(
     robot: RobotConfig, stream: list[tuple[int, int, bool]]
 ) -> None:
     timing = msgspec.structs.replace(

@@ -145,7 +145,7 @@ def test_a_module_has_150_ms_to_report_track() -> None:
         assert engagement.mode is mode
 
 
-def test_a_wrench_that_was_heard_long_ago_eases_nothing(robot: RobotConfig) -> None:
+def test_an_old_wrench_eases_nothing(robot: RobotConfig) -> None:
     """A hand that pulled with 60 N as the harness fell silent would pull for ever."""
     q = np.array(stand_pose(robot, 1.188))
     heard, deaf = Planner(robot, 1), Planner(robot, 1)

@@ -1,4 +1,4 @@
-"""Every state against every event, and against section 4 of the design in its own words."""
+"""Every state against every event, and against docs/architecture.md#age-rule, written once more."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ SITUATIONS = [
 ]
 
 
-def section_4(s: Situation) -> Mode:
+def mode_by_the_docs(s: Situation) -> Mode:
     """Return the state that docs/architecture.md#age-rule asks for.
 
     DISARMED -> HOLD (at power-up, once armed) <-> TRACK (fresh commands); DAMP (e-stop):
@@ -95,11 +95,11 @@ def test_the_sweep_knows_every_state_and_every_event() -> None:
 
 
 @pytest.mark.parametrize("mode", Mode)
-def test_every_situation_leads_where_section_4_says(mode: Mode, timing: Timing) -> None:
+def test_every_situation_leads_to_its_state_by_the_age_rule(mode: Mode, timing: Timing) -> None:
     for situation in (s for s in SITUATIONS if s.mode is mode):
         failsafe = placed(situation, timing)
         cause = failsafe.advance(T0, timing, situation.drive, situation.estop, situation.trip)
-        assert failsafe.mode is section_4(situation), situation
+        assert failsafe.mode is mode_by_the_docs(situation), situation
         assert (cause is None) == (failsafe.mode is mode), situation
 
 
@@ -134,7 +134,7 @@ CAUSES = {
 }
 
 
-def test_every_change_tells_a_cause_that_fits_it() -> None:
+def test_every_change_has_a_cause_that_fits_it() -> None:
     for before, row in TRANSITIONS.items():
         for after, cause in row.values():
             if after is Mode.DAMP:

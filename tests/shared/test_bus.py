@@ -359,7 +359,7 @@ def test_null_is_refused_and_counted_by_the_receiver(run_dir: Path) -> None:
         assert wait_until(lambda: publisher.put(command(2)) and commands.take())
 
 
-def test_process_exits_by_itself_with_nobody_listening(start: Start) -> None:
+def test_a_process_without_a_subscriber_exits_by_itself(start: Start) -> None:
     script = """
 with open_session(robot, "planner", run_dir) as session:
     latest = session.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
@@ -378,7 +378,7 @@ with open_session(robot, "planner", run_dir) as session:
         assert (out, err, process.returncode) == ("left\n", "", code)
 
 
-def test_second_process_of_a_name_is_told_that_the_endpoint_is_in_use(
+def test_a_second_process_of_a_name_learns_that_the_endpoint_is_in_use(
     run_dir: Path, start: Start
 ) -> None:
     script = """

@@ -52,7 +52,7 @@ def standing(seed: int = 1) -> list[tuple[int, bytes]]:
     return frames
 
 
-def test_a_frame_without_stuffing_is_as_long_as_the_standard_says() -> None:
+def test_a_frame_without_stuffing_is_as_long_as_in_the_standard() -> None:
     alternating = bytes([0x55] * 8)
     assert 111 <= bits_on_the_wire(0x2AA, alternating) <= 114
     assert bits_on_the_wire(0, bytes(8)) > 111 + 14
@@ -82,7 +82,7 @@ def test_the_loads_are_those_of_the_design() -> None:
     assert design(12).share(1000.0 / 3.0) < LOAD_MAX < design(12).share(500.0)
 
 
-def test_what_a_bus_is_said_to_carry_loads_it_to_the_limit() -> None:
+def test_the_stated_capacity_loads_a_bus_to_the_limit() -> None:
     for axes in (2, 6, 12):
         load = bus_load(axes, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=250.0)
         assert is_at_limit(load, load.rate_max_hz())
@@ -194,11 +194,9 @@ def test_over_usb_the_buses_carry_nothing(tmp_path: Path) -> None:
     load_changed(tmp_path, change)
 
 
-def test_the_emulated_drives_speak_0_5_unless_told_otherwise(
-    tmp_path: Path, robot: RobotConfig
-) -> None:
+def test_the_emulated_drives_use_0_5_by_default(tmp_path: Path, robot: RobotConfig) -> None:
     assert robot.simulation.can_dialect == "0.5"
-    told = load_changed(tmp_path, setting("simulation.can_dialect", "0.6"))
-    assert told.simulation.can_dialect == "0.6"
+    changed = load_changed(tmp_path, setting("simulation.can_dialect", "0.6"))
+    assert changed.simulation.can_dialect == "0.6"
     with pytest.raises(ConfigError, match="can_dialect"):
         load_changed(tmp_path, setting("simulation.can_dialect", "0.7"))

@@ -203,7 +203,9 @@ def test_what_has_passed_and_does_not_come_out_after_all_is_lost() -> None:
         ({"partition": True, "ordered": True, "loss": 0.5}, "leave out all but ordered"),
     ],
 )
-def test_what_does_not_go_together_is_told(changes: dict[str, float], right: str) -> None:
+def test_impairments_that_do_not_go_together_are_refused(
+    changes: dict[str, float], right: str
+) -> None:
     assert right in msgspec.structs.replace(Impairment(), **changes).fault()
 
 
@@ -228,7 +230,7 @@ def test_a_loss_of_nine_in_ten_comes_in_rows_of_nine() -> None:
         (Impairment(ordered=True, loss=0.1), "delay_ms"),
     ],
 )
-def test_what_would_be_without_effect_is_told_with_what_it_lacks(
+def test_an_ineffective_impairment_is_reported_with_what_it_lacks(
     idle: Impairment, cure: str
 ) -> None:
     found, _, right = idle.fault().partition("; ")
@@ -237,7 +239,7 @@ def test_what_would_be_without_effect_is_told_with_what_it_lacks(
     assert not msgspec.structs.replace(idle, **{cure: 10.0}).fault()
 
 
-def test_every_link_has_both_of_its_directions_but_nobody_speaks_to_a_sensor() -> None:
+def test_every_link_has_both_of_its_directions_but_a_sensor_receives_nothing() -> None:
     named = {name for pair in PAIRS for name in (pair.there, pair.back)}
     assert named - set(DIRECTIONS) == {"planner->harness", "planner->imu"}
     assert all(set(names) <= set(DIRECTIONS) for names in GROUPS.values())

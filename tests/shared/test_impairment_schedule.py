@@ -75,7 +75,7 @@ def test_what_is_planned_for_no_link_is_refused_and_not_kept(rig: Rig) -> None:
     assert rig.impairments.next_due == math.inf
 
 
-def test_what_is_hidden_is_told_with_the_directions_on_which_it_is(rig: Rig) -> None:
+def test_a_hidden_impairment_is_reported_with_its_directions(rig: Rig) -> None:
     everywhere = rig.impairments.begin("all", LATE, math.inf, 0)
     cut = rig.impairments.begin("planner->joints", CUT, math.inf, 0)
     later = rig.impairments.begin("planner->knee_left", LATE, math.inf, 0)
@@ -97,7 +97,7 @@ def test_what_is_hidden_is_told_with_the_directions_on_which_it_is(rig: Rig) -> 
         (WRENCHES, 2.04, (), f"{WRENCHES} delay=5ms (in 2.0 s)"),
     ],
 )
-def test_one_that_is_not_in_force_says_why(
+def test_an_inactive_impairment_names_the_reason(
     link: str, in_s: float, hidden: tuple[str, ...], words: str
 ) -> None:
     requested = RequestedImpairment(1, link, LATE.describe(), None, 0, 0, in_s, hidden)

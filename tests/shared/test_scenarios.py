@@ -125,13 +125,13 @@ def test_a_scenario_comes_back_from_its_own_toml(tmp_path: Path) -> None:
 # ---- faults
 
 
-def test_a_fault_is_of_the_first_axis_and_lasts_as_its_kind_does_unless_told() -> None:
+def test_a_fault_is_of_the_first_axis_and_lasts_as_its_kind_does_by_default() -> None:
     for kind, traits in FAULT_KINDS.items():
         plain = msgspec.convert({"module": "hip_left", "kind": kind, "at": 1.0}, Fault)
         assert plain.axis is None
         assert plain.lasts_s == (traits.duration or 0.0)
-    told = Fault(module="hip_left", kind="link_lost", at=1.0, duration=3.0)
-    assert told.lasts_s == 3.0
+    given = Fault(module="hip_left", kind="link_lost", at=1.0, duration=3.0)
+    assert given.lasts_s == 3.0
 
 
 def test_a_fault_that_leaves_things_out_comes_back_from_its_own_toml(tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ def test_hub_parts_with_clients_that_leave(hub: UnixCanHub) -> None:
     assert hub.clients == 0
 
 
-def test_what_a_client_sent_before_it_left_is_heard_though_it_left_frames_unread(
+def test_what_a_client_sent_before_it_left_arrives_though_it_left_frames_unread(
     hub: UnixCanHub,
 ) -> None:
     """A tool that sends one order and goes: the kernel tells of the unread ones first."""
@@ -147,7 +147,7 @@ def test_what_a_client_sent_before_it_left_is_heard_though_it_left_frames_unread
     assert hub.clients == 0
 
 
-def test_what_a_client_sent_before_it_left_is_heard_though_others_talk_to_it(
+def test_what_a_client_sent_before_it_left_arrives_though_others_send_to_it(
     hub: UnixCanHub,
 ) -> None:
     talker = connect(hub)

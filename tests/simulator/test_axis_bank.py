@@ -106,7 +106,7 @@ def test_torque_is_clamped_to_current_lim_times_torque_constant() -> None:
     assert torque[6:] == pytest.approx(-60.0 * 0.0827)
 
 
-def test_overspeed_disarms_in_torque_mode_and_axis_error_says_what_failed() -> None:
+def test_overspeed_disarms_in_torque_mode_and_axis_error_names_the_cause() -> None:
     bank = make_bank()
     bank.input_torque[:] = 1.0
     speed = np.zeros(12)
@@ -135,7 +135,7 @@ def test_an_idle_axis_spun_too_fast_has_the_error_once_it_has_been_armed() -> No
     assert bank.faults[3].controller == ControllerError.OVERSPEED
 
 
-def test_position_mode_told_anew_makes_where_the_motor_is_its_target() -> None:
+def test_position_mode_set_again_makes_where_the_motor_is_its_target() -> None:
     bank = make_bank(ControlMode.POSITION, turns=2.0)
     bank.input_pos[:] = 5.0
     bank.set_modes(1, ControlMode.POSITION, InputMode.PASSTHROUGH)
@@ -307,7 +307,7 @@ def test_a_count_that_was_set_is_counted_on_from_without_a_jump_in_velocity() ->
     assert bank.vel_estimate[3] == pytest.approx(bank.vel_estimate[2])
 
 
-def test_an_encoder_that_was_lost_comes_back_where_it_was_told_to_be_since() -> None:
+def test_a_lost_encoder_comes_back_where_it_was_set_since() -> None:
     drive = msgspec.structs.replace(DRIVE, zero_mark_turns=64.0)
     bank = AxisBank(drive, encoder_counts_per_turn=CPR)
     bank.step(0.0, ZERO, ZERO)

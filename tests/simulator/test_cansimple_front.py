@@ -235,7 +235,7 @@ def test_in_0_5_estimates_are_zeros_from_each_start_up_to_the_first_closed_loop(
         assert bank.connected[AXIS] == 0.0
 
 
-def test_in_0_5_the_count_says_where_an_axis_is_that_was_never_armed(old: Bench) -> None:
+def test_in_0_5_the_count_locates_an_axis_that_was_never_armed(old: Bench) -> None:
     old.bank.connected[AXIS] = 0.0
     old.bank.set_count(AXIS, 7 * CPR + 5)
     assert old.ask(Command.GET_ENCODER_COUNT) == struct.pack("<ii", 7 * CPR + 5, 5)
@@ -250,7 +250,7 @@ def test_in_0_5_the_same_frame_asks_for_the_encoders_error(old: Bench) -> None:
 
 
 @pytest.mark.parametrize("why", ["link", "supply"])
-def test_a_drive_that_does_not_talk_neither_sends_nor_hears_nor_feeds(old: Bench, why: str) -> None:
+def test_a_silent_drive_neither_sends_nor_receives_nor_feeds(old: Bench, why: str) -> None:
     if why == "link":
         old.bank.conditions.link(AXIS // 2, up=False)
     else:

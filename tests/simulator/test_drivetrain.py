@@ -73,7 +73,7 @@ def test_the_rotor_rings_at_the_root_of_k_over_i(robot: RobotConfig) -> None:
     assert 2.0 * np.pi / period == pytest.approx(np.sqrt(k / inertia), rel=0.01)
 
 
-def test_energy_only_ever_leaves_a_drivetrain_that_nobody_drives(robot: RobotConfig) -> None:
+def test_energy_only_ever_leaves_a_drivetrain_that_is_not_driven(robot: RobotConfig) -> None:
     rotors = drivetrain(robot, stiffness=20000.0, play=0.004, motor_friction=0.1)
     rng = np.random.default_rng(3)
     rotors.theta[:], rotors.rate[:] = rng.normal(0, 0.01, 12), rng.normal(0, 1.0, 12)

@@ -109,12 +109,12 @@ def test_errors_change_the_true_robot_and_not_the_file(robot: RobotConfig) -> No
     assert np.linalg.norm(true.model.opt.gravity) == pytest.approx(9.81)
 
 
-def test_wrong_zeros_show_in_what_the_encoders_tell(robot: RobotConfig) -> None:
+def test_wrong_zeros_show_in_what_the_encoders_report(robot: RobotConfig) -> None:
     errors = np.linspace(-0.01, 0.01, 12)
     plant = changed(IDEAL, {"encoder.zero_errors": errors.tolist()})
     wrong, right = (World(body_of(robot, one), variant("stand")) for one in (plant, IDEAL))
-    told = wrong.motor_turns()[0] - right.motor_turns()[0]
-    joints = np.linalg.solve(body_of(robot, IDEAL).motor_from_joint, told)
+    shown = wrong.motor_turns()[0] - right.motor_turns()[0]
+    joints = np.linalg.solve(body_of(robot, IDEAL).motor_from_joint, shown)
     np.testing.assert_allclose(joints, errors, atol=1e-9)
 
 

@@ -73,10 +73,10 @@ def summary_of(verb: str, out: Path, *flags: str) -> tuple[int, dict[str, Any]]:
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=200, check=False
     )
-    said = done.stdout + done.stderr
-    if stalled_before_it_began(done.returncode, said, out):
+    output = done.stdout + done.stderr
+    if stalled_before_it_began(done.returncode, output, out):
         return 0, {"in_real_time": False}
-    assert done.returncode in (0, 1), said
+    assert done.returncode in (0, 1), output
     return done.returncode, json.loads((out / "summary.json").read_text())
 
 
@@ -123,7 +123,7 @@ WHILE_IMPAIRED_S = (1.7, 4.5)
 QUANTILES_PCT = (25, 50, 75, 90)
 AGES_MS = 8.0
 """How far a quantile of the ages may be from lockstep's: two periods of the planner. What jitter
-does is held much closer by test_on_the_wire_messages_come_as_late_as_the_modelled_network_says."""
+does is held much closer by test_on_the_wire_messages_are_as_late_as_in_the_modelled_network."""
 
 
 def ages_ms(out: Path) -> list[float]:
@@ -271,9 +271,7 @@ def modelled(what: Impairment, seed: int, sent_ns: list[int]) -> list[float]:
 
 
 @pytest.mark.parametrize("name", JITTERS)
-def test_on_the_wire_messages_come_as_late_as_the_modelled_network_says(
-    name: str, wire: Wire
-) -> None:
+def test_on_the_wire_messages_are_as_late_as_in_the_modelled_network(name: str, wire: Wire) -> None:
     """Quantiles of many messages, relative to a link beside it to which nothing is done."""
     what = JITTERS[name]
     wire.client.begin(Inject(link=f"{LATE}->planner", at=0.0, **msgspec.to_builtins(what)))
@@ -301,7 +299,7 @@ def test_on_the_wire_messages_come_as_late_as_the_modelled_network_says(
         ("stream", {"ordered": False}),
     ],
 )
-def test_without_a_word_the_modelled_network_says_what_the_bands_tell_apart(
+def test_without_one_word_the_modelled_network_falls_outside_the_bands(
     name: str, without: dict[str, object]
 ) -> None:
     """Else a network proxy that passes over the word would pass the test above."""

@@ -82,7 +82,7 @@ def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
 
 
 @pytest.mark.parametrize("status", [1, 2], ids=["a failure", "a file that cannot be imported"])
-def test_what_failed_is_said_last_and_the_other_parts_are_run(root: Path, status: int) -> None:
+def test_failures_are_listed_last_and_the_other_parts_are_run(root: Path, status: int) -> None:
     write_tool(root, "mypy", "exit 1")
     write_tool(root, "pytest", f"echo ERROR tests/test_x.py; echo one of $*; exit {status}")
     code, said = run(root)
@@ -100,11 +100,11 @@ def test_ctrl_c_ends_all_of_it(root: Path, part: str, *, background: bool) -> No
     write_tool(root, part, f"trap 'kill $!; exit 2' INT\nsleep 30 &\necho {part} begins\nwait")
     script = start(root, background=background)
     assert script.stdout is not None
-    said = ""
-    while f"{part} begins" not in said:
+    output = ""
+    while f"{part} begins" not in output:
         line = script.stdout.readline()
-        assert line, said
-        said += line
+        assert line, output
+        output += line
     os.killpg(script.pid, signal.SIGINT)
     rest, _ = script.communicate(timeout=30)
     assert script.returncode == 130

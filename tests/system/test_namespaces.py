@@ -139,8 +139,8 @@ def lead_in_a_process(out: Path, run_dir: Path) -> Ended:
     """Run `tests.system.multihost` to its end."""
     leader = start("-m", "tests.system.multihost", str(out), str(run_dir), str(os.getpid()))
     try:
-        said = leader.communicate(timeout=LEADING_S)[0]
-        return Ended(leader.returncode, said)
+        output = leader.communicate(timeout=LEADING_S)[0]
+        return Ended(leader.returncode, output)
     finally:
         leader.terminate()
         leader.wait(ENDING_S)
@@ -171,14 +171,14 @@ def outcome_of(*runs: Told) -> tuple[Led, int]:
 
     def lead(out: Path, _run_dir: Path) -> Ended:
         nonlocal made
-        told = runs[made]
+        output = runs[made]
         made += 1
-        (out / REPORT).write_bytes(msgspec.json.encode(Report([], [], told.finished_ns)))
-        rows = (False, told.fallen)
+        (out / REPORT).write_bytes(msgspec.json.encode(Report([], [], output.finished_ns)))
+        rows = (False, output.fallen)
         key = topics.SIM_TRUTH.key(ROBOT)
         truths = [sample(SimTruth, seq=seq, fallen=row) for seq, row in enumerate(rows)]
         write(out, [(key, codec.encode(truth), truth.seq) for truth in truths])
-        return Ended(told.code, "RunError")
+        return Ended(output.code, "RunError")
 
     with tempfile.TemporaryDirectory() as folder:
         return lead_to_the_end(lambda: Path(tempfile.mkdtemp(dir=folder)), lead), made
@@ -229,7 +229,7 @@ def test_the_modules_of_a_cut_off_leg_hold_by_themselves(led: Led, robot: RobotC
     assert seen, "no link outlived its cut: nothing tells what the modules did meanwhile"
 
 
-def test_the_modules_that_are_still_reached_are_told_to_hold(led: Led) -> None:
+def test_the_modules_that_are_still_reached_hold(led: Led) -> None:
     causes = set()
     for cut, _ in spans(led):
         for module in reached(cut):
@@ -246,7 +246,7 @@ def test_the_modules_that_are_still_reached_are_told_to_hold(led: Led) -> None:
     assert Cause.HOLD_ALL in causes
 
 
-def test_the_planner_leads_only_while_it_hears_all_six(led: Led) -> None:
+def test_the_planner_leads_only_while_it_receives_all_six(led: Led) -> None:
     statuses: list[PlannerStatus] = led.log.messages(topics.PLANNER_STATUS)
     for cut, end_ns in spans(led):
         modes = [s.mode for s in statuses if cut.down_ns < s.t_ns < end_ns]

@@ -65,8 +65,8 @@ class Rig:
         if self.proxy.returncode is not None:
             return
         self.proxy.send_signal(signal.SIGTERM)
-        said = self.proxy.communicate(timeout=PATIENCE_S)[1]
-        assert self.proxy.returncode == 0, said
+        output = self.proxy.communicate(timeout=PATIENCE_S)[1]
+        assert self.proxy.returncode == 0, output
         assert not list(self.run_dir.glob("through-*"))
         assert not (self.run_dir / SOCKET).exists()
 
@@ -166,7 +166,7 @@ def test_unimpaired_nothing_is_lost_and_with_a_delay_it_comes_so_much_later(rig:
     assert 20.0 < added < 35.0
 
 
-def test_such_a_share_is_lost_as_was_asked_for_and_so_much_is_told(rig: Rig) -> None:
+def test_the_requested_fraction_is_lost_and_reported(rig: Rig) -> None:
     """Those that are sent at once travel as one: counted is what travels."""
     inject(rig, loss=0.3)
     rig.send(500)
@@ -180,7 +180,7 @@ def test_such_a_share_is_lost_as_was_asked_for_and_so_much_is_told(rig: Rig) -> 
     assert len(rig.send_to_the_last(100)) == 100
 
 
-def test_what_comes_twice_is_heard_once_and_what_is_overtaken_not_at_all(rig: Rig) -> None:
+def test_a_duplicate_is_received_once_and_an_overtaken_message_not_at_all(rig: Rig) -> None:
     """Zenoh's own sequence numbers: doubles and what is overtaken are dropped."""
     inject(rig, duplicate=0.5)
     rig.send_to_the_last(200)
@@ -209,7 +209,7 @@ def test_a_partition_is_total_and_once_it_is_over_the_link_is_whole_again(rig: R
     assert len(rig.send_to_the_last(100)) == 100
 
 
-def test_what_a_partition_held_on_a_stream_that_is_given_up_is_told_as_lost(rig: Rig) -> None:
+def test_what_a_partition_held_on_a_stream_that_is_given_up_counts_as_lost(rig: Rig) -> None:
     inject(rig, partition=True, ordered=True)
     assert rig.send(500) == []
     rig.client.clear("all")
@@ -226,8 +226,8 @@ def test_a_partition_may_last_though_all_dial_again_and_again(rig: Rig) -> None:
     rig.client.begin(Inject(link="all", at=0.0, duration=12.0, partition=True))
     most = 0
     while time.monotonic() < begun + 10.0:
-        heard = list(rig.send(100))
-        assert not heard or time.monotonic() > begun + 12.0
+        arrived = list(rig.send(100))
+        assert not arrived or time.monotonic() > begun + 12.0
         most = max(most, descriptors(rig))
     assert most < full, "none was turned away for want of one"
     assert rig.proxy.poll() is None
@@ -248,7 +248,9 @@ def test_an_injector_that_is_killed_and_started_again_links_anew_and_does_nothin
     assert len(rig.send_to_the_last(100)) == 100
 
 
-def test_what_lasts_to_the_end_is_told_with_its_counts_when_the_injector_stops(rig: Rig) -> None:
+def test_an_impairment_that_lasts_is_reported_with_its_counts_when_the_injector_stops(
+    rig: Rig,
+) -> None:
     inject(rig, loss=0.5)
     rig.send(100)
     rig.stop()
@@ -257,7 +259,7 @@ def test_what_lasts_to_the_end_is_told_with_its_counts_when_the_injector_stops(r
     assert ended.lost > 0
 
 
-def test_what_is_done_is_told_on_the_bus_and_shown_by_the_verb(
+def test_an_action_is_published_on_the_bus_and_shown_by_the_verb(
     rig: Rig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--run-dir", str(rig.run_dir)]

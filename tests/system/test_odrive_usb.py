@@ -172,7 +172,7 @@ def test_an_axis_that_disarms_is_an_error_with_or_without_an_error_bit(
         assert usb.bank.state[4:6] == [AxisState.IDLE, AxisState.CLOSED_LOOP_CONTROL]
 
 
-def test_a_drive_found_armed_tells_its_torque_until_it_is_taken_over(
+def test_a_drive_found_armed_reports_its_torque_until_it_is_taken_over(
     usb: UsbRobot, armed: Control, drive: OdriveUsb, config: RobotConfig
 ) -> None:
     armed.target = (0.02, -0.03)
@@ -212,7 +212,7 @@ def test_a_drive_with_an_error_arms_again_when_asked(usb: UsbRobot, armed: Contr
     assert eventually(lambda: armed.status is DriveStatus.ARMED)
 
 
-def test_no_reading_after_arm_is_called_tells_of_the_error_before(
+def test_no_reading_after_arm_reports_the_error_before(
     usb: UsbRobot, armed: Control, drive: OdriveUsb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     carry_out = drive._carry_out
@@ -234,7 +234,7 @@ def test_no_reading_after_arm_is_called_tells_of_the_error_before(
     usb.stalled.clear()
 
 
-def test_the_drive_takes_a_position_that_it_is_told(usb: UsbRobot, control: Control) -> None:
+def test_the_drive_takes_a_position_that_is_written(usb: UsbRobot, control: Control) -> None:
     control.drive.set_position((64.25, -3.5))
     assert eventually(lambda: control.pos == (64.25, -3.5))
     with usb.lock:

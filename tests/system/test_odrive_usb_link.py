@@ -135,7 +135,7 @@ def test_a_drive_without_a_watchdog_is_not_lost_at_the_first_silence(
     assert all(answer is None or answer.status == LOST for answer in silence)
 
 
-def test_silence_while_nobody_waited_is_not_held_against_the_drive(
+def test_silence_without_a_reader_does_not_count_against_the_drive(
     usb: UsbRobot, config: RobotConfig
 ) -> None:
     """As when the service is stopped and continued: it has heard nothing because it slept."""

@@ -33,7 +33,7 @@ def told_in_state(usb: UsbRobot, monkeypatch: pytest.MonkeyPatch) -> list[AxisSt
     return states
 
 
-def test_a_position_told_right_after_idle_finds_both_axes_idle(
+def test_a_position_set_right_after_idle_finds_both_axes_idle(
     usb: UsbRobot, armed: Control, drive: OdriveUsb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An armed axis would jump by what it is told: 64 turns where a lost zero is forgotten."""
@@ -47,7 +47,7 @@ def test_a_position_told_right_after_idle_finds_both_axes_idle(
     assert states == [AxisState.IDLE] * 2
 
 
-def test_a_position_told_right_before_arm_comes_before_it(
+def test_a_position_set_right_before_arm_comes_before_it(
     usb: UsbRobot, control: Control, drive: OdriveUsb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     states = told_in_state(usb, monkeypatch)
@@ -60,7 +60,7 @@ def test_a_position_told_right_before_arm_comes_before_it(
     assert usb.bank.input_pos[4:6].tolist() == pytest.approx([0.5, 0.25], abs=1e-3)
 
 
-def test_a_drive_that_is_not_on_the_bus_is_told_of_once_with_its_number(
+def test_a_drive_missing_from_the_bus_is_reported_once_with_its_number(
     usb: UsbRobot,
     config: RobotConfig,
     monkeypatch: pytest.MonkeyPatch,
@@ -77,7 +77,7 @@ def test_a_drive_that_is_not_on_the_bus_is_told_of_once_with_its_number(
     ]
 
 
-def test_a_drive_that_is_there_is_not_told_of(
+def test_a_drive_that_is_present_is_not_reported(
     usb: UsbRobot,
     config: RobotConfig,
     monkeypatch: pytest.MonkeyPatch,

@@ -130,9 +130,9 @@ def test_a_live_joint_service_refuses_old_commands_and_takes_a_planners(
             raise AssertionError("in time")
 
         armed = put(HOUR_NS, until=Mode.HOLD)
-        told = len(service.drive.targets)
+        written = len(service.drive.targets)
         old = put(HOUR_NS, until=Mode.HOLD, refused=100)
         ahead = put(-HOUR_NS, until=Mode.HOLD, refused=old.refused + 100)
         assert old.tau == ahead.tau == armed.tau
-        assert len(set(map(msgspec.json.encode, service.drive.targets[told:]))) == 1
+        assert len(set(map(msgspec.json.encode, service.drive.targets[written:]))) == 1
         assert put(0, until=Mode.TRACK).session == SESSION

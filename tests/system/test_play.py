@@ -118,20 +118,20 @@ def test_chosen_topics_of_a_part_go_under_other_names_with_the_recorded_time_bes
         *("--start-offset", "0.5", "--duration", "1", "--wait", "60"),
     )
     with listening(run_dir, "lab/**") as ear, playing(run_dir, *words) as process:
-        heard = ear.all(process)
+        received = ear.all(process)
     first, last = rows[0][2] + 500_000_000, rows[0][2] + 1_500_000_000
     wanted = {STATE: f"lab/7/xrl/{NAME}/was/knee_left", WRENCH: f"lab/7/{WRENCH}"}
-    assert [row for row in heard if row[0] != "lab/7/clock"] == [
+    assert [row for row in received if row[0] != "lab/7/clock"] == [
         (wanted[key], payload) for key, payload, at in rows if key in wanted and first <= at < last
     ]
-    ticks = [json.loads(payload) for key, payload in heard if key == "lab/7/clock"]
+    ticks = [json.loads(payload) for key, payload in received if key == "lab/7/clock"]
     assert [tick["seq"] for tick in ticks] == list(range(ticks[0]["seq"], ticks[-1]["seq"] + 1))
     stamps = [tick["t_ns"] for tick in ticks]
     assert stamps == sorted(stamps)
     assert first <= stamps[0] < stamps[-1] <= last
 
 
-def test_a_loop_goes_on_until_ctrl_c_and_then_says_how_it_went(
+def test_a_loop_runs_until_ctrl_c_and_then_reports_its_counts(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = items(0.5)

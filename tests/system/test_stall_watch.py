@@ -51,7 +51,7 @@ def test_only_whole_lines_from_a_time_on_are_read(tmp_path: Path) -> None:
     assert gaps_in(path, from_ns=150) == [Gap(200, 40)]
 
 
-def test_nobody_is_let_off_without_a_measured_stall(
+def test_no_process_is_excused_without_a_measured_stall(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "gaps"

@@ -93,16 +93,16 @@ def listen(
         imu: whether the IMU is on it.
         seconds: how long.
     """
-    heard = BusHeard(nodes={node: NodeHeard() for node in nodes})
+    traffic = BusHeard(nodes={node: NodeHeard() for node in nodes})
     try:
         with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
             if ask:
                 for message in _questions(nodes):
                     bus.send(message, timeout=_WAIT_S)
-            _take_in(bus, heard, seconds, cells=cells, imu=imu)
+            _take_in(bus, traffic, seconds, cells=cells, imu=imu)
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:
-        heard.trouble = str(error) or type(error).__name__
-    return heard
+        traffic.trouble = str(error) or type(error).__name__
+    return traffic
 
 
 def long_enough(heartbeat_period_ms: int) -> float:

@@ -31,8 +31,8 @@ _OFF: Final = ("BUS-OFF", "STOPPED", "SLEEPING")
 def ask_ip() -> Links:
     """Return the output of `ip` for the CAN interfaces; nothing without that command."""
     try:
-        said = subprocess.run(_IP, capture_output=True, timeout=_IP_S, check=True).stdout
-        return {link["ifname"]: link for link in json.loads(said or "[]") if "ifname" in link}
+        output = subprocess.run(_IP, capture_output=True, timeout=_IP_S, check=True).stdout
+        return {link["ifname"]: link for link in json.loads(output or "[]") if "ifname" in link}
     except (OSError, subprocess.SubprocessError, ValueError):
         return {}
 

@@ -63,8 +63,8 @@ def verdict_line(groups: Groups) -> str:
     noted = f"{warnings} warning{'s' * (warnings != 1)}: {named}"
     if wrong:
         named = _names(row for row in put_together if row.verdict is FindingKind.WRONG)
-        said = f"{wrong} wrong: {named}"
-        return f"{said}; {noted}" if warnings else said
+        text = f"{wrong} wrong: {named}"
+        return f"{text}; {noted}" if warnings else text
     return f"nothing wrong; {noted}" if warnings else "all ok"
 
 

@@ -41,9 +41,9 @@ def standing(robot: RobotConfig, height: float) -> Standing:
     """
     longest = robot.geometry.l1 + robot.geometry.l2
     if not 0.0 < height < longest:
-        said = f"--standing {height:g}: the hips are between 0 and {longest:g} m above the ankles"
+        text = f"--standing {height:g}: the hips are between 0 and {longest:g} m above the ankles"
         in_mm = f"; if these are mm: --standing {height / 1e3:g}" if height > 100.0 else ""
-        raise RunError(said + in_mm)
+        raise RunError(text + in_mm)
     limits = np.array(robot.joint_limits())
     kinematics = Kinematics(robot)
     ik = InverseKinematics(kinematics, limits)

@@ -59,9 +59,9 @@ def survey(
     if is_simulated(robot) and not fleet_is_up:
         say("starting the simulator: the drives are emulated, and no fleet is up")
     with drives_within_reach(robot, config_path, run_dir, plants):
-        heard = _listen(robot, run_dir, services_up=services_up, say=say)
+        traffic = _listen(robot, run_dir, services_up=services_up, say=say)
         say("the drives over USB")
-        groups[DRIVES] = _usb(robot, run_dir, heard, services_up=services_up)
+        groups[DRIVES] = _usb(robot, run_dir, traffic, services_up=services_up)
     if robot.joint_service.driver == "odrive_can":
         groups[CAN] = [
             row
@@ -69,13 +69,13 @@ def survey(
             for row in check_can.drive_rows(
                 robot,
                 module,
-                heard[robot.module_named(module).bus],
+                traffic[robot.module_named(module).bus],
                 services_up=services_up,
             )
         ]
-    groups[HARNESS] = check_can.harness_rows(robot, heard[robot.harness.bus])
+    groups[HARNESS] = check_can.harness_rows(robot, traffic[robot.harness.bus])
     if robot.imu.fitted:
-        groups[IMU] = check_can.imu_rows(robot, heard[robot.imu.bus])
+        groups[IMU] = check_can.imu_rows(robot, traffic[robot.imu.bus])
     return {name: groups[name] for name in GROUPS if name in groups}
 
 
@@ -83,14 +83,14 @@ def _listen(
     robot: RobotConfig, run_dir: Path, *, services_up: bool, say: Say
 ) -> dict[str, BusHeard]:
     """Listen to every bus of the robot, one after the other."""
-    heard = {}
+    present = {}
     on_usb = robot.joint_service.driver == "odrive_usb"
     for name, nodes in check_can.bus_nodes(robot).items():
         if on_usb and name not in (robot.harness.bus, robot.imu.bus):
             continue
         say(f"CAN bus {name}")
         bus = robot.can[name]
-        heard[name] = listen(
+        present[name] = listen(
             CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir)),
             nodes,
             ask=not services_up,
@@ -98,7 +98,7 @@ def _listen(
             imu=robot.imu.fitted and name == robot.imu.bus,
             seconds=long_enough(robot.drive.heartbeat_period_ms if nodes else 0),
         )
-    return heard
+    return present
 
 
 def _usb(

@@ -265,5 +265,5 @@ class UsbBoard:
 
 def describe(error: BaseException) -> str:
     """Return an exception of the package as one line."""
-    said = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {said[0]}" if said else type(error).__name__
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

@@ -179,11 +179,11 @@ def look(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> FleetStatus
         ear.new_window()
     _listen(ears, _WINDOW_S)
     # before the call to the supervisor, which takes a while on a busy machine
-    heard = {name: (ear.age_s(), ear.rate_hz()) for name, ear in ears.items()}
+    present = {name: (ear.age_s(), ear.rate_hz()) for name, ear in ears.items()}
     fresh = {name for name, ear in ears.items() if ear.is_fresh()}
     services = {}
     for service in fleet.info():
-        age_s, rate_hz = heard.get(service.name, (None, None))
+        age_s, rate_hz = present.get(service.name, (None, None))
         services[service.name] = ServiceStatus(
             pid=service.pid,
             state=service.state,

@@ -69,8 +69,8 @@ class ProxyClient:
         except OSError as error:
             kill = "`xrl kill network_proxy`"
             out = f"{kill[:-1]} --signal CONT` if it was stopped, or {kill}"
-            said = f"{self._path}: the network proxy does not answer: {error}; {out}"
-            raise FleetError(said) from None
+            text = f"{self._path}: the network proxy does not answer: {error}; {out}"
+            raise FleetError(text) from None
         if not line:
             raise FleetError(
                 f"{self._path}: the network proxy ended without an answer; see its log"
@@ -78,8 +78,8 @@ class ProxyClient:
         try:
             reply = _decode(line)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            said = f"{self._path}: the answer is none of a network proxy of this version: {error}"
-            raise FleetError(said) from None
+            text = f"{self._path}: the answer is none of a network proxy of this version: {error}"
+            raise FleetError(text) from None
         if reply.error:
             raise FleetError(f"refused: {reply.error}")
         return reply.requested

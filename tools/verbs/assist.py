@@ -148,7 +148,7 @@ def ask(
         return 0.0
     if status.requested_by not in ("", SCENARIO):
         raise FleetError(f"{status.requested_by} asks already; end that first")
-    start = heard = time.monotonic()
+    start = received_at = time.monotonic()
     while not stop() and (for_s is None or time.monotonic() - start < for_s):
         now = time.monotonic()
         intents.put(
@@ -165,8 +165,8 @@ def ask(
             status = newest
             shown.update(Text(describe(request, status)))
             if status.requested_by == request.source:
-                heard = now
-        if now - heard > HEARD_S:
+                received_at = now
+        if now - received_at > HEARD_S:
             taken = (
                 f"it follows {status.requested_by}" if status.requested_by else "see `xrl status`"
             )

@@ -109,12 +109,12 @@ def show(survey: Survey, run_files: list[Path], console: Console) -> None:
         names = ", ".join(path.name for path in others)
         console.print(f"further files of this run: {printable(names)} (--run counts all together)")
     _show_run(survey, console)
-    heard = {name: topic for name, topic in survey.topics.items() if topic.sequence.count}
+    present = {name: topic for name, topic in survey.topics.items() if topic.sequence.count}
     robot = survey.files[0].metadata.get("run", {}).get("robot", "")
-    if heard:
+    if present:
         console.print()
-        console.print(_table(heard, f"xrl/{robot}/", events=survey.files[0].ours))
-    silent = len(survey.topics) - len(heard)
+        console.print(_table(present, f"xrl/{robot}/", events=survey.files[0].ours))
+    silent = len(survey.topics) - len(present)
     if silent:
         console.print(f"{silent} more topics without a message", style="dim")
 

@@ -65,11 +65,11 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"does not stop {', '.join(elsewhere)}: no service of theirs on this host")
     console.print("held: Enter lays it down; Ctrl-C, or this program's end, stops all modules")
     ends = None if args.for_s is None else time.monotonic() + args.for_s
-    said = None
-    while not stop and said != "":
+    shown = None
+    while not stop and shown != "":
         pendant.beat()
-        said = _line(EVERY_S)
-        if said or (ends is not None and time.monotonic() >= ends):
+        shown = _line(EVERY_S)
+        if shown or (ends is not None and time.monotonic() >= ends):
             pendant.lay_down()
             console.print("laid down: the robot continues without it")
             return 0

@@ -127,11 +127,11 @@ def tables(status: FleetStatus) -> Group:
             module.way_out.replace("MODULE", name),
         )
     way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear"
-    said = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
+    line = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
     slow = f" in slow motion: the fleet's clock goes at {status.pace:g} of real time"
     lines = [f" {describe_lead(status.lead)}"]
     lines += [slow] if status.pace != 1.0 else []
-    lines += [said] if status.network else []
+    lines += [line] if status.network else []
     return Group(services, modules, *lines)
 
 

@@ -150,9 +150,9 @@ def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | 
             )
     for fleet in {fleet.run.path: fleet for fleet in up.values()}.values():
         mine = [module for module, other in up.items() if other.run.path == fleet.run.path]
-        heard = _states(robot, fleet, mine)
+        states = _states(robot, fleet, mine)
         for module in mine:
-            state = heard.get(module)
+            state = states.get(module)
             if state is None:
                 raise FleetError(
                     f"{module}: its joint service in {fleet.run.path} is up, but sends no state; "
@@ -235,17 +235,17 @@ def _states(
     robot: RobotConfig, fleet: SupervisedFleet, modules: list[str]
 ) -> dict[str, JointState]:
     """Return one state of each module of a fleet that sends any."""
-    heard: dict[str, JointState] = {}
+    states: dict[str, JointState] = {}
     with open_session(robot, "zero", fleet.run.path) as session:
         ends = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in modules}
         deadline = time.monotonic() + HEARD_S
-        while time.monotonic() < deadline and len(heard) < len(modules):
+        while time.monotonic() < deadline and len(states) < len(modules):
             for module, latest in ends.items():
                 state = latest.take()
                 if state is not None:  # its stamp is the drive's, which may be silent
-                    heard[module] = state
+                    states[module] = state
             time.sleep(0.01)
-    return heard
+    return states
 
 
 def _way_out(module: str, mode: Mode) -> str:

@@ -107,9 +107,9 @@ def judged(dialect: Dialect, heartbeat: bytes, *, wanted_armed: bool) -> tuple[i
     if dialect == "0.5":
         errors = int(cansimple.unpack_heartbeat(heartbeat).errors)
     else:
-        said = cansimple_06.unpack_heartbeat(heartbeat)
-        errors = errors_from_06(said.axis_error)
-        if wanted_armed and not closed and said.procedure_result not in _FINE:
+        fields = cansimple_06.unpack_heartbeat(heartbeat)
+        errors = errors_from_06(fields.axis_error)
+        if wanted_armed and not closed and fields.procedure_result not in _FINE:
             errors |= AxisError.INVALID_STATE  # asked for, and refused or ended
     if not closed and not wanted_armed:
         errors &= ~AxisError.WATCHDOG_TIMER_EXPIRED

@@ -119,7 +119,7 @@ def test_a_bus_that_is_back_at_once_is_gone_on_with_before_the_next_heartbeat(
 
 
 @pytest.mark.parametrize("data", [b"", b"\x02", bytes(7)])
-def test_a_request_for_a_version_by_somebody_else_is_no_version(bench: Bench, data: bytes) -> None:
+def test_a_foreign_request_for_a_version_is_no_version(bench: Bench, data: bytes) -> None:
     bench.bus.waiting.append(frame(NODES[0], Command06.GET_VERSION, data))
     bench.after(1)
     assert bench.driver.dialect == ""
@@ -279,7 +279,7 @@ def test_a_link_that_fails_and_comes_back_at_once_is_no_lost_drive(path: Path) -
 # ---- filters
 
 
-def test_the_kernel_is_told_which_nodes_to_wake_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_kernel_filters_by_the_nodes_to_wake_for(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(monkeypatch, "socketcan")
     found = bench.bus.options["can_filters"]
     assert isinstance(found, list)

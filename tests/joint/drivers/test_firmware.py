@@ -140,7 +140,7 @@ def test_the_watchdog_has_its_own_bit_in_each_dialect_and_the_other_one_is_somet
     ("dialect", "heartbeat"),
     [("0.5", old(IDLE, 0x800)), ("0.6", new(IDLE, 0x0100_0000, ProcedureResult.DISARMED))],
 )
-def test_a_watchdog_that_ran_out_before_anybody_wrote_is_no_error(
+def test_a_watchdog_that_ran_out_before_the_first_write_is_no_error(
     dialect: Dialect, heartbeat: bytes
 ) -> None:
     assert judged(dialect, heartbeat, wanted_armed=False) == (IDLE, 0)

@@ -59,7 +59,7 @@ def test_reading_holds_the_positions_and_velocities_of_both_axes(rig: Rig, path:
     assert reading.vel_turns == pytest.approx((3.0, -4.0))
 
 
-def test_a_drive_that_was_never_armed_is_where_its_count_says(rig: Rig, path: Path) -> None:
+def test_a_drive_that_was_never_armed_is_where_its_count_shows(rig: Rig, path: Path) -> None:
     rig.pos[[4, 5]] = 64.5, -2.25
     rig.step()
     driver = make_driver(path)
@@ -380,9 +380,9 @@ def test_estimates_without_heartbeats_are_a_lost_drive_since_it_could_disarm_uns
 @pytest.mark.parametrize("silent", NODES)
 def test_heartbeats_of_one_axis_do_not_count_for_the_other(bench: Bench, silent: int) -> None:
     bench.armed()
-    heard = NODES[1 - NODES.index(silent)]
+    sending = NODES[1 - NODES.index(silent)]
     for _ in range(2 * REBOOT_MS // (2 * ARM_GRACE_MS)):
-        receive_heartbeat(bench, heard, CLOSED)
+        receive_heartbeat(bench, sending, CLOSED)
     reading = bench.receive(None)
     assert reading is not None
     assert reading.status is DriveStatus.LOST

@@ -134,7 +134,7 @@ def excess(torques: list[np.ndarray]) -> np.ndarray:
     return np.maximum(0.0, np.abs(np.array(torques)) - np.abs(wanted)) / SPRING
 
 
-def test_without_loss_the_drive_does_what_it_is_told(run: Runner) -> None:
+def test_without_loss_the_drive_does_what_is_commanded(run: Runner) -> None:
     whole = run(())
     assert excess(whole.torques).max() < 1e-3
     wanted = np.array(HOLD.torque) + SPRING

@@ -74,16 +74,16 @@ def test_gains_that_change_while_the_drive_settles_are_sent_without_the_mode(ben
 
 def test_targets_that_a_full_queue_cuts_off_reach_both_axes_in_turn(bench: Bench) -> None:
     settled(bench)
-    heard = dict.fromkeys(NODES, 0)
+    received = dict.fromkeys(NODES, 0)
     for step in range(40):
         bench.bus.room = 3
         bench.driver.write(with_gain(10.0 + step))
         bench.wait(0.002)
         for message in bench.bus.sent:
             node, command = split_id(message.arbitration_id)
-            heard[node] += command == Command.SET_INPUT_POS
+            received[node] += command == Command.SET_INPUT_POS
         bench.bus.sent.clear()
-    assert list(heard.values()) == [20, 20]
+    assert list(received.values()) == [20, 20]
 
 
 def test_targets_that_were_cut_off_are_not_followed_by_gains(bench: Bench) -> None:

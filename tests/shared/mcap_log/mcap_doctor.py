@@ -158,9 +158,9 @@ class _Doctor:
                 self._warn("a message's log time is before an earlier one's")
             self._newest = max(self._newest, record.log_time)
             times.append(record.log_time)
-        said = (chunk.message_start_time, chunk.message_end_time)
-        if times and said != (min(times), max(times)):
-            self._error(f"chunk at {place}: not from {said[0]} to {said[1]}")
+        indexed = (chunk.message_start_time, chunk.message_end_time)
+        if times and indexed != (min(times), max(times)):
+            self._error(f"chunk at {place}: not from {indexed[0]} to {indexed[1]}")
         self.found.messages += len(times)
         self._times += times
         self._chunks[place] = chunk, length, channels

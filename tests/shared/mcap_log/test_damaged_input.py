@@ -173,10 +173,10 @@ def test_the_verbs_answer_a_cut_file_with_a_good_end_or_one_line(
         for verb in ("info", "recover"):
             flags = ["--force"] if verb == "recover" else []
             code = cli.main([verb, str(path), *flags])
-            said = capsys.readouterr()
+            output = capsys.readouterr()
             assert code in (0, 2)
-            assert len(said.err.splitlines()) == (1 if code else 0)
-            assert "Traceback" not in said.err + said.out
+            assert len(output.err.splitlines()) == (1 if code else 0)
+            assert "Traceback" not in output.err + output.out
 
 
 def old_version(path: Path) -> None:
@@ -208,10 +208,10 @@ def test_another_version_and_a_foreign_file_are_shown_recovered_and_refused_in_o
     assert callable(make)
     make(path)
     assert cli.main(["info", str(path)]) == 0
-    said = capsys.readouterr().out
-    assert ("0; this code writes" in said) == (make is old_version)
-    assert ("foreign" in said) == (make is foreign)
-    assert "\x1b" not in said
+    output = capsys.readouterr().out
+    assert ("0; this code writes" in output) == (make is old_version)
+    assert ("foreign" in output) == (make is foreign)
+    assert "\x1b" not in output
     assert cli.main(["recover", str(path), "-o", str(tmp_path / "y.mcap")]) == 0
     with pytest.raises(RunError) as caught:
         read_run(path).messages(topics.JOINT_STATE, "knee_right")
@@ -235,7 +235,7 @@ def test_what_is_no_log_is_one_line_and_exit_code_2(
         os.mkfifo(path)
     there = sorted(tmp_path.iterdir())
     assert cli.main([verb, str(path)]) == 2
-    said = capsys.readouterr()
-    assert len(said.err.splitlines()) == 1
-    assert str(path) in said.err
+    output = capsys.readouterr()
+    assert len(output.err.splitlines()) == 1
+    assert str(path) in output.err
     assert sorted(tmp_path.iterdir()) == there

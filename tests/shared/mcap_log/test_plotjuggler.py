@@ -129,12 +129,14 @@ def test_every_number_and_flag_of_a_run_is_a_point_and_only_text_is_not(
     assert opened(opened_by_3, "whole").words == texts
 
 
-def test_text_is_in_the_fields_whose_schema_says_so_and_nowhere_else(opened: Open) -> None:
-    said = {name for topic in topics.TOPICS for name in words_in(schema.json_schema(topic.type))}
+def test_text_is_in_the_fields_of_text_in_the_schema_and_nowhere_else(opened: Open) -> None:
+    described = {
+        name for topic in topics.TOPICS for name in words_in(schema.json_schema(topic.type))
+    }
     dropped = {path.rpartition("/")[2] for path in opened(opened_by_3, "whole").words}
     assert dropped
-    assert dropped <= said
-    assert not said & {field for _, field in schema.ENUMERATIONS}
+    assert dropped <= described
+    assert not described & {field for _, field in schema.ENUMERATIONS}
 
 
 @pytest.mark.parametrize("reader", VERSIONS)

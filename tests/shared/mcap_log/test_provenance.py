@@ -33,7 +33,7 @@ def test_a_changed_file_makes_the_checkout_dirty(checkout: Path) -> None:
     assert provenance.code(checkout)["git_dirty"] == "true"
 
 
-def test_a_directory_inside_somebody_elses_checkout_is_unknown(checkout: Path) -> None:
+def test_a_directory_inside_another_checkout_is_unknown(checkout: Path) -> None:
     installed = checkout / "site-packages"
     installed.mkdir()
     assert provenance.code(installed) == {"git_commit": "unknown", "git_dirty": "unknown"}

@@ -19,7 +19,7 @@ def test_a_whole_sequence_has_no_gap() -> None:
     assert fed(range(100)) == KeyCount(count=100, last_seq=99)
 
 
-def test_messages_before_the_first_one_heard_are_not_lost() -> None:
+def test_messages_before_the_first_received_one_are_not_lost() -> None:
     assert fed(range(7, 10)).missing == 0
 
 

@@ -73,18 +73,18 @@ def bus() -> Iterator[Bus]:
 
 
 def test_heartbeats_estimates_and_load_cells_are_taken_in(bus: Bus) -> None:
-    heard = listen(bus.config, (NODE,), ask=False, cells=True)
-    axis = heard.nodes[NODE]
-    assert heard.trouble == ""
+    traffic = listen(bus.config, (NODE,), ask=False, cells=True)
+    axis = traffic.nodes[NODE]
+    assert traffic.trouble == ""
     assert axis.heartbeat == IDLE
     assert axis.pos_turns == 64.5
     assert len(axis.heartbeats_s) > 3
-    assert heard.samples[0] == (1.0, 2.0, 3.0, 4.0, 5.0, -6.0)
-    assert heard.malformed == 0
-    assert sorted(heard.nodes) == [NODE, STRANGER], "load cells are no nodes"
+    assert traffic.samples[0] == (1.0, 2.0, 3.0, 4.0, 5.0, -6.0)
+    assert traffic.malformed == 0
+    assert sorted(traffic.nodes) == [NODE, STRANGER], "load cells are no nodes"
 
 
-def test_an_imu_is_heard_where_there_is_one(tmp_path: Path) -> None:
+def test_an_imu_is_received_where_there_is_one(tmp_path: Path) -> None:
     frames = imu_can.pack([1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0], valid=True)
     config = CanConfig(interface="xrl_unix", channel=str(tmp_path / "can.sock"))
     done = threading.Event()
@@ -98,31 +98,31 @@ def test_an_imu_is_heard_where_there_is_one(tmp_path: Path) -> None:
 
         speaker = threading.Thread(target=speak)
         speaker.start()
-        heard = listen(config, (), ask=False, imu=True)
+        traffic = listen(config, (), ask=False, imu=True)
         done.set()
         speaker.join()
-    assert heard.attitudes[0].rate == (0.0, 0.5, 0.0)
-    assert heard.attitudes[0].valid
-    assert len(heard.attitudes) == len(heard.attitudes_s) > 3
-    assert heard.nodes == {}, "its frames are no nodes"
+    assert traffic.attitudes[0].rate == (0.0, 0.5, 0.0)
+    assert traffic.attitudes[0].valid
+    assert len(traffic.attitudes) == len(traffic.attitudes_s) > 3
+    assert traffic.nodes == {}, "its frames are no nodes"
 
 
 def test_nothing_is_sent_where_nothing_is_to_be_asked(bus: Bus) -> None:
-    heard = listen(bus.config, (NODE,), ask=False)
+    traffic = listen(bus.config, (NODE,), ask=False)
     assert bus.asked == [], "any frame feeds a watchdog"
-    assert heard.nodes[NODE].vbus_voltage is None
+    assert traffic.nodes[NODE].vbus_voltage is None
 
 
 def test_version_and_supply_are_asked_for_by_requests_without_data(bus: Bus) -> None:
-    heard = listen(bus.config, (NODE,), ask=True)
+    traffic = listen(bus.config, (NODE,), ask=True)
     assert all(can_id & REMOTE_FLAG for can_id in bus.asked)
-    assert heard.nodes[NODE].vbus_voltage == 47.5
-    version = heard.nodes[NODE].version
+    assert traffic.nodes[NODE].vbus_voltage == 47.5
+    version = traffic.nodes[NODE].version
     assert version is not None
     assert version.firmware == (0, 6, 10)
 
 
-def test_a_bus_that_is_not_there_is_said_and_not_raised(tmp_path: Path) -> None:
+def test_a_missing_bus_is_reported_and_not_raised(tmp_path: Path) -> None:
     nowhere = CanConfig(interface="xrl_unix", channel=str(tmp_path / "no.sock"))
     assert "no.sock" in listen(nowhere, (NODE,), ask=True).trouble
     unknown = CanConfig(interface="carrier_pigeon", channel="0")

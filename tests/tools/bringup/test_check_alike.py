@@ -46,14 +46,14 @@ def test_a_setting_that_one_board_lacks_shows() -> None:
     ]
 
 
-def test_half_against_half_accuses_nobody() -> None:
+def test_half_against_half_accuses_no_module() -> None:
     six = boards()
     for module in MODULES[:3]:
         six[module][POLES] = 20
     assert bad(alike_rows(six)) == []
 
 
-def test_two_boards_tell_nothing() -> None:
+def test_two_boards_prove_nothing() -> None:
     assert alike_rows(dict(list(boards().items())[:2])) == []
 
 

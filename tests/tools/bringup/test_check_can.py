@@ -52,9 +52,9 @@ def test_a_bus_that_carries_both_axes_at_their_periods_is_ok(robot: RobotConfig)
 
 
 def test_an_encoder_at_its_factory_period_is_a_warning_with_the_setting(robot: RobotConfig) -> None:
-    heard = healthy()
-    heard.nodes[8] = axis(encoder_s=0.01)
-    rows = rows_of(robot, heard)
+    traffic = healthy()
+    traffic.nodes[8] = axis(encoder_s=0.01)
+    rows = rows_of(robot, traffic)
     assert bad(rows) == [(f"{MODULE}.axis0", "encoder frames", FindingKind.WARNING)]
     row = next(row for row in rows if row.verdict != FindingKind.OK)
     assert (row.found, row.wanted) == ("10.0 ms", "2 ms")
@@ -62,28 +62,30 @@ def test_an_encoder_at_its_factory_period_is_a_warning_with_the_setting(robot: R
 
 
 def test_an_axis_without_encoder_frames_is_wrong(robot: RobotConfig) -> None:
-    heard = healthy()
-    heard.nodes[9].estimates_s = []
-    assert bad(rows_of(robot, heard)) == [(f"{MODULE}.axis1", "encoder frames", FindingKind.WRONG)]
+    traffic = healthy()
+    traffic.nodes[9].estimates_s = []
+    assert bad(rows_of(robot, traffic)) == [
+        (f"{MODULE}.axis1", "encoder frames", FindingKind.WRONG)
+    ]
 
 
 def test_an_axis_that_sends_no_heartbeat_is_wrong(robot: RobotConfig) -> None:
-    heard = healthy()
-    heard.nodes[9] = NodeHeard()
-    assert bad(rows_of(robot, heard)) == [(f"{MODULE}.axis1", "heartbeat", FindingKind.WRONG)]
+    traffic = healthy()
+    traffic.nodes[9] = NodeHeard()
+    assert bad(rows_of(robot, traffic)) == [(f"{MODULE}.axis1", "heartbeat", FindingKind.WRONG)]
 
 
 def test_other_nodes_on_a_silent_bus_are_named(robot: RobotConfig) -> None:
-    heard = BusHeard(nodes={8: NodeHeard(), 9: NodeHeard(), 0: axis(), 1: axis()})
-    (row,) = rows_of(robot, heard)
+    traffic = BusHeard(nodes={8: NodeHeard(), 9: NodeHeard(), 0: axis(), 1: axis()})
+    (row,) = rows_of(robot, traffic)
     assert row.verdict is FindingKind.WRONG
     assert "nodes 0, 1 are heard" in row.fix
 
 
 def test_a_failed_motor_shows_though_the_axis_error_is_0(robot: RobotConfig) -> None:
-    heard = healthy()
-    heard.nodes[8] = axis(IDLE._replace(motor_failed=True))
-    rows = rows_of(robot, heard)
+    traffic = healthy()
+    traffic.nodes[8] = axis(IDLE._replace(motor_failed=True))
+    rows = rows_of(robot, traffic)
     assert bad(rows) == [(f"{MODULE}.axis0", "errors", FindingKind.WRONG)]
     assert "MOTOR_FAILED" in next(row.found for row in rows if row.verdict != FindingKind.OK)
 
@@ -91,17 +93,17 @@ def test_a_failed_motor_shows_though_the_axis_error_is_0(robot: RobotConfig) -> 
 def test_firmware_0_6_is_named_and_its_heartbeats_are_not_taken_for_errors(
     robot: RobotConfig,
 ) -> None:
-    heard = healthy()
-    heard.nodes[8] = axis(IDLE._replace(motor_failed=True))
-    heard.nodes[8].version = Version(2, (4, 4, 58), (0, 6, 10), 0)
-    rows = rows_of(robot, heard)
+    traffic = healthy()
+    traffic.nodes[8] = axis(IDLE._replace(motor_failed=True))
+    traffic.nodes[8].version = Version(2, (4, 4, 58), (0, 6, 10), 0)
+    rows = rows_of(robot, traffic)
     assert bad(rows) == [(f"{MODULE}.axis0", "firmware", FindingKind.WARNING)]
 
 
 @pytest.mark.parametrize(
     ("interface", "words"), [("xrl_unix", "simulator"), ("socketcan", "ip link set can7 up")]
 )
-def test_a_bus_that_cannot_be_opened_says_how_to_open_it(
+def test_a_bus_that_cannot_be_opened_names_how_to_open_it(
     robot: RobotConfig, interface: str, words: str
 ) -> None:
     can = {name: CanConfig(interface=interface, channel="can7") for name in robot.can}
@@ -111,7 +113,7 @@ def test_a_bus_that_cannot_be_opened_says_how_to_open_it(
     assert words in row.fix
 
 
-def test_a_kernel_without_can_is_not_told_to_bring_an_interface_up(robot: RobotConfig) -> None:
+def test_a_kernel_without_can_gets_no_advice_to_bring_an_interface_up(robot: RobotConfig) -> None:
     can = {name: CanConfig(interface="socketcan", channel="can7") for name in robot.can}
     other = msgspec.structs.replace(robot, can=can)
     trouble = f"[Errno {errno.EAFNOSUPPORT}] {os.strerror(errno.EAFNOSUPPORT)}"
@@ -123,11 +125,11 @@ def test_a_kernel_without_can_is_not_told_to_bring_an_interface_up(robot: RobotC
 def test_two_axes_under_one_node_id_show_however_their_heartbeats_fall(
     robot: RobotConfig, apart_s: float
 ) -> None:
-    heard = healthy()
+    traffic = healthy()
     both = sorted(t + late for t in times(0.02, 25) for late in (0.0, apart_s))
     # the first and the last gap are long ones: so is then the median of 1 and 19 ms
-    heard.nodes[8] = NodeHeard(IDLE, both[1:-1], times(0.002), pos_turns=64.0)
-    rows = rows_of(robot, heard)
+    traffic.nodes[8] = NodeHeard(IDLE, both[1:-1], times(0.002), pos_turns=64.0)
+    rows = rows_of(robot, traffic)
     assert bad(rows) == [(f"{MODULE}.axis0", "heartbeat", FindingKind.WARNING)]
     assert "the same node id" in next(row.why for row in rows if row.verdict != FindingKind.OK)
 
@@ -157,9 +159,9 @@ def test_the_load_cells_are_judged_by_rate_and_range(
 
 
 def test_frames_of_load_cells_out_of_order_are_counted(robot: RobotConfig) -> None:
-    heard = cells()
-    heard.malformed = 3
-    assert [row.found for row in check_can.harness_rows(robot, heard)][-1] == "3"
+    traffic = cells()
+    traffic.malformed = 3
+    assert [row.found for row in check_can.harness_rows(robot, traffic)][-1] == "3"
 
 
 def test_the_period_stands_a_reader_that_stalls_and_a_sender_that_catches_up() -> None:
@@ -201,7 +203,7 @@ def imu_heard(*, valid: bool = True, period_s: float = 0.01) -> BusHeard:
         (BusHeard(trouble="no such device"), [("IMU", "CAN bus", FindingKind.WRONG)]),
     ],
 )
-def test_an_imu_is_judged_by_its_rate_and_by_what_it_says_of_itself(
+def test_an_imu_is_judged_by_its_rate_and_its_own_flags(
     robot: RobotConfig, heard: BusHeard, wrong: list[tuple[str, str, FindingKind]]
 ) -> None:
     assert bad(check_can.imu_rows(robot, heard)) == wrong

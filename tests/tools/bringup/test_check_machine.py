@@ -40,7 +40,7 @@ def row_of(rows: list[Finding], what: str) -> Finding:
         ("proc/swaps", "Filename Type\n/swapfile file", "swap"),
     ],
 )
-def test_what_slows_a_loop_is_a_warning_on_a_real_robot_and_said_on_an_emulated_one(
+def test_a_slow_loop_is_a_warning_on_a_real_robot_and_a_note_on_an_emulated_one(
     robot: RobotConfig, real: RobotConfig, tmp_path: Path, path: str, text: str, what: str
 ) -> None:
     write(tmp_path, path, text)
@@ -57,7 +57,7 @@ def test_one_processor_that_sleeps_is_seen(real: RobotConfig, tmp_path: Path) ->
     assert (row.verdict, row.found) == (FindingKind.WARNING, "performance and powersave")
 
 
-def test_a_kernel_that_tells_nothing_is_ok(robot: RobotConfig, tmp_path: Path) -> None:
+def test_a_kernel_without_the_figure_is_ok(robot: RobotConfig, tmp_path: Path) -> None:
     rows = check_machine.machine_rows(robot, tmp_path)
     assert row_of(rows, "frequency governor").found == "unknown here"
     assert {row.verdict for row in rows} == {FindingKind.OK}

@@ -76,20 +76,18 @@ def test_what_stops_or_delays_frames_is_named(
     assert all(row.fix for row in rows if row.verdict != FindingKind.OK)
 
 
-def test_counted_errors_are_told(real: RobotConfig, tmp_path: Path) -> None:
+def test_counted_errors_are_reported(real: RobotConfig, tmp_path: Path) -> None:
     rows = rows_of(real, tmp_path, link(berr_counter={"tx": 96, "rx": 3}))
     assert "errors sent 96, received 3" in next(r.found for r in rows if r.what == "controller")
 
 
-def test_what_ip_does_not_tell_is_not_judged(real: RobotConfig, tmp_path: Path) -> None:
+def test_what_ip_does_not_report_is_not_judged(real: RobotConfig, tmp_path: Path) -> None:
     (row,) = rows_of(real, tmp_path, {"ifname": "can0", "linkinfo": {"info_kind": "vcan"}})
     assert (row.what, row.verdict) == ("interface", FindingKind.OK)
 
 
 @pytest.mark.parametrize("said", [b"", b"[]", b"[{}]", b"no JSON"])
-def test_an_ip_that_says_nothing_tells_nothing(
-    monkeypatch: pytest.MonkeyPatch, said: bytes
-) -> None:
+def test_unusable_output_of_ip_yields_nothing(monkeypatch: pytest.MonkeyPatch, said: bytes) -> None:
     def run(*_: object, **__: object) -> subprocess.CompletedProcess[bytes]:
         return subprocess.CompletedProcess([], 0, stdout=said)
 
@@ -97,7 +95,7 @@ def test_an_ip_that_says_nothing_tells_nothing(
     assert check_socketcan.ask_ip() == {}
 
 
-def test_without_the_ip_command_there_is_nothing_to_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_ip_command_there_is_nothing_to_report(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(*_: object, **__: object) -> None:
         raise FileNotFoundError
 

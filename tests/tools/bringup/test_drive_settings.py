@@ -51,7 +51,7 @@ def test_every_wanted_setting_exists_in_the_firmware_with_its_type(
         assert isinstance(row.value, bool) is isinstance(shipped[row.name], bool)
 
 
-def test_every_row_says_why() -> None:
+def test_every_row_names_its_reason() -> None:
     assert all(len(setting.why) > 20 for setting in (*AXIS_TABLE, *DRIVE_TABLE))
 
 

@@ -51,23 +51,23 @@ def link(monkeypatch: pytest.MonkeyPatch) -> Link:
     return link
 
 
-def test_over_can_both_axes_are_told_the_robot_files_limits_more_than_once(
+def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
     robot: RobotConfig, link: Link
 ) -> None:
     limits.give_back(robot, MODULE, Path("/nowhere"))
     wanted = (robot.drive.vel_limit, robot.drive.current_lim)
     for node in robot.module_named(MODULE).node_ids:
-        told = [
+        found = [
             cansimple.unpack_two_floats(bytes(message.data))
             for message in link.sent
             if message.arbitration_id == cansimple.arbitration_id(node, Command.SET_LIMITS)
         ]
-        assert told == [pytest.approx(wanted)] * limits.TIMES
+        assert found == [pytest.approx(wanted)] * limits.TIMES
     assert len(link.sent) == 2 * limits.TIMES, "and nothing else"
     assert not link.open
 
 
-def test_a_bus_that_is_gone_is_said(robot: RobotConfig, link: Link) -> None:
+def test_a_bus_that_is_gone_is_reported(robot: RobotConfig, link: Link) -> None:
     link.open = False
     with pytest.raises(DriveError, match="takes no frames"):
         limits.give_back(robot, MODULE, Path("/nowhere"))
@@ -99,7 +99,7 @@ def test_over_usb_they_are_written_and_read_back(on_usb: tuple[RobotConfig, Foun
         limits.give_back(robot, MODULE, Path("/nowhere"))
 
 
-def test_a_board_that_has_gone_is_said(on_usb: tuple[RobotConfig, FoundBoards]) -> None:
+def test_a_board_that_has_gone_is_reported(on_usb: tuple[RobotConfig, FoundBoards]) -> None:
     robot, found = on_usb
     found.boards.clear()
     with pytest.raises(DriveError, match=f"{SERIAL}: not there"):

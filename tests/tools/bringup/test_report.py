@@ -77,7 +77,7 @@ def test_values_wanted_of_one_axis_only_are_not_put_together() -> None:
     assert len(merged(rows)) == len(MODULES)
 
 
-def test_the_same_said_of_several_is_said_once() -> None:
+def test_a_message_of_several_services_is_shown_once() -> None:
     rows = [wrong(f"can{i}", "interface", "not there", "up", "plug it in") for i in range(7)]
     text = " ".join(printed({"computer": rows}, 100).split())
     assert text.count("plug it in") == 1

@@ -41,7 +41,7 @@ def test_a_fleet_without_a_pace_goes_by_the_machines_clock(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("text", ["", "fast", "0", "-1", "1.5", "nan", "inf"])
-def test_a_file_that_tells_no_pace_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_file_without_a_pace_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / clock.PACE_FILE).write_text(text)
     with pytest.raises(FleetError, match="is no pace"):
         clock.keep_pace(tmp_path)
@@ -117,7 +117,7 @@ def test_a_pace_that_was_asked_for_is_kept_or_refused(
     assert machine.paces == [1.0]
 
 
-def test_a_machine_that_carries_no_fleet_says_so(
+def test_a_machine_that_runs_no_fleet_is_reported_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(pace.PACE_VARIABLE, "1")

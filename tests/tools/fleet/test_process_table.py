@@ -169,7 +169,7 @@ def test_a_bound_port_is_refused_with_service_and_endpoint() -> None:
     )
 
 
-def test_a_unix_socket_is_in_use_only_while_somebody_listens(run_dir: Path) -> None:
+def test_a_unix_socket_is_in_use_only_while_it_is_listened_to(run_dir: Path) -> None:
     path = run_dir / "planner.zenoh"
     listener = process_table.ListenPoint(
         "planner", "bus.endpoints.planner", f"{process_table.UNIX}{path}"

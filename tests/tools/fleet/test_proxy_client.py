@@ -31,7 +31,7 @@ def pretend_up(run_dir: Path, *, injected: bool) -> None:
     folder.supervisor_socket.touch()
 
 
-def test_without_a_fleet_it_says_how_to_start_one(run_dir: Path) -> None:
+def test_without_a_fleet_it_names_how_to_start_one(run_dir: Path) -> None:
     with pytest.raises(FleetError, match=r"no fleet is up in .*; `xrl up --injectable` starts one"):
         ProxyClient(run_dir).list()
 
@@ -42,7 +42,9 @@ def test_a_fleet_without_injector_has_to_go_down_first(run_dir: Path) -> None:
         ProxyClient(run_dir).list()
 
 
-def test_an_injector_that_is_down_is_said_so_and_what_went_with_it(run_dir: Path) -> None:
+def test_an_injector_that_is_down_is_reported_with_the_impairments_that_ended(
+    run_dir: Path,
+) -> None:
     pretend_up(run_dir, injected=True)
     with pytest.raises(FleetError, match="every impairment is over; `xrl status`"):
         ProxyClient(run_dir).list()

@@ -133,12 +133,12 @@ def test_words_come_back_exactly_from_what_they_made(what: Impairment) -> None:
     )
 
 
-def test_what_is_done_is_told_with_units_and_shares_in_percent() -> None:
+def test_an_action_is_reported_with_units_and_fractions_in_percent() -> None:
     what = describe_inject.parse_inject("all delay=0.03s jitter=10 loss=1 burst=1 duplicate=.125")
     assert what.describe() == "delay=30ms jitter=10ms loss=100% duplicate=12.5%"
 
 
-def test_a_flag_replaces_the_impairments_of_the_scenario_and_is_told() -> None:
+def test_a_flag_replaces_the_impairments_of_the_scenario_and_is_reported() -> None:
     shipped = experiment.make_scenario(parse("--scenario", "bad_network"))
     assert len(shipped.inject) == 4
     scenario = experiment.make_scenario(

@@ -102,7 +102,7 @@ def test_a_panel_for_the_network_is_there_only_if_something_was_done_to_it(
     assert len(labels) == 6
 
 
-def test_ages_while_impaired_and_otherwise_are_told_apart(log: RunLog) -> None:
+def test_ages_while_impaired_and_otherwise_are_separate(log: RunLog) -> None:
     summary = verdict.summarise(log, 1.5)
     impaired, otherwise = (summary[f"command_age_{when}_ms"] for when in ("impaired", "otherwise"))
     assert otherwise["median"] <= otherwise["p99"] < 20.0

@@ -57,7 +57,7 @@ def test_impairments_that_overlap_keep_each_its_own_begin_and_end() -> None:
     assert [row.at(5 * NS_PER_S) for row in rows] == [True, False]
 
 
-def test_what_has_no_end_in_the_log_is_said_to_have_none() -> None:
+def test_an_impairment_without_an_end_in_the_log_is_reported_so() -> None:
     (row,) = impairments(told(("all", LATE, 3.0, 99.0)))
     assert row.when(0) == "from 3.00 s on"
     assert "its end is not in the log" in row.as_dict(0)["said"]
@@ -92,7 +92,7 @@ def shown(summary: Summary) -> str:
     return text.getvalue()
 
 
-def test_a_limit_passed_with_links_impaired_says_so_and_otherwise_does_not() -> None:
+def test_a_limit_passed_with_links_impaired_is_marked_and_otherwise_not() -> None:
     (row,) = (row for row in LIMITS if row.key == "alive_com_y_max_mm")
     over = judged(alive_com_y_max_mm=row.limit + 1.0)
     assert verdict_table.mark(row, over) == "over"
@@ -154,7 +154,7 @@ def waits(wait_s: float) -> PlannerStatus:
     return found
 
 
-def test_a_planner_that_waits_after_drop_outs_says_how_long() -> None:
+def test_a_planner_that_waits_after_drop_outs_reports_how_long() -> None:
     assert waiting(waits(3.4)) == "leads again in 3 s"
     assert waiting(waits(0.3)) == "leads again soon"
     assert waiting(waits(0.0)) == waiting(None) == ""
@@ -170,7 +170,7 @@ class Planner:
         return self.said.pop() if self.said else None
 
 
-def test_the_line_tells_what_is_done_and_how_long_the_planner_waits() -> None:
+def test_the_line_shows_what_is_done_and_how_long_the_planner_waits() -> None:
     text = io.StringIO()
     view = LiveView(Console(file=text, width=200), INJECTS, Planner())
     truth = sample(SimTruth, seq=1, t_ns=1, scenario_s=3.5)

@@ -214,11 +214,11 @@ def test_what_a_partition_held_comes_before_what_is_sent_after_it() -> None:
 
 
 def network(*injects: Inject) -> tuple[VirtualNetwork, list[LinkEvent]]:
-    told: list[LinkEvent] = []
-    return VirtualNetwork(BASE, injects, 0, told.append), told
+    events: list[LinkEvent] = []
+    return VirtualNetwork(BASE, injects, 0, events.append), events
 
 
-def test_what_lasts_to_the_end_of_a_run_tells_its_counts_then() -> None:
+def test_an_impairment_that_lasts_to_the_end_of_a_run_reports_its_counts_then() -> None:
     made, told = network(
         Inject(link="harness->planner", at=0.0, loss=1.0),
         Inject(link="all", at=9.0, loss=1.0),

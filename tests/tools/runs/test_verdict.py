@@ -96,9 +96,9 @@ def test_motors_at_their_limit_are_no_sound_standing(
     summary = verdict.summarise(read_run(tmp_path / "run.mcap"), 4.0)
     assert (summary["stood"], summary["fallen_at_s"], summary["why_not"]) == (False, None, "")
     assert "torque at its limit" in summary["unsound"]
-    said = capsys.readouterr().out
-    assert "STOOD, BUT NOT SOUNDLY" in said
-    assert "(limit 50)" in said
+    output = capsys.readouterr().out
+    assert "STOOD, BUT NOT SOUNDLY" in output
+    assert "(limit 50)" in output
 
 
 @pytest.mark.parametrize("key", SOUND)
@@ -110,7 +110,7 @@ def test_each_figure_of_soundness_is_judged_by_its_limit(key: str) -> None:
     assert why_not_sound(dict.fromkeys(SOUND)) == "", "of which nothing is known"
 
 
-def test_hard_pushes_are_told(tmp_path: Path) -> None:
+def test_hard_pushes_are_reported(tmp_path: Path) -> None:
     """130 N from the side keep a knee's motors at their limit."""
     push = Push(at=0.5, duration=0.5, force=(0.0, 130.0, 0.0))
     words = f"{push.at:g}:{push.duration:g}:0,130,0"
@@ -119,7 +119,7 @@ def test_hard_pushes_are_told(tmp_path: Path) -> None:
     assert summary["torque_at_limit_ms"] > 50.0
 
 
-def test_nothing_is_said_of_a_gap_in_the_log() -> None:
+def test_nothing_is_reported_of_a_gap_in_the_log() -> None:
     """A service that was dead for 2 s between two torques at the limit."""
     t_ns = (1e9 * np.array([0.0, 0.004, 0.008, 2.0, 2.004])).astype(np.int64)
     assert _longest_s(t_ns, np.ones(5, bool)) == pytest.approx(0.008)

@@ -50,7 +50,7 @@ def status(robot: RobotConfig, requested_by: str, given: float = 0.0) -> Planner
     )
 
 
-def test_it_asks_until_it_is_told_to_stop_and_says_what_is_given(robot: RobotConfig) -> None:
+def test_it_asks_until_it_is_stopped_and_reports_what_is_given(robot: RobotConfig) -> None:
     def answer(heard: list[OperatorIntent]) -> PlannerStatus:
         return status(robot, "me", 80.0) if len(heard) > 2 else status(robot, SCENARIO)
 
@@ -77,13 +77,13 @@ def test_one_who_asks_already_goes_on(robot: RobotConfig) -> None:
     assert not planner.heard
 
 
-def test_a_planner_that_does_not_take_it_is_told(robot: RobotConfig) -> None:
+def test_a_planner_that_does_not_accept_is_reported(robot: RobotConfig) -> None:
     planner = FakePlanner(lambda _: status(robot, SCENARIO))
     with pytest.raises(FleetError, match="does not take what is asked; it follows the scenario"):
         assist.ask(planner, planner, WISH, lambda: False, planner)
 
 
-def test_no_planner_is_told() -> None:
+def test_a_missing_planner_is_reported() -> None:
     planner = FakePlanner(lambda _: None)
     with pytest.raises(FleetError, match="the planner is silent"):
         assist.ask(planner, planner, WISH, lambda: False, planner)

@@ -217,7 +217,7 @@ def test_the_backup_is_written_before_anything_else_and_under_its_time(
     assert (kept.module, kept.firmware) == (MODULE, "0.5.6")
 
 
-def test_help_says_that_it_changes_nothing_by_itself(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_states_that_it_changes_nothing_by_itself(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
         cli.main(["configure", "--help"])
     assert left.value.code == 0

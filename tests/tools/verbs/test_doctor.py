@@ -127,11 +127,11 @@ def test_it_writes_no_endpoint_calls_no_function_and_sends_questions_only(run_di
         check=False,
     )
     assert result.returncode == 0, result.stdout + result.stderr
-    said = json.loads(result.stderr.splitlines()[-1])
-    assert said["usb"] == []
-    assert said["reads"] > 6, "it did read, through what is recorded here"
-    assert len(said["can"]) == 36, "three questions to each axis"
-    for arbitration_id, is_remote in said["can"]:
+    summary = json.loads(result.stderr.splitlines()[-1])
+    assert summary["usb"] == []
+    assert summary["reads"] > 6, "it did read, through what is recorded here"
+    assert len(summary["can"]) == 36, "three questions to each axis"
+    for arbitration_id, is_remote in summary["can"]:
         _, command = cansimple.split_id(arbitration_id)
         assert is_remote
         assert command in (Command06.GET_VERSION, Command.GET_VBUS, Command.GET_ENCODER_COUNT)

@@ -78,14 +78,16 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
         ("1.5", "network: all partition, 1.20 to 1.60 s"),
     ],
 )
-def test_what_is_done_to_the_network_at_the_tick_is_told(
+def test_the_impairments_at_the_tick_are_reported(
     cut: RunLog, at: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["explain", str(cut.path), "--at", at]) == 0
     assert words in capsys.readouterr().out
 
 
-def test_how_old_each_command_was_is_told(cut: RunLog, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_age_of_each_command_is_reported(
+    cut: RunLog, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["explain", str(cut.path), "--at", "0.8"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     for module in MODULES:
@@ -94,7 +96,7 @@ def test_how_old_each_command_was_is_told(cut: RunLog, capsys: pytest.CaptureFix
         assert 20.0 <= float(found[1]) < 32.0
 
 
-def test_where_the_planner_did_not_tick_the_modules_are_told_as_they_were_then(
+def test_where_the_planner_did_not_tick_the_modules_are_described_as_they_were_then(
     cut: RunLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["explain", str(cut.path), "--at", "1.5"]) == 0
@@ -154,7 +156,7 @@ def test_bad_input_is_one_clear_line(
     assert words in capsys.readouterr().err
 
 
-def test_a_time_without_ticks_says_when_there_are_some(
+def test_a_time_without_ticks_names_the_times_with_some(
     log: RunLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["explain", str(log.path), "--at", "60"]) == 2

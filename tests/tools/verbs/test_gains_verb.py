@@ -97,7 +97,7 @@ def test_a_lighter_robot_is_held_more_softly(unladen: tuple[Path, str]) -> None:
     assert light.D[12][1][ankle_theta] < full.D[12][1][ankle_theta]
 
 
-def test_check_says_that_it_fits_until_the_robot_changes(unladen: tuple[Path, str]) -> None:
+def test_check_reports_a_fit_until_the_robot_changes(unladen: tuple[Path, str]) -> None:
     path, _ = unladen
     before = path.with_name("lab.gains.json").read_bytes()
     fits = gains("--check", "--config", str(path))

@@ -72,13 +72,13 @@ def test_every_number_of_the_recorder_s_own_count_is_found_again(
     )  # fmt: skip
 
 
-def test_an_unfinished_file_is_counted_and_says_how_to_recover(
+def test_an_unfinished_file_is_counted_and_names_how_to_recover(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     killed = runs.killed_file(tmp_path)
-    said = as_text(capsys, killed.path)
-    assert "not finished" in said
-    assert f"xrl recover {killed.path}" in said
+    output = as_text(capsys, killed.path)
+    assert "not finished" in output
+    assert f"xrl recover {killed.path}" in output
     found = as_json(capsys, killed.path)
     assert found["messages"] == 1200
     assert not found["files"][0]["finished"]
@@ -90,12 +90,12 @@ def test_a_file_that_is_being_written_is_called_that(
     with runs.writer(tmp_path) as run:
         run.take_from(Queue([state(0, 0)]), 1)
         run.flush()
-        said = as_text(capsys, run.path)
-    assert "being written" in said
-    assert "xrl recover" not in said
+        output = as_text(capsys, run.path)
+    assert "being written" in output
+    assert "xrl recover" not in output
 
 
-def test_a_cut_tells_how_much_and_until_when(
+def test_a_cut_is_described_with_its_extent_and_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     killed = runs.killed_file(tmp_path)
@@ -150,14 +150,14 @@ def test_a_slow_topic_stands_beside_its_rate_and_an_event_has_none(
     for seq in range(3):
         payload = codec.encode(runs.sample(event.type, seq=seq, t_ns=seq * MS))
         items.append((event.key(ROBOT), payload, seq * MS))
-    said = as_text(capsys, runs.write(tmp_path, items))
-    (row,) = [line.split() for line in said.splitlines() if "harness/wrench" in line]
+    output = as_text(capsys, runs.write(tmp_path, items))
+    (row,) = [line.split() for line in output.splitlines() if "harness/wrench" in line]
     assert row == ["harness/wrench", "11", "100.0", "250", "10.0", "0", "0"]
-    (row,) = [line.split() for line in said.splitlines() if "run/event" in line]
+    (row,) = [line.split() for line in output.splitlines() if "run/event" in line]
     assert row == ["run/event", "3", "0", "0"]
 
 
-def test_what_was_injected_is_told_with_its_counts(
+def test_an_injection_is_reported_with_its_counts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     items = [state(seq, 4 * seq) for seq in range(50)]
@@ -167,12 +167,12 @@ def test_what_was_injected_is_told_with_its_counts(
             requested="planner->left", detail="delay=5ms", active=begins, passed=20, lost=7,
         )  # fmt: skip
         items.append((topics.LINK_EVENT.key(ROBOT), codec.encode(event), t_ms * MS))
-    said = " ".join(as_text(capsys, runs.write(tmp_path, items)).split())
-    assert "injected planner->left delay=5ms: 0." in said
-    assert "20 messages passed, 7 lost (s since the log begins)" in said
+    output = " ".join(as_text(capsys, runs.write(tmp_path, items)).split())
+    assert "injected planner->left delay=5ms: 0." in output
+    assert "20 messages passed, 7 lost (s since the log begins)" in output
 
 
-def test_of_a_log_without_an_injection_none_is_told(
+def test_a_log_without_an_injection_has_none_in_its_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "injected" not in as_text(capsys, runs.write(tmp_path, [state(0, 0)]))

@@ -44,7 +44,7 @@ def proxy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "150")
 
 
-def test_the_flags_say_what_where_and_when_and_the_injector_does_the_waiting() -> None:
+def test_the_flags_state_what_where_and_when_and_the_injector_waits() -> None:
     words = "inject --link left->planner --delay 0.03s --loss 20% --ordered --at 500s --for 4"
     assert cli.main(words.split()) == 0
     what = Inject(
@@ -92,7 +92,7 @@ def test_the_words_of_other_verbs_are_taken_too() -> None:
     assert FakeProxy.began == (Inject(link="all", at=2.0, duration=3.0, loss=0.2), 2.0)
 
 
-def test_clearing_tells_what_it_ended_with_its_counts_and_what_is_left(
+def test_clearing_reports_what_it_ended_with_its_counts_and_what_is_left(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     for words, link in (("--clear", "all"), ("--clear --link planner->left", "planner->left")):
@@ -113,7 +113,7 @@ def test_the_list_shows_what_is_hidden_and_by_which_rule_and_what_is_to_come(
     assert f"hidden: {inject.RULE}" in shown
 
 
-def test_the_help_says_which_of_several_counts_and_that_a_loss_of_1_is_all(
+def test_the_help_states_which_of_several_counts_and_that_a_loss_of_1_is_all(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(SystemExit):

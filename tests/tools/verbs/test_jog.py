@@ -53,11 +53,11 @@ def jog(
     *,
     q_seen: Pair = START,
     interrupts: jog_drive.Interrupts | None = None,
-    told: list[Sample] | None = None,
+    published: list[Sample] | None = None,
 ) -> jog_drive.JogResult:
     def progress(sample: Sample) -> None:
-        if told is not None:
-            told.append(sample)
+        if published is not None:
+            published.append(sample)
 
     return jog_drive.jog_drive(
         drive,
@@ -75,15 +75,15 @@ def jog(
 def test_a_free_joint_follows_and_comes_back_and_is_idle(
     drive: BenchDrive, limited: RobotConfig, plan: JogPlan
 ) -> None:
-    told: list[Sample] = []
-    outcome = jog(drive, limited, plan, told=told)
+    published: list[Sample] = []
+    outcome = jog(drive, limited, plan, told=published)
     assert outcome.trouble == ""
     assert all(row.good for row in judge(outcome.samples, plan))
     assert drive.q == pytest.approx(START, abs=0.01)
     assert outcome.is_idle
     assert drive.status is DriveStatus.IDLE
     assert drive.largest <= PLAN.torque_limit + 1e-9
-    assert len(told) > 8
+    assert len(published) > 8
 
 
 def test_friction_is_what_both_ways_take_more_than_gravity(
@@ -160,7 +160,7 @@ def test_a_drive_that_fails_stops_it(
     assert outcome.is_idle == ("silent_at_s" not in fault), "a silent drive proves nothing"
 
 
-def test_a_drive_that_does_not_go_idle_is_not_said_to_be(
+def test_a_drive_that_stays_armed_is_not_reported_idle(
     drive: BenchDrive, limited: RobotConfig
 ) -> None:
     drive.deaf = True
@@ -250,7 +250,7 @@ def turned(axis: int, angle: float) -> np.ndarray:
 
 @pytest.mark.parametrize("by", [0.1, -0.1])
 @pytest.mark.parametrize("axis", [0, 1])
-def test_what_a_person_is_told_to_see_is_what_the_frames_say(axis: int, by: float) -> None:
+def test_what_a_person_is_asked_to_see_is_what_the_frames_do(axis: int, by: float) -> None:
     """x forward, y left, z up; below a torso that hangs still the lower part turns back."""
     upper, lower = turned(axis, by), turned(axis, by).T
     leans, swings = upper @ [0.0, 0.0, 1.0], lower @ [0.0, 0.0, -1.0]
@@ -259,10 +259,10 @@ def test_what_a_person_is_told_to_see_is_what_the_frames_say(axis: int, by: floa
         first, second = what_to_see(module, axis, by).split(";")
         assert names[int(leans[component] > 0.0)] in first
         assert names[int(swings[component] > 0.0)] in second
-    told = what_to_see("ankle_left", axis, by)
+    published = what_to_see("ankle_left", axis, by)
     if axis == 1:
         toes = lower @ [1.0, 0.0, 0.0]
-        assert ("toes point up" in told) == (toes[2] > 0.0)
+        assert ("toes point up" in published) == (toes[2] > 0.0)
     else:
         right_edge = lower @ [0.0, -1.0, 0.0]
-        assert ("right edge up" in told) == (right_edge[2] > 0.0)
+        assert ("right edge up" in published) == (right_edge[2] > 0.0)

@@ -43,7 +43,7 @@ def wait_for(happens: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def test_killed_it_says_no_more(tmp_path: Path, files: list[RearmGuard]) -> None:
+def test_after_a_kill_it_sends_no_more(tmp_path: Path, files: list[RearmGuard]) -> None:
     process = started(tmp_path)
     try:
         wait_for(lambda: all(file.beats > 3 for file in files))
@@ -73,7 +73,7 @@ def test_enter_lays_it_down(tmp_path: Path, files: list[RearmGuard]) -> None:
     assert [file.beats for file in files] == [0] * 6
 
 
-def test_ctrl_c_is_the_stop_and_says_who_has_not_stopped(
+def test_ctrl_c_is_the_stop_and_names_the_services_that_have_not_stopped(
     tmp_path: Path, files: list[RearmGuard]
 ) -> None:
     """Five services stop in this test, the sixth does not hear it."""
@@ -129,7 +129,7 @@ def test_a_time_lays_it_down_by_itself(
     assert files[3].beats == 0
 
 
-def test_where_nobody_hears_it_it_is_refused(
+def test_a_pendant_without_a_joint_service_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2

@@ -54,7 +54,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
         (("--config", "nowhere.toml"), "nowhere.toml"),
     ],
 )
-def test_what_cannot_be_meant_is_one_line_that_says_what_would_be_right(
+def test_a_meaningless_request_is_refused_in_one_line_with_what_would_be_right(
     log: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], right: str
 ) -> None:
     error = refused(capsys, str(log), "--run-dir", str(log.parent / "r"), *words)
@@ -68,7 +68,7 @@ def test_a_file_behind_a_list_of_names_is_asked_for(
     assert "write it first" in refused(capsys, "--topics", "joint/*/state", str(log))
 
 
-def test_a_play_that_nobody_could_begin_is_refused(
+def test_a_playback_without_a_start_is_refused(
     log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--start-paused", "--listen", "none", "--run-dir", str(log.parent / "r"))

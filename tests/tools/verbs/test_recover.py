@@ -21,9 +21,9 @@ def test_the_copy_goes_beside_the_original_which_is_not_touched(
     log = read_run(tmp_path / "killed.recovered.mcap")
     assert (log.complete, log.count(STATE_KEY)) == (True, 1200)
     assert killed.path.read_bytes() == before
-    said = capsys.readouterr().out
-    assert "kept: 1200 messages over 1.20 s" in said
-    assert "lost: nothing that had reached the file" in said
+    output = capsys.readouterr().out
+    assert "kept: 1200 messages over 1.20 s" in output
+    assert "lost: nothing that had reached the file" in output
 
 
 def test_a_finished_file_is_left_and_nothing_is_written(
@@ -79,9 +79,9 @@ def test_an_output_that_cannot_be_written_is_one_line(
 ) -> None:
     killed = runs.killed_file(tmp_path)
     assert cli.main(["recover", str(killed.path), "-o", str(tmp_path / "no" / "x.mcap")]) == 2
-    said = capsys.readouterr().err
-    assert "cannot be written: No such file or directory" in said
-    assert len(said.splitlines()) == 1
+    output = capsys.readouterr().err
+    assert "cannot be written: No such file or directory" in output
+    assert len(output.splitlines()) == 1
 
 
 def test_a_file_that_is_being_written_is_recovered_so_far(

@@ -23,7 +23,7 @@ def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:
 
 
 @pytest.mark.parametrize(("mode", "cause", "drive"), list(product(Mode, Cause, DriveStatus)))
-def test_a_way_out_is_told_where_a_person_has_to_do_something_and_nowhere_else(
+def test_a_way_out_is_given_only_where_a_person_must_act(
     mode: Mode, cause: Cause, drive: DriveStatus
 ) -> None:
     status = module_status(state(mode, cause, drive))
@@ -41,7 +41,7 @@ def test_a_way_out_is_told_where_a_person_has_to_do_something_and_nowhere_else(
 
 
 @pytest.mark.parametrize("drive", DriveStatus)
-def test_angles_are_told_only_where_the_drive_knows_them(drive: DriveStatus) -> None:
+def test_angles_are_reported_only_where_the_drive_knows_them(drive: DriveStatus) -> None:
     status = module_status(state(Mode.DISARMED, Cause.NONE, drive))
     assert (status.q is None) is (drive in (DriveStatus.LOST, DriveStatus.UNZEROED))
 
@@ -56,20 +56,20 @@ def test_what_a_module_does_not_believe_is_named_with_the_way_out(outside: Outsi
     assert (module_status(fine).outside, module_status(fine).way_out) == ("", "")
 
 
-def test_a_module_that_is_not_heard_is_not_guessed_at() -> None:
+def test_a_module_without_states_is_not_guessed_at() -> None:
     status = module_status(None)
     assert (status.mode, status.tier, status.q, status.way_out) == (None, None, None, "")
 
 
-def test_a_planner_that_is_not_heard_is_said_so() -> None:
+def test_a_silent_planner_is_reported() -> None:
     assert lead_status(None) is None
     assert "each module holds" in describe_lead(None)
 
 
-def test_why_the_planner_does_not_lead_yet_is_told() -> None:
+def test_the_reason_why_the_planner_does_not_lead_yet_is_reported() -> None:
     good = LeadStatus("LEADING", wait_s=0.0, margin=1.2)
     assert describe_lead(good) == "planner LEADING, margin 1.20"
     waits = describe_lead(LeadStatus("ALIGNING", wait_s=12.3, margin=1.2))
     assert "leads again in 12 s" in waits
-    told = describe_lead(LeadStatus("MISPLACED", wait_s=0.0, margin=1.2, why="a foot is ahead"))
-    assert told == "planner MISPLACED, margin 1.20; a foot is ahead"
+    line = describe_lead(LeadStatus("MISPLACED", wait_s=0.0, margin=1.2, why="a foot is ahead"))
+    assert line == "planner MISPLACED, margin 1.20; a foot is ahead"

@@ -88,7 +88,7 @@ def test_a_harness_that_is_held_is_not_tared(up: float, refused: bool) -> None:
         (wrench(0.0, Tare.RUNNING), "send nothing"),
     ],
 )
-def test_a_tare_that_does_not_come_says_why(said: Wrench | None, words: str) -> None:
+def test_a_tare_that_does_not_come_names_the_reason(said: Wrench | None, words: str) -> None:
     service = Service(lambda _requests, _looks: said)
     with pytest.raises(FleetError, match=words):
         tare.tare(service, service, anyway=False)

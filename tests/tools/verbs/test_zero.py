@@ -87,7 +87,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zeroing, "TAKEN_S", 0.0)
 
 
-def test_motors_are_told_the_mark_and_what_the_joints_angles_are_at_them(
+def test_motors_are_set_to_the_mark_and_the_joints_angles_there(
     robot: RobotConfig,
 ) -> None:
     drive = PlayedDrive()
@@ -99,14 +99,14 @@ def test_motors_are_told_the_mark_and_what_the_joints_angles_are_at_them(
     assert drive.told == 1
 
 
-def test_what_was_lost_on_the_way_is_told_again(robot: RobotConfig) -> None:
+def test_a_lost_frame_is_sent_again(robot: RobotConfig) -> None:
     drive = PlayedDrive()
     drive.deaf = 2
     assert is_right(zero(drive, (0.0, -1.0), robot), (0.0, -1.0))
     assert drive.told == 3
 
 
-def test_a_drive_that_does_not_take_it_is_not_said_to_be_zeroed(robot: RobotConfig) -> None:
+def test_a_drive_that_keeps_its_position_is_not_reported_zeroed(robot: RobotConfig) -> None:
     drive = PlayedDrive()
     drive.deaf = 100
     back = zero(drive, (0.0, -1.0), robot)
@@ -129,7 +129,7 @@ def test_a_sample_of_the_time_before_is_no_proof(robot: RobotConfig) -> None:
     assert zero(Late(), (0.0, -1.0), robot) is None
 
 
-def test_a_drive_that_its_service_armed_meanwhile_is_not_told_again(robot: RobotConfig) -> None:
+def test_a_drive_that_its_service_armed_meanwhile_is_not_written_again(robot: RobotConfig) -> None:
     drive = PlayedDrive()
     drive.deaf, drive.status = 100, DriveStatus.ARMED
     assert zero(drive, (0.0, -1.0), robot) is not None
@@ -262,7 +262,7 @@ def test_a_stand_is_at_its_height_level_and_inside_the_limits(
         assert outside(robot, module, q_module) == ""
 
 
-def test_a_stand_that_no_leg_reaches_says_why(robot: RobotConfig) -> None:
+def test_a_stand_that_no_leg_reaches_names_the_reason(robot: RobotConfig) -> None:
     with pytest.raises(RunError, match=r"--standing 1\.294.*at its limit"):
         standing(robot, 1.294)
 
@@ -276,7 +276,7 @@ def test_over_usb_the_services_must_be_down(robot: RobotConfig, tmp_path: Path) 
     verb.refuse_services(usb, {MODULE: None})
 
 
-def test_without_a_terminal_yes_must_be_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_yes_must_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO("y"))
     with pytest.raises(FleetError, match="--yes"):
         bench.confirm("sure?", yes=False)

@@ -112,7 +112,7 @@ def _run_once(
         return Heard(witness.truth, witness.events, conductor.said, witness.modes, died)
 
     try:
-        heard = run_live(
+        run = run_live(
             out,
             robot,
             scenario,
@@ -125,7 +125,7 @@ def _run_once(
     except (RunError, FleetError) as error:
         lines = str(error).splitlines()  # a service's log ends with its error
         return unjudged(": ".join(dict.fromkeys((lines[0], lines[-1].strip()))))
-    return measure(case, heard, robot)
+    return measure(case, run, robot)
 
 
 def died_of(services: Sequence[ServiceInfo], said: Sequence[RunEvent]) -> list[str]:

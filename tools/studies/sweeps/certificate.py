@@ -88,14 +88,14 @@ def run(args: argparse.Namespace) -> int:
         batches, args.out, executor, console,
     )  # fmt: skip
     rows = finished.rows
-    said = [(float(row["margin"]), row["stood"] == "True") for row in rows]
-    found = certificate_study.confusion(said)
+    predicted = [(float(row["margin"]), row["stood"] == "True") for row in rows]
+    found = certificate_study.confusion(predicted)
     console.print(
         f"said to stand: {found.stand_stood} stood, {found.stand_fell} fell\n"
         f"said to fall: {found.fall_stood} stood, {found.fall_fell} fell\n"
-        f"fewest mistakes with a margin of {certificate_study.threshold(said):.3f} as the limit"
+        f"fewest mistakes with the limit at margin {certificate_study.threshold(predicted):.3f}"
     )
-    for row, (margin, stood) in zip(rows, said, strict=True):
+    for row, (margin, stood) in zip(rows, predicted, strict=True):
         if (margin > 0.0) != stood:
             console.print(
                 f"  case {row['number']}: margin {row['margin']}, weakest {row['weakest']}, COM "

@@ -117,10 +117,10 @@ def draw_picture(rows: Sequence[Row], title: str, path: Path) -> None:
     axis = figure.subplots()
     for grew, colour in (("False", "#4c9f70"), ("True", "#c0392b")):
         some = [row for row in rows if row["grew"] == grew and row["ended"] != "unready"]
-        said = [float(row["rate"]) for row in some]
+        rates = [float(row["rate"]) for row in some]
         ratio = [float(row["late_rad_s"]) / max(float(row["early_rad_s"]), 1e-4) for row in some]
         label = f"{'grew' if grew == 'True' else 'faded'} ({len(some)})"
-        axis.scatter(said, ratio, s=18, color=colour, alpha=0.7, label=label)
+        axis.scatter(rates, ratio, s=18, color=colour, alpha=0.7, label=label)
     axis.axvline(0.0, color="#7f7f7f", lw=1.0, ls="--")
     axis.set(xscale="symlog", yscale="log")
     axis.set_xlabel("rate of the slowest motion by the certificate, 1/s: below 0 it fades")
@@ -139,8 +139,8 @@ def _begin(trial: DynamicsTrial) -> dict[str, object]:
 
 
 def _row(task: Task, outcome: DynamicsResult) -> dict[str, object]:
-    said = {"said_stable": outcome.said_stable, "grew": outcome.grew}
-    return _begin(task[0]) | msgspec.structs.asdict(outcome) | said
+    stability = {"said_stable": outcome.said_stable, "grew": outcome.grew}
+    return _begin(task[0]) | msgspec.structs.asdict(outcome) | stability
 
 
 def _run_task(task: Task) -> DynamicsResult:

@@ -202,7 +202,7 @@ def run_trial(trial: DynamicsTrial, robot: RobotConfig) -> DynamicsResult:
     other = drawn(robot, trial)
     rates: list[float] = []
     times: list[float] = []
-    said: DynamicsResult | None = None
+    predicted: DynamicsResult | None = None
     ended = "tracked"
     for row in fleet.run():
         if row.fallen or any(c.failsafe.mode is not Mode.TRACK for c in fleet.controllers):
@@ -211,22 +211,22 @@ def run_trial(trial: DynamicsTrial, robot: RobotConfig) -> DynamicsResult:
                 break
             if row.fallen:
                 return UNREADY
-        if said is None and row.scenario_s >= TAKEN_OVER_S:
-            said = _said(fleet, other, trial)
-            if said is None:
+        if predicted is None and row.scenario_s >= TAKEN_OVER_S:
+            predicted = _said(fleet, other, trial)
+            if predicted is None:
                 return UNREADY
             _take_over(fleet, other)
         if row.scenario_s >= TAP_S + TAP_LASTS_S:
             rates.append(float(np.mean([np.square(c.samples.v) for c in fleet.controllers])))
             times.append(row.scenario_s)
-    if said is None:
+    if predicted is None:
         return UNREADY
     t, squares = np.array(times), np.array(rates)
     begin = TAP_S + TAP_LASTS_S
     early = squares[t < begin + WINDOW_S]
     late = squares[t > DURATION_S - WINDOW_S] if ended == "tracked" else squares[-5:]
     return msgspec.structs.replace(
-        said,
+        predicted,
         early_rad_s=_root(early),
         late_rad_s=_root(late),
         ended=ended,

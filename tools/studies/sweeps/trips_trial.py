@@ -214,10 +214,10 @@ def run_trial(trouble: str, plant: str, robot: RobotConfig, seed: int) -> TripRe
         robot: ready to run, with its gain schedule.
         seed: of the noise.
     """
-    told = TROUBLES[trouble]
-    robot = unfiltered(robot) if told.unfiltered else robot
-    seen = _Seen(robot, told, PLANTS[plant], seed)
-    without = _Seen(untripped(robot), told, PLANTS[plant], seed)
+    scenario = TROUBLES[trouble]
+    robot = unfiltered(robot) if scenario.unfiltered else robot
+    seen = _Seen(robot, scenario, PLANTS[plant], seed)
+    without = _Seen(untripped(robot), scenario, PLANTS[plant], seed)
     return TripResult(
         led=seen.fleet.world.scenario_s > BEGINS_S,
         tripped=" ".join(sorted(seen.trips, key=lambda name: seen.trips[name])),

@@ -63,9 +63,9 @@ def test_a_terminal_is_given_back_as_it_was() -> None:
             code = 0 if pressed == [Press.PAUSE] and changed and back else 2
         finally:
             os._exit(code)
-    heard = b""
-    while b"ready" not in heard:
-        heard += os.read(descriptor, 100)
+    typed = b""
+    while b"ready" not in typed:
+        typed += os.read(descriptor, 100)
     os.write(descriptor, b" ")
     _, status = os.waitpid(pid, 0)
     os.close(descriptor)

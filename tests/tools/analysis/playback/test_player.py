@@ -160,22 +160,22 @@ def test_q_ends_a_loop_and_up_makes_it_faster() -> None:
     assert 3.0 <= (world.now - BEGAN) / NS_PER_S <= 3.3
 
 
-def test_the_clock_tells_the_recorded_time_also_while_paused_and_misses_no_step() -> None:
+def test_the_clock_gives_the_recorded_time_also_while_paused_and_misses_no_step() -> None:
     world = World([(0.5, Press.PAUSE), (1.5, Press.PAUSE)])
-    told: list[tuple[int, ClockMessage]] = []
+    published: list[tuple[int, ClockMessage]] = []
 
     class Clock(Port):
         def put(self, payload: bytes) -> bool:
-            told.append((world.now, msgspec.json.decode(payload, type=ClockMessage)))
+            published.append((world.now, msgspec.json.decode(payload, type=ClockMessage)))
             return True
 
     player(world, [0.0, 1.0], rate=2.0, clock=Clock(world)).run()
-    assert [message.seq for _, message in told] == list(range(len(told)))
-    stamps = [message.t_ns for _, message in told]
+    assert [message.seq for _, message in published] == list(range(len(published)))
+    stamps = [message.t_ns for _, message in published]
     assert stamps == sorted(stamps)
     assert stamps[0] == BEGAN
-    assert len(told) == pytest.approx(100 * (world.now - BEGAN) / NS_PER_S, abs=2)
-    for at, message in told:
+    assert len(published) == pytest.approx(100 * (world.now - BEGAN) / NS_PER_S, abs=2)
+    for at, message in published:
         if at - BEGAN < 0.4 * NS_PER_S:
             assert message.t_ns - BEGAN == pytest.approx(2 * (at - BEGAN), abs=10)
     assert all(stamp <= BEGAN + NS_PER_S + 1 for stamp in stamps)

@@ -77,7 +77,7 @@ def test_a_prefix_that_is_none_or_where_live_keys_are_is_refused(prefix: str) ->
 
 
 @given(st.text(alphabet="xrl/ab*@ ", max_size=8))
-def test_no_prefix_makes_a_key_that_a_service_hears(prefix: str) -> None:
+def test_no_prefix_makes_a_key_that_a_service_subscribes_to(prefix: str) -> None:
     try:
         checked = check_prefix(prefix)
     except RunError:

@@ -49,7 +49,7 @@ def test_the_schedule_that_was_recorded_is_used_with_the_changed_gains(robot: Ro
         ("joint_service.loop=magic", "loop"),
     ],
 )
-def test_what_cannot_be_set_is_refused_and_says_what_would_be_right(
+def test_a_value_that_cannot_be_set_is_refused_with_what_would_be_right(
     robot: RobotConfig, text: str, says: str
 ) -> None:
     with pytest.raises(ConfigError) as error:

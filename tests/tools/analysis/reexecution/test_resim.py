@@ -81,7 +81,7 @@ def test_the_planner_of_the_record_knew_the_slope(log: RunLog) -> None:
     assert log.messages(topics.PLANNER_STATUS)[-1].slope == pytest.approx((0.03, -0.02), abs=0.02)
 
 
-def test_an_attitude_that_the_log_lacks_is_told(log: RunLog) -> None:
+def test_an_attitude_missing_in_the_log_is_reported(log: RunLog) -> None:
     key = topics.ATTITUDE.key(log.robot)
     second = [row for row in log.messages(topics.PLANNER_STATUS) if row.session != 1]
     taken = second[300].attitude_seq
@@ -105,7 +105,7 @@ def test_one_bit_in_one_recorded_command_is_found_where_it_was_taken(log: RunLog
     assert execute(log, robot_of(log), "hip_right").comparison.first is None
 
 
-def test_a_state_that_the_log_lacks_is_told_and_execution_goes_on_at_the_next_memory(
+def test_a_state_missing_in_the_log_is_reported_and_execution_resumes_at_the_next_snapshot(
     log: RunLog,
 ) -> None:
     key = topics.JOINT_STATE.key(log.robot, "ankle_left")
@@ -159,7 +159,7 @@ def test_a_changed_gain_changes_what_comes_out_from_the_first_tick_with_an_error
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_a_run_says_how_many_of_its_cycles_were_traced(log: RunLog, module: str) -> None:
+def test_a_run_reports_how_many_of_its_cycles_were_traced(log: RunLog, module: str) -> None:
     cycles = sum(len(trace.cycles) for trace in log.messages(topics.JOINT_TRACE, module))
     states = log.messages(topics.JOINT_STATE, module)
     expected = sum(state.cycle for state in states if _is_last(states, state))

@@ -154,7 +154,7 @@ def test_a_log_with_an_unreadable_robot_file_has_a_page_without_origins(
 
 
 @pytest.mark.parametrize("fraction", [0.3, 0.9])
-def test_a_truncated_log_has_a_page_that_says_so(
+def test_a_truncated_log_has_a_page_that_is_marked_so(
     made: Made, tmp_path: Path, fraction: float
 ) -> None:
     raw = made.path.read_bytes()

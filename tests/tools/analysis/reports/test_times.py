@@ -177,5 +177,5 @@ def panel_and_rows(log: RunLog) -> tuple[dict[str, Any], list[str]]:
     return pages.data_of(render(log)), [row.text for row in timeline_events(RunData(log))]
 
 
-def test_a_log_without_impairments_says_so(page: str) -> None:
+def test_a_log_without_impairments_is_described_so(page: str) -> None:
     assert "<li>Injected network impairments: no impairment in this log" in page

@@ -147,7 +147,7 @@ def test_a_run_that_broke_off_is_not_judged(robot: RobotConfig) -> None:
 
 
 @pytest.mark.parametrize("changes", [{"real_time_factor": 0.9}, {"late_s": 0.2}])
-def test_a_run_on_a_machine_that_was_too_slow_says_so(
+def test_a_run_on_a_machine_that_was_too_slow_is_marked(
     robot: RobotConfig, changes: dict[str, object]
 ) -> None:
     run = heard(PLANNER, holds(), world=lambda t: truth(t, **changes))

@@ -78,7 +78,7 @@ def test_a_fall_is_not_tried_again_and_keeps_its_log(
     assert logs == []
 
 
-def test_a_service_that_ends_untold_is_told_from_one_that_was_killed() -> None:
+def test_a_service_that_ends_by_itself_is_distinguished_from_one_that_was_killed() -> None:
     def service(name: str, *, up: bool, restarts: int = 0) -> ServiceInfo:
         return ServiceInfo(
             name=name,
@@ -93,11 +93,11 @@ def test_a_service_that_ends_untold_is_told_from_one_that_was_killed() -> None:
         return RunEvent(t_ns=1, seq=1, kind=int(kind), subject=name, detail="", scenario_s=1.0)
 
     killed, back = RunEventKind.KILLED, RunEventKind.RESTARTED
-    said = [done(killed, "planner"), done(killed, "hip_left"), done(back, "hip_left")]
+    events = [done(killed, "planner"), done(killed, "hip_left"), done(back, "hip_left")]
     as_told = [service("planner", up=False), service("hip_left", up=True, restarts=1)]
-    assert runner.died_of([*as_told, service("harness", up=True)], said) == []
+    assert runner.died_of([*as_told, service("harness", up=True)], events) == []
     services = [service("harness", up=True, restarts=1), service("hip_left", up=False)]
-    assert runner.died_of(services, said) == ["harness", "hip_left"]
+    assert runner.died_of(services, events) == ["harness", "hip_left"]
 
 
 def test_what_is_chased_is_killed_once_as_the_modules_track_again(
@@ -124,14 +124,14 @@ RESULTS = [
 ]
 
 
-def test_the_exit_code_tells_a_fall_that_was_not_allowed_from_a_run_that_failed() -> None:
+def test_the_exit_code_distinguishes_a_forbidden_fall_from_a_run_that_failed() -> None:
     stood, bad_fall, allowed_fall, lost = RESULTS
     assert crashtest.exit_code([stood, allowed_fall]) == 0
     assert crashtest.exit_code([stood, lost]) == 2
     assert crashtest.exit_code([lost, bad_fall]) == 1
 
 
-def test_json_says_what_was_done_and_what_came_of_it(tmp_path: Path) -> None:
+def test_json_holds_what_was_done_and_what_came_of_it(tmp_path: Path) -> None:
     report.write(RESULTS, tmp_path, {"loop": "onboard"}, planned=5)
     document = json.loads((tmp_path / report.RESULTS).read_text())
     assert document["about"] == {"loop": "onboard"}
@@ -146,7 +146,9 @@ def test_json_says_what_was_done_and_what_came_of_it(tmp_path: Path) -> None:
     assert set(rows["kill-knee_left"]) >= set(CrashResult.__struct_fields__)
 
 
-def test_junit_tells_a_failure_from_an_error_and_allows_what_is_expected(tmp_path: Path) -> None:
+def test_junit_distinguishes_a_failure_from_an_error_and_allows_expected_ones(
+    tmp_path: Path,
+) -> None:
     report.write(RESULTS, tmp_path, {"loop": "onboard"}, planned=4)
     suite = ET.parse(tmp_path / report.JUNIT).getroot().find("testsuite")  # noqa: S314 - our own
     assert suite is not None

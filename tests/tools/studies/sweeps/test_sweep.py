@@ -106,12 +106,12 @@ def test_wilsons_bounds_solve_his_equation(hits: int, of: int) -> None:
 
 def test_a_payload_gets_a_schedule_that_fits(robot: RobotConfig) -> None:
     other = cases.with_payload(robot, 10.2)
-    told: list[tuple[int, int]] = []
-    ready = prepare([robot, other], 2, lambda done, of: told.append((done, of)))
+    reported: list[tuple[int, int]] = []
+    ready = prepare([robot, other], 2, lambda done, of: reported.append((done, of)))
     assert ready[0] is robot, "its schedule was made for it"
     assert [gain_schedule.why_stale(one) for one in ready] == ["", ""]
     assert ready[1].mass.payload == 10.2
-    assert told == [(0, 1), (1, 1)]
+    assert reported == [(0, 1), (1, 1)]
 
 
 def test_the_papers_split_needs_no_schedule(robot: RobotConfig) -> None:
@@ -140,7 +140,7 @@ def test_the_same_seed_gives_the_same_table_gone_on_with_and_with_any_number_of_
     assert all((tmp_path / name / "cases.png").stat().st_size > 20_000 for name in "ab")
 
 
-def test_one_case_alone_is_the_case_of_the_study_and_its_log_says_the_same(tmp_path: Path) -> None:
+def test_a_single_case_equals_the_case_of_the_study_and_so_does_its_log(tmp_path: Path) -> None:
     """The log is judged by the code that judges live runs: another way to the same figures."""
     sweep("--n", "1", "--out", str(tmp_path / "all"))
     assert sweep("--only", "0", "--out", str(tmp_path / "one")) == 0
@@ -170,10 +170,10 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
     seed = next(s for s in range(100) if some.draw(s, 0).payload_kg == 20.4)
     average = ("--n", "1", "--seed", str(seed), "--jacobian", "average")
     assert sweep(*average, "--out", str(tmp_path)) == 1
-    said = " ".join(capsys.readouterr().out.split())
-    assert "1 falls of 1" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "1 falls of 1" in output
     command = f"xrl sweep kill --seed {seed} --split diagonal --jacobian average --only 0"
-    assert command in said
+    assert command in output
     assert cli.main(command.split()[1:]) == 1
 
 

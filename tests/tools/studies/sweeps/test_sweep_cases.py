@@ -117,7 +117,7 @@ def test_a_case_is_a_scenario(robot: RobotConfig, drawn: list[KillCase]) -> None
             assert (led.height, led.pitch, led.assist) == msgspec.structs.astuple(pose)
 
 
-def test_nobody_leads_faster_than_the_pace(robot: RobotConfig, drawn: list[KillCase]) -> None:
+def test_no_operator_leads_faster_than_the_pace(robot: RobotConfig, drawn: list[KillCase]) -> None:
     for case in drawn:
         for a, b in pairwise(cases.scenario_of(robot, case).keyframe):
             for way, speed in zip(
@@ -159,7 +159,7 @@ def test_the_feet_carry_the_robot(diagonal: RobotConfig) -> None:
     assert feet.read()[0] == pytest.approx(feet.read()[1], rel=0.02)
 
 
-def test_the_hand_is_off_from_when_the_case_says(
+def test_the_hand_is_off_from_the_time_in_the_case(
     diagonal: RobotConfig, drawn: list[KillCase]
 ) -> None:
     case = msgspec.structs.replace(drawn[0], kill_s=0.9, let_go_s=0.8, delay_ms=1.0, pushes=())

@@ -29,9 +29,9 @@ def test_without_dask_the_extra_that_brings_it_is_named(
     monkeypatch.setitem(sys.modules, "distributed", None)
     flags = ("--cluster", "tcp://127.0.0.1:1", "--out", str(tmp_path))
     assert cli.main(["sweep", "latency", "--trials", "1", *flags]) == 2
-    said = capsys.readouterr().err
-    assert "extra `cluster`" in said
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "extra `cluster`" in output
+    assert output.count("\n") == 1
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:8786", "http://127.0.0.1:1", "tcp://nowhere"])
@@ -114,7 +114,7 @@ def give_up(_number: int) -> int:
     raise CancelledError("scheduler-connection-lost.\nClient lost the connection.")
 
 
-def test_a_scheduler_that_is_lost_is_said_in_one_line(dask: Inline) -> None:
+def test_a_lost_scheduler_is_reported_in_one_line(dask: Inline) -> None:
     with pytest.raises(RunError) as caught:
         list(cluster.results(give_up, [1], "tcp://127.0.0.1:5", str, ()))
     assert str(caught.value) == "--cluster tcp://127.0.0.1:5: connection to the scheduler lost"

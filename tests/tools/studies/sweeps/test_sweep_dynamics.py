@@ -76,7 +76,7 @@ def test_drawn_gains_change_the_schedule_and_nothing_else(robot: RobotConfig) ->
     assert msgspec.structs.replace(other, gain_schedule=robot.gain_schedule) == robot
 
 
-def test_the_shipped_gains_are_said_to_fade_and_fade_and_far_too_fast_a_coupling_grows(
+def test_the_shipped_gains_are_predicted_to_fade_and_fade_and_far_too_fast_a_coupling_grows(
     robot: RobotConfig,
 ) -> None:
     assert robot.gain_schedule is not None

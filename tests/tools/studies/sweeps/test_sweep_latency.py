@@ -215,7 +215,7 @@ def test_all_links_take_the_delay_that_was_asked_for(robot: RobotConfig) -> None
     assert set(releases.values()) == {30_000_000}
 
 
-def test_a_control_differs_in_what_its_name_says(robot: RobotConfig) -> None:
+def test_a_control_differs_in_what_its_name_states(robot: RobotConfig) -> None:
     assert robot_of(robot, "distributed") is robot
     assert robot_of(robot, "centralised") is robot
     assert robot_of(robot, "diagonal").law.split == "diagonal"

@@ -40,13 +40,13 @@ def test_falls_are_counted_where_they_were(capsys: pytest.CaptureFixture[str]) -
     assert latency_report.falls(own).bounds[0] > 0.3
     assert {row["loss"] for row in latency_report.without_loss(rows)} == {"0"}
     latency_report.show(rows, "xrl sweep latency", Console(width=120))
-    said = capsys.readouterr().out
-    assert "centralised: 4 of 8 fell; most at 50 ms, 4 of 4" in said
-    assert "distributed: none of 8 fell" in said
-    assert "xrl sweep latency --only 4" in said
+    output = capsys.readouterr().out
+    assert "centralised: 4 of 8 fell; most at 50 ms, 4 of 4" in output
+    assert "distributed: none of 8 fell" in output
+    assert "xrl sweep latency --only 4" in output
 
 
-def test_each_delay_has_bounds_of_its_own_and_says_what_mix_they_are_of(
+def test_each_delay_has_bounds_of_its_own_and_names_their_mix(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The worst of several delays is chosen: 95 % of it would be 83 %."""
@@ -63,7 +63,7 @@ def test_each_delay_has_bounds_of_its_own_and_says_what_mix_they_are_of(
     assert latency_report.mix(both) == "0, 50 % lost, 0, 5 ms of jitter"
 
 
-def test_a_study_with_trials_missing_says_how_many_there_are() -> None:
+def test_a_study_with_trials_missing_reports_how_many_there_are() -> None:
     rows = made_up(lambda *_: False)
     assert latency_picture._each(rows) == "4 trials a point"
     assert latency_picture._each(rows[:-1]) == "3 to 4 trials a point"

@@ -81,7 +81,7 @@ def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
     assert outcome.operator_peak_n < 80.0
 
 
-def test_errors_are_told_as_one_number_each() -> None:
+def test_errors_are_reported_as_one_number_each() -> None:
     errors = plants.errors_of(plants.draw("one"))
     assert set(errors) == {row.key for row in plants.shipped().error}
 

@@ -104,7 +104,7 @@ def test_a_row_that_is_of_another_case_is_done_again(tmp_path: Path, value: str)
 
 
 @pytest.mark.parametrize("inputs", [None, b"", b"[]", b"{", b"null", b"\xff\xfe"])
-def test_a_table_of_inputs_that_nobody_knows_is_refused_and_left_alone(
+def test_a_table_of_unknown_inputs_is_refused_and_left_alone(
     tmp_path: Path, inputs: bytes | None
 ) -> None:
     with CaseTable(tmp_path, "t.csv", COLUMNS, INPUTS) as table:

@@ -59,7 +59,7 @@ def test_on_a_plant_of_many_errors_what_is_to_trip_trips_and_stands(
         (row("shakes", untripped_fell_at_s="1"), "SHAKING never tripped"),
     ],
 )
-def test_it_says_what_is_wrong_with_a_row(given: dict[str, str], words: str) -> None:
+def test_it_names_what_is_wrong_with_a_row(given: dict[str, str], words: str) -> None:
     assert wrong_with(given) == words
 
 
