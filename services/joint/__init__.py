@@ -1,1 +1,1 @@
-"""The joint service: local law, failsafe and gate of one 2-DOF module."""
+"""The joint service: local law, failsafe and torque limiter of one 2-DOF module."""

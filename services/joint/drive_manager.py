@@ -55,8 +55,8 @@ class ArmingInhibit(Enum):
     NONE = 0
     UNZEROED = 1
     OUTSIDE_LIMITS = 2
-    WILL_NOT = 3
-    LET_GO = 4
+    REFUSED = 3
+    LOST_TORQUE = 4
     """The drive lost torque after it held the robot; a person must request re-arming."""
     WAITING = 5
     """The drive holds by its own loop; it is taken over once a planner is there."""
@@ -93,7 +93,7 @@ class DriveManager:
         """Take the last state of the service before this one; start DISARMED."""
         self.last_state = last_state
         self.controller = JointController(config, name)
-        self._left_alone = DriveFallback(config, name)
+        self._fallback = DriveFallback(config, name)
         self.onboard = config.joint_service.loop == "onboard"
         drive = config.drive
         self._law = DriveSetpointLaw(
@@ -171,7 +171,7 @@ class DriveManager:
         elif mode is not Mode.DISARMED:
             samples = controller.samples
             order = DriveCommand.TARGET
-            left = self._left_alone.law(controller.setpoint, mode)
+            left = self._fallback.law(controller.setpoint, mode)
             target = self._law.target(now_ns, left, result.tau, samples.pos, samples.vel)
             self._target = target
         return DriveAction(result.event, order, torque, target, ArmingInhibit.NONE)
@@ -282,10 +282,10 @@ class DriveManager:
             self.last_state = LastState.NOTHING  # zeroing it is a request to arm it
             return ArmingInhibit.UNZEROED
         if self.last_state is not LastState.NOTHING:
-            return ArmingInhibit.LET_GO
+            return ArmingInhibit.LOST_TORQUE
         if not self.controller.inside_limits():
             return ArmingInhibit.OUTSIDE_LIMITS
         self._tries += 1
         if self._tries <= ARM_TRIES:
             return ArmingInhibit.NONE
-        return ArmingInhibit.WILL_NOT if self._tries == ARM_TRIES + 1 else None
+        return ArmingInhibit.REFUSED if self._tries == ARM_TRIES + 1 else None

@@ -40,11 +40,11 @@ _WHY_NOT: Final = {
     "encoder is lost; hang the robot and tell it where it is with `xrl zero`",
     ArmingInhibit.OUTSIDE_LIMITS: "the joint is at phi {q[0]:.3f}, theta {q[1]:.3f} rad, outside "
     "its limits; bring it inside, or correct the joint's zero",
-    ArmingInhibit.LET_GO: "the drive held the robot and lost torque while no service ran: drive "
-    "error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
+    ArmingInhibit.LOST_TORQUE: "the drive held the robot and lost torque while no service ran: "
+    "drive error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
     ArmingInhibit.WAITING: "the drive holds by its own loop; it is taken over once a planner is "
     "there",
-    ArmingInhibit.WILL_NOT: f"requested {ARM_TRIES} times: drive error 0x{{error:x}}",
+    ArmingInhibit.REFUSED: f"requested {ARM_TRIES} times: drive error 0x{{error:x}}",
 }
 
 

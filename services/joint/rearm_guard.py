@@ -136,12 +136,12 @@ class Pendant:
     def beat(self) -> None:
         """Say that it is held: from the first time on, its silence stops them."""
         self._beats += 1
-        self._tell(self._beats)
+        self._write_beats(self._beats)
 
     def lay_down(self) -> None:
         """End the pendant's watch: nobody has to hold it any more."""
-        self._tell(0)
+        self._write_beats(0)
 
-    def _tell(self, beats: int) -> None:
+    def _write_beats(self, beats: int) -> None:
         for memory in self._memories.values():
             _BEATS.pack_into(memory, _BEATS_AT, beats)

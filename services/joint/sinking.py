@@ -133,12 +133,12 @@ class Sinking:
             stop, self.upright, self.held, self.below, self.caught, self.doubt_ns, self.held_ns
         )
 
-    def restore(self, memory: SinkingState) -> None:
+    def restore(self, state: SinkingState) -> None:
         """Continue from a state."""
-        self.stop = -math.inf if memory.stop is None else memory.stop
-        self.upright, self.held, self.below = memory.upright, memory.held, memory.below
-        self.caught, self.doubt_ns = memory.caught, memory.doubt_ns
-        self.held_ns = memory.held_ns
+        self.stop = -math.inf if state.stop is None else state.stop
+        self.upright, self.held, self.below = state.upright, state.held, state.below
+        self.caught, self.doubt_ns = state.caught, state.doubt_ns
+        self.held_ns = state.held_ns
 
     def _is_to_hold(self, since_ns: int, near: NeighbourView) -> bool:
         if near.sinks:

@@ -15,8 +15,8 @@ from shared.config.robot_config import RobotConfig
 from shared.robot.joints import kind_of
 
 
-class GateLimits(msgspec.Struct, frozen=True):
-    """What one module's gate allows."""
+class TorqueLimits(msgspec.Struct, frozen=True):
+    """What one module's torque limiter allows."""
 
     phi: Pair
     """Soft stops (low, high) in rad."""
@@ -29,11 +29,11 @@ class GateLimits(msgspec.Struct, frozen=True):
     """N m from one cycle to the next."""
 
 
-def limits_of(config: RobotConfig, module: str) -> GateLimits:
+def limits_of(config: RobotConfig, module: str) -> TorqueLimits:
     """Return a module's limits from the configuration."""
     limit = getattr(config.limits, kind_of(module))
     service = config.joint_service
-    return GateLimits(
+    return TorqueLimits(
         phi=limit.phi,
         theta=limit.theta,
         soft_stop_k_p=service.soft_stop_k_p,
@@ -42,7 +42,7 @@ def limits_of(config: RobotConfig, module: str) -> GateLimits:
     )
 
 
-def limit_torque(tau: Pair, q: Pair, tau_last: Pair, limits: GateLimits) -> Pair:
+def limit_torque(tau: Pair, q: Pair, tau_last: Pair, limits: TorqueLimits) -> Pair:
     """Return the torque that may go to the drive, N m.
 
     Args:

@@ -18,7 +18,7 @@ from shared.bus.traces import CycleTrace, JointTrace
 
 CYCLES: Final = 10
 """Cycles in a message; these are lost with a killed service."""
-MEMORY_EVERY: Final = 50
+SNAPSHOT_EVERY: Final = 50
 """Messages between two with the service's snapshot: 1 s."""
 
 _NOTHING: Final = (0.0, 0.0)
@@ -88,5 +88,5 @@ class Tracer:
 
     def _remember(self) -> None:
         """Take the snapshot if the next message carries it."""
-        due = self._seq % MEMORY_EVERY == 0
+        due = self._seq % SNAPSHOT_EVERY == 0
         self._snapshot = self._encode(self._module.snapshot()).decode() if due else ""

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.network_proxy.commands import Orders
+from services.network_proxy.commands import CommandHandler
 from services.network_proxy.control import ControlSocket
 from services.network_proxy.event_loop import SocketWatch
 from services.network_proxy.listener import SocketListener
 from services.network_proxy.loop import run
-from services.network_proxy.proxy_endpoint import Place, address_of
+from services.network_proxy.proxy_endpoint import ProxyEndpoint, address_of
 from services.network_proxy.relay import Relay
 from shared import log, process
 from shared.bus import session as bus
@@ -42,19 +42,19 @@ def main() -> int:
     stop = process.StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
     directions = {name: Direction(name, arguments.seed) for name in DIRECTIONS}
-    places = [_place(pair, config, arguments.run_dir) for pair in PAIRS]
+    endpoints = [_place(pair, config, arguments.run_dir) for pair in PAIRS]
     watch = SocketWatch()
-    relay = Relay(places, directions, watch, round(config.bus.lease_ms * NS_PER_MS))
+    relay = Relay(endpoints, directions, watch, round(config.bus.lease_ms * NS_PER_MS))
     with bus.open_session(config, "network_proxy", arguments.run_dir) as session:
         impairments = ImpairmentSchedule(
             directions, session.publisher(topics.LINK_EVENT, LinkEvent).put
         )
-        orders = Orders(impairments)
-        control = ControlSocket(arguments.run_dir / SOCKET, orders.obey, watch)
-        logger.info("between %d pairs, priority %s", len(places), granted)
+        commands = CommandHandler(impairments)
+        control = ControlSocket(arguments.run_dir / SOCKET, commands.obey, watch)
+        logger.info("between %d pairs, priority %s", len(endpoints), granted)
         process.freeze_garbage()
         try:
-            run(watch, relay, orders, impairments, stop)
+            run(watch, relay, commands, impairments, stop)
         finally:
             control.close()
             relay.close()
@@ -68,7 +68,7 @@ def main() -> int:
     return 0
 
 
-def _place(pair: Pair, config: RobotConfig, run_dir: Path) -> Place:
+def _place(pair: Pair, config: RobotConfig, run_dir: Path) -> ProxyEndpoint:
     """Stand between two processes.
 
     Raises:
@@ -76,7 +76,7 @@ def _place(pair: Pair, config: RobotConfig, run_dir: Path) -> Place:
     """
     path = Path(expand(endpoint_through(pair), run_dir).removeprefix(_UNIX))
     beyond = address_of(expand(config.bus.endpoints[pair.flushing], run_dir))
-    return Place(pair, SocketListener(path), beyond)
+    return ProxyEndpoint(pair, SocketListener(path), beyond)
 
 
 if __name__ == "__main__":

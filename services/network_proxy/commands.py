@@ -17,7 +17,7 @@ WAIT_MAX_S: Final = 86_400.0
 """Latest begin, from now."""
 
 
-class Orders:
+class CommandHandler:
     """Obeys, or says why not."""
 
     def __init__(self, impairments: ImpairmentSchedule) -> None:
@@ -31,8 +31,8 @@ class Orders:
         at_ns = now_ns()
         try:
             if isinstance(request, Begin):
-                if amiss := self._amiss(request):
-                    return Reply(error=amiss)
+                if problem := self._problem(request):
+                    return Reply(error=problem)
                 self._begin(request, at_ns)
             elif isinstance(request, Clear):
                 self._injections.clear(request.link, at_ns)
@@ -41,7 +41,7 @@ class Orders:
         self.changed = True
         return Reply(requested=tuple(self._asked(at_ns)))
 
-    def _amiss(self, request: Begin) -> str:
+    def _problem(self, request: Begin) -> str:
         """Return why not; empty if it can be done.
 
         Raises:

@@ -77,10 +77,10 @@ class Connection:
             flow.source.close()
             flow.drop()
 
-    def _is_ready(self, says: Flow, hears: Flow, events: int, now_ns: int) -> None:
+    def _is_ready(self, source: Flow, sink: Flow, events: int, now_ns: int) -> None:
         """Continue at an end: one flow reads there, the other writes."""
         if self.parted:
             return  # in this same turn
         if events & WRITE:
-            hears.flush()
-        self._taken(self, says, says.take(now_ns) if events & READ else [], now_ns)
+            sink.flush()
+        self._taken(self, source, source.take(now_ns) if events & READ else [], now_ns)

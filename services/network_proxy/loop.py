@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from services.network_proxy.commands import Orders
+from services.network_proxy.commands import CommandHandler
 from services.network_proxy.event_loop import SocketWatch
 from services.network_proxy.relay import Relay
 from shared.clock import NS_PER_S, machine_s, now_ns
@@ -20,7 +20,7 @@ recorder, which listens for 0.1 s after its own stop.
 def run(
     watch: SocketWatch,
     relay: Relay,
-    orders: Orders,
+    commands: CommandHandler,
     impairments: ImpairmentSchedule,
     stop: StopFlag,
 ) -> None:
@@ -32,8 +32,8 @@ def run(
         for call, events in ready:
             call(events, at_ns)
         relay.give_up(at_ns)
-        if impairments.advance(at_ns, at_ns) or orders.changed:
-            orders.changed = False
+        if impairments.advance(at_ns, at_ns) or commands.changed:
+            commands.changed = False
             relay.release(at_ns)
 
 

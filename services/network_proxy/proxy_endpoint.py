@@ -20,7 +20,7 @@ class Address(NamedTuple):
     """What sockets of the family connect to: a path, or a numeric host with its port."""
 
 
-class Place:
+class ProxyEndpoint:
     """Between the two processes of a pair."""
 
     def __init__(self, pair: Pair, listener: SocketListener, beyond: Address) -> None:
@@ -66,10 +66,10 @@ def address_of(endpoint: str) -> Address:
     Raises:
         BusError: the endpoint is neither a UNIX socket nor TCP, or the host is unknown.
     """
-    kind, _, place = endpoint.partition("/")
+    kind, _, endpoint = endpoint.partition("/")
     if kind == "unixsock-stream":
-        return Address(socket.AF_UNIX, place)
-    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+        return Address(socket.AF_UNIX, endpoint)
+    host, _, port = endpoint.partition("?")[0].partition("#")[0].rpartition(":")
     if kind != "tcp" or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
         text = "cannot be stood before; unixsock-stream/PATH or tcp/HOST:PORT can"
         raise BusError(f"{endpoint}: {text}")

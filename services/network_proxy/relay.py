@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from services.network_proxy.connection import Connection
 from services.network_proxy.direction import Flow, Waiting
 from services.network_proxy.event_loop import READ, SocketWatch
-from services.network_proxy.proxy_endpoint import Place
+from services.network_proxy.proxy_endpoint import ProxyEndpoint
 from shared.network.impairment import Direction
 
 LINKS_MAX: Final = 16
@@ -34,7 +34,7 @@ class Relay:
 
     def __init__(
         self,
-        places: Sequence[Place],
+        endpoints: Sequence[ProxyEndpoint],
         directions: Mapping[str, Direction],
         watch: SocketWatch,
         lease_ns: int,
@@ -42,20 +42,22 @@ class Relay:
         """Start to listen.
 
         Args:
-            places: one for each pair.
+            endpoints: one for each pair.
             directions: impairments by the direction's name; others forward at once.
             watch: of the loop.
             lease_ns: time after which Zenoh gives up a silent link.
         """
         self._directions, self._watch, self._lease_ns = directions, watch, lease_ns
-        self._links: dict[Place, list[Connection]] = {place: [] for place in places}
+        self._links: dict[ProxyEndpoint, list[Connection]] = {
+            endpoint: [] for endpoint in endpoints
+        }
         self._due: list[_Due] = []
         self._looks_ns = 0
         self._count = count()
         self.stuck = 0
         """Connections that were parted because an end took nothing any more."""
-        for place in places:
-            watch.want(place.listener.socket, READ, partial(self._dialled, place))
+        for endpoint in endpoints:
+            watch.want(endpoint.listener.socket, READ, partial(self._dialled, endpoint))
 
     @property
     def links(self) -> int:
@@ -65,7 +67,7 @@ class Relay:
     @property
     def refused(self) -> int:
         """Connections to a process that was not there, or beyond what can be held."""
-        return sum(place.missing + place.listener.turned_away for place in self._links)
+        return sum(endpoint.missing + endpoint.listener.turned_away for endpoint in self._links)
 
     def next_ns(self) -> int | None:
         """Return when the next batch is due; None: none waits."""
@@ -104,21 +106,21 @@ class Relay:
 
     def close(self) -> None:
         """End every connection, and listen no more."""
-        for place, links in self._links.items():
+        for endpoint, links in self._links.items():
             for connection in list(links):
                 self._part(connection)
-            place.listener.close()
+            endpoint.listener.close()
 
-    def _dialled(self, place: Place, _events: int, _now_ns: int) -> None:
-        ends = place.link()
+    def _dialled(self, endpoint: ProxyEndpoint, _events: int, _now_ns: int) -> None:
+        ends = endpoint.link()
         if ends is None:
             return
-        links = self._links[place]
+        links = self._links[endpoint]
         if len(links) >= LINKS_MAX:
             self._part(next((one for one in links if one.left), links[0]))
         there, back = (
             self._directions.get(name) or Direction(name, 0)
-            for name in (place.pair.there, place.pair.back)
+            for name in (endpoint.pair.there, endpoint.pair.back)
         )
         links.append(Connection(ends, (there, back), self._watch, self._pass_on))
 

@@ -131,7 +131,7 @@ class AxisBank:
             if dt_s > 0.0:
                 self._encoders.estimate(dt_s, pos_turns)
         if self.calibration.running or not self.conditions.all_well:
-            self._live_with_conditions()
+            self._apply_conditions()
         if control.too_fast():
             for axis in control.overspeed():
                 self._fail(axis, FAULTS["OVERSPEED"])
@@ -223,7 +223,7 @@ class AxisBank:
             self._encoders.lose_turns(each)
         self.conditions.boot(drive, self.now_s)
 
-    def talks(self, axis: int) -> bool:
+    def is_responding(self, axis: int) -> bool:
         """Return True if the axis's ODrive communicates: powered, started, plugged in."""
         return axis not in self.conditions.silent
 
@@ -265,7 +265,7 @@ class AxisBank:
 
     # ---- within a step
 
-    def _live_with_conditions(self) -> None:
+    def _apply_conditions(self) -> None:
         """Handle rare changes: drives that start, conditions, calibrations."""
         for drive in self.conditions.come_up(self.now_s):
             for axis in _both(2 * drive):

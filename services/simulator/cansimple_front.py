@@ -118,7 +118,7 @@ class CanSimpleFront:
             for node, axis in bus.nodes.items():
                 if now_s >= due_s[axis]:
                     due_s[axis] = max(due_s[axis], now_s) + self._heartbeat_periods_s[axis]
-                    if bank.talks(axis):
+                    if bank.is_responding(axis):
                         can_id = cansimple.arbitration_id(node, Command.HEARTBEAT)
                         frames.append((can_id, self._dialect.heartbeat(bank, axis)))
             if frames:
@@ -147,7 +147,7 @@ class CanSimpleFront:
         """Answer a frame that sets nothing, if it is one that has an answer."""
         node, command = cansimple.split_id(can_id)
         axis = bus.nodes.get(node)
-        if axis is None or can_id & ~_FLAGGED_ID or not self._bank.talks(axis):
+        if axis is None or can_id & ~_FLAGGED_ID or not self._bank.is_responding(axis):
             return
         self._bank.feed(axis)
         answer = self._dialect.answers.get(command)

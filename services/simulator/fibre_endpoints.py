@@ -58,9 +58,9 @@ class EmulatedBoard(NamedTuple):
         return 2 * self.drive + i
 
     @property
-    def talks(self) -> bool:
+    def is_responding(self) -> bool:
         """True if the board is powered, up and plugged in."""
-        return self.bank.talks(self.axis(0))
+        return self.bank.is_responding(self.axis(0))
 
     def save(self) -> None:
         """Save the configuration, which restarts the board; refused while an axis is armed."""

@@ -48,7 +48,7 @@ class FibrePort:
     @property
     def right(self) -> bool:
         """True if the plug is in while the board talks, and out while it does not."""
-        return self.front.board.talks == (self.listener is not None)
+        return self.front.board.is_responding == (self.listener is not None)
 
     def plug(self) -> None:
         """Put the plug in; clients find the drive when they next look."""

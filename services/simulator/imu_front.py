@@ -31,18 +31,18 @@ class ImuFront:
         tilt = _product(_about(0, roll), _about(1, pitch))
         roll, pitch, yaw = config.mounting
         mounting = _product(_about(2, yaw), _product(_about(0, roll), _about(1, pitch)))
-        self._sits = _product(tilt, mounting)
+        self._mounting = _product(tilt, mounting)
         """Turns sensor axes into torso axes."""
         self._random = np.random.default_rng((seed, 1))
 
     def send(self, world: World) -> None:
         """Send one sample of how the torso stands against gravity, and turns."""
         noise = self._errors.noise * self._random.standard_normal(2)
-        turned = _product(world.torso_against_gravity(), self._sits)
+        turned = _product(world.torso_against_gravity(), self._mounting)
         measured = _product(turned, _product(_about(0, noise[0]), _about(1, noise[1])))
-        w, x, y, z = self._sits
+        w, x, y, z = self._mounting
         back = (w, -x, -y, -z)
-        _, *rate = _product(back, _product((0.0, *world.torso_rates()), self._sits))
+        _, *rate = _product(back, _product((0.0, *world.torso_rates()), self._mounting))
         self._hub.poll()
         self._hub.broadcast(imu_can.pack(measured, rate, valid=True))
 

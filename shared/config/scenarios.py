@@ -247,8 +247,8 @@ def check(file: str, scenario: Scenario) -> None:
         _check_inside(file, f"fault[{index}].at", fault.at, scenario.duration)
     for index, inject in enumerate(scenario.inject):
         directions_of(inject.link, file, f"inject[{index}].link")
-        if amiss := inject.fault():
-            found, _, right = amiss.partition("; ")
+        if problem := inject.fault():
+            found, _, right = problem.partition("; ")
             raise ConfigError(file, f"inject[{index}]", found, right)
         _check_inside(file, f"inject[{index}].at", inject.at, scenario.duration)
     for index, restart in enumerate(scenario.restart):

@@ -53,8 +53,8 @@ def in_use(path: Path) -> bool:
     Raises:
         OSError: it cannot be opened.
     """
-    with locked(path) as mine:
-        return not mine
+    with locked(path) as acquired:
+        return not acquired
 
 
 @contextlib.contextmanager

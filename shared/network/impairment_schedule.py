@@ -30,22 +30,22 @@ class ImpairmentSchedule:
     """All of them, by number."""
 
     def __init__(
-        self, directions: Mapping[str, Direction], tell: Callable[[LinkEvent], object]
+        self, directions: Mapping[str, Direction], report: Callable[[LinkEvent], object]
     ) -> None:
         """Begin with none.
 
         Args:
             directions: every one, by name.
-            tell: takes an event for each direction whenever something begins or ends.
+            report: takes an event for each direction whenever something begins or ends.
         """
         self.requested: dict[int, PendingImpairment] = {}
         self.next_due = math.inf
         """When the first of them begins or ends, on the owner's clock."""
         self._directions = directions
-        self._tell = tell
+        self._report = report
         self._coming: list[int] = []
         """Those that have not started, in the order of the requests."""
-        self._count = self._told = 0
+        self._count = self._reported = 0
 
     def begin(self, link: str, what: Impairment, until: float, now_ns: int) -> int:
         """Start an impairment now; return its number.
@@ -93,7 +93,7 @@ class ImpairmentSchedule:
         for name in directions_of(requested.link):
             impairer = self._directions[name].end(number)
             if impairer is not None:
-                self._say(name, number, requested, now_ns, impairer)
+                self._describe(name, number, requested, now_ns, impairer)
         self._find_next()
 
     def advance(self, clock: float, now_ns: int) -> bool:
@@ -143,14 +143,14 @@ class ImpairmentSchedule:
         requested = self.requested[number]
         for name in directions_of(requested.link):
             self._directions[name].begin(number, requested.what)
-            self._say(name, number, requested, now_ns, None)
+            self._describe(name, number, requested, now_ns, None)
 
     def _find_next(self) -> None:
         times = [requested.until for requested in self.requested.values()]
         times += [self.requested[number].begins for number in self._coming]
         self.next_due = min(times, default=math.inf)
 
-    def _say(
+    def _describe(
         self,
         name: str,
         number: int,
@@ -158,12 +158,12 @@ class ImpairmentSchedule:
         now_ns: int,
         ended: Impairer | None,
     ) -> None:
-        self._told += 1
+        self._reported += 1
         what = requested.what
-        self._tell(
+        self._report(
             LinkEvent(
                 t_ns=now_ns,
-                seq=self._told,
+                seq=self._reported,
                 link=name,
                 requested=requested.link,
                 number=number,

@@ -37,7 +37,7 @@ def test_a_drive_that_never_arms_is_asked_so_often_and_reported_once(robot: Robo
             told.append((bench.now_ns, step.command, step.inhibit))
     assert [row[1:] for row in told] == [
         *[(DriveCommand.ARM, ArmingInhibit.NONE)] * ARM_TRIES,
-        (DriveCommand.NOTHING, ArmingInhibit.WILL_NOT),
+        (DriveCommand.NOTHING, ArmingInhibit.REFUSED),
     ]
     times = [row[0] for row in told]
     assert {later - sooner for sooner, later in pairwise(times)} == {ARM_EVERY_NS}

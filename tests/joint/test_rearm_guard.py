@@ -114,7 +114,7 @@ def test_a_drive_that_held_and_has_let_go_is_not_armed_by_a_service_that_was_not
     service = Successor(robot, LastState.HELD, status)
     steps = [service.lead() if led else service.cycle() for _ in range(2000)]
     assert {step.command for step in steps} == {DriveCommand.NOTHING}
-    assert ArmingInhibit.LET_GO in {step.inhibit for step in steps}
+    assert ArmingInhibit.LOST_TORQUE in {step.inhibit for step in steps}
     assert service.mode is Mode.DISARMED
     assert service.module.last_state is LastState.HELD, "nor by the next"
 

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.torque_limiter import GateLimits, limit_differential, limit_torque, limits_of
+from services.joint.torque_limiter import TorqueLimits, limit_differential, limit_torque, limits_of
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 
 MAX = 115.6
 STEP = 40.0
 K_STOP = 400.0
-LIMITS = GateLimits(
+LIMITS = TorqueLimits(
     phi=(-0.6, 0.6), theta=(-3.0, -0.2), soft_stop_k_p=K_STOP, tau_module_max=MAX, tau_step_max=STEP
 )
 FREE: Pair = (0.0, -1.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from services.network_proxy.event_loop import SocketWatch
 from services.network_proxy.listener import SocketListener
-from services.network_proxy.proxy_endpoint import Address, Place
+from services.network_proxy.proxy_endpoint import Address, ProxyEndpoint
 from services.network_proxy.relay import Relay
 from shared.bus.links import Pair
 from shared.clock import NS_PER_MS
@@ -55,9 +55,9 @@ class Rig:
         self.through = folder / "t"
         self.watch = SocketWatch()
         where = Address(self.beyond.family, self.beyond.getsockname())
-        self.place = Place(PAIR, SocketListener(self.through), where)
+        self.endpoint = ProxyEndpoint(PAIR, SocketListener(self.through), where)
         names = {PAIR.there: self.there, PAIR.back: self.back}
-        self.relay = Relay([self.place], names, self.watch, LEASE_NS)
+        self.relay = Relay([self.endpoint], names, self.watch, LEASE_NS)
         self.ends: list[socket.socket] = [self.beyond]
 
     def dial(self) -> socket.socket:

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.network_proxy.commands import ASKED_MAX, Orders
+from services.network_proxy.commands import ASKED_MAX, CommandHandler
 from services.network_proxy.control import ASKERS_MAX, ControlSocket
 from services.network_proxy.event_loop import SocketWatch
 from shared.bus.links import COMMANDS, DIRECTIONS
@@ -33,7 +33,7 @@ class Rig:
         self.directions = {name: Direction(name, 0) for name in DIRECTIONS}
         self.told: list[LinkEvent] = []
         self.impairments = ImpairmentSchedule(self.directions, self.told.append)
-        self.orders = Orders(self.impairments)
+        self.commands = CommandHandler(self.impairments)
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def rig() -> Rig:
 
 
 def test_what_begins_is_active_in_both_directions_of_the_link_and_reported(rig: Rig) -> None:
-    reply = rig.orders.obey(Begin(DELAY))
+    reply = rig.commands.obey(Begin(DELAY))
     assert [row.link for row in reply.requested] == ["planner->joints"]
     assert reply.requested[0].left_s is None
     impaired = {name for name, one in rig.directions.items() if one.active is not None}
@@ -54,7 +54,7 @@ def test_what_begins_is_active_in_both_directions_of_the_link_and_reported(rig: 
 
 
 def test_an_impairment_with_a_duration_ends_by_itself_and_reports_its_counts(rig: Rig) -> None:
-    rig.orders.obey(Begin(LOSS))
+    rig.commands.obey(Begin(LOSS))
     for number in range(100):
         rig.directions["knee_left->planner"].passes(number, 10)
     end_ns = round(rig.impairments.next_due)
@@ -67,18 +67,18 @@ def test_an_impairment_with_a_duration_ends_by_itself_and_reports_its_counts(rig
 
 
 def test_clearing_a_link_ends_what_touches_it_and_leaves_the_rest(rig: Rig) -> None:
-    rig.orders.obey(Begin(DELAY))
-    rig.orders.obey(Begin(Inject(link="harness->planner", at=0.0, loss=0.1)))
-    reply = rig.orders.obey(Clear("planner->knee_left"))
+    rig.commands.obey(Begin(DELAY))
+    rig.commands.obey(Begin(Inject(link="harness->planner", at=0.0, loss=0.1)))
+    reply = rig.commands.obey(Clear("planner->knee_left"))
     assert [row.link for row in reply.requested] == ["harness->planner"]
-    assert rig.orders.obey(Clear()).requested == ()
+    assert rig.commands.obey(Clear()).requested == ()
 
 
 def test_counts_are_reported_while_it_lasts(rig: Rig) -> None:
-    rig.orders.obey(Begin(LOSS))
+    rig.commands.obey(Begin(LOSS))
     for number in range(50):
         rig.directions["planner->knee_left"].passes(number, 10)
-    (row,) = rig.orders.obey(List()).requested
+    (row,) = rig.commands.obey(List()).requested
     assert row.passed + row.lost == 50
     assert row.detail == "loss=50%"
     assert 0.0 < (row.left_s or 0.0) <= 2.0
@@ -101,13 +101,13 @@ def test_counts_are_reported_while_it_lasts(rig: Rig) -> None:
 def test_what_makes_no_sense_is_refused_and_nothing_changes(
     rig: Rig, request_: Begin | Clear, words: str
 ) -> None:
-    assert words in rig.orders.obey(request_).error
+    assert words in rig.commands.obey(request_).error
     assert rig.told == []
     assert rig.impairments.requested == {}
 
 
 def test_what_is_asked_for_later_begins_and_ends_when_it_is_due(rig: Rig) -> None:
-    (row,) = rig.orders.obey(Begin(LOSS, in_s=5.0)).requested
+    (row,) = rig.commands.obey(Begin(LOSS, in_s=5.0)).requested
     assert 4.9 < row.in_s <= 5.0
     assert 6.9 < (row.left_s or 0.0) <= 7.0
     assert rig.told == []
@@ -115,28 +115,28 @@ def test_what_is_asked_for_later_begins_and_ends_when_it_is_due(rig: Rig) -> Non
     assert rig.impairments.advance(begins_ns, begins_ns)
     assert {one.active is None for one in rig.directions.values()} == {False}
     assert rig.impairments.next_due == begins_ns + 2_000_000_000
-    assert rig.orders.obey(List()).requested[0].hidden == ()
+    assert rig.commands.obey(List()).requested[0].hidden == ()
 
 
 def test_a_hidden_impairment_is_reported(rig: Rig) -> None:
-    rig.orders.obey(Begin(LOSS))
-    first, second = rig.orders.obey(Begin(DELAY)).requested
+    rig.commands.obey(Begin(LOSS))
+    first, second = rig.commands.obey(Begin(DELAY)).requested
     assert first.hidden == COMMANDS
     assert second.hidden == ()
 
 
 def test_there_is_a_bound_to_what_is_asked_for_at_once(rig: Rig) -> None:
     for _ in range(ASKED_MAX):
-        assert rig.orders.obey(Begin(LOSS)).error == ""
-    assert "clear some" in rig.orders.obey(Begin(LOSS)).error
-    assert rig.orders.obey(Clear()).error == ""
-    assert rig.orders.obey(Begin(LOSS)).error == ""
+        assert rig.commands.obey(Begin(LOSS)).error == ""
+    assert "clear some" in rig.commands.obey(Begin(LOSS)).error
+    assert rig.commands.obey(Clear()).error == ""
+    assert rig.commands.obey(Begin(LOSS)).error == ""
 
 
 @pytest.fixture
 def served(rig: Rig, tmp_path: Path) -> Iterator[tuple[Rig, Path]]:
     watch = SocketWatch()
-    control = ControlSocket(tmp_path / SOCKET, rig.orders.obey, watch)
+    control = ControlSocket(tmp_path / SOCKET, rig.commands.obey, watch)
     over = threading.Event()
 
     def serve() -> None:
@@ -184,7 +184,7 @@ def test_without_an_injector_the_client_names_how_to_get_one(tmp_path: Path) -> 
 
 def test_a_long_answer_comes_whole_to_one_who_reads_late(served: tuple[Rig, Path]) -> None:
     for _ in range(ASKED_MAX):
-        served[0].orders.obey(Begin(LOSS))
+        served[0].commands.obey(Begin(LOSS))
     requested = 200
     with socket.socket(socket.AF_UNIX) as asking:
         asking.settimeout(5.0)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from services.network_proxy.listener import SocketListener
-from services.network_proxy.proxy_endpoint import Address, Place, address_of
+from services.network_proxy.proxy_endpoint import Address, ProxyEndpoint, address_of
 from shared.exceptions import BusError
 from tests.network_proxy.rig import MESSAGE, PAIR, WAIT_S, Rig, batch, heard, listening
 
@@ -161,14 +161,16 @@ def test_with_a_descriptor_for_one_end_only_neither_is_kept(rig: Rig) -> None:
 def test_a_place_dials_its_own_endpoint(tmp_path: Path) -> None:
     where = str(tmp_path / "b")
     with listening(socket.AF_UNIX, where) as beyond:
-        place = Place(PAIR, SocketListener(tmp_path / "t"), Address(socket.AF_UNIX, where))
+        endpoint = ProxyEndpoint(
+            PAIR, SocketListener(tmp_path / "t"), Address(socket.AF_UNIX, where)
+        )
         with socket.socket(socket.AF_UNIX) as dialling:
             dialling.connect(str(tmp_path / "t"))
-            ends = place.link()
+            ends = endpoint.link()
         assert ends is not None
         beyond.settimeout(WAIT_S)
         beyond.accept()[0].close()
         for end in ends:
             assert not end.getblocking()
             end.close()
-        place.listener.close()
+        endpoint.listener.close()

@@ -1,4 +1,4 @@
-"""Dense sweeps of the last gate before the drive, to each boundary and beyond it."""
+"""Dense sweeps of the last step before the drive, to each boundary and beyond it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from services.joint.torque_limiter import GateLimits, limit_differential, limit_torque, limits_of
+from services.joint.torque_limiter import TorqueLimits, limit_differential, limit_torque, limits_of
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import KINDS
@@ -17,7 +17,7 @@ HUGE = 1.7e308
 
 
 @pytest.fixture(params=KINDS)
-def limits(request: pytest.FixtureRequest, robot: RobotConfig) -> GateLimits:
+def limits(request: pytest.FixtureRequest, robot: RobotConfig) -> TorqueLimits:
     return limits_of(robot, f"{request.param}_left")
 
 
@@ -27,24 +27,26 @@ def around(value: float) -> tuple[float, ...]:
     return (value - 0.01, below, value, above, value + 0.01)
 
 
-def wanted_torques(limits: GateLimits) -> list[float]:
+def wanted_torques(limits: TorqueLimits) -> list[float]:
     boundaries = (limits.tau_module_max / 2.0, limits.tau_module_max, limits.tau_step_max)
     near = [tau for b in boundaries for tau in (*around(b), *around(-b))]
     return [0.0, *near, 1e3, -1e3, HUGE, -HUGE, math.inf, -math.inf, math.nan]
 
 
-def poses(limits: GateLimits) -> list[Pair]:
+def poses(limits: TorqueLimits) -> list[Pair]:
     phis = [0.0, *around(limits.phi[0]), *around(limits.phi[1]), 50.0, math.nan, math.inf]
     thetas = [-0.5, *around(limits.theta[0]), *around(limits.theta[1]), -HUGE, math.nan]
     return [(phi, -0.5) for phi in phis] + [(0.0, theta) for theta in thetas]
 
 
-def corners_and_inside(limits: GateLimits) -> list[Pair]:
+def corners_and_inside(limits: TorqueLimits) -> list[Pair]:
     top, half = limits.tau_module_max, limits.tau_module_max / 2.0
     return [(0.0, 0.0), (top, 0.0), (-top, 0.0), (0.0, top), (0.0, -top), (half, -half), (3, -7)]
 
 
-def test_gate_lets_out_no_more_than_the_diamond_and_no_larger_step(limits: GateLimits) -> None:
+def test_the_limiter_passes_no_more_than_the_diamond_and_no_larger_step(
+    limits: TorqueLimits,
+) -> None:
     torques = wanted_torques(limits)
     worst_sum = worst_step = 0.0
     for phi, theta, last in product(torques, torques, corners_and_inside(limits)):
@@ -59,7 +61,7 @@ def test_gate_lets_out_no_more_than_the_diamond_and_no_larger_step(limits: GateL
     assert worst_step == pytest.approx(limits.tau_step_max, abs=ROUNDING)
 
 
-def test_gate_held_against_the_diamond_never_creeps_out_of_it(limits: GateLimits) -> None:
+def test_gate_held_against_the_diamond_never_creeps_out_of_it(limits: TorqueLimits) -> None:
     out: Pair = (0.0, 0.0)
     for cycle in range(20_000):
         angle = 0.01 * cycle
@@ -78,7 +80,7 @@ def test_no_motor_gets_more_than_its_share_at_any_angle_in_the_plane() -> None:
             assert abs(theta - phi) <= 115.6 + ROUNDING
 
 
-def test_soft_stop_pushes_only_inwards_and_only_beyond_the_stop(limits: GateLimits) -> None:
+def test_soft_stop_pushes_only_inwards_and_only_beyond_the_stop(limits: TorqueLimits) -> None:
     beyond_count = 0
     for axis, (low, high) in enumerate((limits.phi, limits.theta)):
         tiny = [sign * 10.0**-power for sign in (-1, 1) for power in range(5, 13)]

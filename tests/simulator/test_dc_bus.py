@@ -100,4 +100,4 @@ def test_a_sagging_supply_disarms_and_arms_again_only_when_it_is_back() -> None:
     bank.request_state(4, AxisState.CLOSED_LOOP_CONTROL)
     step_for(bank, DT)
     assert bank.state[4] == AxisState.CLOSED_LOOP_CONTROL
-    assert bank.talks(4), "it has not been off"
+    assert bank.is_responding(4), "it has not been off"

@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
     state: AxisState
     registers: Registers
     sibling: AxisState = AxisState.CLOSED_LOOP_CONTROL
-    talks: bool = True
+    is_responding: bool = True
 
 
 OUTCOMES = {
@@ -56,7 +56,7 @@ OUTCOMES = {
         ),
     ),
     "watchdog": Outcome(AxisState.IDLE, Registers(AxisError.WATCHDOG_TIMER_EXPIRED)),
-    "link_lost": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers(), talks=False),
+    "link_lost": Outcome(AxisState.CLOSED_LOOP_CONTROL, Registers(), is_responding=False),
     "disarmed": Outcome(AxisState.IDLE, Registers()),
     "overspeed": Outcome(
         AxisState.IDLE,
@@ -65,7 +65,7 @@ OUTCOMES = {
         ),
     ),
     "brown_out": Outcome(
-        AxisState.UNDEFINED, Registers(), sibling=AxisState.UNDEFINED, talks=False
+        AxisState.UNDEFINED, Registers(), sibling=AxisState.UNDEFINED, is_responding=False
     ),
 }
 
@@ -84,7 +84,7 @@ class Scene:
         while self.steps < round(until_s / DT):
             self.steps += 1
             for axis in range(12):
-                if self.bank.talks(axis):
+                if self.bank.is_responding(axis):
                     self.bank.feed(axis)
             self.injector.advance(self.steps * DT)
             self.torque = self.bank.step(self.steps * DT, np.full(12, 0.5), ZERO).copy()
@@ -111,7 +111,7 @@ def test_a_fault_leaves_these_registers_this_state_and_this_sibling(kind: str, a
     bank, sibling = scene.bank, axis ^ 1
     assert bank.state[axis] == outcome.state
     assert bank.faults[axis] == outcome.registers
-    assert bank.talks(axis) == outcome.talks
+    assert bank.is_responding(axis) == outcome.is_responding
     assert bank.state[sibling] == outcome.sibling
     assert (bank.faults[sibling] == outcome.registers) == (
         FAULT_KINDS[kind].whole or outcome.registers == Registers()
@@ -119,7 +119,7 @@ def test_a_fault_leaves_these_registers_this_state_and_this_sibling(kind: str, a
     closed = [state == AxisState.CLOSED_LOOP_CONTROL for state in bank.state]
     assert scene.torque == pytest.approx(np.array(closed, float)), "what is not armed floats"
     others = [each for each in range(12) if each // 2 != axis // 2]
-    assert all(closed[each] and bank.talks(each) for each in others)
+    assert all(closed[each] and bank.is_responding(each) for each in others)
 
 
 @pytest.mark.parametrize("kind", ["over_temperature", "over_voltage", "encoder"])
@@ -154,9 +154,9 @@ def test_a_link_lost_for_longer_than_the_watchdog_leaves_both_axes_limp() -> Non
     scene.run(0.2)
     assert scene.bank.state[:2] == [AxisState.IDLE] * 2
     assert scene.bank.faults[1].axis == AxisError.WATCHDOG_TIMER_EXPIRED
-    assert not scene.bank.talks(0)
+    assert not scene.bank.is_responding(0)
     scene.run(0.32)
-    assert scene.bank.talks(0)
+    assert scene.bank.is_responding(0)
 
 
 def test_a_brown_out_ends_in_a_restart_in_idle_with_no_error_and_nothing_remembered() -> None:
@@ -164,12 +164,12 @@ def test_a_brown_out_ends_in_a_restart_in_idle_with_no_error_and_nothing_remembe
     scene.bank.vel_limit[2] = 3.0  # written, and never saved
     scene.run(0.11 + BOOT_S - 0.01)
     assert scene.bank.state[2] == AxisState.UNDEFINED
-    assert not scene.bank.talks(3)
+    assert not scene.bank.is_responding(3)
     scene.bank.request_state(2, AxisState.CLOSED_LOOP_CONTROL)
     scene.run(0.11 + BOOT_S + 0.01)
     bank = scene.bank
     assert bank.state[2:4] == [AxisState.IDLE] * 2
-    assert bank.talks(2)
+    assert bank.is_responding(2)
     assert bank.faults[2] == bank.faults[3] == Registers()
     assert bank.input_torque[2] == bank.input_torque[3] == 0.0
     assert bank.vel_limit[2] == 60.0

@@ -67,8 +67,8 @@ def test_the_genuine_package_writes_a_setting_and_saves_it_over_a_restart(usb: U
     board = odrive.find_sync(serial_number(MODULE), timeout=10)
     board.axis1.config.can.encoder_rate_ms = 7
     board.save_configuration()
-    assert eventually(lambda: not usb.bank.talks(5))
-    assert eventually(lambda: usb.bank.talks(5))
+    assert eventually(lambda: not usb.bank.is_responding(5))
+    assert eventually(lambda: usb.bank.is_responding(5))
     board = odrive.find_sync(serial_number(MODULE), timeout=10)
     assert board.axis1.config.can.encoder_rate_ms == 7
     assert board.axis0.config.can.encoder_rate_ms != 7

@@ -66,7 +66,7 @@ def test_a_drive_missing_from_the_bus_is_reported_once_with_its_number(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(odrive_usb, "TELL_S", 0.1)
+    monkeypatch.setattr(odrive_usb, "REPORT_S", 0.1)
     with caplog.at_level(logging.WARNING, "xrl"):
         drive = OdriveUsb("0000000000AB", config.drive)
         assert eventually(lambda: bool(caplog.records))

@@ -139,7 +139,7 @@ def test_a_service_that_is_not_to_restart_stays_down_until_it_is_started(start: 
 def test_a_service_that_is_asleep_waits_until_it_is_started(
     start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fleet = start(asleep=("planner",))
+    fleet = start(not_started=("planner",))
     assert [service(fleet, name).state for name in ("planner", "harness")] == ["stopped", "running"]
     assert cli.main(["start", "planner", "--run-dir", str(run_dir)]) == 0
     assert "planner: started" in capsys.readouterr().out

@@ -252,11 +252,11 @@ def test_clearing_errors_clears_both_axes(client: Client, bank: AxisBank) -> Non
 def test_the_configuration_is_saved_in_idle_only(client: Client, bank: AxisBank) -> None:
     client.exchange("axis0.requested_state", AxisState.CLOSED_LOOP_CONTROL)
     client.call("save_configuration")
-    assert bank.talks(2 * MODULE)
+    assert bank.is_responding(2 * MODULE)
     client.exchange("axis0.requested_state", AxisState.IDLE)
     client.exchange("axis0.controller.config.vel_limit", 7.0)
     client.call("save_configuration")
-    assert not bank.talks(2 * MODULE), "it restarts"
+    assert not bank.is_responding(2 * MODULE), "it restarts"
     assert bank.settings.get(MODULE, "axis0.controller.config.vel_limit") == 7.0
 
 

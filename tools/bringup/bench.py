@@ -72,7 +72,7 @@ def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFlee
 
 @contextlib.contextmanager
 def drives_to_ourselves(
-    robot: RobotConfig, config_path: Path, run_dir: Path, say: Callable[[str], None]
+    robot: RobotConfig, config_path: Path, run_dir: Path, progress: Callable[[str], None]
 ) -> Iterator[bool]:
     """Have the drives within reach, and no new fleet on them, for a while.
 
@@ -90,7 +90,9 @@ def drives_to_ourselves(
         stack.enter_context(reach.no_fleet_meanwhile(robot, run_dir))
         started = stack.enter_context(reach.drives_within_reach(robot, config_path, run_dir))
         if started:
-            say("no fleet is up and the drives are emulated: their simulator runs for the while")
+            progress(
+                "no fleet is up and the drives are emulated: their simulator runs for the while"
+            )
             time.sleep(SETTLE_S)
         if process_table.is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
             stack.enter_context(reach.emulated_usb(run_dir))

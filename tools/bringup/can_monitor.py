@@ -35,7 +35,7 @@ _FRAME_BYTES = 8
 _GAPS_MIN = 3
 
 
-class NodeHeard(msgspec.Struct):
+class NodeTraffic(msgspec.Struct):
     """Frames of one axis."""
 
     heartbeat: Heartbeat | None = None
@@ -52,7 +52,7 @@ class NodeHeard(msgspec.Struct):
     vbus_voltage: float | None = None
 
 
-class BusHeard(msgspec.Struct):
+class BusTraffic(msgspec.Struct):
     """Traffic of one bus."""
 
     trouble: str = ""
@@ -60,7 +60,7 @@ class BusHeard(msgspec.Struct):
     seconds: float = 0.0
     frames: int = 0
     error_frames: int = 0
-    nodes: dict[int, NodeHeard] = {}
+    nodes: dict[int, NodeTraffic] = {}
     """By node id: those that should be there, and whoever else sends heartbeats."""
     samples: list[Vector6] = []
     """Samples of the load cells."""
@@ -78,25 +78,25 @@ def listen(
     config: CanConfig,
     nodes: Sequence[int],
     *,
-    ask: bool,
+    poll_nodes: bool,
     cells: bool = False,
     imu: bool = False,
     seconds: float = LISTEN_S,
-) -> BusHeard:
+) -> BusTraffic:
     """Listen to a bus for a while.
 
     Args:
         config: of the bus, `{run}` in its channel expanded.
         nodes: of the axes that should be on it.
-        ask: whether to ask them; not where services are up.
+        poll_nodes: whether to ask them; not where services are up.
         cells: whether the load cells are on it.
         imu: whether the IMU is on it.
         seconds: how long.
     """
-    traffic = BusHeard(nodes={node: NodeHeard() for node in nodes})
+    traffic = BusTraffic(nodes={node: NodeTraffic() for node in nodes})
     try:
         with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
-            if ask:
+            if poll_nodes:
                 for message in _questions(nodes):
                     bus.send(message, timeout=_WAIT_S)
             _take_in(bus, traffic, seconds, cells=cells, imu=imu)
@@ -140,7 +140,9 @@ def _questions(nodes: Iterable[int]) -> list[can.Message]:
     ]
 
 
-def _take_in(bus: can.BusABC, heard: BusHeard, seconds: float, *, cells: bool, imu: bool) -> None:
+def _take_in(
+    bus: can.BusABC, traffic: BusTraffic, seconds: float, *, cells: bool, imu: bool
+) -> None:
     assembler, orientation = SampleAssembler(), ImuAssembler()
     begun = time.monotonic()
     while (left := begun + seconds - time.monotonic()) > 0.0:
@@ -148,31 +150,31 @@ def _take_in(bus: can.BusABC, heard: BusHeard, seconds: float, *, cells: bool, i
         if message is None:
             continue
         if message.is_error_frame:
-            heard.error_frames += 1
+            traffic.error_frames += 1
         elif not message.is_remote_frame and not message.is_extended_id:
-            heard.frames += 1
+            traffic.frames += 1
             if cells and message.arbitration_id in FRAME_IDS:
                 sample = assembler.add(message.arbitration_id, message.data)
                 if sample is not None:
-                    heard.samples.append(sample)
-                    heard.samples_s.append(message.timestamp)
+                    traffic.samples.append(sample)
+                    traffic.samples_s.append(message.timestamp)
             elif imu and message.arbitration_id in IMU_IDS:
                 attitude = orientation.add(message.arbitration_id, message.data)
                 if attitude is not None:
-                    heard.attitudes.append(attitude)
-                    heard.attitudes_s.append(message.timestamp)
+                    traffic.attitudes.append(attitude)
+                    traffic.attitudes_s.append(message.timestamp)
             elif len(message.data) == _FRAME_BYTES:
-                _of_node(message, heard.nodes)
-    heard.seconds = time.monotonic() - begun
-    heard.malformed = assembler.malformed + orientation.malformed
+                _of_node(message, traffic.nodes)
+    traffic.seconds = time.monotonic() - begun
+    traffic.malformed = assembler.malformed + orientation.malformed
 
 
-def _of_node(message: can.Message, nodes: dict[int, NodeHeard]) -> None:
+def _of_node(message: can.Message, nodes: dict[int, NodeTraffic]) -> None:
     """Take in a frame as an axis sends it; a heartbeat makes a node known that was not."""
     node, command = cansimple.split_id(message.arbitration_id)
     data = bytes(message.data)
     if command == Command.HEARTBEAT:
-        axis = nodes.setdefault(node, NodeHeard())
+        axis = nodes.setdefault(node, NodeTraffic())
         axis.heartbeat = cansimple.unpack_heartbeat(data)
         axis.heartbeats_s.append(message.timestamp)
         return

@@ -48,7 +48,7 @@ class ChangeResult(NamedTuple):
     good: bool
 
 
-def against_wanted(
+def changes_to_wanted(
     module: str, wanted: Iterable[WantedSetting], board: Board
 ) -> list[SettingChange]:
     """Return what of a board is not as the robot wants it.
@@ -62,13 +62,13 @@ def against_wanted(
     for row in wanted:
         before = settings.get(row.name)
         if row.name not in settings:
-            obstacle = "not there in this firmware; 0.5.6 has it"
+            inhibit = "not there in this firmware; 0.5.6 has it"
         elif _fits(row, before):
             continue
         else:
-            obstacle = _uncalibrated(row.name, calibrated)
+            inhibit = _uncalibrated(row.name, calibrated)
         changes.append(
-            SettingChange(module, row.name, before, row.value, row.why, obstacle, _fitter(row))
+            SettingChange(module, row.name, before, row.value, row.why, inhibit, _fitter(row))
         )
     return changes
 
@@ -83,17 +83,17 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
     changes = []
     for name, value in saved.items():
         if name not in settings:
-            obstacle = "not there in this board's firmware"
+            inhibit = "not there in this board's firmware"
         elif equal(settings[name], value):
             continue
         elif name.partition(".")[2] in _FOUND:
-            obstacle = (
+            inhibit = (
                 "calibration finds it, by how the phases are wired now; the board keeps its own"
             )
         else:
-            obstacle = ""
+            inhibit = ""
         changes.append(
-            SettingChange(module, name, settings.get(name), value, "", obstacle,
+            SettingChange(module, name, settings.get(name), value, "", inhibit,
                    _equal_to(value))
         )  # fmt: skip
     return changes

@@ -12,7 +12,7 @@ from shared.can.drive_settings import AXES
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tools.bringup.boards import describe_firmware
-from tools.bringup.can_monitor import BusHeard, NodeHeard, mean_ms, period_ms
+from tools.bringup.can_monitor import BusTraffic, NodeTraffic, mean_ms, period_ms
 from tools.bringup.check_board import describe_flags, state_row
 from tools.bringup.check_socketcan import up_command
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
@@ -26,76 +26,80 @@ RATE_SHARE: Final = 0.2
 
 
 def drive_rows(
-    robot: RobotConfig, module: str, heard: BusHeard, *, services_up: bool
+    robot: RobotConfig, module: str, traffic: BusTraffic, *, services_up: bool
 ) -> list[Finding]:
     """Judge a module's two axes by what came on its bus."""
     bus = robot.can[robot.module_named(module).bus]
-    if heard.trouble:
-        return [wrong(module, "CAN bus", heard.trouble, "open", _how_to_open(bus, heard.trouble))]
+    if traffic.trouble:
+        return [
+            wrong(module, "CAN bus", traffic.trouble, "open", _how_to_open(bus, traffic.trouble))
+        ]
     node_ids = robot.module_named(module).node_ids
     rows = []
     for axis, node in zip(AXES, node_ids, strict=True):
-        known = heard.nodes.get(node, NodeHeard())
+        known = traffic.nodes.get(node, NodeTraffic())
         rows += _axis_rows(robot, f"{module}.{axis}", node, known, services_up=services_up)
-    if not any(heard.nodes[node].heartbeat for node in node_ids if node in heard.nodes):
+    if not any(traffic.nodes[node].heartbeat for node in node_ids if node in traffic.nodes):
         strangers = sorted(
-            node for node, other in heard.nodes.items() if other.heartbeat and node not in node_ids
+            node
+            for node, other in traffic.nodes.items()
+            if other.heartbeat and node not in node_ids
         )
         fix = (
             f"nodes {', '.join(map(str, strangers))} are heard: set `node_ids`, or the drive's"
             if strangers
             else "supply, wires, 120 ohm at both ends; the drive's baud rate must be 1000000"
         )
-        found = f"{heard.frames} frames, {heard.error_frames} errors"
+        found = f"{traffic.frames} frames, {traffic.error_frames} errors"
         return [wrong(module, "heartbeats", found, f"nodes {node_ids[0]}, {node_ids[1]}", fix)]
-    if heard.error_frames:
+    if traffic.error_frames:
         fix = "wires, 120 ohm at both ends, one baud rate"
-        found = f"{heard.error_frames} in {heard.seconds:.1f} s"
+        found = f"{traffic.error_frames} in {traffic.seconds:.1f} s"
         rows.append(warning(module, "CAN error frames", found, "none", fix))
     return rows
 
 
-def harness_rows(robot: RobotConfig, heard: BusHeard) -> list[Finding]:
+def harness_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
     """Judge the load cells by what came on their bus."""
     subject, harness = "harness", robot.harness
     wanted = f"{harness.rate_hz:g} Hz"
-    if heard.trouble:
-        fix = _how_to_open(robot.can[harness.bus], heard.trouble)
-        return [wrong(subject, "CAN bus", heard.trouble, "open", fix)]
-    if not heard.samples:
+    if traffic.trouble:
+        fix = _how_to_open(robot.can[harness.bus], traffic.trouble)
+        return [wrong(subject, "CAN bus", traffic.trouble, "open", fix)]
+    if not traffic.samples:
         fix = "the amplifier's supply and wires; its frames are in shared/can/loadcell_can.py"
         why = "no assist force, no easing, no stop at overload"
-        return [wrong(subject, "load cells", f"{heard.frames} other frames", wanted, fix, why)]
+        return [wrong(subject, "load cells", f"{traffic.frames} other frames", wanted, fix, why)]
     fix = "the amplifier's rate, or `harness.rate_hz`"
-    rows = [_rate_row(subject, "load cells", heard.samples_s, harness.rate_hz, fix)]
-    largest = max(abs(force) for sample in heard.samples for force in sample)
+    rows = [_rate_row(subject, "load cells", traffic.samples_s, harness.rate_hz, fix)]
+    largest = max(abs(force) for sample in traffic.samples for force in sample)
     good = largest < harness.leg_force_max  # NaN is not
     fix = "unload the harness; a cell that stays there is broken, or its wire"
     found, limit = f"{largest:.0f} N", f"< {harness.leg_force_max:g} N"
     rows.append(judged(good, subject, "largest force", found, limit, fix, "saturated, not valid"))
-    return rows + _lost_frames(subject, heard)
+    return rows + _lost_frames(subject, traffic)
 
 
-def imu_rows(robot: RobotConfig, heard: BusHeard) -> list[Finding]:
+def imu_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
     """Judge the IMU by what came on its bus."""
     subject, imu = "IMU", robot.imu
     wanted = f"{imu.rate_hz:g} Hz"
-    if heard.trouble:
-        fix = _how_to_open(robot.can[imu.bus], heard.trouble)
-        return [wrong(subject, "CAN bus", heard.trouble, "open", fix)]
+    if traffic.trouble:
+        fix = _how_to_open(robot.can[imu.bus], traffic.trouble)
+        return [wrong(subject, "CAN bus", traffic.trouble, "open", fix)]
     why = "the floor is taken as level"
-    if not heard.attitudes:
+    if not traffic.attitudes:
         fix = "its supply and wires, its CAN output; its frames are in shared/can/imu_can.py"
-        found = f"{heard.frames} frames that make none"
+        found = f"{traffic.frames} frames that make none"
         return [wrong(subject, "samples", found, wanted, fix, why)]
     fix = "its output rate, or `imu.rate_hz`"
-    rows = [_rate_row(subject, "samples", heard.attitudes_s, imu.rate_hz, fix)]
-    known = sum(sample.valid for sample in heard.attitudes)
-    found = f"{known} of {len(heard.attitudes)} samples"
+    rows = [_rate_row(subject, "samples", traffic.attitudes_s, imu.rate_hz, fix)]
+    known = sum(sample.valid for sample in traffic.attitudes)
+    found = f"{known} of {len(traffic.attitudes)} samples"
     fix = "leave it still for a minute; its status word says that its filter has not settled"
-    good = known == len(heard.attitudes)
+    good = known == len(traffic.attitudes)
     rows.append(judged(good, subject, "orientation valid", found, "all", fix, why))
-    return rows + _lost_frames(subject, heard)
+    return rows + _lost_frames(subject, traffic)
 
 
 def _rate_row(subject: str, what: str, times_s: list[float], wanted_hz: float, fix: str) -> Finding:
@@ -107,30 +111,30 @@ def _rate_row(subject: str, what: str, times_s: list[float], wanted_hz: float, f
     return judged(near, subject, what, found, wanted, fix, otherwise=FindingKind.WARNING)
 
 
-def _lost_frames(subject: str, heard: BusHeard) -> list[Finding]:
+def _lost_frames(subject: str, traffic: BusTraffic) -> list[Finding]:
     """Tell of a sensor's frames that were out of order: others were lost."""
-    if not heard.malformed:
+    if not traffic.malformed:
         return []
     fix = "frames are lost: wires, 120 ohm at both ends"
-    return [warning(subject, "frames out of order", str(heard.malformed), "none", fix)]
+    return [warning(subject, "frames out of order", str(traffic.malformed), "none", fix)]
 
 
-def positions(robot: RobotConfig, module: str, heard: BusHeard) -> tuple[float, float] | None:
+def positions(robot: RobotConfig, module: str, traffic: BusTraffic) -> tuple[float, float] | None:
     """Return both motors' positions in turns, as the drive counts them; None without a reply.
 
     From the count where the estimate is 0, as in firmware 0.5.6 until its first closed loop.
     """
     first, second = (
-        _turns(heard.nodes.get(node, NodeHeard()), robot.joint.encoder_counts_per_turn)
+        _turns(traffic.nodes.get(node, NodeTraffic()), robot.joint.encoder_counts_per_turn)
         for node in robot.module_named(module).node_ids
     )
     return None if first is None or second is None else (first, second)
 
 
-def _turns(heard: NodeHeard, counts_per_turn: int) -> float | None:
-    if heard.pos_turns == 0.0 and heard.shadow_count is not None:
-        return heard.shadow_count / counts_per_turn
-    return heard.pos_turns
+def _turns(traffic: NodeTraffic, counts_per_turn: int) -> float | None:
+    if traffic.pos_turns == 0.0 and traffic.shadow_count is not None:
+        return traffic.shadow_count / counts_per_turn
+    return traffic.pos_turns
 
 
 def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
@@ -153,29 +157,37 @@ def _how_to_open(bus: CanConfig, trouble: str) -> str:
 
 
 def _axis_rows(
-    robot: RobotConfig, subject: str, node: int, heard: NodeHeard, *, services_up: bool
+    robot: RobotConfig, subject: str, node: int, traffic: NodeTraffic, *, services_up: bool
 ) -> list[Finding]:
-    if heard.heartbeat is None:
+    if traffic.heartbeat is None:
         fix = f"node {node} in `node_ids`, or the drive's config.can.node_id and heartbeat_rate_ms"
-        return [wrong(subject, "heartbeat", f"node {node} silent", "heard", fix)]
-    if heard.version is not None:
-        found = describe_firmware(heard.version.firmware)
+        return [wrong(subject, "heartbeat", f"node {node} silent", "traffic", fix)]
+    if traffic.version is not None:
+        found = describe_firmware(traffic.version.firmware)
         fix = "the settings of firmware 0.6 are not read back yet: check them in its web GUI"
         return [warning(subject, "firmware", found, "0.5.6", fix, "other settings, other errors")]
     drive = robot.drive
     # Errors by the flags too: `axis_error` alone can stay 0.
-    errors = heard.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED
+    errors = traffic.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED
     words = describe_flags(AxisError, errors) if errors else "none"
     fix = "find what caused it; `xrl up` clears it at arming, power off and on does too"
     return [
         _period(
-            subject, "heartbeat", heard.heartbeats_s, drive.heartbeat_period_ms, "heartbeat_rate_ms"
+            subject,
+            "heartbeat",
+            traffic.heartbeats_s,
+            drive.heartbeat_period_ms,
+            "heartbeat_rate_ms",
         ),
         _period(
-            subject, "encoder frames", heard.estimates_s, drive.encoder_period_ms, "encoder_rate_ms"
+            subject,
+            "encoder frames",
+            traffic.estimates_s,
+            drive.encoder_period_ms,
+            "encoder_rate_ms",
         ),
         judged(not errors, subject, "errors", words, "none", fix),
-        state_row(subject, heard.heartbeat.axis_state, services_up=services_up),
+        state_row(subject, traffic.heartbeat.axis_state, services_up=services_up),
     ]
 
 

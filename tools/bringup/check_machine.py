@@ -14,7 +14,7 @@ from typing import Final
 
 from shared import priority
 from shared.config.robot_config import RobotConfig
-from tools.bringup.check_socketcan import ask_ip, socketcan_rows
+from tools.bringup.check_socketcan import query_ip, socketcan_rows
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 from tools.fleet.process_table import is_simulated
 
@@ -58,7 +58,7 @@ def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
         return rows
     if any(module.serial_number for module in robot.module):
         rows += [_libusb(), *usb_node_rows(root)]
-    return rows + socketcan_rows(robot, root, ask_ip())
+    return rows + socketcan_rows(robot, root, query_ip())
 
 
 def usb_node_rows(root: Path) -> list[Finding]:

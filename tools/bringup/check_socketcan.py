@@ -28,7 +28,7 @@ _WELL: Final = "ERROR-ACTIVE"
 _OFF: Final = ("BUS-OFF", "STOPPED", "SLEEPING")
 
 
-def ask_ip() -> Links:
+def query_ip() -> Links:
     """Return the output of `ip` for the CAN interfaces; nothing without that command."""
     try:
         output = subprocess.run(_IP, capture_output=True, timeout=_IP_S, check=True).stdout

@@ -33,6 +33,6 @@ def shown(difference: Sequence[SettingChange]) -> Group:
         if change.why:
             reasons.setdefault(f"{tail}: {change.why}")
         if change.inhibit:
-            obstacle = f"{change.module} {change.name} cannot be written: {change.inhibit}"
-            reasons.setdefault(obstacle)
+            inhibit = f"{change.module} {change.name} cannot be written: {change.inhibit}"
+            reasons.setdefault(inhibit)
     return Group(rows, *(Padding(Text(reason), (0, 1, 0, 2)) for reason in reasons))

@@ -72,7 +72,7 @@ class Interrupts:
         self.number = self.number or number
 
 
-def first_words(drive: Drive, clock: Clock = now_ns) -> DriveReading:
+def first_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
     """Return a drive's first reading that is not LOST.
 
     Raises:
@@ -154,7 +154,7 @@ def _move(
     give_up_ns: int,
 ) -> None:
     """Run the jog until it is done, in trouble, or interrupted."""
-    tell_at_s = 0.0
+    report_at_s = 0.0
     while not jog.done and not jog.trouble:
         reading = drive.read(READ_S)
         now = clock()
@@ -166,8 +166,8 @@ def _move(
             drive.write(target)
         if now > give_up_ns:
             jog.trouble = "it took too long: the drive's samples come too seldom"
-        elif jog.samples and jog.samples[-1].t_s >= tell_at_s:
-            tell_at_s = jog.samples[-1].t_s + PROGRESS_S
+        elif jog.samples and jog.samples[-1].t_s >= report_at_s:
+            report_at_s = jog.samples[-1].t_s + PROGRESS_S
             progress(jog.samples[-1])
 
 

@@ -1,6 +1,6 @@
 """Moving one axis of one module a little and back, by the drive's own loop: law and judgement.
 
-The law, the gate and the drive's targets are the joint service's, so a sign that is right here is
+The law, the torque limiter and the drive's targets are the joint service's, so a sign that is right here is
 right there. Only the force differs: the drive's own current limit keeps every motor below the
 requested torque, whatever happens to this process. Pure; `jog_drive` has the clock and the drive.
 """
@@ -16,7 +16,7 @@ from services.joint import pd_law
 from services.joint.differential import joint_from_motor
 from services.joint.drive_setpoint import DriveSetpointLaw
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.torque_limiter import GateLimits, limit_torque, limits_of
+from services.joint.torque_limiter import TorqueLimits, limit_torque, limits_of
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
@@ -165,13 +165,13 @@ class Jog:
         stand = robot.stand_gains(module)
         self._k_p, self._k_d = stand.k_p, stand.k_d
         limits = limits_of(robot, module)
-        self._limits: GateLimits = msgspec.structs.replace(
+        self._limits: TorqueLimits = msgspec.structs.replace(
             limits, tau_module_max=min(plan.torque_limit, limits.tau_module_max)
         )
         self._gear_ratio = robot.joint.gear_ratio
         self._onboard = DriveSetpointLaw(robot.joint.gear_ratio, robot.drive.vel_limit)
         self._plan, self._q_start = plan, q
-        self._start_ns = self._heard_ns = now_ns
+        self._start_ns = self._received_ns = now_ns
         self._at_limit_s: float | None = None
         self._tau: Pair = pd_law.ZERO
         self.trouble = ""
@@ -187,10 +187,10 @@ class Jog:
         """
         t_s = (now_ns - self._start_ns) / NS_PER_S
         if reading is None:
-            if now_ns - self._heard_ns > SILENT_S * NS_PER_S:
+            if now_ns - self._received_ns > SILENT_S * NS_PER_S:
                 self.trouble = f"no sample of the drive for {SILENT_S:g} s"
             return None
-        self._heard_ns = now_ns
+        self._received_ns = now_ns
         if reading.status is not DriveStatus.ARMED:
             self.trouble = f"the drive is {reading.status.name}, error 0x{reading.error:x}"
             return None

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from services.joint.drivers.can_link import CanLink
-from services.joint.drivers.odrive_frames import orders
+from services.joint.drivers.odrive_frames import messages_of
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.can.drive_settings import AXES
@@ -50,7 +50,7 @@ def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
     try:
         taken = link.connect()
         for _ in range(TIMES):
-            taken = taken and link.send(orders(wiring.node_ids, (limits,)))
+            taken = taken and link.send(messages_of(wiring.node_ids, (limits,)))
             link.receive(_APART_S)
     finally:
         link.close()

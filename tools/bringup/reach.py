@@ -149,7 +149,10 @@ def wait_for_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> Non
     bus = robot.can[robot.harness.bus]
     config = CanConfig(interface=bus.interface, channel=expand(bus.channel, RunDir(run_dir).path))
     until = time.monotonic() + seconds
-    while time.monotonic() < until and not listen(config, (), ask=False, seconds=_POLL_S).frames:
+    while (
+        time.monotonic() < until
+        and not listen(config, (), poll_nodes=False, seconds=_POLL_S).frames
+    ):
         time.sleep(_POLL_S)
 
 

@@ -13,14 +13,14 @@ from shared.exceptions import DriveError, FleetError
 from shared.robot.joints import MODULES
 from tools.bringup import check_alike, check_board, check_can, check_machine, check_robot
 from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, number
-from tools.bringup.can_monitor import BusHeard, listen, long_enough
+from tools.bringup.can_monitor import BusTraffic, listen, long_enough
 from tools.bringup.reach import boards_on_usb, drives_within_reach, is_up
 from tools.bringup.rows import Finding, FindingKind, judged, ok
 from tools.fleet.process_table import is_simulated
 
 Groups = dict[str, list[Finding]]
 """Rows by the heading that they stand under."""
-Say = Callable[[str], None]
+Progress = Callable[[str], None]
 
 COMPUTER: Final = "this computer"
 ROBOT: Final = "robot file and bus"
@@ -32,7 +32,7 @@ GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS, IMU)
 
 
 def survey(
-    robot: RobotConfig, config_path: Path, run_dir: Path, plants: Sequence[str], say: Say
+    robot: RobotConfig, config_path: Path, run_dir: Path, plants: Sequence[str], progress: Progress
 ) -> Groups:
     """Check everything and return the rows.
 
@@ -41,13 +41,13 @@ def survey(
         config_path: the robot file.
         run_dir: of the fleet; if none is up, an emulated robot's simulator runs there meanwhile.
         plants: settings that the emulated drives have kept.
-        say: receives the subject of each check.
+        progress: receives the subject of each check.
 
     Raises:
         FleetError: the simulator cannot be started.
     """
     fleet_is_up = is_up(run_dir)
-    say("this computer, the robot file, the bus")
+    progress("this computer, the robot file, the bus")
     groups: Groups = {
         COMPUTER: check_machine.machine_rows(robot),
         ROBOT: [
@@ -57,10 +57,10 @@ def survey(
     }
     services_up = bool(check_robot.joint_services(check_robot.services_up(robot, run_dir)))
     if is_simulated(robot) and not fleet_is_up:
-        say("starting the simulator: the drives are emulated, and no fleet is up")
+        progress("starting the simulator: the drives are emulated, and no fleet is up")
     with drives_within_reach(robot, config_path, run_dir, plants):
-        traffic = _listen(robot, run_dir, services_up=services_up, say=say)
-        say("the drives over USB")
+        traffic = _listen(robot, run_dir, services_up=services_up, progress=progress)
+        progress("the drives over USB")
         groups[DRIVES] = _usb(robot, run_dir, traffic, services_up=services_up)
     if robot.joint_service.driver == "odrive_can":
         groups[CAN] = [
@@ -80,20 +80,20 @@ def survey(
 
 
 def _listen(
-    robot: RobotConfig, run_dir: Path, *, services_up: bool, say: Say
-) -> dict[str, BusHeard]:
+    robot: RobotConfig, run_dir: Path, *, services_up: bool, progress: Progress
+) -> dict[str, BusTraffic]:
     """Listen to every bus of the robot, one after the other."""
     present = {}
     on_usb = robot.joint_service.driver == "odrive_usb"
     for name, nodes in check_can.bus_nodes(robot).items():
         if on_usb and name not in (robot.harness.bus, robot.imu.bus):
             continue
-        say(f"CAN bus {name}")
+        progress(f"CAN bus {name}")
         bus = robot.can[name]
         present[name] = listen(
             CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir)),
             nodes,
-            ask=not services_up,
+            poll_nodes=not services_up,
             cells=name == robot.harness.bus,
             imu=robot.imu.fitted and name == robot.imu.bus,
             seconds=long_enough(robot.drive.heartbeat_period_ms if nodes else 0),
@@ -102,7 +102,7 @@ def _listen(
 
 
 def _usb(
-    robot: RobotConfig, run_dir: Path, heard: dict[str, BusHeard], *, services_up: bool
+    robot: RobotConfig, run_dir: Path, traffic: dict[str, BusTraffic], *, services_up: bool
 ) -> list[Finding]:
     """Check every module's board; what of it cannot be reached over USB is a row too."""
     rows: list[Finding] = []
@@ -111,7 +111,7 @@ def _usb(
         with boards_on_usb(robot, run_dir, MODULES) as found:
             for module in MODULES:
                 rows += _module(robot, module, found, read, services_up=services_up)
-                rows += _position(robot, module, found, heard)
+                rows += _position(robot, module, found, traffic)
             rows += check_alike.alike_rows(read)
     except (DriveError, FleetError) as error:
         found_out, _, fix = str(error).removeprefix("USB: ").partition("; ")
@@ -168,10 +168,10 @@ def _board(
 
 
 def _position(
-    robot: RobotConfig, module: str, found: FoundBoards, heard: dict[str, BusHeard]
+    robot: RobotConfig, module: str, found: FoundBoards, traffic: dict[str, BusTraffic]
 ) -> list[Finding]:
     """Judge where a module is, by its bus if it is on one, else by its board."""
-    bus = heard.get(robot.module_named(module).bus)
+    bus = traffic.get(robot.module_named(module).bus)
     turns = check_can.positions(robot, module, bus) if bus else None
     board = found.boards.get(robot.module_named(module).serial_number.upper())
     if turns is None and board is not None:

@@ -159,28 +159,28 @@ def ears_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMonito
     """
     elsewhere = dict.fromkeys(MODULES, JOINT_STATE.name) | {PLANNER: PLANNER_STATUS.name}
     by_name = {topic.name: topic for topic in TOPICS}
-    ears = {}
+    monitors = {}
     for service, name in (elsewhere | dict(topics)).items():
         if name:
             topic = by_name[name]
             module = service if topic.per_module else ""
-            ears[service] = RateMonitor(session.latest(topic, topic.type, module))
-    return ears
+            monitors[service] = RateMonitor(session.latest(topic, topic.type, module))
+    return monitors
 
 
-def listen_for_all(ears: Mapping[str, RateMonitor]) -> None:
+def listen_for_all(monitors: Mapping[str, RateMonitor]) -> None:
     """Wait for a first message of each, but not for long."""
-    _listen(ears, _LINKS_S, until=lambda: all(ear.newest for ear in ears.values()))
+    _listen(monitors, _LINKS_S, until=lambda: all(monitor.newest for monitor in monitors.values()))
 
 
-def look(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> FleetStatus:
+def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor]) -> FleetStatus:
     """Listen for one window and return the fleet's status."""
-    for ear in ears.values():
-        ear.new_window()
-    _listen(ears, _WINDOW_S)
+    for monitor in monitors.values():
+        monitor.new_window()
+    _listen(monitors, _WINDOW_S)
     # before the call to the supervisor, which takes a while on a busy machine
-    present = {name: (ear.age_s(), ear.rate_hz()) for name, ear in ears.items()}
-    fresh = {name for name, ear in ears.items() if ear.is_fresh()}
+    present = {name: (monitor.age_s(), monitor.rate_hz()) for name, monitor in monitors.items()}
+    fresh = {name for name, monitor in monitors.items() if monitor.is_fresh()}
     services = {}
     for service in fleet.info():
         age_s, rate_hz = present.get(service.name, (None, None))
@@ -194,11 +194,11 @@ def look(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> FleetStatus
             last_exit=service.last_exit,
         )
     modules = {
-        module: module_status(ears[module].newest if module in fresh else None)
+        module: module_status(monitors[module].newest if module in fresh else None)
         for module in MODULES
-        if module in ears
+        if module in monitors
     }
-    lead = lead_status(ears[PLANNER].newest if PLANNER in fresh else None)
+    lead = lead_status(monitors[PLANNER].newest if PLANNER in fresh else None)
     config, network = fleet.manifest.config, impairments(fleet)
     return FleetStatus(str(fleet.run.path), config, services, modules, lead, network, pace())
 
@@ -254,10 +254,12 @@ def lead_status(message: Message | None) -> LeadStatus | None:
 
 
 def _listen(
-    ears: Mapping[str, RateMonitor], duration_s: float, until: Callable[[], bool] = lambda: False
+    monitors: Mapping[str, RateMonitor],
+    duration_s: float,
+    until: Callable[[], bool] = lambda: False,
 ) -> None:
     deadline = time.monotonic() + duration_s
     while time.monotonic() < deadline and not until():
-        for ear in ears.values():
-            ear.listen()
+        for monitor in monitors.values():
+            monitor.listen()
         time.sleep(_POLL_S)

@@ -100,7 +100,7 @@ def make_plan(
     *,
     overrides: Mapping[str, Sequence[str]],
     services: Collection[str] | None,
-    asleep: Collection[str] = (),
+    not_started: Collection[str] = (),
     simulation: bool,
     injected: bool = False,
     table_path: Path,
@@ -118,9 +118,9 @@ def make_plan(
     rows = select(
         table, simulation=emulated, injected=injected, imu=config.imu.fitted, services=services
     )
-    check_known([*overrides, *asleep], [row.name for row in rows])
+    check_known([*overrides, *not_started], [row.name for row in rows])
     rows = tuple(
-        msgspec.structs.replace(row, autostart=row.autostart and row.name not in asleep)
+        msgspec.structs.replace(row, autostart=row.autostart and row.name not in not_started)
         for row in rows
     )
     check_run_dir(run_dir, config)

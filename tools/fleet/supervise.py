@@ -48,7 +48,7 @@ class SupervisedFleet:
         overrides: Mapping[str, Sequence[str]] | None = None,
         no_restart: frozenset[str] = frozenset(),
         services: Collection[str] | None = None,
-        asleep: Collection[str] = (),
+        not_started: Collection[str] = (),
         simulation: bool = True,
         injected: bool = False,
         pace: float | None = None,
@@ -66,7 +66,7 @@ class SupervisedFleet:
             overrides: further arguments for some services.
             no_restart: services that stay down when they end.
             services: to start; None for all that the table starts by default.
-            asleep: those that wait for `start_service`.
+            not_started: those that wait for `start_service`.
             simulation: False leaves the simulator out; where all drives are real it always is.
             injected: with the network proxy on the links of planner, joints and sensors.
             pace: clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1.
@@ -86,7 +86,7 @@ class SupervisedFleet:
             started.run.path,
             overrides=overrides or {},
             services=services,
-            asleep=asleep,
+            not_started=not_started,
             simulation=simulation,
             injected=injected,
             table_path=table_path,

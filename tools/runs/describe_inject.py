@@ -104,11 +104,11 @@ def make(link: str, words: Mapping[str, str], dash: str = "") -> Inject:
         word = next(word for word, number in NUMBERS.items() if number.field == error.key)
         found, right = f"{words[word]!r} is out of range", f"{error.expected}; {NUMBERS[word].like}"
         raise ConfigError(_FILE, f"{dash}{word}", found, right) from None
-    amiss = inject.fault()
-    if not amiss and inject.describe() == "nothing":
-        amiss = "nothing is done to it; give a delay, a loss or another word"
-    if amiss:
-        found, _, right = amiss.partition("; ")
+    problem = inject.fault()
+    if not problem and inject.describe() == "nothing":
+        problem = "nothing is done to it; give a delay, a loss or another word"
+    if problem:
+        found, _, right = problem.partition("; ")
         raise ConfigError(_FILE, link, found, right)
     return inject
 

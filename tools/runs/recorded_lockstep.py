@@ -77,7 +77,7 @@ def record_run(
     scenario: Scenario,
     robot: RobotConfig,
     out: Path,
-    facts: dict[str, str],
+    metadata: dict[str, str],
     run: Callable[[Record, Watch], Outcome],
     watch: Watch,
     true_plant: PlantConfig,
@@ -88,7 +88,7 @@ def record_run(
         scenario: what happens.
         robot: ready to run.
         out: an empty folder.
-        facts: added to the log's facts, at least `lockstep` with the command or the network.
+        metadata: added to the log's facts, at least `lockstep` with the command or the network.
         run: runs it, given the function that records a message and the one that sees the world.
         watch: sees the world at its rate.
         true_plant: that `run` simulates.
@@ -102,7 +102,7 @@ def record_run(
     inputs = experiment.write_inputs(out, robot, scenario, true_plant)
     outbox = Outbox(robot.name)
     recorded = {key: topic for key, topic in topics.all_keys(robot.name).items() if topic.recorded}
-    run_facts = {
+    run_metadata = {
         "schema_version": SCHEMA_VERSION,
         "robot": robot.name,
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -113,7 +113,7 @@ def record_run(
         recorded,
         offset_ns=0,
         metadata={
-            "run": run_facts | facts | provenance.code(CHECKOUT) | provenance.machine(),
+            "run": run_metadata | metadata | provenance.code(CHECKOUT) | provenance.machine(),
             "packages": provenance.packages(),
         },
         attachments={file.name: file.read_bytes() for file in inputs}
@@ -179,8 +179,8 @@ def simulate(
         f"delay {network.delay_ms:g} ms, jitter {network.jitter_ms:g} ms, "
         f"loss {network.loss:g}, seed {seed}"
     )
-    facts = {"lockstep": lockstep, "control": control}
-    return record_run(scenario, robot, out, facts, run, watch, true_plant)
+    metadata = {"lockstep": lockstep, "control": control}
+    return record_run(scenario, robot, out, metadata, run, watch, true_plant)
 
 
 def judge_run(scenario: Scenario, out: Path, **figures: Any) -> Summary:

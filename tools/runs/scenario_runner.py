@@ -63,7 +63,7 @@ class LiveSnapshot(NamedTuple):
     note: str
 
 
-class Chase(NamedTuple):
+class TriggeredKill(NamedTuple):
     """A kill at no fixed time: when modules track again after a drop-out."""
 
     service: str
@@ -105,15 +105,15 @@ class ScenarioRunner:
         session: Session,
         scenario: Scenario,
         show: Callable[[LiveSnapshot], None],
-        chase: Chase | None = None,
+        triggered_kill: TriggeredKill | None = None,
     ) -> None:
         """Take the scenario's kills, and perhaps one that the modules' modes trigger."""
         self._fleet = fleet
         self._scenario = scenario
         self._show = show
-        self._chase = chase
+        self._triggered_kill = triggered_kill
         self._dropped_out = False
-        self._chase_at_s = math.inf
+        self._triggered_kill_at_s = math.inf
         self.said: list[RunEvent] = []
         """Actions on the run so far."""
         self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
@@ -306,15 +306,17 @@ class ScenarioRunner:
 
     def _follow(self, scenario_s: float) -> None:
         """Kill the triggered service when its time has come."""
-        if self._chase is None:
+        if self._triggered_kill is None:
             return
         now_s = time.monotonic()
         tracking = list(self._modes.values()).count(Mode.TRACK)
         self._dropped_out |= tracking == 0
-        if self._dropped_out and tracking >= self._chase.modules:
-            self._chase_at_s = min(self._chase_at_s, now_s + machine_s(self._chase.after_s))
-        if now_s >= self._chase_at_s:
-            service, self._chase = self._chase.service, None
+        if self._dropped_out and tracking >= self._triggered_kill.modules:
+            self._triggered_kill_at_s = min(
+                self._triggered_kill_at_s, now_s + machine_s(self._triggered_kill.after_s)
+            )
+        if now_s >= self._triggered_kill_at_s:
+            service, self._triggered_kill = self._triggered_kill.service, None
             self._act(Kill(service=service, at=scenario_s))
 
     def _wait_until_ended(self, service: str) -> None:

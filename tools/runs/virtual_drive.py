@@ -41,14 +41,14 @@ class VirtualDrive:
     def read(self, now_ns: int) -> DriveReading | None:
         """Return what a driver would: None during a short silence, then LOST."""
         bank, (a, b) = self._bank, self._axes
-        talks = bank.talks(a)
-        if talks:
+        is_responding = bank.is_responding(a)
+        if is_responding:
             self._sampled_ns = now_ns
         elif now_ns - self._sampled_ns <= self._lost_after_ns:
             return None
         armed = bank.state[a] == bank.state[b] == AxisState.CLOSED_LOOP_CONTROL
         status = DriveStatus.LOST
-        if talks:
+        if is_responding:
             status = DriveStatus.ARMED if armed else DriveStatus.IDLE
         errors = 0 if armed else bank.heartbeat(a).errors | bank.heartbeat(b).errors
         pos, vel = bank.pos_estimate, bank.vel_estimate
@@ -65,7 +65,7 @@ class VirtualDrive:
     def carry_out(self, step: DriveAction, *, onboard: bool) -> None:
         """Carry out a cycle's action, if the drive receives it; each frame feeds its watchdog."""
         bank, (a, b) = self._bank, self._axes
-        if step.command is DriveCommand.NOTHING or not bank.talks(a):
+        if step.command is DriveCommand.NOTHING or not bank.is_responding(a):
             return
         self._written = True
         if step.target is not None:

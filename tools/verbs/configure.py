@@ -141,12 +141,12 @@ def modules_of(
     for module in modules:
         if module not in by_module:
             raise DriveError(f"{args.restore}: it has no {module}; it has {', '.join(by_module)}")
-        mine = robot.module_named(module).serial_number.upper() if module in MODULES else ""
+        serial = robot.module_named(module).serial_number.upper() if module in MODULES else ""
         other = by_module[module].serial_number.upper()
-        if mine != other:
+        if serial != other:
             raise DriveError(
-                f"{args.restore}: {module} is ODrive {other} there and {mine or 'unnamed'} in the "
-                "robot file; a backup is for the board that it was made of"
+                f"{args.restore}: {module} is ODrive {other} there and {serial or 'unnamed'} in "
+                "the robot file; a backup is for the board that it was made of"
             )
     return modules
 
@@ -211,7 +211,7 @@ def differences(
     for module, board in boards.items():
         if saved is None:
             wanted = drive_settings.of_module(robot, module)
-            rows += changes.against_wanted(module, wanted, board)
+            rows += changes.changes_to_wanted(module, wanted, board)
             continue
         firmware = describe_firmware(board.firmware)
         if firmware != kept[module].firmware:
@@ -256,15 +256,15 @@ def apply(
     """
     outcomes: list[ChangeResult] = []
     for module, board in boards.items():
-        mine = [change for change in difference if change.module == module]
-        if interrupts.number or not mine:
+        serial = [change for change in difference if change.module == module]
+        if interrupts.number or not serial:
             continue
         try:
             with console.status(f"{module}: writing, saving, restarting"):
-                outcomes += changes.apply(board, mine)
+                outcomes += changes.apply(board, serial)
         except DriveError as error:
             console.print(f"[bold red]{module}[/]: {escape(str(error))}")
-            outcomes += [ChangeResult(change, None, good=False) for change in mine]
+            outcomes += [ChangeResult(change, None, good=False) for change in serial]
     return outcomes
 
 

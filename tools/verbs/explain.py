@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 AWAY_S = 0.1
 """s; a tick that much older than the requested time does not describe the robot then."""
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
-SPLIT_IN_WORDS = {
+SPLIT_DESCRIPTION = {
     SplitSource.DIAGONAL: "diag(K_q)",
     SplitSource.SCHEDULE: "certified schedule",
     SplitSource.STIFFENED: "stiffened: what was wanted does not meet the certificate",
@@ -243,7 +243,7 @@ def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
         "each module.",
         style="dim",
     )
-    console.print(f"local gains: {SPLIT_IN_WORDS[found.local.source]}")
+    console.print(f"local gains: {SPLIT_DESCRIPTION[found.local.source]}")
     for who, weakest in (
         ("joint services alone", found.weakest), ("drives alone", found.weakest_onboard),
     ):  # fmt: skip

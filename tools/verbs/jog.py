@@ -18,7 +18,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, FleetError, XrlError
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, limits
-from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_words, jog_drive
+from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_reading, jog_drive
 from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
         if started:
             console.print(f"its soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
-        outcome = look_ask_move(args, console, limited, plan, interrupts)
+        outcome = confirm_and_move(args, console, limited, plan, interrupts)
         if outcome is None:
             console.print("nothing was moved")
             return 2
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def look_ask_move(
+def confirm_and_move(
     args: argparse.Namespace,
     console: Console,
     robot: RobotConfig,
@@ -125,7 +125,7 @@ def look_ask_move(
     drive = open_drive(robot, module, args.run_dir)
     try:
         try:
-            reading = first_words(drive)
+            reading = first_reading(drive)
         except DriveError as error:
             raise DriveError(f"{module}: {error}") from None
         q = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)

@@ -160,8 +160,8 @@ def _alarm(
     refused = guard.those_of(rows, targets.values())
 
     def look() -> None:
-        if watch is not None and refused and (heard := watch.heard()):
-            raise FleetError(f"stopped: {heard}, and it acts on {guard.describe(refused)}")
+        if watch is not None and refused and (subscribers := watch.subscribers()):
+            raise FleetError(f"stopped: {subscribers}, and it acts on {guard.describe(refused)}")
 
     return look
 
@@ -207,10 +207,13 @@ def _play(
         return INTERRUPTED
     finally:
         display.clear()
-        print(summary(player, (now_ns() - began_ns) / NS_PER_S, heard=display.heard), flush=True)
-    if patient and display.heard:
+        print(
+            summary(player, (now_ns() - began_ns) / NS_PER_S, subscribers=display.subscribers),
+            flush=True,
+        )
+    if patient and display.subscribers:
         time.sleep(_FLUSH_S)
-    return 1 if player.tally.failed else 0
+    return 1 if player.stats.failed else 0
 
 
 def _await_subscriber(ports: Sequence[RawPublisher], wait_s: float, keyboard: Keyboard) -> None:

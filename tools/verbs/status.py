@@ -28,7 +28,7 @@ from tools.fleet.fleet_status import (
 from tools.fleet.supervise import SupervisedFleet
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
-_WORDS: Final = ("state", "last exit")
+_LABELS: Final = ("state", "last exit")
 _GOOD: Final = ("running", "starting")
 
 
@@ -53,12 +53,12 @@ def run(args: argparse.Namespace) -> int:
     """Look at the fleet once, or until interrupted."""
     fleet = SupervisedFleet.attach(args.run_dir)
     with open_session(load(Path(fleet.manifest.config)), "status", fleet.run.path) as session:
-        ears = ears_of(session, fleet.manifest.topics)
-        listen_for_all(ears)
+        monitors = ears_of(session, fleet.manifest.topics)
+        listen_for_all(monitors)
         if args.watch:
-            _watch(fleet, ears)
+            _watch(fleet, monitors)
         else:
-            status = look(fleet, ears)
+            status = look(fleet, monitors)
             if args.json:
                 print(msgspec.json.format(msgspec.json.encode(status)).decode())
             else:
@@ -93,7 +93,7 @@ def tables(status: FleetStatus) -> Group:
         "restarts",
         "last exit",
     ):
-        words = heading in _WORDS
+        words = heading in _LABELS
         services.add_column(
             heading, justify="left" if words else "right", no_wrap=heading != "last exit"
         )
@@ -135,7 +135,7 @@ def tables(status: FleetStatus) -> Group:
     return Group(services, modules, *lines)
 
 
-def _watch(fleet: SupervisedFleet, ears: Mapping[str, RateMonitor]) -> None:
-    with Live(tables(look(fleet, ears)), console=Console(), auto_refresh=False) as live:
+def _watch(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor]) -> None:
+    with Live(tables(look(fleet, monitors)), console=Console(), auto_refresh=False) as live:
         while True:
-            live.update(tables(look(fleet, ears)), refresh=True)
+            live.update(tables(look(fleet, monitors)), refresh=True)

@@ -96,18 +96,18 @@ def run(args: argparse.Namespace) -> int:
         overrides = {name: words for name, words in overrides.items() if name in services}
     if services is None or "recorder" in services:
         make_out(out, "up")
-    asleep = args.no_planner and (services is None or "planner" in services)
+    not_started = args.no_planner and (services is None or "planner" in services)
     fleet = SupervisedFleet.start(
         args.config,
         args.run_dir,
         overrides=overrides,
         services=services,
-        asleep=("planner",) if asleep else (),
+        not_started=("planner",) if not_started else (),
         simulation=not args.no_sim,
         injected=args.injectable,
         pace=args.pace,
     )
-    up = len(fleet.manifest.services) - asleep
+    up = len(fleet.manifest.services) - not_started
     record = f", record: {out}" if "recorder" in fleet.manifest.services else ""
     print(
         f"{up} service{'s are' if up != 1 else ' is'} up in {fleet.run.path} "

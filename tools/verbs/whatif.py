@@ -85,10 +85,10 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     with bar as progress:
         shown = progress.add_task("", total=len(tasks), fell="0 fell")
-        for _, fate in results(
+        for _, counterfactual in results(
             counterfactual_of, tasks, args.workers, lambda task: f"{task.moment.at_s:g} s"
         ):
-            counterfactuals.append(fate)
+            counterfactuals.append(counterfactual)
             fell = sum(not one.stood for one in counterfactuals)
             progress.update(shown, advance=1, fell=f"{fell} fell")
     counterfactuals.sort(key=lambda one: one.at_s)

@@ -149,9 +149,9 @@ def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | 
                 "`xrl down` first"
             )
     for fleet in {fleet.run.path: fleet for fleet in up.values()}.values():
-        mine = [module for module, other in up.items() if other.run.path == fleet.run.path]
-        states = _states(robot, fleet, mine)
-        for module in mine:
+        served = [module for module, other in up.items() if other.run.path == fleet.run.path]
+        states = _states(robot, fleet, served)
+        for module in served:
             state = states.get(module)
             if state is None:
                 raise FleetError(

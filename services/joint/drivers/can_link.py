@@ -19,7 +19,7 @@ FRAMES_PER_READ: Final = 512
 """More than can wait in a socket; a flooded bus must not hold up the loop."""
 RETRY_MS: Final = 200
 """Between two attempts to open the bus: on socketcan an attempt may cost a millisecond."""
-ORDERS_MS: Final = 100
+COMMANDS_MS: Final = 100
 """An order that the bus has not taken by then is given up: it belongs to another moment."""
 IN_KERNEL: Final = ("socketcan",)
 """Interfaces whose frames all wait in the kernel, behind one file descriptor: it throws other
@@ -78,8 +78,8 @@ class CanLink:
         self._receive: Receive = _nothing
         self._send: Send = _drop
         self._retry_at_ns = 0
-        self._orders: Sequence[can.Message] = ()
-        self._orders_until_ns = 0
+        self._commands: Sequence[can.Message] = ()
+        self._commands_until_ns = 0
 
     @property
     def is_open(self) -> bool:
@@ -120,8 +120,8 @@ class CanLink:
 
         Error frames are among them: they are for `error_frame`.
         """
-        if self._orders:
-            self._send_orders()
+        if self._commands:
+            self._send_commands()
         try:
             frames = self._receive(timeout_s)
             off = not frames and self._bus is not None and self._bus.state is can.BusState.ERROR
@@ -144,7 +144,7 @@ class CanLink:
 
         What waits by `order` goes first; until it has gone, nothing else goes.
         """
-        if self._orders and not self._send_orders():
+        if self._commands and not self._send_commands():
             return False
         # A full queue comes here too. A dead link shows in receiving.
         return self._send(messages) == len(messages)
@@ -158,22 +158,22 @@ class CanLink:
         """
         if self._bus is None:
             return
-        self._orders = messages
-        self._orders_until_ns = now_ns() + ORDERS_MS * NS_PER_MS
-        self._send_orders()
+        self._commands = messages
+        self._commands_until_ns = now_ns() + COMMANDS_MS * NS_PER_MS
+        self._send_commands()
 
     def close(self) -> None:
         """Leave the bus for good."""
         self._disconnect()
         self._retry_at_ns = 1 << 63
 
-    def _send_orders(self) -> bool:
+    def _send_commands(self) -> bool:
         """Send as many frames as the bus has room for; True if none is left."""
-        if now_ns() > self._orders_until_ns:
-            self._orders = ()
+        if now_ns() > self._commands_until_ns:
+            self._commands = ()
         else:
-            self._orders = self._orders[self._send(self._orders) :]
-        return not self._orders
+            self._commands = self._commands[self._send(self._commands) :]
+        return not self._commands
 
     def _go_off(self) -> None:
         self.bus_offs += 1
@@ -188,7 +188,7 @@ class CanLink:
         self._bus = None
         self._receive = _nothing
         self._send = _drop
-        self._orders = ()
+        self._commands = ()
 
 
 def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:

@@ -182,7 +182,7 @@ class OdriveCan:
         messages = frames.torques
         settles = self._due.with_torques(now_ns())
         if settles:
-            messages = frames.torques_anew
+            messages = frames.first_torques
         if not self._link.send(messages):
             self.write_failures += 1
             if settles:
@@ -214,7 +214,7 @@ class OdriveCan:
         otherwise bring back the earlier torque, and the factory gains have an integrator. `status`
         is IDLE until heartbeats show more.
         """
-        self._order(odrive_frames.arming(self._drive, onboard=onboard), armed=True)
+        self._send(odrive_frames.arming(self._drive, onboard=onboard), armed=True)
         now = now_ns()
         self._due.armed(now)
         self._insist_until_ns = 0
@@ -222,7 +222,7 @@ class OdriveCan:
 
     def idle(self) -> None:
         """Ask both axes to go idle, with their input torque zeroed."""
-        self._order(odrive_frames.IDLING, armed=False)
+        self._send(odrive_frames.IDLING, armed=False)
         self._insist_until_ns = now_ns() + INSIST_MS * NS_PER_MS
         self._due.idle()
         self._feed_until_ns = 0
@@ -249,12 +249,12 @@ class OdriveCan:
             time.sleep(1e-3)
         self._link.close()
 
-    def _order(self, commands: tuple[odrive_frames.Order, ...], *, armed: bool) -> None:
+    def _send(self, commands: tuple[odrive_frames.CanCommand, ...], *, armed: bool) -> None:
         """Send commands to both axes and forget their earlier reports."""
         self._report.requested(armed=armed)
         self._answers.forget_torques()
         self._believe_from_ns = now_ns() + ARM_GRACE_MS * NS_PER_MS
-        self._link.order(odrive_frames.orders(self._node_ids, commands))
+        self._link.order(odrive_frames.messages_of(self._node_ids, commands))
 
     def _pump(self, timeout_s: float) -> None:
         """Take in the frames of one wait; most of a shared bus's are other modules'."""
@@ -286,7 +286,7 @@ class OdriveCan:
             return
         self._heard_ns[axis] = now
         if now < self._insist_until_ns and data[4] == AxisState.CLOSED_LOOP_CONTROL:
-            self._order(odrive_frames.IDLING, armed=False)  # it was lost on the way
+            self._send(odrive_frames.IDLING, armed=False)  # it was lost on the way
             return
         report = self._report
         report.receive(axis, bytes(data))

@@ -20,7 +20,7 @@ from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
 
 Nodes = tuple[int, int]
-Order = tuple[Command, bytes]
+CanCommand = tuple[Command, bytes]
 """A command with its payload, for both axes."""
 
 LARGEST: Final = 1e9
@@ -29,18 +29,18 @@ LARGEST: Final = 1e9
 _pack_float = Struct("<f").pack
 _pack_two_floats = Struct("<ff").pack
 
-IDLING: Final[tuple[Order, ...]] = (
+IDLING: Final[tuple[CanCommand, ...]] = (
     (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
     (Command.SET_AXIS_STATE, cansimple.pack_u32(AxisState.IDLE)),
 )
 
 
-def orders(nodes: Nodes, commands: tuple[Order, ...]) -> list[can.Message]:
+def messages_of(nodes: Nodes, commands: tuple[CanCommand, ...]) -> list[can.Message]:
     """Return the frames of commands to both axes."""
     return [message(node, command, data) for command, data in commands for node in nodes]
 
 
-def arming(drive: DriveConfig, *, onboard: bool) -> tuple[Order, ...]:
+def arming(drive: DriveConfig, *, onboard: bool) -> tuple[CanCommand, ...]:
     """Return what leads to closed loop with no torque, and with no gains if onboard.
 
     Errors are cleared, and `input_torque` zeroed first: re-arming would otherwise bring back
@@ -89,18 +89,18 @@ class Frames:
         self._inputs = [message(n, Command.SET_INPUT_POS, bytes(8)) for n in nodes]
         self._vel_gains = [message(n, Command.SET_VEL_GAINS, bytes(8)) for n in nodes]
         self._pos_gains = [message(n, Command.SET_POS_GAIN, bytes(4)) for n in nodes]
-        self.torques_anew = [*limit_frames, *torque_mode, *self.torques]
+        self.first_torques = [*limit_frames, *torque_mode, *self.torques]
         lone = [[target] for target in self._inputs]
         gains = [list(both) for both in zip(self._pos_gains, self._vel_gains, strict=True)]
         with_gains = [own + target for own, target in zip(gains, lone, strict=True)]
-        anew = [
+        first = [
             [*own, mode, *target]
             for own, mode, target in zip(gains, position_mode, lone, strict=True)
         ]
         self.rows = (
             _either_first([], lone),
             _either_first([], with_gains),
-            _either_first(limit_frames, anew),
+            _either_first(limit_frames, first),
         )
 
     def fill_torques(self, torque: Pair) -> None:

@@ -49,7 +49,7 @@ STATES_EVERY: Final = 4
 """Exchanges of a drive that we hold armed from one look at its states to the next: 20 ms."""
 ANSWER_S: Final = 0.003
 """Time an exchange waits for the control thread's target after its sample."""
-TELL_S: Final = 5.0
+REPORT_S: Final = 5.0
 """Time after which a drive that is not found is reported: its number may be another's."""
 CLOSE_S: Final = 1.0
 """Time that `close` waits for a last request; not for the control path."""
@@ -223,7 +223,7 @@ class OdriveUsb:
                     self.connections += 1
                     await self._stay(board)
             except Exception as error:  # noqa: BLE001 - the package raises bare Exceptions
-                self._tell(f"{type(error).__name__}: {error}")
+                self._report(f"{type(error).__name__}: {error}")
                 await asyncio.sleep(RETRY_S)
             finally:
                 self._connected = False
@@ -237,19 +237,19 @@ class OdriveUsb:
             manager.wait_for(serial_number=self._serial_number, return_type=RuntimeDevice)
         )
         loop = asyncio.get_running_loop()
-        tell_at = loop.time() + TELL_S
+        report_at = loop.time() + REPORT_S
         try:
             while not self._closing:
                 await asyncio.wait((search,), timeout=RETRY_S)
                 if search.done():
                     return search.result()
-                if loop.time() > tell_at:
-                    self._tell("not on USB; `xrl doctor` lists the serial numbers that are there")
+                if loop.time() > report_at:
+                    self._report("not on USB; `xrl doctor` lists the serial numbers that are there")
         finally:
             search.cancel()
         return None
 
-    def _tell(self, trouble: str) -> None:
+    def _report(self, trouble: str) -> None:
         """Log why the drive is absent, unless that was the last line."""
         if trouble != self.trouble:
             self.trouble = trouble

@@ -47,7 +47,7 @@ class ResendPolicy:
 
     def __init__(self) -> None:
         self.gains: Gains | None = None
-        self._told_ns = 0
+        self._sent_ns = 0
         self._gains_at_ns = 0
         self._settle_at_ns = 0
         self._settle_until_ns = 0
@@ -73,9 +73,9 @@ class ResendPolicy:
         if self.gains is None:  # taken over as it stands
             self._settle(now_ns)
         if due:
-            drifting = now_ns - self._told_ns < DRIFT_MS * NS_PER_MS
+            drifting = now_ns - self._sent_ns < DRIFT_MS * NS_PER_MS
             wait_ms = GAINS_MS if not new else DRIFT_MS if drifting else 0
-            self.gains, self._told_ns = gains, now_ns
+            self.gains, self._sent_ns = gains, now_ns
             self._gains_at_ns = now_ns + wait_ms * NS_PER_MS
         if self.with_torques(now_ns):
             return GainRow.ALL

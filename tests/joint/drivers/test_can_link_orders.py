@@ -8,7 +8,7 @@ import time
 import can
 import pytest
 
-from services.joint.drivers.can_link import ORDERS_MS, RETRY_MS
+from services.joint.drivers.can_link import COMMANDS_MS, RETRY_MS
 from shared.can.cansimple import Command
 from tests.joint.drivers.can_bench import Bench
 from tests.joint.drivers.rig import TARGET
@@ -66,7 +66,7 @@ def test_an_order_that_waited_too_long_is_given_up(bench: Bench) -> None:
     bench.commands()
     bench.bus.room = 0
     bench.driver.arm(onboard=True)
-    bench.wait(1e-3 * ORDERS_MS + 1e-3)
+    bench.wait(1e-3 * COMMANDS_MS + 1e-3)
     bench.bus.room = 100
     bench.after(1)
     assert bench.commands() == []

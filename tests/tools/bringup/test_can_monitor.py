@@ -73,7 +73,7 @@ def bus() -> Iterator[Bus]:
 
 
 def test_heartbeats_estimates_and_load_cells_are_taken_in(bus: Bus) -> None:
-    traffic = listen(bus.config, (NODE,), ask=False, cells=True)
+    traffic = listen(bus.config, (NODE,), poll_nodes=False, cells=True)
     axis = traffic.nodes[NODE]
     assert traffic.trouble == ""
     assert axis.heartbeat == IDLE
@@ -98,7 +98,7 @@ def test_an_imu_is_received_where_there_is_one(tmp_path: Path) -> None:
 
         speaker = threading.Thread(target=speak)
         speaker.start()
-        traffic = listen(config, (), ask=False, imu=True)
+        traffic = listen(config, (), poll_nodes=False, imu=True)
         done.set()
         speaker.join()
     assert traffic.attitudes[0].rate == (0.0, 0.5, 0.0)
@@ -108,13 +108,13 @@ def test_an_imu_is_received_where_there_is_one(tmp_path: Path) -> None:
 
 
 def test_nothing_is_sent_where_nothing_is_to_be_asked(bus: Bus) -> None:
-    traffic = listen(bus.config, (NODE,), ask=False)
+    traffic = listen(bus.config, (NODE,), poll_nodes=False)
     assert bus.asked == [], "any frame feeds a watchdog"
     assert traffic.nodes[NODE].vbus_voltage is None
 
 
 def test_version_and_supply_are_asked_for_by_requests_without_data(bus: Bus) -> None:
-    traffic = listen(bus.config, (NODE,), ask=True)
+    traffic = listen(bus.config, (NODE,), poll_nodes=True)
     assert all(can_id & REMOTE_FLAG for can_id in bus.asked)
     assert traffic.nodes[NODE].vbus_voltage == 47.5
     version = traffic.nodes[NODE].version
@@ -124,6 +124,6 @@ def test_version_and_supply_are_asked_for_by_requests_without_data(bus: Bus) -> 
 
 def test_a_missing_bus_is_reported_and_not_raised(tmp_path: Path) -> None:
     nowhere = CanConfig(interface="xrl_unix", channel=str(tmp_path / "no.sock"))
-    assert "no.sock" in listen(nowhere, (NODE,), ask=True).trouble
+    assert "no.sock" in listen(nowhere, (NODE,), poll_nodes=True).trouble
     unknown = CanConfig(interface="carrier_pigeon", channel="0")
-    assert "carrier_pigeon" in listen(unknown, (NODE,), ask=True).trouble
+    assert "carrier_pigeon" in listen(unknown, (NODE,), poll_nodes=True).trouble

@@ -28,7 +28,7 @@ def wanted(robot: RobotConfig) -> tuple[WantedSetting, ...]:
 
 def test_a_board_as_wanted_is_left_alone(wanted: tuple[WantedSetting, ...]) -> None:
     board = BoardInMemory(as_wanted())
-    assert changes.against_wanted(MODULE, wanted, board) == []
+    assert changes.changes_to_wanted(MODULE, wanted, board) == []
     assert changes.apply(board, []) == []
     assert (board.writes, board.saves) == ([], 0)
 
@@ -37,7 +37,7 @@ def test_only_what_differs_is_written_saved_once_and_read_back(
     wanted: tuple[WantedSetting, ...],
 ) -> None:
     board = BoardInMemory(as_wanted() | {VEL_LIMIT: 2.0, PERIOD: 10, "config.other": 7})
-    difference = changes.against_wanted(MODULE, wanted, board)
+    difference = changes.changes_to_wanted(MODULE, wanted, board)
     assert [(c.name, c.before, c.after) for c in difference] == [
         (VEL_LIMIT, 2.0, 60.0),
         (PERIOD, 10, 2),
@@ -54,7 +54,7 @@ def test_a_value_that_the_board_does_not_take_is_not_called_good(
 ) -> None:
     board = BoardInMemory(as_wanted() | {VEL_LIMIT: 2.0, PERIOD: 10})
     board.deaf = {PERIOD}
-    difference = changes.against_wanted(MODULE, wanted, board)
+    difference = changes.changes_to_wanted(MODULE, wanted, board)
     outcomes = {outcome.change.name: outcome for outcome in changes.apply(board, difference)}
     assert outcomes[VEL_LIMIT].good
     assert not outcomes[PERIOD].good
@@ -65,13 +65,13 @@ def test_pre_calibrated_is_written_to_an_axis_only_once_it_is_calibrated(
     wanted: tuple[WantedSetting, ...],
 ) -> None:
     raw = BoardInMemory(as_wanted() | {PRE_CALIBRATED: False}, **{"axis1.encoder.is_ready": False})
-    (change,) = changes.against_wanted(MODULE, wanted, raw)
+    (change,) = changes.changes_to_wanted(MODULE, wanted, raw)
     assert "CALIBRATION" in change.inhibit
     (outcome,) = changes.apply(raw, [change])
     assert not outcome.good
     assert (raw.writes, raw.saves) == ([], 0)
     ready = BoardInMemory(as_wanted() | {PRE_CALIBRATED: False})
-    assert changes.apply(ready, changes.against_wanted(MODULE, wanted, ready))[0].good
+    assert changes.apply(ready, changes.changes_to_wanted(MODULE, wanted, ready))[0].good
 
 
 def test_a_setting_that_is_not_in_this_firmware_is_a_row_and_no_crash(
@@ -80,7 +80,7 @@ def test_a_setting_that_is_not_in_this_firmware_is_a_row_and_no_crash(
     settings = as_wanted()
     del settings[PERIOD]
     board = BoardInMemory(settings)
-    (change,) = changes.against_wanted(MODULE, wanted, board)
+    (change,) = changes.changes_to_wanted(MODULE, wanted, board)
     assert (change.before, change.name) == (None, PERIOD)
     assert "firmware" in change.inhibit
     assert not changes.apply(board, [change])[0].good
@@ -114,7 +114,7 @@ def test_a_current_that_counts_the_other_way_is_nothing_to_write(
     wanted: tuple[WantedSetting, ...],
 ) -> None:
     board = BoardInMemory(as_wanted() | {"axis0.encoder.config.direction": -1})
-    assert changes.against_wanted(MODULE, wanted, board) == []
+    assert changes.changes_to_wanted(MODULE, wanted, board) == []
 
 
 @pytest.mark.parametrize("state", [AxisState.CLOSED_LOOP_CONTROL, AxisState.MOTOR_CALIBRATION, 99])

@@ -15,7 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from tests.imu.robots import with_imu
 from tools.bringup import check_can
-from tools.bringup.can_monitor import BusHeard, NodeHeard, long_enough, period_ms
+from tools.bringup.can_monitor import BusTraffic, NodeTraffic, long_enough, period_ms
 from tools.bringup.rows import Finding, FindingKind
 
 MODULE = "knee_left"
@@ -29,16 +29,16 @@ def times(period_s: float, n: int = 40) -> list[float]:
 
 def axis(
     heartbeat: Heartbeat = IDLE, heartbeat_s: float = 0.02, encoder_s: float = 0.002
-) -> NodeHeard:
-    return NodeHeard(heartbeat, times(heartbeat_s, 10), times(encoder_s), pos_turns=64.0)
+) -> NodeTraffic:
+    return NodeTraffic(heartbeat, times(heartbeat_s, 10), times(encoder_s), pos_turns=64.0)
 
 
-def healthy() -> BusHeard:
-    return BusHeard(seconds=0.5, frames=600, nodes={node: axis() for node in NODES})
+def healthy() -> BusTraffic:
+    return BusTraffic(seconds=0.5, frames=600, nodes={node: axis() for node in NODES})
 
 
-def rows_of(robot: RobotConfig, heard: BusHeard) -> list[Finding]:
-    return check_can.drive_rows(robot, MODULE, heard, services_up=False)
+def rows_of(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
+    return check_can.drive_rows(robot, MODULE, traffic, services_up=False)
 
 
 def bad(rows: list[Finding]) -> list[tuple[str, str, FindingKind]]:
@@ -71,12 +71,12 @@ def test_an_axis_without_encoder_frames_is_wrong(robot: RobotConfig) -> None:
 
 def test_an_axis_that_sends_no_heartbeat_is_wrong(robot: RobotConfig) -> None:
     traffic = healthy()
-    traffic.nodes[9] = NodeHeard()
+    traffic.nodes[9] = NodeTraffic()
     assert bad(rows_of(robot, traffic)) == [(f"{MODULE}.axis1", "heartbeat", FindingKind.WRONG)]
 
 
 def test_other_nodes_on_a_silent_bus_are_named(robot: RobotConfig) -> None:
-    traffic = BusHeard(nodes={8: NodeHeard(), 9: NodeHeard(), 0: axis(), 1: axis()})
+    traffic = BusTraffic(nodes={8: NodeTraffic(), 9: NodeTraffic(), 0: axis(), 1: axis()})
     (row,) = rows_of(robot, traffic)
     assert row.verdict is FindingKind.WRONG
     assert "nodes 0, 1 are heard" in row.fix
@@ -108,7 +108,7 @@ def test_a_bus_that_cannot_be_opened_names_how_to_open_it(
 ) -> None:
     can = {name: CanConfig(interface=interface, channel="can7") for name in robot.can}
     other = msgspec.structs.replace(robot, can=can)
-    (row,) = rows_of(other, BusHeard(trouble="no such device"))
+    (row,) = rows_of(other, BusTraffic(trouble="no such device"))
     assert row.verdict is FindingKind.WRONG
     assert words in row.fix
 
@@ -117,7 +117,7 @@ def test_a_kernel_without_can_gets_no_advice_to_bring_an_interface_up(robot: Rob
     can = {name: CanConfig(interface="socketcan", channel="can7") for name in robot.can}
     other = msgspec.structs.replace(robot, can=can)
     trouble = f"[Errno {errno.EAFNOSUPPORT}] {os.strerror(errno.EAFNOSUPPORT)}"
-    (row,) = rows_of(other, BusHeard(trouble=trouble))
+    (row,) = rows_of(other, BusTraffic(trouble=trouble))
     assert "modprobe can_raw" in row.fix
 
 
@@ -128,33 +128,33 @@ def test_two_axes_under_one_node_id_show_however_their_heartbeats_fall(
     traffic = healthy()
     both = sorted(t + late for t in times(0.02, 25) for late in (0.0, apart_s))
     # the first and the last gap are long ones: so is then the median of 1 and 19 ms
-    traffic.nodes[8] = NodeHeard(IDLE, both[1:-1], times(0.002), pos_turns=64.0)
+    traffic.nodes[8] = NodeTraffic(IDLE, both[1:-1], times(0.002), pos_turns=64.0)
     rows = rows_of(robot, traffic)
     assert bad(rows) == [(f"{MODULE}.axis0", "heartbeat", FindingKind.WARNING)]
     assert "the same node id" in next(row.why for row in rows if row.verdict != FindingKind.OK)
 
 
-def cells(rate_hz: float = 250.0, force: float = 20.0) -> BusHeard:
+def cells(rate_hz: float = 250.0, force: float = 20.0) -> BusTraffic:
     n = 50
     sample = (force, 0.0, 0.0, 0.0, 0.0, -force)
-    return BusHeard(seconds=n / rate_hz, samples=[sample] * n, samples_s=times(1.0 / rate_hz, n))
+    return BusTraffic(seconds=n / rate_hz, samples=[sample] * n, samples_s=times(1.0 / rate_hz, n))
 
 
 @pytest.mark.parametrize(
-    ("heard", "expected"),
+    ("traffic", "expected"),
     [
         (cells(), []),
         (cells(rate_hz=100.0), [("load cells", FindingKind.WARNING)]),
         (cells(force=1500.0), [("largest force", FindingKind.WRONG)]),
         (cells(force=float("nan")), [("largest force", FindingKind.WRONG)]),
-        (BusHeard(seconds=0.5, frames=3), [("load cells", FindingKind.WRONG)]),
-        (BusHeard(trouble="gone"), [("CAN bus", FindingKind.WRONG)]),
+        (BusTraffic(seconds=0.5, frames=3), [("load cells", FindingKind.WRONG)]),
+        (BusTraffic(trouble="gone"), [("CAN bus", FindingKind.WRONG)]),
     ],
 )
 def test_the_load_cells_are_judged_by_rate_and_range(
-    robot: RobotConfig, heard: BusHeard, expected: list[tuple[str, FindingKind]]
+    robot: RobotConfig, traffic: BusTraffic, expected: list[tuple[str, FindingKind]]
 ) -> None:
-    rows = check_can.harness_rows(robot, heard)
+    rows = check_can.harness_rows(robot, traffic)
     assert [(row.what, row.verdict) for row in rows if row.verdict != FindingKind.OK] == expected
 
 
@@ -188,25 +188,25 @@ def test_every_bus_of_the_robot_is_listened_to(robot: RobotConfig) -> None:
     assert nodes[robot.harness.bus] == ()
 
 
-def imu_heard(*, valid: bool = True, period_s: float = 0.01) -> BusHeard:
+def imu_heard(*, valid: bool = True, period_s: float = 0.01) -> BusTraffic:
     sample = ImuSample((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), valid)
-    return BusHeard(frames=150, attitudes=[sample] * 50, attitudes_s=times(period_s, 50))
+    return BusTraffic(frames=150, attitudes=[sample] * 50, attitudes_s=times(period_s, 50))
 
 
 @pytest.mark.parametrize(
-    ("heard", "wrong"),
+    ("traffic", "wrong"),
     [
         (imu_heard(), []),
         (imu_heard(period_s=0.02), [("IMU", "samples", FindingKind.WARNING)]),
         (imu_heard(valid=False), [("IMU", "orientation valid", FindingKind.WRONG)]),
-        (BusHeard(frames=7), [("IMU", "samples", FindingKind.WRONG)]),
-        (BusHeard(trouble="no such device"), [("IMU", "CAN bus", FindingKind.WRONG)]),
+        (BusTraffic(frames=7), [("IMU", "samples", FindingKind.WRONG)]),
+        (BusTraffic(trouble="no such device"), [("IMU", "CAN bus", FindingKind.WRONG)]),
     ],
 )
 def test_an_imu_is_judged_by_its_rate_and_its_own_flags(
-    robot: RobotConfig, heard: BusHeard, wrong: list[tuple[str, str, FindingKind]]
+    robot: RobotConfig, traffic: BusTraffic, wrong: list[tuple[str, str, FindingKind]]
 ) -> None:
-    assert bad(check_can.imu_rows(robot, heard)) == wrong
+    assert bad(check_can.imu_rows(robot, traffic)) == wrong
 
 
 def test_a_bus_is_listened_to_for_an_imu_only_where_one_is_fitted(robot: RobotConfig) -> None:

@@ -92,7 +92,7 @@ def test_unusable_output_of_ip_yields_nothing(monkeypatch: pytest.MonkeyPatch, s
         return subprocess.CompletedProcess([], 0, stdout=said)
 
     monkeypatch.setattr(subprocess, "run", run)
-    assert check_socketcan.ask_ip() == {}
+    assert check_socketcan.query_ip() == {}
 
 
 def test_without_the_ip_command_there_is_nothing_to_report(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,4 +100,4 @@ def test_without_the_ip_command_there_is_nothing_to_report(monkeypatch: pytest.M
         raise FileNotFoundError
 
     monkeypatch.setattr(subprocess, "run", run)
-    assert check_socketcan.ask_ip() == {}
+    assert check_socketcan.query_ip() == {}

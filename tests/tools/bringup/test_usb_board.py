@@ -71,7 +71,7 @@ def test_what_is_written_is_lost_by_a_restart_and_what_is_saved_is_not(
     board.write({VEL_LIMIT: 3.5})
     with usb.lock:
         usb.bank.reboot(AXIS)
-    assert eventually(lambda: usb.bank.talks(AXIS))
+    assert eventually(lambda: usb.bank.is_responding(AXIS))
     with usb.lock:
         assert usb.bank.settings.get(MODULE, VEL_LIMIT) == 7.5
 

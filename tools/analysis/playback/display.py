@@ -54,45 +54,45 @@ def _common(keys: Sequence[str]) -> str:
     return first[: first.rfind("/", 0, same) + 1]
 
 
-def summary(player: Player, took_s: float, *, heard: bool) -> str:
+def summary(player: Player, took_s: float, *, subscribers: bool) -> str:
     """Return how it went, in one line."""
-    tally = player.tally
-    keys = sum(1 for count in tally.counts if count)
-    line = f"{tally.put} messages on {keys} keys in {took_s:.2f} s"
+    stats = player.stats
+    keys = sum(1 for count in stats.counts if count)
+    line = f"{stats.put} messages on {keys} keys in {took_s:.2f} s"
     if player.schedule.passes:
         line += f", {player.schedule.passes} passes and a part"
-    if tally.put:
-        mean_ms = tally.late_sum_ns / (tally.put + tally.failed) / NS_PER_MS
-        line += f"; late by {mean_ms:.2f} ms on average, {tally.late_max_ns / NS_PER_MS:.1f} ms "
+    if stats.put:
+        mean_ms = stats.late_sum_ns / (stats.put + stats.failed) / NS_PER_MS
+        line += f"; late by {mean_ms:.2f} ms on average, {stats.late_max_ns / NS_PER_MS:.1f} ms "
         line += "at most"
-    line += f"; {tally.failed} not sent: the session is closed" if tally.failed else "; all sent"
-    return line if heard else f"{line}; nobody listened"
+    line += f"; {stats.failed} not sent: the session is closed" if stats.failed else "; all sent"
+    return line if subscribers else f"{line}; nobody listened"
 
 
 class Display:
     """One line on a terminal that is rewritten; nothing on a pipe."""
 
     def __init__(self, ports: Sequence[RawPublisher]) -> None:
-        self.heard = False
+        self.subscribers = False
         """Somebody has subscribed to a key, as far as has been looked."""
         self._ports = ports
         self._terminal = sys.stdout.isatty()
 
     def show(self, player: Player) -> None:
         """Write the line."""
-        self.heard = self.heard or any(port.matched for port in self._ports)
+        self.subscribers = self.subscribers or any(port.matched for port in self._ports)
         if not self._terminal:
             return
-        head, schedule, tally = player.head, player.schedule, player.tally
+        head, schedule, stats = player.head, player.schedule, player.stats
         line = (
             f"{player.position_ns() / NS_PER_S:8.2f} / {schedule.length_ns / NS_PER_S:.2f} s  "
-            f"{head.rate:.3g}x  {tally.put} messages, "
-            f"{sum(1 for count in tally.counts if count)} of {len(self._ports)} keys"
+            f"{head.rate:.3g}x  {stats.put} messages, "
+            f"{sum(1 for count in stats.counts if count)} of {len(self._ports)} keys"
         )
         if schedule.passes:
             line += f", pass {schedule.passes + 1}"
         line += ", paused" if head.paused else ""
-        line += "" if self.heard else ", nobody listens"
+        line += "" if self.subscribers else ", nobody listens"
         sys.stdout.write(f"\r\x1b[2K{line}")
         sys.stdout.flush()
 

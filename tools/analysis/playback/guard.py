@@ -88,12 +88,12 @@ class LiveRobotWatch:
                 return f"the joint service {module} listens on {endpoint}"
         deadline = time.monotonic() + LISTEN_S
         while time.monotonic() < deadline:
-            if heard := self.heard():
-                return heard
+            if subscribers := self.subscribers():
+                return subscribers
             time.sleep(_POLL_S)
         return ""
 
-    def heard(self) -> str:
+    def subscribers(self) -> str:
         """Return the joint services that have sent since the last call, as text."""
         for module, states in self._states.items():
             if states.take() is not None or states.refused:

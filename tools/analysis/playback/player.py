@@ -82,7 +82,7 @@ class Player:
             clock_hz: rate of that, also while paused.
         """
         self.schedule, self.head = schedule, head
-        self.tally = PlaybackStats(counts=[0] * len(ports))
+        self.stats = PlaybackStats(counts=[0] * len(ports))
         self._puts = [port.put for port in ports]
         self._hand, self._now_ns, self._show = hand, now_ns, show
         self._clock = clock
@@ -109,7 +109,7 @@ class Player:
 
     def _put_due(self) -> None:
         """Publish what is due; late messages go at once, in order."""
-        schedule, head, tally = self.schedule, self.head, self.tally
+        schedule, head, stats = self.schedule, self.head, self.stats
         for _ in range(BURST):
             position = schedule.next_ns()
             due_ns = None if position is None else head.due_ns(position)
@@ -117,18 +117,18 @@ class Player:
             if due_ns is None or due_ns > now_ns:
                 return
             late_ns = now_ns - due_ns
-            tally.late_sum_ns += late_ns
-            if late_ns > tally.late_max_ns:
-                tally.late_max_ns = late_ns
+            stats.late_sum_ns += late_ns
+            if late_ns > stats.late_max_ns:
+                stats.late_max_ns = late_ns
             self._put_next()
 
     def _put_next(self) -> None:
         entry = self.schedule.pop()
         if self._puts[entry.key](entry.payload):
-            self.tally.put += 1
-            self.tally.counts[entry.key] += 1
+            self.stats.put += 1
+            self.stats.counts[entry.key] += 1
         else:
-            self.tally.failed += 1
+            self.stats.failed += 1
 
     def _tell_time(self) -> None:
         """Put the recorded time if it is due; moments that were missed are left out."""

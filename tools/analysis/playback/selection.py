@@ -53,8 +53,8 @@ def choose(
         and not any(_fits(name, key) for name in unwanted)
     )
     if not chosen:
-        heard = ", ".join(sorted({_row_of(short(key)) for key in present})) or "nothing"
-        raise RunError(f"nothing is left to play; the log holds {heard}")
+        recorded = ", ".join(sorted({_row_of(short(key)) for key in present})) or "nothing"
+        raise RunError(f"nothing is left to play; the log holds {recorded}")
     return chosen
 
 

@@ -69,10 +69,10 @@ class JointExecution:
             self._outcome.starts += 1
             return
         if self._outcome.exact:
-            mine = msgspec.structs.replace(
+            computed = msgspec.structs.replace(
                 trace, snapshot=_encode(self._module.snapshot()).decode()
             )
-            self._compare("trace", self._module.controller.cycle, trace, mine)
+            self._compare("trace", self._module.controller.cycle, trace, computed)
 
     def _cycle(self, module: DriveManager, cycle: CycleTrace) -> Iterator[Message]:
         c, outcome = cycle, self._outcome
@@ -88,9 +88,11 @@ class JointExecution:
         step = module.step(c.now_ns, _reading(c), command, c.estop, near)
         controller = module.controller
         outcome.ticks += 1
-        mine = msgspec.structs.replace(cycle, drive_command=step.command.value, tau=controller.tau)
-        if mine != cycle:
-            self._compare("trace", controller.cycle, _single(cycle), _single(mine))
+        computed = msgspec.structs.replace(
+            cycle, drive_command=step.command.value, tau=controller.tau
+        )
+        if computed != cycle:
+            self._compare("trace", controller.cycle, _single(cycle), _single(computed))
         if controller.cycle % self._state_every == 0:
             state = controller.state(c.now_ns)
             recorded = self._states.get((state.t_ns, state.cycle))
@@ -98,9 +100,9 @@ class JointExecution:
                 self._compare("state", controller.cycle, recorded, state)
                 yield state
         if step.event is not None:
-            told = self._events.get(step.event.t_ns)
-            if told is not None:
-                self._compare("event", controller.cycle, told, step.event)
+            logged = self._events.get(step.event.t_ns)
+            if logged is not None:
+                self._compare("event", controller.cycle, logged, step.event)
                 yield step.event
 
     def _compare(self, what: str, tick: int, recorded: Message, recomputed: Message) -> None:

@@ -30,8 +30,8 @@ class PlannerExecution:
         """Take the log, the robot to execute with and what to fill in."""
         self._robot, self._outcome = robot, outcome
         self._statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-        memories: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
-        self._memories = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in memories}
+        snapshots: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
+        self._snapshots = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in snapshots}
         self._states = [BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
         self._wrenches = BySeq(log.messages(topics.WRENCH))
         self._attitudes = BySeq(log.messages(topics.ATTITUDE))
@@ -52,7 +52,7 @@ class PlannerExecution:
             if last is not None and (status.session != last.session or status.seq > last.seq + 1):
                 self._planner = None  # another planner, or ticks that the log lacks
             last = status
-            if self._planner is None or not self._hear(self._planner, status):
+            if self._planner is None or not self._receive(self._planner, status):
                 self._planner = None
                 self._outcome.skipped += 1
                 self._begin(status)
@@ -66,7 +66,7 @@ class PlannerExecution:
 
     def _begin(self, status: PlannerStatus) -> None:
         """Go on from the memory after this tick, if the log has it."""
-        snapshot = self._memories.get((status.session, status.t_ns))
+        snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is None:
             return
         known = _decode(snapshot.snapshot)
@@ -77,7 +77,7 @@ class PlannerExecution:
         self._attitude_seq = known.attitude_seq
         self._outcome.starts += 1
 
-    def _hear(self, planner: Planner, status: PlannerStatus) -> bool:
+    def _receive(self, planner: Planner, status: PlannerStatus) -> bool:
         """Give the planner what this tick took; False if the log lacks something of it."""
         for module, seq in enumerate(status.state_seq):
             arrived_ns = status.t_ns - status.state_age_ns[module]
@@ -119,10 +119,12 @@ class PlannerExecution:
             if recorded is not None:
                 compare(f"joint/{name}/command", tick, recorded, command)
                 yield name, command
-        mine = planner.status(status.t_ns, status.tick_us)  # tick_us is a time that was measured
-        compare("planner/status", tick, status, mine)
-        yield "", mine
-        snapshot = self._memories.get((status.session, status.t_ns))
+        computed = planner.status(
+            status.t_ns, status.tick_us
+        )  # tick_us is a time that was measured
+        compare("planner/status", tick, status, computed)
+        yield "", computed
+        snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:
             text = _encode(planner.snapshot()).decode()
             mine_then = msgspec.structs.replace(snapshot, snapshot=text)

@@ -85,7 +85,7 @@ class PassThrough(DriveManager):
 
     It comes up as the shipped one, from the hoist through HOLD into TRACK. From the end of that
     blend on it has no law: the newest torque that has come goes to the drive until the next
-    one, however old. Of the gate only the torque diamond is left. An e-stop, or a drive that is
+    one, however old. The torque limiter keeps only the torque diamond. An e-stop, or a drive that is
     lost, is the shipped module's again.
     """
 
@@ -105,8 +105,8 @@ class PassThrough(DriveManager):
         near: NeighbourView = UNKNOWN,  # noqa: ARG002 - nothing here sinks
     ) -> DriveAction:
         """Run one cycle; arguments as for the shipped module."""
-        amiss = estop or (reading is not None and reading.status is not DriveStatus.ARMED)
-        if amiss or not self._passes(now_ns):
+        problem = estop or (reading is not None and reading.status is not DriveStatus.ARMED)
+        if problem or not self._passes(now_ns):
             step = super().step(now_ns, reading, command, estop)
             if step.event is not None:
                 tracks = step.event.mode_after == Mode.TRACK

@@ -22,16 +22,16 @@ def draw(
     """Draw the fates over the recorded height into a PNG file."""
     truth = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
     figure = Figure(figsize=(11, 7.0), dpi=110, layout="constrained")
-    height, fate, com, margin = figure.subplots(
+    height, ended, com, margin = figure.subplots(
         4, 1, sharex=True, gridspec_kw={"height_ratios": [1.6, 0.4, 1.6, 1.2]}
     )
     height.plot([row.scenario_s for row in truth], [row.torso[2] for row in truth], lw=1.1)
     height.set_ylabel("torso height as recorded, m", fontsize=8)
     for one in counterfactuals:
         colour = STOOD if one.stood else FELL
-        fate.axvspan(one.at_s, one.at_s + every_s, color=colour, lw=0)
-    fate.set_yticks([])
-    fate.set_ylabel("killed then", fontsize=8, rotation=0, ha="right", va="center")
+        ended.axvspan(one.at_s, one.at_s + every_s, color=colour, lw=0)
+    ended.set_yticks([])
+    ended.set_ylabel("killed then", fontsize=8, rotation=0, ha="right", va="center")
     at = np.array([one.at_s for one in counterfactuals])
     com.plot(at, [one.com_x_max_mm for one in counterfactuals], ".-", ms=4, lw=0.8, label="x")
     com.plot(at, [one.com_y_max_mm for one in counterfactuals], ".-", ms=4, lw=0.8, label="y")

@@ -25,7 +25,7 @@ from shared.config.scenarios import (
 )
 from shared.robot.fault_table import DRIVE_FAULTS
 from shared.robot.joints import MODULES, kind_of
-from tools.runs.scenario_runner import Chase
+from tools.runs.scenario_runner import TriggeredKill
 
 CRASH_S: Final = 2.4
 REQUEST_S: Final = 5.0
@@ -79,7 +79,7 @@ class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
     """Why no better is expected, or why so much is."""
     before: tuple[Kill | Restart, ...] = ()
     """What leads up to the crash."""
-    chase: Chase | None = None
+    triggered_kill: TriggeredKill | None = None
     """A crash that a change of the modules' modes triggers."""
     holds: bool = True
     """The modules that are not hit go to HOLD; False: they go on tracking."""
@@ -91,7 +91,7 @@ class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
     def hit(self) -> frozenset[str]:
         """Services and modules that the crash is of."""
         names = {row.service if isinstance(row, Kill) else row.module for row in self.crash}
-        return frozenset(names | ({self.chase.service} if self.chase else set()))
+        return frozenset(names | ({self.triggered_kill.service} if self.triggered_kill else set()))
 
     @property
     def others(self) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ def scenario_of(case: CrashCase) -> Scenario:
     """Return the case as a scenario, with the requests that restart what was lost."""
     kills = [row for row in (*case.before, *case.crash) if isinstance(row, Kill)]
     down = [row.service for row in case.crash if isinstance(row, Kill)]
-    down += [case.chase.service] if case.chase else []
+    down += [case.triggered_kill.service] if case.triggered_kill else []
     faulted = [row.module for row in case.crash if isinstance(row, Fault)]
     kills += [Kill(service=name, at=REQUEST_S) for name in faulted if name not in down]
     back = dict.fromkeys((*down, *faulted))
@@ -234,7 +234,7 @@ def _reengaging() -> list[CrashCase]:
             kind="planner killed during re-engagement",
             crash=(),
             before=before,
-            chase=Chase("planner", modules=modules, after_s=after_s),
+            triggered_kill=TriggeredKill("planner", modules=modules, after_s=after_s),
             expected=CrashVerdict.STOOD,
             why=why,
             quick=name == "blend",

@@ -147,13 +147,13 @@ def _is(row: RunEvent, kind: RunEventKind, since_s: float) -> bool:
 
 
 def _crash_s(case: CrashCase, said: Sequence[RunEvent]) -> float | None:
-    """Return the scenario time of the crash, s: of the chase, if there is one."""
+    """Return the scenario time of the crash, s: of the triggered kill, if there is one."""
     kills = [
         row.scenario_s
         for row in said
         if row.kind == RunEventKind.KILLED and row.scenario_s < REQUEST_S - END_TOLERANCE_S
     ]
-    if case.chase is not None:
+    if case.triggered_kill is not None:
         led_up = sum(1 for row in scenario_of(case).kill if row.at < CRASH_S)
         return kills[led_up] if len(kills) > led_up else None
     return kills[0] if kills else CRASH_S

@@ -53,10 +53,10 @@ def describe(case: CrashCase) -> str:
         f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill if row.at <= CRASH_S
     ]
     words += [f"{row.service} back at {row.at:g} s" for row in scenario.restart if row.at < CRASH_S]
-    if case.chase is not None:
-        when = f"{case.chase.after_s:g} s after" if case.chase.after_s else "as"
-        many = "all modules track" if case.chase.modules > 1 else "the first module tracks"
-        words.append(f"{case.chase.service} KILL {when} {many} again")
+    if case.triggered_kill is not None:
+        when = f"{case.triggered_kill.after_s:g} s after" if case.triggered_kill.after_s else "as"
+        many = "all modules track" if case.triggered_kill.modules > 1 else "the first module tracks"
+        words.append(f"{case.triggered_kill.service} KILL {when} {many} again")
     words += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
     return f"{', '.join(words)}; asked back at {BACK_S:g} s"
 
@@ -116,7 +116,9 @@ def show(results: Sequence[Result], console: Console) -> None:
     bad = [result for result in results if not result.good]
     for case, outcome in bad:
         console.print(f"[bold red]{outcome.verdict.upper()}[/] {case.name}: {case.why}")
-    counts = ", ".join(f"{number} {name}" for name, number in tally(results).items() if number)
+    counts = ", ".join(
+        f"{number} {name}" for name, number in count_by_verdict(results).items() if number
+    )
     colour = "red" if bad else "green"
     console.print(
         f"[bold {colour}]{len(results) - len(bad)} of {len(results)} as expected or better[/]: "
@@ -125,7 +127,7 @@ def show(results: Sequence[Result], console: Console) -> None:
     )
 
 
-def tally(results: Sequence[Result]) -> dict[str, int]:
+def count_by_verdict(results: Sequence[Result]) -> dict[str, int]:
     """Return how often each verdict was given."""
     verdicts = [outcome.verdict for _, outcome in results]
     return {str(name): verdicts.count(name) for name in CrashVerdict}
@@ -162,7 +164,7 @@ def as_json(results: Sequence[Result], about: Mapping[str, str], *, planned: int
         "about": dict(about),
         "planned": planned,
         "complete": len(results) == planned,
-        "counts": tally(results),
+        "counts": count_by_verdict(results),
         "cases": rows,
     }
     return msgspec.json.format(msgspec.json.encode(document), indent=2) + b"\n"

@@ -105,7 +105,7 @@ def _run_once(
 
     def lead(fleet: SupervisedFleet, session: Session) -> Heard:
         witness = Witness(session, show)
-        conductor = ScenarioRunner(fleet, session, scenario, witness.see, case.chase)
+        conductor = ScenarioRunner(fleet, session, scenario, witness.see, case.triggered_kill)
         conductor.run()
         witness.listen()
         died = died_of(fleet.info(), conductor.said)

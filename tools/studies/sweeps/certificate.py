@@ -23,7 +23,7 @@ BATCH: Final = 20
 TABLE: Final = "certificate.csv"
 PICTURE: Final = "certificate.png"
 CODE: Final = code_of("tools.studies.sweeps.certificate_study")
-WORDS: Final = {"stood": {"True", "False"}, "weakest": frozenset(DIRECTIONS)}
+LABELS: Final = {"stood": {"True", "False"}, "weakest": frozenset(DIRECTIONS)}
 
 EXAMPLES: Final = """
     xrl sweep certificate
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     switches = [f"--{name}" for name in ("rigid", "friction") if getattr(args, name)]
     command = study.command("certificate", args, f"--n {args.n}", f"--seed {args.seed}", *switches)
     finished = study.run(
-        study.Study("certificate", TABLE, tuple(first), WORDS, inputs, (), args.n, JOB, command),
+        study.Study("certificate", TABLE, tuple(first), LABELS, inputs, (), args.n, JOB, command),
         batches, args.out, executor, console,
     )  # fmt: skip
     rows = finished.rows

@@ -224,7 +224,7 @@ def _nudge(rng: np.random.Generator) -> tuple[float, float]:
 
 
 class _Module:
-    """A joint service that holds: its law frozen, its gate and its differential."""
+    """A joint service that holds: its law frozen, its torque limiter and its differential."""
 
     def __init__(self, robot: RobotConfig, case: CertificateCase, index: int) -> None:
         def pair(values: Array) -> Pair:

@@ -32,7 +32,7 @@ N: Final = 100
 TABLE: Final = "dynamics.csv"
 PICTURE: Final = "dynamics.png"
 CODE: Final = code_of("tools.studies.sweeps.dynamics_trial")
-WORDS: Final = {
+LABELS: Final = {
     "ended": ENDINGS,
     "mode": frozenset(("", *HALF_NAMES)),
     "said_stable": {"True", "False"},
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     command = study.command("dynamics", args, f"--seed {args.seed}")
     finished = study.run(
         study.Study(
-            "dynamics", TABLE, columns, WORDS, inputs, begins, args.n, JOB,
+            "dynamics", TABLE, columns, LABELS, inputs, begins, args.n, JOB,
             f"{command} --n {args.n}",
         ),
         lambda done: [(trial, robot) for trial in trials if trial.number not in done],

@@ -25,7 +25,7 @@ PICTURE: Final = "cases.png"
 CODE: Final = code_of("tools.studies.sweeps.outcome")
 """What decides how a case comes out."""
 COLUMNS_OUT: Final = KillResult.__struct_fields__
-WORDS: Final = {"ending": ENDINGS}
+LABELS: Final = {"ending": ENDINGS}
 Task: TypeAlias = "tuple[cases.KillCase, RobotConfig]"
 
 EXAMPLES: Final = """
@@ -88,7 +88,7 @@ def _run_all(
     )
     finished = study.run(
         study.Study(
-            "kill", TABLE, columns, WORDS, inputs, rows_begin, args.n, JOB,
+            "kill", TABLE, columns, LABELS, inputs, rows_begin, args.n, JOB,
             f"{_command(args)} --n {args.n}",
         ),
         tasks, args.out, executor, console,

@@ -41,7 +41,7 @@ TABLE: Final = "latency.csv"
 CODE: Final = code_of("tools.studies.sweeps.latency_trial")
 """What decides how a trial comes out."""
 COLUMNS_OUT: Final = LatencyResult.__struct_fields__
-WORDS: Final = {"control": frozenset(CONTROLS), "ending": ENDINGS}
+LABELS: Final = {"control": frozenset(CONTROLS), "ending": ENDINGS}
 Task: TypeAlias = "tuple[LatencyTrial, RobotConfig]"
 
 EXAMPLES: Final = """
@@ -186,7 +186,7 @@ def _run_all(
     )  # fmt: skip
     finished = study.run(
         study.Study(
-            "latency", TABLE, columns, WORDS, inputs, drawn, len(trials), JOB,
+            "latency", TABLE, columns, LABELS, inputs, drawn, len(trials), JOB,
             f"{_command(args)} --trials {args.trials}",
         ),
         lambda done: [(t, robots[t.control]) for t in trials if t.number not in done],
@@ -211,13 +211,13 @@ def _run_one(
     trial = trials[args.only]
     robot = robot_of(robot, trial.control)
     study.show(f"Trial {trial.number}", row_of(trial), console)
-    facts = {"lockstep": f"{_command(args)} --only {trial.number}", "control": trial.control}
+    metadata = {"lockstep": f"{_command(args)} --only {trial.number}", "control": trial.control}
     return run_alone(
         partial(run_trial, trial, robot),
         trial.scenario(robot),
         robot,
         args.out,
-        facts,
+        metadata,
         console,
         plant_of(trial),
     )

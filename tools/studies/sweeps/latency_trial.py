@@ -262,19 +262,19 @@ def run_trial(
         after_fall_s: time to continue after a fall; measurement ends with the fall.
     """
     impaired_from_s = trial.draw.impaired_from_s
-    ear = LatencyRecorder(record, impaired_from_s)
-    fleet = fleet_of(trial, robot, ear)
+    monitor = LatencyRecorder(record, impaired_from_s)
+    fleet = fleet_of(trial, robot, monitor)
     rows: list[SimTruth] = []
     for row in that_count(fleet.run(), impaired_from_s, watch, after_fall_s):
         rows.append(row)
-        ear.fallen = row.fallen
-    return measure(rows, fleet.events, ear, robot)
+        monitor.fallen = row.fallen
+    return measure(rows, fleet.events, monitor, robot)
 
 
 def measure(
     rows: Sequence[SimTruth],
     events: Sequence[tuple[str, JointEvent]],
-    ear: LatencyRecorder,
+    monitor: LatencyRecorder,
     robot: RobotConfig,
 ) -> LatencyResult:
     """Return the figures of a run.
@@ -282,14 +282,14 @@ def measure(
     Args:
         rows: the world since the impairment began, to the fall if there was one.
         events: every change of mode since the start, by module.
-        ear: the other messages.
+        monitor: the other messages.
         robot: for the size of its feet.
     """
-    if not rows or ear.from_ns is None:
+    if not rows or monitor.from_ns is None:
         return LatencyResult(ending=Ending.FELL if rows else Ending.UNREADY)
     last = rows[-1]
     hand = np.array([row.operator_force[2] for row in rows])
-    within = [(m, e) for m, e in events if ear.from_ns <= e.t_ns <= last.t_ns]
+    within = [(m, e) for m, e in events if monitor.from_ns <= e.t_ns <= last.t_ns]
     since = [(m, e) for m, e in within if e.mode_after in (Mode.HOLD, Mode.TRACK)]
     into_hold = [m for m, e in since if e.mode_after == Mode.HOLD]
     return LatencyResult(
@@ -298,9 +298,9 @@ def measure(
         operator_peak_n=operator_peak_n(rows),
         operator_rms_n=float(np.sqrt(np.mean(hand * hand))),
         com_max_mm=com_max_mm(rows),
-        hold_share=hold_share(events, ear.from_ns, last.t_ns),
+        hold_share=hold_share(events, monitor.from_ns, last.t_ns),
         holds=max(into_hold.count(module) for module in MODULES),
-        torque_step_nm=ear.torque_step,
+        torque_step_nm=monitor.torque_step,
         hold_step_nm=max(event_steps_nm(event for _, event in since), default=0.0),
         sole_tilt_max_rad=sole_tilt_max_rad(rows),
     )

@@ -111,13 +111,13 @@ def run_case(
         watch: sees the world at its rate.
         after_fall_s: time to continue after a fall; measurement ends with the fall.
     """
-    ear = KillRecorder(record)
+    monitor = KillRecorder(record)
     fleet = Lockstep(
         robot,
         scenario_of(robot, case),
         network_of(case),
         seed=case.number,
-        record=ear,
+        record=monitor,
         plant=plant_of(case),
     )
     feet = FootLoads(fleet.world)
@@ -133,7 +133,7 @@ def run_case(
     for row in that_count(fleet.run(), 0.0, see, after_fall_s):
         rows.append(row)
         loads.append(min(feet.read()))
-    return measure(case, rows, loads, fleet.events, ear, robot)
+    return measure(case, rows, loads, fleet.events, monitor, robot)
 
 
 class FootLoads:
@@ -164,7 +164,7 @@ def measure(
     rows: list[SimTruth],
     loads: list[float],
     events: list[tuple[str, JointEvent]],
-    ear: KillRecorder,
+    monitor: KillRecorder,
     robot: RobotConfig,
 ) -> KillResult:
     """Return the figures of a run.
@@ -174,7 +174,7 @@ def measure(
         rows: the world since the scenario's start, or the fall before it.
         loads: of the lighter foot, at each row, N.
         events: every change of mode, by module.
-        ear: the other messages.
+        monitor: the other messages.
         robot: for the size of its feet.
     """
     if not rows or rows[0].scenario_s < 0.0:
@@ -182,14 +182,14 @@ def measure(
     last = rows[-1]
     figures = _before([row for row in rows if row.scenario_s < case.kill_s])
     after = [row for row in rows if row.scenario_s >= case.kill_s]
-    if after and ear.kill_ns is not None:
-        figures |= _after(after) | _handover(events, ear.kill_ns)
+    if after and monitor.kill_ns is not None:
+        figures |= _after(after) | _handover(events, monitor.kill_ns)
         figures["foot_load_min_n"] = min(loads[-len(after) :])
-    if ear.status is not None:
-        figures["kill_margin"] = ear.status.margin
-        figures["kill_margin_onboard"] = ear.status.margin_onboard
+    if monitor.status is not None:
+        figures["kill_margin"] = monitor.status.margin
+        figures["kill_margin_onboard"] = monitor.status.margin_onboard
     start_ns = rows[0].t_ns
-    until_ns = ear.kill_ns if ear.kill_ns is not None else rows[-1].t_ns
+    until_ns = monitor.kill_ns if monitor.kill_ns is not None else rows[-1].t_ns
     return KillResult(
         ending=ending_of(last, case.end_s, robot),
         fell_at_s=last.scenario_s if last.fallen else None,

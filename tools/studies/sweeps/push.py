@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     finished = study.run(
         study.Study(
-            "push", TABLE, columns, WORDS, inputs, rows_begin, len(trials), JOB, _command(args)
+            "push", TABLE, columns, LABELS, inputs, rows_begin, len(trials), JOB, _command(args)
         ),
         lambda done: [(trial, robot, plant) for trial in trials if trial.number not in done],
         args.out, executor, console,
@@ -203,7 +203,7 @@ class _AnyText(frozenset[str]):
         return True
 
 
-WORDS: Final = {
+LABELS: Final = {
     "pose": frozenset(POSES),
     "mode": frozenset(MODES),
     "held_part": _AnyText(),

@@ -39,7 +39,7 @@ def run_alone(
     scenario: Scenario,
     robot: RobotConfig,
     out: Path | None,
-    facts: dict[str, str],
+    metadata: dict[str, str],
     console: Console,
     true_plant: PlantConfig,
 ) -> int:
@@ -50,7 +50,7 @@ def run_alone(
         scenario: what happens.
         robot: ready to run.
         out: folder for its log; None: no log.
-        facts: for the log, as for `record_run`.
+        metadata: for the log, as for `record_run`.
         console: to print on.
         true_plant: that `run` simulates.
 
@@ -74,7 +74,7 @@ def run_alone(
                 scenario,
                 robot,
                 out,
-                facts,
+                metadata,
                 lambda record, look: run(record=record, watch=look, after_fall_s=AFTER_FALL_S),
                 watch,
                 true_plant,

@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     finished = study.run(
         study.Study(
-            "robust", TABLE, columns, WORDS, inputs, rows_begin, args.n, JOB,
+            "robust", TABLE, columns, LABELS, inputs, rows_begin, args.n, JOB,
             f"{_command(args)} --n {args.n}",
         ),
         lambda done: [(trial, robot) for trial in drawn if trial.number not in done],
@@ -238,7 +238,7 @@ def _rows(task: Task, outcome: RobustResult) -> list[dict[str, object]]:
     return [row_of(task[0]) | msgspec.structs.asdict(outcome)]
 
 
-WORDS: Final = {"ending": ENDINGS, "kind": frozenset(("squat", "crawl", "lean"))}
+LABELS: Final = {"ending": ENDINGS, "kind": frozenset(("squat", "crawl", "lean"))}
 JOB: Final = study.Job(_run_task, _name, _rows, lambda row: row["ending"] != Ending.STOOD)
 
 

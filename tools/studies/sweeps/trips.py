@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     inputs = study.inputs("trips", robot, CODE, grid=repr(grid), seed=str(args.seed))
     finished = study.run(
         study.Study(
-            "trips", TABLE, columns, WORDS, inputs, begins, len(grid), JOB, _command(args)
+            "trips", TABLE, columns, LABELS, inputs, begins, len(grid), JOB, _command(args)
         ),
         lambda done: [
             (number, trouble, plant, robot, args.seed)
@@ -156,7 +156,7 @@ class _TripNames(frozenset[str]):
         return isinstance(text, str) and set(text.split()) <= known
 
 
-WORDS: Final = {
+LABELS: Final = {
     "trouble": frozenset(TROUBLES),
     "on": frozenset(PLANTS),
     "led": frozenset(("True", "False")),

@@ -104,8 +104,8 @@ def test_messages_go_in_order_none_early_and_late_by_no_more_than_the_machine_is
     for at_s, recorded_s in zip(world.times_s, times_s, strict=True):
         due_s = (recorded_s - times_s[0]) / rate
         assert due_s - 1e-6 <= at_s <= due_s + slowest_ns / NS_PER_S + 1e-6
-    assert play.tally.put == len(times_s)
-    assert play.tally.late_max_ns <= slowest_ns + 1_000
+    assert play.stats.put == len(times_s)
+    assert play.stats.late_max_ns <= slowest_ns + 1_000
 
 
 def test_after_a_stall_what_is_late_goes_at_once_and_the_rest_on_time() -> None:
@@ -118,7 +118,7 @@ def test_after_a_stall_what_is_late_goes_at_once_and_the_rest_on_time() -> None:
         n for n, (at, due) in enumerate(zip(world.times_s, times_s, strict=True)) if at > due + 1e-6
     ]
     assert len(late) == pytest.approx(300, abs=3)
-    assert play.tally.late_max_ns == pytest.approx(300 * NS_PER_MS, abs=3 * NS_PER_MS)
+    assert play.stats.late_max_ns == pytest.approx(300 * NS_PER_MS, abs=3 * NS_PER_MS)
     assert world.times_s[-1] == pytest.approx(times_s[-1], abs=1e-6), "no drift"
 
 
@@ -185,7 +185,7 @@ def test_what_cannot_be_sent_is_counted() -> None:
     world = World()
     play = player(world, [0.0, 0.1], works=False)
     play.run()
-    assert (play.tally.put, play.tally.failed) == (0, 2)
+    assert (play.stats.put, play.stats.failed) == (0, 2)
 
 
 def test_what_the_display_raises_ends_the_play() -> None:

@@ -25,7 +25,7 @@ BY_NAME = {case.name: case for case in CASES}
 
 
 def alone(case: CrashCase) -> bool:
-    return len(case.crash) == 1 and case.chase is None
+    return len(case.crash) == 1 and case.triggered_kill is None
 
 
 @pytest.mark.parametrize("signal", ["KILL", "STOP"])
@@ -59,8 +59,8 @@ def test_pairs_all_joint_services_and_the_planner_coming_back_are_tried() -> Non
     assert sum(case.kind == "pair" and len(case.crash) == 2 for case in CASES) >= 10
     assert BY_NAME["kill-all-joints"].hit == set(MODULES)
     assert BY_NAME["kill-all-joints"].others == ()
-    chased = [case.chase for case in CASES if case.chase is not None]
-    assert {chase.service for chase in chased} == {"planner"}
+    chased = [case.triggered_kill for case in CASES if case.triggered_kill is not None]
+    assert {triggered_kill.service for triggered_kill in chased} == {"planner"}
 
 
 def test_the_short_run_has_one_of_each_kind_in_five_minutes() -> None:

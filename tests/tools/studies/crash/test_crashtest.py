@@ -18,7 +18,7 @@ from shared.exceptions import RunError
 from shared.robot.joints import MODULES
 from tests.tools.test_cli import assert_one_line_error, xrl
 from tools.fleet.supervisor_client import ServiceInfo
-from tools.runs.scenario_runner import Chase, ScenarioRunner
+from tools.runs.scenario_runner import ScenarioRunner, TriggeredKill
 from tools.studies.crash import report, runner
 from tools.studies.crash.cases import CASES, CrashCase, CrashVerdict, scenario_of
 from tools.studies.crash.outcome import CrashResult
@@ -105,8 +105,8 @@ def test_what_is_chased_is_killed_once_as_the_modules_track_again(
 ) -> None:
     session = SimpleNamespace(latest=lambda *_: None, publisher=lambda *_: None)
     scenario = scenario_of(BY_NAME["reengaging-first"])
-    chase = Chase("planner", modules=2, after_s=0.0)
-    conductor = ScenarioRunner(None, session, scenario, print, chase)  # type: ignore[arg-type]
+    triggered_kill = TriggeredKill("planner", modules=2, after_s=0.0)
+    conductor = ScenarioRunner(None, session, scenario, print, triggered_kill)  # type: ignore[arg-type]
     killed: list[object] = []
     monkeypatch.setattr(conductor, "_act", killed.append)
     for tracking, expected in ((6, 0), (3, 0), (0, 0), (1, 0), (2, 1), (6, 1)):
