@@ -1,8 +1,8 @@
 """Moving one axis of one module a little and back, by the drive's own loop: law and judgement.
 
-The law, the torque limiter and the drive's targets are the joint service's, so a sign that is right here is
-right there. Only the force differs: the drive's own current limit keeps every motor below the
-requested torque, whatever happens to this process. Pure; `jog_drive` has the clock and the drive.
+Law, torque limiter and drive targets are the joint service's, so a sign that is right here is right
+there. Only the force differs: the drive's own current limit keeps every motor below the requested
+torque, whatever happens to this process. Pure; `jog_drive` has the clock and the drive.
 """
 
 from __future__ import annotations

@@ -85,8 +85,8 @@ class PassThrough(DriveManager):
 
     It comes up as the shipped one, from the hoist through HOLD into TRACK. From the end of that
     blend on it has no law: the newest torque that has come goes to the drive until the next
-    one, however old. The torque limiter keeps only the torque diamond. An e-stop, or a drive that is
-    lost, is the shipped module's again.
+    one, however old. The torque limiter keeps only the torque diamond. After an e-stop, or with a
+    lost drive, the shipped module's law is in force again.
     """
 
     def __init__(self, config: RobotConfig, name: str) -> None:
