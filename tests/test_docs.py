@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import re
 import subprocess
 import sys
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +18,16 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 _PAGE = re.compile(r"docs/([\w/-]+\.md)(?:#([\w-]+))?")
 _PATH = re.compile(r"`((?:services|shared|tools|tests|deploy|docs|examples)/[\w./-]+?)/?`")
+_NAME = re.compile(r"(?<!`)`([A-Za-z_][\w.]*\w)(?:\(\))?`(?!`)")
+_ABROAD = {
+    *("odrv", "odrv0", "control_mode_updated", "flat_endpoints", "is_ready"),  # ODrive
+    "erase_configuration",
+    *("lowlatency", "wait_before_close"),  # Zenoh
+    *("corrupt", "gemodel", "paretonormal"),  # netem
+    *("camera", "settings", "ts"),  # Foxglove
+    *("x_limit_torque", "x_limit_torque__mutmut_3"),  # mutmut
+}
+"""Names in backticks that are other programs'."""
 _OLD = re.compile(r"design,?\s+(?:#\s+)?sections?\s+\d", re.IGNORECASE)
 
 
@@ -75,6 +87,37 @@ def test_every_file_that_a_page_names_exists() -> None:
         if not (ROOT / name).exists()
     ]
     assert missing == []
+
+
+def _known_names() -> set[str]:
+    """Return every name in code, in its strings other than docstrings, in data and in paths."""
+    known = set(_ABROAD)
+    for path in _tracked(".py", ".toml", ".c", ".js", ".json", ".sh", ".md", ".lock", ".rules", ""):
+        known.update(re.findall(r"\w+", str(path.relative_to(ROOT))))
+        if path.suffix == ".md":
+            continue
+        text = path.read_text(encoding="utf-8")
+        if path.suffix != ".py":
+            known.update(re.findall(r"\w+", text))
+            continue
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type == tokenize.NAME:
+                known.add(token.string)
+            elif token.type == tokenize.STRING and not token.string.startswith('"""'):
+                known.update(re.findall(r"\w+", token.string))
+    return known
+
+
+def test_every_name_in_backticks_exists() -> None:
+    known = _known_names()
+    stale = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in _tracked(".py", ".md")
+        if path.name != "CHANGELOG.md"
+        for name in _NAME.findall(path.read_text(encoding="utf-8"))
+        if not known.issuperset(name.split("."))
+    ]
+    assert stale == [], "renamed or removed"
 
 
 def test_the_pages_build_without_a_warning(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ class Mutation(Section, frozen=True, order=True):
     """What a mutant is."""
 
     function: str
-    """As mutmut names it, such as `services.joint.torque_limiter.x_gate`."""
+    """As mutmut names it, such as `services.joint.torque_limiter.x_limit_torque`."""
     was: str
     """The lines of code, stripped and joined by a space."""
     becomes: str
@@ -228,7 +228,7 @@ def change_of(name: str, shown: str) -> Mutation:
     """Return what a mutant changes.
 
     Args:
-        name: mutmut's, such as `services.joint.torque_limiter.x_gate__mutmut_3`.
+        name: mutmut's, such as `services.joint.torque_limiter.x_limit_torque__mutmut_3`.
         shown: its unified diff.
     """
     lines = [line for line in shown.splitlines() if not line.startswith(("---", "+++"))]

@@ -29,8 +29,8 @@ _PACKETS = 64  # a client that floods the link must not hold up the simulator
 class FibrePort:
     """The USB plug of one board.
 
-    While the board does not talk (`AxisBank.talks`: no power, booting, cable pulled) the plug
-    is out: every client loses the drive, and finds it again when it is back.
+    While the board does not respond (`AxisBank.is_responding`: no power, booting, cable pulled)
+    the plug is out: every client loses the drive, and finds it again when it is back.
 
     Raises:
         FleetError: the path cannot be listened on.

@@ -18,7 +18,7 @@ planner period, just before the sample of that period. Its rows are, in this ord
     W 12                          each target written but not yet in use, oldest first
 
 How many commands and targets are under way follows from the delays, see `state_size`.
-Units are SI (m, rad, s, N, N m) but for the bandwidths: those named `_hz` are in Hz, and the
+Units are SI (m, rad, s, N, N m) but for the bandwidths: those named _hz are in Hz, and the
 encoder bandwidth is in rad/s.
 
 Order of what falls on the same instant: planner sample, joint service, then drive step. A

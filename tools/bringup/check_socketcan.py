@@ -43,7 +43,7 @@ def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding
     Args:
         robot: its buses.
         root: of the file system; another one for tests.
-        links: of `ask_ip`.
+        links: of `query_ip`.
     """
     rows = []
     used = [robot.can[name] for name in robot.buses]

@@ -153,7 +153,7 @@ class CanLink:
         """Send messages of which none may be missing, in this order.
 
         A row of a dozen can be longer than the queue of the interface (ten frames, unless
-        set): the rest follows when there is room, within `ORDERS_MS`. They take the place
+        set): the rest follows when there is room, within `COMMANDS_MS`. They take the place
         of an order that is still waiting.
         """
         if self._bus is None:

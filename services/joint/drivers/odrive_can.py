@@ -1,7 +1,7 @@
 """One ODrive over CANSimple and python-can (docs/drives.md).
 
 The same code on the robot (socketcan) and in the demo (`xrl_unix`): only the configured
-interface and channel differ. It speaks to firmware 0.5 and 0.6 (`odrive_dialects`).
+interface and channel differ. It speaks to firmware 0.5 and 0.6 (`services.joint.drivers.firmware`).
 """
 
 from __future__ import annotations

@@ -68,9 +68,9 @@ class Frames:
 
     Attributes:
         torques: both input torques.
-        torques_anew: with the limits and modes that arming has sent.
-        rows: what goes out with a target, by `odrive_due.Row`, with axis0 first and with axis1
-            first: where a full queue has cut one off, the other axis is not to go without again.
+        first_torques: with the limits and modes that arming has sent.
+        rows: what goes out with a target, by `resend_policy.GainRow`, with axis0 first and with
+            axis1 first. After a full queue cut one axis off, the other is not cut off next.
             An axis's gains come right before the target that they belong to. Its stiffness is
             the product of both, and where they change by much (DAMP) pos_gain falls: it goes
             first, or the stiffness doubles in between. A mode that is set puts a 0.5 drive's

@@ -36,7 +36,7 @@ class Heard(NamedTuple):
     said: Sequence[RunEvent]
     """Actions on the run."""
     modes: Sequence[str]
-    """The modules at the end, as in `conductor.Snapshot`."""
+    """The modules at the end, as in `scenario_runner.LiveSnapshot`."""
     died: Sequence[str] = ()
     """Services that ended without a request."""
 
