@@ -5,6 +5,7 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
 stamp=$venv/xrl.stamp       # what the environment was made from; absent while it is being made
 half_made=$venv/xrl.making  # stands from the first to the last step of making it
+graphs=$venv/xrl-graphs/stamp  # what the law's graphs were translated into C from, where cc is
 
 say() { printf '%s\n' "deploy: $*" >&2; }
 die() { say "$*"; exit 1; }
@@ -52,14 +53,31 @@ make_environment() {
   rm -f "$half_made"
 }
 
+# The graphs' C is right while this stays the same; a library also carries its graph's hash.
+graphs_fingerprint() {
+  cat "$stamp" "$root"/services/planner/{symbolic,model,kinematics}.py "$root"/deploy/robot.toml \
+    "$root"/services/simulator/{drivetrain,plant}.py "$root"/tools/graph_libraries.py 2>/dev/null |
+    sha256sum || true
+}
+
+graphs_are_current() { [ "$(cat "$graphs" 2>/dev/null)" = "$(graphs_fingerprint)" ]; }
+
+# Speed only: what cannot be translated is said, and CasADi interprets it.
+translate_graphs() {
+  (cd "$root" && "$venv/bin/python" -m tools.graph_libraries) || say "the graphs stay interpreted"
+  mkdir -p "${graphs%/*}"
+  graphs_fingerprint >"$graphs"
+}
+
 # Make `.venv` from the lock file, or do nothing, quickly, if it is right already.
 # Two at once: the second waits. Stopped in the middle: the next one starts afresh.
 environment() {
-  is_current && return
+  is_current && graphs_are_current && return
   command -v flock >/dev/null || die "flock is missing (package util-linux)"
   exec 9<"$root"
   flock --nonblock 9 || { say "waiting for another script that is making .venv"; flock 9; }
   is_current || make_environment
+  graphs_are_current || translate_graphs
   exec 9<&-
 }
 

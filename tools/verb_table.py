@@ -49,7 +49,7 @@ VERBS: Final = (
     Verb("export", "copy a log with a 3-D scene in it, or write a viewer's layout"),
     Verb("resim", "run a log's services again and compare, bit for bit or changed"),
     Verb("whatif", "kill a service at each moment of a run: would it have stood?"),
-    Verb("bench", "measure how fast the law and lockstep run here"),
+    Verb("bench", "measure what each part of the fleet costs here, warm and cold"),
     Verb("stiffness", "print how stiff the body must be to balance"),
     Verb("down", "stop the fleet and leave nothing behind"),
 )

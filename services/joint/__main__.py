@@ -58,11 +58,11 @@ def main() -> int:
             traces=session.publisher(topics.JOINT_TRACE, JointTrace, module),
         )
         drive = open_drive(robot, module, arguments.run_dir, read_only=arguments.readonly)
-        last_state = None if arguments.readonly else RearmGuard(arguments.run_dir, module)
-        left = LastState.NOTHING if last_state is None else last_state.read()
+        rearm_guard = None if arguments.readonly else RearmGuard(arguments.run_dir, module)
+        last_state = LastState.NOTHING if rearm_guard is None else rearm_guard.read()
         neighbours = None if arguments.readonly else Neighbours(arguments.run_dir, module)
         loop = JointLoop(
-            robot, DriveManager(robot, module, left), drive, ports, last_state, neighbours
+            robot, DriveManager(robot, module, last_state), drive, ports, rearm_guard, neighbours
         )
         logger.info("up, %s%s", granted, ", read-only" if arguments.readonly else "")
         freeze_garbage()

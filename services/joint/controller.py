@@ -256,7 +256,7 @@ class JointController:
             return
         command = s.failsafe.command
         accepted = s.failsafe.outside is Outside.NOTHING
-        if command is not None and accepted and s.failsafe.usable(now_ns, self.timing):
+        if command is not None and accepted and s.failsafe.is_fresh(now_ns, self.timing):
             k_p, k_d = command.k_p, command.k_d  # as soft as the other five
         carried = pd_law.take_over(q, v, s.initial_torque, k_p, k_d)
         law.start(s.failsafe.mode, now_ns, carried)

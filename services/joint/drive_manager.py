@@ -161,20 +161,24 @@ class DriveManager:
         if mode is Mode.DISARMED and now_ns >= self._arm_at_ns:
             inhibit = self._inhibit(now_ns, reading)
             if inhibit is not None:
-                order = DriveCommand.ARM if inhibit is ArmingInhibit.NONE else DriveCommand.NOTHING
-                return DriveAction(result.event, order, _NO_TORQUE, None, inhibit)
-        order, torque, target = DriveCommand.NOTHING, _NO_TORQUE, None
+                command_out = (
+                    DriveCommand.ARM if inhibit is ArmingInhibit.NONE else DriveCommand.NOTHING
+                )
+                return DriveAction(result.event, command_out, _NO_TORQUE, None, inhibit)
+        command_out, torque, target = DriveCommand.NOTHING, _NO_TORQUE, None
         if mode is Mode.FAULT:
-            order = self._in_fault(now_ns)
+            command_out = self._in_fault(now_ns)
         elif not self.onboard:
-            order, torque = DriveCommand.TORQUE, motor_torque(result.tau, self._gear_ratio)
+            command_out, torque = DriveCommand.TORQUE, motor_torque(result.tau, self._gear_ratio)
         elif mode is not Mode.DISARMED:
             samples = controller.samples
-            order = DriveCommand.TARGET
-            left = self._fallback.law(controller.setpoint, mode)
-            target = self._law.target(now_ns, left, result.tau, samples.pos, samples.vel)
+            command_out = DriveCommand.TARGET
+            fallback_setpoint = self._fallback.law(controller.setpoint, mode)
+            target = self._law.target(
+                now_ns, fallback_setpoint, result.tau, samples.pos, samples.vel
+            )
             self._target = target
-        return DriveAction(result.event, order, torque, target, ArmingInhibit.NONE)
+        return DriveAction(result.event, command_out, torque, target, ArmingInhibit.NONE)
 
     def snapshot(self) -> DriveManagerState:
         """Return the state; `restore` continues from it."""
@@ -194,9 +198,9 @@ class DriveManager:
             gains_changed_ns=self._law.changed_ns,
         )
 
-    def restore(self, memory: DriveManagerState) -> None:
+    def restore(self, state: DriveManagerState) -> None:
         """Continue from a state, bit for bit."""
-        m = memory
+        m = state
         self.controller.restore(m.controller)
         self._law.gains, self._law.changed_ns = m.gains, m.gains_changed_ns
         self._estop, self._arm_at_ns, self._idle_at_ns = m.estop, m.arm_at_ns, m.idle_at_ns
@@ -248,7 +252,7 @@ class DriveManager:
         if not self.onboard:
             return msgspec.structs.replace(reading, status=DriveStatus.IDLE)
         failsafe, timing = self.controller.failsafe, self.controller.timing
-        led = self._estop or failsafe.usable(now_ns, timing)
+        led = self._estop or failsafe.is_fresh(now_ns, timing)
         self._holding = reading.torque is None or not led
         if self._holding:
             return msgspec.structs.replace(reading, status=DriveStatus.HOLDING)

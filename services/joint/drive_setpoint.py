@@ -25,8 +25,8 @@ from shared.clock import NS_PER_MS
 GAIN_CHANGE: Final = 0.02
 """Relative change of the gains below which the drive keeps its old ones: the difference goes in as
 torque, and the bus is spared."""
-FOLLOW_MS: Final = 8
-"""Time between two changes of the drive's gains, ns. In a blend they would change in every cycle,
+GAIN_UPDATE_MIN_MS: Final = 8
+"""Time between two changes of the drive's gains, ms. In a blend they would change in every cycle,
 and three modules on one CAN bus were 15 to 20 ms behind by its end; the difference goes in as
 torque."""
 POS_GAIN_MAX: Final = 400.0
@@ -76,7 +76,7 @@ class DriveSetpointLaw:
             vel: motor velocities of the sample, turn/s.
         """
         s = setpoint
-        if now_ns - self.changed_ns >= FOLLOW_MS * NS_PER_MS or not self.changed_ns:
+        if now_ns - self.changed_ns >= GAIN_UPDATE_MIN_MS * NS_PER_MS or not self.changed_ns:
             stiffness, damping = s.k_p[0] + s.k_p[1], s.k_d[0] + s.k_d[1]
             self._follow(now_ns, self._per_turn * stiffness, self._per_turn * damping)
         vel_gain = self._vel_gain

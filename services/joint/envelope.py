@@ -63,7 +63,7 @@ class Envelope:
             v: joint rates, rad/s.
             age_s: time by which the reference is extrapolated, s.
             settled: True if TRACK has blended in; before, a robot that was held off centre still
-        moves to the reference.
+                moves to the reference.
         """
         bounds, c = self._bounds, command
         if bounds is None:

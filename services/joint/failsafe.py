@@ -72,8 +72,9 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
     },
     Mode.FAULT: {},
 }
-"""(mode, event) -> (next mode, cause); an event that is not listed changes nothing. Only a restart
-leaves DAMP and FAULT: a robot under load never stiffens again by itself."""
+"""(mode, event) -> (next mode, cause); an event that is not listed changes nothing. Only a new
+service leaves DAMP and FAULT, and only if a person requested it (`services.joint.rearm_guard`): a
+robot under load never stiffens again by itself."""
 
 
 class Timing(msgspec.Struct, frozen=True):
@@ -191,7 +192,7 @@ class Failsafe(msgspec.Struct):
         old = now_ns - self.judged_ns > timing.max_command_age_ns
         return Outside.NOTHING if old else self.outside
 
-    def usable(self, now_ns: int, timing: Timing) -> bool:
+    def is_fresh(self, now_ns: int, timing: Timing) -> bool:
         """Return True if the newest accepted command is within the age limit."""
         return (
             self.command is not None
@@ -228,7 +229,7 @@ class Failsafe(msgspec.Struct):
             estop: the emergency stop is engaged.
             trip: one of `TRIPS`, or NONE.
         """
-        fresh = self.usable(now_ns, timing)
+        fresh = self.is_fresh(now_ns, timing)
         # a new session replaced a current one that went stale in this cycle
         broken = self.mode is Mode.TRACK and self.fresh_since_ns < 0
         if not fresh or self.mode is Mode.DISARMED:
@@ -276,7 +277,7 @@ class Failsafe(msgspec.Struct):
             return Refusal.TOO_OLD
         if command.session != self.session:
             # another session takes over only when no usable command of the present one is left
-            if command.session in self.retired or self.usable(now_ns, timing):
+            if command.session in self.retired or self.is_fresh(now_ns, timing):
                 return Refusal.FOREIGN_SESSION
         elif self.command is not None and command.seq <= self.command.seq:
             return Refusal.NOT_NEWER

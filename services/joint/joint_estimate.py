@@ -23,7 +23,7 @@ JUMP_TURNS: Final = 0.1
 JUMP_SPEED: Final = 10.0
 """turn/s that a motor may have gained since the last sample, which may be 100 ms old: a leg
 in free fall gains 8."""
-ODD_MAX: Final = 3
+REJECTED_MAX: Final = 3
 """Number of rejected samples in a row after which the position is lost."""
 
 _EVENT: Final = {
@@ -73,7 +73,7 @@ class JointEstimate(msgspec.Struct):
             self.rejected_count += 1
             if event is not Event.DRIVE_ARMED:
                 return event
-            return Event.POSITION_LOST if self.rejected_count >= ODD_MAX else Event.NONE
+            return Event.POSITION_LOST if self.rejected_count >= REJECTED_MAX else Event.NONE
         self.rejected_count = 0
         self.pos, self.vel, self.accepted_ns = reading.pos_turns, reading.vel_turns, self.t_ns
         self.q = joint_from_motor(reading.pos_turns, self.gear_ratio)

@@ -67,7 +67,7 @@ class JointLoop:
         module: DriveManager,
         drive: Drive,
         ports: JointPorts,
-        last_state: RearmGuard | None = None,
+        rearm_guard: RearmGuard | None = None,
         neighbours: Neighbours | None = None,
     ) -> None:
         """Take the parts of the service.
@@ -77,11 +77,11 @@ class JointLoop:
             module: decisions of a cycle.
             drive: the module's drive.
             ports: publishers and subscribers.
-            last_state: shared memory for the next service of this module, and for a local stop.
+            rearm_guard: shared memory for the next service of this module, and for a local stop.
             neighbours: shared memory of the six services on this host.
         """
         service = config.joint_service
-        self._last_state, self._neighbours = last_state, neighbours
+        self._rearm_guard, self._neighbours = rearm_guard, neighbours
         self._pendant = PendantWatch(service.pendant_ms)
         self._module = module
         self._drive = drive
@@ -106,8 +106,8 @@ class JointLoop:
             self._ports.traces.put(rest)
         if stop.interrupted or not self._module.leaves_holding:
             self._drive.idle()
-        if stop.interrupted and self._last_state is not None:
-            self._last_state.write(LastState.NOTHING)
+        if stop.interrupted and self._rearm_guard is not None:
+            self._rearm_guard.write(LastState.NOTHING)
 
     def cycle(self) -> None:
         """Run one cycle."""
@@ -128,8 +128,8 @@ class JointLoop:
             ports.states.put(controller.state(now))
         if step.event is not None:
             ports.events.put(step.event)
-        if self._last_state is not None:
-            self._last_state.write(module.last_state)
+        if self._rearm_guard is not None:
+            self._rearm_guard.write(module.last_state)
         trace = tracer.after(now, reading, command, estop, step, near)
         if trace is not None:
             ports.traces.put(trace)
@@ -138,10 +138,10 @@ class JointLoop:
 
     def _is_stopped_here(self, now: int) -> bool:
         """Return True if a local emergency stop is set, or the pendant is silent."""
-        last_state = self._last_state
-        if last_state is None:
+        guard = self._rearm_guard
+        if guard is None:
             return False
-        return self._pendant.is_lost(now, last_state.beats) or last_state.stop_requested
+        return self._pendant.is_lost(now, guard.beats) or guard.stop_requested
 
     def _write(self, step: DriveAction) -> None:
         """Send this cycle's command to the drive."""

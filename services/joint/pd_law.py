@@ -83,7 +83,7 @@ def freeze(setpoint: Setpoint, moving_share: float) -> Setpoint:
     Args:
         setpoint: the setpoint when the references froze.
         moving_share: fraction of v_ref and tau_coupled that is left, 1 .. 0. v_ref fades too,
-    because in the middle of a squat k_d v_ref is 10 N m, a blow if dropped at once.
+            because in the middle of a squat k_d v_ref is 10 N m, a blow if dropped at once.
     """
     s, share = setpoint, moving_share
     if share <= 0.0:

@@ -43,12 +43,12 @@ class LastState(IntEnum):
 
 
 def path_of(run_dir: Path, module: str) -> Path:
-    """Return where a module's will is kept."""
+    """Return the path of a module's rearm-guard file."""
     return run_dir / f"{module}.rearm"
 
 
 class RearmGuard:
-    """A module's will, in its run directory."""
+    """A module's rearm guard, a file in its run directory that processes map."""
 
     def __init__(self, run_dir: Path, module: str) -> None:
         """Open it, or make it; the directory is there."""

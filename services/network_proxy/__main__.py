@@ -42,7 +42,7 @@ def main() -> int:
     stop = process.StopFlag()
     granted = raise_priority(FIFO_PRIORITY)
     directions = {name: Direction(name, arguments.seed) for name in DIRECTIONS}
-    endpoints = [_place(pair, config, arguments.run_dir) for pair in PAIRS]
+    endpoints = [_proxy_endpoint(pair, config, arguments.run_dir) for pair in PAIRS]
     watch = SocketWatch()
     relay = Relay(endpoints, directions, watch, round(config.bus.lease_ms * NS_PER_MS))
     with bus.open_session(config, "network_proxy", arguments.run_dir) as session:
@@ -68,14 +68,14 @@ def main() -> int:
     return 0
 
 
-def _place(pair: Pair, config: RobotConfig, run_dir: Path) -> ProxyEndpoint:
+def _proxy_endpoint(pair: Pair, config: RobotConfig, run_dir: Path) -> ProxyEndpoint:
     """Stand between two processes.
 
     Raises:
         BusError: it is not possible there.
     """
     path = Path(expand(endpoint_through(pair), run_dir).removeprefix(_UNIX))
-    beyond = address_of(expand(config.bus.endpoints[pair.flushing], run_dir))
+    beyond = address_of(expand(config.bus.endpoints[pair.listens], run_dir))
     return ProxyEndpoint(pair, SocketListener(path), beyond)
 
 

@@ -66,10 +66,10 @@ def address_of(endpoint: str) -> Address:
     Raises:
         BusError: the endpoint is neither a UNIX socket nor TCP, or the host is unknown.
     """
-    kind, _, endpoint = endpoint.partition("/")
+    kind, _, rest = endpoint.partition("/")
     if kind == "unixsock-stream":
-        return Address(socket.AF_UNIX, endpoint)
-    host, _, port = endpoint.partition("?")[0].partition("#")[0].rpartition(":")
+        return Address(socket.AF_UNIX, rest)
+    host, _, port = rest.partition("?")[0].partition("#")[0].rpartition(":")
     if kind != "tcp" or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
         text = "cannot be stood before; unixsock-stream/PATH or tcp/HOST:PORT can"
         raise BusError(f"{endpoint}: {text}")

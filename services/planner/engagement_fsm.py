@@ -1,4 +1,4 @@
-"""Decides when all six modules track and when they hold (docs/architecture.md#age-rule).
+"""Decides when all six modules track and when they hold (docs/architecture.md#modes).
 
 All six modules track or none does. While one module's state is stale, or one module is not in
 TRACK, every command carries `hold`, so that no leg works against the other. Modules report `ready`
@@ -25,8 +25,8 @@ GRACE_NS = 150_000_000
 """ns; after `hold` is lifted, modules may take this long to report TRACK."""
 WAITS_NS: Final = tuple(round(s * NS_PER_S) for s in (0.0, 0.5, 1.5, 4.0, 10.0, 20.0, 30.0))
 """ns; shortest time from a drop-out to re-engaging, by the number of counted drop-outs. With these
-and `FORGET_NS`, no network causes more than six drop-outs in a minute. The first wait is zero,
-because one stall of the machine must not stop the operator."""
+and `FORGET_NS`, no network causes more than six drop-outs in a minute. Index 0: no drop-out
+is counted."""
 FORGET_NS: Final = 25 * NS_PER_S
 """ns; a time engaged without a drop-out that removes one from the count. With 20 s, seven drop-outs
 would fit into a minute."""

@@ -17,17 +17,17 @@ class Pair(NamedTuple):
     """Two processes with a link."""
 
     dials: str
-    flushing: str
+    listens: str
 
     @property
     def there(self) -> str:
         """Name of the direction from the one that dials."""
-        return f"{self.dials}->{self.flushing}"
+        return f"{self.dials}->{self.listens}"
 
     @property
     def back(self) -> str:
         """Name of the direction from the one that listens."""
-        return f"{self.flushing}->{self.dials}"
+        return f"{self.listens}->{self.dials}"
 
 
 PAIRS: Final = (
@@ -57,7 +57,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 
 def endpoint_through(pair: Pair) -> str:
     """Return where the network proxy listens for a pair: what `bus.endpoints` is without it."""
-    return f"unixsock-stream/{{run}}/through-{pair.dials}-{pair.flushing}.zenoh"
+    return f"unixsock-stream/{{run}}/through-{pair.dials}-{pair.listens}.zenoh"
 
 
 def directions_of(link: str, file: str = "--link", key: str = "link") -> tuple[str, ...]:

@@ -28,7 +28,7 @@ joints are controlled on old samples.
 GAINS_HZ: Final = 10.0
 """How often the onboard loop's gains go out even if they stand still."""
 BLEND_HZ: Final = 125.0
-"""And while they blend: `FOLLOW_MS` of `services.joint.drive_setpoint`."""
+"""And while they blend: `GAIN_UPDATE_MIN_MS` of `services.joint.drive_setpoint`."""
 LOADCELL_FRAMES: Final = 3
 """To a sample of the harness sensor."""
 

@@ -88,6 +88,14 @@ Stiffness6 = tuple[
     Annotated[float, Range(0.0, 1e5, "N m/rad")],
     Annotated[float, Range(0.0, 1e5, "N m/rad")],
 ]
+Damping6 = tuple[
+    Annotated[float, Range(0.0, 1e5, "N s/m")],
+    Annotated[float, Range(0.0, 1e5, "N s/m")],
+    Annotated[float, Range(0.0, 1e5, "N s/m")],
+    Annotated[float, Range(0.0, 1e5, "N m s/rad")],
+    Annotated[float, Range(0.0, 1e5, "N m s/rad")],
+    Annotated[float, Range(0.0, 1e5, "N m s/rad")],
+]
 Selection = Literal[0, 1]
 
 
@@ -104,7 +112,7 @@ class LawConfig(Section, frozen=True):
     """Gains and choices of the law (docs/law.md)."""
 
     K_p: Stiffness6
-    B_p: Stiffness6
+    B_p: Damping6
     K_0: Annotated[float, Range(0.0, 1e4, "N m/rad")]
     B_0: Annotated[float, Range(0.0, 1e3, "N m s/rad")]
     S: tuple[Selection, Selection, Selection, Selection, Selection, Selection]

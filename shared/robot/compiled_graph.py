@@ -1,6 +1,18 @@
-"""A CasADi graph with fixed memory: a call in a loop costs microseconds and allocates nothing."""
+"""A CasADi graph with fixed memory: a call in a loop costs microseconds and allocates nothing.
+
+CasADi interprets a graph. Where a C compiler is, `python -m tools.graph_libraries` translates the
+graphs of a robot into C once (`deploy/lib.sh` calls it), and every process loads what it finds.
+There is no second law: the C comes from the graph, and a library is kept only if it gives the same
+numbers to the last bit. Without libraries all runs, slower.
+"""
 
 from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from pathlib import Path
+from typing import Final
 
 import casadi as ca
 import numpy as np
@@ -8,16 +20,28 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+FOLDER: Final = Path(sys.prefix) / "xrl-graphs"
+"""Libraries of this environment, one for each graph."""
+SWITCH: Final = "XRL_GRAPHS"
+"""Environment variable; `interpreted` leaves every library aside."""
+
 
 class CompiledGraph:
     """A graph with fixed memory for its arguments and results.
 
     `arguments` are written, the object is called, `results` are read; all are arrays of
     the graph's shapes, column-major.
+
+    Attributes:
+        translated: True if C translated from the graph computes the results.
     """
 
     def __init__(self, function: ca.Function) -> None:
         """Take the graph."""
+        path = library_of(function)
+        self.translated = path.is_file() and os.environ.get(SWITCH) != "interpreted"
+        if self.translated:
+            function = ca.external(function.name(), str(path))
         buffer, self._call = function.buffer()
         self._buffer = buffer
         self.arguments = [_room(function.size_in(i)) for i in range(function.n_in())]
@@ -30,6 +54,16 @@ class CompiledGraph:
     def __call__(self) -> None:
         """Compute the results from the arguments."""
         self._call()
+
+
+def library_of(function: ca.Function) -> Path:
+    """Return the path of a graph's library, whether it was built or not.
+
+    Its name is a hash of the graph with all its constants and of CasADi's version: another robot or
+    another law has another library.
+    """
+    content = f"{ca.CasadiMeta.version()}\n{function.serialize()}"
+    return FOLDER / f"{function.name()}-{hashlib.sha256(content.encode()).hexdigest()[:32]}.so"
 
 
 def _room(shape: tuple[int, int]) -> Array:

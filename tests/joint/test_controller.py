@@ -210,7 +210,7 @@ def test_a_new_session_in_track_makes_no_step_in_the_torque(bench: Bench) -> Non
     bench.to_track()
     bench.run(24)
     assert bench.mode is Mode.TRACK
-    assert not bench.controller.failsafe.usable(
+    assert not bench.controller.failsafe.is_fresh(
         bench.now_ns + bench.cycle_ns, bench.controller.timing
     )
     taus = [bench.controller.tau]

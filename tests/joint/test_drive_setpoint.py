@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from services.joint.differential import joint_torque, motor_from_joint, motor_torque
 from services.joint.drive_setpoint import (
-    FOLLOW_MS,
     GAIN_CHANGE,
+    GAIN_UPDATE_MIN_MS,
     INPUT_TORQUE_SHARE,
     POS_GAIN_MAX,
     DriveSetpointLaw,
@@ -113,7 +113,7 @@ def test_small_changes_of_the_gains_are_not_sent_and_large_ones_are() -> None:
     law = DriveSetpointLaw(N, VEL_LIMIT)
     sent = []
     for at, share in enumerate((1.0, 1.0 + 0.9 * GAIN_CHANGE, 1.0 + 1.1 * GAIN_CHANGE)):
-        now_ns = NOW + at * FOLLOW_MS * NS_PER_MS
+        now_ns = NOW + at * GAIN_UPDATE_MIN_MS * NS_PER_MS
         k_p = (500.0 * share, 700.0 * share)
         setpoint = Setpoint(ZERO, ZERO, ZERO, ZERO, k_p, (5.0, 7.0))
         sent.append(law.target(now_ns, setpoint, ZERO, ZERO, ZERO).pos_gain)
@@ -133,7 +133,7 @@ def test_in_a_blend_the_gains_change_at_most_every_few_ms_and_in_the_end_they_ar
         if (target.pos_gain, target.vel_gain) != before:
             before = (target.pos_gain, target.vel_gain)
             changed.append(cycle)
-    assert min(np.diff(changed)) * CYCLE_NS == FOLLOW_MS * NS_PER_MS
+    assert min(np.diff(changed)) * CYCLE_NS == GAIN_UPDATE_MIN_MS * NS_PER_MS
     after = DriveSetpointLaw(N, VEL_LIMIT)
     after.target(NOW, setpoint, ZERO, ZERO, ZERO)
     assert law.gains == pytest.approx(after.gains, rel=GAIN_CHANGE)
@@ -142,14 +142,14 @@ def test_in_a_blend_the_gains_change_at_most_every_few_ms_and_in_the_end_they_ar
 def test_gains_that_change_after_a_pause_change_at_once() -> None:
     law = DriveSetpointLaw(N, VEL_LIMIT)
     law.target(NOW, Setpoint(ZERO, ZERO, ZERO, ZERO, (900.0, 26.0), (60.0, 60.0)), ZERO, ZERO, ZERO)
-    later = NOW + FOLLOW_MS * NS_PER_MS
+    later = NOW + GAIN_UPDATE_MIN_MS * NS_PER_MS
     law.target(later, Setpoint(ZERO, ZERO, ZERO, ZERO, ZERO, (60.0, 60.0)), ZERO, ZERO, ZERO)
     assert law.gains[0] == 0.0
 
 
 def test_changing_gains_come_sooner_than_drifting_ones_are_sent_again() -> None:
     """Else each change would go out twice."""
-    assert FOLLOW_MS < DRIFT_MS
+    assert GAIN_UPDATE_MIN_MS < DRIFT_MS
 
 
 @pytest.mark.parametrize("k_d", [0.0, 1e-6])

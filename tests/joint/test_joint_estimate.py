@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
-from services.joint.joint_estimate import JUMP_SPEED, JUMP_TURNS, ODD_MAX, JointEstimate
+from services.joint.joint_estimate import JUMP_SPEED, JUMP_TURNS, REJECTED_MAX, JointEstimate
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 
@@ -61,15 +61,15 @@ def test_a_fast_motor_may_go_on_fast(samples: JointEstimate, vel: Pair, moved: P
 def test_a_few_odd_samples_in_a_row_and_the_position_is_lost(samples: JointEstimate) -> None:
     events = [
         samples.take(reading(T0 + (k + 1) * PERIOD, (5.0, -2.0)), armed=True)
-        for k in range(ODD_MAX)
+        for k in range(REJECTED_MAX)
     ]
-    assert events == [Event.NONE] * (ODD_MAX - 1) + [Event.POSITION_LOST]
+    assert events == [Event.NONE] * (REJECTED_MAX - 1) + [Event.POSITION_LOST]
     assert samples.pos == (1.0, -2.0)
 
 
 def test_odd_samples_that_are_not_in_a_row_are_only_left_out(samples: JointEstimate) -> None:
-    for k in range(4 * ODD_MAX):
-        pos = (5.0 if k % ODD_MAX else 1.0, -2.0)
+    for k in range(4 * REJECTED_MAX):
+        pos = (5.0 if k % REJECTED_MAX else 1.0, -2.0)
         event = samples.take(reading(T0 + (k + 1) * PERIOD, pos), armed=True)
         assert event is not Event.POSITION_LOST
     assert samples.pos == (1.0, -2.0)

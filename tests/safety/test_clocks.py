@@ -71,7 +71,7 @@ def bench_in(mode: Mode, robot: RobotConfig) -> Bench:
     bench.to_hold()
     bench.cycle(bench.fresh(session=RETIRED))
     bench.run(30)
-    assert not bench.controller.failsafe.usable(bench.now_ns, timing_of(robot))
+    assert not bench.controller.failsafe.is_fresh(bench.now_ns, timing_of(robot))
     bench.run(300, fresh=True, hold=mode is Mode.HOLD)
     assert bench.mode is mode
     return bench

@@ -49,7 +49,7 @@ def test_a_taken_command_is_usable_up_to_the_limit_to_the_nanosecond(
     off_ns: int, usable: bool, timing: Timing
 ) -> None:
     failsafe = taken(timing)
-    assert failsafe.usable(T0 + timing.max_command_age_ns + off_ns, timing) is usable
+    assert failsafe.is_fresh(T0 + timing.max_command_age_ns + off_ns, timing) is usable
 
 
 @pytest.mark.parametrize(("off_ns", "mode"), [(-1, Mode.TRACK), (0, Mode.TRACK), (1, Mode.HOLD)])
@@ -98,7 +98,7 @@ def test_a_packet_sent_again_after_seconds_is_refused(seconds: int, timing: Timi
     assert failsafe.offer(command(seq=5), now_ns, timing) is not Refusal.NONE
     # seconds in a stalled link: never seen before, and still too old
     assert failsafe.offer(command(seq=6), now_ns, timing) is Refusal.TOO_OLD
-    assert not failsafe.usable(now_ns, timing)
+    assert not failsafe.is_fresh(now_ns, timing)
 
 
 def test_a_foreign_session_is_refused_while_the_current_one_is_usable(timing: Timing) -> None:
@@ -233,7 +233,7 @@ def test_whatever_is_in_use_met_the_whole_rule_when_it_was_taken(
     for wait_ns, age_ns, session, seq, good in offers:
         now_ns += wait_ns
         before, current = failsafe.command, failsafe.session
-        was_usable = failsafe.usable(now_ns, timing)
+        was_usable = failsafe.is_fresh(now_ns, timing)
         k_p = (1.0, 1.0) if good else (1.0, math.inf)
         sent = command(echo_t_ns=now_ns - age_ns, session=session, seq=seq, k_p=k_p)
         rule = 0 <= age_ns <= timing.max_command_age_ns and good and session not in retired

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.drive_setpoint import FOLLOW_MS, DriveSetpointLaw
+from services.joint.drive_setpoint import GAIN_UPDATE_MIN_MS, DriveSetpointLaw
 from services.joint.drivers.resend_policy import GainRow, ResendPolicy
 from services.joint.pd_law import ZERO, Setpoint
 from shared.can.can_load import BLEND_HZ, BLEND_MAX, LOAD_MAX, BusLoad, bus_load, frame_bits
@@ -101,7 +101,7 @@ def is_at_limit(load: BusLoad, rate_hz: float) -> bool:
 
 
 def test_gains_blend_at_the_rate_that_the_joint_services_send_them() -> None:
-    assert BLEND_HZ == 1e3 / FOLLOW_MS
+    assert BLEND_HZ == 1e3 / GAIN_UPDATE_MIN_MS
 
 
 def test_with_torques_alone_no_gains_blend() -> None:

@@ -32,7 +32,7 @@ def root(tmp_path: Path) -> Path:
         check=True,
     )
     for name in ("python", "ruff", "mypy", "pytest"):
-        write_tool(tmp_path, name, f"echo {name} called")
+        write_tool(tmp_path, name, f"echo {name} called: $*")
     return tmp_path
 
 
@@ -78,7 +78,8 @@ def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
     assert said.count("ruff called") == 2
     assert said.count("mypy called") == 1
     assert said.count("pytest called") == 3
-    assert said.count("python called") == 1, "a sample of the mutants"
+    assert said.count("python called: -m tools.mutants --sample") == 1
+    assert said.count("python called: -m tools.graph_libraries") == 1
 
 
 @pytest.mark.parametrize("status", [1, 2], ids=["a failure", "a file that cannot be imported"])

@@ -14,9 +14,11 @@ from typing import Final
 
 from shared import priority
 from shared.config.robot_config import RobotConfig
+from shared.robot.compiled_graph import library_of
 from tools.bringup.check_socketcan import query_ip, socketcan_rows
 from tools.bringup.rows import Finding, FindingKind, judged, ok, warning, wrong
 from tools.fleet.process_table import is_simulated
+from tools.graph_libraries import graphs_of
 
 SUBJECT: Final = "machine"
 CPUS_MIN: Final = 2
@@ -53,6 +55,7 @@ def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
         _clock(root, emulated=emulated),
         _real_time(emulated=emulated),
         _swap(root, emulated=emulated),
+        _graphs(robot),
     ]
     if emulated:
         return rows
@@ -84,6 +87,17 @@ def _cpus() -> Finding:
         return warning(SUBJECT, "processors", str(count), f">= {CPUS_MIN}", fix)
     wanted = f">= {CPUS_MIN}; {CPUS_FOR_1_KHZ} for 1 kHz"
     return ok(SUBJECT, "processors", str(count), wanted)
+
+
+def _graphs(robot: RobotConfig) -> Finding:
+    """Check that the law's graphs run as C; interpreted they only cost more time."""
+    graphs = graphs_of(robot)
+    there = sum(library_of(graph).is_file() for graph in graphs)
+    found, wanted = f"{there} of {len(graphs)} in C", "all in C"
+    if there == len(graphs):
+        return ok(SUBJECT, "law's graphs", found, wanted)
+    fix = "with a C compiler `cc`: `python -m tools.graph_libraries --config FILE`"
+    return warning(SUBJECT, "law's graphs", found, wanted, fix)
 
 
 def _governor(root: Path, *, emulated: bool) -> Finding:

@@ -8,22 +8,26 @@ from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_typ
 
 import msgspec
 
+from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.config.toml_file import Range
 from shared.process import DEFAULT_CONFIG
+from shared.robot.gain_schedule import inputs_of
 from tools.reference.field_docs import field_docs, one_line, summary
 
 _INTRODUCTION: Final = """\
 # The robot file
 
 `deploy/robot.toml` holds the whole robot; `--config FILE` names another one. An unknown key or an
-impossible value is refused with the file, the key, the value and what would be right. Masses,
-lengths, limits, `K_p` and `[certificate]` also enter the gain schedule beside the file: after a
-change of these run `xrl gains`. `assumed` lists the values that the paper does not give; measure
-them on your robot and take them off the list.
+impossible value is refused with the file, the key, the value and what would be right. `assumed`
+lists the values that the paper does not give; measure them on your robot and take them off the
+list.
 
 A unit of `1` is a plain number. *Default* is what holds when the key is missing; a key without a
 default must be there. *Shipped* is the value in `deploy/robot.toml`.
+
+After a change of one of these run `xrl gains`, because the gain schedule beside the file depends on
+them: {inputs}.
 """
 _LONGEST: Final = 60
 """Characters of a shipped value that fit a cell."""
@@ -35,13 +39,28 @@ def page() -> str:
     """Return the page in Markdown."""
     text = DEFAULT_CONFIG.read_text(encoding="utf-8")
     shipped = _Shipped(text)
-    lines = [_INTRODUCTION, "## Top level", ""]
+    lines = [_INTRODUCTION.format(inputs=_schedule_inputs()), "## Top level", ""]
     lines += _table(RobotConfig, "", shipped)
     for name, hint in get_type_hints(RobotConfig, include_extras=True).items():
         section = _section(hint)
         if section is not None and name != _NOT_IN_THE_FILE:
             lines += _sections(section, name, shipped)
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _schedule_inputs() -> str:
+    """Return the keys on which the gain schedule depends; a whole table as `[table]`."""
+    config = config_file.load(DEFAULT_CONFIG)
+    keys: dict[str, list[str]] = {}
+    for key in inputs_of(config):
+        section, _, name = key.partition(".")
+        keys.setdefault(section, []).append(name)
+    shown = []
+    for section, names in keys.items():
+        whole = {field.name for field in msgspec.structs.fields(getattr(config, section))}
+        named = [f"`{section}.{name}`" for name in names]
+        shown += [f"`[{section}]`"] if whole.issubset(names) else named
+    return ", ".join(shown)
 
 
 class _Shipped:
@@ -53,6 +72,8 @@ class _Shipped:
         above: list[str] = []
         table = ""
         for line in _joined(text.splitlines()):
+            if re.match(r"#\s*[\w.]+\s*=", line):
+                continue  # a key that is commented out
             if line.startswith("#"):
                 above.append(line.lstrip("# "))
                 continue
@@ -136,8 +157,6 @@ def _see(prefix: str, name: str) -> str:
 
 
 def _meaning(doc: str, comment: str) -> str:
-    if doc and comment:
-        return f"{doc} {comment[0].upper()}{comment[1:]}"
     return doc or comment
 
 

@@ -1,59 +1,35 @@
-"""`xrl bench`: how fast the law and lockstep are on this machine.
+"""`xrl bench`: what each part of the fleet costs on this machine.
 
-Absolute times of a busy machine say little: each figure stands beside a yardstick that is
-measured in turn with it, and its ratio to that is what two versions are compared by.
+Absolute times of a busy machine say little. Two versions are compared by `--against`, which runs
+both in turn, or by the ratio of each figure to a yardstick that ran beside it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import time
-from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
-import msgspec
-import numpy as np
 from rich import box
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from services.planner.planner import Planner
-from shared.bus import topics
-from shared.bus.messages import JointState, Message, Tare, Wrench
-from shared.bus.topics import Topic
 from shared.config import files as config_file
-from shared.config import scenarios
-from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
+from shared.process import CHECKOUT
 from shared.robot import gain_schedule
-from shared.robot.joints import MODULES
-from tools.runs.experiment import scenario_file
-from tools.runs.lockstep import Lockstep
+from tools.bench import revisions, table
+from tools.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
+from tools.bench.table import Row
+from tools.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
+from tools.bench.worker import Round
 from tools.verb_table import Subparsers, add_config, add_verb
 
-TICK_US: Final = 500.0
-SPEED: Final = 3.0
-"""Targets of docs/results.md#targets: planner tick, median; lockstep, in times of real time."""
-TICKS: Final = 750
-"""Ticks of a recorded squat: 3 s at 250 Hz, on the way down and up."""
-YARDSTICK_CALLS: Final = 20
-
-
-class Figure(NamedTuple):
-    """One line of the table."""
-
-    what: str
-    value: float
-    unit: str
-    spread: str
-    ratio: float
-    """To the yardstick measured in turn with it."""
-    target: str
-    ok: bool
+SPEEDS: Final = {LOCKSTEP: 10.0, LOCKSTEP_RECORDED: 7.0}
+"""Targets of docs/results.md#targets, times real time."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -63,12 +39,19 @@ def add_parser(subparsers: Subparsers) -> None:
         "bench",
         """
         xrl bench
+        xrl bench --against HEAD~1 --rounds 5
         xrl bench --rounds 9 --json bench.json
         """,
     )
     add_config(parser)
     parser.add_argument(
-        "--rounds", type=int, default=5, metavar="N", help="of every measurement, in turn (5)"
+        "--against",
+        metavar="REV",
+        help="measure a git revision too, in turn with this tree, and print the ratios; both run "
+        "in this environment",
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=3, metavar="N", help="of every measurement, in turn (3)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
     parser.add_argument("--strict", action="store_true", help="exit 1 if a target is missed")
@@ -78,148 +61,84 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print; with --strict 1 if a target is missed."""
     if args.rounds < 1:
         raise RunError(f"--rounds {args.rounds}: at least 1")
-    robot = config_file.load(args.config)
-    gain_schedule.require(robot, args.config)
+    gain_schedule.require(config_file.load(args.config), args.config)
     console = Console()
-    figures = measure(robot, args.rounds, console)
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in ("", "median", "10 .. 90 %", "/ yardstick", "target"):
-        table.add_column(column, justify="right" if column else "left", no_wrap=True)
-    for row in figures:
-        mark = "[green]ok[/]" if row.ok else "[yellow]missed[/]"
-        table.add_row(
-            row.what, f"{row.value:.3g} {row.unit}", row.spread, f"{row.ratio:.3g}",
-            f"{row.target} {mark}" if row.target else "",
-        )  # fmt: skip
-    console.print(table)
+    rounds, others = measure(args.config.resolve(), args.against, args.rounds, console)
+    rows = rows_of(rounds, others)
+    console.print(_table(rows, args.against))
+    for done, tree in ((rounds, "here"), (others, args.against)):
+        for name, error in (done[0].missing if done else {}).items():
+            console.print(f"[yellow]{name}: not measured {tree}: {error}[/]")
     console.print(
-        f"yardstick: the time of {YARDSTICK_CALLS} solutions of a 12 x 12 system in NumPy, "
-        "measured in turn with each figure",
+        "Medians of the rounds' medians, us; CPU is the calling thread's. "
+        f"Cold: {SWEPT_BYTES >> 20} MiB are swept and {1e3 * ASLEEP_S:g} ms slept before a call. "
+        f"Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in NumPy.",
         style="dim",
     )
     if args.json is not None:
-        text = json.dumps([row._asdict() for row in figures], indent=2) + "\n"
+        text = json.dumps([row._asdict() for row in rows], indent=2) + "\n"
         args.json.write_text(text, encoding="utf-8")
-    return 1 if args.strict and not all(row.ok for row in figures) else 0
+    return 1 if args.strict and not all(row.ok for row in rows) else 0
 
 
-def measure(robot: RobotConfig, rounds: int, console: Console) -> list[Figure]:
-    """Return the figures; every round measures each thing once."""
-    scenario = scenarios.load(scenario_file("squat"))
-    record = recorded_inputs(robot, scenario)
-    law = msgspec.structs.replace(robot.law, split="diagonal")
-    paper = msgspec.structs.replace(robot, law=law)
-    ticks: dict[str, list[float]] = {"certified": [], "diagonal": []}
-    speeds: list[float] = []
-    yards: list[float] = []
-    for _ in track(range(rounds), "measuring", console=console, transient=True):
-        for name, variant in (("certified", robot), ("diagonal", paper)):
-            yards.append(yardstick_s())
-            ticks[name] += tick_times(variant, record)
-        yards.append(yardstick_s())
-        speeds.append(lockstep_speed(robot, scenario))
-    yard = float(np.median(yards))
-    return [
-        _timing("planner tick, certified", ticks["certified"], yard, TICK_US),
-        _timing("planner tick, diagonal", ticks["diagonal"], yard, None),
-        _speed("lockstep to real time", speeds, yard),
+def measure(
+    config: Path, against: str | None, rounds: int, console: Console
+) -> tuple[list[Round], list[Round]]:
+    """Return the rounds of this tree, and of the other revision in turn with them.
+
+    Args:
+        config: robot file; the other revision takes its own if this is the shipped one.
+        against: a git revision, or None.
+        rounds: how many.
+        console: for the progress.
+    """
+    here: list[Round] = []
+    there: list[Round] = []
+    with ExitStack() as stack:
+        other = stack.enter_context(revisions.unpacked(against)) if against is not None else None
+        its_config = config
+        if other is not None and config.is_relative_to(CHECKOUT):
+            its_config = other / config.relative_to(CHECKOUT)
+        for _ in track(range(rounds), "measuring", console=console, transient=True):
+            here.append(revisions.run_round(CHECKOUT, config))
+            if other is not None:
+                there.append(revisions.run_round(other, its_config))
+    return here, there
+
+
+def rows_of(rounds: list[Round], others: list[Round]) -> list[Row]:
+    """Return the table's rows: each part warm and cold, then lockstep."""
+    rows = [
+        table.timing(part.name, cold=cold, rounds=rounds, others=others, target=target)
+        for part in PARTS
+        for cold, target in ((False, part.warm_us), (True, part.cold_us))
     ]
+    rows += [
+        table.speed(name, rounds=rounds, others=others, target=target)
+        for name, target in SPEEDS.items()
+    ]
+    return [row for row in rows if row is not None]
 
 
-def recorded_inputs(robot: RobotConfig, scenario: Scenario) -> list[tuple[int, list[JointState]]]:
-    """Return the six states of every tick of a squat, with the time of the tick, ns."""
-    latest: dict[str, JointState] = {}
-    inputs: list[tuple[int, list[JointState]]] = []
-
-    def take(topic: Topic, module: str, message: Message) -> None:
-        if topic is topics.JOINT_STATE and isinstance(message, JointState):
-            latest[module] = message
-        elif topic is topics.PLANNER_STATUS and len(latest) == len(MODULES):
-            inputs.append((message.t_ns, [latest[name] for name in MODULES]))
-
-    fleet = Lockstep(robot, scenario, record=take)
-    for truth in fleet.run():
-        if truth.scenario_s < 0.0:
-            inputs.clear()
-        if len(inputs) >= TICKS:
-            break
-    return inputs[:TICKS]
+def _table(rows: list[Row], against: str | None) -> Table:
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    compared = ["/ yard"] if against is None else [against, "ratio"]
+    for column in ("", "CPU", "wall", *compared, "target"):
+        shown.add_column(column, justify="right" if column else "left", no_wrap=True)
+    for row in rows:
+        cells = [row.what, f"{_number(row.value)} {row.unit}", _number(row.wall)]
+        if against is None:
+            cells.append(_number(row.to_yardstick))
+        else:
+            cells += [_number(row.other), "" if row.ratio is None else f"{row.ratio:.2f}"]
+        sign = ">=" if row.unit == "x" else "<="
+        mark = "[green]ok[/]" if row.ok else "[yellow]missed[/]"
+        cells.append("" if row.target is None else f"{sign} {row.target:g} {mark}")
+        shown.add_row(*cells)
+    return shown
 
 
-def tick_times(robot: RobotConfig, inputs: Sequence[tuple[int, list[JointState]]]) -> list[float]:
-    """Return the time of each tick over recorded states, s: states in, messages out."""
-    planner = Planner(robot, session=1)
-    wrench = _leading()
-    times = []
-    for now_ns, states in inputs:
-        begin = time.perf_counter()
-        planner.receive_wrench(wrench, now_ns)
-        for module, state in enumerate(states):
-            planner.receive_state(module, state, now_ns)
-        planner.tick(now_ns)
-        planner.status(now_ns, 0.0)
-        times.append(time.perf_counter() - begin)
-    return times
-
-
-def lockstep_speed(robot: RobotConfig, scenario: Scenario) -> float:
-    """Return how many times faster than real time a squat runs on one core, without a log."""
-    fleet = Lockstep(robot, scenario)
-    begin, started_ns = time.process_time(), fleet.now_ns
-    for truth in fleet.run():
-        if truth.scenario_s >= scenario.keyframe[-1].at:
-            break
-    return (fleet.now_ns - started_ns) / 1e9 / (time.process_time() - begin)
-
-
-def yardstick_s() -> float:
-    """Return the time of the yardstick, s: the least of a few, so that a stall does not count."""
-    A = np.eye(12) + 0.01 * np.arange(144.0).reshape(12, 12) / 144.0
-    b = np.ones(12)
-
-    def once() -> float:
-        begin = time.perf_counter()
-        for _ in range(YARDSTICK_CALLS):
-            np.linalg.solve(A, b)
-        return time.perf_counter() - begin
-
-    return _least(once)
-
-
-def _least(measurement: Callable[[], float]) -> float:
-    return min(measurement() for _ in range(15))
-
-
-def _leading() -> Wrench:
-    """Return the wrench of a hand that leads: the harness is in the loop."""
-    zero = (0.0, 0.0, 0.0)
-    return Wrench(
-        t_ns=0, seq=0, force=(0.0, 0.0, -20.0), moment=zero, valid=True, saturated=False,
-        tare=int(Tare.DONE), age_ns=0,
-    )  # fmt: skip
-
-
-def _timing(what: str, times: list[float], yard: float, target_us: float | None) -> Figure:
-    low, median, high = np.percentile(np.array(times) * 1e6, [10, 50, 90])
-    return Figure(
-        what,
-        float(median),
-        "us",
-        f"{low:.0f} .. {high:.0f}",
-        float(median) * 1e-6 / yard,
-        "" if target_us is None else f"<= {target_us:g} us",
-        target_us is None or bool(median <= target_us),
-    )
-
-
-def _speed(what: str, speeds: list[float], yard: float) -> Figure:
-    low, median, high = np.percentile(speeds, [10, 50, 90])
-    return Figure(
-        what,
-        float(median),
-        "x",
-        f"{low:.1f} .. {high:.1f}",
-        1e-3 / float(median) / yard,
-        f">= {SPEED:g} x",
-        bool(median >= SPEED),
-    )
+def _number(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"

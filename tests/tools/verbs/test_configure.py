@@ -175,7 +175,7 @@ def test_ctrl_c_finishes_the_board_that_was_begun_and_touches_no_other(robot: Ro
     difference = [
         change
         for module, board in boards.items()
-        for change in changes.against_wanted(module, of_module(robot, MODULE), board)
+        for change in changes.changes_to_wanted(module, of_module(robot, MODULE), board)
     ]
     interrupts = Interrupts()
     with interrupts.kept():

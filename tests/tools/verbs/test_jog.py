@@ -76,7 +76,7 @@ def test_a_free_joint_follows_and_comes_back_and_is_idle(
     drive: BenchDrive, limited: RobotConfig, plan: JogPlan
 ) -> None:
     published: list[Sample] = []
-    outcome = jog(drive, limited, plan, told=published)
+    outcome = jog(drive, limited, plan, published=published)
     assert outcome.trouble == ""
     assert all(row.good for row in judge(outcome.samples, plan))
     assert drive.q == pytest.approx(START, abs=0.01)

@@ -1,0 +1,103 @@
+"""Graphs in C: they give the interpreter's numbers, and without them all runs."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import casadi as ca
+import pytest
+
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.robot import compiled_graph
+from shared.robot.compiled_graph import SWITCH, CompiledGraph, library_of
+from tools import graph_libraries
+from tools.graph_libraries import build, compare, graphs_of
+
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+
+
+def graph(factor: float = 2.0) -> ca.Function:
+    x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2, 2)
+    return ca.Function("wave", [x, y], [factor * ca.sin(x) / 3.0, y @ y + ca.dot(x, x)])
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(compiled_graph, "FOLDER", tmp_path)
+    monkeypatch.delenv(SWITCH, raising=False)
+    return tmp_path
+
+
+def called(one: CompiledGraph) -> list[bytes]:
+    one.arguments[0][:] = 0.1, -0.7, 2.5
+    one.arguments[1][:] = [[0.3, 0.1], [-0.4, 1e-3]]
+    one()
+    return [result.tobytes() for result in one.results]
+
+
+@needs_compiler
+def test_a_translated_graph_gives_the_interpreters_numbers_to_the_last_bit(folder: Path) -> None:
+    interpreted = CompiledGraph(graph())
+    assert not interpreted.translated
+    assert build(graph(), folder) == library_of(graph())
+    translated = CompiledGraph(graph())
+    assert translated.translated
+    assert called(translated) == called(interpreted)
+
+
+@needs_compiler
+def test_a_library_is_used_for_its_own_graph_alone(folder: Path) -> None:
+    build(graph(), folder)
+    assert not CompiledGraph(graph(factor=2.0000001)).translated
+
+
+@needs_compiler
+def test_the_switch_leaves_libraries_aside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    build(graph(), folder)
+    monkeypatch.setenv(SWITCH, "interpreted")
+    assert not CompiledGraph(graph()).translated
+
+
+def test_a_library_with_other_numbers_is_refused() -> None:
+    with pytest.raises(RunError, match="result 0 of the C library differs"):
+        compare(graph(), graph(factor=2.0 * (1.0 + 2.0**-52)))
+
+
+def test_a_graph_whose_results_are_hardly_ever_numbers_proves_nothing() -> None:
+    x = ca.SX.sym("x")
+    root = ca.Function("root", [x], [ca.sqrt(x - 10.0)])
+    with pytest.raises(RunError, match="0 of 200 results are numbers"):
+        compare(root, root)
+
+
+def test_without_a_compiler_it_says_so_and_succeeds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(shutil, "which", lambda _name: None)
+    assert graph_libraries.main([]) == 0
+    assert "all runs" in capsys.readouterr().err
+    with pytest.raises(RunError, match="no C compiler"):
+        build(graph())
+
+
+@needs_compiler
+def test_a_compiler_that_fails_leaves_nothing_behind(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(graph_libraries, "FLAGS", ("--no-such-flag",))
+    with pytest.raises(RunError, match="failed"):
+        build(graph(), folder)
+    assert list(folder.iterdir()) == []
+
+
+@needs_compiler
+def test_every_graph_of_the_shipped_robot_can_be_translated(
+    folder: Path, robot: RobotConfig
+) -> None:
+    found = graphs_of(robot)
+    assert {one.name() for one in found} >= {"sharing", "pose", "hessian", "stance", "drivetrain"}
+    for one in found:
+        build(one, folder)
+        assert library_of(one).stat().st_size > 0

@@ -1,0 +1,1 @@
+"""What each part of the fleet costs: warm and cold, two revisions in turn."""
