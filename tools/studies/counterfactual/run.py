@@ -45,14 +45,22 @@ class Counterfactual(msgspec.Struct, frozen=True):
 
 
 def scenario_from(scenario: Scenario, at_s: float, kill: tuple[str, ...], for_s: float) -> Scenario:
-    """Return the scenario from a time on: its pushes and faults to come, and these kills."""
+    """Return the scenario from a time on: its pushes and faults from then, and these kills.
+
+    A lasting fault that began before goes on from the first instant for the rest of its time.
+    """
+    lasting = (
+        msgspec.structs.replace(fault, at=at_s, duration=fault.at + fault.lasts_s - at_s)
+        for fault in scenario.fault
+        if fault.at < at_s < fault.at + fault.lasts_s
+    )
     return msgspec.structs.replace(
         scenario,
         duration=at_s + for_s,
         kill=tuple(Kill(service=name, at=at_s + KILL_AFTER_S) for name in kill),
         restart=(),
         push=tuple(push for push in scenario.push if push.at + push.duration > at_s),
-        fault=tuple(fault for fault in scenario.fault if fault.at >= at_s),
+        fault=(*lasting, *(fault for fault in scenario.fault if fault.at >= at_s)),
     )
 
 

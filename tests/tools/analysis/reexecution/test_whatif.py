@@ -11,7 +11,7 @@ from services.simulator.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Scenario
+from shared.config.scenarios import Fault, Scenario
 from shared.exceptions import RunError
 from tests.lockstep.runs import kill, push, run, still
 from tools.runs.network import BASE
@@ -19,7 +19,7 @@ from tools.runs.recorded_lockstep import simulate
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.studies.counterfactual.moments import Moment, moments_of
-from tools.studies.counterfactual.run import Task, counterfactual_of
+from tools.studies.counterfactual.run import Task, counterfactual_of, scenario_from
 from tools.verbs import whatif
 
 HARD = push(2.6, 150.0, 0.0, 0.0)
@@ -44,6 +44,20 @@ def log(robot: RobotConfig, scenario: Scenario, tmp_path_factory: pytest.TempPat
 @pytest.fixture(scope="module")
 def moments(log: RunLog) -> list[Moment]:
     return moments_of(log, robot_of(log), 0.5)
+
+
+def test_a_lasting_fault_that_began_before_the_moment_goes_on_for_the_rest_of_its_time() -> None:
+    faults = (
+        Fault(module="knee_left", kind="link_lost", at=1.0, duration=3.0),
+        Fault(module="hip_left", kind="link_lost", at=0.5, duration=1.0),
+        Fault(module="hip_right", kind="over_voltage", at=1.5),
+        Fault(module="ankle_left", kind="over_voltage", at=2.5),
+    )
+    rest = scenario_from(still(5.0, fault=faults), 2.0, (), 2.0)
+    assert rest.fault == (
+        Fault(module="knee_left", kind="link_lost", at=2.0, duration=2.0),
+        faults[3],
+    )
 
 
 def test_moments_are_as_far_apart_as_asked_and_have_everybody_in_them(
