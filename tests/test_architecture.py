@@ -110,6 +110,7 @@ LAWS = [
     "services/planner/hocca.py",
     "services/planner/inverse_kinematics.py",
     "services/planner/kinematics.py",
+    "services/planner/lu.py",
     "services/planner/planner.py",
     "services/planner/split.py",
     "services/planner/symbolic.py",

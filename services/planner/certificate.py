@@ -56,7 +56,9 @@ class Weakest(NamedTuple):
 
 def motor_mean(D: Array) -> Array:
     """Return D (12,) with each module's two stiffnesses replaced by their mean."""
-    return np.asarray(np.repeat(D.reshape(-1, 2).mean(axis=1), 2), float)
+    mean = np.empty(N_JOINTS)
+    mean[0::2] = mean[1::2] = 0.5 * (D[0::2] + D[1::2])
+    return mean
 
 
 class Certificate:
@@ -66,6 +68,7 @@ class Certificate:
         """Set the required stiffness."""
         self.K_required: Array = np.array(config.certificate.K_required)
         self._scale = 1.0 / np.sqrt(self.K_required)
+        self._scale_squared = np.outer(self._scale, self._scale)
         self._T_scaled: Array = np.zeros((N_JOINTS, 6))
         self._K_geo: Array = np.zeros((6, 6))
         self._pair: Array = np.zeros((2, N_JOINTS, 1))
@@ -114,4 +117,4 @@ class Certificate:
     def failsafe_stiffness(self, D: Array) -> Array:
         """Return K_fail (6, 6) of local stiffnesses D (12,): N/m, N/rad and N m/rad."""
         K = self._T_scaled.T @ (D[:, np.newaxis] * self._T_scaled) + self._K_geo
-        return np.asarray(K / np.outer(self._scale, self._scale), float)
+        return np.asarray(K / self._scale_squared, float)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
+from services.planner.lu import LuDecomposition
 from shared.robot.joints import JOINTS, N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
@@ -111,6 +112,8 @@ class InverseKinematics:
         self._system: Array = np.zeros((N_JOINTS, N_JOINTS))
         self._error: Array = np.zeros(N_JOINTS)
         self._damping = DAMPING**2 * np.eye(N_JOINTS)
+        self._normal: LuDecomposition | None = None
+        """Of A^T A with its damping, for `_system` A; None until it is needed."""
         self._evaluations = 0
 
     def solve(self, p_ref: Array, D_left: Array | None = None, iterations_max: int = 4) -> IkResult:
@@ -163,7 +166,9 @@ class InverseKinematics:
     def solve_rates(self, right_side: Array) -> Array:
         """Return x (12,) that solves [J; C] x = right side (12,), damped."""
         A = self._system
-        return np.asarray(np.linalg.solve(A.T @ A + self._damping, A.T @ right_side), float)
+        if self._normal is None:
+            self._normal = LuDecomposition(A.T @ A + self._damping)
+        return self._normal.solve(A.T @ right_side)
 
     def solve_from_anywhere(self, p_ref: Array) -> Reach:
         """Improve `q` as far as possible inside the joint limits, from any configuration.
@@ -306,6 +311,7 @@ class InverseKinematics:
         kinematics = self.kinematics
         kinematics.update(self.q, D_left)
         self._system[:6], self._system[6:] = kinematics.J, kinematics.C
+        self._normal = None
         np.subtract(p_ref, kinematics.p, out=self._error[:6])
         np.negative(kinematics.closure, out=self._error[6:])
         return float(np.abs(self._error).max())

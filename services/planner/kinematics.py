@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner import symbolic
+from services.planner.lu import LuDecomposition
 from services.planner.model import leg_geometry
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import GeometryConfig, LawConfig, MassConfig
@@ -135,6 +136,7 @@ def leg_loads(C: Array, tau: Array) -> tuple[float, float]:
 
 
 def _vertical_force(J_leg: Array, tau: Array) -> float:
-    if not abs(float(np.linalg.det(J_leg))) > DETERMINANT_MIN:
+    decomposition = LuDecomposition(J_leg)
+    if not decomposition.determinant > DETERMINANT_MIN:
         return math.nan
-    return float(np.linalg.solve(J_leg.T, tau)[2])
+    return float(decomposition.solve_transposed(tau)[2])
