@@ -1,4 +1,4 @@
-"""Runs rounds of the bench in this tree and in another revision's, in turn.
+"""Runs the bench in this tree and in another revision's, in turn.
 
 The other revision is unpacked into a temporary folder. This tree's `tools/bench` is laid over it,
 so both are measured by the same code.
@@ -16,13 +16,13 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import msgspec
 
 from shared.exceptions import RunError
 from shared.process import CHECKOUT
-from tools.bench.worker import Round
+from tools.bench.worker import Answer, Request
 
 _BENCH: Final = "tools/bench"
 
@@ -57,26 +57,52 @@ def unpacked(revision: str) -> Iterator[Path]:
         yield tree
 
 
-def run_round(tree: Path, config: Path) -> Round:
-    """Measure one round in a tree, in a process of its own.
+class Worker:
+    """A tree's bench in a process of its own. Use it in a `with` statement."""
 
-    Args:
-        tree: source tree to import from.
-        config: robot file.
+    def __init__(self, tree: Path, config: Path) -> None:
+        """Start it.
 
-    Raises:
-        RunError: the process failed.
-    """
-    environment = os.environ | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.bench.worker", str(config)],
-        check=False,
-        cwd=tree,
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        lines = done.stderr.strip().splitlines()[-1:] or ["it said nothing"]
-        raise RunError(f"{tree}: the bench ended with {done.returncode}: {lines[0]}")
-    return msgspec.json.decode(done.stdout, type=Round)
+        Args:
+            tree: source tree to import from.
+            config: robot file.
+        """
+        self.tree = tree
+        environment = os.environ | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed in __exit__
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tools.bench.worker", str(config)],
+            cwd=tree, env=environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+        )  # fmt: skip
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.communicate()
+        self._errors.close()
+
+    def ask(self, request: Request) -> Answer:
+        """Have it measure; the others wait meanwhile.
+
+        Raises:
+            RunError: the process ended.
+        """
+        assert self._process.stdin is not None  # noqa: S101 - both are pipes
+        assert self._process.stdout is not None  # noqa: S101
+        try:
+            self._process.stdin.write(msgspec.json.encode(request).decode() + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        if not line:
+            code = self._process.wait()
+            self._errors.seek(0)
+            last = (self._errors.read().strip().splitlines() or ["it said nothing"])[-1]
+            raise RunError(f"{self.tree}: the bench ended with {code}: {last}")
+        return msgspec.json.decode(line, type=Answer)

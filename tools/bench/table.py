@@ -1,4 +1,4 @@
-"""Rows of `xrl bench` from its rounds: medians, and the ratio to another revision. Pure."""
+"""Rows of `xrl bench` from its answers: medians, and the ratio to another revision. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from statistics import median
 from typing import NamedTuple
 
-from tools.bench.worker import Round
+from tools.bench.worker import Answer, Request
 
 
 class Row(NamedTuple):
@@ -15,17 +15,17 @@ class Row(NamedTuple):
     what: str
     unit: str
     value: float
-    """Median over the rounds of each round's median."""
+    """Median of the turns' medians: CPU time in us, or times real time."""
     wall: float | None
     """The same by the wall's clock; None: CPU time only."""
     spread: tuple[float, float]
-    """Least and most of the rounds."""
+    """Least and most of the turns."""
     to_yardstick: float
-    """Time in units of the yardstick that ran in the same process; a speed's is its inverse."""
+    """Time in units of the yardstick that ran right before it; a speed's is its inverse."""
     other: float | None = None
     """The other revision's."""
     ratio: float | None = None
-    """This over the other, round by round, in the median; below 1 this one is faster."""
+    """This time over the other's, turn by turn, in the median; below 1 this tree is faster."""
     target: float | None = None
 
     @property
@@ -36,51 +36,43 @@ class Row(NamedTuple):
         return self.value >= self.target if self.unit == "x" else self.value <= self.target
 
 
-def timing(
-    name: str, *, cold: bool, rounds: Sequence[Round], others: Sequence[Round], target: float | None
+def row_of(
+    request: Request, turns: Sequence[Answer], others: Sequence[Answer], target: float | None
 ) -> Row | None:
-    """Return the row of a part; None if this tree does not have it.
+    """Return a row; None if this tree does not have the part.
 
     Args:
-        name: of the part.
-        cold: of the cold calls.
-        rounds: of this tree.
+        request: what was measured.
+        turns: of this tree.
         others: of the other tree, in turn with them; empty: none.
-        target: us of CPU time, or None.
+        target: us of CPU time, or times real time; None: none.
     """
-    costs = [(done.cold if cold else done.warm).get(name) for done in rounds]
-    present = [cost for cost in costs if cost is not None]
-    if not present:
+    if any(turn.missing for turn in turns):
         return None
-    found = [(done.cold if cold else done.warm).get(name) for done in others]
-    cpu = [cost.cpu.p50 for cost in present]
-    past = [cost.cpu.p50 for cost in found if cost is not None]
+    values = [_value(turn) for turn in turns]
+    times = [_time_us(turn) for turn in turns]
+    present = [other for other in others if not other.missing]
+    walls = [turn.cost.wall.p50 for turn in turns if turn.cost is not None]
+    what = f"{request.name}, {'cold' if request.cold else 'warm'}" if walls else request.name
     return Row(
-        f"{name}, {'cold' if cold else 'warm'}",
-        "us",
-        median(cpu),
-        median(cost.wall.p50 for cost in present),
-        (min(cpu), max(cpu)),
-        median(us / done.yardstick_us for us, done in zip(cpu, rounds, strict=False)),
-        median(past) if past else None,
-        median(now / then for now, then in zip(cpu, past, strict=False)) if past else None,
+        what,
+        "us" if walls else "x",
+        median(values),
+        median(walls) if walls else None,
+        (min(values), max(values)),
+        median(us / turn.yardstick_us for us, turn in zip(times, turns, strict=True)),
+        median(map(_value, present)) if present else None,
+        median(us / _time_us(other) for us, other in zip(times, present, strict=True))
+        if present
+        else None,
         target,
     )
 
 
-def speed(
-    name: str, *, rounds: Sequence[Round], others: Sequence[Round], target: float | None
-) -> Row:
-    """Return the row of a speed of lockstep; arguments as for `timing`, the target in times."""
-    now, past = [done.speed[name] for done in rounds], [done.speed[name] for done in others]
-    return Row(
-        name,
-        "x",
-        median(now),
-        None,
-        (min(now), max(now)),
-        median(1e3 / (value * done.yardstick_us) for value, done in zip(now, rounds, strict=True)),
-        median(past) if past else None,
-        median(then / value for value, then in zip(now, past, strict=True)) if past else None,
-        target,
-    )
+def _value(turn: Answer) -> float:
+    return turn.cost.cpu.p50 if turn.cost is not None else turn.speed or 0.0
+
+
+def _time_us(turn: Answer) -> float:
+    """Return CPU time, us: of a speed, that of a millisecond."""
+    return turn.cost.cpu.p50 if turn.cost is not None else 1e3 / (turn.speed or 1.0)

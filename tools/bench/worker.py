@@ -1,7 +1,10 @@
-"""Measures one round in a process of its own: `python -m tools.bench.worker CONFIG`.
+"""Measures on request, in a process of its own: `python -m tools.bench.worker CONFIG`.
 
-It runs with the source tree in whose folder it is started, so `xrl bench --against` starts it in
-two trees in turn. Prints one JSON object, `Round`.
+It runs with the source tree in whose folder it is started. `xrl bench --against` starts one in each
+of two trees and lets them measure in turn, some tenths of a second each: a shared machine may be
+twice as slow from one minute to the next.
+
+Reads one `Request` a line, answers each with one `Answer`; ends with its input.
 """
 
 from __future__ import annotations
@@ -17,50 +20,79 @@ import msgspec
 from shared.config import files as config_file
 from shared.config import scenarios
 from tools.bench import parts
-from tools.bench.timing import Cost, measure, yardstick_us
+from tools.bench.timing import Cost, Repeated, measure, yardstick_us
 from tools.runs.experiment import scenario_file
 
-WARM_CALLS: Final = 750
-COLD_CALLS: Final = 200
+FIRST_CALLS: Final = 50
+"""Before a part is timed for the first time."""
 
 
-class Round(msgspec.Struct):
-    """What one process measured."""
+class Request(msgspec.Struct, frozen=True):
+    """What to measure: a part, or with no calls a speed of lockstep."""
 
-    yardstick_us: float = 0.0
-    warm: dict[str, Cost] = {}
-    cold: dict[str, Cost] = {}
-    speed: dict[str, float] = {}
+    name: str
+    cold: bool = False
+    calls: int = 0
+
+
+class Answer(msgspec.Struct, frozen=True):
+    """One of `cost`, `speed` and `missing`, beside the yardstick of the same instant."""
+
+    yardstick_us: float
+    cost: Cost | None = None
+    speed: float | None = None
     """Of lockstep, times real time."""
-    missing: dict[str, str] = {}
-    """Parts that this tree does not have as the bench needs them, and the error."""
+    missing: str = ""
+    """Why this tree cannot run the part as the bench needs it."""
 
 
-def run_round(config: Path) -> Round:
-    """Measure every part once, warm and cold, and lockstep."""
-    robot, scenario = config_file.load(config), scenarios.load(scenario_file("squat"))
-    done = Round(yardstick_us=yardstick_us())
-    recorded = parts.record(robot, scenario)
-    for part in parts.PARTS:
-        try:
-            with ExitStack() as stack:
-                repeated = part.prepare(recorded, stack)
-                measure(repeated, 50, cold=False)
-                done.warm[part.name] = measure(repeated, WARM_CALLS, cold=False)
-                done.cold[part.name] = measure(repeated, COLD_CALLS, cold=True)
-        except Exception as error:  # noqa: BLE001 - another revision's part may differ in any way
-            done.missing[part.name] = f"{type(error).__name__}: {error}"
-    for name, kept in ((parts.LOCKSTEP, False), (parts.LOCKSTEP_RECORDED, True)):
-        done.speed[name] = parts.lockstep_speed(robot, scenario, recorded=kept)
-    return done
+class Bench:
+    """Parts of one tree, prepared once."""
+
+    def __init__(self, config: Path, stack: ExitStack) -> None:
+        """Run a squat in virtual time and prepare every part with what it met.
+
+        Args:
+            config: robot file.
+            stack: keeps what parts have open.
+        """
+        robot, squat = config_file.load(config), scenarios.load(scenario_file("squat"))
+        recorded = parts.record(robot, squat)
+        self._parts: dict[str, Repeated] = {}
+        self._missing: dict[str, str] = {}
+        for part in parts.PARTS:
+            try:
+                self._parts[part.name] = part.prepare(recorded, stack)
+                measure(self._parts[part.name], FIRST_CALLS, cold=False)
+            except Exception as error:  # noqa: BLE001 - another revision may differ in any way
+                self._missing[part.name] = f"{type(error).__name__}: {error}"
+        self._runs = {
+            parts.LOCKSTEP: parts.LockstepRun(robot, squat, stack, recorded=False),
+            parts.LOCKSTEP_RECORDED: parts.LockstepRun(robot, squat, stack, recorded=True),
+        }
+
+    def answer(self, request: Request) -> Answer:
+        """Measure."""
+        yardstick = yardstick_us()
+        if request.name in self._runs:
+            return Answer(yardstick, speed=self._runs[request.name].speed())
+        if request.name in self._missing:
+            return Answer(yardstick, missing=self._missing[request.name])
+        cost = measure(self._parts[request.name], request.calls, cold=request.cold)
+        return Answer(yardstick, cost=cost)
 
 
 def main() -> int:
-    """Measure and print."""
+    """Answer requests until the input ends."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("config", type=Path)
     arguments = parser.parse_args()
-    sys.stdout.write(msgspec.json.encode(run_round(arguments.config)).decode() + "\n")
+    decode = msgspec.json.Decoder(Request).decode
+    with ExitStack() as stack:
+        bench = Bench(arguments.config, stack)
+        for line in sys.stdin:
+            sys.stdout.write(msgspec.json.encode(bench.answer(decode(line))).decode() + "\n")
+            sys.stdout.flush()
     return 0
 
 

@@ -23,12 +23,16 @@ from shared.process import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import bus, revisions, table
 from tools.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
+from tools.bench.revisions import Worker
 from tools.bench.table import Row
 from tools.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
 from tools.bench.transports.base import TRANSPORTS, installed
-from tools.bench.worker import Round
+from tools.bench.worker import Request
 from tools.verb_table import Subparsers, add_config, add_verb
 
+WARM_CALLS: Final = 200
+COLD_CALLS: Final = 60
+"""Calls of a turn: a few tenths of a second."""
 SPEEDS: Final = {LOCKSTEP: 10.0, LOCKSTEP_RECORDED: 7.0}
 """Targets of docs/results.md#targets, times real time."""
 
@@ -40,8 +44,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "bench",
         """
         xrl bench
-        xrl bench --against HEAD~1 --rounds 5
-        xrl bench --rounds 9 --json bench.json
+        xrl bench --against HEAD~1
+        xrl bench --rounds 25 --json bench.json
         xrl bench bus                                # the bus beside other transports
         """,
     )
@@ -54,7 +58,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "in this environment",
     )
     parser.add_argument(
-        "--rounds", type=int, default=3, metavar="N", help="of every measurement, in turn (3)"
+        "--rounds", type=int, default=9, metavar="N", help="turns of every measurement (9)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
     parser.add_argument("--strict", action="store_true", help="exit 1 if a target is missed")
@@ -135,12 +139,10 @@ def run_parts(args: argparse.Namespace) -> int:
     """Measure the parts and print; with --strict 1 if a target is missed."""
     gain_schedule.require(config_file.load(args.config), args.config)
     console = Console()
-    rounds, others = measure(args.config.resolve(), args.against, args.rounds, console)
-    rows = rows_of(rounds, others)
+    rows, missing = measure(args.config.resolve(), args.against, args.rounds, console)
     console.print(_table(rows, args.against))
-    for done, tree in ((rounds, "here"), (others, args.against)):
-        for name, error in (done[0].missing if done else {}).items():
-            console.print(f"[yellow]{name}: not measured {tree}: {error}[/]")
+    for line in missing:
+        console.print(f"[yellow]{line}[/]")
     console.print(
         "Medians of the rounds' medians, us; CPU is the calling thread's. "
         f"Cold: {SWEPT_BYTES >> 20} MiB are swept and {1e3 * ASLEEP_S:g} ms slept before a call. "
@@ -155,41 +157,38 @@ def run_parts(args: argparse.Namespace) -> int:
 
 def measure(
     config: Path, against: str | None, rounds: int, console: Console
-) -> tuple[list[Round], list[Round]]:
-    """Return the rounds of this tree, and of the other revision in turn with them.
+) -> tuple[list[Row], list[str]]:
+    """Return the table's rows, and what could not be measured.
 
     Args:
         config: robot file; the other revision takes its own if this is the shipped one.
-        against: a git revision, or None.
-        rounds: how many.
+        against: a git revision that measures in turn with this tree, or None.
+        rounds: turns of each.
         console: for the progress.
     """
-    here: list[Round] = []
-    there: list[Round] = []
     with ExitStack() as stack:
-        other = stack.enter_context(revisions.unpacked(against)) if against is not None else None
-        its_config = config
-        if other is not None and config.is_relative_to(CHECKOUT):
-            its_config = other / config.relative_to(CHECKOUT)
-        for _ in track(range(rounds), "measuring", console=console, transient=True):
-            here.append(revisions.run_round(CHECKOUT, config))
-            if other is not None:
-                there.append(revisions.run_round(other, its_config))
-    return here, there
-
-
-def rows_of(rounds: list[Round], others: list[Round]) -> list[Row]:
-    """Return the table's rows: each part warm and cold, then lockstep."""
-    rows = [
-        table.timing(part.name, cold=cold, rounds=rounds, others=others, target=target)
-        for part in PARTS
-        for cold, target in ((False, part.warm_us), (True, part.cold_us))
-    ]
-    rows += [
-        table.speed(name, rounds=rounds, others=others, target=target)
-        for name, target in SPEEDS.items()
-    ]
-    return [row for row in rows if row is not None]
+        workers = [stack.enter_context(Worker(CHECKOUT, config))]
+        if against is not None:
+            other = stack.enter_context(revisions.unpacked(against))
+            inside = config.is_relative_to(CHECKOUT)
+            its_config = other / config.relative_to(CHECKOUT) if inside else config
+            workers.append(stack.enter_context(Worker(other, its_config)))
+        plan = [
+            (Request(part.name, cold=cold, calls=COLD_CALLS if cold else WARM_CALLS), target)
+            for part in PARTS
+            for cold, target in ((False, part.warm_us), (True, part.cold_us))
+        ]
+        plan += [(Request(name), target) for name, target in SPEEDS.items()]
+        rows, missing = [], []
+        for request, target in track(plan, "measuring", console=console, transient=True):
+            turns = [[worker.ask(request) for worker in workers] for _ in range(rounds)]
+            here, *there = zip(*turns, strict=True)
+            row = table.row_of(request, here, there[0] if there else (), target)
+            rows += [] if row is None else [row]
+            for tree, answer in zip(("here", f"in {against}"), turns[0], strict=False):
+                if answer.missing and not request.cold:
+                    missing.append(f"{request.name}: not measured {tree}: {answer.missing}")
+    return rows, missing
 
 
 def _table(rows: list[Row], against: str | None) -> Table:

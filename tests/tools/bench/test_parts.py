@@ -11,11 +11,13 @@ import pytest
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.process import CHECKOUT
+from shared.process import CHECKOUT, DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.bench import parts, revisions, timing
 from tools.bench.parts import PARTS, Part, Recorded
+from tools.bench.revisions import Worker
 from tools.bench.timing import Repeated, measure
+from tools.bench.worker import Bench, Request
 from tools.runs.experiment import scenario_file
 
 
@@ -54,12 +56,15 @@ def test_each_cold_call_is_prepared_then_follows_a_sweep_and_a_sleep(
 
 
 @pytest.mark.parametrize("kept", [False, True])
-def test_lockstep_has_a_speed_with_and_without_a_record(
+def test_lockstep_has_a_speed_with_and_without_a_record_beyond_a_run_too(
     robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, kept: bool
 ) -> None:
-    monkeypatch.setattr(parts, "SECONDS", 0.2)
+    monkeypatch.setattr(parts, "SECONDS", 0.15)
+    monkeypatch.setattr(parts, "PIECE_S", 0.1)
     squat = scenarios.load(scenario_file("squat"))
-    assert parts.lockstep_speed(robot, squat, recorded=kept) > 0.1
+    with ExitStack() as stack:
+        run = parts.LockstepRun(robot, squat, stack, recorded=kept)
+        assert all(run.speed() > 0.05 for _ in range(3))
 
 
 @pytest.fixture
@@ -93,6 +98,27 @@ def test_an_unknown_revision_is_refused_by_name() -> None:
         pass
 
 
-def test_a_round_that_fails_is_an_error_with_its_last_line(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"the bench ended with 1: .*no\.toml"):
-        revisions.run_round(CHECKOUT, tmp_path / "no.toml")
+def test_a_bench_that_cannot_start_is_an_error_with_its_last_line(tmp_path: Path) -> None:
+    with (
+        Worker(CHECKOUT, tmp_path / "no.toml") as worker,
+        pytest.raises(RunError, match=r"the bench ended with 1: .*no\.toml"),
+    ):
+        worker.ask(Request("planner tick", calls=1))
+
+
+def test_a_bench_answers_for_each_part_and_names_one_it_cannot_run(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_recorded: Recorded, _stack: ExitStack) -> Repeated:
+        raise AttributeError("no such thing in this tree")
+
+    monkeypatch.setattr(parts, "SECONDS", 0.1)
+    monkeypatch.setattr(parts, "PARTS", (PARTS[2], Part("gone", broken)))
+    with ExitStack() as stack:
+        bench = Bench(DEFAULT_CONFIG, stack)
+        cost = bench.answer(Request(PARTS[2].name, calls=3)).cost
+        assert cost is not None
+        assert cost.cpu.p50 > 0.0
+        gone = bench.answer(Request("gone", calls=3))
+        assert gone.missing == "AttributeError: no such thing in this tree"
+        assert bench.answer(Request(parts.LOCKSTEP)).speed is not None
