@@ -47,6 +47,7 @@ class RobotConfig(Section, frozen=True):
 
     name: str
     assumed: tuple[str, ...]
+    """Keys whose values the paper does not give; measure them on your robot and remove them here."""
     mass: MassConfig
     geometry: GeometryConfig
     joint: JointConfig
