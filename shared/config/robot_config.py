@@ -47,7 +47,7 @@ class RobotConfig(Section, frozen=True):
 
     name: str
     assumed: tuple[str, ...]
-    """Keys whose values the paper does not give; measure them on your robot and remove them here."""
+    """Keys whose values the paper does not give; measure them, and remove them from this list."""
     mass: MassConfig
     geometry: GeometryConfig
     joint: JointConfig
