@@ -113,7 +113,7 @@ class InverseKinematics:
         self._error: Array = np.zeros(N_JOINTS)
         self._damping = DAMPING**2 * np.eye(N_JOINTS)
         self._normal: LuDecomposition | None = None
-        """Of A^T A with its damping, for `_system` A; None until it is needed."""
+        """Decomposition of A^T A with its damping, for `_system` A; None until it is needed."""
         self._evaluations = 0
 
     def solve(self, p_ref: Array, D_left: Array | None = None, iterations_max: int = 4) -> IkResult:

@@ -35,7 +35,7 @@ class BusFigures(NamedTuple):
     lost: float
     """Fraction of commands that were never taken."""
     cpu: float
-    """Of the seven processes, as a fraction of one core."""
+    """CPU time of the seven processes, as a fraction of one core."""
 
 
 def measure(transport: str, seconds: float) -> BusFigures:

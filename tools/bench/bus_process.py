@@ -42,7 +42,7 @@ class BusReport(msgspec.Struct):
     """CPU time of all its threads while it was measured."""
     wall_s: float = 0.0
     latency_us: list[float] = []
-    """Of each command: from the planner's put to the module's take."""
+    """Time of each command from the planner's put to the module's take."""
     cycles: int = 0
     missed: int = 0
     """Commands that one cycle could have taken, and a later one took."""

@@ -35,7 +35,7 @@ from tools.runs.recorded_lockstep import DRAIN_EVERY, Outbox
 SECONDS: Final = 3.0
 """Recorded of the squat: on the way down and up."""
 PIECE_S: Final = 0.5
-"""Of lockstep, in virtual time, for one figure."""
+"""Virtual time of a lockstep run that makes one figure, s."""
 BATCH: Final = 64
 """Messages that the recorder takes in one cycle of 12 ms."""
 MODULE: Final = "knee_right"
@@ -55,7 +55,7 @@ class Recorded(NamedTuple):
     ticks: list[tuple[int, list[JointState]]]
     """Time of each planner tick, ns, and the six states that it used."""
     cycles: list[JointInputs]
-    """Of `MODULE`'s service."""
+    """Cycles of `MODULE`'s service."""
     messages: list[tuple[Topic, str, Message]]
     """All that the recorder would get."""
     fleet: Lockstep

@@ -43,7 +43,7 @@ class Cost(msgspec.Struct, frozen=True):
     """Cost of one call."""
 
     cpu: Spread
-    """Of the calling thread."""
+    """CPU time of the calling thread."""
     wall: Spread
 
 

@@ -41,7 +41,7 @@ class Answer(msgspec.Struct, frozen=True):
     yardstick_us: float
     cost: Cost | None = None
     speed: float | None = None
-    """Of lockstep, times real time."""
+    """Speed of lockstep, times real time."""
     missing: str = ""
     """Why this tree cannot run the part as the bench needs it."""
 
