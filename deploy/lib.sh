@@ -55,18 +55,19 @@ make_environment() {
 
 # The graphs' C is right while this stays the same; a library also carries its graph's hash.
 graphs_fingerprint() {
-  cat "$stamp" "$root"/services/planner/{symbolic,model,kinematics}.py "$root"/deploy/robot.toml \
-    "$root"/services/simulator/{drivetrain,plant}.py "$root"/tools/graph_libraries.py 2>/dev/null |
-    sha256sum || true
+  { command -v cc; cat "$stamp" "$root"/services/planner/{symbolic,model}.py \
+    "$root"/services/simulator/{body,drivetrain,plant}.py "$root"/shared/robot/compiled_graph.py \
+    "$root"/tools/graph_libraries.py "$root"/deploy/robot.toml; } 2>/dev/null | sha256sum || true
 }
 
 graphs_are_current() { [ "$(cat "$graphs" 2>/dev/null)" = "$(graphs_fingerprint)" ]; }
 
 # Speed only: what cannot be translated is said, and CasADi interprets it.
 translate_graphs() {
-  (cd "$root" && "$venv/bin/python" -m tools.graph_libraries) || say "the graphs stay interpreted"
-  mkdir -p "${graphs%/*}"
-  graphs_fingerprint >"$graphs"
+  local from
+  from=$(graphs_fingerprint)
+  (cd "$root" && "$venv/bin/python" -m tools.graph_libraries && mkdir -p "${graphs%/*}" &&
+    printf '%s\n' "$from" >"$graphs") || say "the law's graphs stay interpreted: slower, else the same"
 }
 
 # Make `.venv` from the lock file, or do nothing, quickly, if it is right already.

@@ -43,7 +43,7 @@ class FlexibleDrivetrain:
             motor_from_joint: motor turns per joint angle (12, 12), turns/rad.
             dt: step, s.
         """
-        self._graph = CompiledGraph(_step_graph(config, motor_from_joint, dt))
+        self._graph = CompiledGraph(step_graph(config, motor_from_joint, dt))
         self.theta, self.rate, *self._arguments = self._graph.arguments
         self._theta_next, self._rate_next, self._tau, self.damping = self._graph.results
 
@@ -69,7 +69,7 @@ class FlexibleDrivetrain:
         return self._tau
 
 
-def _step_graph(config: Drivetrain, motor_from_joint: Array, dt: float) -> ca.Function:
+def step_graph(config: Drivetrain, motor_from_joint: Array, dt: float) -> ca.Function:
     """Return (theta, w, tau_motor, q, q') -> (theta, w, tau_spring + b w, b): one step."""
     theta, rate, tau_motor, q, v = (ca.SX.sym(name, N_JOINTS) for name in "trmqv")
     k, b = config.stiffness, config.damping_s * config.stiffness

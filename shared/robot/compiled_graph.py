@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 FOLDER: Final = Path(sys.prefix) / "xrl-graphs"
 """Libraries of this environment, one for each graph."""
+FLAGS: Final = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+"""The compiler's. No fused multiply-add: it would round otherwise than CasADi's interpreter."""
 SWITCH: Final = "XRL_GRAPHS"
 """Environment variable; `interpreted` leaves every library aside."""
 
@@ -38,10 +40,9 @@ class CompiledGraph:
 
     def __init__(self, function: ca.Function) -> None:
         """Take the graph."""
-        path = library_of(function)
-        self.translated = path.is_file() and os.environ.get(SWITCH) != "interpreted"
-        if self.translated:
-            function = ca.external(function.name(), str(path))
+        translated = _translated(function)
+        self.translated = translated is not None
+        function = translated or function
         buffer, self._call = function.buffer()
         self._buffer = buffer
         self.arguments = [_room(function.size_in(i)) for i in range(function.n_in())]
@@ -59,11 +60,22 @@ class CompiledGraph:
 def library_of(function: ca.Function) -> Path:
     """Return the path of a graph's library, whether it was built or not.
 
-    Its name is a hash of the graph with all its constants and of CasADi's version: another robot or
-    another law has another library.
+    Its name is a hash of the graph with all its constants, of CasADi's version and the compiler's
+    flags: another robot or another law has another library.
     """
-    content = f"{ca.CasadiMeta.version()}\n{function.serialize()}"
+    content = f"{ca.CasadiMeta.version()}\n{FLAGS}\n{function.serialize()}"
     return FOLDER / f"{function.name()}-{hashlib.sha256(content.encode()).hexdigest()[:32]}.so"
+
+
+def _translated(function: ca.Function) -> ca.Function | None:
+    """Return a graph's translation; None if there is none, or it cannot be loaded."""
+    path = library_of(function)
+    if not path.is_file() or os.environ.get(SWITCH) == "interpreted":
+        return None
+    try:
+        return ca.external(function.name(), str(path))
+    except RuntimeError:
+        return None
 
 
 def _room(shape: tuple[int, int]) -> Array:

@@ -8,12 +8,18 @@ from pathlib import Path
 import casadi as ca
 import pytest
 
+from services.planner.planner import Planner
+from services.simulator.body import body_of
+from services.simulator.plant import PlantConfig
+from services.simulator.world import World
+from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot import compiled_graph
 from shared.robot.compiled_graph import SWITCH, CompiledGraph, library_of
 from tools import graph_libraries
 from tools.graph_libraries import build, compare, graphs_of
+from tools.runs.experiment import scenario_file
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
 
@@ -90,6 +96,42 @@ def test_a_compiler_that_fails_leaves_nothing_behind(
     with pytest.raises(RunError, match="failed"):
         build(graph(), folder)
     assert list(folder.iterdir()) == []
+
+
+@needs_compiler
+def test_a_library_that_cannot_be_loaded_is_left_aside_and_built_again(folder: Path) -> None:
+    library_of(graph()).write_bytes(b"")
+    one = CompiledGraph(graph())
+    assert not one.translated
+    build(graph(), folder)
+    assert CompiledGraph(graph()).translated
+
+
+@needs_compiler
+def test_a_folder_that_cannot_be_made_is_an_error_with_its_name(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match=r"wave: .*Not a directory"):
+        build(graph(), tmp_path / "file" / "graphs")
+
+
+@needs_compiler
+def test_planner_and_world_find_every_library_of_the_shipped_robot(
+    folder: Path, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for one in graphs_of(robot):
+        build(one, folder)
+    made: list[CompiledGraph] = []
+    original = CompiledGraph.__init__
+
+    def gather(self: CompiledGraph, function: ca.Function) -> None:
+        original(self, function)
+        made.append(self)
+
+    monkeypatch.setattr(CompiledGraph, "__init__", gather)
+    Planner(robot, session=1)
+    World(body_of(robot, PlantConfig()), scenarios.load(scenario_file("stand")))
+    assert len(made) > 5
+    assert all(one.translated for one in made)
 
 
 @needs_compiler

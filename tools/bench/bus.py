@@ -49,8 +49,10 @@ def measure(transport: str, seconds: float) -> BusFigures:
         RunError: a process failed, or no command arrived.
     """
     with tempfile.TemporaryDirectory(prefix="xrl-bus-") as folder:
-        processes = [_start(transport, name, Path(folder), seconds) for name in (*MODULES, PLANNER)]
+        processes: list[subprocess.Popen[str]] = []
         try:
+            names = (*MODULES, PLANNER)
+            processes.extend(_start(transport, name, Path(folder), seconds) for name in names)
             reports = [_report(transport, one, seconds) for one in processes]
         finally:
             for one in processes:

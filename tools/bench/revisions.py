@@ -25,6 +25,8 @@ from shared.process import CHECKOUT
 from tools.bench.worker import Answer, Request
 
 _BENCH: Final = "tools/bench"
+PATIENCE_S: Final = 10.0
+"""Time for a worker to end."""
 
 
 @contextmanager
@@ -49,12 +51,20 @@ def unpacked(revision: str) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="xrl-bench-") as name:
         tree = Path(name)
         with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
-            archive.extractall(tree, filter="data")
+            safe = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # from 3.11.4 on
+            archive.extractall(tree, **safe)  # type: ignore[arg-type]  # noqa: S202 - git's own
         shutil.rmtree(tree / _BENCH, ignore_errors=True)
         shutil.copytree(
             CHECKOUT / _BENCH, tree / _BENCH, ignore=shutil.ignore_patterns("__pycache__")
         )
+        if (tree / "tools/graph_libraries.py").is_file():
+            command = [sys.executable, "-m", "tools.graph_libraries"]
+            subprocess.run(command, cwd=tree, env=_environment(tree), check=False)
         yield tree
+
+
+def _environment(tree: Path) -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
 
 
 class Worker:
@@ -68,11 +78,10 @@ class Worker:
             config: robot file.
         """
         self.tree = tree
-        environment = os.environ | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed in __exit__
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tools.bench.worker", str(config)],
-            cwd=tree, env=environment, text=True,
+            cwd=tree, env=_environment(tree), text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
         )  # fmt: skip
 
@@ -81,9 +90,12 @@ class Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End the process."""
-        self._process.kill()
-        self._process.communicate()
+        """End the process; it removes its files once its input ends."""
+        try:
+            self._process.communicate(timeout=PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate()
         self._errors.close()
 
     def ask(self, request: Request) -> Answer:

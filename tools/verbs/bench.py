@@ -27,11 +27,13 @@ from tools.bench.revisions import Worker
 from tools.bench.table import Row
 from tools.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
 from tools.bench.transports.base import TRANSPORTS, installed
-from tools.bench.worker import Request
+from tools.bench.worker import READY, Request
 from tools.verb_table import Subparsers, add_config, add_verb
 
 WARM_CALLS: Final = 200
 COLD_CALLS: Final = 60
+ROUNDS: Final = 9
+BUS_ROUNDS: Final = 3
 """Calls of a turn: a few tenths of a second."""
 SPEEDS: Final = {LOCKSTEP: 10.0, LOCKSTEP_RECORDED: 7.0}
 """Targets of docs/results.md#targets, times real time."""
@@ -58,7 +60,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "in this environment",
     )
     parser.add_argument(
-        "--rounds", type=int, default=9, metavar="N", help="turns of every measurement (9)"
+        "--rounds", type=int, metavar="N", help="turns of every measurement (9; of a transport 3)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
     parser.add_argument("--strict", action="store_true", help="exit 1 if a target is missed")
@@ -83,15 +85,21 @@ def add_parser(subparsers: Subparsers) -> None:
         "--seconds", type=float, default=10.0, metavar="S", help="of each run, s (10)"
     )
     bus_parser.add_argument(
-        "--rounds", type=int, default=3, metavar="N", help="of every transport, in turn (3)"
+        "--rounds", type=int, default=argparse.SUPPRESS, metavar="N", help="of every transport (3)"
     )
-    bus_parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
+    bus_parser.add_argument(
+        "--json",
+        type=Path,
+        default=argparse.SUPPRESS,
+        metavar="FILE",
+        help="write the figures there too",
+    )
     bus_parser.set_defaults(bench=run_bus)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    if args.rounds < 1:
+    if args.rounds is not None and args.rounds < 1:
         raise RunError(f"--rounds {args.rounds}: at least 1")
     code: int = args.bench(args)
     return code
@@ -109,7 +117,9 @@ def run_bus(args: argparse.Namespace) -> int:
     console = Console()
     rounds = [
         [bus.measure(name, args.seconds) for name in names]
-        for _ in track(range(args.rounds), "measuring", console=console, transient=True)
+        for _ in track(
+            range(args.rounds or BUS_ROUNDS), "measuring", console=console, transient=True
+        )
     ]
     rows = [bus.median_of(column) for column in zip(*rounds, strict=True)]
     shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -139,7 +149,7 @@ def run_parts(args: argparse.Namespace) -> int:
     """Measure the parts and print; with --strict 1 if a target is missed."""
     gain_schedule.require(config_file.load(args.config), args.config)
     console = Console()
-    rows, missing = measure(args.config.resolve(), args.against, args.rounds, console)
+    rows, missing = measure(args.config.resolve(), args.against, args.rounds or ROUNDS, console)
     console.print(_table(rows, args.against))
     for line in missing:
         console.print(f"[yellow]{line}[/]")
@@ -161,7 +171,7 @@ def measure(
     """Return the table's rows, and what could not be measured.
 
     Args:
-        config: robot file; the other revision takes its own if this is the shipped one.
+        config: robot file; of one in this checkout the other revision takes its own version.
         against: a git revision that measures in turn with this tree, or None.
         rounds: turns of each.
         console: for the progress.
@@ -173,6 +183,8 @@ def measure(
             inside = config.is_relative_to(CHECKOUT)
             its_config = other / config.relative_to(CHECKOUT) if inside else config
             workers.append(stack.enter_context(Worker(other, its_config)))
+        for worker in workers:  # the machine is then this measurement's alone
+            worker.ask(READY)
         plan = [
             (Request(part.name, cold=cold, calls=COLD_CALLS if cold else WARM_CALLS), target)
             for part in PARTS
