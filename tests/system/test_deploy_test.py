@@ -82,6 +82,26 @@ def test_all_parts_are_run_and_success_is_exit_code_0(root: Path) -> None:
     assert said.count("python called: -m tools.graph_libraries") == 1
 
 
+@pytest.mark.parametrize("in_the_way", [False, True], ids=["it fails", "no place for libraries"])
+def test_graphs_that_cannot_be_translated_cost_speed_only(root: Path, in_the_way: bool) -> None:
+    body = "echo python called: $*"
+    if in_the_way:
+        (root / ".venv/xrl-graphs").write_text("")
+    else:
+        body += "; [[ $* != *graph_libraries* ]]"
+    write_tool(root, "python", body)
+    code, said = run(root)
+    assert code == 0
+    assert "the law's graphs stay interpreted" in said
+    again = run(root)[1]
+    assert "-m tools.graph_libraries" in again, "it is tried again"
+
+
+def test_translated_graphs_are_not_translated_again(root: Path) -> None:
+    run(root)
+    assert "graph_libraries" not in run(root)[1]
+
+
 @pytest.mark.parametrize("status", [1, 2], ids=["a failure", "a file that cannot be imported"])
 def test_failures_are_listed_last_and_the_other_parts_are_run(root: Path, status: int) -> None:
     write_tool(root, "mypy", "exit 1")
