@@ -147,8 +147,8 @@ def test_a_loop_runs_until_ctrl_c_and_then_reports_its_counts(
     assert "messages on 3 keys" in done.out
     assert "passes" in done.out
     assert "Traceback" not in done.out
-    assert [payload for _, payload in ear.heard] == [
-        row[1] for row in itertools.islice(itertools.cycle(rows), len(ear.heard))
+    assert [payload for _, payload in ear.received] == [
+        row[1] for row in itertools.islice(itertools.cycle(rows), len(ear.received))
     ]
 
 
@@ -210,7 +210,7 @@ def test_on_a_terminal_space_begins_right_steps_and_q_ends(
         os.close(terminal)
     assert os.waitstatus_to_exitcode(status) == 0, screen.decode()
     assert b"all sent" in screen
-    assert [payload for _, payload in ear.heard] == [row[1] for row in rows[: len(ear.heard)]]
+    assert [payload for _, payload in ear.received] == [row[1] for row in rows[: len(ear.received)]]
 
 
 def test_under_its_prefix_a_player_never_reaches_a_live_joint_service(
@@ -251,7 +251,7 @@ def test_with_no_live_drive_the_live_keys_are_played_until_one_comes_up(
     words = (log, "--prefix", "", "--wait", "60", "--loop")
     with listening(run_dir, f"xrl/{NAME}/**") as ear, playing(run_dir, *words) as process:
         assert ear.has(101)
-        assert {key for key, _ in ear.heard} == {row[0] for row in command_items()}
+        assert {key for key, _ in ear.received} == {row[0] for row in command_items()}
         with LiveJoint(run_dir):
             done = ended(process)
     assert done.code == 2

@@ -106,14 +106,14 @@ class Ear:
 
     def __init__(self, session: Session, expression: str) -> None:
         self._stream = session.stream([expression], capacity=1_000_000)
-        self.subscribers: list[tuple[str, bytes]] = []
+        self.received: list[tuple[str, bytes]] = []
 
     def until(self, enough: Callable[[], bool]) -> bool:
         deadline = time.monotonic() + PATIENCE_S
         while not enough():
             item = self._stream.take()
             if item is not None:
-                self.subscribers.append(item[:2])
+                self.received.append(item[:2])
             elif time.monotonic() > deadline:
                 return False
             else:
@@ -122,13 +122,13 @@ class Ear:
 
     def has(self, count: int) -> bool:
         """Return True once so many messages have come."""
-        return self.until(lambda: len(self.subscribers) >= count)
+        return self.until(lambda: len(self.received) >= count)
 
     def all(self, process: subprocess.Popen[str]) -> list[tuple[str, bytes]]:
         """Return what has come when the player has ended and nothing more comes."""
         assert self.until(lambda: process.poll() is not None)
         self.quiet()
-        return self.subscribers
+        return self.received
 
     def quiet(self) -> int:
         """Return how many messages have come, once no more do."""
@@ -136,9 +136,9 @@ class Ear:
         while time.monotonic() < quiet:
             item = self._stream.take()
             if item is not None:
-                self.subscribers.append(item[:2])
+                self.received.append(item[:2])
                 quiet = time.monotonic() + 0.5
-        return len(self.subscribers)
+        return len(self.received)
 
 
 @contextlib.contextmanager
