@@ -320,7 +320,9 @@ with open_session(robot, "planner", run_dir) as session:
             process.wait()
 
 
-def test_number_that_is_not_finite_is_refused_and_counted_by_the_sender(run_dir: Path) -> None:
+@pytest.fixture
+def ankle(run_dir: Path) -> Iterator[tuple[Session, Publisher[JointCommand], Latest[JointCommand]]]:
+    """Return the planner's session, its publisher and the ankle's subscriber, linked."""
     with (
         open_session(ROBOT, "ankle_right", run_dir) as joint,
         open_session(ROBOT, "planner", run_dir) as planner,
@@ -328,39 +330,45 @@ def test_number_that_is_not_finite_is_refused_and_counted_by_the_sender(run_dir:
         commands = joint.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
         publisher = planner.publisher(topics.JOINT_COMMAND, JointCommand, "ankle_right")
         assert wait_until(lambda: publisher.put(command(0)) and commands.take())
-        assert publisher.failed == 0
-        for bad in (math.nan, math.inf, -math.inf):
-            assert not publisher.put(command(1, q_phi=bad))
-        assert publisher.failed == 3
-        assert publisher.put(command(2))
-        later: list[int] = []
-
-        def good_one_came() -> bool:
-            later.extend(m.seq for m in [commands.take()] if m is not None)
-            return 2 in later
-
-        assert wait_until(good_one_came)
-        assert 1 not in later
-        assert commands.refused == 0
+        yield planner, publisher, commands
 
 
-def test_null_is_refused_and_counted_by_the_receiver(run_dir: Path) -> None:
-    with (
-        open_session(ROBOT, "ankle_right", run_dir) as joint,
-        open_session(ROBOT, "planner", run_dir) as planner,
-    ):
-        commands = joint.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
-        publisher = planner.publisher(topics.JOINT_COMMAND, JointCommand, "ankle_right")
-        assert wait_until(lambda: publisher.put(command(0)) and commands.take())
-        key = topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right")
-        planner._session.put(key, b'{"t_ns":0,"seq":1,"q_ref":[null,0.0]}')
-        planner._session.put(key, b"no json")
-        assert wait_until(lambda: commands.take() is None and commands.refused >= 1)
-        assert wait_until(lambda: publisher.put(command(2)) and commands.take())
+def test_number_that_is_not_finite_is_refused_and_counted_by_the_sender(
+    ankle: tuple[Session, Publisher[JointCommand], Latest[JointCommand]],
+) -> None:
+    _, publisher, commands = ankle
+    assert publisher.failed == 0
+    for bad in (math.nan, math.inf, -math.inf):
+        assert not publisher.put(command(1, q_phi=bad))
+    assert publisher.failed == 3
+    assert publisher.put(command(2))
+    later: list[int] = []
+
+    def good_one_came() -> bool:
+        later.extend(m.seq for m in [commands.take()] if m is not None)
+        return 2 in later
+
+    assert wait_until(good_one_came)
+    assert 1 not in later
+    assert commands.refused == 0
 
 
-def test_a_process_without_a_subscriber_exits_by_itself(start: Start) -> None:
-    script = """
+@pytest.mark.parametrize("bad", [b'{"t_ns":0,"seq":1,"q_ref":[null,0.0]}', b"no json", b""])
+def test_message_that_is_none_is_refused_and_counted_by_the_receiver(
+    ankle: tuple[Session, Publisher[JointCommand], Latest[JointCommand]], bad: bytes
+) -> None:
+    planner, publisher, commands = ankle
+    planner._session.put(topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right"), bad)
+    assert wait_until(lambda: commands.take() is None and commands.refused == 1)
+    assert wait_until(lambda: publisher.put(command(2)) and commands.take())
+
+
+@pytest.mark.parametrize(("arguments", "code"), [((), 0), (("raise",), 7)])
+def test_a_process_without_a_subscriber_exits_by_itself(
+    start: Start, arguments: tuple[str, ...], code: int
+) -> None:
+    process = start(
+        """
 with open_session(robot, "planner", run_dir) as session:
     latest = session.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
     stream = session.stream([f"xrl/{robot.name}/**"])
@@ -371,11 +379,11 @@ with open_session(robot, "planner", run_dir) as session:
     print("left", flush=True)
     if sys.argv[2:]:
         raise SystemExit(7)
-"""
-    for arguments, code in (((), 0), (("raise",), 7)):
-        process = start(script, *arguments)
-        out, err = process.communicate(timeout=30)
-        assert (out, err, process.returncode) == ("left\n", "", code)
+""",
+        *arguments,
+    )
+    out, err = process.communicate(timeout=30)
+    assert (out, err, process.returncode) == ("left\n", "", code)
 
 
 def test_a_second_process_of_a_name_learns_that_the_endpoint_is_in_use(
@@ -397,36 +405,43 @@ except BusError as error:
         assert session.alive() == {"planner"}
 
 
-def test_socket_path_that_is_too_long_is_refused_by_name(run_dir: Path) -> None:
-    long_dir = run_dir / ("x" * 100)
-    for name in ("planner", "ankle_right", TOOL):
-        with pytest.raises(BusError, match=rf"unixsock-stream/{long_dir}/.*shorter run directory"):
-            open_session(ROBOT, name, long_dir)
+SESSIONS_REFUSED = {
+    "": ("", "no name for a process"),
+    "a/b": ("", "no name for a process"),
+    "*": ("", "no name for a process"),
+    "a b": ("", "no name for a process"),
+    "planner": ("x" * 100, r"unixsock-stream/.*/planner\.zenoh.*shorter run directory"),
+    "ankle_right": ("x" * 100, r"unixsock-stream/.*/ankle_right\.zenoh.*shorter run directory"),
+    TOOL: ("x" * 100, r"unixsock-stream/.*shorter run directory"),
+    "simulator": ("file", r"file/simulator\.zenoh: simulator cannot listen: "),
+}
+"""Name: folder below the run directory, and what the error says."""
 
 
-def test_directory_that_cannot_be_made_is_one_clear_error(run_dir: Path) -> None:
+@pytest.mark.parametrize("name", SESSIONS_REFUSED)
+def test_session_that_cannot_be_opened_is_one_clear_error(run_dir: Path, name: str) -> None:
+    folder, why = SESSIONS_REFUSED[name]
     (run_dir / "file").write_text("in the way")
-    with pytest.raises(BusError, match=r"file/planner\.zenoh: planner cannot listen: ") as caught:
-        open_session(ROBOT, "planner", run_dir / "file")
+    with pytest.raises(BusError, match=why) as caught:
+        open_session(ROBOT, name, run_dir / folder)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "*", "a b"])
-def test_name_that_cannot_stand_in_a_key_is_refused(run_dir: Path, name: str) -> None:
-    with pytest.raises(BusError, match="no name for a process"):
-        open_session(ROBOT, name, run_dir)
+USES_REFUSED: dict[str, Callable[[Session], object]] = {
+    "harness/wrench: Estop is not its type; use Wrench": lambda s: s.publisher(
+        topics.WRENCH, Estop
+    ),
+    r"joint/\*/command: '' is no module": lambda s: s.latest(topics.JOINT_COMMAND, JointCommand),
+    "leave the module out": lambda s: s.latest(topics.WRENCH, Wrench, "ankle_right"),
+    "xrl//estop": lambda s: s.stream(["xrl//estop"]),
+}
 
 
 def test_topic_used_with_a_wrong_type_or_module_is_refused(run_dir: Path) -> None:
     with open_session(ROBOT, "planner", run_dir) as session:
-        with pytest.raises(BusError, match=r"harness/wrench: Estop is not its type; use Wrench"):
-            session.publisher(topics.WRENCH, Estop)
-        with pytest.raises(BusError, match=r"joint/\*/command: '' is no module"):
-            session.latest(topics.JOINT_COMMAND, JointCommand)
-        with pytest.raises(BusError, match="leave the module out"):
-            session.latest(topics.WRENCH, Wrench, "ankle_right")
-        with pytest.raises(BusError, match="xrl//estop"):
-            session.stream(["xrl//estop"])
+        for why, use in USES_REFUSED.items():
+            with pytest.raises(BusError, match=why):
+                use(session)
 
 
 def test_mute_and_absent_peers_delay_neither_opening_nor_closing(run_dir: Path) -> None:

@@ -80,19 +80,24 @@ def test_filters_of_python_can_apply(hub: UnixCanHub) -> None:
         assert bus.recv(0.01) is None
 
 
-def test_frames_of_several_packets_are_all_read_in_order(hub: UnixCanHub) -> None:
-    with connect(hub) as bus:
-        hub.broadcast([(1, b"a"), (2, b"b")])
-        hub.broadcast([(3, b"c")])
-        assert bus.recv_many(1.0) == [(1, b"a"), (2, b"b"), (3, b"c")]
-        assert bus.recv_many(0.0) == []
+PACKETS = {
+    "one frame": [[(3, b"")]],
+    "two in one packet": [[(1, b"a"), (2, b"b")]],
+    "two packets": [[(1, b"a"), (2, b"b")], [(3, b"c")]],
+}
 
 
-def test_hub_reads_all_packets_and_all_frames_of_a_client(hub: UnixCanHub) -> None:
+@pytest.mark.parametrize("packets", PACKETS.values(), ids=PACKETS)
+def test_all_frames_of_all_packets_arrive_in_order_either_way(
+    hub: UnixCanHub, packets: list[list[tuple[int, bytes]]]
+) -> None:
+    frames = [frame for packet in packets for frame in packet]
     with connect(hub) as bus:
-        bus.send_many([message(1, b"a"), message(2, b"b")])
-        bus.send(message(3, b""))
-        assert hub.poll() == [(1, b"a"), (2, b"b"), (3, b"")]
+        for packet in packets:
+            hub.broadcast(packet)
+            bus.send_many([message(*frame) for frame in packet])
+        assert bus.recv_many(1.0) == hub.poll() == frames
+        assert bus.recv_many(0.0) == hub.poll() == []
 
 
 def test_hub_hands_frames_to_the_other_clients_and_not_back(hub: UnixCanHub) -> None:
@@ -135,31 +140,21 @@ def test_hub_parts_with_clients_that_leave(hub: UnixCanHub) -> None:
     assert hub.clients == 0
 
 
-def test_what_a_client_sent_before_it_left_arrives_though_it_left_frames_unread(
-    hub: UnixCanHub,
-) -> None:
-    """A tool that sends one order and goes: the kernel tells of the unread ones first."""
-    leaving = connect(hub)
-    hub.broadcast([(0x1, b"unread")])
-    leaving.send(message(0x55, b"order"))
-    leaving.shutdown()
-    assert hub.poll() == [(0x55, b"order")]
-    assert hub.clients == 0
-
-
-def test_what_a_client_sent_before_it_left_arrives_though_others_send_to_it(
-    hub: UnixCanHub,
-) -> None:
-    talker = connect(hub)
-    leaving = connect(hub)
-    leaving.send(message(0x55, b"order"))
-    leaving.shutdown()
-    hub.broadcast([(0x1, b"too late")])
-    with talker:
+@pytest.mark.parametrize("broadcast_to", ["the leaving", "the left", "nobody"])
+def test_what_a_client_sent_before_it_left_arrives(hub: UnixCanHub, broadcast_to: str) -> None:
+    """A tool that sends one order and goes; the kernel tells of frames it left unread first."""
+    with connect(hub) as talker:
+        leaving = connect(hub)
+        if broadcast_to == "the leaving":
+            hub.broadcast([(0x1, b"unread")])
+        leaving.send(message(0x55, b"order"))
+        leaving.shutdown()
+        if broadcast_to == "the left":
+            hub.broadcast([(0x1, b"too late")])
         talker.send(message(0x2, b"too"))
         assert sorted(hub.poll()) == [(0x2, b"too"), (0x55, b"order")]
-    assert hub.poll() == []
-    assert hub.clients == 0
+        assert hub.poll() == []
+        assert hub.clients == 1
 
 
 def test_client_learns_that_the_hub_has_closed(path: Path) -> None:
@@ -208,25 +203,17 @@ def test_stale_socket_file_is_replaced_and_removed_at_close(path: Path) -> None:
     assert not path.exists()
 
 
-def test_path_in_use_is_refused_and_its_hub_goes_on(hub: UnixCanHub) -> None:
-    with pytest.raises(FleetError, match="in use"):
-        UnixCanHub(hub.path)
-    hub.poll()
-    with UnixCanBus(str(hub.path)) as bus:
-        bus.send(message(1, b"z"))
-        assert (1, b"z") in hub.poll()
-
-
-def test_file_that_is_no_socket_is_refused_and_kept(path: Path) -> None:
-    path.write_text("precious")
-    with pytest.raises(FleetError, match="no socket"):
-        UnixCanHub(path)
-    assert path.read_text() == "precious"
-
-
-def test_path_too_long_for_a_socket_is_refused_with_the_limit(tmp_path: Path) -> None:
-    with pytest.raises(FleetError, match="107 bytes"):
-        UnixCanHub(tmp_path / ("x" * 120))
+def test_path_that_cannot_be_the_hubs_is_refused_with_the_reason(path: Path) -> None:
+    file, long = path.parent / "file", path.parent / ("x" * 120)
+    file.write_text("precious")
+    with UnixCanHub(path) as hub:
+        for refused, why in ((path, "in use"), (file, "no socket"), (long, "107 bytes")):
+            with pytest.raises(FleetError, match=why):
+                UnixCanHub(refused)
+        with connect(hub) as bus:  # the hub whose path was wanted goes on
+            bus.send(message(1, b"z"))
+            assert hub.poll() == [(1, b"z")]
+    assert file.read_text() == "precious"
 
 
 def test_closing_leaves_the_socket_of_a_successor(path: Path) -> None:
