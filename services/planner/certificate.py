@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from services.planner.small_matrices import eigenvalue_min
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import N_JOINTS
 
@@ -95,8 +96,7 @@ class Certificate:
         K = self._T_scaled.T @ (pair * self._T_scaled) + self._K_geo
         if not np.isfinite(K).all():
             return Margins(0.0, 0.0)
-        smallest = np.linalg.eigvalsh(K)[:, 0]
-        return Margins(float(smallest[0]), float(smallest[1]))
+        return Margins(eigenvalue_min(K[0]), eigenvalue_min(K[1]))
 
     def weakest(self, D: Array) -> Weakest:
         """Return the weakest direction under local stiffnesses D (12,), N m/rad."""

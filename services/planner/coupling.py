@@ -21,6 +21,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from services.planner.small_matrices import positive_part
 from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]
@@ -43,12 +44,10 @@ class UncoupledGains:
             damping: c, as a fraction of B_p.
         """
         closed = np.flatnonzero(S == 0.0)
-        self._rows = np.ix_(closed, closed)
-        body = np.array((K_p[closed], damping * B_p[closed]))
-        self._body: Array = body[:, :, np.newaxis] * np.eye(len(closed))
-        root = np.sqrt(np.where(body > GAIN_MIN, body, 1.0))
-        self._scale: Array = root[:, :, np.newaxis] * root[:, np.newaxis, :]
-        """(2, closed, closed): scales of K and of B that make metres and radians comparable."""
+        self._indices = 6 * closed[:, np.newaxis] + closed
+        """Flat indices of the closed rows and columns in a (6, 6) matrix."""
+        self._stiffness = _scaled(K_p[closed])
+        self._damping = _scaled(damping * B_p[closed])
 
     def at(self, K_fail: Array, B_local: Array) -> tuple[Array, Array]:
         """Return K_c and B_c (6, 6), symmetric and not negative.
@@ -59,16 +58,22 @@ class UncoupledGains:
             K_fail: stiffness of the local gains along p (6, 6).
             B_local: T^T D_B T (6, 6).
         """
-        local = np.array((K_fail[self._rows], B_local[self._rows]))
-        scaled = (self._body - local) / self._scale
-        K_c, B_c = np.zeros((6, 6)), np.zeros((6, 6))
-        if not np.isfinite(scaled).all():
-            return K_c, B_c
-        values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
-        positive = (vectors * np.maximum(values, 0.0)[:, np.newaxis]) @ vectors.transpose(0, 2, 1)
-        positive *= self._scale
-        K_c[self._rows], B_c[self._rows] = positive
-        return K_c, B_c
+        return self._lacking(self._stiffness, K_fail), self._lacking(self._damping, B_local)
+
+    def _lacking(self, body: tuple[Array, Array], local: Array) -> Array:
+        """Return what local gains (6, 6) lack of the body's, given with its scale."""
+        gains, scale = body
+        lacking: Array = np.zeros((6, 6))
+        scaled = (gains - local.take(self._indices)) / scale
+        if np.isfinite(scaled).all():
+            lacking.put(self._indices, positive_part(scaled) * scale)
+        return lacking
+
+
+def _scaled(gains: Array) -> tuple[Array, Array]:
+    """Return gains (n,) as a diagonal matrix, and its scale (n, n) for metres and radians."""
+    root = np.sqrt(np.where(gains > GAIN_MIN, gains, 1.0))
+    return np.diag(gains), np.outer(root, root)
 
 
 def pole_gain(bandwidth_hz: float, dt: float) -> float:

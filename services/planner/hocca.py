@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still, wrench_in_world
 from services.planner.coupling import CouplingFilter, UncoupledGains
 from services.planner.gains import GainLaw, JointGains
-from services.planner.inverse_kinematics import InverseKinematics
-from services.planner.kinematics import Kinematics, leg_loads
+from services.planner.kinematics import Measured
 from services.planner.levelling import Levelling
 from services.planner.load import Load
+from services.planner.reference import Reference
 from services.planner.shift import ShiftReference
 from services.planner.snapshots import LawState
 from services.planner.split import GainSplit, LocalGains
@@ -100,35 +100,31 @@ class LawAtReference:
         self._gains, self._split = gains, split
         self._uncoupled = UncoupledGains(gains.K_p, gains.B_p, gains.S, split.coupling.damping)
 
-    def evaluate(
-        self, at_ref: Kinematics, T: Array, F_O: Array, F_assist: Array, e_p: Array, e_pdot: Array
-    ) -> LawTerms:
+    def evaluate(self, reference: Reference, e_p: Array, e_pdot: Array) -> LawTerms:
         """Return the terms.
 
         Args:
-            at_ref: kinematics at the reference pose.
-            T: joint rates per unit of p along the closed chain (12, 6).
-            F_O: force and moment that hold the body (6,), N and N m, world.
-            F_assist: force at the harness (3,), N, world.
+            reference: evaluated at the reference pose.
             e_p: p_ref - p (6,), m and rad.
             e_pdot: pdot_ref - pdot (6,), m/s and rad/s.
         """
-        hessian_O = at_ref.hessian_times(F_O, F_assist).copy()
+        T, p = reference.T, reference.p
 
         def body_gains() -> JointGains:
-            F = self._gains.K_p * e_p + self._gains.B_p * e_pdot + F_O
-            return self._gains.gains(at_ref, at_ref.hessian_times(F, F_assist))
+            F = self._gains.K_p * e_p + self._gains.B_p * e_pdot + reference.F_O
+            kinematics = reference.kinematics()
+            return self._gains.gains(kinematics, kinematics.hessian_times(F, reference.F_assist))
 
-        local = self._split.split(body_gains, at_ref.p[2], at_ref.p[4], T, hessian_O)
+        local = self._split.split(body_gains, float(p[2]), float(p[4]), T, reference.hessian_O)
         K_fail = self._split.certificate.failsafe_stiffness(local.D)
         K_c, B_c = self._uncoupled.at(K_fail, (T.T * local.D_B) @ T)
         return LawTerms(
-            gravity=F_O @ at_ref.J,
-            assist=F_assist @ at_ref.J_harness,
-            hessian_O=hessian_O,
+            gravity=reference.gravity,
+            assist=reference.assist,
+            hessian_O=reference.hessian_O,
             body_gains=body_gains,
             local=local,
-            coupled=(K_c @ e_p + B_c @ e_pdot) @ at_ref.J,
+            coupled=(K_c @ e_p + B_c @ e_pdot) @ reference.J,
         )
 
 
@@ -137,9 +133,8 @@ class Hocca:
 
     def __init__(self, config: RobotConfig) -> None:
         """Build the law; the first tick starts from the measured pose."""
-        self._measured = Kinematics(config)
-        limits = np.array(config.joint_limits())
-        self._ik = InverseKinematics(Kinematics(config), limits)
+        self._measured = Measured(config)
+        self._reference = Reference(config)
         self._gains = GainLaw(config)
         self._split = GainSplit(config)
         self._S = self._gains.S
@@ -158,7 +153,6 @@ class Hocca:
         certified = config.law.split == "certified"
         correction_max = config.law.load_correction if certified else (0.0, 0.0)
         self._load = Load(correction_max, self._weight, config.torso_mass, inertia)
-        self._T: Array = np.zeros((12, 6))
         assist = config.assist
         self._assist = AssistLaw(
             assist.force_max, assist.rate_max, assist.integral_max, assist.integral_s
@@ -169,8 +163,6 @@ class Hocca:
         self._since_align_s = 0.0
         self._aligned = False
         self._has_led = False
-        self._F_assist: Array = np.zeros(3)
-        self._unit_p: Array = np.eye(12)[:, :6].copy()
 
     @property
     def stance_refused(self) -> bool:
@@ -226,12 +218,12 @@ class Hocca:
             wrench: of the operator on the torso, if it is fresh and valid.
             up_torso: unit vector against gravity, torso axes, if the IMU knows it now.
         """
-        measured, ik = self._measured, self._ik
+        measured, reference = self._measured, self._reference
         if align or not self._aligned:
             fraction = min(1.0, dt / FOLLOW_S) if self._has_led else 1.0
             self._stance.take(measured.stance_at(q), fraction)
             self._apply_stance()
-        measured.update(q)
+        measured.update(q, v)
         self._levelling.advance(up_torso, measured.p[3:], dt, jump=align or not self._aligned)
         up = self._levelling.up
         self._F_O[:3] = self._weight * up
@@ -242,7 +234,7 @@ class Hocca:
         else:
             self._has_led = True
             self._shift.advance(shift_requested, dt)
-        pdot = measured.J @ v
+        pdot = measured.pdot
         p_C, pdot_C = self._closed_loop_reference(dt)
         self._shift.add_to(p_C, pdot_C)
         lean = up[:2] / up[2]
@@ -259,32 +251,31 @@ class Hocca:
         assist_rate = self._assist.advance(assist_wanted, measured_assist, dt, still=still)
         ease_z, ease_pitch = self._easing.ease(force, moment_pitch, self._assist.assist, dt)
 
-        result = ik.solve(p_ref, measured.D_left)
-        q_ref = ik.q.copy()
-        T = self._T = ik.solve_rates(self._unit_p)
-        v_ref = T @ pdot_ref
-
-        at_ref = ik.kinematics
-        self._F_assist[:] = (self._assist.assist + self._load.force()) * up
-        terms = self._terms.evaluate(
-            at_ref, T, self._F_O, self._F_assist, p_ref - measured.p, pdot_ref - pdot
+        reference.load(
+            pdot_ref,
+            self._F_O,
+            (self._assist.assist + self._load.force()) * up,
+            assist_rate * up,
+            measured.D_left,
         )
-        tau_ff = terms.gravity + terms.assist
-        dtau_ff = terms.hessian_O @ v_ref + (up @ at_ref.J_harness) * assist_rate
+        result = reference.solve(p_ref)
+        terms = self._terms.evaluate(reference, p_ref - measured.p, pdot_ref - pdot)
         tau_coupled = self._coupling.advance(terms.coupled, dt)
         # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive the
         # hand. It is a force fed forward, not fed-back joint rates, so the harness filter is enough
-        tau_coupled += ease_z * at_ref.J_harness[2] + ease_pitch * at_ref.J[4]
+        tau_coupled += ease_z * reference.J_harness[2] + ease_pitch * reference.J[4]
+        # where the next reference will be, if it goes on so
+        np.add(reference.q, dt * reference.v, out=reference.start)
         return LawOutput(
-            q_ref,
-            v_ref,
-            tau_ff,
-            dtau_ff,
+            reference.q.copy(),
+            reference.v.copy(),
+            terms.gravity + terms.assist,
+            reference.dtau_ff.copy(),
             tau_coupled,
             terms.coupled,
             terms.local,
             measured.p.copy(),
-            pdot,
+            pdot.copy(),
             p_ref,
             measured.closure.copy(),
             self._assist.assist,
@@ -302,7 +293,7 @@ class Hocca:
         Args:
             tau: joint torques (12,), N m.
         """
-        return leg_loads(self._measured.C, tau)
+        return self._measured.leg_loads(tau)
 
     def weigh(self, tau: Array, v: Array, wrench: Wrench | None, dt: float, *, led: bool) -> None:
         """Update the estimate of the load beyond the robot file, at the last tick's pose.
@@ -317,12 +308,13 @@ class Hocca:
         if not self._load.enabled:
             return
         if wrench is None:
-            self._load.advance_without_harness(float(tau @ self._T[:, 2]), dt, led=led)
+            F_z = float(tau @ self._reference.T[:, 2])
+            self._load.advance_without_harness(F_z, dt, led=led)
             return
-        at_ref, p = self._ik.kinematics, self._measured.p
+        at_ref, p = self._reference, self._measured.p
         force, moment = wrench_in_world(wrench, float(p[3]), float(p[4]))
         tau_held = tau + force @ at_ref.J_harness + moment * at_ref.J[4]
-        T, rates = self._T, (self.harness_rate(v), float(self._measured.J[4] @ v))
+        T, rates = at_ref.T, (self.harness_rate(v), float(self._measured.pdot[4]))
         self._load.advance(tau_held @ T, at_ref.J_harness[2] @ T, float(p[4]), rates, dt, led=led)
 
     def pause_load_estimate(self) -> None:
@@ -343,7 +335,7 @@ class Hocca:
             tuple(self._p_C0.tolist()),
             self._since_align_s,
             self._aligned,
-            tuple(self._ik.q.tolist()),
+            tuple(self._reference.start.tolist()),
             self._assist.snapshot(),
             self._easing.snapshot(),
             self._has_led,
@@ -359,7 +351,7 @@ class Hocca:
         self._p_C0 = np.array(state.p_C0)
         self._since_align_s, self._aligned = state.since_align_s, state.aligned
         self._has_led = state.has_led
-        self._ik.q[:] = state.q
+        self._reference.start[:] = state.q
         self._assist.restore(state.assist)
         self._easing.restore(state.easing)
         self._coupling.restore(state.coupling)
@@ -370,8 +362,8 @@ class Hocca:
         self._apply_stance()
 
     def _apply_stance(self) -> None:
-        for kinematics in (self._measured, self._ik.kinematics):
-            kinematics.stance[:] = self._stance.taken
+        for stance in (self._measured.stance, self._reference.stance):
+            stance[:] = self._stance.taken
 
     def _align(self, q: Array) -> None:
         self._aligned = True
@@ -381,7 +373,7 @@ class Hocca:
         p[:2] -= self._levelling.up[:2] / self._levelling.up[2] * p[2]
         self._p_C0 = p * kept_rows
         self._since_align_s = 0.0
-        self._ik.q[:] = q
+        self._reference.start[:] = q
 
     def _closed_loop_reference(self, dt: float) -> tuple[Array, Array]:
         """Return p_C and its rate: a minimum-jerk path from the pose found by `align` to zero.

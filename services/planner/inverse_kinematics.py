@@ -20,15 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.kinematics import Kinematics
-from services.planner.lu import LuDecomposition
+from services.planner.small_matrices import LuDecomposition
+from services.planner.symbolic import DAMPING
 from shared.robot.joints import JOINTS, N_JOINTS, N_LEG
 
 Array = NDArray[np.float64]
 
 TOLERANCE = 1e-6
 """Largest residual of a solution, m or rad."""
-DAMPING = 1e-4
-"""Levenberg damping; bounds the step where the legs are nearly singular."""
 STEP_SURE = 1e-3
 """rad; a Gauss-Newton step's error is below the step's square (m or rad), so below `TOLERANCE`."""
 STEP_MAX = 0.2
@@ -162,6 +161,10 @@ class InverseKinematics:
             step = self._damped_step(self._system, self._error, DAMPING**2)
             step = _limited_length(step, STEP_MAX)
         return step, limited
+
+    def allows(self, q: Array) -> bool:
+        """Return True if joint angles (12,), rad, are inside the joint limits."""
+        return bool((self._low <= q).all() and (q <= self._high).all())
 
     def solve_rates(self, right_side: Array) -> Array:
         """Return x (12,) that solves [J; C] x = right side (12,), damped."""

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner import symbolic
-from services.planner.lu import LuDecomposition
 from services.planner.model import leg_geometry
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import GeometryConfig, LawConfig, MassConfig
 from shared.robot.compiled_graph import CompiledGraph
+from shared.robot.joints import N_LEG
 
 Array = NDArray[np.float64]
 
@@ -51,11 +51,10 @@ class Kinematics:
 
     def __init__(self, config: RobotConfig) -> None:
         """Build the graphs from the generated model."""
-        graphs = _graphs_of(config)
+        graphs = graphs_of(config)
         self._sharing = CompiledGraph(graphs.sharing)
         self._pose = CompiledGraph(graphs.pose)
         self._hessian = CompiledGraph(graphs.hessian)
-        self._stance = CompiledGraph(graphs.stance)
         self.stance: Array = np.zeros(6)
         self.D_left = self._sharing.results[0]
         (
@@ -87,12 +86,6 @@ class Kinematics:
         self._pose.arguments[2][:] = self.D_left
         self._pose()
 
-    def stance_at(self, q: Array) -> Array:
-        """Return the stance (6,) in which the legs agree at q; overwritten by the next call."""
-        self._stance.arguments[0][:] = q
-        self._stance()
-        return self._stance.results[0]
-
     def hessian_times(self, F: Array, F_harness: Array) -> Array:
         """Return sum_i H_i F_i (12, 12), plus the harness point's term for its force, N m/rad.
 
@@ -112,31 +105,62 @@ class Kinematics:
         return self._hessian.results[0]
 
 
-def _graphs_of(config: RobotConfig) -> symbolic.Graphs:
+class Measured:
+    """What a tick needs at the measured joints.
+
+    `update` writes these arrays, and the next call overwrites them: `D_left`, `p`, `closure`, `J`,
+    `C` and `J_harness` as in `Kinematics`, and `pdot` (6,): J v, m/s and rad/s.
+
+    The caller writes `stance` (6,), as in `Kinematics`.
+    """
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Build the graph."""
+        graphs = graphs_of(config)
+        self._graph, self._stance = CompiledGraph(graphs.measured), CompiledGraph(graphs.stance)
+        self._q, self._v, self.stance = self._graph.arguments
+        (
+            self.D_left, self.p, self.closure, self.J, self.C, self.J_harness, self.pdot,
+            self._upward, self._determinants,
+        ) = self._graph.results  # fmt: skip
+
+    def update(self, q: Array, v: Array) -> None:
+        """Compute all outputs.
+
+        Args:
+            q: joint angles (12,), rad.
+            v: joint rates (12,), rad/s.
+        """
+        self._q[:], self._v[:] = q, v
+        self._graph()
+
+    def stance_at(self, q: Array) -> Array:
+        """Return the stance (6,) in which the legs agree at q; overwritten by the next call."""
+        self._stance.arguments[0][:] = q
+        self._stance()
+        return self._stance.results[0]
+
+    def leg_loads(self, tau: Array) -> tuple[float, float]:
+        """Return the upward force of right and left leg on the torso, N; NaN if it is not known.
+
+        Straight and folded legs give none (`DETERMINANT_MIN`). A leg carries part of its own
+        weight, which is not subtracted.
+
+        Args:
+            tau: joint torques (12,), N m.
+        """
+        rows, (right, left) = self._upward, self._determinants.tolist()
+        return (
+            float(rows[0] @ tau[:N_LEG]) if right > DETERMINANT_MIN else math.nan,
+            float(rows[1] @ tau[N_LEG:]) if left > DETERMINANT_MIN else math.nan,
+        )
+
+
+def graphs_of(config: RobotConfig) -> symbolic.Graphs:
+    """Return the graphs of a robot."""
     key = (config.mass, config.geometry, config.law)
     if key not in _GRAPHS:
         if len(_GRAPHS) == _GRAPHS_KEPT:
             del _GRAPHS[next(iter(_GRAPHS))]
         _GRAPHS[key] = symbolic.build(config, leg_geometry(config))
     return _GRAPHS[key]
-
-
-def leg_loads(C: Array, tau: Array) -> tuple[float, float]:
-    """Return the upward force of right and left leg on the torso, N; NaN if it is not known.
-
-    Straight and folded legs give none (`DETERMINANT_MIN`). A leg's own Jacobian J_leg (6, 6) is its
-    part of the closure's, with the leg's sign: J_leg^T W = tau. A leg carries part of its own
-    weight, which is not subtracted.
-
-    Args:
-        C: d closure/dq (6, 12): left minus right.
-        tau: joint torques (12,), N m.
-    """
-    return _vertical_force(-C[:, :6], tau[:6]), _vertical_force(C[:, 6:], tau[6:])
-
-
-def _vertical_force(J_leg: Array, tau: Array) -> float:
-    decomposition = LuDecomposition(J_leg)
-    if not decomposition.determinant > DETERMINANT_MIN:
-        return math.nan
-    return float(decomposition.solve_transposed(tau)[2])

@@ -8,7 +8,7 @@ tick took 0.5 ms alone, and 1.5 ms among the fleet's other processes on two core
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -16,6 +16,10 @@ import numpy as np
 from services.planner.model import LegGeometry
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import N_JOINTS, N_LEG
+
+DAMPING: Final = 1e-4
+"""Levenberg damping of the closed chain's system; bounds the step where the legs are nearly
+singular."""
 
 
 class Graphs(NamedTuple):
@@ -29,6 +33,12 @@ class Graphs(NamedTuple):
     """(q, stance, D_L, F, F_harness) -> sum_i H_i F_i (12, 12)."""
     stance: ca.Function
     """q -> stance (6,) in which the legs agree: position of the right foot relative to the left."""
+    measured: ca.Function
+    """(q, v, stance) -> D_L, p, closure, J, C, J_harness, pdot, and of each leg the row (2, 6) that
+    gives its upward force from its torques, and its Jacobian's determinant (2,), m^3."""
+    reference: ca.Function
+    """(q, stance, D_L, p_ref, pdot_ref, F_O, F_assist, F_assist rate) -> what a tick needs at the
+    reference pose (`services.planner.reference`)."""
 
 
 class _Foot(NamedTuple):
@@ -59,20 +69,86 @@ def build(config: RobotConfig, geometry: tuple[LegGeometry, LegGeometry]) -> Gra
     legs = _chains(geometry, feet, q)
     pose = _pose(config, legs, D_left)
     F, F_harness = ca.SX.sym("F", 6), ca.SX.sym("F_h", 3)
-    hessian = _hessian(config, legs, D_left, pose, F, F_harness)
-    return Graphs(
-        sharing=ca.Function("sharing", [q, stance], [_left_load_share(config, feet, legs)]),
-        pose=ca.Function(
-            "pose",
-            [q, stance, D_left],
-            [ca.densify(part) for part in pose[:7]],
-            {"cse": True},
-        ),
-        hessian=ca.Function(
-            "hessian", [q, stance, D_left, F, F_harness], [ca.densify(hessian)], {"cse": True}
-        ),
-        stance=ca.Function("stance", [q], [_stance(geometry, q)], {"cse": True}),
+    sharing = ca.Function("sharing", [q, stance], [_left_load_share(config, feet, legs)])
+    at_pose = ca.Function(
+        "pose", [q, stance, D_left], [ca.densify(part) for part in pose[:7]], {"cse": True}
     )
+    hessian = ca.Function(
+        "hessian",
+        [q, stance, D_left, F, F_harness],
+        [ca.densify(_hessian(config, legs, D_left, pose, F, F_harness))],
+        {"cse": True},
+    )
+    return Graphs(
+        sharing=sharing,
+        pose=at_pose,
+        hessian=hessian,
+        stance=ca.Function("stance", [q], [_stance(geometry, q)], {"cse": True}),
+        measured=_measured(sharing, at_pose),
+        reference=_reference(at_pose, hessian),
+    )
+
+
+def _measured(sharing: ca.Function, pose: ca.Function) -> ca.Function:
+    """Return the graph of what a tick needs at the measured joints.
+
+    It calls the other graphs: as one flat expression its code would be slow in a cold cache.
+    """
+    q, v, stance = ca.MX.sym("q", N_JOINTS), ca.MX.sym("v", N_JOINTS), ca.MX.sym("s", 6)
+    D_left = sharing(q, stance)
+    p, closure, J, C, J_harness, _, _ = pose(q, stance, D_left)
+    leg = _upward_force()
+    (right, det_right), (left, det_left) = leg(-C[:, :N_LEG]), leg(C[:, N_LEG:])
+    return ca.Function(
+        "measured",
+        [q, v, stance],
+        [
+            D_left, p, closure, J, C, J_harness, J @ v,
+            ca.horzcat(right, left).T, ca.vertcat(det_right, det_left),
+        ],
+    )  # fmt: skip
+
+
+def _upward_force() -> ca.Function:
+    """Return J_leg (6, 6) -> x (6,), |det J_leg|: the leg's upward force on the torso is x . tau.
+
+    J_leg^T W = tau, so W_z is the third row of J_leg^-T: J_leg x = unit z.
+    """
+    J_leg = ca.SX.sym("J", N_LEG, N_LEG)
+    Q, R = ca.qr(J_leg)
+    x = ca.solve(R, Q[2, :].T)
+    determinant = ca.fabs(R[0, 0])
+    for i in range(1, N_LEG):
+        determinant *= ca.fabs(R[i, i])
+    return ca.Function("upward_force", [J_leg], [ca.densify(x), determinant], {"cse": True})
+
+
+def _reference(pose: ca.Function, hessian: ca.Function) -> ca.Function:
+    """Return the graph of what a tick needs at the reference pose.
+
+    One Gauss-Newton step, damped as `InverseKinematics.solve_rates`, and with the same
+    decomposition T = [J; C]^-1 [I; 0]; see docs/law.md for the torques.
+    """
+    q, stance, D_left = ca.MX.sym("q", N_JOINTS), ca.MX.sym("s", 6), ca.MX.sym("D_L", 6, 6)
+    p_ref, pdot_ref, F_O = ca.MX.sym("p", 6), ca.MX.sym("pdot", 6), ca.MX.sym("F_O", 6)
+    F_assist, assist_rate = ca.MX.sym("F_a", 3), ca.MX.sym("Fdot_a", 3)
+    p, closure, J, C, J_harness, _, _ = pose(q, stance, D_left)
+    error = ca.vertcat(p_ref - p, -closure)
+    unit_p = ca.densify(ca.vertcat(ca.DM.eye(6), ca.DM(6, 6)))
+    A = ca.vertcat(J, C)
+    normal = A.T @ A + DAMPING**2 * ca.DM.eye(N_JOINTS)
+    solved = ca.solve(normal, A.T @ ca.horzcat(error, unit_p), "ldl")
+    step, T = solved[:, 0], solved[:, 1:]
+    v_ref = T @ pdot_ref
+    H = hessian(q, stance, D_left, F_O, F_assist)
+    return ca.Function(
+        "reference",
+        [q, stance, D_left, p_ref, pdot_ref, F_O, F_assist, assist_rate],
+        [
+            step, error, T, v_ref, p, J, J_harness, H,
+            J.T @ F_O, J_harness.T @ F_assist, H @ v_ref + J_harness.T @ assist_rate,
+        ],
+    )  # fmt: skip
 
 
 def _feet(geometry: tuple[LegGeometry, LegGeometry], stance: ca.SX) -> list[_Foot]:

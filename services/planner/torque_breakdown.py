@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from services.planner.certificate import Weakest, motor_mean
 from services.planner.gains import GainLaw
 from services.planner.hocca import LawAtReference
-from services.planner.kinematics import Kinematics
+from services.planner.kinematics import Measured
 from services.planner.levelling import up_of
 from services.planner.push_limit import PushLimits, limits_at
+from services.planner.reference import Reference
 from services.planner.split import GainSplit, LocalGains
 from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
 from shared.config.robot_config import GRAVITY, RobotConfig
@@ -86,42 +87,35 @@ def torque_breakdown(
     Raises:
         ConfigError: the gain split needs a schedule, and the robot's is missing or stale.
     """
-    measured, at_ref = Kinematics(config), Kinematics(config)
-    for kinematics in (measured, at_ref):
-        kinematics.stance[:] = stance
-    measured.update(q)
-    at_ref.update(q_ref, measured.D_left)
+    measured, reference = Measured(config), Reference(config)
+    measured.stance[:] = reference.stance[:] = stance
+    measured.update(q, v)
     law, split = GainLaw(config), GainSplit(config)
-    pdot = measured.J @ v
     up = np.array(up_of(slope))
     F_O, F_assist = np.zeros(6), assist * up
     F_O[:3] = config.total_mass * GRAVITY * up
+    reference.load(np.zeros(6), F_O, F_assist, np.zeros(3), measured.D_left)
+    reference.evaluate(q_ref)
+    at_ref = reference.kinematics()
     hessian_weight = at_ref.hessian_times(F_O, np.zeros(3)).copy()
-    T = per_unit_of_p(at_ref)
-    e_p, e_pdot = at_ref.p - measured.p, at_ref.J @ v_ref - pdot
-    terms = LawAtReference(law, split).evaluate(at_ref, T, F_O, F_assist, e_p, e_pdot)
+    e_p, e_pdot = reference.p - measured.p, reference.J @ v_ref - measured.pdot
+    terms = LawAtReference(law, split).evaluate(reference, e_p, e_pdot)
     body, local, certificate = terms.body_gains(), terms.local, split.certificate
     return TorqueBreakdown(
         p=measured.p,
-        pdot=pdot,
-        p_ref=at_ref.p,
+        pdot=measured.pdot,
+        p_ref=reference.p,
         F=law.K_p * e_p + law.B_p * e_pdot + F_O,
-        singular_values=np.asarray(np.linalg.svd(at_ref.J, compute_uv=False), float),
+        singular_values=np.asarray(np.linalg.svd(reference.J, compute_uv=False), float),
         K_q=body.K_q,
         B_q=body.B_q,
         local=local,
         weakest=certificate.weakest(local.D),
         weakest_onboard=certificate.weakest(motor_mean(local.D)),
-        pushes=limits_at(config, at_ref, T, hessian_weight, local.D, local.D_B),
+        pushes=limits_at(config, at_ref, reference.T, hessian_weight, local.D, local.D_B),
         gravity=terms.gravity,
         assist=terms.assist,
         local_pd=local.D * (q_ref - q) + local.D_B * (v_ref - v),
         coupled=terms.coupled,
         eased=np.zeros(12),
     )
-
-
-def per_unit_of_p(kinematics: Kinematics) -> Array:
-    """Return T (12, 6): joint rates per unit of p along the closed chain, undamped."""
-    A = np.vstack((kinematics.J, kinematics.C))
-    return np.asarray(np.linalg.lstsq(A, np.eye(12)[:, :6], rcond=None)[0], float)

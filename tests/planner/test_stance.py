@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 from services.planner.hocca import Hocca
-from services.planner.kinematics import Kinematics
+from services.planner.kinematics import Kinematics, Measured
 from services.planner.planner import Planner
 from services.planner.poses import Poses
 from services.planner.push_limit import LoadedStand
@@ -76,9 +76,9 @@ def standing_there(robot: RobotConfig, closed: Closed, stance: Array) -> tuple[K
 def test_the_stance_found_is_the_one_in_which_the_legs_agree(
     robot: RobotConfig, standing_there: tuple[Kinematics, Array], stance: Array
 ) -> None:
-    kinematics, q = standing_there
+    _, q = standing_there
     np.testing.assert_allclose(Standing(robot, q, stance).closure, 0.0, atol=1e-6)
-    np.testing.assert_allclose(kinematics.stance_at(q), stance, atol=1e-6)
+    np.testing.assert_allclose(Measured(robot).stance_at(q), stance, atol=1e-6)
 
 
 def test_the_pose_is_the_papers_with_the_feet_where_they_stand(
@@ -146,7 +146,7 @@ def test_while_it_leads_it_keeps_the_stance_and_in_hold_it_follows_slowly(
     moved[[2, 3]] += 0.01
     for _ in range(20):
         np.testing.assert_array_equal(law.tick(moved, STILL, 0.0, DT).stance, began)
-    there = Kinematics(robot).stance_at(moved).copy()
+    there = Measured(robot).stance_at(moved).copy()
     away = np.abs(there - began).max()
     assert away > 5e-3
     for _ in range(round(0.1 / DT)):
@@ -221,12 +221,12 @@ def test_angles_that_are_no_numbers_are_refused_and_leave_no_trace(number: float
 @pytest.mark.parametrize("joint", range(12))
 @pytest.mark.parametrize("off", [-np.pi, 3.1, 1.8])
 def test_an_encoder_that_is_half_a_turn_off_is_no_stance(
-    kinematics: Kinematics, robot: RobotConfig, closed: Closed, joint: int, off: float
+    robot: RobotConfig, closed: Closed, joint: int, off: float
 ) -> None:
     q = closed(1.0, pitch=0.3)
     q[joint] += off
     held = Stance(robot.law.stance_max)
-    held.take(kinematics.stance_at(q))
+    held.take(Measured(robot).stance_at(q))
     assert held.refused
 
 

@@ -1,0 +1,99 @@
+"""Solves the reference of a tick, and evaluates what the law needs there, in one graph. Pure.
+
+The graph (`services.planner.symbolic`) makes one Gauss-Newton step of the inverse kinematics from
+where the last reference was going. From tick to tick that step is shorter than `STEP_SURE`, so its
+error is below the solver's tolerance and nothing is evaluated twice. A longer step, or one out of
+the joint limits, goes to `InverseKinematics`, and the graph is evaluated where that ends.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner.inverse_kinematics import STEP_SURE, IkResult, InverseKinematics
+from services.planner.kinematics import Kinematics, graphs_of
+from shared.config.robot_config import RobotConfig
+from shared.robot.compiled_graph import CompiledGraph
+
+Array = NDArray[np.float64]
+
+
+class Reference:
+    """The reference pose.
+
+    `solve` and `evaluate` write these arrays, and the next call overwrites them. All but `q` are
+    evaluated at the pose from which the last step went, less than `STEP_SURE` rad from `q`:
+
+    - `q` (12,): q_ref, rad; `v` (12,): v_ref, rad/s.
+    - `T` (12, 6): joint rates per unit of p along the closed chain.
+    - `p` (6,), `J` (6, 12), `J_harness` (3, 12): as in `Kinematics`.
+    - `hessian_O` (12, 12): change of gravity and assist torque with the joints, N m/rad.
+    - `gravity` (12,): F_O^T J; `assist` (12,): F_assist^T J_harness; N m.
+    - `dtau_ff` (12,): change of both along v_ref and with the assist, N m/s.
+
+    `load` sets `D_left` (6, 6), `F_O` (6,) and `F_assist` (3,); the caller writes `stance` (6,).
+    """
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Build the graph and the solver."""
+        self._ik = InverseKinematics(Kinematics(config), np.array(config.joint_limits()))
+        self._graph = CompiledGraph(graphs_of(config).reference)
+        (
+            self._q, self.stance, self.D_left,
+            self._p_ref, self._pdot_ref, self.F_O, self.F_assist, self._assist_rate,
+        ) = self._graph.arguments  # fmt: skip
+        (
+            self._step, self._error, self.T, self.v, self.p, self.J, self.J_harness,
+            self.hessian_O, self.gravity, self.assist, self.dtau_ff,
+        ) = self._graph.results  # fmt: skip
+        self.q: Array = np.zeros(12)
+        self.start: Array = np.zeros(12)
+        """Joint angles (12,), rad, from which the next `solve` begins."""
+
+    def load(
+        self, pdot_ref: Array, F_O: Array, F_assist: Array, assist_rate: Array, D_left: Array
+    ) -> None:
+        """Set what the next `solve` or `evaluate` uses besides the pose.
+
+        Args:
+            pdot_ref: (6,), m/s and rad/s.
+            F_O: force and moment that hold the body (6,), N and N m, world.
+            F_assist: force at the harness (3,), N, world.
+            assist_rate: its rate (3,), N/s.
+            D_left: load sharing (6, 6), chosen at the measured pose.
+        """
+        self._pdot_ref[:], self.F_O[:] = pdot_ref, F_O
+        self.F_assist[:], self._assist_rate[:] = F_assist, assist_rate
+        self.D_left[:] = D_left
+
+    def solve(self, p_ref: Array) -> IkResult:
+        """Solve q = IK(p_ref) from `start`, and evaluate all arrays there.
+
+        Args:
+            p_ref: (6,), m and rad.
+        """
+        self._q[:], self._p_ref[:] = self.start, p_ref
+        self._graph()
+        largest = max(float(self._step.max()), -float(self._step.min()))
+        if largest < STEP_SURE:
+            np.add(self._q, self._step, out=self.q)
+            if self._ik.allows(self.q):
+                return IkResult(1, largest * largest)
+        ik = self._ik
+        ik.q[:], ik.kinematics.stance[:] = self.start, self.stance
+        result = ik.solve(p_ref, self.D_left)
+        self.evaluate(ik.q)
+        return result
+
+    def evaluate(self, q: Array) -> None:
+        """Take q (12,), rad, for the reference, and evaluate all arrays there."""
+        self.q[:] = self._q[:] = q
+        self._graph()
+
+    def kinematics(self) -> Kinematics:
+        """Return the kinematics at the pose of the last evaluation; not for every tick."""
+        kinematics = self._ik.kinematics
+        kinematics.stance[:] = self.stance
+        kinematics.update(self._q, self.D_left)
+        return kinematics
