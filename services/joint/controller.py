@@ -50,6 +50,7 @@ class JointController:
         self._gear_ratio = config.joint.gear_ratio
         self._blend_ns = service.blend_ms * NS_PER_MS
         self._period_late_ns = round(2 * NS_PER_S / service.rate_hz)
+        self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._law = SetpointLaw(config, module)
         self._state = ControllerState(estimate=JointEstimate(config.joint.gear_ratio))
 
@@ -158,6 +159,13 @@ class JointController:
     def setpoint(self) -> Setpoint:
         """Setpoint of the last cycle."""
         return self._law.current
+
+    @property
+    def is_state_due(self) -> bool:
+        """True if this cycle sends a state: every nth does, in the planner's phase."""
+        command = self._state.failsafe.command
+        phase = command.state_phase if command is not None else 0
+        return (self._state.cycle - phase) % self._state_every == 0
 
     def state(self, now_ns: int) -> JointState:
         """Return the module's state message.

@@ -89,7 +89,6 @@ class JointLoop:
         self._tracer = Tracer(module)
         self._reported = ArmingInhibit.NONE
         self._report_at_ns = 0
-        self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._nowhere = (-config.drive.zero_mark_turns,) * 2
 
     def run(self, stop: StopFlag) -> None:
@@ -124,7 +123,7 @@ class JointLoop:
         controller = module.controller
         if self._neighbours is not None:
             self._neighbours.write(row_of(controller))
-        if controller.cycle % self._state_every == 0:
+        if controller.is_state_due:
             ports.states.put(controller.state(now))
         if step.event is not None:
             ports.events.put(step.event)

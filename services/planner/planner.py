@@ -20,6 +20,7 @@ from services.planner.intents import OperatorRequest
 from services.planner.limp_leg_watch import LimpLegWatch
 from services.planner.plausible import Plausible
 from services.planner.snapshots import TickState
+from services.planner.state_phases import StatePhases
 from services.planner.trips import PlannerTrips, values_of
 from services.planner.unattended import Unattended
 from shared.bus.messages import (
@@ -85,6 +86,8 @@ class Planner:
         self._limp_legs = LimpLegWatch()
         self._trips = PlannerTrips(config)
         self._unattended = Unattended()
+        service = config.joint_service
+        self._phases = StatePhases(service.rate_hz, service.state_rate_hz)
         self._support = Support.NONE
         self._wrench_seq = -1
         self._last_ns = 0
@@ -156,6 +159,7 @@ class Planner:
             self._inhibit(),
         )
         self._support = self._limp_legs.advance(now_ns, states)
+        self._phases.advance(states, self._arrived_ns)
         # until all engage, the law restarts from the measured pose each tick: there is no
         # step
         self._output = self._law.tick(
@@ -206,6 +210,7 @@ class Planner:
             self._trips.snapshot(),
             self._request,
             self._unattended.snapshot(),
+            self._phases.snapshot(),
         )
 
     def restore(self, snapshot: TickState) -> None:
@@ -216,6 +221,7 @@ class Planner:
                 self.receive_state(module, state, arrived_ns)
         self._request = m.request
         self._unattended.restore(m.unattended)
+        self._phases.restore(m.phases)
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
         self._attitude, self._attitude_ns = m.attitude, m.attitude_ns
         self._attitude_seq = m.attitude_seq
@@ -243,8 +249,8 @@ class Planner:
             )
         ).reshape(7, N_MODULES, 2)
         commands = []
-        for module, state, row in zip(
-            MODULES, states, rows.transpose(1, 0, 2).tolist(), strict=True
+        for module, state, phase, row in zip(
+            MODULES, states, self._phases.phases, rows.transpose(1, 0, 2).tolist(), strict=True
         ):
             q_ref, v_ref, tau_ff, dtau_ff, tau_coupled, k_p, k_d = map(_pair, row)
             command = JointCommand(
@@ -263,6 +269,7 @@ class Planner:
                 margin=local.margins.service,
                 margin_onboard=local.margins.onboard,
                 stiffen=self._support.includes(module),
+                state_phase=phase,
             )
             commands.append(command)
         return commands

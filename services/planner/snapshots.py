@@ -78,6 +78,15 @@ class UnattendedState(msgspec.Struct, frozen=True):
     """Pose in which it left the robot: height of the COM, m, and the torso's pitch, rad."""
 
 
+class PhasesState(msgspec.Struct, frozen=True):
+    """State of `StatePhases`."""
+
+    phases: tuple[int, ...] = ()
+    behind: tuple[Pair, ...] = ()
+    """Of each module, the mean of (cos, sin) of 2 pi d / n: its states come d cycles behind the
+    first's."""
+
+
 class LoadState(msgspec.Struct, frozen=True):
     """State of `Load`."""
 
@@ -132,3 +141,4 @@ class TickState(msgspec.Struct, frozen=True):
     trips: TripsState = TripsState()
     request: OperatorRequest = OperatorRequest()
     unattended: UnattendedState = UnattendedState()
+    phases: PhasesState = PhasesState()

@@ -274,6 +274,9 @@ class JointCommand(Message, frozen=True):
     stiffen: bool = False
     """True while another module may be limp: in HOLD this one raises its gains to the stand
     gains."""
+    state_phase: int = 0
+    """The module is to send its state in the cycles of this number, modulo the cycles of a state
+    (docs/architecture.md#rates)."""
 
 
 class JointEvent(Message, frozen=True):

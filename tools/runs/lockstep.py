@@ -289,7 +289,7 @@ class Lockstep:
         self._record(topics.RUN_EVENT, "", event)
 
     def _joint(self, index: int, clock: HostClock) -> VirtualJoint:
-        name, joint = MODULES[index], self.config.joint_service
+        name = MODULES[index]
         return VirtualJoint(
             name,
             lambda: self.module_type(self.config, name),
@@ -298,7 +298,6 @@ class Lockstep:
             self.network.states()[index],
             self._record,
             clock=clock,
-            state_every=round(joint.rate_hz / joint.state_rate_hz),
             traced=self._traces,
         )
 

@@ -36,7 +36,6 @@ class VirtualJoint:
         record: Callable[[Topic, str, Message], None],
         *,
         clock: HostClock,
-        state_every: int,
         traced: bool,
     ) -> None:
         """Start the service.
@@ -49,14 +48,13 @@ class VirtualJoint:
             states: link to the planner.
             record: takes every message.
             clock: of the service's host.
-            state_every: cycles from one state message to the next.
             traced: record what re-execution needs.
         """
         self.name = name
         self.frozen = self.dead = False
         self._make, self._drive, self._clock = make, drive, clock
         self._commands, self._states, self._record = commands, states, record
-        self._state_every, self._traced = state_every, traced
+        self._traced = traced
         self.manager = make()
         self._tracer = Tracer(self.manager)
 
@@ -68,7 +66,7 @@ class VirtualJoint:
         self._drive.carry_out(action, onboard=manager.onboard)
         if action.event is not None:
             self._record(topics.JOINT_EVENT, self.name, action.event)
-        if manager.controller.cycle % self._state_every == 0:
+        if manager.controller.is_state_due:
             state = manager.controller.state(host_ns)
             self._states.put(now_ns, state)
             self._record(topics.JOINT_STATE, self.name, state)

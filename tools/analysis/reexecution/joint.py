@@ -38,8 +38,6 @@ class JointExecution:
         states: list[JointState] = log.messages(topics.JOINT_STATE, name)
         self._states = {(state.t_ns, state.cycle): state for state in states}
         self._events = {event.t_ns: event for event in log.messages(topics.JOINT_EVENT, name)}
-        service = robot.joint_service
-        self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._module: DriveManager | None = None
 
     def run(self) -> Iterator[Message]:
@@ -93,7 +91,7 @@ class JointExecution:
         )
         if computed != cycle:
             self._compare("trace", controller.cycle, _single(cycle), _single(computed))
-        if controller.cycle % self._state_every == 0:
+        if controller.is_state_due:
             state = controller.state(c.now_ns)
             recorded = self._states.get((state.t_ns, state.cycle))
             if recorded is not None:

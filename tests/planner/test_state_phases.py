@@ -1,0 +1,144 @@
+"""Six modules whose cycles no clock ties together send their states close together."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.planner.state_phases import StatePhases
+from shared.bus.messages import JointState
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.robot.joints import N_MODULES
+from tests.planner.test_planner import state
+
+RATE_HZ, STATE_HZ = 500.0, 250.0
+CYCLE_NS = round(NS_PER_S / RATE_HZ)
+STATE = state(0, np.zeros(12))
+
+
+class Modules:
+    """Six services: each with its own clock, count and phase."""
+
+    def __init__(
+        self,
+        begin_ns: Sequence[int],
+        counts: Sequence[int],
+        *,
+        n: int = 2,
+        ppm: Sequence[float] = (0.0,) * N_MODULES,
+        jitter_ns: int = 0,
+    ) -> None:
+        """Set when each begins and at which count, cycles per state, clock errors and jitter."""
+        self.n, self.phases = n, [0] * N_MODULES
+        self._begin_ns, self._first = begin_ns, counts
+        self._cycle_ns = [CYCLE_NS * (1.0 + 1e-6 * error) for error in ppm]
+        self._counts, self._dice, self._jitter_ns = list(counts), random.Random(1), jitter_ns
+
+    def send(self, module: int) -> tuple[JointState, int]:
+        """Return the module's next state and its arrival."""
+        self._counts[module] += 1
+        while (self._counts[module] - self.phases[module]) % self.n:
+            self._counts[module] += 1
+        count = self._counts[module]
+        cycles = count - self._first[module]
+        arrives = self._begin_ns[module] + cycles * self._cycle_ns[module]
+        arrives += self._dice.uniform(0.0, self._jitter_ns)
+        return msgspec.structs.replace(STATE, cycle=count), round(arrives)
+
+
+def run(phases: StatePhases, modules: Modules, ticks: int, *, heard: bool = True) -> list[float]:
+    """Return the spread of the arrivals of each tick, cycles."""
+    spreads = []
+    for _ in range(ticks):
+        sent = [modules.send(module) for module in range(N_MODULES)]
+        arrived = [arrival for _, arrival in sent]
+        phases.advance([state for state, _ in sent], arrived)
+        if heard:
+            modules.phases = list(phases.phases)
+        period = modules.n * CYCLE_NS
+        behind = [(a - arrived[0] + period / 2) % period - period / 2 for a in arrived]
+        spreads.append((max(behind) - min(behind)) / CYCLE_NS)
+    return spreads
+
+
+@given(
+    begin=st.lists(st.integers(0, 20 * CYCLE_NS), min_size=6, max_size=6),
+    counts=st.lists(st.integers(0, 9), min_size=6, max_size=6),
+    n=st.sampled_from([2, 3, 4]),
+)
+def test_after_a_second_all_states_come_within_a_cycle(
+    begin: list[int], counts: list[int], n: int
+) -> None:
+    phases = StatePhases(RATE_HZ, RATE_HZ / n)
+    spreads = run(phases, Modules(begin, counts, n=n), 250)
+    assert max(spreads[-20:]) <= 1.0 + 2 * 0.15 + 1e-9
+
+
+def test_jitter_of_a_cycle_moves_no_module_to_and_fro() -> None:
+    begin = [module * CYCLE_NS // 10 for module in range(N_MODULES)]
+    modules = Modules(begin, [0] * N_MODULES, jitter_ns=CYCLE_NS)
+    phases = StatePhases(RATE_HZ, STATE_HZ)
+    seen = set()
+    for _ in range(2500):
+        run(phases, modules, 1)
+        seen.add(tuple(phases.phases))
+    assert seen == {(0,) * N_MODULES}
+
+
+def test_drives_whose_clocks_drift_change_phase_once_for_each_cycle_they_drift() -> None:
+    modules = Modules([0] * N_MODULES, [0] * N_MODULES, ppm=[0, 200, 0, 0, 0, 0])
+    phases = StatePhases(RATE_HZ, STATE_HZ)
+    changes, last = 0, 0
+    for _ in range(10_000):  # 40 s: 8 ms, four cycles
+        run(phases, modules, 1)
+        changes += phases.phases[1] != last
+        last = phases.phases[1]
+    assert changes == 4
+
+
+def test_one_late_state_moves_nothing() -> None:
+    modules = Modules([0] * N_MODULES, [0] * N_MODULES)
+    phases = StatePhases(RATE_HZ, STATE_HZ)
+    run(phases, modules, 250)
+    states = [modules.send(module)[0] for module in range(N_MODULES)]
+    for late_ns in (1, CYCLE_NS, 100 * NS_PER_MS):
+        phases.advance(states, [0, late_ns, 0, 0, 0, 0])
+    assert phases.phases == [0] * N_MODULES
+
+
+def test_modules_that_do_not_hear_are_not_told_again_and_again() -> None:
+    modules = Modules([0, CYCLE_NS, 0, 0, 0, 0], [0] * N_MODULES)
+    phases = StatePhases(RATE_HZ, STATE_HZ)
+    run(phases, modules, 500, heard=False)
+    assert phases.phases == [0, 1, 0, 0, 0, 0]
+
+
+def test_a_new_planner_adopts_the_phases_that_the_last_one_left() -> None:
+    modules = Modules([0, CYCLE_NS, 0, 0, 0, 0], [0] * N_MODULES)
+    run(StatePhases(RATE_HZ, STATE_HZ), modules, 250)
+    left = list(modules.phases)
+    new = StatePhases(RATE_HZ, STATE_HZ)
+    assert max(run(new, modules, 500)) < 0.5
+    assert new.phases == left == [0, 1, 0, 0, 0, 0]
+
+
+def test_where_every_cycle_sends_a_state_there_is_nothing_to_choose() -> None:
+    phases = StatePhases(RATE_HZ, RATE_HZ)
+    run(phases, Modules([0, 700_000, 0, 0, 0, 0], [0, 1, 2, 3, 4, 5], n=1), 500)
+    assert phases.phases == [0] * N_MODULES
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 30, 60])
+def test_it_continues_from_a_state_bit_for_bit(ticks: int) -> None:
+    one, other = StatePhases(RATE_HZ, STATE_HZ), StatePhases(RATE_HZ, STATE_HZ)
+    run(one, Modules([0, 1_700_000, 300_000, 0, 0, 0], [0] * N_MODULES), ticks)
+    other.restore(one.snapshot())
+    for phases in (one, other):
+        run(phases, Modules([0, 1_700_000, 300_000, 0, 0, 0], [0] * N_MODULES), 60)
+    assert other.snapshot() == one.snapshot()
