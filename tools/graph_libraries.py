@@ -1,7 +1,8 @@
 """Translates a robot's graphs into C and keeps the libraries: `python -m tools.graph_libraries`.
 
-The graphs are the kinematics' and the simulated drivetrain's. A library is kept only if it gives
-the graph's own numbers, to the last bit, on drawn arguments (`shared.robot.compiled_graph`).
+The graphs are the law's, the simulated drivetrain's and the simulated drives'. A library is kept
+only if it gives the graph's own numbers, to the last bit, on drawn arguments
+(`shared.robot.compiled_graph`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from services.planner import symbolic
 from services.planner.model import leg_geometry
+from services.simulator import axis_control
 from services.simulator.body import body_of
 from services.simulator.drivetrain import step_graph
 from services.simulator.plant import PlantConfig
@@ -42,7 +44,7 @@ def graphs_of(robot: RobotConfig) -> list[ca.Function]:
     """Return every graph that a planner and a simulated world of a robot call in their cycles."""
     body = body_of(robot, PlantConfig())
     drivetrain = step_graph(body.drivetrain, body.motor_from_joint, body.model.opt.timestep)
-    return [*symbolic.build(robot, leg_geometry(robot)), drivetrain]
+    return [*symbolic.build(robot, leg_geometry(robot)), drivetrain, axis_control.law_graph()]
 
 
 def build(function: ca.Function, folder: Path = FOLDER) -> Path:

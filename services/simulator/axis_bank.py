@@ -86,7 +86,7 @@ class AxisBank:
         mark = round(drive.zero_mark_turns * encoder_counts_per_turn)
         self.counts_from = encoders.counts_from
         self.counts_from[:] = mark * np.array(motor_signs)
-        self.bus = DcBus(self.settings)
+        self.bus = DcBus(self.settings, control.power, control.mechanical)
         self.state = [AxisState.IDLE] * n
         self.faults = [AxisErrors()] * n
         self.control_mode = control.control_mode
@@ -132,12 +132,14 @@ class AxisBank:
                 self._encoders.estimate(dt_s, pos_turns)
         if self.calibration.running or not self.conditions.all_well:
             self._apply_conditions()
-        if control.too_fast():
+        self._check_watchdogs()
+        too_fast, least, most = control.control()
+        if too_fast:
             for axis in control.overspeed():
                 self._fail(axis, FAULTS["OVERSPEED"])
-        self._check_watchdogs()
-        control.control()
-        for drive, why in self.bus.check(self.torque, self.vel_estimate).items():
+            _, least, most = control.control()
+        control.integrate()
+        for drive, why in self.bus.check(least, most).items():
             for axis in _both(2 * drive):
                 self._fail(axis, BUS_FAULTS[why])
         return self.torque

@@ -96,7 +96,6 @@ class Conditions:
         high = float(self._settings.axis(below + "temp_limit_upper")[axis])
         share = min(1.0, max(0.0, (high - celsius) / (high - low))) if enabled else 1.0
         self._control.derating[axis] = share
-        self._control.derated = bool((self._control.derating < 1.0).any())
         over = enabled and celsius >= high + OVER_TEMP_MARGIN
         (self._hot.add if over else self._hot.discard)(axis)
 

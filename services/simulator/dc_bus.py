@@ -8,14 +8,12 @@ currents. A brake resistor takes regenerated current beyond `max_regen_current`.
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.axis_settings import N_DRIVES, Settings
-from shared.robot.joints import N_JOINTS
 
 Vector = NDArray[np.float64]
 
@@ -25,7 +23,6 @@ SUPPLY_RESISTANCE: Final = 0.05
 DEAD_VOLTAGE: Final = 6.0
 """V; below it the processor stops as well."""
 BRAKE_DUTY_MAX: Final = 0.95
-_TURN: Final = 2.0 * math.pi
 
 
 class DcBus:
@@ -36,37 +33,28 @@ class DcBus:
         resistance: of each supply (6,), ohm.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, power: Vector, mechanical: Vector) -> None:
+        """Take the settings, and the motors' electrical and mechanical powers (12,), W."""
         self._settings = settings
         self._seen = -1
         self.supply = np.full(N_DRIVES, SUPPLY_VOLTAGE)
         self.resistance = np.full(N_DRIVES, SUPPLY_RESISTANCE)
-        self._power = np.zeros(N_JOINTS)
-        self._mechanical = np.zeros(N_JOINTS)
+        self._power, self._mechanical = power, mechanical
 
     def changed(self) -> None:
         """Say that a supply has been changed."""
         self._seen = -1
 
-    def check(self, torque: Vector, vel_turns: Vector) -> dict[int, str]:
-        """Take the motors' power of this instant; return the drives that trip, and why.
+    def check(self, least: float, most: float) -> dict[int, str]:
+        """Return the drives (0 .. 5) that their limits disarm, each with a name in `BUS_FAULTS`.
 
         Args:
-            torque: of the motors (12,), N m; 0 where the phases float.
-            vel_turns: of the motors (12,), turn/s.
-
-        Returns:
-            For each drive (0 .. 5) that its limits disarm, a name in `BUS_FAULTS`.
+            least: power of the motor that takes the least now, W.
+            most: of the one that takes the most.
         """
         if self._seen != self._settings.version:
             self._derive()
-        power, mechanical = self._power, self._mechanical
-        np.multiply(vel_turns, _TURN, out=mechanical)
-        mechanical *= torque
-        np.multiply(torque, torque, out=power)
-        power *= self._copper
-        power += mechanical
-        near = np.count_nonzero(power < self._least) or np.count_nonzero(power > self._most)
+        near = least < self._least or most > self._most
         return self._trips() if near or self._always else {}
 
     def state(self, drive: int) -> tuple[float, float]:
@@ -82,8 +70,6 @@ class DcBus:
         """Work out constants, and the power below which no limit can be near."""
         settings = self._settings
         self._seen = settings.version
-        kt = settings.axis("motor.config.torque_constant")
-        self._copper = 1.5 * settings.axis("motor.config.phase_resistance") / kt**2
         self._lowest = settings.drive("config.dc_bus_undervoltage_trip_level").copy()
         self._highest = settings.drive("config.dc_bus_overvoltage_trip_level").copy()
         self._negative = settings.drive("config.dc_max_negative_current").copy()

@@ -52,6 +52,17 @@ class CompiledGraph:
         for index, array in enumerate(self.results):
             buffer.set_res(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
 
+    def bind(self, index: int, array: Array) -> None:
+        """Read an argument from a caller's array (n,), which must live as long as the graph does.
+
+        Args:
+            index: of the argument.
+            array: contiguous; of the argument's length.
+        """
+        assert array.shape == self.arguments[index].shape  # noqa: S101 - else it reads beyond
+        self.arguments[index] = array
+        self._buffer.set_arg(index, memoryview(array))  # type: ignore[call-arg, arg-type]  # casadi's stub
+
     def __call__(self) -> None:
         """Compute the results from the arguments."""
         self._call()

@@ -85,12 +85,13 @@ class VirtualDrive:
         bank.feed(b)
 
     def _aim(self, target: MotorTarget) -> None:
-        bank, module = self._bank, self._module
-        bank.input_pos[module] = target.pos_turns
-        bank.input_vel[module] = target.vel_turns
-        bank.input_torque[module] = target.torque
-        bank.pos_gain[module] = target.pos_gain
-        bank.vel_gain[module] = target.vel_gain
+        """Write a target; number by number, which costs a third of writing slices."""
+        bank, (a, b) = self._bank, self._axes
+        bank.input_pos[a], bank.input_pos[b] = target.pos_turns
+        bank.input_vel[a], bank.input_vel[b] = target.vel_turns
+        bank.input_torque[a], bank.input_torque[b] = target.torque
+        bank.pos_gain[a], bank.pos_gain[b] = target.pos_gain
+        bank.vel_gain[a], bank.vel_gain[b] = target.vel_gain
 
     def _arm(self, *, onboard: bool) -> None:
         """Apply the settings of the drivers' arming frames."""
