@@ -58,6 +58,7 @@ VENDORS = {
     "cvxpy": ["services/planner/split_program.py"],
     "casadi": [
         "services/planner/symbolic.py",
+        "services/simulator/axis_control.py",
         "services/simulator/drivetrain.py",
         "shared/robot/compiled_graph.py",
         "tools/graph_libraries.py",
@@ -92,6 +93,7 @@ LAWS = [
     "services/joint/drivers/firmware.py",
     "services/joint/drivers/wired_drive.py",
     "services/joint/setpoint_law.py",
+    "services/joint/sample_clock.py",
     "shared/can/can_load.py",
     "shared/robot/dropouts.py",
     "shared/robot/fault_table.py",

@@ -7,7 +7,7 @@ from pathlib import Path
 from services.harness.filter import WrenchFilter
 from services.harness.loop import HarnessLoop
 from services.harness.sensor import CanHarnessSensor
-from shared import log, process
+from shared import log, process, scheduling
 from shared.bus import session as bus
 from shared.bus import topics
 from shared.bus.messages import TareRequest, Wrench
@@ -15,10 +15,6 @@ from shared.can.can_sensor import pause_ns
 from shared.can.sensor_loop import run
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig, expand
-from shared.priority import raise_priority
-
-FIFO_PRIORITY = 10
-"""Below the joint services and the planner: both stand and lead without it."""
 
 
 def main() -> int:
@@ -31,7 +27,7 @@ def main() -> int:
     sensor = make_sensor(config, arguments.run_dir)
     law = WrenchFilter(config.harness)
     stop = process.StopFlag()
-    granted = raise_priority(FIFO_PRIORITY)
+    granted = scheduling.apply("harness")
     with bus.open_session(
         config, "harness", arguments.run_dir, injected=arguments.injected
     ) as session:

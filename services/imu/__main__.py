@@ -6,7 +6,7 @@ from pathlib import Path
 
 from services.imu.attitude import AttitudeLaw
 from services.imu.loop import ImuLoop
-from shared import log, process
+from shared import log, process, scheduling
 from shared.bus import session as bus
 from shared.bus import topics
 from shared.bus.messages import Attitude
@@ -15,10 +15,6 @@ from shared.can.imu_can import ImuAssembler, ImuSample
 from shared.can.sensor_loop import run
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig, expand
-from shared.priority import raise_priority
-
-FIFO_PRIORITY = 10
-"""Below the joint services and the planner: both stand and lead without it."""
 
 
 def main() -> int:
@@ -31,7 +27,7 @@ def main() -> int:
     sensor = make_sensor(config, arguments.run_dir)
     law = AttitudeLaw(config.imu)
     stop = process.StopFlag()
-    granted = raise_priority(FIFO_PRIORITY)
+    granted = scheduling.apply("imu")
     with bus.open_session(config, "imu", arguments.run_dir, injected=arguments.injected) as session:
         loop = ImuLoop(sensor, law, session.publisher(topics.ATTITUDE, Attitude))
         logger.info("started at %g Hz, priority %s", config.imu.rate_hz, granted)

@@ -11,7 +11,7 @@ from services.joint.drivers.wired_drive import MotorFrame, WiredDrive
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import LastState, RearmGuard
-from shared import log
+from shared import log, scheduling
 from shared.bus import topics
 from shared.bus.messages import Estop, JointCommand, JointEvent, JointState
 from shared.bus.session import open_session
@@ -19,7 +19,6 @@ from shared.bus.traces import JointTrace
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
-from shared.priority import raise_priority
 from shared.process import (
     StopFlag,
     freeze_garbage,
@@ -27,9 +26,6 @@ from shared.process import (
     service_parser,
 )
 from shared.robot.joints import MODULES
-
-FIFO_PRIORITY = 20
-"""Above the planner: this tier stands when the others do not get the processor."""
 
 
 def main() -> int:
@@ -48,7 +44,7 @@ def main() -> int:
     logger = log.setup(module)
     robot = config_file.load(arguments.config)
     stop = StopFlag()
-    granted = raise_priority(FIFO_PRIORITY)
+    granted = scheduling.apply("joint", module)
     with open_session(robot, module, arguments.run_dir) as session:
         ports = JointPorts(
             commands=session.latest(topics.JOINT_COMMAND, JointCommand, module),

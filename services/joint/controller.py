@@ -50,6 +50,7 @@ class JointController:
         self._gear_ratio = config.joint.gear_ratio
         self._blend_ns = service.blend_ms * NS_PER_MS
         self._period_late_ns = round(2 * NS_PER_S / service.rate_hz)
+        self._period_ns = round(NS_PER_S / service.rate_hz)
         self._state_every = round(service.rate_hz / service.state_rate_hz)
         self._law = SetpointLaw(config, module)
         self._state = ControllerState(estimate=JointEstimate(config.joint.gear_ratio))
@@ -163,9 +164,13 @@ class JointController:
     @property
     def is_state_due(self) -> bool:
         """True if this cycle sends a state: every nth does, in the planner's phase."""
+        clock = self._state.clock
+        return clock.is_new and (clock.count - self._state_phase) % self._state_every == 0
+
+    @property
+    def _state_phase(self) -> int:
         command = self._state.failsafe.command
-        phase = command.state_phase if command is not None else 0
-        return (self._state.cycle - phase) % self._state_every == 0
+        return command.state_phase % self._state_every if command is not None else 0
 
     def state(self, now_ns: int) -> JointState:
         """Return the module's state message.
@@ -195,6 +200,7 @@ class JointController:
             drive_error=estimate.error,
             stiffened=self._law.stiffened,
             outside=int(failsafe.current_outside(now_ns, self.timing)),
+            state_phase=self._state_phase,
         )
 
     def snapshot(self) -> ControllerSnapshot:
@@ -217,6 +223,7 @@ class JointController:
         if s.last_cycle_ns and now_ns - s.last_cycle_ns > self._period_late_ns:
             s.late += 1
         s.last_cycle_ns = now_ns
+        s.clock.advance(now_ns, self._period_ns)
 
     def _estimated(self, reading: DriveReading | None, *, flushing: bool) -> Event:
         """Update the joint's estimate; return what happened to the drive."""

@@ -8,6 +8,7 @@ from services.joint.drivers.base import MotorTarget
 from services.joint.failsafe import Failsafe
 from services.joint.joint_estimate import JointEstimate
 from services.joint.rearm_guard import LastState
+from services.joint.sample_clock import SampleClock
 from services.joint.setpoint_law import SetpointState
 from services.joint.trips import JointTrips
 from shared.bus.messages import Pair
@@ -31,6 +32,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
     """Joint torque of the last cycle (phi, theta), N m."""
     cycle: int = 0
     late: int = 0
+    clock: SampleClock = msgspec.field(default_factory=SampleClock)
     events: int = 0
     states: int = 0
 
@@ -42,6 +44,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
             estimate=replace(self.estimate),
             failsafe=self.failsafe.copied(),
             trips=replace(self.trips),
+            clock=replace(self.clock),
         )
 
 

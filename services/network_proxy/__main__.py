@@ -14,7 +14,7 @@ from services.network_proxy.listener import SocketListener
 from services.network_proxy.loop import run
 from services.network_proxy.proxy_endpoint import ProxyEndpoint, address_of
 from services.network_proxy.relay import Relay
-from shared import log, process
+from shared import log, process, scheduling
 from shared.bus import session as bus
 from shared.bus import topics
 from shared.bus.links import DIRECTIONS, PAIRS, Pair, endpoint_through
@@ -25,10 +25,7 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.network.impairment import Direction
 from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.network.proxy_protocol import SOCKET
-from shared.priority import raise_priority
 
-FIFO_PRIORITY = 15
-"""Priority of the services whose messages it forwards: its own delay must be small."""
 _UNIX = "unixsock-stream/"
 
 
@@ -40,7 +37,7 @@ def main() -> int:
     logger = log.setup("network_proxy")
     config = load(arguments.config)
     stop = process.StopFlag()
-    granted = raise_priority(FIFO_PRIORITY)
+    granted = scheduling.apply("network_proxy")
     directions = {name: Direction(name, arguments.seed) for name in DIRECTIONS}
     endpoints = [_proxy_endpoint(pair, config, arguments.run_dir) for pair in PAIRS]
     watch = SocketWatch()

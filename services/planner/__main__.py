@@ -6,7 +6,7 @@ import secrets
 
 from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner
-from shared import log
+from shared import log, scheduling
 from shared.bus import topics
 from shared.bus.messages import (
     Attitude,
@@ -19,7 +19,6 @@ from shared.bus.messages import (
 from shared.bus.session import open_session
 from shared.bus.traces import PlannerCheckpoint
 from shared.config import files as config_file
-from shared.priority import raise_priority
 from shared.process import (
     StopFlag,
     add_injected,
@@ -29,9 +28,6 @@ from shared.process import (
 )
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
-
-FIFO_PRIORITY = 15
-"""Below the joint services, because the failsafe has priority over the law."""
 
 
 def main() -> int:
@@ -45,7 +41,7 @@ def main() -> int:
     robot = config_file.load(arguments.config)
     gain_schedule.require(robot, arguments.config)
     stop = StopFlag()
-    granted = raise_priority(FIFO_PRIORITY)
+    granted = scheduling.apply("planner")
     with open_session(robot, "planner", arguments.run_dir, injected=arguments.injected) as session:
         ports = PlannerPorts(
             states=[session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES],

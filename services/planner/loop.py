@@ -36,9 +36,9 @@ class PlannerPorts(msgspec.Struct, frozen=True):
     checkpoint: Publisher[PlannerCheckpoint]
 
 
-POLL_NS = 400 * NS_PER_US
+POLL_NS = 200 * NS_PER_US
 """ns between two polls for states, once they are due."""
-REST_FRACTION = 0.8
+REST_FRACTION = 0.9
 """Fraction of a period after a tick in which no states are expected."""
 
 
@@ -58,7 +58,8 @@ class PlannerLoop:
             now = now_ns()
             if self.receive_states(now):
                 self.tick(now)
-                sleep_until(now + self._rest_ns)
+                rests = not self._planner.compares_arrivals
+                sleep_until(now + (self._rest_ns if rests else POLL_NS))
             else:
                 sleep_until(now + POLL_NS)
 

@@ -97,6 +97,11 @@ class Planner:
         self._source: SplitSource | None = None
         """Source of the gains of the last tick."""
 
+    @property
+    def compares_arrivals(self) -> bool:
+        """True if the next states' arrivals count (`services.planner.state_phases`)."""
+        return self._phases.compares
+
     def receive_state(self, module: int, state: JointState, now_ns: int) -> None:
         """Store a module's newest state, if it is plausible."""
         if not self._plausible.is_state(module, state):

@@ -82,8 +82,12 @@ class PhasesState(msgspec.Struct, frozen=True):
     """State of `StatePhases`."""
 
     phases: tuple[int, ...] = ()
-    behind: tuple[Pair, ...] = ()
-    """Of each module, the mean of (cos, sin) of 2 pi d / n: its states come d cycles behind the
+    tick: int = 0
+    """Ticks since the last comparison began."""
+    every: int = 128
+    """Ticks from its begin to that of the next."""
+    sums: tuple[Pair, ...] = ()
+    """Of each module, the sum of (cos, sin) of 2 pi d / n: its states come d cycles behind the
     first's."""
 
 

@@ -6,6 +6,9 @@ in its even cycles what the others send in their odd ones, each tick waits for i
 states that are a cycle older than they need be. The planner compares the states' arrivals with the
 first module's, and names in each command the cycle in which the next state is to be sent
 (`JointCommand.state_phase`). A late command, or none, changes nothing: a module keeps its phase.
+
+Arrivals are compared in the first ticks of each `EVERY_TICKS`. Only then does the planner's loop
+look for states all the time; otherwise it rests after a tick, and what came early looks late.
 """
 
 from __future__ import annotations
@@ -19,12 +22,13 @@ from shared.bus.messages import JointState, Pair
 from shared.clock import NS_PER_S
 from shared.robot.joints import N_MODULES
 
-FOLLOW_FRACTION: Final = 1.0 / 64.0
-"""Of a new arrival in a module's mean: a quarter of a second at 250 Hz, so that no single late
-message moves a module."""
+EVERY_TICKS: Final = 1024
+"""Most ticks from one comparison to the next: 4 s, in which two drives' clocks drift apart by a
+fifth of a cycle at the most (100 ppm). The first follow sooner: a starting fleet is not quiet."""
+COMPARED_TICKS: Final = 64
+"""Ticks of a comparison: a quarter of a second, so that no single late message moves a module."""
 SURE: Final = 0.5
-"""Length of a mean from which it counts, 0 .. 1: an even spread over all phases has 0, and so has a
-mean that has just begun."""
+"""Length of a mean direction from which it counts, 0 .. 1; an even spread over all phases has 0."""
 HYSTERESIS: Final = 0.15
 """Of a cycle, beyond half a cycle: the drives' clocks drift past one another, and a phase is not to
 change to and fro."""
@@ -41,8 +45,15 @@ class StatePhases:
         """Set the rates of the modules' cycles and of their states, Hz."""
         self._n = round(rate_hz / state_rate_hz)
         self._radians_per_ns = 2.0 * math.pi * state_rate_hz / NS_PER_S
-        self._behind: list[Pair] = [(0.0, 0.0)] * N_MODULES
+        self._tick = 0
+        self._every = 2 * COMPARED_TICKS
+        self._sums: list[Pair] = [(0.0, 0.0)] * N_MODULES
         self.phases: list[int] = []
+
+    @property
+    def compares(self) -> bool:
+        """True if the next tick's arrivals are compared: they must not be rounded up by a rest."""
+        return self._n > 1 and self._tick < COMPARED_TICKS
 
     def advance(self, states: Sequence[JointState], arrived_ns: Sequence[int]) -> None:
         """Compare the states of a tick.
@@ -53,27 +64,33 @@ class StatePhases:
         """
         n, first_ns = self._n, arrived_ns[0]
         if not self.phases:  # as the last planner left them
-            self.phases = [state.cycle % n for state in states]
-        if n == 1:
-            return
-        for module, state in enumerate(states):
-            if state.cycle % n != self.phases[module]:
-                continue  # it has not heard yet
-            angle = self._radians_per_ns * (arrived_ns[module] - first_ns)
-            x, y = self._behind[module]
-            x += FOLLOW_FRACTION * (math.cos(angle) - x)
-            y += FOLLOW_FRACTION * (math.sin(angle) - y)
-            cycles = n / (2.0 * math.pi) * math.atan2(y, x)
-            if math.hypot(x, y) > SURE and abs(cycles) > 0.5 + HYSTERESIS:
-                self.phases[module] = (self.phases[module] - round(cycles)) % n
-                x = y = 0.0
-            self._behind[module] = (x, y)
+            self.phases = [state.state_phase % n for state in states]
+        compares = self.compares and self._tick > 0  # before the first there was a rest
+        self._tick = (self._tick + 1) % self._every
+        if compares:
+            for module, (x, y) in enumerate(self._sums):
+                angle = self._radians_per_ns * (arrived_ns[module] - first_ns)
+                self._sums[module] = (x + math.cos(angle), y + math.sin(angle))
+            if not self.compares:
+                self._decide(states)
+
+    def _decide(self, states: Sequence[JointState]) -> None:
+        """Choose the phases, and begin anew."""
+        n, count = self._n, COMPARED_TICKS - 1
+        for module, (state, (x, y)) in enumerate(zip(states, self._sums, strict=True)):
+            behind = n / (2.0 * math.pi) * math.atan2(y, x)
+            # one that is in another phase than it was told has not heard yet
+            told = state.state_phase % n == self.phases[module]
+            if told and math.hypot(x, y) > SURE * count and abs(behind) > 0.5 + HYSTERESIS:
+                self.phases[module] = (self.phases[module] - round(behind)) % n
+        self._sums = [(0.0, 0.0)] * N_MODULES
+        self._every = min(EVERY_TICKS, 2 * self._every)
 
     def snapshot(self) -> PhasesState:
         """Return the state."""
-        return PhasesState(tuple(self.phases), tuple(self._behind))
+        return PhasesState(tuple(self.phases), self._tick, self._every, tuple(self._sums))
 
     def restore(self, state: PhasesState) -> None:
         """Continue from a state."""
-        self.phases = list(state.phases)
-        self._behind = list(state.behind) or [(0.0, 0.0)] * N_MODULES
+        self.phases, self._tick, self._every = list(state.phases), state.tick, state.every
+        self._sums = list(state.sums) or [(0.0, 0.0)] * N_MODULES

@@ -22,7 +22,7 @@ from services.recorder.auto_recover import AutoRecovery
 from services.recorder.disk_guard import MIB
 from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
 from services.recorder.snapshot import SnapshotRing
-from shared import log
+from shared import log, scheduling
 from shared.bus import topics
 from shared.bus.session import open_session
 from shared.clock import keep_pace, now_ns, pace
@@ -32,13 +32,8 @@ from shared.exceptions import ConfigError, RunError
 from shared.mcap_log import provenance
 from shared.mcap_log.files import FIRST
 from shared.mcap_log.writer import SCHEMA_VERSION, MessageSource, RunWriter
-from shared.priority import raise_priority
 from shared.process import CHECKOUT, StopFlag, run_service, service_parser
 from shared.robot import gain_schedule
-
-FIFO_PRIORITY: Final = 5
-"""Below every control service, above what has no such priority: a starved recorder's
-messages are dropped by their senders before they reach its queue."""
 
 DRAIN_PERIOD_S: Final = 0.02
 """Bounds how late `log_time` is. 5, 10 and 20 ms cost the same CPU at 5000 messages/s."""
@@ -76,7 +71,7 @@ def main() -> int:
     metadata = _metadata(config.name, arguments, config.recorder)
     recorded = {key: t for key, t in topics.all_keys(config.name).items() if t.recorded}
     snapshot = _snapshot(arguments.snapshot, config.recorder, recorded)
-    granted = raise_priority(FIFO_PRIORITY)
+    granted = scheduling.apply("recorder")
     # The bus before the file: an endpoint that is taken leaves no empty file behind.
     with open_session(config, "recorder", arguments.run_dir) as session:
         stream = session.stream([f"xrl/{config.name}/**"], capacity=CAPACITY)

@@ -19,7 +19,7 @@ from services.simulator.plant import plant_from
 from services.simulator.unix_can_hub import UnixCanHub
 from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
-from shared import log
+from shared import log, scheduling
 from shared.bus import topics
 from shared.bus.messages import OperatorIntent, SimControl, SimTruth
 from shared.bus.session import open_session
@@ -27,7 +27,6 @@ from shared.bus.traces import SimState
 from shared.config import files as config_file
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig, expand
-from shared.priority import raise_priority
 from shared.process import (
     DEFAULT_CONFIG,
     StopFlag,
@@ -36,9 +35,6 @@ from shared.process import (
     service_parser,
 )
 from shared.robot.joints import MODULE_INDEX, N_JOINTS
-
-FIFO_PRIORITY = 25
-"""The world waits for nobody."""
 
 DEFAULT_SCENARIO = DEFAULT_CONFIG.parent / "scenarios" / "stand.toml"
 
@@ -79,7 +75,7 @@ def main() -> int:
     scenario = scenarios.load(arguments.scenario)
     true_plant = plant_from(arguments.plant)
     stop = StopFlag()
-    granted = raise_priority(FIFO_PRIORITY)
+    granted = scheduling.apply("simulator")
     with ExitStack() as stack:
         session = stack.enter_context(open_session(robot, "simulator", arguments.run_dir))
         ports = SimulatorPorts(

@@ -240,6 +240,8 @@ class JointState(Message, frozen=True):
     """True while this module holds with all of its stand gains because another may be limp."""
     outside: int = 0
     """Part of the newest command that lies outside the envelope; 0 if none."""
+    state_phase: int = 0
+    """Phase in which this module sends its states, as the planner asked (`JointCommand`)."""
 
 
 class JointCommand(Message, frozen=True):
@@ -275,7 +277,7 @@ class JointCommand(Message, frozen=True):
     """True while another module may be limp: in HOLD this one raises its gains to the stand
     gains."""
     state_phase: int = 0
-    """The module is to send its state in the cycles of this number, modulo the cycles of a state
+    """The module is to send its state in the periods of this number, modulo the periods of a state
     (docs/architecture.md#rates)."""
 
 

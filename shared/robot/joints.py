@@ -40,3 +40,8 @@ MODULE_INDEX: Final = {name: index for index, name in enumerate(MODULES)}
 def kind_of(module: str) -> str:
     """Return "ankle", "knee" or "hip" for a module name."""
     return module.rpartition("_")[0]
+
+
+def side_of(module: str) -> str:
+    """Return "right" or "left" for a module name."""
+    return module.rpartition("_")[2]

@@ -16,7 +16,7 @@ PERIOD_NS: Final = 2_000_000
 GAP_NS: Final = 20_000_000
 """A delay beyond the period that counts: with some milliseconds of network, an age of 50 ms."""
 PRIORITY: Final = 90
-"""Above every service (`shared.priority`)."""
+"""Above every service (`shared.scheduling`)."""
 
 
 class Gap(NamedTuple):

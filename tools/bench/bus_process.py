@@ -18,7 +18,7 @@ from typing import Final
 import msgspec
 
 from services.planner.loop import POLL_NS, REST_FRACTION
-from shared import priority
+from shared import scheduling
 from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, JointState
 from shared.clock import NS_PER_S
@@ -166,7 +166,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seconds", type=float, default=10.0)
     arguments = parser.parse_args()
-    priority.raise_priority(_PRIORITY)
+    scheduling.raise_priority(_PRIORITY)
     transport = open_transport(arguments.transport, arguments.name, arguments.folder)
     gc.freeze()
     gc.disable()

@@ -1,7 +1,7 @@
 """Checks of the computer: processors, clock, real-time permission, USB, CAN interfaces.
 
 For an emulated robot, a missing capability of a sandbox or a laptop is ok if the services can do
-without it (`shared.priority`); the row says so.
+without it (`shared.scheduling`); the row says so.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import resource
 from pathlib import Path
 from typing import Final
 
-from shared import priority
+from shared import scheduling
 from shared.config.robot_config import RobotConfig
 from shared.robot.compiled_graph import library_of
 from tools.bringup.check_socketcan import query_ip, socketcan_rows
@@ -26,9 +26,6 @@ CPUS_FOR_1_KHZ: Final = 4
 """Two carry the fleet at 500 Hz (CHANGELOG.md)."""
 CLOCKS: Final = ("tsc", "arch_sys_counter", "kvm-clock")
 """Clock sources that are read without a system call."""
-FIFO_PRIORITY: Final = 20
-"""FIFO priority of the joint services."""
-
 ODRIVE_VENDOR: Final = "1209"
 ODRIVE_PRODUCTS: Final = tuple(f"0d3{i}" for i in range(1, 10))
 """As in deploy/udev/91-odrive.rules."""
@@ -38,6 +35,11 @@ UDEV_FIX: Final = (
 RTPRIO_FIX: Final = (
     "`YOU - rtprio 40` in /etc/security/limits.d/xrl.conf and log in again, or systemd's "
     "LimitRTPRIO=40"
+)
+
+MEMLOCK_FIX: Final = (
+    "`YOU - memlock unlimited` in /etc/security/limits.d/xrl.conf and log in again, or systemd's "
+    "LimitMEMLOCK=infinity"
 )
 
 
@@ -54,6 +56,7 @@ def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
         _governor(root, emulated=emulated),
         _clock(root, emulated=emulated),
         _real_time(emulated=emulated),
+        _memory(emulated=emulated),
         _swap(root, emulated=emulated),
         _graphs(robot),
     ]
@@ -86,7 +89,9 @@ def _cpus() -> Finding:
         fix = "another computer, or more of this one's processors (taskset, container)"
         return warning(SUBJECT, "processors", str(count), f">= {CPUS_MIN}", fix)
     wanted = f">= {CPUS_MIN}; {CPUS_FOR_1_KHZ} for 1 kHz"
-    return ok(SUBJECT, "processors", str(count), wanted)
+    halves = (scheduling.half_of(os.sched_getaffinity(0), kind) for kind in ("harness", "planner"))
+    listed = " | ".join(",".join(map(str, sorted(half))) for half in halves)
+    return ok(SUBJECT, "processors", f"{count}: right leg {listed} left leg, planner", wanted)
 
 
 def _graphs(robot: RobotConfig) -> Finding:
@@ -135,7 +140,7 @@ def _real_time(*, emulated: bool) -> Finding:
     what, wanted = "real-time priority", "SCHED_FIFO"
     if _may_be_fifo():
         return ok(SUBJECT, what, "SCHED_FIFO allowed", wanted)
-    fallback = priority.short_slice()
+    fallback = scheduling.short_slice()
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     if fallback == "normal priority":
         why = "the loops come late when the machine is busy"
@@ -149,11 +154,26 @@ def _real_time(*, emulated: bool) -> Finding:
 def _may_be_fifo() -> bool:
     """Try it and go back: limits, capabilities and control groups all have their say."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(scheduling.TABLE["joint"].fifo))
     except OSError:
         return False
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     return True
+
+
+def _memory(*, emulated: bool) -> Finding:
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    may = scheduling.may_lock()
+    return judged(
+        may or emulated,
+        SUBJECT,
+        "locked memory",
+        "allowed" if may else f"refused: {limit // 1024} KiB",
+        "allowed",
+        MEMLOCK_FIX,
+        "a page that has to be read again stops a loop",
+        otherwise=FindingKind.WARNING,
+    )
 
 
 def _swap(root: Path, *, emulated: bool) -> Finding:
@@ -165,7 +185,7 @@ def _swap(root: Path, *, emulated: bool) -> Finding:
         "none" if areas <= 0 else f"{areas} in use",
         "none",
         "`sudo swapoff -a`",
-        "the services lock no memory: a page that was swapped out stops a loop",
+        "a service that may not lock its memory stops for a page that was swapped out",
         otherwise=FindingKind.WARNING,
     )
 

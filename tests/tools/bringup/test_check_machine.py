@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared import priority
+from shared import scheduling
 from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from tools.bringup import check_machine
@@ -84,7 +84,7 @@ def test_without_real_time_permission_the_services_fallback_is_named(
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    monkeypatch.setattr(priority, "short_slice", lambda: granted)
+    monkeypatch.setattr(scheduling, "short_slice", lambda: granted)
     rows = check_machine.machine_rows(robot if emulated else real, tmp_path)
     row = row_of(rows, "real-time priority")
     assert row.verdict is verdict

@@ -1,0 +1,119 @@
+"""Priority, processors and locked memory of each process, by one table (docs/networks.md).
+
+Call `apply` before the bus is opened: the bus's threads inherit priority and processors.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import resource
+import struct
+from collections.abc import Collection
+from typing import Final, Literal, NamedTuple
+
+from shared.robot.joints import SIDES, side_of
+
+PINNED_VARIABLE: Final = "XRL_PINNED"
+"""Environment variable; with "1" the processes stay on their half of the processors. The fleet's
+process table sets it (`deploy/processes.toml`)."""
+
+
+class ProcessSchedule(NamedTuple):
+    """A process's row."""
+
+    fifo: int
+    """SCHED_FIFO priority, 1 .. 99."""
+    half: Literal["first", "second", "by leg"]
+    """Half of the processors: a leg and who feeds it share their caches."""
+
+
+TABLE: Final[dict[str, ProcessSchedule]] = {
+    "simulator": ProcessSchedule(25, "first"),
+    "joint": ProcessSchedule(20, "by leg"),
+    "planner": ProcessSchedule(15, "second"),
+    "network_proxy": ProcessSchedule(15, "first"),
+    "harness": ProcessSchedule(10, "first"),
+    "imu": ProcessSchedule(10, "first"),
+    "recorder": ProcessSchedule(5, "second"),
+}
+"""By kind of process. The right leg is on the first half, the left leg on the second."""
+
+_PR_SET_TIMERSLACK: Final = 29
+_SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "armv7l": 380}
+_SCHED_ATTR: Final = struct.Struct("=IIQiIQQQ")
+"""size, policy, flags, nice, priority, runtime, deadline, period."""
+SLICE_NS: Final = 100_000
+"""The shortest slice that the kernel gives: a short slice is a near deadline (EEVDF)."""
+TIMER_SLACK_NS: Final = 1_000
+"""Sleeps end so close to their time; the default is 50 us."""
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+
+
+def apply(kind: str, module: str = "") -> str:
+    """Give this process its priority, processors and locked memory; return what was granted.
+
+    Args:
+        kind: of process, in `TABLE`.
+        module: of a joint service.
+    """
+    granted = [raise_priority(TABLE[kind].fifo)]
+    if os.environ.get(PINNED_VARIABLE) == "1":
+        processors = half_of(os.sched_getaffinity(0), kind, module)
+        os.sched_setaffinity(0, processors)
+        granted.append(f"processors {','.join(map(str, sorted(processors)))}")
+    if lock_memory():
+        granted.append("memory locked")
+    return ", ".join(granted)
+
+
+def half_of(processors: Collection[int], kind: str, module: str = "") -> set[int]:
+    """Return the processors of a process, out of those that there are; a single one is for all."""
+    half = TABLE[kind].half
+    if half == "by leg":
+        half = "first" if side_of(module) == SIDES[0] else "second"
+    ordered = sorted(processors)
+    middle = (len(ordered) + 1) // 2
+    return set(ordered[:middle] if half == "first" else ordered[middle:] or ordered)
+
+
+def raise_priority(fifo: int) -> str:
+    """Set SCHED_FIFO, or what needs no privilege; return what was granted."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo))
+    except (OSError, AttributeError):
+        return short_slice()
+    return f"SCHED_FIFO {fifo}"
+
+
+def short_slice() -> str:
+    """Set a short scheduling slice and exact timers; return what was granted."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    granted = []
+    if libc.prctl(_PR_SET_TIMERSLACK, TIMER_SLACK_NS, 0, 0, 0) == 0:
+        granted.append(f"timer slack {TIMER_SLACK_NS} ns")
+    number = _SCHED_SETATTR.get(platform.machine())
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+    attributes = _SCHED_ATTR.pack(_SCHED_ATTR.size, os.SCHED_OTHER, 0, nice, 0, SLICE_NS, 0, 0)
+    if number is not None and libc.syscall(number, 0, attributes, 0) == 0:
+        granted.append(f"slice {SLICE_NS} ns")
+    return ", ".join(granted) or "normal priority"
+
+
+def lock_memory() -> bool:
+    """Keep in memory every page that this process has touched or will touch; True if granted.
+
+    Pages that are never touched, such as most of each thread's stack, take no memory. Under a limit
+    nothing is locked: beyond it, an allocation would fail in the middle of the work.
+    """
+    if not may_lock():
+        return False
+    libc = ctypes.CDLL(None, use_errno=True)
+    done: int = libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
+    return done == 0
+
+
+def may_lock() -> bool:
+    """Return True if this process may lock memory without a limit."""
+    return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] < 0

@@ -1,0 +1,69 @@
+"""Periods are counted, not samples: none is lost or counted twice while a service is held up."""
+
+from __future__ import annotations
+
+import random
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.joint.sample_clock import SampleClock
+from shared.clock import NS_PER_MS, NS_PER_S
+
+PERIOD_NS = 2 * NS_PER_MS
+
+
+def counted(times_ns: list[int]) -> list[int]:
+    clock, counts = SampleClock(), []
+    for now_ns in times_ns:
+        clock.advance(now_ns, PERIOD_NS)
+        counts.append(clock.count)
+    return counts
+
+
+@given(
+    seed=st.integers(0, 1000),
+    ppm=st.floats(-200.0, 200.0),
+    late=st.floats(0.0, 0.45),
+    lost=st.floats(0.0, 0.2),
+)
+def test_the_count_is_that_of_the_periods_whatever_is_late_or_lost(
+    seed: int, ppm: float, late: float, lost: float
+) -> None:
+    dice = random.Random(seed)
+    numbers = [0, *(number for number in range(1, 2000) if dice.random() >= lost)]
+    period = PERIOD_NS * (1.0 + 1e-6 * ppm)
+    times = [NS_PER_S + round(period * (n + dice.uniform(0.0, late))) for n in numbers]
+    times[0] = NS_PER_S
+    assert counted(times) == [number + 1 for number in numbers]
+
+
+@pytest.mark.parametrize("held_up_ns", [3 * NS_PER_MS, 9 * NS_PER_MS, NS_PER_S])
+def test_after_a_service_was_held_up_the_count_goes_on_as_if_it_had_not(held_up_ns: int) -> None:
+    times = [NS_PER_S + number * PERIOD_NS for number in range(100)]
+    held = max(now_ns for now_ns in times if now_ns <= times[50] + held_up_ns)
+    late = [now_ns for now_ns in times if now_ns <= times[50] or now_ns > times[50] + held_up_ns]
+    late.append(times[50] + held_up_ns)
+    expected = {now_ns: (now_ns - NS_PER_S) // PERIOD_NS + 1 for now_ns in times}
+    for now_ns, count in zip(sorted(late), counted(sorted(late)), strict=True):
+        if now_ns in expected:
+            assert count == expected[now_ns], (held, now_ns)
+
+
+def test_two_samples_within_a_period_begin_one() -> None:
+    clock, began = SampleClock(), 0
+    for number in range(100):
+        for soon_ns in (0, 100_000):
+            clock.advance(NS_PER_S + number * PERIOD_NS + soon_ns, PERIOD_NS)
+            began += clock.is_new
+    assert began == clock.count == 100
+
+
+def test_a_copy_does_not_change_with_it() -> None:
+    clock = SampleClock()
+    clock.advance(NS_PER_S, PERIOD_NS)
+    copy = msgspec.structs.replace(clock)
+    clock.advance(NS_PER_S + PERIOD_NS, PERIOD_NS)
+    assert (copy.count, clock.count) == (1, 2)

@@ -1,0 +1,86 @@
+"""What each process is given, and what one may have without privilege."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from shared.robot.joints import MODULES
+from shared.scheduling import SLICE_NS, TABLE, TIMER_SLACK_NS, half_of
+from tools.fleet.process_table import TABLE as PROCESSES
+from tools.fleet.process_table import load_table
+
+READ_BACK = """
+from pathlib import Path
+from shared.scheduling import short_slice
+print(short_slice())
+print(Path("/proc/self/timerslack_ns").read_text().strip())
+print([line.split(":")[1].strip() for line in Path("/proc/self/sched").read_text().splitlines()
+       if line.startswith("se.slice")])
+"""
+
+
+def test_a_short_slice_and_exact_timers_need_no_privilege() -> None:
+    granted, slack, _slice = subprocess.run(
+        [sys.executable, "-c", READ_BACK], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    assert slack == str(TIMER_SLACK_NS)
+    assert f"timer slack {TIMER_SLACK_NS} ns" in granted
+    if "slice" not in granted.replace("timer slack", ""):
+        pytest.skip("this kernel takes no slice by sched_setattr")
+    assert f"slice {SLICE_NS} ns" in granted
+
+
+def test_every_process_of_the_fleet_has_a_row() -> None:
+    assert {row.kind for row in load_table(PROCESSES).process} == set(TABLE)
+
+
+def test_what_a_step_needs_first_has_the_higher_priority() -> None:
+    order = ("simulator", "joint", "planner", "harness", "recorder")
+    priorities = [TABLE[kind].fifo for kind in order]
+    assert priorities == sorted(priorities, reverse=True)
+    assert len(set(priorities)) == len(order)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 8])
+def test_the_halves_are_the_legs_and_no_processor_is_left_out(count: int) -> None:
+    processors = list(range(10, 10 + count))
+    right, left = (
+        half_of(processors, "joint", "knee_right"),
+        half_of(processors, "joint", "hip_left"),
+    )
+    assert right | left == set(processors)
+    assert not right & left or count == 1
+    assert abs(len(right) - len(left)) <= 1
+    for module in MODULES:
+        half = half_of(processors, "joint", module)
+        assert half == (right if module.endswith("right") else left)
+    assert half_of(processors, "planner") == half_of(processors, "recorder") == left
+    assert half_of(processors, "simulator") == half_of(processors, "harness") == right
+
+
+APPLY = """
+import os
+from shared import scheduling
+before = os.sched_getaffinity(0)
+print(scheduling.apply("joint", "hip_left"))
+print(os.sched_getaffinity(0) == scheduling.half_of(before, "joint", "hip_left"), len(before))
+block = bytearray(50_000_000)
+"""
+
+
+@pytest.mark.parametrize("pinned", ["0", "1"])
+def test_a_process_is_pinned_only_where_the_fleets_table_says_so(pinned: str) -> None:
+    said, row = subprocess.run(
+        [sys.executable, "-c", APPLY],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"XRL_PINNED": pinned},
+    ).stdout.splitlines()
+    same, count = row.split()
+    assert ("processors" in said) == (pinned == "1")
+    assert (same == "True") == (pinned == "1" or count == "1")
