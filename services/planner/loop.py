@@ -39,7 +39,10 @@ class PlannerPorts(msgspec.Struct, frozen=True):
 POLL_NS = 200 * NS_PER_US
 """ns between two polls for states, once they are due."""
 REST_FRACTION = 0.9
-"""Fraction of a period after a tick in which no states are expected."""
+"""Fraction of a period after the states were due in which no new ones are expected."""
+FOLLOW_NS = 50 * NS_PER_US
+"""ns by which the time at which states are due follows late ones from tick to tick: a tick that was
+held up makes none of the following late."""
 
 
 class PlannerLoop:
@@ -48,7 +51,8 @@ class PlannerLoop:
     def __init__(self, config: RobotConfig, planner: Planner, ports: PlannerPorts) -> None:
         self._planner = planner
         self._ports = ports
-        self._rest_ns = round(REST_FRACTION * NS_PER_S / config.planner.rate_hz)
+        self._period_ns = round(NS_PER_S / config.planner.rate_hz)
+        self._due_ns = 0
         self._intents = Intents(config.assist)
         self._checkpoints = Checkpoints(config.planner.rate_hz)
 
@@ -58,10 +62,17 @@ class PlannerLoop:
             now = now_ns()
             if self.receive_states(now):
                 self.tick(now)
-                rests = not self._planner.compares_arrivals
-                sleep_until(now + (self._rest_ns if rests else POLL_NS))
+                sleep_until(self._rests_until(now))
             else:
                 sleep_until(now + POLL_NS)
+
+    def _rests_until(self, now: int) -> int:
+        """Return when to look for states again, ns, after a tick that began `now`."""
+        expected = self._due_ns + self._period_ns + FOLLOW_NS
+        self._due_ns = now if now - expected > self._period_ns else min(now, expected)
+        if self._planner.compares_arrivals:
+            return now + POLL_NS
+        return self._due_ns + round(REST_FRACTION * self._period_ns)
 
     def receive_states(self, now: int) -> bool:
         """Receive new states; return True if a tick is due."""
