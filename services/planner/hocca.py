@@ -47,6 +47,9 @@ RECENTRED = np.array([True, True, False, True, False, True])
 ankles along gravity. Along the floor's normal the COM is off them by its height times the floor's
 slope."""
 
+KEPT = np.where(RECENTRED, 0.0, 1.0)
+"""1 for the rows of p_C that stay."""
+
 
 class LawOutput(NamedTuple):
     """Outputs of one tick for the twelve joints, (12,) where no other shape is given."""
@@ -381,6 +384,8 @@ class Hocca:
         Height and pitch stay where they were found, if they are closed: at zero nothing stands.
         """
         self._since_align_s += dt
+        if self._since_align_s >= self._recentre_s:
+            return self._p_C0 * KEPT, np.zeros(6)
         s = min(1.0, self._since_align_s / self._recentre_s)
         remaining = 1.0 - s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
         rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / self._recentre_s

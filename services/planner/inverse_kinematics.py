@@ -162,10 +162,6 @@ class InverseKinematics:
             step = _limited_length(step, STEP_MAX)
         return step, limited
 
-    def allows(self, q: Array) -> bool:
-        """Return True if joint angles (12,), rad, are inside the joint limits."""
-        return bool((self._low <= q).all() and (q <= self._high).all())
-
     def solve_rates(self, right_side: Array) -> Array:
         """Return x (12,) that solves [J; C] x = right side (12,), damped."""
         A = self._system

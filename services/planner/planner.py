@@ -28,7 +28,6 @@ from shared.bus.messages import (
     JointCommand,
     JointState,
     Mode,
-    Pair,
     PlannerMode,
     PlannerStatus,
     SplitSource,
@@ -242,22 +241,16 @@ class Planner:
     ) -> list[JointCommand]:
         """Return the tick's six commands; each echoes the stamp of its module's state."""
         local, hold = output.local, self._hold()
-        rows = np.array(
-            (
-                output.q_ref,
-                output.v_ref,
-                output.tau_ff,
-                output.dtau_ff,
-                output.tau_coupled,
-                local.D,
-                local.D_B,
-            )
-        ).reshape(7, N_MODULES, 2)
+        arrays = (
+            output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled,
+            local.D, local.D_B,
+        )  # fmt: skip
+        pairs = [list(zip(row[::2], row[1::2], strict=True)) for row in map(_listed, arrays)]
         commands = []
-        for module, state, phase, row in zip(
-            MODULES, states, self._phases.phases, rows.transpose(1, 0, 2).tolist(), strict=True
+        for module, state, phase, *row in zip(
+            MODULES, states, self._phases.phases, *pairs, strict=True
         ):
-            q_ref, v_ref, tau_ff, dtau_ff, tau_coupled, k_p, k_d = map(_pair, row)
+            q_ref, v_ref, tau_ff, dtau_ff, tau_coupled, k_p, k_d = row
             command = JointCommand(
                 t_ns=now_ns,
                 seq=self._seq,
@@ -378,8 +371,9 @@ class Planner:
         )
 
 
-def _pair(row: list[float]) -> Pair:
-    return row[0], row[1]
+def _listed(values: Array) -> list[float]:
+    numbers: list[float] = values.tolist()
+    return numbers
 
 
 def _vector6(values: Array) -> Vector6:

@@ -37,14 +37,16 @@ class Reference:
 
     def __init__(self, config: RobotConfig) -> None:
         """Build the graph and the solver."""
-        self._ik = InverseKinematics(Kinematics(config), np.array(config.joint_limits()))
+        limits = np.array(config.joint_limits())
+        self._ik = InverseKinematics(Kinematics(config), limits)
         self._graph = CompiledGraph(graphs_of(config).reference)
         (
             self._q, self.stance, self.D_left,
-            self._p_ref, self._pdot_ref, self.F_O, self.F_assist, self._assist_rate,
+            self._p_ref, self._pdot_ref, self.F_O, self.F_assist, self._assist_rate, low, high,
         ) = self._graph.arguments  # fmt: skip
+        low[:], high[:] = limits.T
         (
-            self._step, self._error, self.T, self.v, self.p, self.J, self.J_harness,
+            self._q_next, self._check, self.T, self.v, self.p, self.J, self.J_harness,
             self.hessian_O, self.gravity, self.assist, self.dtau_ff,
         ) = self._graph.results  # fmt: skip
         self.q: Array = np.zeros(12)
@@ -75,11 +77,10 @@ class Reference:
         """
         self._q[:], self._p_ref[:] = self.start, p_ref
         self._graph()
-        largest = max(float(self._step.max()), -float(self._step.min()))
-        if largest < STEP_SURE:
-            np.add(self._q, self._step, out=self.q)
-            if self._ik.allows(self.q):
-                return IkResult(1, largest * largest)
+        largest, beyond = self._check.tolist()
+        if largest < STEP_SURE and beyond <= 0.0:
+            self.q[:] = self._q_next
+            return IkResult(1, largest * largest)
         ik = self._ik
         ik.q[:], ik.kinematics.stance[:] = self.start, self.stance
         result = ik.solve(p_ref, self.D_left)

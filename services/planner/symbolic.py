@@ -37,8 +37,8 @@ class Graphs(NamedTuple):
     """(q, v, stance) -> D_L, p, closure, J, C, J_harness, pdot, and of each leg the row (2, 6) that
     gives its upward force from its torques, and its Jacobian's determinant (2,), m^3."""
     reference: ca.Function
-    """(q, stance, D_L, p_ref, pdot_ref, F_O, F_assist, F_assist rate) -> what a tick needs at the
-    reference pose (`services.planner.reference`)."""
+    """(q, stance, D_L, p_ref, pdot_ref, F_O, F_assist, F_assist rate, lower and upper joint limits)
+    -> what a tick needs at the reference pose (`services.planner.reference`)."""
 
 
 class _Foot(NamedTuple):
@@ -132,6 +132,7 @@ def _reference(pose: ca.Function, hessian: ca.Function) -> ca.Function:
     q, stance, D_left = ca.MX.sym("q", N_JOINTS), ca.MX.sym("s", 6), ca.MX.sym("D_L", 6, 6)
     p_ref, pdot_ref, F_O = ca.MX.sym("p", 6), ca.MX.sym("pdot", 6), ca.MX.sym("F_O", 6)
     F_assist, assist_rate = ca.MX.sym("F_a", 3), ca.MX.sym("Fdot_a", 3)
+    low, high = ca.MX.sym("low", N_JOINTS), ca.MX.sym("high", N_JOINTS)
     p, closure, J, C, J_harness, _, _ = pose(q, stance, D_left)
     error = ca.vertcat(p_ref - p, -closure)
     unit_p = ca.densify(ca.vertcat(ca.DM.eye(6), ca.DM(6, 6)))
@@ -139,13 +140,14 @@ def _reference(pose: ca.Function, hessian: ca.Function) -> ca.Function:
     normal = A.T @ A + DAMPING**2 * ca.DM.eye(N_JOINTS)
     solved = ca.solve(normal, A.T @ ca.horzcat(error, unit_p), "ldl")
     step, T = solved[:, 0], solved[:, 1:]
-    v_ref = T @ pdot_ref
+    q_ref, v_ref = q + step, T @ pdot_ref
+    beyond = ca.mmax(ca.vertcat(low - q_ref, q_ref - high))
     H = hessian(q, stance, D_left, F_O, F_assist)
     return ca.Function(
         "reference",
-        [q, stance, D_left, p_ref, pdot_ref, F_O, F_assist, assist_rate],
+        [q, stance, D_left, p_ref, pdot_ref, F_O, F_assist, assist_rate, low, high],
         [
-            step, error, T, v_ref, p, J, J_harness, H,
+            q_ref, ca.vertcat(ca.mmax(ca.fabs(step)), beyond), T, v_ref, p, J, J_harness, H,
             J.T @ F_O, J_harness.T @ F_assist, H @ v_ref + J_harness.T @ assist_rate,
         ],
     )  # fmt: skip
