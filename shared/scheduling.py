@@ -11,6 +11,7 @@ import platform
 import resource
 import struct
 from collections.abc import Collection
+from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from shared.robot.joints import SIDES, side_of
@@ -48,6 +49,7 @@ SLICE_NS: Final = 100_000
 """The shortest slice that the kernel gives: a short slice is a near deadline (EEVDF)."""
 TIMER_SLACK_NS: Final = 1_000
 """Sleeps end so close to their time; the default is 50 us."""
+_CAP_IPC_LOCK: Final = 14
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
@@ -60,9 +62,7 @@ def apply(kind: str, module: str = "") -> str:
     """
     granted = [raise_priority(TABLE[kind].fifo)]
     if os.environ.get(PINNED_VARIABLE) == "1":
-        processors = half_of(os.sched_getaffinity(0), kind, module)
-        os.sched_setaffinity(0, processors)
-        granted.append(f"processors {','.join(map(str, sorted(processors)))}")
+        granted.append(_pin(half_of(os.sched_getaffinity(0), kind, module)))
     if lock_memory():
         granted.append("memory locked")
     return ", ".join(granted)
@@ -73,9 +73,29 @@ def half_of(processors: Collection[int], kind: str, module: str = "") -> set[int
     half = TABLE[kind].half
     if half == "by leg":
         half = "first" if side_of(module) == SIDES[0] else "second"
-    ordered = sorted(processors)
+    ordered = sorted(processors, key=_core_of)
     middle = (len(ordered) + 1) // 2
     return set(ordered[:middle] if half == "first" else ordered[middle:] or ordered)
+
+
+def _core_of(processor: int) -> tuple[int, int, int]:
+    """Return what sorts processors so that two threads of a core are neighbours."""
+    topology = Path(f"/sys/devices/system/cpu/cpu{processor}/topology")
+    try:
+        package, core = (
+            int((topology / name).read_text()) for name in ("physical_package_id", "core_id")
+        )
+    except (OSError, ValueError):
+        return (0, processor, processor)
+    return (package, core, processor)
+
+
+def _pin(processors: set[int]) -> str:
+    try:
+        os.sched_setaffinity(0, processors)
+    except (OSError, AttributeError):
+        return "all processors"
+    return f"processors {','.join(map(str, sorted(processors)))}"
 
 
 def raise_priority(fifo: int) -> str:
@@ -116,4 +136,14 @@ def lock_memory() -> bool:
 
 def may_lock() -> bool:
     """Return True if this process may lock memory without a limit."""
-    return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] < 0
+    unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+    return unlimited or _has_capability(_CAP_IPC_LOCK)
+
+
+def _has_capability(bit: int) -> bool:
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return False
+    effective = [int(line.split()[1], 16) for line in lines if line.startswith("CapEff:")]
+    return bool(effective) and bool(effective[0] >> bit & 1)

@@ -164,8 +164,7 @@ class JointController:
     @property
     def is_state_due(self) -> bool:
         """True if this cycle sends a state: every nth does, in the planner's phase."""
-        clock = self._state.clock
-        return clock.is_new and (clock.count - self._state_phase) % self._state_every == 0
+        return self._state.clock.passed(self._state_every, self._state_phase)
 
     @property
     def _state_phase(self) -> int:

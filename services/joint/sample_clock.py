@@ -18,22 +18,29 @@ class SampleClock(msgspec.Struct):
 
     Attributes:
         count: of periods; 0 before the first.
-        is_new: True if the last sample began a period.
+        before: the count at the sample before.
     """
 
     count: int = 0
-    is_new: bool = False
+    before: int = 0
     at_ns: int = 0
     """When the present period began, smoothed."""
 
     def advance(self, now_ns: int, period_ns: int) -> None:
         """Take the time of a sample, and the drive's period."""
+        self.before = self.count
         if not self.count:
-            self.count, self.is_new, self.at_ns = 1, True, now_ns
+            self.count, self.at_ns = 1, now_ns
             return
         since_ns = now_ns - self.at_ns
         periods = max(0, (since_ns + period_ns // 2) // period_ns)
         self.count += periods
-        self.is_new = periods > 0
         self.at_ns += periods * period_ns
         self.at_ns += (now_ns - self.at_ns) >> FOLLOW_SHIFT
+
+    def passed(self, every: int, phase: int) -> bool:
+        """Return True if a period phase, phase + every, ... began since the sample before.
+
+        With a sample lost, it is the next sample that passes it.
+        """
+        return (self.count - phase) // every > (self.before - phase) // every

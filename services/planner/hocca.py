@@ -267,8 +267,7 @@ class Hocca:
         # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive the
         # hand. It is a force fed forward, not fed-back joint rates, so the harness filter is enough
         tau_coupled += ease_z * reference.J_harness[2] + ease_pitch * reference.J[4]
-        # where the next reference will be, if it goes on so
-        np.add(reference.q, dt * reference.v, out=reference.start)
+        reference.expect(dt)
         return LawOutput(
             reference.q.copy(),
             reference.v.copy(),

@@ -3,7 +3,8 @@
 Six task rows (p = p_ref) and six closure rows (both legs agree on the torso) form a square system
 in the 12 joint angles. There are two solvers:
 
-- `solve`, each tick: Gauss-Newton from the last solution, one or two steps.
+- `solve`, from a solution near by: Gauss-Newton, one or two steps. A tick needs it only where the
+  single step of `services.planner.reference` is too long, or at a joint limit.
 - `solve_from_anywhere`, at the start and in tools: Levenberg-Marquardt inside the joint limits,
   from several starts. If p_ref is out of reach, it ends at the nearest pose at which the legs still
   agree, and reports what limits it.
@@ -119,8 +120,7 @@ class InverseKinematics:
         """Improve `q` until p(q) = p_ref and the legs agree.
 
         A step whose second-order error is below the tolerance is taken without computing the
-        kinematics again. From tick to tick one evaluation is therefore enough. `kinematics` is then
-        at most `STEP_SURE` rad from `q`.
+        kinematics again. `kinematics` is then at most `STEP_SURE` rad from `q`.
 
         Args:
             p_ref: (6,), m and rad.

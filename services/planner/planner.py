@@ -145,8 +145,9 @@ class Planner:
         Args:
             now_ns: the planner's monotonic clock.
         """
-        dt = min((now_ns - self._last_ns) / NS_PER_S, TICK_GAP_MAX_S)
-        if not self._last_ns:
+        last_ns = self._last_ns
+        dt = min((now_ns - last_ns) / NS_PER_S, TICK_GAP_MAX_S)
+        if not last_ns:
             dt = self._period_s
         self._last_ns = now_ns
         self._new = 0
@@ -163,7 +164,7 @@ class Planner:
             self._inhibit(),
         )
         self._support = self._limp_legs.advance(now_ns, states)
-        self._phases.advance(states, self._arrived_ns)
+        self._phases.advance(states, self._arrived_ns, last_ns)
         # until all engage, the law restarts from the measured pose each tick: there is no
         # step
         self._output = self._law.tick(

@@ -42,9 +42,10 @@ class Reference:
         self._graph = CompiledGraph(graphs_of(config).reference)
         (
             self._q, self.stance, self.D_left,
-            self._p_ref, self._pdot_ref, self.F_O, self.F_assist, self._assist_rate, low, high,
+            self._p_ref, self._pdot_ref, self.F_O, self.F_assist, self._assist_rate,
+            self._low, self._high,
         ) = self._graph.arguments  # fmt: skip
-        low[:], high[:] = limits.T
+        self._low[:], self._high[:] = limits.T
         (
             self._q_next, self._check, self.T, self.v, self.p, self.J, self.J_harness,
             self.hessian_O, self.gravity, self.assist, self.dtau_ff,
@@ -78,7 +79,7 @@ class Reference:
         self._q[:], self._p_ref[:] = self.start, p_ref
         self._graph()
         largest, beyond = self._check.tolist()
-        if largest < STEP_SURE and beyond <= 0.0:
+        if 0.0 <= largest < STEP_SURE and beyond <= 0.0:  # NaN came to -inf
             self.q[:] = self._q_next
             return IkResult(1, largest * largest)
         ik = self._ik
@@ -86,6 +87,18 @@ class Reference:
         result = ik.solve(p_ref, self.D_left)
         self.evaluate(ik.q)
         return result
+
+    def expect(self, dt: float) -> None:
+        """Begin the next `solve` where the reference will be in dt, s, if it goes on as it does.
+
+        Inside the joint limits, as the solver's own solutions are.
+        """
+        np.multiply(self.v, dt, out=self.start)
+        self.start += self.q
+        if not np.isfinite(self.start).all():
+            self.start[:] = self.q
+        np.maximum(self.start, self._low, out=self.start)
+        np.minimum(self.start, self._high, out=self.start)
 
     def evaluate(self, q: Array) -> None:
         """Take q (12,), rad, for the reference, and evaluate all arrays there."""

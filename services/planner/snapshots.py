@@ -84,7 +84,7 @@ class PhasesState(msgspec.Struct, frozen=True):
     phases: tuple[int, ...] = ()
     tick: int = 0
     """Ticks since the last comparison began."""
-    every: int = 128
+    every: int = 256
     """Ticks from its begin to that of the next."""
     sums: tuple[Pair, ...] = ()
     """Of each module, the sum of (cos, sin) of 2 pi d / n: its states come d cycles behind the

@@ -1,14 +1,14 @@
-"""Chooses in which of its cycles each module sends its state, so that the six come together. Pure.
+"""Chooses in which periods each module sends its state, so that the six come together. Pure.
 
-A module sends its state every nth cycle (n = 2: 500 Hz and 250 Hz). The modules' cycles follow
-their drives, which no clock ties together, and their counts begin at different times. If one sends
-in its even cycles what the others send in their odd ones, each tick waits for it, and uses five
-states that are a cycle older than they need be. The planner compares the states' arrivals with the
-first module's, and names in each command the cycle in which the next state is to be sent
+A module sends its state every nth period of its drive (n = 2: 500 Hz and 250 Hz). No clock ties the
+drives together, and the modules begin to count at different times. If one sends in its even periods
+what the others send in their odd ones, each tick waits for it, and uses five states that are a
+period older than they need be. The planner compares the states' arrivals with the
+first module's, and names in each command the period in which the next state is to be sent
 (`JointCommand.state_phase`). A late command, or none, changes nothing: a module keeps its phase.
 
 Arrivals are compared in the first ticks of each `EVERY_TICKS`. Only then does the planner's loop
-look for states all the time; otherwise it rests after a tick, and what came early looks late.
+look for states all the time; otherwise it rests until they are due, and what came early looks late.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ from shared.robot.joints import N_MODULES
 
 EVERY_TICKS: Final = 1024
 """Most ticks from one comparison to the next: 4 s, in which two drives' clocks drift apart by a
-fifth of a cycle at the most (100 ppm). The first follow sooner: a starting fleet is not quiet."""
+fifth of a period at the most (100 ppm)."""
 COMPARED_TICKS: Final = 64
 """Ticks of a comparison: a quarter of a second, so that no single late message moves a module."""
+SOON_TICKS: Final = 256
+"""Ticks to the next comparison after one that settled nothing: a second."""
 SURE: Final = 0.5
 """Length of a mean direction from which it counts, 0 .. 1; an even spread over all phases has 0."""
 HYSTERESIS: Final = 0.15
@@ -38,53 +40,62 @@ class StatePhases:
     """Phases of six modules.
 
     Attributes:
-        phases: of each module: it is to send its state in cycles of this number modulo n.
+        phases: of each module: it is to send its state in periods of this number modulo n.
     """
 
     def __init__(self, rate_hz: float, state_rate_hz: float) -> None:
-        """Set the rates of the modules' cycles and of their states, Hz."""
+        """Set the rates of the drives' samples and of the states, Hz."""
         self._n = round(rate_hz / state_rate_hz)
         self._radians_per_ns = 2.0 * math.pi * state_rate_hz / NS_PER_S
         self._tick = 0
-        self._every = 2 * COMPARED_TICKS
+        self._every = SOON_TICKS
         self._sums: list[Pair] = [(0.0, 0.0)] * N_MODULES
         self.phases: list[int] = []
 
     @property
     def compares(self) -> bool:
         """True if the next tick's arrivals are compared: they must not be rounded up by a rest."""
-        return self._n > 1 and self._tick < COMPARED_TICKS
+        return self._n > 1 and bool(self.phases) and self._tick < COMPARED_TICKS
 
-    def advance(self, states: Sequence[JointState], arrived_ns: Sequence[int]) -> None:
-        """Compare the states of a tick.
+    def advance(
+        self, states: Sequence[JointState], arrived_ns: Sequence[int], last_tick_ns: int
+    ) -> None:
+        """Compare the states of a tick, if all six are new.
 
         Args:
             states: of the six modules.
             arrived_ns: their arrivals, by the planner's clock.
+            last_tick_ns: time of the tick before.
         """
         n, first_ns = self._n, arrived_ns[0]
         if not self.phases:  # as the last planner left them
             self.phases = [state.state_phase % n for state in states]
         compares = self.compares and self._tick > 0  # before the first there was a rest
         self._tick = (self._tick + 1) % self._every
-        if compares:
+        if not compares:
+            return
+        if min(arrived_ns) > last_tick_ns:
             for module, (x, y) in enumerate(self._sums):
                 angle = self._radians_per_ns * (arrived_ns[module] - first_ns)
                 self._sums[module] = (x + math.cos(angle), y + math.sin(angle))
-            if not self.compares:
-                self._decide(states)
+        if not self.compares:
+            self._decide(states)
 
     def _decide(self, states: Sequence[JointState]) -> None:
-        """Choose the phases, and begin anew."""
+        """Choose the phases, and begin anew: soon, if a module was silent or has been moved."""
         n, count = self._n, COMPARED_TICKS - 1
+        settled = True
         for module, (state, (x, y)) in enumerate(zip(states, self._sums, strict=True)):
             behind = n / (2.0 * math.pi) * math.atan2(y, x)
             # one that is in another phase than it was told has not heard yet
             told = state.state_phase % n == self.phases[module]
-            if told and math.hypot(x, y) > SURE * count and abs(behind) > 0.5 + HYSTERESIS:
+            sure = math.hypot(x, y) > SURE * count
+            settled &= sure
+            if told and sure and abs(behind) > 0.5 + HYSTERESIS:
                 self.phases[module] = (self.phases[module] - round(behind)) % n
+                settled = False
         self._sums = [(0.0, 0.0)] * N_MODULES
-        self._every = min(EVERY_TICKS, 2 * self._every)
+        self._every = min(EVERY_TICKS, 2 * self._every) if settled else SOON_TICKS
 
     def snapshot(self) -> PhasesState:
         """Return the state."""

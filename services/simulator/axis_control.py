@@ -193,4 +193,5 @@ def law_graph() -> ca.Function:
 
 
 def _clamp(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:
-    return ca.fmax(ca.fmin(value, high), low)
+    """Return a value within its limits; of a NaN, NaN, as the firmware's `std::clamp` does."""
+    return ca.if_else(value < low, low, ca.if_else(value > high, high, value))

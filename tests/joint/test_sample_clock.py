@@ -57,8 +57,23 @@ def test_two_samples_within_a_period_begin_one() -> None:
     for number in range(100):
         for soon_ns in (0, 100_000):
             clock.advance(NS_PER_S + number * PERIOD_NS + soon_ns, PERIOD_NS)
-            began += clock.is_new
+            began += clock.passed(1, 0)
     assert began == clock.count == 100
+
+
+@pytest.mark.parametrize("phase", [0, 1, 2, 3])
+@pytest.mark.parametrize("every", [1, 2, 4])
+@pytest.mark.parametrize("rate", [1, 2, 3])
+def test_each_due_period_is_passed_once_whatever_samples_are_lost(
+    every: int, phase: int, rate: int
+) -> None:
+    """With a drive that sends at a half or a third of the rate, no sample meets it exactly."""
+    clock, passed = SampleClock(), 0
+    for number in range(0, 1200, rate):
+        clock.advance(NS_PER_S + number * PERIOD_NS, PERIOD_NS)
+        passed += clock.passed(every, phase % every)
+    wanted = 1200 / max(every, rate) if rate <= every or every == 1 else 1200 / rate
+    assert abs(passed - wanted) <= 2
 
 
 def test_a_copy_does_not_change_with_it() -> None:

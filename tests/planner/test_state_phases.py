@@ -58,7 +58,7 @@ def run(phases: StatePhases, modules: Modules, ticks: int, *, heard: bool = True
     for _ in range(ticks):
         sent = [modules.send(module) for module in range(N_MODULES)]
         arrived = [arrival for _, arrival in sent]
-        phases.advance([state for state, _ in sent], arrived)
+        phases.advance([state for state, _ in sent], arrived, min(arrived) - 1)
         if heard:
             modules.phases = list(phases.phases)
         period = modules.n * CYCLE_NS
@@ -109,7 +109,7 @@ def test_one_late_state_moves_nothing() -> None:
     run(phases, modules, 1)
     states = [modules.send(module)[0] for module in range(N_MODULES)]
     for late_ns in (1, CYCLE_NS, 100 * NS_PER_MS):
-        phases.advance(states, [0, late_ns, 0, 0, 0, 0])
+        phases.advance(states, [0, late_ns, 0, 0, 0, 0], -1)
     run(phases, modules, COMPARED_TICKS)
     assert phases.phases == [0] * N_MODULES
 
@@ -134,6 +134,26 @@ def test_where_every_cycle_sends_a_state_there_is_nothing_to_choose() -> None:
     phases = StatePhases(RATE_HZ, RATE_HZ)
     run(phases, Modules([0, 700_000, 0, 0, 0, 0], [0, 1, 2, 3, 4, 5], n=1), 500)
     assert phases.phases == [0] * N_MODULES
+
+
+@pytest.mark.parametrize("silent", [0, 3])
+def test_while_a_module_is_silent_the_others_keep_their_phases(silent: int) -> None:
+    """Compared with what came last from it, long ago, they would all drift through all phases."""
+    modules = Modules([0] * N_MODULES, [0] * N_MODULES, ppm=[20, 40, 60, 80, 100, 0])
+    phases = StatePhases(RATE_HZ, STATE_HZ)
+    run(phases, modules, COMPARED_TICKS)
+    last = modules.send(silent)
+    for _ in range(20 * EVERY_TICKS):
+        sent = [last if module == silent else modules.send(module) for module in range(N_MODULES)]
+        others = [arrival for module, (_, arrival) in enumerate(sent) if module != silent]
+        phases.advance(*zip(*sent, strict=True), min(others) - 1)
+        modules.phases = list(phases.phases)
+    assert phases.phases == [0] * N_MODULES
+    assert not phases.compares or phases._tick < COMPARED_TICKS, "and it rests"
+
+
+def test_before_there_are_six_modules_nothing_is_compared() -> None:
+    assert not StatePhases(RATE_HZ, STATE_HZ).compares
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 30, 63, 64, 1000])

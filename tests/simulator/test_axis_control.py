@@ -114,3 +114,19 @@ def test_axes_with_another_encoder_bandwidth_follow_by_their_own() -> None:
         slow.step(k * 1e-3, speed * k * 1e-3, speed)
     assert both.vel_estimate[1] == pytest.approx(slow.vel_estimate[1], abs=1e-9)
     assert both.vel_estimate[0] > both.vel_estimate[1] + 0.5
+
+
+@pytest.mark.parametrize("mode", [ControlMode.TORQUE, ControlMode.VELOCITY, ControlMode.POSITION])
+@pytest.mark.parametrize("column", ["input_pos", "input_vel", "input_torque"])
+def test_what_is_no_number_is_not_made_one(mode: ControlMode, column: str) -> None:
+    """The firmware's clamp passes NaN on; made the limit's torque, it would push a motor."""
+    bank = make_bank()
+    for axis in (0, 1):
+        bank.set_modes(axis, mode, InputMode.PASSTHROUGH)
+        bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
+    bank.pos_gain[:], bank.vel_gain[:] = 20.0, 0.2
+    getattr(bank, column)[0] = math.nan
+    torque = bank.step(bank.now_s + 1e-3, ZERO, ZERO)
+    used = {"input_torque": 1, "input_vel": 2, "input_pos": 3}[column] <= mode
+    assert math.isnan(torque[0]) == used
+    assert math.isfinite(torque[1])

@@ -17,17 +17,19 @@ from typing import Final
 
 import msgspec
 
-from services.planner.loop import POLL_NS, REST_FRACTION
 from shared import scheduling
 from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, JointState
-from shared.clock import NS_PER_S
+from shared.clock import NS_PER_S, NS_PER_US
 from shared.robot.joints import MODULES
 from tools.bench.transports.base import Transport, open_transport
 
 CYCLE_HZ: Final = 500.0
 TICK_HZ: Final = 250.0
 STATE_EVERY: Final = 2
+POLL_NS: Final = 400 * NS_PER_US
+REST_FRACTION: Final = 0.8
+"""Of a period, in which the planner looks for no states; then it looks every `POLL_NS`."""
 WARM_UP_S: Final = 1.5
 """Time until all links are there; nothing of it is counted."""
 _PRIORITY: Final = 20

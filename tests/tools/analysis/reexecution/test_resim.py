@@ -31,7 +31,7 @@ def recorded(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Pa
         5.0,
         height=1.1,
         kill=(Kill(service="planner", at=1.0), Kill(service="knee_left", at=2.5)),
-        restart=(Restart(service="planner", at=1.5), Restart(service="knee_left", at=2.6)),
+        restart=(Restart(service="planner", at=1.5), Restart(service="knee_left", at=2.601)),
         fault=(Fault(module="hip_right", kind="link_lost", at=4.3),),
     )
     folder = tmp_path_factory.mktemp("resim")
@@ -75,6 +75,11 @@ def test_every_tick_of_a_run_with_restarts_holds_and_a_fault_is_equal_bit_for_bi
     restarted = name in ("planner", "knee_left")
     assert outcome.starts == (2 if restarted else 1)
     assert outcome.comparison.compared > outcome.ticks // 3
+
+
+def test_in_the_record_a_service_began_out_of_step_and_was_brought_into_it(log: RunLog) -> None:
+    phases = [row.state_phase for row in log.messages(topics.JOINT_COMMAND, "knee_left")]
+    assert (phases[0], phases[-1]) == (0, 1)
 
 
 def test_the_planner_of_the_record_knew_the_slope(log: RunLog) -> None:

@@ -1,0 +1,86 @@
+"""The reference: one step of the inverse kinematics from where it was going, inside the limits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.planner.hocca import Hocca
+from services.planner.inverse_kinematics import TOLERANCE, InverseKinematics
+from services.planner.kinematics import Kinematics
+from services.planner.reference import Reference
+from shared.config.robot_config import RobotConfig
+from tests.planner.conftest import Closed
+from tests.planner.oracle import Array
+
+DT = 0.004
+NOWHERE = np.tile([-4.0, 4.0], (12, 1))
+"""Joint limits that stop nothing."""
+
+
+def solved(robot: RobotConfig, reference: Reference, q: Array, p_ref: Array) -> int:
+    """Solve for p_ref from q, at rest; return the iterations."""
+    at_start = Kinematics(robot)
+    at_start.update(q)
+    reference.start[:] = q
+    reference.load(np.zeros(6), np.zeros(6), np.zeros(3), np.zeros(3), at_start.D_left)
+    return reference.solve(p_ref).iterations
+
+
+@pytest.mark.parametrize("away", [1e-5, 2e-4, 0.02])
+def test_it_finds_what_the_solver_finds_near_by_and_far_away(
+    robot: RobotConfig, closed: Closed, away: float
+) -> None:
+    q = closed(1.0, pitch=0.3)
+    there = Kinematics(robot)
+    there.update(q)
+    p_ref = there.p + away * np.array([0.1, -0.1, 1.0, 0.0, 0.5, 0.0])
+    reference = Reference(robot)
+    iterations = solved(robot, reference, q, p_ref)
+    there.update(reference.q)
+    assert np.abs(there.p - p_ref).max() < 2.0 * TOLERANCE
+    assert np.abs(there.closure).max() < 2.0 * TOLERANCE
+    assert (iterations == 1) == (away < 0.01)
+
+
+@pytest.mark.parametrize("rate", [0.005, 0.05, 0.2, 0.6])
+def test_led_beyond_a_joint_limit_its_angles_stay_inside(
+    robot: RobotConfig, closed: Closed, rate: float
+) -> None:
+    """The solver takes a start for granted; one beyond the limits let q_ref creep to 0.17 rad."""
+    limits = np.array(robot.joint_limits())
+    law, ik = Hocca(robot), InverseKinematics(Kinematics(robot), NOWHERE)
+    height = 0.923  # of the COM: 4 mm below where the knees come to their limit
+    ik.q[:] = closed(1.15)
+    p = np.array([0.0, 0.0, height, 0.0, 0.0, 0.0])
+    assert ik.solve(p, iterations_max=50).converged
+    q = ik.q.copy()
+    law.tick(q, np.zeros(12), 0.0, DT, align=True)
+    beyond = 0.0
+    while p[2] < height + 0.01:
+        p[2] += rate * DT
+        ik.solve(p, iterations_max=50)
+        v, q = (ik.q - q) / DT, ik.q.copy()
+        q_ref = law.tick(q, v, 0.0, DT).q_ref
+        beyond = max(beyond, float(np.maximum(limits[:, 0] - q_ref, q_ref - limits[:, 1]).max()))
+    assert np.maximum(limits[:, 0] - q, q - limits[:, 1]).max() > 0.03, "it was led beyond"
+    assert beyond < 1e-9
+
+
+def test_of_what_is_no_number_nothing_is_found_and_the_next_is_found_again(
+    robot: RobotConfig, closed: Closed
+) -> None:
+    q = closed(1.0)
+    there = Kinematics(robot)
+    there.update(q)
+    reference = Reference(robot)
+    p_ref = there.p.copy()
+    p_ref[1] = np.nan
+    reference.start[:] = q
+    reference.load(np.full(6, np.nan), np.zeros(6), np.zeros(3), np.zeros(3), there.D_left)
+    assert not reference.solve(p_ref).converged
+    reference.expect(DT)
+    assert np.isfinite(reference.start).all()
+    reference.load(np.zeros(6), np.zeros(6), np.zeros(3), np.zeros(3), there.D_left)
+    assert reference.solve(there.p).converged
+    np.testing.assert_allclose(reference.q, q, atol=1e-6)
