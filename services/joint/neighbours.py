@@ -23,8 +23,8 @@ from typing import Final, NamedTuple
 
 from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS
-from shared.robot.joints import MODULES, N_MODULES, kind_of
-from shared.robot.limp_leg_support import SUPPORT_FOR, Support
+from shared.robot.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
+from shared.robot.limp_leg_support import SUPPORT_FOR
 
 STALE_NS: Final = 20 * NS_PER_MS
 """An older angle says nothing of where the joint is now."""
@@ -80,16 +80,22 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
         rows: the six rows; None while one is being written.
         now_ns: the host's monotonic clock.
     """
-    kind, own = kind_of(module), MODULES.index(module)
-    limp = [wanted for row, wanted in zip(rows, SUPPORT_FOR, strict=True) if _is_limp(row)]
-    stiffen = max(limp, default=Support.NONE).includes(module)
+    kind, own = kind_of(module), MODULE_INDEX[module]
+    limp = [
+        wanted
+        for row, wanted in zip(rows, SUPPORT_FOR, strict=True)
+        if row is not None and row.mode == Mode.FAULT and row.t_ns > 0
+    ]
+    stiffen = bool(limp) and max(limp).includes(module)
     if kind == "hip":
-        below = rows[own - 2], rows[own - 1]
-        known = [row for row in below if row is not None and _is_fresh(row, now_ns)]
-        if len(known) < len(below):
+        ankle, knee = rows[own - 2], rows[own - 1]
+        if (
+            ankle is None
+            or knee is None
+            or not (_is_fresh(ankle, now_ns) and _is_fresh(knee, now_ns))
+        ):
             return NeighbourView(stiffen=stiffen)
-        theta, rate = sum(row.theta for row in known), sum(row.rate for row in known)
-        return NeighbourView((theta, rate), stiffen=stiffen)
+        return NeighbourView((ankle.theta + knee.theta, ankle.rate + knee.rate), stiffen=stiffen)
     if kind == "knee":
         other = rows[(own + _LEG) % N_MODULES]
         return NeighbourView(sinks=other is None or not _stays(other, now_ns), stiffen=stiffen)
@@ -106,10 +112,6 @@ def _stays(row: NeighbourRow, now_ns: int) -> bool:
     if row.t_ns == 0 or row.t_ns > now_ns + STALE_NS:
         return False  # of another host, or its clock
     return now_ns - row.t_ns > GONE_NS or row.mode != Mode.DAMP or row.caught > 0
-
-
-def _is_limp(row: NeighbourRow | None) -> bool:
-    return row is not None and row.t_ns > 0 and row.mode == Mode.FAULT
 
 
 class Neighbours:

@@ -37,7 +37,7 @@ from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive
 from tools.runs.virtual_harness import VirtualHarness
 from tools.runs.virtual_imu import VirtualImu
-from tools.runs.virtual_joint import VirtualJoint, view_from
+from tools.runs.virtual_joint import NeighbourRows, VirtualJoint
 from tools.runs.virtual_network import VirtualNetwork
 from tools.runs.virtual_planner import VirtualPlanner
 
@@ -241,11 +241,12 @@ class Lockstep:
         return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
 
     def _cycle_joints(self, now: int) -> None:
+        rows = NeighbourRows(self.joints, now)
         for index, joint in enumerate(self.joints):
             if joint.frozen:
                 continue
-            near = view_from(index, now, self.joints)
-            event = joint.cycle(now, estop=self.estop, near=near)
+            event = joint.cycle(now, estop=self.estop, near=rows.view(index))
+            rows.write(index)
             if event is not None:
                 self.events.append((joint.name, event))
 

@@ -83,6 +83,8 @@ class VirtualJoint:
         """
         row = row_of(self.manager.controller)
         offset_ns = self._clock.read(now_ns) - now_ns
+        if row.t_ns and not offset_ns:
+            return row
         return row._replace(t_ns=row.t_ns - offset_ns if row.t_ns else int(self.dead))
 
     def kill(self, *, for_good: bool) -> None:
@@ -99,14 +101,28 @@ class VirtualJoint:
             self._drive.start_service()
 
 
-def view_from(index: int, now_ns: int, joints: Sequence[VirtualJoint]) -> NeighbourView:
-    """Return a module's view of the others, as from shared memory (`services.joint.neighbours`).
+class NeighbourRows:
+    """What the joint services of a host read of one another within a cycle, in lockstep.
 
-    Args:
-        index: of the module that reads.
-        now_ns: virtual time.
-        joints: all six.
+    They run one after the other: each reads the rows of those before it as they are after this
+    cycle, as from shared memory (`services.joint.neighbours`).
     """
-    if not joints[index].manager.needs_neighbours:
-        return UNKNOWN
-    return view_of(MODULES[index], [joint.neighbour_row(now_ns) for joint in joints], now_ns)
+
+    def __init__(self, joints: Sequence[VirtualJoint], now_ns: int) -> None:
+        """Begin a cycle at a virtual time."""
+        self._joints, self._now_ns = joints, now_ns
+        self._rows: list[NeighbourRow] = []
+
+    def view(self, index: int) -> NeighbourView:
+        """Return a module's view of the others, before it runs its cycle."""
+        joints, now_ns, rows = self._joints, self._now_ns, self._rows
+        if not joints[index].manager.needs_neighbours:
+            return UNKNOWN
+        if not rows:
+            rows += [joint.neighbour_row(now_ns) for joint in joints]
+        return view_of(MODULES[index], rows, now_ns)
+
+    def write(self, index: int) -> None:
+        """Take a module's row, after it has run its cycle."""
+        if self._rows:
+            self._rows[index] = self._joints[index].neighbour_row(self._now_ns)
