@@ -1,22 +1,33 @@
 """Solves the reference of a tick, and evaluates what the law needs there, in one graph. Pure.
 
 The graph (`services.planner.symbolic`) makes one Gauss-Newton step of the inverse kinematics from
-where the last reference was going. From tick to tick that step is shorter than `STEP_SURE`, so its
-error is below the solver's tolerance and nothing is evaluated twice. A longer step, or one out of
+where the last reference was going. While the planner leads, that step is shorter than `STEP_SURE`,
+so its error is below the solver's tolerance and nothing is evaluated twice. While it holds, two
+steps lead from the measured pose to the middle. What takes more than `STEPS_MAX` steps, or leaves
 the joint limits, goes to `InverseKinematics`, and the graph is evaluated where that ends.
 """
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.inverse_kinematics import STEP_SURE, IkResult, InverseKinematics
+from services.planner.inverse_kinematics import (
+    STEP_MAX,
+    STEP_SURE,
+    IkResult,
+    InverseKinematics,
+)
 from services.planner.kinematics import Kinematics, graphs_of
 from shared.config.robot_config import RobotConfig
 from shared.robot.compiled_graph import CompiledGraph
 
 Array = NDArray[np.float64]
+
+STEPS_MAX: Final = 3
+"""Steps by the graph; near a solution each squares the error. What needs more is not near."""
 
 
 class Reference:
@@ -77,11 +88,15 @@ class Reference:
             p_ref: (6,), m and rad.
         """
         self._q[:], self._p_ref[:] = self.start, p_ref
-        self._graph()
-        largest, beyond = self._check.tolist()
-        if 0.0 <= largest < STEP_SURE and beyond <= 0.0:  # NaN came to -inf
-            self.q[:] = self._q_next
-            return IkResult(1, largest * largest)
+        for iterations in range(1, STEPS_MAX + 1):
+            self._graph()
+            largest, beyond = self._check.tolist()
+            if not (0.0 <= largest < STEP_MAX and beyond <= 0.0):  # NaN came to -inf
+                break
+            if largest < STEP_SURE:
+                self.q[:] = self._q_next
+                return IkResult(iterations, largest * largest)
+            self._q[:] = self._q_next
         ik = self._ik
         ik.q[:], ik.kinematics.stance[:] = self.start, self.stance
         result = ik.solve(p_ref, self.D_left)
