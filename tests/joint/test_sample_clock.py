@@ -52,6 +52,13 @@ def test_after_a_service_was_held_up_the_count_goes_on_as_if_it_had_not(held_up_
             assert count == expected[now_ns], (held, now_ns)
 
 
+@pytest.mark.parametrize(("late", "count"), [(0.45, 2), (0.55, 3), (1.45, 3), (1.55, 4)])
+def test_a_sample_late_by_more_than_half_a_period_counts_as_the_next(
+    late: float, count: int
+) -> None:
+    assert counted([NS_PER_S, NS_PER_S + round((1.0 + late) * PERIOD_NS)]) == [1, count]
+
+
 def test_two_samples_within_a_period_begin_one() -> None:
     clock, began = SampleClock(), 0
     for number in range(100):

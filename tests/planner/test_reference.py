@@ -67,6 +67,30 @@ def test_led_beyond_a_joint_limit_its_angles_stay_inside(
     assert beyond < 1e-9
 
 
+@pytest.mark.parametrize("rate", [-50.0, 50.0])
+def test_the_next_begins_inside_the_limits_wherever_it_goes(
+    robot: RobotConfig, closed: Closed, rate: float
+) -> None:
+    reference = Reference(robot)
+    solved(robot, reference, closed(1.0), np.zeros(6))
+    reference.v[:] = rate
+    reference.expect(1.0)
+    low, high = np.array(robot.joint_limits()).T
+    np.testing.assert_array_equal(reference.start, low if rate < 0.0 else high)
+
+
+def test_its_kinematics_are_those_of_its_own_arrays(robot: RobotConfig, closed: Closed) -> None:
+    """With the load sharing that the tick chose, not one of its own."""
+    reference, q = Reference(robot), closed(1.0, pitch=0.3)
+    D_left = np.diag([0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
+    reference.load(np.zeros(6), np.zeros(6), np.zeros(3), np.zeros(3), D_left)
+    reference.evaluate(q)
+    kinematics = reference.kinematics()
+    np.testing.assert_array_equal(kinematics.J, reference.J)
+    np.testing.assert_array_equal(kinematics.p, reference.p)
+    np.testing.assert_array_equal(kinematics.J_harness, reference.J_harness)
+
+
 def test_of_what_is_no_number_nothing_is_found_and_the_next_is_found_again(
     robot: RobotConfig, closed: Closed
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from itertools import pairwise
 
 import msgspec
 import numpy as np
@@ -150,6 +151,63 @@ def test_while_a_module_is_silent_the_others_keep_their_phases(silent: int) -> N
         modules.phases = list(phases.phases)
     assert phases.phases == [0] * N_MODULES
     assert not phases.compares or phases._tick < COMPARED_TICKS, "and it rests"
+
+
+def begun_after(phases: StatePhases, modules: Modules, comparisons: int) -> list[int]:
+    """Return the ticks from the begin of each comparison to that of the next."""
+    begins, ticks, before = [], 0, True
+    while len(begins) <= comparisons:
+        run(phases, modules, 1)
+        ticks += 1
+        if phases.compares and not before:
+            begins.append(ticks)
+        before = phases.compares
+    return [later - earlier for earlier, later in pairwise([0, *begins])]
+
+
+def test_what_is_settled_is_compared_ever_more_rarely() -> None:
+    phases = StatePhases(RATE_HZ, STATE_HZ)
+    gaps = begun_after(phases, Modules([0] * N_MODULES, [0] * N_MODULES), 4)
+    assert gaps == [512, 1024, 1024, 1024, 1024]
+
+
+@pytest.mark.parametrize("moved", [1, 5])
+def test_after_a_module_was_moved_it_is_compared_again_in_a_second(moved: int) -> None:
+    begin = [CYCLE_NS * (module == moved) for module in range(N_MODULES)]
+    gaps = begun_after(StatePhases(RATE_HZ, STATE_HZ), Modules(begin, [0] * N_MODULES), 3)
+    assert gaps == [256, 512, 1024, 1024]
+
+
+def test_after_a_module_was_silent_it_is_compared_again_in_a_second() -> None:
+    modules, phases = Modules([0] * N_MODULES, [0] * N_MODULES), StatePhases(RATE_HZ, STATE_HZ)
+    run(phases, modules, 512 - 1)
+    for _ in range(COMPARED_TICKS):  # nothing new in all of the second
+        sent = [modules.send(module) for module in range(N_MODULES)]
+        arrived = [arrival for _, arrival in sent]
+        phases.advance([state for state, _ in sent], arrived, max(arrived))
+    assert 150 < begun_after(phases, modules, 1)[0] <= 256
+
+
+@pytest.mark.parametrize(("behind", "phase"), [(0.6, 0), (-0.6, 0), (0.7, 1), (-0.7, 1)])
+def test_a_module_moves_if_it_is_behind_by_more_than_half_a_period_and_a_bit(
+    behind: float, phase: int
+) -> None:
+    begin = [round(CYCLE_NS * (10.0 + behind * (module == 2))) for module in range(N_MODULES)]
+    phases = StatePhases(RATE_HZ, STATE_HZ)
+    run(phases, Modules(begin, [0] * N_MODULES), COMPARED_TICKS)
+    assert phases.phases == [0, 0, phase, 0, 0, 0]
+
+
+def test_arrivals_in_all_phases_move_nothing_and_are_not_remembered() -> None:
+    modules, phases = Modules([0] * N_MODULES, [0] * N_MODULES), StatePhases(RATE_HZ, STATE_HZ)
+    run(phases, modules, 1)
+    for tick in range(COMPARED_TICKS):
+        sent = [modules.send(module) for module in range(N_MODULES)]
+        arrived = [arrival for _, arrival in sent]
+        arrived[3] += tick % 8 * CYCLE_NS // 4
+        phases.advance([state for state, _ in sent], arrived, min(arrived) - 1)
+    assert phases.phases == [0] * N_MODULES
+    assert phases.snapshot().sums == ((0.0, 0.0),) * N_MODULES
 
 
 def test_before_there_are_six_modules_nothing_is_compared() -> None:
