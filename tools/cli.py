@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -12,10 +11,6 @@ from types import FrameType
 
 from shared.exceptions import XrlError
 from tools.verb_table import VERBS
-
-# Before NumPy is imported: on small matrices more threads only wait for one another, and figures
-# are the same bit by bit from one thread.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 INTERRUPTED = 128 + signal.SIGINT
 

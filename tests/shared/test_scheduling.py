@@ -84,3 +84,19 @@ def test_a_process_is_pinned_only_where_the_fleets_table_says_so(pinned: str) ->
     same, count = row.split()
     assert ("processors" in said) == (pinned == "1")
     assert (same == "True") == (pinned == "1" or count == "1")
+
+
+@pytest.mark.parametrize("first", ["services.planner.planner", "tools.runs.lockstep", "tools.cli"])
+def test_linear_algebra_runs_in_one_thread_whatever_is_imported_first(first: str) -> None:
+    script = (
+        f"import {first}, numpy as np\n"
+        "from scipy.linalg import lapack\n"
+        "A = np.eye(400)\n"
+        "A @ A, lapack.dgetrf(A)\n"
+        "import os; print(len(os.listdir('/proc/self/task')))"
+    )
+    bare = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=bare
+    )
+    assert done.stdout.strip() == "1"
