@@ -112,6 +112,7 @@ LAWS = [
     "services/planner/hocca.py",
     "services/planner/inverse_kinematics.py",
     "services/planner/kinematics.py",
+    "services/planner/law_terms.py",
     "services/planner/reference.py",
     "services/planner/small_matrices.py",
     "services/planner/state_phases.py",

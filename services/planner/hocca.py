@@ -19,16 +19,16 @@ Pure: no clock, bus or thread.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import AssistLaw, LeadEasing, force_up, is_still, wrench_in_world
-from services.planner.coupling import CouplingFilter, UncoupledGains
-from services.planner.gains import GainLaw, JointGains
+from services.planner.coupling import CouplingFilter
+from services.planner.gains import GainLaw
 from services.planner.kinematics import Measured
+from services.planner.law_terms import LawAtReference
 from services.planner.levelling import Levelling
 from services.planner.load import Load
 from services.planner.reference import Reference
@@ -76,59 +76,6 @@ class LawOutput(NamedTuple):
     """The right foot relative to the left (6,), as deviation from the robot file, m and rad."""
     ik_iterations: int
     ik_residual: float
-
-
-class LawTerms(NamedTuple):
-    """One tick's torques (12,), N m, and gains before any filter; `xrl explain` prints them."""
-
-    gravity: Array
-    """F_O^T J: holds the body's weight."""
-    assist: Array
-    """F_assist^T J_harness: carries part of the person."""
-    hessian_O: Array
-    """Change of gravity and assist torque with the joints (12, 12), N m/rad."""
-    body_gains: Callable[[], JointGains]
-    """Computes K_q and B_q of all the body; the certified split does not need them."""
-    local: LocalGains
-    """D and D_B, certified."""
-    coupled: Array
-    """J^T [K_c e_p + B_c e_pdot]: what the planner adds to the local gains."""
-
-
-class LawAtReference:
-    """The law's terms at a pose, without state (paper, section IV)."""
-
-    def __init__(self, gains: GainLaw, split: GainSplit) -> None:
-        """Take the body's gains and how they are split."""
-        self._gains, self._split = gains, split
-        self._uncoupled = UncoupledGains(gains.K_p, gains.B_p, gains.S, split.coupling.damping)
-
-    def evaluate(self, reference: Reference, e_p: Array, e_pdot: Array) -> LawTerms:
-        """Return the terms.
-
-        Args:
-            reference: evaluated at the reference pose.
-            e_p: p_ref - p (6,), m and rad.
-            e_pdot: pdot_ref - pdot (6,), m/s and rad/s.
-        """
-        T, p = reference.T, reference.p
-
-        def body_gains() -> JointGains:
-            F = self._gains.K_p * e_p + self._gains.B_p * e_pdot + reference.F_O
-            kinematics = reference.kinematics()
-            return self._gains.gains(kinematics, kinematics.hessian_times(F, reference.F_assist))
-
-        local = self._split.split(body_gains, float(p[2]), float(p[4]), T, reference.hessian_O)
-        K_fail = self._split.certificate.failsafe_stiffness(local.D)
-        K_c, B_c = self._uncoupled.at(K_fail, (T.T * local.D_B) @ T)
-        return LawTerms(
-            gravity=reference.gravity,
-            assist=reference.assist,
-            hessian_O=reference.hessian_O,
-            body_gains=body_gains,
-            local=local,
-            coupled=(K_c @ e_p + B_c @ e_pdot) @ reference.J,
-        )
 
 
 class Hocca:
@@ -271,7 +218,7 @@ class Hocca:
         return LawOutput(
             reference.q.copy(),
             reference.v.copy(),
-            terms.gravity + terms.assist,
+            reference.gravity + reference.assist,
             reference.dtau_ff.copy(),
             tau_coupled,
             terms.coupled,
@@ -385,7 +332,7 @@ class Hocca:
         self._since_align_s += dt
         if self._since_align_s >= self._recentre_s:
             return self._p_C0 * KEPT, np.zeros(6)
-        s = min(1.0, self._since_align_s / self._recentre_s)
+        s = self._since_align_s / self._recentre_s
         remaining = 1.0 - s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
         rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / self._recentre_s
         return self._p_C0 * np.where(RECENTRED, remaining, 1.0), self._p_C0 * np.where(

@@ -87,8 +87,8 @@ class PhasesState(msgspec.Struct, frozen=True):
     every: int = 256
     """Ticks from its begin to that of the next."""
     sums: tuple[Pair, ...] = ()
-    """Of each module, the sum of (cos, sin) of 2 pi d / n: its states come d cycles behind the
-    first's."""
+    """Sum of (cos, sin) of 2 pi d / n for each module, whose states arrive d periods behind the
+    first module's."""
 
 
 class LoadState(msgspec.Struct, frozen=True):

@@ -3,8 +3,8 @@
 A module sends its state every nth period of its drive (n = 2: 500 Hz and 250 Hz). No clock ties the
 drives together, and the modules begin to count at different times. If one sends in its even periods
 what the others send in their odd ones, each tick waits for it, and uses five states that are a
-period older than they need be. The planner compares the states' arrivals with the
-first module's, and names in each command the period in which the next state is to be sent
+period older than they need be. The planner compares the states' arrivals with the first module's,
+and names in each command the period in which the next state is to be sent
 (`JointCommand.state_phase`). A late command, or none, changes nothing: a module keeps its phase.
 
 Arrivals are compared in the first ticks of each `EVERY_TICKS`. Only then does the planner's loop
@@ -23,17 +23,17 @@ from shared.clock import NS_PER_S
 from shared.robot.joints import N_MODULES
 
 EVERY_TICKS: Final = 1024
-"""Most ticks from one comparison to the next: 4 s, in which two drives' clocks drift apart by a
-fifth of a period at the most (100 ppm)."""
+"""Largest number of ticks between two comparisons: 4 s, in which two drives' clocks drift apart by
+at most a fifth of a period (100 ppm)."""
 COMPARED_TICKS: Final = 64
 """Ticks of a comparison: a quarter of a second, so that no single late message moves a module."""
 SOON_TICKS: Final = 256
-"""Ticks to the next comparison after one that settled nothing: a second."""
+"""Ticks until the next comparison after a module moved or was silent: a second."""
 SURE: Final = 0.5
 """Length of a mean direction from which it counts, 0 .. 1; an even spread over all phases has 0."""
 HYSTERESIS: Final = 0.15
-"""Of a cycle, beyond half a cycle: the drives' clocks drift past one another, and a phase is not to
-change to and fro."""
+"""Fraction of a period beyond half a period at which a module moves. The drives' clocks drift past
+one another; without it a phase would change back and forth at the boundary."""
 
 
 class StatePhases:
@@ -82,7 +82,7 @@ class StatePhases:
             self._decide(states)
 
     def _decide(self, states: Sequence[JointState]) -> None:
-        """Choose the phases, and begin anew: soon, if a module was silent or has been moved."""
+        """Choose the phases and when to compare next: soon if a module moved or was silent."""
         n, count = self._n, COMPARED_TICKS - 1
         settled = True
         for module, (state, (x, y)) in enumerate(zip(states, self._sums, strict=True)):

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from services.planner.certificate import Weakest, motor_mean
 from services.planner.gains import GainLaw
-from services.planner.hocca import LawAtReference
 from services.planner.kinematics import Measured
+from services.planner.law_terms import LawAtReference
 from services.planner.levelling import up_of
 from services.planner.push_limit import PushLimits, limits_at
 from services.planner.reference import Reference
@@ -113,8 +113,8 @@ def torque_breakdown(
         weakest=certificate.weakest(local.D),
         weakest_onboard=certificate.weakest(motor_mean(local.D)),
         pushes=limits_at(config, at_ref, reference.T, hessian_weight, local.D, local.D_B),
-        gravity=terms.gravity,
-        assist=terms.assist,
+        gravity=reference.gravity,
+        assist=reference.assist,
         local_pd=local.D * (q_ref - q) + local.D_B * (v_ref - v),
         coupled=terms.coupled,
         eased=np.zeros(12),

@@ -43,13 +43,12 @@ def test_the_count_is_that_of_the_periods_whatever_is_late_or_lost(
 @pytest.mark.parametrize("held_up_ns", [3 * NS_PER_MS, 9 * NS_PER_MS, NS_PER_S])
 def test_after_a_service_was_held_up_the_count_goes_on_as_if_it_had_not(held_up_ns: int) -> None:
     times = [NS_PER_S + number * PERIOD_NS for number in range(100)]
-    held = max(now_ns for now_ns in times if now_ns <= times[50] + held_up_ns)
     late = [now_ns for now_ns in times if now_ns <= times[50] or now_ns > times[50] + held_up_ns]
     late.append(times[50] + held_up_ns)
     expected = {now_ns: (now_ns - NS_PER_S) // PERIOD_NS + 1 for now_ns in times}
     for now_ns, count in zip(sorted(late), counted(sorted(late)), strict=True):
         if now_ns in expected:
-            assert count == expected[now_ns], (held, now_ns)
+            assert count == expected[now_ns]
 
 
 @pytest.mark.parametrize(("late", "count"), [(0.45, 2), (0.55, 3), (1.45, 3), (1.55, 4)])
@@ -79,8 +78,7 @@ def test_each_due_period_is_passed_once_whatever_samples_are_lost(
     for number in range(0, 1200, rate):
         clock.advance(NS_PER_S + number * PERIOD_NS, PERIOD_NS)
         passed += clock.passed(every, phase % every)
-    wanted = 1200 / max(every, rate) if rate <= every or every == 1 else 1200 / rate
-    assert abs(passed - wanted) <= 2
+    assert abs(passed - 1200 / max(every, rate)) <= 2
 
 
 def test_a_copy_does_not_change_with_it() -> None:

@@ -1,13 +1,15 @@
-"""What each process is given, and what one may have without privilege."""
+"""Each process gets its row of the table, and without privilege the next best."""
 
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 
 import pytest
 
+from shared import scheduling
 from shared.robot.joints import MODULES
 from shared.scheduling import SLICE_NS, TABLE, TIMER_SLACK_NS, half_of
 from tools.fleet.process_table import TABLE as PROCESSES
@@ -60,6 +62,30 @@ def test_the_halves_are_the_legs_and_no_processor_is_left_out(count: int) -> Non
         assert half == (right if module.endswith("right") else left)
     assert half_of(processors, "planner") == half_of(processors, "recorder") == left
     assert half_of(processors, "simulator") == half_of(processors, "harness") == right
+
+
+def test_two_threads_of_a_core_stay_in_one_half(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processors i and i + 4 are the threads of core i."""
+    monkeypatch.setattr(scheduling, "_core_of", lambda processor: (0, processor % 4, processor))
+    assert half_of(range(8), "harness") == {0, 4, 1, 5}
+    assert half_of(range(8), "planner") == {2, 6, 3, 7}
+
+
+@pytest.mark.parametrize(
+    ("limit", "capable", "may"),
+    [
+        (resource.RLIM_INFINITY, False, True),
+        (1 << 30, True, True),
+        (1 << 30, False, False),
+        (0, False, False),
+    ],
+)
+def test_memory_is_locked_only_where_no_later_allocation_can_fail_for_it(
+    monkeypatch: pytest.MonkeyPatch, limit: int, capable: bool, may: bool
+) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _kind: (limit, limit))
+    monkeypatch.setattr(scheduling, "_has_capability", lambda _bit: capable)
+    assert scheduling.may_lock() == may
 
 
 APPLY = """

@@ -29,7 +29,7 @@ TICK_HZ: Final = 250.0
 STATE_EVERY: Final = 2
 POLL_NS: Final = 400 * NS_PER_US
 REST_FRACTION: Final = 0.8
-"""Of a period, in which the planner looks for no states; then it looks every `POLL_NS`."""
+"""Fraction of a period before the planner polls again; then it polls every `POLL_NS`."""
 WARM_UP_S: Final = 1.5
 """Time until all links are there; nothing of it is counted."""
 _PRIORITY: Final = 20

@@ -102,7 +102,7 @@ class VirtualJoint:
 
 
 class NeighbourRows:
-    """What the joint services of a host read of one another within a cycle, in lockstep.
+    """Rows that the joint services of a host exchange within a cycle of lockstep.
 
     They run one after the other: each reads the rows of those before it as they are after this
     cycle, as from shared memory (`services.joint.neighbours`).

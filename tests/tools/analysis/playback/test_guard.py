@@ -8,7 +8,7 @@ import pytest
 
 from shared.bus import topics
 from shared.exceptions import FleetError
-from tests.shared.test_bus import TALK, TOOL
+from tests.shared.test_links import TALK, TOOL
 from tools.analysis.playback import guard, selection
 from tools.analysis.playback.guard import ACTED_ON, IN_THE_LOOP, allowed, describe, those_of
 
