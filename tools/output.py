@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from rich.console import Console
 from rich.markup import escape
+from rich.progress import Progress
 
 from shared.exceptions import RunError
 
@@ -13,6 +16,15 @@ from shared.exceptions import RunError
 def printable(text: str) -> str:
     """Return a text of a file, which may be foreign or damaged, safe to print with Rich."""
     return escape("".join(c if c.isprintable() else "?" for c in text))
+
+
+@contextlib.contextmanager
+def progress_along(what: str, length_s: float) -> Iterator[Callable[[float], None]]:
+    """Show on a terminal how much of a run is done; the callable takes its time in s."""
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as shown:
+        bar = shown.add_task(what, total=length_s)
+        yield lambda done_s: shown.update(bar, completed=done_s)
 
 
 def write_atomically(out: Path, content: bytes) -> None:

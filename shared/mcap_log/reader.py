@@ -41,6 +41,7 @@ _TAIL: Final = PREFIX.size + _FOOTER_LENGTH + len(MAGIC)
 _CHUNK_MARKS: Final = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
 _MARK_AT: Final = PREFIX.size + CHUNK_TIMES.size
 """Offset of a chunk's compression from its start."""
+_CHANNEL: Final = struct.Struct("<H")  # of a message index
 _LOOSE_HEAD: Final = struct.Struct("<HIQQ")  # of a message that is in no chunk
 
 
@@ -79,8 +80,23 @@ class LostBytes(NamedTuple):
     """Log times; 0: unknown."""
 
 
+class ChunkPlace(NamedTuple):
+    """A chunk that was found and not opened, or a message that is in no chunk."""
+
+    start: int
+    """Offset of its record in the file."""
+    first_ns: int
+    last_ns: int
+    """Log times of its messages."""
+    channels: frozenset[int] | None
+    """Channels with a message in it; None: unknown."""
+
+
 class LogReader:
-    """Reads one file. Iterate over it once; then `cut` and `damage` say what was lost."""
+    """Reads one file. Iterate over it once; then `cut` and `damage` say what was lost.
+
+    Or `skim` it, and `read_at` the places that are needed.
+    """
 
     def __init__(self, data: bytes | mmap.mmap) -> None:
         """Take the file's bytes, which begin with the magic."""
@@ -112,6 +128,68 @@ class LogReader:
                     return
                 self._learn(record)
                 yield record
+
+    def skim(self) -> Iterator[LogRecord | ChunkPlace]:
+        """Yield what iteration does, but the places of the chunks in place of their contents.
+
+        Only the heads of chunks are touched: damage within one shows when it is read.
+        """
+        yield from self._summary()
+        at = len(MAGIC)
+        while at < self._end:
+            place, following = self._place(at)
+            if place is not None:
+                yield place
+                at = following
+                continue
+            start = at
+            record, at = self._next(at)
+            if record is None:
+                continue
+            if record.opcode == Opcode.DATA_END:
+                return
+            self._learn(record)
+            if record.rows:
+                channels = frozenset(row.channel_id for row in record.rows)
+                yield ChunkPlace(start, record.rows[0].log_ns, record.rows[-1].log_ns, channels)
+            else:
+                yield record
+
+    def read_at(self, start: int) -> LogRecord | None:
+        """Return the record at a place that `skim` found; None if it turns out damaged."""
+        damage, self.damage = self.damage, []
+        record, _ = self._next(start)
+        self.damage = damage + [loss for loss in self.damage if loss not in damage]
+        if record is not None:
+            self._learn(record)
+        return record
+
+    def _place(self, at: int) -> tuple[ChunkPlace | None, int]:
+        """Return a chunk's place and the offset behind its indices; None for other records."""
+        opcode, end = self._head(at)
+        if opcode != Opcode.CHUNK or end > self._end or not self._plausible(end):
+            return None, at
+        first_ns, last_ns = CHUNK_TIMES.unpack_from(self._data, at + PREFIX.size)[:2]
+        channels = set()
+        following = end
+        while True:
+            opcode, end = self._head(following)
+            if opcode != Opcode.MESSAGE_INDEX or end > self._end:
+                break
+            channels.add(
+                int.from_bytes(
+                    self.raw(following + PREFIX.size, following + PREFIX.size + 2), "little"
+                )
+            )
+            following = end
+        return ChunkPlace(at, first_ns, last_ns, frozenset(channels) or None), following
+
+    def _head(self, at: int) -> tuple[int, int]:
+        """Return the opcode of the record at a place and the offset of its end; 0 if none fits."""
+        if self._end - at < PREFIX.size + CHUNK_TIMES.size:
+            return 0, self._end
+        opcode, length = PREFIX.unpack_from(self._data, at)
+        return opcode, at + PREFIX.size + length
 
     def raw(self, start: int, end: int) -> bytes:
         """Return the file's bytes from one place to another."""

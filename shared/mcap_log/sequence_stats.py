@@ -34,3 +34,11 @@ class KeyCount(msgspec.Struct, gc=False, kw_only=True):
                 self.restarts += 1
         self.count += 1
         self.last_seq = seq
+
+    def join(self, later: KeyCount) -> None:
+        """Add the counts of a later file of the same run."""
+        self.count += later.count
+        self.gaps += later.gaps
+        self.missing += later.missing
+        self.restarts += later.restarts
+        self.last_seq = later.last_seq

@@ -43,6 +43,8 @@ SCHEMA_VERSION: Final = "6"
 
 FILE_NAME: Final = files.FIRST
 PROFILE: Final = "xrl"
+COUNTS: Final = "counts"
+"""Metadata at the end of a file: counts, gaps and restarts of each key in it."""
 
 _MEDIA_TYPES: Final = {
     ".json": "application/json",
@@ -268,7 +270,7 @@ class RunWriter:
                 key: msgspec.json.encode(_since(self._before[key], count)).decode()
                 for key, count in self.counts.items()
             }
-            self._writer.add_metadata("counts", counts)
+            self._writer.add_metadata(COUNTS, counts)
             self._finish_writer()
             self._file.flush()  # finish() leaves the end of a stream that was passed in unwritten
             self._syncer.request(self._file.fileno(), last=True)

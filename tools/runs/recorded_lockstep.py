@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import deque
 from collections.abc import Callable
@@ -23,10 +22,10 @@ from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.network.impairment import Impairment
 from shared.process import CHECKOUT
 from shared.robot.robot_model import mjcf
-from tools.runs import experiment, figure, verdict
+from tools.runs import experiment
 from tools.runs.centralised.fleet import CONTROLS, SHIPPED
+from tools.runs.judgement import judge_run
 from tools.runs.lockstep import Record, Watch
-from tools.runs.run_log import read_run
 from tools.runs.verdict import Summary
 
 Outcome = TypeVar("Outcome")
@@ -183,8 +182,8 @@ def simulate(
     return record_run(scenario, robot, out, metadata, run, watch, true_plant)
 
 
-def judge_run(scenario: Scenario, out: Path, **figures: Any) -> Summary:
-    """Judge a recorded run by its log; write `summary.json` and `run.png` beside it.
+def judge_in_lockstep(scenario: Scenario, out: Path, **figures: Any) -> Summary:
+    """Judge a run in virtual time, which has no real time to keep.
 
     Args:
         scenario: what happened.
@@ -194,9 +193,5 @@ def judge_run(scenario: Scenario, out: Path, **figures: Any) -> Summary:
     Raises:
         RunError: the log holds nothing to judge, or a file cannot be written.
     """
-    log = read_run(out / "run.mcap")
-    summary = verdict.summarise(log, scenario.duration)
-    summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True} | figures
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    figure.draw(log, f"{scenario.name} in lockstep", summary, out / "run.png")
-    return summary
+    figures |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+    return judge_run(out, f"{scenario.name} in lockstep", scenario.duration, figures)

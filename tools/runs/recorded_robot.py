@@ -8,10 +8,11 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot.gain_table import GainSchedule
+from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog
 
 
-def robot_of(log: RunLog) -> RobotConfig:
+def robot_of(log: RunLog | RunIndex) -> RobotConfig:
     """Return the robot that a log was made with.
 
     Raises:

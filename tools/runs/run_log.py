@@ -1,24 +1,51 @@
-"""Reads a run's MCAP file, or all of its files, into memory: finished or killed.
+"""Reads a run's messages from its files, finished or killed: all of it, or a part of its time.
 
 A killed file has no summary, and may end in the middle of a record; the readers of the mcap package
 find nothing in the first and may stumble over the second (docs/logs.md). `shared.mcap_log.reader`
 walks the records from the start and keeps every whole one; here they are sorted by key.
+
+A whole run takes about 3 MB of memory for each of its seconds, and ten with its messages decoded.
+So what may be long is read by `parts_of`, one after the other.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
+from shared.bus import topics
 from shared.bus.topics import Topic
+from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from shared.mcap_log.reader import LogRecord, LostBytes, open_log
-from shared.mcap_log.records import Attachment, Channel, Metadata
 from shared.mcap_log.sequence_stats import KeyCount
-from shared.mcap_log.writer import SCHEMA_VERSION
-from tools.runs.run_files import files_in
+from tools.runs.run_index import RunIndex
+
+PART_S: Final = 30.0
+"""Length of a part: its messages, decoded, fit into some 0.4 GB."""
+MARGIN_S: Final = 1.0
+"""Messages before and behind a part that are read with it: what a tick consumed or sent."""
+WHOLE_MAX_S: Final = 600.0
+"""Longest time that is read at once."""
+PICTURE_MAX_S: Final = 120.0
+"""Longest time in one picture of a run."""
+
+
+class RunPart(NamedTuple):
+    """A part of a run's time, s since its first message."""
+
+    begin_s: float = 0.0
+    end_s: float = math.inf
+
+
+_EVER: Final = 1 << 62
+WHOLE: Final = RunPart()
+NOTHING: Final = RunPart(0.0, 0.0)
+"""Events alone."""
 
 
 class Series:
@@ -27,61 +54,52 @@ class Series:
     def __init__(self) -> None:
         self.payloads: list[bytes] = []
         self.received_ns: list[int] = []
-        """Reception by the recorder, monotonic clock (once the offset is taken off)."""
+        """Reception by the recorder, monotonic clock."""
         self.seq: list[int] = []
         self.decoded: list[Any] | None = None
 
 
 class RunLog:
-    """A run in memory: about 2.5 MB for each second of the whole fleet.
+    """The messages of a run, or of a part of it, in memory.
 
-    Messages are decoded on request, once for each key.
+    Messages are decoded on request, once for each key. Topics of events, which have no rate, are
+    always of the whole run: a mode or a cut link that began before a part holds in it.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Read a file, or the run in a directory; `read_run` is the name to use.
+    def __init__(self, index: RunIndex, part: RunPart = WHOLE, margin_s: float = 0.0) -> None:
+        """Read the messages; `read_run` is the name to use.
+
+        Args:
+            index: of the run.
+            part: what of it to read.
+            margin_s: how much before and behind it is read as well.
 
         Raises:
-            RunError: a file is missing, empty, no MCAP file or no run; or the directory holds
-                no run, or several.
+            RunError: a file has gone, or is no log any more.
         """
-        self.path = path
-        self.files = files_in(path) if path.is_dir() else [path]
-        """The files read, in order: several if the run was split."""
-        self.metadata: dict[str, dict[str, str]] = {}
-        """Metadata records by name: `run`, `clock`, `packages`, at the end `counts`."""
-        self.attachments: dict[str, bytes] = {}
-        self.complete = True
-        """True if the recorder finished every file; False if it was killed."""
-        self.damage: list[LostBytes] = []
-        """Places that could not be read: their contents are left out."""
-        self.cut: LostBytes | None = None
-        """What follows the last whole record of a file that was cut off."""
+        self.index = index
+        self.path, self.files = index.path, index.files
+        self.metadata, self.attachments = index.metadata, index.attachments
+        self.robot, self.offset_ns = index.robot, index.offset_ns
+        self.begin_ns = self.began_ns() + _ns(part.begin_s)
+        self.end_ns = min(self.began_ns() + _ns(part.end_s), self._ended_ns() + 1)
+        """The part, monotonic clock: from `begin_ns`, before `end_ns`."""
+        self.is_first = part.begin_s <= 0.0
+        self.is_last = self.end_ns > self._ended_ns()
+        self.is_whole = self.is_first and self.is_last
         self._series: dict[str, Series] = {}
-        self._by_channel: dict[int, Series] = {}
-        for file in self.files:
-            self._read(file)
-        self._check_version(self._required("run", "schema_version"))
-        self.robot = self._required("run", "robot")
-        offset = self._required("clock", "offset_ns")
-        if not offset.lstrip("-").isdecimal():
-            raise RunError(f"{path}: clock.offset_ns is {offset!r}; an integer is right")
-        self.offset_ns = int(offset)
-        """wall clock in ns since 1970 = `t_ns` of a message + `offset_ns`."""
-        for series in self._series.values():
-            series.received_ns = [t - self.offset_ns for t in series.received_ns]
-
-    def _check_version(self, version: str) -> None:
-        if version != SCHEMA_VERSION:
-            raise RunError(
-                f"{self.path}: the log has schema version {version}, and this code reads "
-                f"{SCHEMA_VERSION}: read it with the checkout that wrote it"
-            )
+        self._read(_ns(margin_s))
+        self.complete, self.damage, self.cut = index.complete, index.damage, index.cut
 
     @property
     def damaged(self) -> int:
         """Number of places in the middle of the file that could not be read."""
         return len(self.damage)
+
+    @property
+    def has_world(self) -> bool:
+        """True if a simulated world is in it."""
+        return bool(self.count(topics.SIM_TRUTH.key(self.robot)))
 
     def keys(self) -> list[str]:
         """Return every key that has at least one message."""
@@ -122,9 +140,11 @@ class RunLog:
         return list(zip(series.received_ns, series.payloads, series.seq, strict=True))
 
     def began_ns(self) -> int:
-        """Return when the first message reached the recorder, monotonic clock; 0 if none did."""
-        begun = [one.received_ns[0] for one in self._series.values() if one.received_ns]
-        return min(begun, default=0)
+        """Return when the run's first message reached the recorder, monotonic; 0 if none did."""
+        return self.index.began_ns - self.offset_ns
+
+    def _ended_ns(self) -> int:
+        return self.index.ended_ns - self.offset_ns
 
     def received_ns(self, topic: Topic, module: str = "") -> list[int]:
         """Return when each of `messages(topic, module)` reached the recorder.
@@ -142,14 +162,9 @@ class RunLog:
                 found[key].feed(seq)
         return found
 
-    def _read(self, file: Path) -> None:
-        self._by_channel = {}
-        with open_log(file) as reader:
-            for record in reader:
-                self._take(record)
-            self.complete = self.complete and reader.finished
-            self.damage += reader.damage
-            self.cut = reader.cut or self.cut
+    def forget(self) -> None:
+        """Let go of all messages; what is said about the run stays."""
+        self._series = {}
 
     def _key(self, topic: Topic, module: str) -> str:
         if topic.per_module != bool(module):
@@ -160,45 +175,103 @@ class RunLog:
     def _of(self, key: str) -> Series:
         return self._series.get(key) or Series()
 
-    def _required(self, record: str, field: str) -> str:
-        value = self.metadata.get(record, {}).get(field)
-        if value is None:
-            raise RunError(
-                f"{self.path}: no metadata {record}.{field}; an MCAP file written by "
-                "services.recorder, not cut off before its first message, is right"
-            )
-        return value
+    def _read(self, margin_ns: int) -> None:
+        if self.is_whole:
+            self._take(0, _EVER)
+            return
+        known = topics.all_keys(self.robot).items()
+        events = frozenset(key for key, topic in known if not topic.rate_hz)
+        self._take(0, _EVER, events, others=False)
+        self._take(self.begin_ns - margin_ns, self.end_ns + margin_ns, events, others=True)
 
-    def _take(self, record: LogRecord) -> None:
-        for value in record.values():
-            match value:
-                case Metadata(name=name, metadata=entries):
-                    self.metadata[name] = entries
-                case Attachment(name=name, data=data):
-                    self.attachments[name] = data
-                case Channel(id=number, topic=topic):
-                    self._by_channel[number] = self._series.setdefault(topic, Series())
-        self._take_messages(record)
+    def _take(
+        self,
+        first_ns: int,
+        last_ns: int,
+        keys: frozenset[str] = frozenset(),
+        *,
+        others: bool = True,
+    ) -> None:
+        """Sort the messages of a time by key.
 
-    def _take_messages(self, record: LogRecord) -> None:
-        """Sort messages by channel; the hot loop of reading."""
-        body, by_channel = record.body, self._by_channel
-        for channel, seq, log_ns, _, start, end in record.rows:
-            series = by_channel.get(channel)
-            if series is not None:
-                series.payloads.append(body[start:end])
-                series.received_ns.append(log_ns)
-                series.seq.append(seq)
+        Args:
+            first_ns: monotonic clock, inclusive.
+            last_ns: the same, exclusive.
+            keys: full keys.
+            others: take the messages of all other keys; else of these.
+        """
+        offset_ns = self.offset_ns
+        first_ns, last_ns = first_ns + offset_ns, last_ns + offset_ns
+        for record, file in self.index.records(first_ns, last_ns, None if others else keys):
+            body = record.body
+            by_channel = {
+                number: self._series.setdefault(key, Series())
+                for number, key in file.keys.items()
+                if (key in keys) != others
+            }
+            for channel, seq, log_ns, _, start, end in record.rows:  # the hot loop of reading
+                series = by_channel.get(channel)
+                if series is not None and first_ns <= log_ns < last_ns:
+                    series.payloads.append(body[start:end])
+                    series.received_ns.append(log_ns - offset_ns)
+                    series.seq.append(seq)
 
 
-def read_run(path: Path) -> RunLog:
+def read_run(path: Path, part: RunPart | None = None) -> RunLog:
     """Read a run, finished or killed.
 
     Args:
         path: a file; or a directory: all files of the run in it.
+        part: what of it to read; None: all.
 
     Raises:
         RunError: a file is missing, empty, no MCAP file or no run; or the directory holds no
-            run, or several.
+            run, or several; or the part is empty, or longer than is read at once.
     """
-    return RunLog(path)
+    index = RunIndex(path)
+    return read_part(index, part or WHOLE)
+
+
+def read_part(index: RunIndex, part: RunPart) -> RunLog:
+    """Read a part of a run at once.
+
+    Raises:
+        RunError: the part is empty, or longer than is read at once.
+    """
+    length_s = index.length_s
+    if part.begin_s > length_s:
+        raise RunError(f"{index.path}: --from {part.begin_s:g}: the run is {length_s:.1f} s long")
+    read_s = min(part.end_s, length_s) - max(part.begin_s, 0.0)
+    if read_s > WHOLE_MAX_S:
+        raise RunError(
+            f"{index.path}: {read_s:.0f} s are more than the {WHOLE_MAX_S:g} s that are read at "
+            "once; give --from and --to"
+        )
+    return RunLog(index, part)
+
+
+def parts_of(
+    index: RunIndex, part: RunPart = WHOLE, *, part_s: float = PART_S, margin_s: float = MARGIN_S
+) -> Iterator[RunLog]:
+    """Yield a run, or a part of it, in parts that follow each other: one in memory at a time.
+
+    Each forgets its messages when the next is asked for.
+
+    Args:
+        index: of the run.
+        part: what of it to read.
+        part_s: length of each part.
+        margin_s: how much before and behind each is read as well.
+    """
+    begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
+    count = max(1, math.ceil((end_s - begin_s) / part_s))
+    step_s = (end_s - begin_s) / count
+    edges = [*(begin_s + number * step_s for number in range(count)), part.end_s]
+    for first_s, last_s in pairwise(edges):
+        log = RunLog(index, RunPart(first_s, last_s), margin_s)
+        yield log
+        log.forget()
+
+
+def _ns(seconds: float) -> int:
+    return round(min(seconds, 1e9) * NS_PER_S)

@@ -147,6 +147,47 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
     return summary
 
 
+LAST_COUNTS: Final = ("world_time_lost_s", "real_time_factor", "duration_s", "pace", "began")
+"""Figures that a later part has of the whole run."""
+SUMS: Final = ("messages_recorded", "sequence_gaps")
+LEAST: Final = ("torso_height_min_m",)
+
+
+def joined(parts: Sequence[Summary]) -> Summary:
+    """Return the figures of a run from those of its parts, in their order.
+
+    Extremes are those of the run. A percentile or a mean is that of the worst part, a median
+    the median of the parts.
+
+    Args:
+        parts: at least one; the scenario of each is that of the whole run.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    last, summary = parts[-1], dict(parts[-1])
+    for key in last:
+        found = [part[key] for part in parts if part[key] is not None]
+        if not found or key in LAST_COUNTS or not isinstance(found[0], int | float | dict):
+            continue
+        if isinstance(found[0], dict):
+            if "p99" in found[0]:
+                summary[key] = {
+                    "median": float(np.median([one["median"] for one in found])),
+                    "p99": max(one["p99"] for one in found),
+                }
+        elif key in SUMS:
+            summary[key] = sum(found)
+        elif not isinstance(found[0], bool):
+            summary[key] = min(found) if key in LEAST else max(found)
+    fallen = [part["fallen_at_s"] for part in parts if part["fallen_at_s"] is not None]
+    summary["fallen_at_s"] = min(fallen, default=None)
+    stands = (last["stood"] or bool(last["unsound"])) and not fallen
+    summary["unsound"] = why_not_sound(summary) if stands else ""
+    summary["stood"] = stands and not summary["unsound"]
+    summary["in_real_time"] = all(part["in_real_time"] for part in parts)
+    return summary
+
+
 def _robot_of(log: RunLog) -> RobotConfig | None:
     """Return the robot of a log; None if the log has none, or one of another version."""
     try:

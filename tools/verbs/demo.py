@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from rich.console import Console
@@ -17,10 +16,10 @@ from shared.config.scenarios import Scenario
 from tools.fleet import procfs
 from tools.fleet.pace import add_pace
 from tools.fleet.supervise import SupervisedFleet
-from tools.runs import experiment, figure, verdict, verdict_table
+from tools.runs import experiment, verdict_table
+from tools.runs.judgement import judge_run
 from tools.runs.live import run_live
 from tools.runs.live_view import LiveView
-from tools.runs.run_log import read_run
 from tools.runs.scenario_runner import ScenarioRunner
 from tools.verb_table import Subparsers, add_verb
 
@@ -111,10 +110,7 @@ def lead_run(
 
 def judge(out: Path, scenario: Scenario, cpu_pct: float | None, console: Console) -> int:
     """Write summary and picture from the log, print the verdict, return the exit code."""
-    log = read_run(out / "run.mcap")
-    summary = verdict.summarise(log, scenario.duration) | {"fleet_cpu_pct": cpu_pct}
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    figure.draw(log, scenario.name, summary, out / "run.png")
+    summary = judge_run(out, scenario.name, scenario.duration, {"fleet_cpu_pct": cpu_pct})
     verdict_table.show(summary, console)
     console.print(f"{out}/run.mcap, run.png, summary.json, logs/", style="dim", highlight=False)
     return 0 if summary["stood"] else EXIT_FELL

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import bisect
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +28,20 @@ from shared.exceptions import RunError
 from shared.robot import gain_schedule
 from shared.robot.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
-from tools.runs import snapshot_text, verdict
+from tools.runs import snapshot_text
 from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import RunLog, read_run
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import RunLog, RunPart
+from tools.runs.run_parts import zero_ns
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_verb
 
 Array = NDArray[np.float64]
 
 AWAY_S = 0.1
 """s; a tick that much older than the requested time does not describe the robot then."""
+LONG_S: Final = 60.0
+"""Of a longer run only what is around the tick is read."""
+AROUND_S: Final = 5.0
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 SPLIT_DESCRIPTION = {
     SplitSource.DIAGONAL: "diag(K_q)",
@@ -99,10 +104,12 @@ def run(args: argparse.Namespace) -> int:
         still = np.zeros(N_JOINTS)
         show(robot, torque_breakdown(robot, q, still, q, still, args.assist), console)
         return 0
-    log = read_run(args.log)
+    index = RunIndex(args.log)
+    zero = zero_ns(index)
+    log = read_around(index, zero, args.at)
     robot = robot_of(log)
-    tick = tick_at(log, args.at)
-    _introduce(log, tick, args.at, console)
+    tick = tick_at(log, args.at, zero)
+    _introduce(log, tick, args.at, zero, console)
     q, v = (_joined(tick.states, name) for name in ("q", "v"))
     q_ref, v_ref = (_joined(tick.commands, name) for name in ("q_ref", "v_ref"))
     found = torque_breakdown(
@@ -153,8 +160,25 @@ def at_pose(robot: RobotConfig, text: str) -> Array:
     return ik.q
 
 
-def tick_at(log: RunLog, at_s: float | None) -> Tick:
-    """Return the planner's last tick at or before a scenario time; by default the last.
+def read_around(index: RunIndex, zero: int, at_s: float | None) -> RunLog:
+    """Read a run; of a long one what is around a time, or its end.
+
+    Args:
+        index: of the run.
+        zero: monotonic stamp of time 0.
+        at_s: time on the axis of the report; None: the end.
+    """
+    if index.length_s <= LONG_S:
+        return RunLog(index)
+    at_s = (
+        index.length_s if at_s is None else at_s + (zero - index.began_ns + index.offset_ns) / 1e9
+    )
+    at_s = min(max(at_s, 0.0), index.length_s)
+    return RunLog(index, RunPart(max(0.0, at_s - AROUND_S), at_s + AROUND_S))
+
+
+def tick_at(log: RunLog, at_s: float | None, zero_ns: int) -> Tick:
+    """Return the planner's last tick at or before a time; by default the last.
 
     Raises:
         RunError: the planner did not tick there, or the log lacks its inputs.
@@ -165,7 +189,6 @@ def tick_at(log: RunLog, at_s: float | None) -> Tick:
         raise RunError(f"{log.path}: the planner never ticked with all six states")
     index = len(led) - 1
     if at_s is not None:
-        zero_ns = verdict.course(log).zero_ns
         at_ns = zero_ns + round(at_s * 1e9)
         index = bisect.bisect_right([row.t_ns for row in led], at_ns) - 1
         first, last = ((row.t_ns - zero_ns) / 1e9 for row in (led[0], led[-1]))
@@ -197,19 +220,18 @@ def _joined(messages: list[Any], name: str) -> Array:
     return np.array([getattr(message, name) for message in messages], dtype=float).ravel()
 
 
-def _introduce(log: RunLog, tick: Tick, at_s: float | None, console: Console) -> None:
+def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, console: Console) -> None:
     status = tick.status
-    course = verdict.course(log)
     ages = max(status.state_age_ns) / NS_PER_MS
     console.print(
-        f"[bold]tick {status.seq}[/] at {(status.t_ns - course.zero_ns) / 1e9:.3f} s: planner "
+        f"[bold]tick {status.seq}[/] at {(status.t_ns - zero_ns) / 1e9:.3f} s: planner "
         f"{PlannerMode(status.mode).name}{' with hold' if status.hold else ''}, states up to "
         f"{ages:.1f} ms old, assist {status.assist_n:.1f} N, IK {status.ik_iterations} steps, "
         f"residual {status.ik_residual:.1e}"
     )
     words = snapshot_text.describe_modules(tick.states)
     console.print(f"modules, and how old their commands were: {words}", style="dim")
-    at_ns = status.t_ns if at_s is None else course.zero_ns + round(at_s * 1e9)
+    at_ns = status.t_ns if at_s is None else zero_ns + round(at_s * 1e9)
     late_s = (at_ns - status.t_ns) / 1e9
     if late_s > AWAY_S:
         words = snapshot_text.describe_modules(snapshot_text.states_at(log, at_ns))
@@ -217,7 +239,7 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, console: Console) ->
             f"[yellow]at {at_s:g} s the planner did not tick: its last, {late_s:.2f} s before, "
             f"is shown. The modules at {at_s:g} s: {words}[/]"
         )
-    network = snapshot_text.describe_network(log, at_ns, course.zero_ns)
+    network = snapshot_text.describe_network(log, at_ns, zero_ns)
     if network:
         console.print(f"network: {network}", style="yellow", markup=False, highlight=False)
 

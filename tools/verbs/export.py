@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,16 +12,18 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from shared.config.robot_config import RobotConfig
+from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.extended_copy import write_extended
 from shared.mcap_log.files import SUFFIX
 from shared.process import DEFAULT_CONFIG
 from tools.analysis.reports import scene
 from tools.analysis.reports.moving_picture import write_gif
-from tools.output import write_atomically
+from tools.output import progress_along, write_atomically
 from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import RunLog, read_run
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import RunLog, parts_of, read_part
+from tools.runs.run_parts import add_part, part_of
 from tools.verb_table import Subparsers, add_verb
 
 SCENE_SUFFIX: Final = ".scene" + SUFFIX
@@ -38,6 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl export out/a/run.mcap --scene
         xrl export out/a/run.mcap --scene -o shown.mcap --layout layout.json
         xrl export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
+        xrl export out/a/run.mcap --gif shove.gif --from 5 --to 9
         """,
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a run's record; it is not touched")
@@ -67,6 +71,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="FILE",
         help="also draw the robot from the side and the front, as an animated picture",
     )
+    add_part(parser, "of the picture")
     parser.add_argument("--force", action="store_true", help="replace what exists")
 
 
@@ -77,19 +82,22 @@ def run(args: argparse.Namespace) -> int:
     path: Path = args.file
     if path.is_dir():
         raise RunError(f"{path}: is a directory; give one of its files")
-    log = read_run(path)
+    index = RunIndex(path)
+    part = part_of(args, index)
     console = Console()
     if args.scene:
         out: Path = args.out or path.with_name(path.name.removesuffix(SUFFIX) + SCENE_SUFFIX)
         _free(out, path, force=args.force)
-        count = export_scene(log, robot_of(log), out)
+        count = export_scene(index, out)
         console.print(f"[bold]{escape(str(out))}[/]: {count} messages", soft_wrap=True)
     if args.gif is not None:
         _free(args.gif, path, force=args.force)
-        _draw(log, args.gif, console)
+        _draw(read_part(index, part), args.gif, console)
     if args.layout is not None:
         _free(args.layout, path, force=args.force)
-        write_atomically(args.layout, json.dumps(layout_for(log.robot), indent=2).encode() + b"\n")
+        write_atomically(
+            args.layout, json.dumps(layout_for(index.robot), indent=2).encode() + b"\n"
+        )
         console.print(f"[bold]{escape(str(args.layout))}[/]: import it in Foxglove")
     return 0
 
@@ -102,13 +110,23 @@ def _draw(log: RunLog, out: Path, console: Console) -> None:
     console.print(f"[bold]{escape(str(out))}[/]: {count} frames", soft_wrap=True)
 
 
-def export_scene(log: RunLog, robot: RobotConfig, out: Path) -> int:
-    """Write a copy of a log with its scene; return how many messages it has.
+def export_scene(index: RunIndex, out: Path) -> int:
+    """Write a copy of a log with its scene, with progress; return how many messages it has.
 
     Raises:
         RunError: the log cannot be copied or lacks states, or the copy cannot be written.
     """
-    return write_extended(log.path, out, scene.channels(log.robot), scene.messages(log, robot))
+    robot = robot_of(index)
+
+    def parts() -> Iterator[RunLog]:
+        with progress_along("copying", index.length_s) as done:
+            for log in parts_of(index):
+                yield log
+                done((log.end_ns - log.began_ns()) / NS_PER_S)
+
+    return write_extended(
+        index.path, out, scene.channels(index.robot), scene.messages(parts(), robot)
+    )
 
 
 def layout_for(robot: str) -> dict[str, Any]:

@@ -20,15 +20,18 @@ from shared.mcap_log.recover import clock_time, describe_lost
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
 from tools.output import printable
-from tools.runs import verdict
 from tools.runs.impairment_intervals import impairments
 from tools.runs.run_files import files_of_run
-from tools.runs.run_log import RunLog, read_run
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import NOTHING, RunLog
+from tools.runs.run_parts import zero_ns
 from tools.verb_table import Subparsers, add_verb
 
 SLOW: Final = 0.9
 """Fraction of a topic's nominal rate below which it is marked."""
 MIB: Final = 1 << 20
+LARGE: Final = 128 * MIB
+"""A larger finished file is not read through."""
 INJECTED_MAX: Final = 12
 """Impairments with a line of their own."""
 
@@ -51,23 +54,34 @@ def add_parser(subparsers: Subparsers) -> None:
         action="store_true",
         help="all files of the run that it belongs to, counted together",
     )
+    parser.add_argument(
+        "--full",
+        action="store_true",
+        help=f"read every message of a finished file over {LARGE >> 20} MiB too: sizes, longest "
+        "gaps and damage; else what its recorder counted is shown",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON, in SI units")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print it; 0 if the file can be read."""
     survey = Survey()
-    first = survey.add(args.file)
+    first = _add(survey, args.file, full=args.full)
     run_files = files_of_run(args.file, first.metadata)
     if args.whole_run and len(run_files) > 1:
         survey = Survey()
         for path in run_files:
-            survey.add(path)
+            _add(survey, path, full=args.full)
     if args.json:
         print(json.dumps(as_json(survey, run_files), indent=2))
     else:
         show(survey, run_files, Console())
     return 0
+
+
+def _add(survey: Survey, path: Path, *, full: bool) -> FileFacts:
+    large = path.is_file() and path.stat().st_size > LARGE
+    return survey.add(path, by_index=large and not full)
 
 
 def as_json(survey: Survey, run_files: list[Path]) -> dict[str, Any]:
@@ -90,7 +104,9 @@ def as_json(survey: Survey, run_files: list[Path]) -> dict[str, Any]:
                 "bytes": topic.bytes,
                 "rate_hz": topic.rate_hz,
                 "nominal_hz": topic.nominal_hz or None,
-                "longest_gap_s": topic.longest_gap_ns / NS_PER_S,
+                "longest_gap_s": None
+                if topic.longest_gap_ns is None
+                else topic.longest_gap_ns / NS_PER_S,
                 "lost": topic.sequence.missing,
                 "gaps": topic.sequence.gaps,
                 "restarts": topic.sequence.restarts,
@@ -114,6 +130,8 @@ def show(survey: Survey, run_files: list[Path], console: Console) -> None:
     if present:
         console.print()
         console.print(_table(present, f"xrl/{robot}/", events=survey.files[0].ours))
+    if any(topic.longest_gap_ns is None for topic in present.values()):
+        console.print("as its recorder counted; --full reads every message", style="dim")
     silent = len(survey.topics) - len(present)
     if silent:
         console.print(f"{silent} more topics without a message", style="dim")
@@ -187,24 +205,27 @@ def _injected(survey: Survey) -> list[str]:
     if topic is None or not topic.sequence.count or not survey.files[0].ours:
         return []
     try:
-        logs = [read_run(file.path) for file in survey.files]
-        events = [event for log in logs for event in log.messages(topics.LINK_EVENT)]
-        zero_ns, since = _zero(logs[0])
+        indices = [RunIndex(file.path) for file in survey.files]
+        events = [
+            event
+            for index in indices
+            for event in RunLog(index, NOTHING).messages(topics.LINK_EVENT)
+        ]
+        zero, since = _zero(indices[0])
     except XrlError as error:
         return [str(error)]
-    lines = [f"{row.title}: {row.when(zero_ns)}; {row.counts()}" for row in impairments(events)]
+    lines = [f"{row.title}: {row.when(zero)}; {row.counts()}" for row in impairments(events)]
     more = len(lines) - INJECTED_MAX
     if more > 0:
         lines[INJECTED_MAX:] = [f"and {more} more"]
     return [line + since for line in lines[:1]] + lines[1:]
 
 
-def _zero(log: RunLog) -> tuple[int, str]:
+def _zero(index: RunIndex) -> tuple[int, str]:
     """Return time zero of the listed impairments, and its name if not the scenario's start."""
-    try:
-        return verdict.course(log).zero_ns, ""
-    except XrlError:
-        return log.began_ns(), " (s since the log begins)"
+    zero = zero_ns(index)
+    since = " (s since the log begins)" if zero == index.began_ns - index.offset_ns else ""
+    return zero, since
 
 
 def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
@@ -229,7 +250,9 @@ def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
             str(topic.sequence.count),
             Text(f"{rate:.1f}" if steady else "", style="yellow" if slow else ""),
             f"{nominal:g}" if nominal else "",
-            f"{topic.longest_gap_ns * 1e-6:.1f}" if steady else "",
+            f"{topic.longest_gap_ns * 1e-6:.1f}"
+            if steady and topic.longest_gap_ns is not None
+            else "",
             Text(str(lost), style="yellow" if lost else ""),
             str(topic.sequence.restarts),
         )

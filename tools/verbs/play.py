@@ -8,6 +8,7 @@ import gc
 import math
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -25,7 +26,8 @@ from tools.analysis.playback.display import Display, introduce, summary, where
 from tools.analysis.playback.keyboard import Keyboard, Press
 from tools.analysis.playback.player import Player
 from tools.analysis.playback.reading import Recording
-from tools.analysis.playback.schedule import Playhead, Schedule, Window, window
+from tools.analysis.playback.schedule import Entry, Playhead, Schedule, Window, window
+from tools.analysis.playback.stream import EntryStream
 from tools.cli import INTERRUPTED
 from tools.fleet.supervise import SupervisedFleet
 from tools.verb_table import Subparsers, add_verb
@@ -69,7 +71,8 @@ def run(args: argparse.Namespace) -> int:
         )
         if watch is not None:
             targets = _permitted(targets, watch, console, force=args.force)
-        schedule = schedule_of(recording, targets, part, loop=args.loop)
+        executor = stack.enter_context(ThreadPoolExecutor(1, "read ahead"))
+        schedule = schedule_of(recording, targets, part, executor, loop=args.loop)
         listen = [] if args.listen == arguments.NOWHERE else [args.listen]
         session = stack.enter_context(open_session(bus.robot, "play", args.run_dir, listen=listen))
         listening = expand(args.listen, args.run_dir) if listen else ""
@@ -122,20 +125,25 @@ def bus_of(recording: Recording, args: argparse.Namespace) -> Bus:
 
 
 def schedule_of(
-    recording: Recording, targets: dict[str, str], part: Window, *, loop: bool
+    recording: Recording,
+    targets: dict[str, str],
+    part: Window,
+    executor: Executor | None = None,
+    *,
+    loop: bool,
 ) -> Schedule:
     """Return the messages to be put, numbered by the keys of `targets`.
 
     Raises:
         RunError: there is none.
     """
-    number = {key: index for index, key in enumerate(targets)}
-    new = [number.get(key, -1) for key in recording.keys]
-    entries = [
-        entry._replace(key=new[entry.key]) for entry in recording.entries if new[entry.key] >= 0
-    ]
-    schedule = Schedule(entries, part, loop=loop)
-    if not len(schedule):
+    keys = list(targets)
+
+    def read(begin_ns: int, end_ns: int) -> list[Entry]:
+        return recording.entries(begin_ns, end_ns, keys)
+
+    schedule = Schedule(EntryStream(read, part, executor), part, loop=loop)
+    if schedule.is_empty:
         raise RunError("none of these topics has a message in this part of the log")
     return schedule
 

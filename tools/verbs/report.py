@@ -13,9 +13,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from shared.exceptions import RunError
-from tools.analysis.reports.page import render
-from tools.output import write_atomically
-from tools.runs.run_log import read_run
+from tools.analysis.reports.page import render_parts
+from tools.output import progress_along, write_atomically
+from tools.runs.run_index import RunIndex
+from tools.runs.run_parts import add_part, part_of
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 MIB: Final = 1 << 20
@@ -29,9 +30,11 @@ def add_parser(subparsers: Subparsers) -> None:
         """
         xrl report out/a/run.mcap
         xrl report out/a/run.mcap -o report.html --open no
+        xrl report out/a/run.mcap --from 1200 --to 1260   # a minute of an hour
         """,
     )
     parser.add_argument("file", type=Path, metavar="RUN", help=RUN_HELP)
+    add_part(parser)
     parser.add_argument(
         "-o",
         "--out",
@@ -50,13 +53,15 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the page."""
     path: Path = args.file
-    log = read_run(path)
-    out: Path = args.out or log.files[0].with_suffix(".html")
+    index = RunIndex(path)
+    part = part_of(args, index)
+    out: Path = args.out or index.files[0].with_suffix(".html")
     if out.is_dir():
         raise RunError(f"{out}: is a directory; give a file with -o")
     if out.exists() and path.exists() and out.samefile(path):
         raise RunError(f"{out}: is the log itself; give another file with -o")
-    page = render(log).encode()
+    with progress_along("reading", min(part.end_s, index.length_s)) as done:
+        page = render_parts(index, part, done=done).encode()
     write_atomically(out, page)
     name = escape(str(out))
     Console().print(f"[bold]{name}[/]: {len(page) / MIB:.2f} MiB, one file", soft_wrap=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -12,20 +11,20 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from shared.bus import topics
-from shared.bus.messages import JointEvent, JointState, Message, PlannerStatus
+from shared.bus.messages import Message
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.mcap_log.provenance import machine
 from shared.robot.joints import MODULES
 from tools.analysis.reexecution import rewritten
 from tools.analysis.reexecution.compare import size
-from tools.analysis.reexecution.joint import JointExecution
+from tools.analysis.reexecution.execution import Execution
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.analysis.reexecution.params import with_params
-from tools.analysis.reexecution.planner import PlannerExecution
 from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import RunLog, read_run
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import RunLog, parts_of, read_part
+from tools.runs.run_parts import add_part, part_of
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 SERVICES: Final = ("planner", *MODULES)
@@ -44,6 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl resim out/a/run.mcap --service planner --param law.K_p.x=2000
         xrl resim out/a/run.mcap --tolerance 1e-9             # of another machine class
         xrl resim out/a                                       # a split run, all of its files
+        xrl resim out/a --from 1200 --to 1260                 # a minute of a long one
         """,
     )
     parser.add_argument("log", type=Path, metavar="RUN", help=RUN_HELP)
@@ -63,6 +63,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "joint_service.blend_ms=100: the same inputs, and what would have come out; a new file "
         "is written beside the old",
     )
+    add_part(parser)
     parser.add_argument(
         "--until-first-difference", action="store_true", help="stop there; sooner done"
     )
@@ -86,28 +87,44 @@ def run(args: argparse.Namespace) -> int:
     if not args.tolerance >= 0.0:
         raise RunError(f"--tolerance {args.tolerance:g}: zero or more is right")
     console = Console()
-    log = read_run(args.log)
-    robot = robot_of(log)
-    if args.param:
-        robot = with_params(robot, args.param, str(args.log))
+    index = RunIndex(args.log)
+    part = part_of(args, index)
+    # the new file is written from all of the old: that is read at once
+    logs = iter((read_part(index, part),)) if args.param else parts_of(index, part)
+    robot: RobotConfig | None = None
     chosen = set(args.service or ("all",))
     names = SERVICES if "all" in chosen else tuple(name for name in SERVICES if name in chosen)
-    path = args.out or log.files[0].with_suffix(".resim.mcap")
+    path = args.out or index.files[0].with_suffix(".resim.mcap")
     if args.param and path.exists():
         raise RunError(f"{path}: is there already; remove it, or name another with --out")
-    outcomes, recomputed = [], dict[str, list[Message]]()
+    recomputed = dict[str, list[Message]]()
+    executions: list[Execution] = []
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("executing again", total=len(names))
-        for name in names:
-            progress.update(task, description=f"executing {name}")
-            outcome = ReexecutionResult(name, args.tolerance, exact=not args.param)
-            for key, message in execute(log, robot, name, outcome):
-                if args.param:
-                    recomputed.setdefault(key, []).append(message)
-                if args.until_first_difference and outcome.comparison.first is not None:
-                    break
-            outcomes.append(outcome)
-            progress.advance(task)
+        task = progress.add_task("executing again", total=None)
+        for log in logs:
+            if robot is None:
+                robot = with_params(robot_of(log), args.param, str(args.log))
+                executions = [
+                    Execution(robot, name, args.tolerance, exact=not args.param) for name in names
+                ]
+            for number, execution in enumerate(executions):
+                if args.until_first_difference and execution.differs:
+                    continue
+                done_s = number / len(executions) * (log.end_ns - log.begin_ns) / 1e9
+                progress.update(
+                    task,
+                    description=f"executing {execution.outcome.service}",
+                    completed=(log.begin_ns - log.began_ns()) / 1e9 + done_s,
+                    total=min(part.end_s, index.length_s),
+                )
+                for key, message in execution.run(log):
+                    if args.param:
+                        recomputed.setdefault(key, []).append(message)
+                    if args.until_first_difference and execution.differs:
+                        break
+            if args.until_first_difference and all(one.differs for one in executions):
+                break
+    outcomes = [execution.outcome for execution in executions]
     _other_machine(log, console)
     console.print(summary(outcomes))
     for outcome in outcomes:
@@ -122,23 +139,6 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"{count} messages, the recomputed ones among them, in {path}")
         return 0
     return 0 if all(outcome.equal for outcome in outcomes if outcome.ticks) else 1
-
-
-def execute(
-    log: RunLog, robot: RobotConfig, name: str, outcome: ReexecutionResult
-) -> Iterator[tuple[str, Message]]:
-    """Execute a service; yield what comes out, with its full key."""
-    if name == "planner":
-        for module, message in PlannerExecution(log, robot, outcome).run():
-            status = isinstance(message, PlannerStatus)
-            topic = topics.PLANNER_STATUS if status else topics.JOINT_COMMAND
-            yield topic.key(log.robot, module), message
-        return
-    for message in JointExecution(log, robot, name, outcome).run():
-        if isinstance(message, JointState):
-            yield topics.JOINT_STATE.key(log.robot, name), message
-        elif isinstance(message, JointEvent):
-            yield topics.JOINT_EVENT.key(log.robot, name), message
 
 
 def summary(outcomes: list[ReexecutionResult]) -> Table:

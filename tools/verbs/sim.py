@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
             robot, scenario, network, args.seed, out, watch, args.control, true_plant
         )
     factor = simulated_s / (time.monotonic() - begin)
-    summary = recorded_lockstep.judge_run(scenario, out, speed=factor)
+    summary = recorded_lockstep.judge_in_lockstep(scenario, out, speed=factor)
     verdict_table.show(summary, console)
     console.print(f"{factor:.1f} x real time; {out}/run.mcap, run.png, summary.json", style="dim")
     return 0 if summary["stood"] else 1

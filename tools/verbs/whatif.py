@@ -19,7 +19,9 @@ from shared.exceptions import RunError
 from shared.robot.joints import MODULES
 from tools.runs.experiment import PLANT_FILE
 from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import RunLog, read_run
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import RunLog
+from tools.runs.run_parts import add_part, read_asked
 from tools.studies.counterfactual import picture
 from tools.studies.counterfactual.moments import moments_of
 from tools.studies.counterfactual.run import Counterfactual, Task, counterfactual_of
@@ -39,6 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
         """
         xrl whatif out/a/run.mcap --kill planner
         xrl whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
+        xrl whatif out/a/run.mcap --kill planner --from 5 --to 9
         """,
     )
     parser.add_argument("log", type=Path, metavar="RUN", help=f"{RUN_HELP}; of a simulated robot")
@@ -50,6 +53,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="SERVICE",
         help=f"dies at the moment: {', '.join(KILLABLE)}; may be given several times",
     )
+    add_part(parser)
     parser.add_argument(
         "--every", type=float, default=0.1, metavar="S", help="between two moments (0.1 s)"
     )
@@ -72,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     if not (args.every >= 0.1 - 1e-9 and args.for_s > 0.0 and args.workers >= 1):
         raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
     console = Console()
-    log = read_run(args.log)
+    log = read_asked(args, RunIndex(args.log))
     robot, scenario = robot_of(log), scenario_of(log)
     moments = moments_of(log, robot, args.every)
     kill = tuple(dict.fromkeys(args.kill))

@@ -17,6 +17,7 @@ from shared.robot.robot_model import stand_pose
 from tools import cli
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
+from tools.runs.run_parts import zero_ns
 from tools.verbs import explain
 
 
@@ -33,7 +34,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
 def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(
     log: RunLog, at_s: float | None
 ) -> None:
-    tick = explain.tick_at(log, at_s)
+    tick = explain.tick_at(log, at_s, zero_ns(log.index))
     robot = robot_of(log)
     q, v = (np.array([getattr(s, n) for s in tick.states]).ravel() for n in ("q", "v"))
     commands = {
@@ -55,9 +56,10 @@ def test_a_tick_recomputed_from_the_log_is_the_tick_that_was_sent(
 
 def test_the_tick_is_the_last_at_or_before_the_time(log: RunLog) -> None:
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    early, late = explain.tick_at(log, 1.0).status, explain.tick_at(log, 1.004).status
+    zero = zero_ns(log.index)
+    early, late = (explain.tick_at(log, at_s, zero).status for at_s in (1.0, 1.004))
     assert late.seq == early.seq + 1
-    assert explain.tick_at(log, None).status == statuses[-1]
+    assert explain.tick_at(log, None, zero).status == statuses[-1]
 
 
 @pytest.fixture(scope="module")

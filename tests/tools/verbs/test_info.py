@@ -184,3 +184,35 @@ def test_a_file_without_a_message_is_shown(
     found = as_json(capsys, runs.write(tmp_path, []))
     assert (found["messages"], found["duration_s"], found["start_ns"]) == (0, None, None)
     assert all(topic["rate_hz"] is None for topic in found["topics"].values())
+
+
+def test_a_large_finished_file_is_told_from_its_index_like_the_messages_tell_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    items = [item for seq in range(3000) for item in (state(seq, 4 * seq), wrench(seq, 4 * seq))]
+    del items[2000:2060]
+    path = runs.write(tmp_path, items)
+    read = as_json(capsys, path)
+    monkeypatch.setattr("tools.verbs.info.LARGE", 1)
+    found = as_json(capsys, path)
+    full = as_json(capsys, path, "--full")
+    assert full == read
+    counted = ("count", "lost", "gaps", "restarts", "schema", "nominal_hz")
+    for key in (STATE_KEY, WRENCH_KEY):
+        topic, told = found["topics"][key], read["topics"][key]
+        assert {name: topic[name] for name in counted} == {name: told[name] for name in counted}
+        assert topic["rate_hz"] == pytest.approx(told["rate_hz"], rel=0.02)
+        assert (topic["bytes"], topic["longest_gap_s"]) == (None, None)
+    assert (found["start_ns"], found["duration_s"]) == (read["start_ns"], read["duration_s"])
+    assert "--full reads every message" in as_text(capsys, path)
+
+
+def test_a_large_file_that_was_cut_off_is_read_through(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = runs.write(tmp_path, [state(seq, 4 * seq) for seq in range(3000)])
+    path.write_bytes(path.read_bytes()[:-200])
+    monkeypatch.setattr("tools.verbs.info.LARGE", 1)
+    found = as_json(capsys, path)
+    assert not found["files"][0]["finished"]
+    assert found["topics"][STATE_KEY]["bytes"] > 0

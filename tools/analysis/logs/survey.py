@@ -10,10 +10,10 @@ import msgspec
 
 from shared.clock import NS_PER_S
 from shared.mcap_log.files import in_use
-from shared.mcap_log.reader import LogReader, LogRecord, LostBytes, open_log
+from shared.mcap_log.reader import ChunkPlace, LogReader, LogRecord, LostBytes, open_log
 from shared.mcap_log.records import Attachment, Channel, Header, McapRecord, Metadata, Schema
 from shared.mcap_log.sequence_stats import KeyCount
-from shared.mcap_log.writer import PROFILE
+from shared.mcap_log.writer import COUNTS, PROFILE
 from tools.runs.run_files import MetadataByName
 
 _NEVER: Final = -1
@@ -25,12 +25,12 @@ class TopicFacts(msgspec.Struct, kw_only=True):
     schema: str
     nominal_hz: float
     """From the table of topics at the recording; 0: events, or unknown."""
-    bytes: int = 0
-    """Size of the payload before compression, bytes."""
+    bytes: int | None = 0
+    """Size of the payload before compression, bytes. None: not read."""
     first_ns: int = _NEVER
     last_ns: int = _NEVER
-    longest_gap_ns: int = 0
-    """Between two messages after each other; by the sender's clock in our logs."""
+    longest_gap_ns: int | None = 0
+    """Between two messages after each other; by the sender's clock in our logs. None: not read."""
     sequence: KeyCount = msgspec.field(default_factory=KeyCount)
 
     @property
@@ -90,8 +90,13 @@ class Survey:
         """Log time of the last message; -1 without any."""
         return max((f.last_ns for f in self.files if f.messages), default=_NEVER)
 
-    def add(self, path: Path) -> FileFacts:
+    def add(self, path: Path, *, by_index: bool = False) -> FileFacts:
         """Read a file.
+
+        Args:
+            path: the file.
+            by_index: of a finished file of ours take what its recorder counted, to within a
+                chunk, and do not look for damage; its messages are not read.
 
         Raises:
             RunError: it is missing, empty, or no MCAP file.
@@ -100,7 +105,9 @@ class Survey:
             facts = FileFacts(
                 path=path, size=reader.size, finished=reader.finished, in_use=_in_use(path)
             )
-            _Reading(facts, self.topics).read(reader)
+            reading = _Reading(facts, self.topics)
+            if not (by_index and reader.finished and reading.skim(reader)):
+                reading.read(reader)
             facts.cut, facts.damage = reader.cut, reader.damage
         self.files.append(facts)
         return facts
@@ -120,6 +127,39 @@ class _Reading:
                 self._take(value)
             if record.rows:
                 self._count(record)
+
+    def skim(self, reader: LogReader) -> bool:
+        """Take the recorder's own counts; return False if there are none, and nothing is taken."""
+        places: list[ChunkPlace] = []
+        others: list[McapRecord] = []
+        for found in reader.skim():
+            if isinstance(found, ChunkPlace):
+                places.append(found)
+            else:
+                others += found.values()
+        counts = next(
+            (m.metadata for m in others if isinstance(m, Metadata) and m.name == COUNTS), None
+        )
+        if counts is None:
+            return False
+        for value in others:
+            self._take(value)
+        if places:
+            self._facts.first_ns = min(place.first_ns for place in places)
+            self._facts.last_ns = max(place.last_ns for place in places)
+        names = {value.topic: value.id for value in others if isinstance(value, Channel)}
+        for key, text in counts.items():
+            topic = self._channels[names[key]]
+            within = [place for place in places if names[key] in (place.channels or ())]
+            count = msgspec.json.decode(text, type=KeyCount)
+            self._facts.messages += count.count
+            topic.sequence.join(count)
+            topic.bytes = topic.longest_gap_ns = None
+            if within:
+                first_ns = min(place.first_ns for place in within)
+                topic.first_ns = first_ns if topic.first_ns == _NEVER else topic.first_ns
+                topic.last_ns = max(place.last_ns for place in within)
+        return True
 
     def _take(self, value: McapRecord) -> None:
         match value:
@@ -156,13 +196,13 @@ class _Reading:
             elif log_ns < file.first_ns:
                 file.first_ns = log_ns
             file.messages += 1
-            topic.bytes += end - start
+            topic.bytes = (topic.bytes or 0) + end - start
             topic.sequence.feed(seq)
             time_ns = publish_ns if ours else log_ns
             gap_ns = time_ns - topic.last_ns
             if topic.last_ns == _NEVER:
                 topic.first_ns = time_ns
-            elif gap_ns > topic.longest_gap_ns:
+            elif gap_ns > (topic.longest_gap_ns or 0):
                 topic.longest_gap_ns = gap_ns
             topic.last_ns = time_ns
 

@@ -2,56 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
-import msgspec
-
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from shared.mcap_log.reader import LogReader, LogRecord, open_log
+from shared.mcap_log.reader import ChunkPlace, LogRecord, open_log
 from shared.mcap_log.records import Attachment, Channel, Metadata
 from tools.analysis.playback.schedule import Entry
 from tools.runs.run_files import MetadataByName, files_in
 
 ROBOT_FILE: Final = "robot.toml"
 
+_EVER: Final = 1 << 63
 _CLOCKS_APART_NS: Final = NS_PER_S
 """Wall clocks are set right by less while a machine runs; a restart changes far more."""
 
 
-class Recording(msgspec.Struct):
+class Recording:
     """Some files of one robot, as one log."""
 
-    robot: str = ""
-    robot_file: str | None = None
-    """The robot file that was in use, as TOML; None if the log does not hold it."""
-    offset_ns: int = 0
-    """Wall clock in ns since 1970 = time of an entry + this."""
-    keys: list[str] = msgspec.field(default_factory=list)
-    """`Entry.key` counts in these; each has a message."""
-    entries: list[Entry] = msgspec.field(default_factory=list)
-    """Sorted by time; what came at the same moment stays as it stood in the file."""
-    unfinished: list[Path] = msgspec.field(default_factory=list)
-    """Files without an end: there may have been more."""
-    damaged: list[Path] = msgspec.field(default_factory=list)
-    """Files with unreadable places in the middle."""
-
-    @property
-    def began_ns(self) -> int:
+    def __init__(self, files: Sequence[RecordedFile]) -> None:
+        """Take files that belong together, in any order; at least one."""
+        self._files = sorted(files, key=lambda file: file.began_ns)
+        self.robot = files[0].metadata["run"]["robot"]
+        self.robot_file = next((file.robot_file for file in files if file.robot_file), None)
+        """The robot file that was in use, as TOML; None if the log does not hold it."""
+        self.offset_ns = files[0].offset_ns
+        """Wall clock in ns since 1970 = time of an entry + this."""
+        self.keys = list(dict.fromkeys(key for file in files for key in file.keys_with_messages()))
+        """`Entry.key` counts in these; each has a message."""
+        self.unfinished = [file.path for file in files if not file.finished]
+        """Files without an end: there may have been more."""
+        self.damaged = [file.path for file in files if file.damaged]
+        """Files with unreadable places in the middle, as far as is known yet."""
+        self.began_ns = min(file.began_ns for file in files)
         """When the first message reached the recorder, by its clock."""
-        return self.entries[0].time_ns
-
-    @property
-    def ended_ns(self) -> int:
+        self.ended_ns = max(file.ended_ns for file in files)
         """When the last one did."""
-        return self.entries[-1].time_ns
+
+    def entries(
+        self, begin_ns: int = 0, end_ns: int = _EVER, keys: Sequence[str] | None = None
+    ) -> list[Entry]:
+        """Return messages sorted by time; what came at the same moment stays as in the file.
+
+        Args:
+            begin_ns: recorder's clock, inclusive.
+            end_ns: the same, exclusive.
+            keys: `Entry.key` counts in these, and other messages are left out; None: `self.keys`.
+        """
+        numbers = {key: number for number, key in enumerate(self.keys if keys is None else keys)}
+        found = [row for file in self._files for row in file.entries(begin_ns, end_ns, numbers)]
+        found.sort(key=attrgetter("time_ns"))
+        return found
 
 
 def read(paths: Sequence[Path]) -> Recording:
-    """Read files of one run, or of runs of one robot on one clock.
+    """Look through files of one run, or of runs of one robot on one clock.
 
     Args:
         paths: files, in any order.
@@ -59,22 +68,21 @@ def read(paths: Sequence[Path]) -> Recording:
     Raises:
         RunError: a file is no run, two do not belong together, or none holds a message.
     """
-    recording = Recording()
-    index: dict[str, int] = {}
+    files: list[RecordedFile] = []
     seen: dict[tuple[str, str], Path] = {}
     for path in paths:
-        file = _File(path, index)
-        file.check()
+        file = RecordedFile(path)
         split = file.metadata.get("split", {})
         number = (split.get("run", str(path.resolve())), split.get("number", ""))
         if number in seen:
             raise RunError(f"{path}: the same part of the run as {seen[number]}; give one of them")
         seen[number] = path
-        _join(recording, file)
-    if not recording.entries:
+        if files:
+            _check_together(files[0], file)
+        files.append(file)
+    recording = Recording([file for file in files if file.chunks] or files)
+    if not recording.keys:
         raise RunError(f"{', '.join(map(str, paths))}: holds no message; nothing to play")
-    recording.keys = list(index)
-    recording.entries.sort(key=attrgetter("time_ns"))
     return recording
 
 
@@ -92,48 +100,92 @@ def files_named(given: Iterable[Path]) -> list[Path]:
     return found
 
 
-def _join(recording: Recording, file: _File) -> None:
-    robot = file.metadata["run"]["robot"]
-    if not recording.robot:
-        recording.robot, recording.offset_ns = robot, file.offset_ns
-    if robot != recording.robot:
+def _check_together(first: RecordedFile, file: RecordedFile) -> None:
+    robot, known = (one.metadata["run"]["robot"] for one in (file, first))
+    if robot != known:
         raise RunError(
             f"{file.path}: a run of the robot {robot!r}, and those before are of "
-            f"{recording.robot!r}; play one robot at a time"
+            f"{known!r}; play one robot at a time"
         )
-    apart_ns = abs(file.offset_ns - recording.offset_ns)
+    apart_ns = abs(file.offset_ns - first.offset_ns)
     if apart_ns > _CLOCKS_APART_NS:
         raise RunError(
             f"{file.path}: its clock and that of the files before are "
             f"{apart_ns / NS_PER_S:.0f} s apart, so another machine or another day; play one "
             "after the other"
         )
-    recording.robot_file = recording.robot_file or file.robot_file
-    recording.entries += file.entries
-    if not file.finished:
-        recording.unfinished.append(file.path)
-    if file.damaged:
-        recording.damaged.append(file.path)
 
 
-class _File:
-    """One file, read through."""
+class RecordedFile:
+    """One file, looked through; its messages are read when they are needed."""
 
-    def __init__(self, path: Path, index: dict[str, int]) -> None:
+    def __init__(self, path: Path) -> None:
+        """Look through a file.
+
+        Raises:
+            RunError: it is no run of this project.
+        """
         self.path = path
         self.metadata: MetadataByName = {}
         self.robot_file: str | None = None
-        self.entries: list[Entry] = []
-        self.offset_ns = 0
-        self._index = index
+        self.chunks: list[ChunkPlace] = []
         self._channels: dict[int, str] = {}
         with open_log(path) as reader:
-            self._read(reader)
+            for found in reader.skim():
+                if isinstance(found, ChunkPlace):
+                    self.chunks.append(found)
+                else:
+                    self._learn(found)
             self.finished = reader.finished
             self.damaged = bool(reader.damage)
+        self.offset_ns = self._check()
+        times = [(chunk.first_ns, chunk.last_ns) for chunk in self.chunks] or [
+            (self.offset_ns,) * 2
+        ]
+        self.began_ns = min(first for first, _ in times) - self.offset_ns
+        self.ended_ns = max(last for _, last in times) - self.offset_ns
 
-    def check(self) -> None:
-        """Refuse a file that is no run of this project.
+    def keys_with_messages(self) -> list[str]:
+        """Return the keys that have a message, in the order of their channels."""
+        known = {n for chunk in self.chunks if chunk.channels is not None for n in chunk.channels}
+        if any(chunk.channels is None for chunk in self.chunks):
+            known |= {row.channel_id for record in self._records(0, _EVER) for row in record.rows}
+        return [self._channels[number] for number in sorted(known) if number in self._channels]
+
+    def entries(self, begin_ns: int, end_ns: int, numbers: dict[str, int]) -> Iterator[Entry]:
+        """Yield messages from a time to another, of the keys that have a number."""
+        offset_ns = self.offset_ns
+        begin_ns, end_ns = begin_ns + offset_ns, end_ns + offset_ns
+        for record in self._records(begin_ns, end_ns):
+            body = record.body
+            wanted = {n: numbers.get(key, -1) for n, key in self._channels.items()}
+            for channel, _, log_ns, _, start, end in record.rows:
+                number = wanted.get(channel, -1)
+                if number >= 0 and begin_ns <= log_ns < end_ns:
+                    yield Entry(log_ns - offset_ns, number, body[start:end])
+
+    def _records(self, begin_ns: int, end_ns: int) -> Iterator[LogRecord]:
+        with open_log(self.path) as reader:
+            for place in self.chunks:
+                if place.last_ns >= begin_ns and place.first_ns < end_ns:
+                    record = reader.read_at(place.start)
+                    if record is not None:
+                        self._learn(record)
+                        yield record
+            self.damaged = self.damaged or bool(reader.damage)
+
+    def _learn(self, record: LogRecord) -> None:
+        for value in record.values():
+            match value:
+                case Channel(id=number, topic=topic):
+                    self._channels[number] = topic
+                case Metadata(name=name, metadata=entries):
+                    self.metadata[name] = entries
+                case Attachment(name=name, data=data) if name == ROBOT_FILE:
+                    self.robot_file = data.decode(errors="replace")
+
+    def _check(self) -> int:
+        """Return the clock's offset of a run of this project.
 
         Raises:
             RunError: it is none.
@@ -149,25 +201,4 @@ class _File:
                 f"{self.path}: no metadata run.robot and clock.offset_ns; an MCAP file written by "
                 "services.recorder, not cut off before its first message, is right"
             )
-        self.offset_ns = offset_ns
-        self.entries = [row._replace(time_ns=row.time_ns - offset_ns) for row in self.entries]
-
-    def _read(self, reader: LogReader) -> None:
-        for record in reader:
-            for value in record.values():
-                match value:
-                    case Channel(id=number, topic=topic):
-                        self._channels[number] = topic
-                    case Metadata(name=name, metadata=entries):
-                        self.metadata[name] = entries
-                    case Attachment(name=name, data=data) if name == ROBOT_FILE:
-                        self.robot_file = data.decode(errors="replace")
-            self._take_messages(record)
-
-    def _take_messages(self, record: LogRecord) -> None:
-        body, index = record.body, self._index
-        for channel, _, log_ns, _, start, end in record.rows:
-            topic = self._channels.get(channel)
-            if topic is not None:
-                key = index.setdefault(topic, len(index))
-                self.entries.append(Entry(log_ns, key, body[start:end]))
+        return offset_ns

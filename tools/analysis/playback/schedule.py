@@ -9,9 +9,7 @@ position of each message.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 from shared.clock import NS_PER_MS
 
@@ -108,47 +106,54 @@ class Playhead:
         self._since_ns, self._from_ns = now_ns, position_ns
 
 
+class EntrySource(Protocol):
+    """The messages of a window, in order."""
+
+    def rewind(self) -> None:
+        """Begin again."""
+
+    def peek(self) -> Entry | None:
+        """Return the next message, which stays the next; None behind the last."""
+
+    def pop(self) -> Entry:
+        """Return the next message, which `peek` has returned."""
+
+
 class Schedule:
     """The messages of a window in order, once or for ever."""
 
-    def __init__(self, entries: Sequence[Entry], part: Window, *, loop: bool) -> None:
+    def __init__(self, source: EntrySource, part: Window, *, loop: bool) -> None:
         """Take messages in the order of playback.
 
         Args:
-            entries: sorted by time; those outside the window are left out.
+            source: those of the window.
             part: the window.
             loop: restart at its end.
         """
-        self._entries = entries
-        self._first = bisect_left(entries, part.start_ns, key=_time)
-        self._end = bisect_left(entries, part.end_ns, key=_time)
-        self._next = self._first
+        self._source = source
         self._start_ns = part.start_ns
         self.length_ns = max(0, part.end_ns - part.start_ns)
         """Length of one pass, ns."""
-        self._loop = loop and self._end > self._first
+        self.is_empty = source.peek() is None
+        self._loop = loop and not self.is_empty
         self._period_ns = max(self.length_ns, PASS_MIN_NS)
         self.passes = 0
         """Passes that are over."""
 
-    def __len__(self) -> int:
-        """Return the number of messages in one pass."""
-        return max(0, self._end - self._first)
-
     def next_ns(self) -> int | None:
         """Return the position of the next message; None behind the last."""
-        if self._next >= self._end:
-            if not self._loop:
-                return None
-            self._next = self._first
+        entry = self._source.peek()
+        if entry is None and self._loop:
+            self._source.rewind()
             self.passes += 1
-        return self.passes * self._period_ns + self._entries[self._next].time_ns - self._start_ns
+            entry = self._source.peek()
+        if entry is None:
+            return None
+        return self.passes * self._period_ns + entry.time_ns - self._start_ns
 
     def pop(self) -> Entry:
         """Return the next message, whose position `next_ns` has returned."""
-        entry = self._entries[self._next]
-        self._next += 1
-        return entry
+        return self._source.pop()
 
     def recorded_ns(self, position_ns: int) -> int:
         """Return the recorder's clock at a position, within the window."""
@@ -159,7 +164,3 @@ class Schedule:
         if self._loop:
             position_ns %= self._period_ns
         return min(position_ns, self.length_ns)
-
-
-def _time(entry: Entry) -> int:
-    return entry.time_ns

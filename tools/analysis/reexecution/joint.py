@@ -26,27 +26,27 @@ _encode: Final = msgspec.json.Encoder().encode
 class JointExecution:
     """One module's service, from its traces."""
 
-    def __init__(
-        self, log: RunLog, robot: RobotConfig, name: str, outcome: ReexecutionResult
-    ) -> None:
-        """Take the log, the robot to execute with, the module's name and what to fill in."""
+    def __init__(self, robot: RobotConfig, name: str, outcome: ReexecutionResult) -> None:
+        """Take the robot to execute with, the module's name and what to fill in."""
         self._robot, self._name, self._outcome = robot, name, outcome
-        self._log = log
-        self._traces: list[JointTrace] = log.messages(topics.JOINT_TRACE, name)
-        commands: list[JointCommand] = log.messages(topics.JOINT_COMMAND, name)
-        self._commands = {(command.session, command.seq): command for command in commands}
-        states: list[JointState] = log.messages(topics.JOINT_STATE, name)
-        self._states = {(state.t_ns, state.cycle): state for state in states}
-        self._events = {event.t_ns: event for event in log.messages(topics.JOINT_EVENT, name)}
         self._module: DriveManager | None = None
+        self._expected = 0
 
-    def run(self) -> Iterator[Message]:
-        """Execute every cycle that can be; yield what comes out, where the log has its like."""
-        expected = 0
-        for trace in self._traces:
-            if trace.seq != expected:
+    def run(self, log: RunLog) -> Iterator[Message]:
+        """Execute every cycle that can be; yield what comes out, where the log has its like.
+
+        Args:
+            log: a run, or its parts one after the other.
+        """
+        self._load(log)
+        traces: list[JointTrace] = log.messages(topics.JOINT_TRACE, self._name)
+        received = log.received_ns(topics.JOINT_TRACE, self._name)
+        for trace, received_ns in zip(traces, received, strict=True):
+            if not log.begin_ns <= received_ns < log.end_ns:
+                continue
+            if trace.seq != self._expected:
                 self._module = None  # the log lacks traces in between, or the service restarted
-            expected = trace.seq + 1
+            self._expected = trace.seq + 1
             if trace.snapshot:
                 self._remember(trace)
             for cycle in trace.cycles:
@@ -54,6 +54,15 @@ class JointExecution:
                     self._outcome.skipped += 1
                 else:
                     yield from self._cycle(self._module, cycle)
+
+    def _load(self, log: RunLog) -> None:
+        """Look up what the cycles of a part took and sent."""
+        name = self._name
+        commands: list[JointCommand] = log.messages(topics.JOINT_COMMAND, name)
+        self._commands = {(command.session, command.seq): command for command in commands}
+        states: list[JointState] = log.messages(topics.JOINT_STATE, name)
+        self._states = {(state.t_ns, state.cycle): state for state in states}
+        self._events = {event.t_ns: event for event in log.messages(topics.JOINT_EVENT, name)}
 
     def snapshot(self) -> DriveManagerState | None:
         """Return the service's present state; None while it cannot be executed."""

@@ -26,10 +26,39 @@ _encode: Final = msgspec.json.Encoder().encode
 class PlannerExecution:
     """The planner, re-executed from its statuses: each lists the inputs of its tick."""
 
-    def __init__(self, log: RunLog, robot: RobotConfig, outcome: ReexecutionResult) -> None:
-        """Take the log, the robot to execute with and what to fill in."""
+    def __init__(self, robot: RobotConfig, outcome: ReexecutionResult) -> None:
+        """Take the robot to execute with and what to fill in."""
         self._robot, self._outcome = robot, outcome
-        self._statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+        self._planner: Planner | None = None
+        self._last: PlannerStatus | None = None
+        self._state_seq: list[int] = []
+        self._wrench_seq = -1
+        self._attitude_seq = -1
+
+    def run(self, log: RunLog) -> Iterator[tuple[str, Message]]:
+        """Execute every tick that can be; yield module (or "") and what comes out.
+
+        Args:
+            log: a run, or its parts one after the other.
+        """
+        self._load(log)
+        statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+        received = log.received_ns(topics.PLANNER_STATUS)
+        for status, received_ns in zip(statuses, received, strict=True):
+            if not log.begin_ns <= received_ns < log.end_ns:
+                continue
+            last, self._last = self._last, status
+            if last is not None and (status.session != last.session or status.seq > last.seq + 1):
+                self._planner = None  # another planner, or ticks that the log lacks
+            if self._planner is None or not self._receive(self._planner, status):
+                self._planner = None
+                self._outcome.skipped += 1
+                self._begin(status)
+                continue
+            yield from self._tick(self._planner, status)
+
+    def _load(self, log: RunLog) -> None:
+        """Look up what the ticks of a part took and sent."""
         snapshots: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
         self._snapshots = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in snapshots}
         self._states = [BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
@@ -40,24 +69,6 @@ class PlannerExecution:
             for name in MODULES
             for command in log.messages(topics.JOINT_COMMAND, name)
         }
-        self._planner: Planner | None = None
-        self._state_seq: list[int] = []
-        self._wrench_seq = -1
-        self._attitude_seq = -1
-
-    def run(self) -> Iterator[tuple[str, Message]]:
-        """Execute every tick that can be; yield module (or "") and what comes out."""
-        last: PlannerStatus | None = None
-        for status in self._statuses:
-            if last is not None and (status.session != last.session or status.seq > last.seq + 1):
-                self._planner = None  # another planner, or ticks that the log lacks
-            last = status
-            if self._planner is None or not self._receive(self._planner, status):
-                self._planner = None
-                self._outcome.skipped += 1
-                self._begin(status)
-                continue
-            yield from self._tick(self._planner, status)
 
     def snapshot(self) -> tuple[int, TickState] | None:
         """Return the planner's session and present state; None while it cannot be executed."""

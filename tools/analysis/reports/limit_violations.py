@@ -5,6 +5,7 @@ The search for the cause of a fall begins at the earliest violation.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
@@ -28,6 +29,8 @@ TORQUE_DURATION_MIN_S: Final = 0.02
 AT_LIMIT: Final = 0.999
 """Fraction of a module's torque limit from which the torque counts as limited."""
 
+TORQUE: Final = "torque at its limit"
+
 ALLOWED: Final = {row.key: (row.limit, row.unit) for row in LIMITS}
 WORLD: Final = (
     ("COM x", "com", 0, 1e3, "alive_com_x_max_mm", "hold_com_x_max_mm"),
@@ -45,29 +48,60 @@ planner leads, key while it does not lead); an empty key: no limit."""
 class Violation(NamedTuple):
     """Time that one figure spent beyond its limit."""
 
+    what: str
+    """The limit."""
     name: str
+    """The figure, module or joint."""
     t: float
     """First time beyond the limit, s."""
     duration_s: float
     """Total time beyond the limit."""
+    least: float = math.inf
+    """Least value, of a figure that has a lower limit."""
+
+    def joined(self, later: Violation) -> Violation:
+        """Return it with what a later part of the run has of it."""
+        return self._replace(
+            duration_s=self.duration_s + later.duration_s, least=min(self.least, later.least)
+        )
 
 
-def limit_violations(run: RunData) -> Iterator[TimelineEvent]:
-    """Yield the first violation of each limit, in no order.
+class LimitViolations:
+    """The violations of a run, whose parts are taken one after the other.
 
     The simulated world has the limits of the verdict (docs/results.md#targets); torques, joints
     and margins have those of the robot file.
     """
-    yield from _world(run)
-    yield from _torques(run)
-    yield from _stops(run)
-    yield from _margins(run)
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[str, str], Violation] = {}
+
+    def take(self, run: RunData) -> None:
+        """Take a run, or the next part of it."""
+        for find in (_world, _torques, _stops, _margins):
+            for new in find(run):
+                old = self._found.get((new.what, new.name))
+                self._found[new.what, new.name] = new if old is None else old.joined(new)
+
+    def events(self) -> Iterator[TimelineEvent]:
+        """Yield the first violation of each limit, in no order."""
+        found = [one for one in self._found.values() if one.duration_s >= _duration_min_s(one)]
+        for group in _together(found):
+            yield _event(group)
 
 
-def first_violation(name: str, t: Array, beyond: NDArray[np.bool_]) -> Violation | None:
+def limit_violations(run: RunData) -> list[TimelineEvent]:
+    """Return the first violation of each limit of a whole run, in no order."""
+    found = LimitViolations()
+    found.take(run)
+    return list(found.events())
+
+
+def first_violation(what: str, name: str, t: Array, beyond: NDArray[np.bool_]) -> Violation | None:
     """Return the first time beyond a limit and the total duration; None if there is none.
 
     Args:
+        what: the limit.
         name: the figure, module or joint.
         t: times, s, not falling.
         beyond: True where the limit is exceeded; one for each time.
@@ -77,15 +111,16 @@ def first_violation(name: str, t: Array, beyond: NDArray[np.bool_]) -> Violation
     steps = np.append(np.diff(t), 0.0)
     usual = float(np.median(steps[:-1])) if len(steps) > 1 else 0.0
     duration = float(np.minimum(steps, 5.0 * usual)[beyond].sum())
-    return Violation(name, float(t[int(np.argmax(beyond))]), duration)
+    return Violation(what, name, float(t[int(np.argmax(beyond))]), duration)
 
 
-def _world(run: RunData) -> Iterator[TimelineEvent]:
+def _world(run: RunData) -> Iterator[Violation]:
     """Yield violations of the verdict's limits, over the time that the verdict judges."""
     if run.course is None:
         return
-    t = run.course.t
+    t = run.course.t + run.at(run.course.zero_ns)
     leads = leading(run.log, np.round(t * NS_PER_S).astype(np.int64) + run.zero_ns)
+    inside = run.inside(t)
     for name, field, index, scale, leading_key, other_key in WORLD:
         rows = np.array([getattr(row, field) for row in run.course.rows], dtype=np.float64)
         values = np.abs(rows if rows.ndim == 1 else rows[:, index]) * scale
@@ -96,32 +131,31 @@ def _world(run: RunData) -> Iterator[TimelineEvent]:
             if not key:
                 continue
             most, unit = ALLOWED[key]
-            found = first_violation(name, t, (values > most) & mask)
+            what = f"over {most:g} {unit}, the limit {condition}"
+            found = first_violation(what, name, t, (values > most) & mask & inside)
             if found is not None:
-                yield _event([found], f"over {most:g} {unit}, the limit {condition}")
+                yield found
 
 
-def _torques(run: RunData) -> Iterator[TimelineEvent]:
+def _torques(run: RunData) -> Iterator[Violation]:
     if run.robot is None:
         return
     most = run.robot.joint.tau_module_max
-    found = []
     for module in MODULES:
         (tau,) = run.columns(topics.JOINT_STATE, module, "tau")
         if not len(tau):
             continue
         t = run.times(topics.JOINT_STATE, module)
-        at_limit = first_violation(module, t, np.abs(tau).sum(axis=1) >= AT_LIMIT * most)
-        if at_limit is not None and at_limit.duration_s >= TORQUE_DURATION_MIN_S:
-            found.append(at_limit)
-    for group in _together(found):
-        yield _event(group, f"torque at its limit of {most:g} N m")
+        at_limit = np.abs(tau).sum(axis=1) >= AT_LIMIT * most
+        what = f"{TORQUE} of {most:g} N m"
+        found = first_violation(what, module, t, at_limit & run.inside(t))
+        if found is not None:
+            yield found
 
 
-def _stops(run: RunData) -> Iterator[TimelineEvent]:
+def _stops(run: RunData) -> Iterator[Violation]:
     if run.robot is None:
         return
-    found = []
     limits = run.robot.joint_limits()
     armed_s = run.armed_s()
     for number, joint in enumerate(JOINTS):
@@ -133,14 +167,14 @@ def _stops(run: RunData) -> Iterator[TimelineEvent]:
         angle = q[:, number % 2]
         t = run.times(topics.JOINT_STATE, module)
         outside = (angle < low) | (angle > high)
-        at_stop = first_violation(joint, t, outside & (t >= armed_s))
-        if at_stop is not None:
-            found.append(at_stop)
-    for group in _together(found):
-        yield _event(group, "beyond a soft stop")
+        found = first_violation(
+            "beyond a soft stop", joint, t, outside & (t >= armed_s) & run.inside(t)
+        )
+        if found is not None:
+            yield found
 
 
-def _margins(run: RunData) -> Iterator[TimelineEvent]:
+def _margins(run: RunData) -> Iterator[Violation]:
     if run.robot is None:
         return
     certificate = run.robot.certificate
@@ -148,30 +182,38 @@ def _margins(run: RunData) -> Iterator[TimelineEvent]:
         topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard"
     )
     t = run.times(topics.PLANNER_STATUS)
-    has_margin = ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED))
+    has_margin = ~np.isin(mode, (PlannerMode.WAITING, PlannerMode.MISPLACED)) & run.inside(t)
     for name, values, least in (
         ("margin of the joint services alone", service, certificate.margin_min),
         ("margin of the drives alone", onboard, certificate.onboard_margin_min),
     ):
         below = (values < least) & has_margin
-        found = first_violation(name, t, below)
+        found = first_violation(f"under {least:g}", name, t, below)
         if found is not None:
-            yield _event([found], f"under {least:g}, down to {values[below].min():.3g}")
+            yield found._replace(least=float(values[below].min()))
+
+
+def _duration_min_s(found: Violation) -> float:
+    return TORQUE_DURATION_MIN_S if found.what.startswith(TORQUE) else 0.0
 
 
 def _together(found: Sequence[Violation]) -> list[list[Violation]]:
-    """Group violations that began at about the same time."""
+    """Group violations of the modules or joints that began at about the same time."""
     groups: list[list[Violation]] = []
-    for one in sorted(found, key=lambda violation: violation.t):
-        if groups and one.t - groups[-1][0].t <= TOGETHER_S:
-            groups[-1].append(one)
+    for one in sorted(found, key=lambda violation: (violation.what, violation.t)):
+        before = groups[-1] if groups else []
+        many = one.name in (*MODULES, *JOINTS)
+        if many and before and before[0].what == one.what and one.t - before[0].t <= TOGETHER_S:
+            before.append(one)
         else:
             groups.append([one])
     return groups
 
 
-def _event(group: Sequence[Violation], what: str) -> TimelineEvent:
+def _event(group: Sequence[Violation]) -> TimelineEvent:
     names = ", ".join(one.name for one in group)
     longest = max(one.duration_s for one in group)
-    text = f"{names}: {what}, for the first time; {longest:.2f} s in total"
+    least = min(one.least for one in group)
+    down = f", down to {least:.3g}" if math.isfinite(least) else ""
+    text = f"{names}: {group[0].what}{down}, for the first time; {longest:.2f} s in total"
     return TimelineEvent(group[0].t, "limit", text)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Final
 
-from tools.analysis.reports import network, panels, summary, timeline, times, torques
-from tools.analysis.reports.page_model import PageModel, TimelineEvent
-from tools.analysis.reports.run_data import RunData
-from tools.analysis.reports.summary import RunVerdict
+from shared.clock import NS_PER_S
+from tools.analysis.reports import network, panels, summary, times, torques
+from tools.analysis.reports.page_model import PageModel, PageWindow, TimelineEvent
+from tools.analysis.reports.run_data import RunData, TimeAxis
+from tools.analysis.reports.signals import Span
+from tools.analysis.reports.summary import RunVerdict, TopicLoss
+from tools.analysis.reports.timeline import Timeline
 from tools.runs import verdict_table
-from tools.runs.run_log import RunLog
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import PART_S, WHOLE, RunLog, RunPart, parts_of
+from tools.runs.run_parts import zero_ns
 
 HERE: Final = Path(__file__).parent
 VENDOR: Final = HERE / "vendor" / "uplot"
@@ -45,34 +50,104 @@ POLICY: Final = (
 """Makes the browser refuse every request to another place."""
 
 
+class Page:
+    """The page of a run, whose parts are taken one after the other."""
+
+    def __init__(self, axis: TimeAxis | None = None) -> None:
+        """Begin a page.
+
+        Args:
+            axis: its time axis; None, for a run that is taken at once: that of the run.
+        """
+        self._axis = axis
+        self._model: PageModel | None = None
+        self._about: RunData | None = None
+        self._timeline = Timeline()
+        self._judge = summary.Judge()
+        self._losses = summary.MessageLosses()
+
+    def take(self, log: RunLog) -> None:
+        """Take a run, or the next part of it.
+
+        Raises:
+            RunError: a message has another version.
+        """
+        run = RunData(log, self._axis)
+        if self._about is None or (self._about.course is None and run.course is not None):
+            self._about = run  # a part in which the scenario runs names the time axis
+        self._model = self._model or PageModel(run.span)
+        span = None if log.is_whole else run.span
+        self._model.window = PageWindow(run.begin_s, run.end_s, span)
+        add_panels(run, self._model)
+        self._timeline.take(run)
+        self._judge.take(run)
+        self._losses.take(run)
+
+    def html(self) -> str:
+        """Return the page."""
+        run, model = self._about, self._model
+        assert run is not None  # noqa: S101 - a run has a part
+        assert model is not None  # noqa: S101
+        log = run.log
+        events = self._timeline.events(run.span)
+        verdict = self._judge.verdict(log)
+        name = log.metadata["run"].get("scenario") or log.path.name
+        fell_s = next((row.t for row in events if row.kind == "fall"), None)
+        parts = (
+            _head(run, verdict, name),
+            _tools(run, fell_s),
+            f'<div class="work">{_timeline(events)}<main id="panels"></main></div>',
+            _left_out(model),
+            _message_losses(run, self._losses.rows(log.robot)),
+            _inputs(run),
+        )
+        data = json.dumps(model.as_data(events), separators=(",", ":"), allow_nan=False)
+        prefix = "" if verdict.good is None else f"{verdict.sentence}: "
+        return _document(f"{prefix}{name}, {log.robot}", "\n".join(parts), data)
+
+
 def render(log: RunLog) -> str:
-    """Return the page of a run.
+    """Return the page of a run that is in memory.
 
     Raises:
         RunError: a message has another version.
     """
-    run = RunData(log)
-    model = page_model(run)
-    events = timeline.timeline_events(run)
-    verdict = summary.judge(run)
-    name = log.metadata["run"].get("scenario") or log.path.name
-    fell_s = next((row.t for row in events if row.kind == "fall"), None)
-    parts = (
-        _head(run, verdict, name),
-        _tools(run, fell_s),
-        f'<div class="work">{_timeline(events)}<main id="panels"></main></div>',
-        _left_out(model),
-        _losses(run),
-        _inputs(run),
-    )
-    data = json.dumps(model.as_data(events), separators=(",", ":"), allow_nan=False)
-    prefix = "" if verdict.good is None else f"{verdict.sentence}: "
-    return _document(f"{prefix}{name}, {log.robot}", "\n".join(parts), data)
+    page = Page()
+    page.take(log)
+    return page.html()
 
 
-def page_model(run: RunData) -> PageModel:
-    """Return all panels of a run, in the order of the page."""
-    model = PageModel(run.span)
+def render_parts(
+    index: RunIndex,
+    part: RunPart = WHOLE,
+    *,
+    part_s: float = PART_S,
+    done: Callable[[float], None] = lambda _: None,
+) -> str:
+    """Return the page of a run, or of a part of it, with little of it in memory at a time.
+
+    Args:
+        index: of the run.
+        part: what of it to show.
+        part_s: length of what is read at a time, s.
+        done: takes the time of the run that is done, s.
+
+    Raises:
+        RunError: a message has another version.
+    """
+    zero = zero_ns(index)
+    began_ns = index.began_ns - index.offset_ns
+    offset_s = (began_ns - zero) / NS_PER_S
+    begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
+    page = Page(TimeAxis(zero, Span(begin_s + offset_s, end_s + offset_s)))
+    for log in parts_of(index, part, part_s=part_s):
+        page.take(log)
+        done((log.end_ns - began_ns) / NS_PER_S)
+    return page.html()
+
+
+def add_panels(run: RunData, model: PageModel) -> None:
+    """Add all panels of a run, in the order of the page."""
     panels.add_body(run, model)
     panels.add_states(run, model)
     network.add_network(run, model)
@@ -81,7 +156,6 @@ def page_model(run: RunData) -> PageModel:
     torques.add_joints(run, model)
     panels.add_harness(run, model)
     times.add_times(run, model)
-    return model
 
 
 def _document(title: str, body: str, data: str) -> str:
@@ -190,8 +264,7 @@ def _before(row: TimelineEvent) -> str:
     return f' data-before="{BEFORE_FALL_S:g}"' if row.kind == "fall" else ""
 
 
-def _losses(run: RunData) -> str:
-    rows = summary.message_losses(run)
+def _message_losses(run: RunData, rows: Sequence[TopicLoss]) -> str:
     missing = sum(row.lost for row in rows)
     cells = [
         (

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shared.bus import topics
 from shared.bus.messages import DriveStatus
@@ -20,10 +21,25 @@ from tools.runs.run_log import RunLog
 from tools.runs.verdict import Course
 
 
-class RunData:
-    """A log, its time axis and its robot."""
+class TimeAxis(NamedTuple):
+    """The time axis of a page."""
 
-    def __init__(self, log: RunLog) -> None:
+    zero_ns: int
+    """Monotonic stamp of time 0."""
+    span: Span
+    """What the page shows: a run, or the part asked for."""
+
+
+class RunData:
+    """A log or a part of one, its time axis and its robot."""
+
+    def __init__(self, log: RunLog, axis: TimeAxis | None = None) -> None:
+        """Take a log.
+
+        Args:
+            log: a run; or a part of one, read with a margin.
+            axis: of the page; None: that of the log alone.
+        """
         self.log = log
         self.course: Course | None = None
         """Trajectory of the simulated world; None if the log has none or its scenario never
@@ -42,9 +58,26 @@ class RunData:
             self.robot = robot_of(log)
         except XrlError as error:
             self.without_robot = _reason(log, error)
-        self.zero_ns = self.course.zero_ns if self.course else log.began_ns()
-        self.span = self._span()
+        if axis is None:
+            zero_ns = self.course.zero_ns if self.course else log.began_ns()
+            axis = TimeAxis(zero_ns, Span(_s(log.begin_ns - zero_ns), _s(log.end_ns - 1 - zero_ns)))
+        self.zero_ns, self.span = axis
+        self.begin_s = -np.inf if log.is_first else self.at(log.begin_ns)
+        self.end_s = np.inf if log.is_last else self.at(log.end_ns)
+        """Time to take from this log: what lies outside is a margin."""
         self._times: dict[tuple[str, str], Array] = {}
+
+    def at(self, t_ns: int) -> float:
+        """Return a monotonic stamp as time on the axis, s."""
+        return _s(t_ns - self.zero_ns)
+
+    def is_inside(self, t: float) -> bool:
+        """Return True for a time on the axis that is not in a margin."""
+        return self.begin_s <= t < self.end_s
+
+    def inside(self, t: Array) -> NDArray[np.bool_]:
+        """Return True for times on the axis that are not in a margin."""
+        return np.asarray((t >= self.begin_s) & (t < self.end_s))
 
     @property
     def axis(self) -> str:
@@ -96,17 +129,6 @@ class RunData:
             found.append(float(self.times(topics.JOINT_STATE, module)[armed[0]]))
         return max(found)
 
-    def _span(self) -> Span:
-        received = [
-            times
-            for key, topic in topics.all_keys(self.log.robot).items()
-            if (times := self.log.received_ns(topic, module_of(topic, key)))
-        ]
-        if not received:
-            return Span(0.0, 0.0)
-        first, last = min(map(min, received)), max(map(max, received))
-        return Span((first - self.zero_ns) / NS_PER_S, (last - self.zero_ns) / NS_PER_S)
-
 
 def module_of(topic: Topic, key: str) -> str:
     """Return the module of a full key; empty if its topic has no modules."""
@@ -116,3 +138,7 @@ def module_of(topic: Topic, key: str) -> str:
 def _reason(log: RunLog, error: XrlError) -> str:
     """Return an error's text without the path of the file, since pages are shared."""
     return str(error).replace(f"{log.path}: ", "").replace(str(log.path), log.path.name)
+
+
+def _s(ns: int) -> float:
+    return ns / NS_PER_S

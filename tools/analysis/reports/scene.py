@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -109,22 +109,33 @@ def channels(robot: str) -> list[NewChannel]:
     return [*found, model]
 
 
-def messages(log: RunLog, robot: RobotConfig) -> Iterator[NewMessage]:
+def messages(logs: Iterable[RunLog], robot: RobotConfig) -> Iterator[NewMessage]:
     """Yield the messages of a run's scene in the order of time.
+
+    Args:
+        logs: the run, or its parts one after the other.
+        robot: of the run.
 
     Raises:
         RunError: the log does not hold the states of all six modules.
     """
     links_ns: int | None = None
-    for pose in poses(log, robot):
-        ns = pose.t_ns + log.offset_ns
-        if links_ns is None:
-            yield NewMessage(MODEL, ns, urdf.message(model(log.robot, robot, pose)))
-        yield NewMessage(FRAMES, ns, foxglove.transforms(ns, frames(robot, pose)))
-        if links_ns is None or ns - links_ns >= LINKS_PERIOD_S * NS_PER_S:
-            links_ns = ns
-            yield NewMessage(LINKS, ns, foxglove.scene(ns, links(robot)))
-        yield NewMessage(STATE, ns, foxglove.scene(ns, state(pose)))
+    missing: RunError | None = None
+    for log in logs:
+        try:
+            for pose in poses(log, robot):
+                ns = pose.t_ns + log.offset_ns
+                if links_ns is None:
+                    yield NewMessage(MODEL, ns, urdf.message(model(log.robot, robot, pose)))
+                yield NewMessage(FRAMES, ns, foxglove.transforms(ns, frames(robot, pose)))
+                if links_ns is None or ns - links_ns >= LINKS_PERIOD_S * NS_PER_S:
+                    links_ns = ns
+                    yield NewMessage(LINKS, ns, foxglove.scene(ns, links(robot)))
+                yield NewMessage(STATE, ns, foxglove.scene(ns, state(pose)))
+        except RunError as error:  # a module was silent in this part
+            missing = missing or error
+    if links_ns is None and missing is not None:
+        raise missing
 
 
 def model(name: str, robot: RobotConfig, pose: RobotPose) -> str:
@@ -155,7 +166,11 @@ def poses(log: RunLog, robot: RobotConfig) -> Iterator[RobotPose]:
     kinematics = None if truth else Kinematics(robot)
     # a service without a sample from its drive yet publishes a stamp of 0
     first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
+    if not log.is_first:
+        first_ns = max(first_ns, log.begin_ns)
     for row in _thin(truth or states[0], first_ns):
+        if row.t_ns >= log.end_ns and not log.is_last:
+            break
         states_now = [one.at(row.t_ns) for one in newest]
         q = tuple(angle for state_now in states_now for angle in state_now.q)
         sensed = wrench.at(row.t_ns) if wrenches and wrenches[0].t_ns <= row.t_ns else None

@@ -129,6 +129,26 @@ def encode_signal(t: Array, values: Array, span: Span) -> dict[str, Any] | None:
     }
 
 
+def thinned(t: Array, values: Array, span: Span) -> tuple[Array, Array]:
+    """Return the samples of each bin that `encode_signal` needs: its extremes, first and last.
+
+    Args:
+        t: times, s, not falling.
+        values: one value for each time; NaN where there is none.
+        span: time that the page shows.
+    """
+    usable = np.isfinite(values)
+    t, values = t[usable], values[usable]
+    if not len(t):
+        return t, values
+    bins = ((t - span.begin) / span.bin_s).astype(np.int64)
+    starts = np.flatnonzero(np.concatenate(([True], np.diff(bins) > 0)))
+    by_value = np.lexsort((values, bins))
+    ends = np.append(starts[1:], len(t)) - 1
+    kept = np.unique(np.concatenate((starts, ends, by_value[starts], by_value[ends])))
+    return t[kept], values[kept]
+
+
 def _gap(t: Array) -> float:
     usual = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
     return max(GAP_S, 5.0 * usual)

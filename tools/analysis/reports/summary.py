@@ -14,8 +14,10 @@ from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from shared.mcap_log.recover import describe_lost
+from shared.mcap_log.sequence_stats import KeyCount
 from tools.analysis.reports.run_data import RunData
 from tools.runs import verdict, verdict_table
+from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary
 from tools.runs.verdict_limits import LIMITS
 
@@ -52,20 +54,37 @@ class TopicLoss(NamedTuple):
     restarts: int
 
 
-def judge(run: RunData) -> RunVerdict:
-    """Return the verdict in the words of the command that made the run."""
-    log = run.log
-    if run.course is None:
-        return RunVerdict(f"No verdict: {run.without_course}", None, [])
-    try:
-        summary = verdict.summarise(log, _duration_s(run))
-    except XrlError as error:
-        return RunVerdict(f"No verdict: {error}", None, [])
-    if log.metadata["run"].get("lockstep"):
-        summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
-    lines = _verdict_lines(summary)
-    caution = "" if summary["in_real_time"] else lines[-2]
-    return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)
+class Judge:
+    """Judges a run in the words of the command that made it, from its parts in their order."""
+
+    def __init__(self) -> None:
+        self._summaries: list[Summary] = []
+        self._why_not = ""
+
+    def take(self, run: RunData) -> None:
+        """Take a run, or the next part of it."""
+        if run.course is None:
+            self._why_not = self._why_not or run.without_course
+            return
+        try:
+            self._summaries.append(verdict.summarise(run.log, _duration_s(run)))
+        except XrlError as error:
+            self._why_not = str(error)
+
+    def verdict(self, log: RunLog) -> RunVerdict:
+        """Return the verdict.
+
+        Args:
+            log: the run, or any part of it.
+        """
+        if not self._summaries:
+            return RunVerdict(f"No verdict: {self._why_not}", None, [])
+        summary = verdict.joined(self._summaries)
+        if log.metadata["run"].get("lockstep"):
+            summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+        lines = _verdict_lines(summary)
+        caution = "" if summary["in_real_time"] else lines[-2]
+        return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)
 
 
 def _duration_s(run: RunData) -> float:
@@ -155,22 +174,45 @@ def _commit(about: dict[str, str]) -> str:
     return f"{commit} with changes" if about.get("git_dirty") == "true" else commit
 
 
-def message_losses(run: RunData) -> list[TopicLoss]:
-    """Return recorded and lost messages of each topic, by sequence numbers."""
-    log, rows = run.log, []
-    known = topics.all_keys(log.robot)
-    for key, count in sorted(log.gaps().items()):
-        received = [row[0] for row in log.raw(key)]
-        span_s = (max(received) - min(received)) / NS_PER_S
-        nominal_hz = known[key].rate_hz if key in known else 0.0
-        rate = (len(received) - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
-        name = key.removeprefix(f"xrl/{log.robot}/")
-        rows.append(
-            TopicLoss(
-                name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts
+class MessageLosses:
+    """Recorded and lost messages of each topic, by sequence numbers."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, KeyCount] = {}
+        self._times_ns: dict[str, tuple[int, int]] = {}
+
+    def take(self, run: RunData) -> None:
+        """Take a run, or the next part of it."""
+        log = run.log
+        for key in log.keys():  # noqa: SIM118 - a log is no mapping
+            rows = [
+                (t_ns, seq)
+                for t_ns, _, seq in log.raw(key)
+                if (log.is_first or log.begin_ns <= t_ns) and (log.is_last or t_ns < log.end_ns)
+            ]
+            if not rows:
+                continue
+            count = self._counts.setdefault(key, KeyCount())
+            for _, seq in rows:
+                count.feed(seq)
+            first_ns, last_ns = min(rows)[0], max(rows)[0]
+            self._times_ns[key] = (self._times_ns.get(key, (first_ns, 0))[0], last_ns)
+
+    def rows(self, robot: str) -> list[TopicLoss]:
+        """Return a row for each topic that has messages."""
+        known, rows = topics.all_keys(robot), []
+        for key, count in sorted(self._counts.items()):
+            first_ns, last_ns = self._times_ns[key]
+            span_s = (last_ns - first_ns) / NS_PER_S
+            nominal_hz = known[key].rate_hz if key in known else 0.0
+            rate = (count.count - 1) / span_s if nominal_hz > 0.0 and span_s > 0.0 else None
+            name = key.removeprefix(f"xrl/{robot}/")
+            rows.append(
+                TopicLoss(
+                    name, count.count, rate, nominal_hz, count.missing, count.gaps, count.restarts
+                )
             )
-        )
-    return rows
+        return rows
 
 
 def damage(run: RunData) -> list[str]:

@@ -22,12 +22,12 @@ from shared.bus.messages import (
     Tare,
     Wrench,
 )
-from shared.clock import NS_PER_MS, NS_PER_S
+from shared.clock import NS_PER_MS
 from shared.robot.joints import MODULES
-from tools.analysis.reports.limit_violations import limit_violations
+from tools.analysis.reports.limit_violations import LimitViolations
 from tools.analysis.reports.page_model import TimelineEvent
-from tools.analysis.reports.run_data import RunData
-from tools.analysis.reports.signals import GAP_S, message_times
+from tools.analysis.reports.run_data import RunData, module_of
+from tools.analysis.reports.signals import GAP_S, Span, message_times
 from tools.runs.impairment_intervals import impairments
 
 TOGETHER_S: Final = 0.1
@@ -51,36 +51,52 @@ KINDS: Final = {
 _NORMAL_MODES: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
 
 
+class Timeline:
+    """The events of a run, whose parts are taken one after the other."""
+
+    def __init__(self) -> None:
+        self._found: list[TimelineEvent] = []
+        self._violations = LimitViolations()
+        self._silences = Silences()
+
+    def take(self, run: RunData) -> None:
+        """Take a run, or the next part of it."""
+        found = (
+            *_run_events(run),
+            *_mode_changes(run),
+            *_drives(run),
+            *_planner(run),
+            *_harness(run),
+            *_world(run),
+            *_network(run),
+        )
+        self._found += [event for event in found if run.is_inside(event.t)]
+        self._violations.take(run)
+        self._silences.take(run)
+
+    def events(self, span: Span) -> list[TimelineEvent]:
+        """Return all events in the order of time."""
+        found = [*self._found, *self._violations.events(), *self._silences.events()]
+        found.sort(key=lambda row: row.t)
+        if len(found) > ROWS_MAX:
+            left = len(found) - ROWS_MAX
+            kept = [row for row in found if row.mark] + _first_unmarked(found)
+            found = sorted(kept, key=lambda row: row.t)
+            found.append(TimelineEvent(span.end, "note", f"about {left} more rows are left out"))
+        return found
+
+
 def timeline_events(run: RunData) -> list[TimelineEvent]:
-    """Return all events of a run in the order of time."""
-    found = [
-        *_run_events(run),
-        *_mode_changes(run),
-        *_drives(run),
-        *_planner(run),
-        *_harness(run),
-        *_world(run),
-        *_silences(run),
-        *limit_violations(run),
-        *_network(run),
-    ]
-    found.sort(key=lambda row: row.t)
-    if len(found) > ROWS_MAX:
-        left = len(found) - ROWS_MAX
-        kept = [row for row in found if row.mark] + _first_unmarked(found)
-        found = sorted(kept, key=lambda row: row.t)
-        found.append(TimelineEvent(run.span.end, "note", f"about {left} more rows are left out"))
-    return found
+    """Return all events of a whole run in the order of time."""
+    timeline = Timeline()
+    timeline.take(run)
+    return timeline.events(run.span)
 
 
 def _first_unmarked(found: Sequence[TimelineEvent]) -> list[TimelineEvent]:
     """Return the first rows without a mark, as many as the page has room for."""
     unmarked = [row for row in found if not row.mark]
     return unmarked[: max(0, ROWS_MAX - (len(found) - len(unmarked)))]
-
-
-def _at(run: RunData, t_ns: int) -> float:
-    return (t_ns - run.zero_ns) / NS_PER_S
 
 
 def _run_events(run: RunData) -> Iterator[TimelineEvent]:
@@ -94,15 +110,15 @@ def _run_events(run: RunData) -> Iterator[TimelineEvent]:
             mark = mark or f"{event.subject} back"
         if kind == "push":
             mark = f"push {event.detail.partition(' for ')[0]}"
-        yield TimelineEvent(_at(run, event.t_ns), kind, text, mark)
+        yield TimelineEvent(run.at(event.t_ns), kind, text, mark)
     last = None
     for stop in run.log.messages(topics.ESTOP):
-        t = _at(run, stop.t_ns)
+        t = run.at(stop.t_ns)
         if last is None or t - last > 1.0:  # a stop is published repeatedly
             yield TimelineEvent(t, "estop", f"emergency stop by {stop.source}", "e-stop")
         last = t
     for request in run.log.messages(topics.HARNESS_TARE):
-        yield TimelineEvent(_at(run, request.t_ns), "note", f"tare requested by {request.source}")
+        yield TimelineEvent(run.at(request.t_ns), "note", f"tare requested by {request.source}")
 
 
 def _network(run: RunData) -> Iterator[TimelineEvent]:
@@ -132,7 +148,7 @@ def _describe_run_event(event: RunEvent) -> str:
 
 def _mode_changes(run: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointEvent]] = sorted(
-        (_at(run, event.t_ns), module, event)
+        (run.at(event.t_ns), module, event)
         for module in MODULES
         for event in run.log.messages(topics.JOINT_EVENT, module)
     )
@@ -247,29 +263,43 @@ def _world(run: RunData) -> Iterator[TimelineEvent]:
     rows: list[SimTruth] = run.log.messages(topics.SIM_TRUTH)
     for row in rows:
         if row.fallen:
-            yield TimelineEvent(_at(run, row.t_ns), "fall", "the robot fell", "fell")
+            yield TimelineEvent(run.at(row.t_ns), "fall", "the robot fell", "fell")
             return
 
 
-def _silences(run: RunData) -> Iterator[TimelineEvent]:
-    """Yield the gaps in periodic topics, by the recorder's clock."""
-    found: list[tuple[float, str, float]] = []
-    for key, topic in topics.all_keys(run.log.robot).items():
-        if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
-            continue
-        t = message_times([row[0] for row in run.log.raw(key)], run.zero_ns)
-        steps = np.diff(t)
-        name = key.removeprefix(f"xrl/{run.log.robot}/")
-        found += [
-            (float(t[index]), name, float(steps[index]))
-            for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz))
-        ]
-    for group in _together(sorted(found), lambda _: None):
-        names = ", ".join(_merged([name for _, name, _ in group]))
-        longest = max(length for *_, length in group)
-        most = "up to " if len(group) > 1 else ""
-        text = f"{names} silent for {most}{longest:.2f} s"
-        yield TimelineEvent(group[0][0], "note", text)
+class Silences:
+    """The gaps in periodic topics, by the recorder's clock."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, float] = {}
+        self._found: list[tuple[float, str, float]] = []
+
+    def take(self, run: RunData) -> None:
+        """Take a run, or the next part of it."""
+        for key, topic in topics.all_keys(run.log.robot).items():
+            if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
+                continue
+            t = message_times(run.log.received_ns(topic, module_of(topic, key)), run.zero_ns)
+            t = t[run.inside(t)]
+            if not len(t):
+                continue
+            t = np.append(self._last.get(key, t[0]), t)
+            self._last[key] = float(t[-1])
+            steps = np.diff(t)
+            name = key.removeprefix(f"xrl/{run.log.robot}/")
+            self._found += [
+                (float(t[index]), name, float(steps[index]))
+                for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz))
+            ]
+
+    def events(self) -> Iterator[TimelineEvent]:
+        """Yield the gaps; those that begin together in one row."""
+        for group in _together(sorted(self._found), lambda _: None):
+            names = ", ".join(_merged([name for _, name, _ in group]))
+            longest = max(length for *_, length in group)
+            most = "up to " if len(group) > 1 else ""
+            text = f"{names} silent for {most}{longest:.2f} s"
+            yield TimelineEvent(group[0][0], "note", text)
 
 
 def _merged(names: Sequence[str]) -> list[str]:

@@ -65,7 +65,7 @@ def _add_state_ages(run: RunData, model: PageModel) -> None:
     (ages,) = run.columns(topics.PLANNER_STATUS, "", "state_age_ns")
     (sample,) = run.columns(topics.WRENCH, "", "age_ns")
     if not ages.any() and not (sample > 0.0).any():
-        model.left_out.append(("Age of the planner's inputs", NO_REAL_TIME))
+        model.leave_out("Age of the planner's inputs", NO_REAL_TIME)
         return
     t = run.times(topics.PLANNER_STATUS)
     ages[ages < 0.0] = np.nan
@@ -119,7 +119,8 @@ def _add_cycles(run: RunData, model: PageModel) -> None:
         cycles, *counts = run.columns(topics.JOINT_STATE, module, "cycle", "late", "refused")
         rates.append(Line(module, *_cycle_rate(t, cycles), number))
         for lines, count in zip((late, refused), counts, strict=True):
-            lines.append(Line(module, t[t >= armed_s], _increase(count[t >= armed_s]), number))
+            after = t >= armed_s
+            lines.append(Line(module, t[after], _increase(count[after]), number, counts_up=True))
     model.plot(
         "Control cycles of each service", "Hz", rates,
         note=f"Mean over {RATE_WINDOW_S:g} s, by each service's clock.",
@@ -129,8 +130,7 @@ def _add_cycles(run: RunData, model: PageModel) -> None:
         ("Late control cycles", late, LATE_NOTE, "no cycle was late"),
         ("Refused commands", refused, REFUSED_NOTE, "no command was refused"),
     ):
-        counted = any(line.values.any() for line in lines)
-        model.plot(title, "count", lines if counted else [], note=note, if_empty=none)
+        model.plot(title, "count", lines, note=note, if_empty=none, needs_count=True)
 
 
 def _cycle_rate(t: Array, cycles: Array) -> tuple[Array, Array]:
@@ -153,7 +153,7 @@ def _add_tick(run: RunData, model: PageModel) -> None:
     t = run.times(topics.PLANNER_STATUS)
     (tick,) = run.columns(topics.PLANNER_STATUS, "", "tick_us")
     if not tick.any():
-        model.left_out.append(("Planner tick", NO_REAL_TIME))
+        model.leave_out("Planner tick", NO_REAL_TIME)
         return
     model.plot(
         "Planner tick", "\u00b5s", [Line("tick", t, tick, 0)],

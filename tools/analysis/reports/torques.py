@@ -78,10 +78,15 @@ def add_joints(run: RunData, model: PageModel) -> None:
     if robot is None:
         note = f"Origins unknown: {run.without_robot}."
     hardest = max(peaks, key=lambda joint: peaks[joint], default="")
-    model.choice("Torque of one joint, by origin", "N m", "joint", torques, initial=hardest,
-                 note=note, if_empty=NO_STATES)  # fmt: skip
-    model.choice("Angle of one joint", "rad", "joint", angles, initial=hardest, if_empty=NO_STATES)
-    model.choice("Rate of one joint", "rad/s", "joint", rates, initial=hardest, if_empty=NO_STATES)
+    for title, unit, choices, words in (
+        ("Torque of one joint, by origin", "N m", torques, note),
+        ("Angle of one joint", "rad", angles, ""),
+        ("Rate of one joint", "rad/s", rates, ""),
+    ):
+        model.choice(
+            title, unit, "joint", choices, initial=hardest, weight=peaks.get(hardest, 0.0),
+            note=words, if_empty=NO_STATES,
+        )  # fmt: skip
 
 
 def torque_terms(run: RunData, robot: RobotConfig, module: str) -> TorqueTerms:

@@ -70,13 +70,13 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
             "whose scenario has begun has one every 0.1 s, a real robot's has none"
         )
     for name in MODULES:
-        joint = JointExecution(log, robot, name, ReexecutionResult(name, 0.0, exact=False))
-        rows = ((message.t_ns, joint) for message in joint.run())
+        joint = JointExecution(robot, name, ReexecutionResult(name, 0.0, exact=False))
+        rows = ((message.t_ns, joint) for message in joint.run(log))
         for moment, snapshot in _at(found, rows, _copy):
             if snapshot is not None:
                 moment.modules[name] = snapshot
-    planner = PlannerExecution(log, robot, ReexecutionResult("planner", 0.0, exact=False))
-    ticks = ((m.t_ns, planner) for _, m in planner.run() if isinstance(m, PlannerStatus))
+    planner = PlannerExecution(robot, ReexecutionResult("planner", 0.0, exact=False))
+    ticks = ((m.t_ns, planner) for _, m in planner.run(log) if isinstance(m, PlannerStatus))
     for moment, known in _at(found, ticks, PlannerExecution.snapshot):
         moment.planner = known
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)

@@ -14,7 +14,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from tools.runs import experiment
 from tools.runs.lockstep import Record, Watch
-from tools.runs.recorded_lockstep import AFTER_FALL_S, judge_run, record_run
+from tools.runs.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
 from tools.studies.sweeps import study
 from tools.studies.sweeps.figures import Ended
 
@@ -79,7 +79,7 @@ def run_alone(
                 watch,
                 true_plant,
             )
-            judge_run(scenario, out)
+            judge_in_lockstep(scenario, out)
     study.show("Measured", msgspec.structs.asdict(outcome), console)
     if out is not None:
         console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)

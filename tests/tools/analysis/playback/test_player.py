@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.clock import NS_PER_MS, NS_PER_S
+from tests.tools.analysis.playback.schedules import schedule_of
 from tools.analysis.playback.keyboard import Press
 from tools.analysis.playback.player import BURST, STEP_NS, ClockMessage, Player
-from tools.analysis.playback.schedule import Entry, Playhead, Schedule, window
+from tools.analysis.playback.schedule import Entry, Playhead, window
 
 BEGAN = 4_000_000_000_000
 
@@ -73,7 +74,7 @@ def player(
     works: bool = True,
 ) -> Player:
     rows = entries(times_s)
-    schedule = Schedule(rows, window(rows[0].time_ns, rows[-1].time_ns, 0, None), loop=loop)
+    schedule = schedule_of(rows, window(rows[0].time_ns, rows[-1].time_ns, 0, None), loop=loop)
     return Player(
         schedule,
         Playhead(world.now, rate, paused=paused),

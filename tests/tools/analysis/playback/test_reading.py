@@ -19,7 +19,7 @@ WRENCH_KEY = topics.WRENCH.key(runs.ROBOT)
 
 
 def payloads(path: Path) -> list[bytes]:
-    return [entry.payload for entry in read([path]).entries]
+    return [entry.payload for entry in read([path]).entries()]
 
 
 def split_run(directory: Path, parts: int = 3, size: int = 10) -> list[Path]:
@@ -38,7 +38,7 @@ def split_run(directory: Path, parts: int = 3, size: int = 10) -> list[Path]:
 def test_messages_are_given_as_recorded_in_the_order_of_their_reception(tmp_path: Path) -> None:
     items = [item(n, STATE_KEY if n % 3 else WRENCH_KEY) for n in range(50)]
     recording = read([write(tmp_path, items)])
-    found = [(recording.keys[e.key], e.payload, e.time_ns) for e in recording.entries]
+    found = [(recording.keys[e.key], e.payload, e.time_ns) for e in recording.entries()]
     assert found == items
     assert recording.robot == runs.ROBOT
     assert recording.robot_file == runs.ATTACHMENTS["robot.toml"].decode()
@@ -55,9 +55,9 @@ def test_the_files_of_a_run_are_one_log_in_whatever_order_they_are_given(tmp_pat
     paths = split_run(tmp_path)
     assert len(paths) == 3
     forwards, backwards = read(paths), read(paths[::-1])
-    assert [e.payload for e in forwards.entries] == [item(n)[1] for n in range(30)]
-    assert [(e.time_ns, e.payload) for e in backwards.entries] == [
-        (e.time_ns, e.payload) for e in forwards.entries
+    assert [e.payload for e in forwards.entries()] == [item(n)[1] for n in range(30)]
+    assert [(e.time_ns, e.payload) for e in backwards.entries()] == [
+        (e.time_ns, e.payload) for e in forwards.entries()
     ]
 
 
@@ -111,7 +111,7 @@ def test_runs_of_two_robots_or_two_clocks_are_not_played_together(
 def test_an_unfinished_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     killed = killed_file(tmp_path, batches=3, size=20)
     recording = read([killed.path])
-    assert len(recording.entries) == 60
+    assert len(recording.entries()) == 60
     assert recording.unfinished == [killed.path]
     content = killed.path.read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -119,7 +119,7 @@ def test_an_unfinished_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
         cut.write_bytes(content[:size])
         least = killed.at_least(size)
         try:
-            entries = read([cut]).entries
+            entries = read([cut]).entries()
         except RunError:
             assert least == 0
         else:

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.clock import NS_PER_MS, NS_PER_S
+from tests.tools.analysis.playback.schedules import schedule_of
 from tools.analysis.playback.schedule import (
     PASS_MIN_NS,
     RATE_MAX,
@@ -40,7 +41,7 @@ def whole(rows: list[Entry]) -> Window:
 @given(TIMES)
 def test_without_a_window_every_message_is_played_once_and_in_order(times: list[int]) -> None:
     rows = entries(times)
-    found = played(Schedule(rows, whole(rows), loop=False))
+    found = played(schedule_of(rows, whole(rows), loop=False))
     assert [payload for _, payload in found] == [row.payload for row in rows]
     assert [position for position, _ in found] == [t - times[0] for t in times]
 
@@ -53,7 +54,7 @@ def test_windows_that_follow_one_another_hold_every_message_once(
     offset, found = 0, list[bytes]()
     for duration in (*durations, None):
         part = window(rows[0].time_ns, rows[-1].time_ns, offset, duration)
-        found += [payload for _, payload in played(Schedule(rows, part, loop=False))]
+        found += [payload for _, payload in played(schedule_of(rows, part, loop=False))]
         offset += duration or 0
     assert found == [row.payload for row in rows]
 
@@ -61,18 +62,18 @@ def test_windows_that_follow_one_another_hold_every_message_once(
 def test_a_window_has_its_first_moment_and_not_its_last() -> None:
     rows = entries([0, 10, 20, 30])
     part = window(BEGAN, BEGAN + 30, 10, 20)
-    assert played(Schedule(rows, part, loop=False)) == [(0, b"1"), (10, b"2")]
+    assert played(schedule_of(rows, part, loop=False)) == [(0, b"1"), (10, b"2")]
 
 
 def test_a_window_behind_the_log_is_empty() -> None:
     rows = entries([0, 10])
-    assert played(Schedule(rows, window(BEGAN, BEGAN + 10, 11, None), loop=True)) == []
+    assert played(schedule_of(rows, window(BEGAN, BEGAN + 10, 11, None), loop=True)) == []
 
 
 @given(TIMES, st.integers(2, 4))
 def test_a_loop_repeats_the_pass_at_one_spacing(times: list[int], passes: int) -> None:
     rows = entries(times)
-    schedule = Schedule(rows, whole(rows), loop=True)
+    schedule = schedule_of(rows, whole(rows), loop=True)
     found = played(schedule, passes * len(rows))
     period = max(schedule.length_ns, PASS_MIN_NS)
     for number, (position, payload) in enumerate(found):
@@ -84,14 +85,14 @@ def test_a_loop_repeats_the_pass_at_one_spacing(times: list[int], passes: int) -
 
 def test_a_log_of_one_message_is_not_looped_without_a_pause() -> None:
     rows = entries([0])
-    positions = [position for position, _ in played(Schedule(rows, whole(rows), loop=True), 3)]
+    positions = [position for position, _ in played(schedule_of(rows, whole(rows), loop=True), 3)]
     assert positions == [0, PASS_MIN_NS, 2 * PASS_MIN_NS]
 
 
 def test_the_recorded_time_goes_on_to_the_windows_end_and_begins_anew_in_a_loop() -> None:
     rows = entries([0, NS_PER_S])
     part = window(BEGAN, BEGAN + NS_PER_S, 0, None)
-    once, looped = (Schedule(rows, part, loop=loop) for loop in (False, True))
+    once, looped = (schedule_of(rows, part, loop=loop) for loop in (False, True))
     for schedule in (once, looped):
         assert schedule.recorded_ns(NS_PER_S // 2) == BEGAN + NS_PER_S // 2
     assert once.recorded_ns(5 * NS_PER_S) == BEGAN + NS_PER_S + 1

@@ -12,11 +12,10 @@ import pytest
 
 from shared.bus import topics
 from shared.robot.joints import MODULES
+from tests.tools.analysis.reexecution.executions import executed
 from tests.tools.analysis.reexecution.make_golden import TRACED
-from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import read_run
-from tools.verbs import resim
 
 GOLDEN = sorted((Path(__file__).parent / "golden").glob("*.mcap"))
 NEWEST = GOLDEN[-1]
@@ -42,17 +41,13 @@ def test_a_golden_log_is_read_message_by_message(path: Path) -> None:
 @pytest.mark.parametrize("name", TRACED)
 def test_joint_services_of_the_newest_come_out_equal_on_any_machine(name: str) -> None:
     log = read_run(NEWEST)
-    outcome = ReexecutionResult(name, 0.0, exact=True)
-    for _ in resim.execute(log, robot_of(log), name, outcome):
-        pass
+    outcome = executed(log, name)
     assert outcome.ticks >= 200
     assert outcome.comparison.first is None
 
 
 def test_the_planner_of_the_newest_comes_out_equal_but_for_last_bits() -> None:
     log = read_run(NEWEST)
-    outcome = ReexecutionResult("planner", OTHER_MACHINES, exact=True)
-    for _ in resim.execute(log, robot_of(log), "planner", outcome):
-        pass
+    outcome = executed(log, "planner", OTHER_MACHINES)
     assert outcome.ticks >= 100
     assert outcome.comparison.first is None

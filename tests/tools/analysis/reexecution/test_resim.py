@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,10 @@ from shared.network.impairment import Impairment
 from shared.robot.joints import MODULES
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
-from tools.analysis.reexecution.outcome import ReexecutionResult
+from tests.tools.analysis.reexecution.executions import executed
+from tools import cli
 from tools.runs.recorded_lockstep import simulate
-from tools.runs.recorded_robot import robot_of
-from tools.runs.run_log import RunLog, read_run
+from tools.runs.run_log import RunLog, RunPart, parts_of, read_run
 from tools.verbs import resim
 
 
@@ -51,23 +50,40 @@ def log(recorded: Path) -> RunLog:
     return read_run(recorded)
 
 
-def execute(log: RunLog, robot: RobotConfig, name: str, *, exact: bool = True) -> ReexecutionResult:
-    outcome = ReexecutionResult(name, 0.0, exact=exact)
-    for _ in resim.execute(log, robot, name, outcome):
-        pass
-    return outcome
+def edited(log: RunLog, key: str, change: list[Any]) -> None:
+    """Change the decoded messages of a key: others in their places, or some left out."""
+    series = log._series[key]
+    assert series.decoded is not None
+    if len(change) < len(series.decoded):
+        kept = {id(message) for message in change}
+        rows = zip(series.decoded, series.received_ns, strict=True)
+        series.received_ns = [received for message, received in rows if id(message) in kept]
+    series.decoded = change
 
 
-def edited(log: RunLog, key: str, change: Any) -> None:
-    """Change the decoded messages of a key."""
-    log._series[key].decoded = change
+@pytest.mark.parametrize("name", ["planner", "knee_left"])
+def test_a_run_read_in_parts_is_executed_like_the_whole(log: RunLog, name: str) -> None:
+    parts = parts_of(log.index, part_s=0.7)
+    outcome, whole = executed(log, name, parts=parts), executed(log, name)
+    assert outcome.comparison.first is None
+    assert (outcome.ticks, outcome.skipped, outcome.starts) == (
+        whole.ticks, whole.skipped, whole.starts,
+    )  # fmt: skip
+
+
+def test_a_part_of_a_run_is_executed_from_its_first_memory_on(log: RunLog) -> None:
+    part = RunLog(log.index, RunPart(3.0, 5.0), margin_s=1.0)
+    outcome = executed(log, "planner", parts=[part])
+    assert outcome.comparison.first is None
+    assert outcome.ticks > 100
+    assert outcome.lost_inputs == 0
 
 
 @pytest.mark.parametrize("name", resim.SERVICES)
 def test_every_tick_of_a_run_with_restarts_holds_and_a_fault_is_equal_bit_for_bit(
     log: RunLog, name: str
 ) -> None:
-    outcome = execute(log, robot_of(log), name)
+    outcome = executed(log, name)
     assert outcome.comparison.first is None
     assert outcome.ticks > 900
     assert outcome.lost_inputs == 0
@@ -91,7 +107,7 @@ def test_an_attitude_missing_in_the_log_is_reported(log: RunLog) -> None:
     second = [row for row in log.messages(topics.PLANNER_STATUS) if row.session != 1]
     taken = second[300].attitude_seq
     edited(log, key, [row for row in log.messages(topics.ATTITUDE) if row.seq != taken])
-    outcome = execute(log, robot_of(log), "planner")
+    outcome = executed(log, "planner")
     assert outcome.lost_inputs == 1
     assert outcome.comparison.first is None
 
@@ -103,11 +119,11 @@ def test_one_bit_in_one_recorded_command_is_found_where_it_was_taken(log: RunLog
     a, b = commands[at].q_ref
     commands[at] = msgspec.structs.replace(commands[at], q_ref=(a, b + 2.3e-16 * max(1.0, abs(b))))
     edited(log, key, commands)
-    outcome = execute(log, robot_of(log), "hip_left")
+    outcome = executed(log, "hip_left")
     first = outcome.comparison.first
     assert first is not None
     assert commands[at].t_ns <= first.t_ns <= commands[at].t_ns + 200_000_000
-    assert execute(log, robot_of(log), "hip_right").comparison.first is None
+    assert executed(log, "hip_right").comparison.first is None
 
 
 def test_a_state_missing_in_the_log_is_reported_and_execution_resumes_at_the_next_snapshot(
@@ -119,7 +135,7 @@ def test_a_state_missing_in_the_log_is_reported_and_execution_resumes_at_the_nex
     second = [status for status in statuses if status.session != statuses[0].session]
     taken = second[300].state_seq[MODULES.index("ankle_left")]
     edited(log, key, [state for state in states if state.seq != taken])
-    outcome = execute(log, robot_of(log), "planner")
+    outcome = executed(log, "planner")
     assert outcome.lost_inputs == 1
     assert outcome.starts == 3
     assert 0 < outcome.skipped < 300
@@ -133,7 +149,7 @@ def test_a_trace_that_the_log_lacks_does_not_let_the_service_go_on_from_a_guess(
     traces = list(log.messages(topics.JOINT_TRACE, "ankle_left"))
     del traces[70]
     edited(log, key, traces)
-    outcome = execute(log, robot_of(log), "ankle_left")
+    outcome = executed(log, "ankle_left")
     assert outcome.starts == 2
     assert outcome.comparison.first is None
 
@@ -142,12 +158,10 @@ def test_a_changed_gain_changes_what_comes_out_from_the_first_tick_with_an_error
     log: RunLog, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "changed.mcap"
-    code = resim.run(
-        Namespace(
-            log=recorded, service=["planner"], param=["gains.k_p_x=2000"], out=out,
-            until_first_difference=False, tolerance=0.0,
-        )
-    )  # fmt: skip
+    changed_gain = ["--param", "gains.k_p_x=2000"]
+    code = cli.main(
+        ["resim", str(recorded), "--service", "planner", *changed_gain, "--out", str(out)]
+    )
     assert code == 0
     text = capsys.readouterr().out
     assert "planner, first at" in text

@@ -14,13 +14,11 @@ from shared.mcap_log.writer import RunWriter
 from shared.robot.joints import MODULES
 from tests.lockstep.runs import still
 from tests.shared.mcap_log.runs import Queue
+from tests.tools.analysis.reexecution.executions import executed
 from tools import cli
-from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.runs.network import BASE
 from tools.runs.recorded_lockstep import simulate
-from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
-from tools.verbs import resim
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +74,7 @@ def test_the_directory_of_a_split_run_is_the_run(whole: RunLog, directory: Path)
 @pytest.mark.parametrize("name", ["planner", MODULES[0]])
 def test_a_split_run_is_executed_again_across_its_files(directory: Path, name: str) -> None:
     log = read_run(directory)
-    outcome = ReexecutionResult(name, 0.0, exact=True)
-    for _ in resim.execute(log, robot_of(log), name, outcome):
-        pass
+    outcome = executed(log, name)
     assert outcome.comparison.first is None
     assert (outcome.lost_inputs, outcome.starts) == (0, 2 if name == "planner" else 1)
     assert outcome.skipped <= 4
@@ -86,9 +82,7 @@ def test_a_split_run_is_executed_again_across_its_files(directory: Path, name: s
 
 def test_one_file_of_a_split_run_stands_for_itself(directory: Path) -> None:
     log = read_run(directory / "run_1.mcap")
-    outcome = ReexecutionResult("ankle_left", 0.0, exact=True)
-    for _ in resim.execute(log, robot_of(log), "ankle_left", outcome):
-        pass
+    outcome = executed(log, "ankle_left")
     assert outcome.comparison.first is None
     assert outcome.ticks > 0
 

@@ -145,7 +145,7 @@ def test_hold_has_the_other_limits_only_if_the_network_was_impaired_on_purpose(
 @given(st.lists(st.booleans(), min_size=1, max_size=50))
 def test_the_duration_of_a_violation_is_that_of_its_samples(beyond: list[bool]) -> None:
     t = np.arange(len(beyond)) * 0.01
-    found = first_violation("x", t, np.array(beyond))
+    found = first_violation("over 1", "x", t, np.array(beyond))
     if not any(beyond):
         assert found is None
         return
