@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import os
 import signal
 import sys
 from collections.abc import Callable
@@ -13,9 +12,7 @@ from types import FrameType
 
 from shared import log
 from shared.exceptions import XrlError
-
-RUN_DIR_VARIABLE = "XRL_RUN_DIR"
-"""Environment variable that names the run directory of the fleet."""
+from shared.run_directory import default_run_dir, own_directory
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 """Top of this checkout; where the packages are installed, the folder that holds them."""
@@ -24,11 +21,6 @@ DEFAULT_CONFIG = CHECKOUT / "deploy" / "robot.toml"
 
 SOCKET_PATH_MAX = 100
 """Longest path of a UNIX socket that works everywhere; the kernel takes 107 bytes."""
-
-
-def default_run_dir() -> Path:
-    """Return the run directory: sockets, logs and the supervisor's files of one fleet."""
-    return Path(os.environ.get(RUN_DIR_VARIABLE) or f"/tmp/xrl-{os.getuid()}")  # noqa: S108 - short on purpose: socket paths have 107 bytes
 
 
 def service_parser(description: str, example: str) -> argparse.ArgumentParser:
@@ -40,7 +32,10 @@ def service_parser(description: str, example: str) -> argparse.ArgumentParser:
     )
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, help="robot file (TOML)")
     parser.add_argument(
-        "--run-dir", type=Path, default=default_run_dir(), help="directory of the fleet's sockets"
+        "--run-dir",
+        type=own_directory,
+        default=str(default_run_dir()),
+        help="directory of the fleet's sockets",
     )
     return parser
 

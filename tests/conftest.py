@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import signal
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -35,6 +37,13 @@ SLOWEST = (
 """Files begun with, so that none of them is left to one core in the end."""
 
 ROBOT_FILE = Path(__file__).parents[1] / "deploy" / "robot.toml"
+
+
+@pytest.fixture
+def run_dir() -> Iterator[Path]:
+    """Return where a fleet may run; the path is short, for sockets are in it."""
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
+        yield Path(path) / "r"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

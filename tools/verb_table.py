@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
-from shared.process import DEFAULT_CONFIG, RUN_DIR_VARIABLE, default_run_dir
+from shared.process import DEFAULT_CONFIG
+from shared.run_directory import RUN_DIR_VARIABLE, default_run_dir, own_directory
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"  # noqa: SLF001 - its only name
 """What `add_parser` is given."""
@@ -81,8 +82,8 @@ def add_run_dir(parser: argparse.ArgumentParser) -> None:
     """Add `--run-dir`: which fleet is meant."""
     parser.add_argument(
         "--run-dir",
-        type=Path,
-        default=default_run_dir(),
+        type=own_directory,
+        default=str(default_run_dir()),
         metavar="DIR",
         help="directory of the fleet's sockets and logs (default: "
         f"${RUN_DIR_VARIABLE}, else /tmp/xrl-UID of the user); keep it short",

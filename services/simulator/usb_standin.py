@@ -27,7 +27,8 @@ FOLDER: Final = "usb"
 VARIABLE: Final = "XRL_USB"
 """Environment variable in which the stand-in looks for the folder of the plugs."""
 
-_BUILT = "usb_standin"  # in the run directory: library and cache
+BUILT: Final = "usb_standin"
+"""Folder of library and cache in the run directory."""
 _COMPILER = "cc"
 _COMPILE_S = 60.0
 
@@ -75,7 +76,7 @@ def prepare(run_dir: Path) -> dict[str, str]:
     Raises:
         FleetError: see `build`.
     """
-    library = build(run_dir / _BUILT)
+    library = build(run_dir / BUILT)
     paths = [str(library.parent), os.environ.get("LD_LIBRARY_PATH", "")]
     return {
         "LD_LIBRARY_PATH": os.pathsep.join(filter(None, paths)),
@@ -87,7 +88,7 @@ def prepare(run_dir: Path) -> dict[str, str]:
 
 def clear(run_dir: Path) -> None:
     """Remove what `prepare` has built, and plugs that a killed simulator has left."""
-    shutil.rmtree(run_dir / _BUILT, ignore_errors=True)
+    shutil.rmtree(run_dir / BUILT, ignore_errors=True)
     folder = run_dir / FOLDER
     for plug in folder.glob("*"):
         if plug.is_socket():

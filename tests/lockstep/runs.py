@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,18 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.simulator.plant import PlantConfig
-from services.simulator.plant import to_toml as plant_to_toml
-from services.simulator.state import taken
 from shared.bus.messages import SimTruth
 from shared.config import scenarios
-from shared.config.files import to_toml
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
 from shared.network.impairment import Impairment
-from shared.robot.joints import MODULES
-from tests.lockstep.partial import PartialStart
 from tools.runs.lockstep import Lockstep
 from tools.runs.network import BASE
+from tools.runs.standing_start import begin_standing
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 
@@ -78,23 +75,14 @@ def still(duration: float, height: float = 1.188, **changes: object) -> Scenario
     return variant("stand", duration=duration, keyframe=frames, **changes)
 
 
-def standing(robot: RobotConfig, plant: PlantConfig) -> PartialStart:
-    """Return the moment at which a scenario begins; a robot is stood up once in this process."""
-    schedule = robot.gain_schedule
-    key = (to_toml(robot), plant_to_toml(plant), schedule.digest if schedule else "")
-    if key not in _standing:
-        fleet = Lockstep(robot, still(1.0), BASE, plant=plant)
-        assert any(row.scenario_s >= 0.0 for row in fleet.run()), "it stands and tracks"
-        assert fleet.planner is not None
-        _standing[key] = PartialStart(
-            taken(fleet.world, fleet.bank, fleet.now_ns, 0),
-            {module: fleet.snapshot_of(module) for module in MODULES},
-            (fleet.planner.session, fleet.planner.snapshot()),
-        )
-    return _standing[key]
-
-
-_standing: dict[tuple[str, str, str], PartialStart] = {}
+def at_rest(rows: Sequence[SimTruth], seconds: float = 1.5) -> bool:
+    """Return True if the torso has not moved for some time: by 1 mm, by 1 mrad."""
+    count = round(100 * seconds)  # the world is seen at 100 Hz
+    if len(rows) < count or len(rows) % 10:
+        return False
+    last = rows[-count::10]
+    moved = np.ptp([(*row.torso, *row.angles) for row in last], axis=0)
+    return bool(moved.max() < 1e-3)
 
 
 def run(
@@ -111,8 +99,7 @@ def run(
     """
     lockstep = Lockstep(robot, scenario, Impairment(delay_ms=delay_ms), plant=plant)
     if stands and delay_ms == BASE.delay_ms:
-        start = standing(robot, lockstep.plant)
-        lockstep.resume(start.state, start.modules, start.planner)
+        assert begin_standing(lockstep), "it stands and tracks"
     rows = []
     for row in lockstep.run():
         if row.scenario_s >= 0.0:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from services.simulator.plant import PlantConfig, changed
-from shared.bus.messages import Mode
+from shared.bus.messages import Mode, SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Fault, Keyframe, Kill, Restart
 from shared.robot.joints import MODULES
-from tests.lockstep.runs import still
+from tests.lockstep.runs import at_rest, still
 from tools.runs.lockstep import Lockstep
+from tools.runs.standing_start import begin_standing
 from tools.studies.sweeps import plants
 
 
@@ -24,15 +25,19 @@ def test_the_robot_sinks_slowly_and_does_not_topple(
     robot: RobotConfig, height: float, hand: bool
 ) -> None:
     fleet = Lockstep(robot, still(12.0, height))
-    heights = []
+    begin_standing(fleet)
+    rows: list[SimTruth] = []
     for truth in fleet.run():
         if truth.scenario_s >= 4.0 and not fleet.estop:
             fleet.estop = True
             if not hand:
                 fleet.world.let_go()
         if fleet.estop:
-            heights.append(truth.torso[2])
+            rows.append(truth)
             assert not truth.fallen, f"{truth.scenario_s:.2f} s"
+            if at_rest(rows):
+                break
+    heights = [row.torso[2] for row in rows]
     assert all(controller.failsafe.mode is Mode.DAMP for controller in fleet.controllers)
     speed = -np.gradient(heights, 0.01)
     assert speed.max() < 0.25, "slowly"
@@ -90,22 +95,25 @@ def stop(
     faults: tuple[Fault, ...] = (),
     restarts: tuple[Restart, ...] = (),
 ) -> Stopped:
-    """Lead to a pose in 3 s, let go and stop at 3.8 s; go on for 10 s."""
+    """Lead to a pose in 3 s, let go and stop at 3.8 s; go on until it rests, or for 10 s."""
     frames = (Keyframe(at=0.0, height=1.188), Keyframe(at=3.0, height=height, pitch=pitch))
     scenario = still(14.0, kill=kills, restart=restarts, fault=faults, push=())
     scenario = msgspec.structs.replace(scenario, keyframe=frames)
     law = msgspec.structs.replace(robot.law, load_correction=(0.0, 0.0))  # led whatever it carries
     fleet = Lockstep(msgspec.structs.replace(robot, law=law), scenario, plant=plant)
-    pitches, heights = [], []
+    begin_standing(fleet)
+    happens_until_s = max((row.at for row in (*kills, *faults, *restarts)), default=0.0)
+    rows: list[SimTruth] = []
     for truth in fleet.run():
         if truth.scenario_s >= 3.8 and not fleet.estop:
             fleet.estop = True
             fleet.world.let_go()
         if fleet.estop:
-            pitches.append(truth.angles[1])
-            heights.append(truth.torso[2])
-        if truth.fallen:
+            rows.append(truth)
+        rests = truth.scenario_s > happens_until_s + 1.5 and at_rest(rows)
+        if truth.fallen or rests:
             break
+    pitches, heights = ([row.angles[1] for row in rows], [row.torso[2] for row in rows])
     turned = np.abs(np.array(pitches) - pitches[0]).max()
     speed = -np.gradient(heights, 0.01)
     return Stopped(truth.fallen, turned, heights[0] - heights[-1], speed.max())
@@ -207,6 +215,7 @@ def test_a_hip_whose_leg_falls_silent_on_the_way_down_goes_on_without_a_step(
 def test_a_stop_that_not_all_hear_tips_nothing(robot: RobotConfig) -> None:
     """One knee sank beside one that held."""
     fleet = Lockstep(robot, still(10.0, 1.0))
+    begin_standing(fleet)
     for truth in fleet.run():
         if truth.scenario_s >= 4.0:
             fleet.world.let_go()

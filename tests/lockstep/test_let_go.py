@@ -18,6 +18,7 @@ from shared.config.scenarios import Keyframe
 from shared.network.impairment import Impairment
 from tests.lockstep.runs import variant
 from tools.runs.lockstep import Lockstep
+from tools.runs.standing_start import begin_standing
 
 LET_GO_S = 3.0
 
@@ -30,6 +31,7 @@ def run(
     scenario = variant("stand", duration=8.0, keyframe=frames, kill=(), push=())
     plant = changed(PlantConfig(), errors)
     fleet = Lockstep(robot, scenario, Impairment(delay_ms=1.0), plant=plant)
+    begin_standing(fleet)
     poses = []
     for row in fleet.run():
         assert not row.fallen

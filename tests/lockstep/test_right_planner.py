@@ -20,6 +20,8 @@ from shared.network.impairment import Impairment
 from shared.robot.trip_table import JOINT_TRIPS
 from tests.lockstep.runs import kill, push, restart, variant
 from tools.runs.lockstep import Lockstep
+from tools.runs.network import BASE
+from tools.runs.standing_start import begin_standing
 from tools.studies.sweeps import plants
 from tools.studies.sweeps.push_range import PushRange
 
@@ -67,6 +69,8 @@ def run(
     robot: RobotConfig, told: Scenario, network: Impairment, plant: PlantConfig | None = None
 ) -> Lockstep:
     fleet = Lockstep(robot, told, network, plant=plant)
+    if network == BASE:
+        begin_standing(fleet)
     for row in fleet.run():
         assert not row.fallen
     return fleet

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -51,13 +50,6 @@ def carried_pace() -> str:
 def _is_led(item: pytest.Item) -> bool:
     """Return True for a test of this folder that leads a fleet; others may have files so named."""
     return item.path.parent == Path(__file__).parent and item.path.stem in LED
-
-
-@pytest.fixture
-def run_dir() -> Iterator[Path]:
-    """Return where a fleet may run; the path is short, for sockets are in it."""
-    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
-        yield Path(path) / "r"
 
 
 @pytest.hookimpl(tryfirst=True)

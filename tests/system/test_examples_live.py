@@ -14,8 +14,9 @@ from shared.bus import topics
 from shared.bus.messages import PlannerMode, PlannerStatus
 from shared.bus.session import open_session
 from shared.config.robot_config import RobotConfig
-from shared.process import DEFAULT_CONFIG, RUN_DIR_VARIABLE
+from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
+from shared.run_directory import RUN_DIR_VARIABLE
 from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]

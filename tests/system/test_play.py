@@ -11,10 +11,8 @@ import select
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -35,12 +33,6 @@ from tests.tools.analysis.playback.bench import (
 )
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
-
-
-@pytest.fixture
-def run_dir() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
-        yield Path(path) / "r"
 
 
 def test_a_subscriber_gets_every_message_in_the_recorded_order_byte_for_byte(

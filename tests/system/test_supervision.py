@@ -20,6 +20,7 @@ from shared.process import DEFAULT_CONFIG
 from tests.system.waiting import wait_for
 from tools import cli
 from tools.fleet import procfs
+from tools.fleet.run_dir import MARKER
 from tools.fleet.supervise import ServiceInfo, SupervisedFleet
 
 pytestmark = pytest.mark.system
@@ -103,7 +104,10 @@ def supervisor_pid(fleet: SupervisedFleet) -> int:
 def assert_nothing_left(run_dir: Path, pids: Sequence[int]) -> None:
     assert procfs.fleet_pids(run_dir) == set()
     assert all(procfs.is_gone(pid) for pid in pids)
-    assert not run_dir.exists() or {path.name for path in run_dir.iterdir()} <= {"logs"}
+    assert not run_dir.exists() or {path.name for path in run_dir.iterdir()} <= {
+        "logs",
+        MARKER,
+    }
 
 
 def test_a_stopped_fleet_leaves_no_process_and_no_file(start: Start, run_dir: Path) -> None:

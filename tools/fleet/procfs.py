@@ -19,18 +19,20 @@ FLEET_VARIABLE = "XRL_FLEET"
 
 def fleet_pids(run_dir: Path) -> set[int]:
     """Return the processes of the fleet in this run directory, supervisor included."""
+    pids = (int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
+    return {pid for pid in pids if pid != os.getpid() and belongs(pid, run_dir)}
+
+
+def belongs(pid: int, run_dir: Path) -> bool:
+    """Return True if a process is this user's and of the fleet in this run directory."""
     mark = os.fsencode(f"{FLEET_VARIABLE}={run_dir}")
-    found = set()
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdecimal() or int(entry.name) == os.getpid():
-            continue
-        try:
-            environment = (entry / "environ").read_bytes()
-        except OSError:
-            continue  # it has just ended, or is somebody else's
-        if mark in environment.split(b"\0"):
-            found.add(int(entry.name))
-    return found
+    entry = Path(f"/proc/{pid}")
+    try:
+        return entry.stat().st_uid == os.getuid() and mark in (
+            (entry / "environ").read_bytes().split(b"\0")
+        )
+    except OSError:
+        return False  # it has just ended, or is somebody else's
 
 
 def fleets() -> set[str]:

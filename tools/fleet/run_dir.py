@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import shlex
-import shutil
 import stat
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
 from services.joint import neighbours, rearm_guard
+from services.simulator import usb_standin
 from shared.clock import PACE_FILE
 from shared.exceptions import FleetError
 from shared.robot.joints import MODULES
+from shared.run_directory import check_own
 from tools.fleet.process_table import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_listening
+
+MARKER: Final = ".xrl-run"
+"""Lies in every run directory: nothing is removed, and nobody attached to, where it does not."""
+
+_OURS: Final = ("*.lock", "*.rearm", "*.near", "*.pid", MARKER, PACE_FILE, "supervisord.conf",
+                "fleet.json", usb_standin.FOLDER, usb_standin.BUILT)  # fmt: skip
+"""Names in a run directory that services started by hand, or an earlier version, may have left."""
+_LOGS: Final = ("*.log", "*.log.1", "supervisord.stderr")
 
 _NEVER_GIVE_UP = 1_000_000
 """Starts that may fail in a row; each waits a second longer than the one before."""
@@ -41,6 +52,7 @@ class RunDir:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(os.path.abspath(path))  # noqa: PTH100 - no symlink resolved: paths stay short
+        self.marker = self.path / MARKER
         self.pace = self.path / PACE_FILE
         self.supervisor_socket = self.path / SUPERVISOR_SOCKET
         self.supervisor_config = self.path / "supervisord.conf"
@@ -54,13 +66,27 @@ class RunDir:
         """Return where a service's output goes."""
         return self.logs / f"{service}.log"
 
+    @property
+    def is_marked(self) -> bool:
+        """True for a directory that is this user's alone, and a fleet's.
+
+        Raises:
+            FleetError: the directory is there, and is not this user's alone.
+        """
+        check_own(self.path)
+        return self.marker.exists()
+
     def claim(self) -> int:
-        """Make the directory and lock it; return the descriptor that holds the lock.
+        """Make the directory, or take one that is empty or a fleet's; mark and lock it.
 
         The supervisor inherits the descriptor, so the lock lives as long as it does.
 
+        Returns:
+            The descriptor that holds the lock.
+
         Raises:
-            FleetError: a fleet is up here, or the directory is not ours.
+            FleetError: a fleet is up here, the directory is not this user's alone, or it holds
+                files that are no fleet's.
         """
         while True:
             descriptor = self._open()
@@ -73,19 +99,35 @@ class RunDir:
                     "or give another directory with --run-dir"
                 ) from None
             if self._is_current(descriptor):
-                return descriptor
+                return self._marked(descriptor)
             os.close(descriptor)  # removed by a `down` before we had the lock: again
 
     def _open(self) -> int:
+        check_own(self.path)
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+            return os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
         except OSError as error:
             raise FleetError(f"{self.path}: cannot be a run directory: {error.strerror}") from None
-        if os.fstat(descriptor).st_uid != os.getuid():
+
+    def _marked(self, descriptor: int) -> int:
+        foreign = None if self.is_marked else self._foreign()
+        if foreign is not None:
             os.close(descriptor)
-            raise FleetError(f"{self.path}: belongs to another user; give another --run-dir")
+            raise FleetError(
+                f"{self.path}: holds {foreign}, which is no fleet's; give a new or an empty "
+                "directory with --run-dir"
+            )
+        self.marker.touch(mode=0o600)
         return descriptor
+
+    def _foreign(self) -> str | None:
+        """Return the name of a file that no fleet has left here, or None."""
+        for entry in sorted(self.path.iterdir()):
+            ours = any(entry.match(pattern) for pattern in _OURS)
+            if not ours and not stat.S_ISSOCK(entry.lstat().st_mode):
+                return entry.name
+        return None
 
     def _is_current(self, descriptor: int) -> bool:
         try:
@@ -98,8 +140,8 @@ class RunDir:
         self.pace.unlink(missing_ok=True)
         if pace != 1.0:
             self.pace.write_text(f"{pace:g}\n", encoding="ascii")
-        shutil.rmtree(self.logs, ignore_errors=True)
-        self.logs.mkdir()
+        self._remove_logs()
+        self.logs.mkdir(exist_ok=True)
         sockets = [item.endpoint for item in plan.listeners if item.endpoint.startswith(UNIX)]
         manifest = Manifest(
             config=str(plan.config_path),
@@ -127,7 +169,12 @@ class RunDir:
             return None
 
     def clear(self, *, keep_logs: bool) -> None:
-        """Remove the fleet's files, and the directory itself if it is then empty."""
+        """Remove the fleet's files, and the directory itself if it is then empty.
+
+        In a directory that is no fleet's nothing is removed.
+        """
+        if not self.is_marked:
+            return
         manifest = self.read_manifest()
         for path in manifest.sockets if manifest else ():
             _remove_socket(Path(path))
@@ -136,9 +183,18 @@ class RunDir:
         for file in (self.supervisor_config, self.supervisor_pid, self.manifest, self.pace):
             file.unlink(missing_ok=True)
         if not keep_logs:
-            shutil.rmtree(self.logs, ignore_errors=True)
-        if self.path.is_dir() and not any(self.path.iterdir()):
+            self._remove_logs()
+        if [entry.name for entry in self.path.iterdir()] == [MARKER]:
+            self.marker.unlink()
             self.path.rmdir()
+
+    def _remove_logs(self) -> None:
+        """Remove the services' logs, and their folder if it is then empty."""
+        for pattern in _LOGS:
+            for log in self.logs.glob(pattern):
+                log.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # none there, or it holds files of others
+            self.logs.rmdir()
 
 
 def supervisor_config(run: RunDir, plan: FleetPlan, no_restart: Collection[str]) -> str:

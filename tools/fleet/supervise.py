@@ -123,7 +123,11 @@ class SupervisedFleet:
             FleetError: none is.
         """
         attached = cls(run_dir)
-        if attached.run.read_manifest() is None or not attached.run.supervisor_socket.exists():
+        if (
+            not attached.run.is_marked
+            or attached.run.read_manifest() is None
+            or not attached.run.supervisor_socket.exists()
+        ):
             raise FleetError(f"no fleet is up in {attached.run.path}; `xrl up` starts one")
         attached._supervisor.call("getState")
         return attached
@@ -154,6 +158,8 @@ class SupervisedFleet:
         pid = self.pids().get(service)
         if pid is None:
             raise FleetError(f"{service} has no process to signal now; see `xrl status`")
+        if not procfs.belongs(pid, self.run.path):
+            raise FleetError(f"{service}: process {pid} is not of this fleet, and gets no signal")
         try:
             os.kill(pid, number)
         except ProcessLookupError:
@@ -198,6 +204,8 @@ class SupervisedFleet:
             FleetError: a process survived SIGKILL.
         """
         self._end()
+        if not self.run.is_marked:
+            return  # no fleet was ever here: nothing in it is ours
         try:
             lock = self.run.claim()
         except FleetError:
@@ -214,9 +222,11 @@ class SupervisedFleet:
 
     def _end(self) -> None:
         """End every process of the fleet."""
-        manifest = self.run.read_manifest()
+        manifest = self.run.read_manifest() if self.run.is_marked else None
         procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGCONT)
         try:
+            if manifest is None:
+                raise FleetError(f"no fleet is up in {self.run.path}")
             self._supervisor.call("stopAllProcesses", False)  # all at once,
             self._supervisor.call("shutdown")  # which by itself goes one by one
         except FleetError:

@@ -24,7 +24,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Stop every service, also of a fleet whose supervisor is dead; keep the logs."""
     fleet = SupervisedFleet(args.run_dir)
-    was_up = fleet.run.read_manifest() is not None
+    was_up = fleet.run.is_marked and fleet.run.read_manifest() is not None
     fleet.stop(keep_logs=True)
     if was_up:
         print(f"the fleet in {fleet.run.path} is down; its logs stay in {fleet.run.logs}")

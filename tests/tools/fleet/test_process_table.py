@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -181,25 +180,6 @@ def test_a_unix_socket_is_in_use_only_while_it_is_listened_to(run_dir: Path) -> 
             process_table.check_free([listener])
     assert path.exists()
     process_table.check_free([listener])
-
-
-def test_the_run_directory_has_one_owner_at_a_time(run_dir: Path) -> None:
-    lock = RunDir(run_dir).claim()
-    with pytest.raises(FleetError, match="a fleet is up in"):
-        RunDir(run_dir).claim()
-    os.close(lock)
-    os.close(RunDir(run_dir).claim())
-
-
-def test_clearing_leaves_foreign_files_and_sockets_alone(run_dir: Path) -> None:
-    run = RunDir(run_dir)
-    run.prepare(plan(run_dir))
-    (run_dir / "notes.txt").write_text("mine")
-    for name in ("planner.zenoh", "foreign.sock"):
-        with socket.socket(socket.AF_UNIX) as dead:
-            dead.bind(str(run_dir / name))
-    run.clear(keep_logs=False)
-    assert sorted(path.name for path in run_dir.iterdir()) == ["foreign.sock", "notes.txt"]
 
 
 def test_a_percent_sign_in_a_path_reaches_supervisord_unharmed(run_dir: Path) -> None:

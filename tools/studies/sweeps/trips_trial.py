@@ -23,6 +23,7 @@ from shared.process import DEFAULT_CONFIG
 from shared.robot.gain_schedule import believing
 from shared.robot.trip_table import JOINT_TRIPS, untripped
 from tools.runs.lockstep import Lockstep
+from tools.runs.standing_start import begin_standing
 
 SMALL_ERRORS: Final[Mapping[str, Any]] = {
     "encoder.zero_errors": [math.radians(0.5) * (-1) ** i for i in range(12)],
@@ -166,6 +167,8 @@ class _Seen:
             plant=changed(plant, trouble.errors),
             record=self._record,
         )
+        if not trouble.unfiltered:  # what shakes may never be led so far
+            begin_standing(self.fleet)
         self._run(trouble.let_go_s)
         self._joints()
 
@@ -195,7 +198,7 @@ class _Seen:
         began_ns = self.fleet.now_ns - round((self.fleet.world.scenario_s - BEGINS_S) * NS_PER_S)
         if first_ns < began_ns:
             tracks = [e.t_ns for _, e in self.fleet.events if e.mode_after == Mode.TRACK]
-            began_ns = min(tracks)
+            began_ns = min(tracks, default=first_ns)
         return (first_ns - began_ns) / NS_PER_S
 
     def _joints(self) -> None:

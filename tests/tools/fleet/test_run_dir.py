@@ -1,0 +1,163 @@
+"""Whose a run directory is, and what is removed from it: nothing of anybody else's."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from shared.exceptions import FleetError
+from shared.process import DEFAULT_CONFIG
+from shared.run_directory import check_own
+from tools import cli
+from tools.fleet import process_table, procfs
+from tools.fleet.run_dir import MARKER, RunDir
+from tools.fleet.supervise import SupervisedFleet
+
+WORDS = ("up", "down", "status", "kill")
+
+
+def plan(run_dir: Path) -> process_table.FleetPlan:
+    return process_table.make_plan(
+        DEFAULT_CONFIG, run_dir, overrides={}, services=None, simulation=True,
+        table_path=process_table.TABLE,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def claimed(run_dir: Path) -> Iterator[RunDir]:
+    run = RunDir(run_dir)
+    lock = run.claim()
+    run.prepare(plan(run_dir))
+    yield run
+    os.close(lock)
+
+
+def files_in(directory: Path) -> list[str]:
+    return sorted(str(path.relative_to(directory)) for path in directory.rglob("*"))
+
+
+def test_the_run_directory_has_one_owner_at_a_time(run_dir: Path) -> None:
+    lock = RunDir(run_dir).claim()
+    with pytest.raises(FleetError, match="a fleet is up in"):
+        RunDir(run_dir).claim()
+    os.close(lock)
+    os.close(RunDir(run_dir).claim())
+
+
+def test_clearing_leaves_foreign_files_and_sockets_alone(claimed: RunDir) -> None:
+    (claimed.path / "notes.txt").write_text("mine")
+    (claimed.logs / "thesis.tex").write_text("mine")
+    claimed.log_of("planner").write_text("a line")
+    for name in ("planner.zenoh", "foreign.sock"):
+        with closing(socket.socket(socket.AF_UNIX)) as dead:
+            dead.bind(str(claimed.path / name))
+    claimed.clear(keep_logs=False)
+    assert files_in(claimed.path) == [
+        MARKER, "foreign.sock", "logs", "logs/thesis.tex", "notes.txt",
+    ]  # fmt: skip
+
+
+def test_a_start_in_a_used_directory_keeps_what_a_person_put_beside_its_logs(
+    claimed: RunDir,
+) -> None:
+    (claimed.logs / "thesis.tex").write_text("mine")
+    claimed.prepare(plan(claimed.path))
+    assert (claimed.logs / "thesis.tex").read_text() == "mine"
+
+
+def test_an_empty_directory_is_gone_after_the_fleet(claimed: RunDir) -> None:
+    claimed.clear(keep_logs=False)
+    assert not claimed.path.exists()
+
+
+def test_a_folder_of_a_persons_own_files_is_refused_and_stays_as_it_is(run_dir: Path) -> None:
+    (run_dir / "logs").mkdir(parents=True)
+    (run_dir / "logs/run.log").write_text("mine")
+    (run_dir / "supervisord.conf").write_text("mine too")
+    with pytest.raises(FleetError, match="holds logs, which is no fleet's"):
+        RunDir(run_dir).claim()
+    RunDir(run_dir).clear(keep_logs=False)
+    SupervisedFleet(run_dir).stop()
+    assert cli.main(["down", "--run-dir", str(run_dir)]) == 0
+    assert files_in(run_dir) == ["logs", "logs/run.log", "supervisord.conf"]
+
+
+def test_down_where_nothing_is_makes_nothing(run_dir: Path) -> None:
+    assert cli.main(["down", "--run-dir", str(run_dir)]) == 0
+    assert not run_dir.exists()
+
+
+def test_sockets_of_services_started_by_hand_are_no_obstacle(run_dir: Path) -> None:
+    run_dir.mkdir()
+    with closing(socket.socket(socket.AF_UNIX)) as dead:
+        dead.bind(str(run_dir / "play.zenoh"))
+    (run_dir / "play.zenoh.lock").touch()
+    (run_dir / "knee_left.rearm").touch()
+    os.close(RunDir(run_dir).claim())
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702])
+def test_a_directory_that_others_may_write_to_is_refused(run_dir: Path, mode: int) -> None:
+    run_dir.mkdir()
+    run_dir.chmod(mode)
+    with pytest.raises(FleetError, match="others may write to it"):
+        RunDir(run_dir).claim()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a directory away")
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_strangers_directory_is_refused_by_every_verb(
+    run_dir: Path, linked: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    theirs = run_dir.with_name("theirs")
+    theirs.mkdir()
+    os.chown(theirs, 12345, 12345)
+    if linked:
+        run_dir.symlink_to(theirs)
+        os.chown(run_dir, 12345, 12345, follow_symlinks=False)
+    else:
+        theirs.rename(run_dir)
+    for words in (["up"], ["down"], ["status"], ["kill", "planner"], ["estop"]):
+        with pytest.raises(SystemExit) as ended:
+            cli.main([*words, "--run-dir", str(run_dir)])
+        assert ended.value.code == 2
+        assert "belongs to another user" in capsys.readouterr().err
+    with pytest.raises(FleetError, match="belongs to another user"):
+        SupervisedFleet.attach(run_dir)
+
+
+def test_a_file_is_no_run_directory(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(FleetError, match="is no directory"):
+        check_own(tmp_path / "file")
+
+
+def test_a_process_that_is_not_of_the_fleet_gets_no_signal(
+    claimed: RunDir, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as stranger:
+        assert not procfs.belongs(stranger.pid, claimed.path)
+        fleet = SupervisedFleet(claimed.path)
+        monkeypatch.setattr(fleet, "pids", lambda: {"planner": stranger.pid})
+        with pytest.raises(FleetError, match="is not of this fleet, and gets no signal"):
+            fleet.kill("planner", signal.SIGKILL)
+        assert stranger.poll() is None
+        stranger.communicate(b"\n")
+
+
+def test_a_process_of_the_fleet_is_known_by_its_mark(claimed: RunDir) -> None:
+    marked = {**os.environ, procfs.FLEET_VARIABLE: str(claimed.path)}
+    with subprocess.Popen(
+        [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, env=marked
+    ) as member:
+        assert procfs.fleet_pids(claimed.path) == {member.pid}
+        assert procfs.fleet_pids(claimed.path.with_name("other")) == set()
+        member.communicate(b"\n")
