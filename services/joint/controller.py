@@ -179,6 +179,7 @@ class JointController:
         s = self._state
         failsafe, estimate, command = s.failsafe, s.estimate, s.failsafe.command
         s.states += 1
+        refusal, refused_session = failsafe.newest_refusal(now_ns)
         return JointState(
             t_ns=estimate.t_ns,
             seq=s.states,
@@ -200,6 +201,8 @@ class JointController:
             stiffened=self._law.stiffened,
             outside=int(failsafe.current_outside(now_ns, self.timing)),
             state_phase=self._state_phase,
+            refusal=int(refusal),
+            refused_session=refused_session,
         )
 
     def snapshot(self) -> ControllerSnapshot:

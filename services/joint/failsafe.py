@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from shared.bus.messages import Cause, JointCommand, Mode, Outside
+from shared.bus.messages import Cause, JointCommand, Mode, Outside, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.dropouts import Dropouts
@@ -108,19 +108,13 @@ def timing_of(config: RobotConfig) -> Timing:
     )
 
 
-class Refusal(IntEnum):
-    """Reason to refuse a command (docs/architecture.md#age-rule)."""
-
-    NONE = 0
-    TOO_OLD = 1
-    FROM_THE_FUTURE = 2
-    FOREIGN_SESSION = 3
-    NOT_NEWER = 4
-    OUT_OF_LIMITS = 5
-    OUT_OF_ENVELOPE = 6
-
-
 RETIRED_SESSIONS_KEPT: Final = 256
+SEQ_AHEAD_MAX: Final = 500
+"""Largest step of a command's number: a wrong one, accepted, has all right ones refused."""
+TICKS_PER_S_MAX: Final = 2000
+"""More than any planner counts in a second, also while nobody hears it."""
+REFUSED_SHOWN_NS: Final = NS_PER_S
+"""How long the cause of the newest refusal is reported."""
 
 
 class Failsafe(msgspec.Struct):
@@ -138,6 +132,12 @@ class Failsafe(msgspec.Struct):
     dropouts: Dropouts = msgspec.field(default_factory=Dropouts)
     """Recent drop-outs of commands; each doubles the wait before TRACK."""
     refused: int = 0
+    refusal: Refusal = Refusal.NONE
+    """Cause of the newest refusal."""
+    refused_session: int = 0
+    """Session of the newest refused command."""
+    refused_ns: int = 0
+    """Time of the newest refusal."""
     outside: Outside = Outside.NOTHING
     """Part of the newest usable command that lies outside the envelope."""
     judged_ns: int = 0
@@ -165,6 +165,8 @@ class Failsafe(msgspec.Struct):
             refusal = Refusal.OUT_OF_ENVELOPE
         if refusal is not Refusal.NONE:
             self.refused += 1
+            self.refusal, self.refused_session = refusal, command.session
+            self.refused_ns = now_ns
             return refusal
         if command.session != self.session:
             if self.session:
@@ -191,6 +193,12 @@ class Failsafe(msgspec.Struct):
         """Return the part of the newest command outside the envelope, while that is recent."""
         old = now_ns - self.judged_ns > timing.max_command_age_ns
         return Outside.NOTHING if old else self.outside
+
+    def newest_refusal(self, now_ns: int) -> tuple[Refusal, int]:
+        """Return the cause of the newest refusal and its session, while that is recent."""
+        if not self.refused or now_ns - self.refused_ns > REFUSED_SHOWN_NS:
+            return Refusal.NONE, 0
+        return self.refusal, self.refused_session
 
     def is_fresh(self, now_ns: int, timing: Timing) -> bool:
         """Return True if the newest accepted command is within the age limit."""
@@ -279,8 +287,13 @@ class Failsafe(msgspec.Struct):
             # another session takes over only when no usable command of the present one is left
             if command.session in self.retired or self.is_fresh(now_ns, timing):
                 return Refusal.FOREIGN_SESSION
-        elif self.command is not None and command.seq <= self.command.seq:
-            return Refusal.NOT_NEWER
+        elif self.command is not None:
+            ahead = command.seq - self.command.seq
+            if ahead <= 0:
+                return Refusal.NOT_NEWER
+            counted = TICKS_PER_S_MAX * (now_ns - self.command.echo_t_ns) / NS_PER_S
+            if ahead > SEQ_AHEAD_MAX + counted:
+                return Refusal.TOO_FAR_AHEAD
         return Refusal.NONE if within_limits(command, timing) else Refusal.OUT_OF_LIMITS
 
 

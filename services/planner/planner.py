@@ -19,6 +19,7 @@ from services.planner.hocca import Hocca, LawOutput
 from services.planner.intents import OperatorRequest
 from services.planner.limp_leg_watch import LimpLegWatch
 from services.planner.plausible import Plausible
+from services.planner.rival_watch import RivalWatch
 from services.planner.snapshots import TickState
 from services.planner.state_phases import StatePhases
 from services.planner.trips import PlannerTrips, values_of
@@ -83,6 +84,8 @@ class Planner:
         self._attitude_stale_ns = round(config.imu.stale_ms * NS_PER_MS)
         self._overload = Overload.of(config.harness)
         self._limp_legs = LimpLegWatch()
+        self._rival = RivalWatch()
+        self._command_age_ns = round(config.joint_service.max_command_age_ms * NS_PER_MS)
         self._trips = PlannerTrips(config)
         self._unattended = Unattended()
         service = config.joint_service
@@ -140,7 +143,9 @@ class Planner:
         return since_s >= LATE_FRACTION * self._period_s
 
     def tick(self, now_ns: int) -> list[JointCommand]:
-        """Run the law; return six commands, or none until every module has sent a state.
+        """Run the law; return six commands.
+
+        None until every module has sent a state, and none while another planner leads.
 
         Args:
             now_ns: the planner's monotonic clock.
@@ -155,11 +160,14 @@ class Planner:
         if len(states) < N_MODULES:
             return []
         fresh = [now_ns - arrived <= self._stale_ns for arrived in self._arrived_ns]
+        self._watch_rival(
+            now_ns, [s for s, is_fresh in zip(states, fresh, strict=True) if is_fresh]
+        )
         engagement = self._engagement
         engagement.advance(
             now_ns,
             fresh,
-            [state.ready for state in states],
+            [state.ready and state.session == self.session for state in states],
             [state.mode for state in states],
             self._inhibit(),
         )
@@ -192,7 +200,7 @@ class Planner:
         values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)
         self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
-        return self._commands(now_ns, states, self._output)
+        return [] if self._rival.yields else self._commands(now_ns, states, self._output)
 
     def snapshot(self) -> TickState:
         """Return the state between two ticks; `restore` continues from it."""
@@ -216,6 +224,7 @@ class Planner:
             self._request,
             self._unattended.snapshot(),
             self._phases.snapshot(),
+            msgspec.structs.replace(self._rival),
         )
 
     def restore(self, snapshot: TickState) -> None:
@@ -233,9 +242,20 @@ class Planner:
         self._last_ns, self._seq, self._source = m.last_ns, m.seq, m.source
         self._engagement = m.engagement.copied()
         self._limp_legs = msgspec.structs.replace(m.limp_legs)
+        self._rival = msgspec.structs.replace(m.rival)
         self._overload.restore(m.overload)
         self._law.restore(m.law)
         self._trips.restore(m.trips)
+
+    def _watch_rival(self, now_ns: int, states: Sequence[JointState]) -> None:
+        """Find out if another planner leads.
+
+        The modules may have retired this planner's session for the other's: once it may send again
+        it goes on in a new one.
+        """
+        changed = self._rival.advance(now_ns, self.session, states, self._command_age_ns)
+        if changed and not self._rival.yields:
+            self.session += 1
 
     def _commands(
         self, now_ns: int, states: Sequence[JointState], output: LawOutput
@@ -306,6 +326,8 @@ class Planner:
 
     def _inhibit(self) -> PlannerMode | None:
         """Return why the planner may not engage, from the last tick's results; None if it may."""
+        if self._rival.yields:
+            return PlannerMode.YIELDING
         if self._overload.hold:
             return PlannerMode.OVERLOADED
         if self._law.stance_refused:
@@ -367,7 +389,10 @@ class Planner:
             load=self._law.load,
             requested_by=self._request.source,
             stance=stance,
-            why=self._law.stance_refusal() or self._law.load_refusal() or self._trips.why,
+            why=self._rival.describe()
+            or self._law.stance_refusal()
+            or self._law.load_refusal()
+            or self._trips.why,
             trip=int(self._trips.tripped),
         )
 

@@ -7,6 +7,7 @@ import msgspec
 from services.planner.engagement_fsm import Engagement
 from services.planner.intents import OperatorRequest
 from services.planner.limp_leg_watch import LimpLegWatch
+from services.planner.rival_watch import RivalWatch
 from shared.bus.messages import (
     AS_CONFIGURED,
     STRAIGHT,
@@ -146,3 +147,4 @@ class TickState(msgspec.Struct, frozen=True):
     request: OperatorRequest = OperatorRequest()
     unattended: UnattendedState = UnattendedState()
     phases: PhasesState = PhasesState()
+    rival: RivalWatch = msgspec.field(default_factory=RivalWatch)

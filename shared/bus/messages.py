@@ -111,6 +111,27 @@ class Outside(IntEnum):
     """The margin is below the least that the planner may publish."""
 
 
+class Refusal(IntEnum):
+    """Cause for which a joint service refused a command (docs/architecture.md#age-rule)."""
+
+    NONE = 0
+    """None was refused lately."""
+    TOO_OLD = 1
+    """It answers a state that is too old."""
+    FROM_THE_FUTURE = 2
+    """It answers a state that this module has not sent yet."""
+    FOREIGN_SESSION = 3
+    """Another planner sends it, or one that this module has left."""
+    NOT_NEWER = 4
+    """One with its number or a higher one was accepted before."""
+    OUT_OF_LIMITS = 5
+    """A number is not finite, or beyond what the joint service may be told."""
+    OUT_OF_ENVELOPE = 6
+    """It lies outside the envelope (`Outside`)."""
+    TOO_FAR_AHEAD = 7
+    """Its number is higher than any planner can have counted to since the last one."""
+
+
 class DriveStatus(IntEnum):
     """Status of a module's two axes together."""
 
@@ -148,6 +169,8 @@ class PlannerMode(IntEnum):
     MISLOADED = 7
     """The load is farther from the robot file than `law.load_correction`, or not yet weighed after
     hanging on a hoist: all hold."""
+    YIELDING = 8
+    """Another planner leads: this one sends nothing until that one has ended."""
 
 
 class SplitSource(IntEnum):
@@ -242,6 +265,10 @@ class JointState(Message, frozen=True):
     """Part of the newest command that lies outside the envelope; 0 if none."""
     state_phase: int = 0
     """Phase in which this module sends its states, as the planner asked (`JointCommand`)."""
+    refusal: int = 0
+    """Cause of the newest refusal of a command, for a second; 0 if there was none."""
+    refused_session: int = 0
+    """Session of that command: of whom it came."""
 
 
 class JointCommand(Message, frozen=True):

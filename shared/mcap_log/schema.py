@@ -31,6 +31,7 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.PlannerStatus, "split"): messages.SplitSource,
     (messages.JointState, "drive"): messages.DriveStatus,
     (messages.JointState, "outside"): messages.Outside,
+    (messages.JointState, "refusal"): messages.Refusal,
     (messages.PlannerStatus, "trip"): messages.Trip,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from services.joint.drivers.base import DriveReading, DriveStatus
-from shared.bus.messages import Cause, JointCommand, Mode, Pair
+from shared.bus.messages import Cause, JointCommand, Mode, Pair, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, Bench, command, with_service
@@ -265,7 +265,7 @@ def test_a_reading_that_is_no_number_lets_out_no_torque_that_is_none(
 def test_a_state_holds_what_the_cycle_saw_and_did(bench: Bench) -> None:
     bench.to_track()
     bench.v = (0.1, -0.1)
-    sent = bench.fresh(seq=5_000)
+    sent = bench.fresh(seq=900)
     bench.cycle(sent)
     bench.cycle(command(seq=1, echo_t_ns=bench.now_ns))
     state = bench.controller.state(bench.now_ns)
@@ -275,9 +275,10 @@ def test_a_state_holds_what_the_cycle_saw_and_did(bench: Bench) -> None:
     assert state.tau == bench.controller.tau
     assert (state.mode, state.ready) == (Mode.TRACK, True)
     assert (state.cause, state.stiffened) == (Cause.COMMANDS_FRESH, False)
-    assert (state.session, state.command_seq) == (SESSION, 5_000)
+    assert (state.session, state.command_seq) == (SESSION, 900)
     assert state.age_ns == bench.now_ns - sent.echo_t_ns == 2 * bench.cycle_ns
     assert (state.refused, state.dropouts, state.late) == (1, 0, 0)
+    assert (state.refusal, state.refused_session) == (Refusal.NOT_NEWER, SESSION)
     assert state.cycle == bench.controller.cycle > 400
 
 

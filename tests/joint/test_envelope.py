@@ -12,8 +12,8 @@ import pytest
 from services.joint import pd_law
 from services.joint.controller import JointController
 from services.joint.envelope import ROUNDING, Envelope
-from services.joint.failsafe import Event, Failsafe, Refusal, timing_of
-from shared.bus.messages import JointCommand, Mode, Outside, Pair
+from services.joint.failsafe import Event, Failsafe, timing_of
+from shared.bus.messages import JointCommand, Mode, Outside, Pair, Refusal
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.robot.gain_schedule import believing

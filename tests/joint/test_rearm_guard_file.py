@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -93,6 +94,7 @@ def fleet_of(
     monkeypatch.setattr(SupervisedFleet, "manifest", SimpleNamespace(services=services))
     monkeypatch.setattr(SupervisedFleet, "attach", lambda _run_dir: fleet)
     monkeypatch.setattr(procfs, "is_suspended", lambda _pid: calls.suspended)
+    monkeypatch.setattr(procfs, "belongs", lambda _pid, _run_dir: True)
     monkeypatch.setattr(supervise, "os", SimpleNamespace(kill=calls.kill))
     return fleet
 
@@ -226,6 +228,9 @@ def test_a_fleet_does_not_hear_of_what_held_before_it(
         plan.processes = (SimpleNamespace(name=MODULE, topic="", stop_s=1.0),)
         RunDir(tmp_path).prepare(cast("process_table.FleetPlan", plan))
     else:
-        RunDir(tmp_path).clear(keep_logs=True)
+        run = RunDir(tmp_path)
+        lock = run.claim()
+        run.clear(keep_logs=True)
+        os.close(lock)
     assert not path_of(tmp_path, MODULE).exists()
     assert not neighbours.path_of(tmp_path).exists()

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.failsafe import Event, Failsafe, Refusal, Timing, timing_of
-from shared.bus.messages import Mode
+from services.joint.failsafe import Event, Failsafe, Timing, timing_of
+from shared.bus.messages import Mode, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import SESSION, T0, command
@@ -245,3 +245,48 @@ def test_whatever_is_in_use_met_the_whole_rule_when_it_was_taken(
         assert failsafe.command is (sent if rule else before)
         if rule and before is not None and session != current:
             retired.add(current)
+
+
+def test_a_number_far_ahead_is_refused_and_the_right_ones_after_it_are_not(timing: Timing) -> None:
+    """One message with seq = 2^61 had six modules in HOLD until the planner was restarted."""
+    failsafe = taken(timing, seq=10)
+    assert failsafe.offer(command(seq=2**61), T0, timing) is Refusal.TOO_FAR_AHEAD
+    assert failsafe.offer(command(seq=11), T0, timing) is Refusal.NONE
+
+
+@pytest.mark.parametrize("away_s", [0.0, 1.0, 60.0, 3600.0])
+def test_a_planner_that_was_not_heard_for_a_while_is_heard_again(
+    timing: Timing, away_s: float
+) -> None:
+    """It ticks on at 250 Hz, or at any rate up to 1 kHz, while its link is cut."""
+    failsafe = taken(timing, seq=10)
+    now_ns = T0 + round(away_s * NS_PER_S)
+    told = command(seq=11 + round(1000 * away_s), echo_t_ns=now_ns)
+    assert failsafe.offer(told, now_ns, timing) is Refusal.NONE
+
+
+@given(ahead=st.integers(1, 2**62), away_ns=st.integers(0, 3600 * NS_PER_S))
+def test_no_message_locks_the_planner_out_for_longer_than_it_was_away(
+    ahead: int, away_ns: int
+) -> None:
+    """Whatever was accepted, a planner of 250 Hz has counted beyond it soon after."""
+    timing = Timing(
+        max_command_age_ns=50 * NS_PER_MS, engage_after_ns=1, engage_after_max_ns=1,
+        dropout_forget_ns=1, dropouts_max=1, k_p_max=1e6, k_d_max=1e6, v_max=1e6, tau_max=1e6,
+    )  # fmt: skip
+    failsafe = taken(timing, seq=10)
+    now_ns = T0 + away_ns
+    accepted = failsafe.offer(command(seq=10 + ahead, echo_t_ns=now_ns), now_ns, timing)
+    if accepted is Refusal.NONE:
+        assert ahead <= 500 + 2000 * away_ns / NS_PER_S
+    else:
+        assert accepted is Refusal.TOO_FAR_AHEAD
+        assert failsafe.offer(command(seq=11, echo_t_ns=now_ns), now_ns, timing) is Refusal.NONE
+
+
+def test_the_newest_refusal_is_told_for_a_second_and_of_whom_it_came(timing: Timing) -> None:
+    failsafe = taken(timing, seq=10)
+    assert failsafe.newest_refusal(T0) == (Refusal.NONE, 0)
+    failsafe.offer(command(session=OTHER, seq=11), T0, timing)
+    assert failsafe.newest_refusal(T0 + NS_PER_S) == (Refusal.FOREIGN_SESSION, OTHER)
+    assert failsafe.newest_refusal(T0 + NS_PER_S + 1) == (Refusal.NONE, 0)

@@ -11,19 +11,19 @@ from services.joint.failsafe import (
     RETIRED_SESSIONS_KEPT,
     Event,
     Failsafe,
-    Refusal,
     Timing,
     timing_of,
 )
 from services.planner.engagement_fsm import GRACE_NS, Engagement
 from services.planner.planner import Planner
-from shared.bus.messages import Cause, Mode, PlannerMode, Wrench
+from shared.bus.messages import Cause, Mode, PlannerMode, Refusal, Wrench
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.gain_schedule import believing
 from shared.robot.joints import MODULES, kind_of
 from shared.robot.robot_model import stand_pose
 from tests.joint.helpers import SESSION, T0, Bench, command
+from tests.planner.test_planner import SESSION as PLANNER
 from tests.planner.test_planner import START_NS, lead, receive_all
 
 GENTLE = (3.0, -5.0)
@@ -148,7 +148,7 @@ def test_a_module_has_150_ms_to_report_track() -> None:
 def test_an_old_wrench_eases_nothing(robot: RobotConfig) -> None:
     """A hand that pulled with 60 N as the harness fell silent would pull for ever."""
     q = np.array(stand_pose(robot, 1.188))
-    heard, deaf = Planner(robot, 1), Planner(robot, 1)
+    heard, deaf = Planner(robot, PLANNER), Planner(robot, PLANNER)
     now_ns = lead(heard, q)
     assert lead(deaf, q) == now_ns
     pull = Wrench(

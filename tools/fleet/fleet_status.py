@@ -18,6 +18,7 @@ from shared.bus.messages import (
     Pair,
     PlannerMode,
     PlannerStatus,
+    Refusal,
     Trip,
 )
 from shared.bus.session import Latest, Session
@@ -81,6 +82,14 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """It holds with all of its stand gains, for another may be limp."""
     outside: str = ""
     """Name of the refused part of the newest command (`Outside`); empty if it is accepted."""
+    session: int = 0
+    """Session of the planner whose commands it uses; 0 if there is none."""
+    refused_hz: float = 0.0
+    """Commands that it refuses, per second."""
+    refusal: str = ""
+    """Name of the cause of the newest refusal (`Refusal`), while it refuses any."""
+    refused_session: int = 0
+    """Session of the planner that sent it."""
 
 
 class LeadStatus(msgspec.Struct, frozen=True):
@@ -94,6 +103,7 @@ class LeadStatus(msgspec.Struct, frozen=True):
     """Margin of the gains by the failsafe certificate; 1 is required."""
     why: str = ""
     """Why it does not lead, in words, where the mode does not say it all."""
+    session: int = 0
 
 
 class FleetStatus(msgspec.Struct, frozen=True):
@@ -141,6 +151,14 @@ class RateMonitor:
         """Return True if the newest message still says how things are."""
         age_s = self.age_s()
         return age_s is not None and age_s < _FRESH_S
+
+    def refused_hz(self) -> float:
+        """Return commands refused per second in this window; 0 of what is no joint service."""
+        first, newest = self._first, self.newest
+        if not isinstance(first, JointState) or not isinstance(newest, JointState):
+            return 0.0
+        span_ns, refused = newest.t_ns - first.t_ns, newest.refused - first.refused
+        return max(0, refused) * NS_PER_S / span_ns if span_ns > 0 else 0.0
 
     def rate_hz(self) -> float | None:
         """Return messages per second in this window; 0 if none has come in it."""
@@ -194,7 +212,9 @@ def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor]) -> FleetSt
             last_exit=service.last_exit,
         )
     modules = {
-        module: module_status(monitors[module].newest if module in fresh else None)
+        module: module_status(
+            monitors[module].newest if module in fresh else None, monitors[module].refused_hz()
+        )
         for module in MODULES
         if module in monitors
     }
@@ -213,8 +233,13 @@ def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
         return (SILENT_PROXY,)
 
 
-def module_status(state: Message | None) -> ModuleStatus:
-    """Return a module's mode and tier from the newest state of its joint service."""
+def module_status(state: Message | None, refused_hz: float = 0.0) -> ModuleStatus:
+    """Return a module's mode and tier from the newest state of its joint service.
+
+    Args:
+        state: that state; None: it sends nothing now.
+        refused_hz: commands that it refuses, per second.
+    """
     if not isinstance(state, JointState):
         return ModuleStatus(None, None, None, None, None, "")
     mode, cause, drive = Mode(state.mode), Cause(state.cause), DriveStatus(state.drive)
@@ -239,7 +264,11 @@ def module_status(state: Message | None) -> ModuleStatus:
     q = state.q if knows else None
     stiffened = state.stiffened and mode in (Mode.HOLD, Mode.DAMP)
     tier = TIERS.get(mode)
-    return ModuleStatus(mode.name, tier, cause.name, drive.name, q, way_out, stiffened, outside)
+    return ModuleStatus(
+        mode.name, tier, cause.name, drive.name, q, way_out, stiffened, outside,
+        state.session, refused_hz, Refusal(state.refusal).name if refused_hz else "",
+        state.refused_session if refused_hz else 0,
+    )  # fmt: skip
 
 
 def lead_status(message: Message | None) -> LeadStatus | None:
@@ -250,7 +279,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
     why = message.why
     if message.trip:
         why += f": {PLANNER_TRIPS[Trip(message.trip)].recovery}"
-    return LeadStatus(mode, message.wait_s, message.margin, why)
+    return LeadStatus(mode, message.wait_s, message.margin, why, message.session)
 
 
 def _listen(

@@ -13,7 +13,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
-from shared.bus.messages import DriveStatus
+from shared.bus.messages import DriveStatus, Refusal
 from shared.bus.session import open_session
 from shared.config.files import load
 from tools.fleet.fleet_status import (
@@ -78,6 +78,44 @@ def describe_lead(lead: LeadStatus | None) -> str:
     return words
 
 
+REMEDIES: Final = {
+    Refusal.TOO_OLD.name: "a slow link, a slow planner, or a record played onto the live keys",
+    Refusal.FOREIGN_SESSION.name: "a second planner, or one that the module has left: end one",
+    Refusal.NOT_NEWER.name: "twice the same sender, or a network that repeats",
+    Refusal.OUT_OF_ENVELOPE.name: "a wrong planner: xrl kill planner",
+    Refusal.OUT_OF_LIMITS.name: "a wrong planner: xrl kill planner",
+    Refusal.TOO_FAR_AHEAD.name: "a number that no planner counts to: find out who sends it",
+    Refusal.FROM_THE_FUTURE.name: "clocks of several hosts mixed up, or a forged command",
+}
+"""By the cause of a refusal: what it is likely to be, or what to do."""
+
+
+def describe_refusals(status: FleetStatus) -> list[str]:
+    """Return a line for each cause and sender of refused commands."""
+    found: dict[tuple[str, int], list[str]] = {}
+    for name, module in status.modules.items():
+        if module.refusal in REMEDIES:
+            words = f"{name} {module.refused_hz:.0f}/s"
+            found.setdefault((module.refusal, module.refused_session), []).append(words)
+    return [
+        f"refused, {cause} of session {session}: {', '.join(words)}; {REMEDIES[cause]}"
+        for (cause, session), words in found.items()
+    ]
+
+
+def describe_sessions(status: FleetStatus) -> str:
+    """Return what to say if the modules do not all follow the planner that is heard; else ""."""
+    lead = status.lead.session if status.lead is not None else 0
+    others: dict[int, list[str]] = {}
+    for name, module in status.modules.items():
+        if module.session and lead and module.session != lead and module.mode is not None:
+            others.setdefault(module.session, []).append(name)
+    return "; ".join(
+        f"{', '.join(names)}: last followed session {session}, and the planner heard is {lead}"
+        for session, names in others.items()
+    )
+
+
 def tables(status: FleetStatus) -> Group:
     """Return the status as two tables for the terminal, and what there is to say beside."""
     services = Table(
@@ -132,6 +170,9 @@ def tables(status: FleetStatus) -> Group:
     lines = [f" {describe_lead(status.lead)}"]
     lines += [slow] if status.pace != 1.0 else []
     lines += [line] if status.network else []
+    lines += [f" [bold yellow]{text}[/]" for text in describe_refusals(status)]
+    sessions = describe_sessions(status)
+    lines += [f" [bold yellow]{sessions}[/]"] if sessions else []
     return Group(services, modules, *lines)
 
 

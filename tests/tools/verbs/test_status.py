@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from itertools import product
+from types import SimpleNamespace
+from typing import cast
 
 import msgspec
 import pytest
 
-from shared.bus.messages import Cause, DriveStatus, JointState, Mode, Outside
+from shared.bus.messages import Cause, DriveStatus, JointState, Message, Mode, Outside, Refusal
+from shared.bus.session import Latest
+from shared.robot.joints import MODULES
 from shared.robot.trip_table import JOINT_TRIPS
-from tools.fleet.fleet_status import LeadStatus, lead_status, module_status
-from tools.verbs.status import describe_lead
+from tools.fleet.fleet_status import (
+    FleetStatus,
+    LeadStatus,
+    ModuleStatus,
+    RateMonitor,
+    lead_status,
+    module_status,
+)
+from tools.verbs.status import describe_lead, describe_refusals, describe_sessions
 
 
 def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:
@@ -73,3 +84,52 @@ def test_the_reason_why_the_planner_does_not_lead_yet_is_reported() -> None:
     assert "leads again in 12 s" in waits
     line = describe_lead(LeadStatus("MISPLACED", wait_s=0.0, margin=1.2, why="a foot is ahead"))
     assert line == "planner MISPLACED, margin 1.20; a foot is ahead"
+
+
+def fleet_with(lead_session: int, *modules: ModuleStatus) -> FleetStatus:
+    lead = LeadStatus("LEADING", 0.0, 1.1, session=lead_session)
+    named = dict(zip(MODULES, modules, strict=False))
+    return FleetStatus("/tmp/x", "robot.toml", {}, named, lead)
+
+
+@pytest.mark.parametrize("refusal", [each for each in Refusal if each])
+def test_refused_commands_are_told_with_their_cause_sender_and_what_to_do(refusal: Refusal) -> None:
+    tracks = state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED)
+    refusing = msgspec.structs.replace(tracks, refusal=int(refusal), refused_session=99)
+    rows = [module_status(refusing, 250.0), module_status(refusing, 120.0), module_status(tracks)]
+    (line,) = describe_refusals(fleet_with(7, *rows))
+    assert f"refused, {refusal.name} of session 99: ankle_right 250/s, knee_right 120/s; " in line
+    assert len(line.rpartition("; ")[2]) > 10, "and what to do"
+
+
+def test_a_refusal_that_is_over_is_not_told() -> None:
+    tracks = state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED)
+    before = msgspec.structs.replace(tracks, refusal=int(Refusal.TOO_OLD), refused=9)
+    assert describe_refusals(fleet_with(7, module_status(before, 0.0))) == []
+
+
+def test_modules_that_follow_another_planner_are_named() -> None:
+    follows = msgspec.structs.replace(
+        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED), session=99
+    )
+    own = msgspec.structs.replace(follows, session=7)
+    rows = [module_status(own), module_status(follows)]
+    words = describe_sessions(fleet_with(7, *rows))
+    assert words == "knee_right: last followed session 99, and the planner heard is 7"
+    assert describe_sessions(fleet_with(7, module_status(own), module_status(None))) == ""
+
+
+@pytest.mark.parametrize(("first", "last", "hz"), [(10, 35, 250.0), (10, 10, 0.0), (90, 5, 0.0)])
+def test_refusals_are_counted_over_the_window_and_a_restart_counts_none(
+    first: int, last: int, hz: float
+) -> None:
+    begin = msgspec.structs.replace(
+        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED), refused=first
+    )
+    end = msgspec.structs.replace(begin, t_ns=begin.t_ns + 100_000_000, seq=26, refused=last)
+    messages = iter([begin, end])
+    monitor = RateMonitor(cast("Latest[Message]", SimpleNamespace(take=lambda: next(messages))))
+    monitor.listen()
+    monitor.new_window()
+    monitor.listen()
+    assert monitor.refused_hz() == pytest.approx(hz)

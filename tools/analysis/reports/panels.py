@@ -35,7 +35,7 @@ PLANNER_COLOURS: Final[dict[int, str]] = {
     PlannerMode.WAITING: "idle", PlannerMode.ALIGNING: "warn", PlannerMode.LEADING: "good",
     PlannerMode.OVERLOADED: "odd", PlannerMode.UNCERTIFIED: "bad",
     PlannerMode.MISPLACED: "bad", PlannerMode.TRIPPED: "bad",
-    PlannerMode.MISLOADED: "bad",
+    PlannerMode.MISLOADED: "bad", PlannerMode.YIELDING: "odd",
 }  # fmt: skip
 SPLIT_COLOURS: Final[dict[int, str]] = {
     SplitSource.DIAGONAL: "idle", SplitSource.SCHEDULE: "good", SplitSource.STIFFENED: "warn",
