@@ -385,7 +385,7 @@ def _meet_link(event: zenoh.LinkEvent) -> None:
     """
     link = event.link
     if event.kind == zenoh.SampleKind.PUT and link.src.startswith(_TCP):
-        socket_linger.turn_off(_address(link.src), _address(link.dst))
+        socket_linger.reset_on_close(_address(link.src), _address(link.dst))
 
 
 def _address(locator: str) -> socket_linger.Address:

@@ -14,14 +14,16 @@ from typing import Final
 Address = tuple[str, int]
 """Numeric host and port."""
 
-_OFF: Final = struct.pack("ii", 0, 0)
+_RESET: Final = struct.pack("ii", 1, 0)
 
 
-def turn_off(local: Address, remote: Address) -> bool:
-    """Turn SO_LINGER off on this process's TCP connection between two addresses.
+def reset_on_close(local: Address, remote: Address) -> bool:
+    """Have this process's TCP connection between two addresses closed by a reset.
 
-    With it, `close` blocks its thread until the other side has received everything or the time is
-    over. Without it, unsent data is still sent.
+    With a linger time, `close` blocks its thread until the other side has received everything or
+    the time is over. Without any, the kernel goes on sending to a host that is cut off, and a TLS
+    link that is dialled again meanwhile was not led again within 30 s. A reset drops what is
+    unsent: it is older than what the next link brings.
 
     Returns:
         False if there is no such connection.
@@ -36,7 +38,7 @@ def turn_off(local: Address, remote: Address) -> bool:
                     continue
                 ends = connection.getsockname()[:2], connection.getpeername()[:2]
                 if ends == (local, remote):
-                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _OFF)
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
                     return True
             finally:
                 connection.detach()  # it is not ours to close

@@ -17,14 +17,14 @@ from shared.process import DEFAULT_CONFIG
 ON_FOR_10_S = struct.pack("ii", 1, 10)
 
 
-def lingers(connection: socket.socket) -> bool:
-    """Return True if `close` waits for the other side."""
+def resets(connection: socket.socket) -> bool:
+    """Return True if `close` resets the connection, and so does not wait for the other side."""
     option = connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(ON_FOR_10_S))
-    return bool(struct.unpack("ii", option)[0])
+    return struct.unpack("ii", option) == (1, 0)
 
 
 def connections() -> list[bool]:
-    """Return for each TCP connection of this process whether it lingers."""
+    """Return for each TCP connection of this process whether it is closed by a reset."""
     found = []
     for entry in Path("/proc/self/fd").iterdir():
         try:
@@ -36,7 +36,7 @@ def connections() -> list[bool]:
         try:
             connection.getpeername()
             if connection.family == socket.AF_INET:
-                found.append(lingers(connection))
+                found.append(resets(connection))
         except OSError:
             pass
         finally:
@@ -58,10 +58,10 @@ def test_only_the_connection_between_the_two_addresses_is_changed() -> None:
         ):
             for connection in (one, other):
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, ON_FOR_10_S)
-            assert socket_linger.turn_off(one.getsockname(), one.getpeername())
-            assert not lingers(one)
-            assert lingers(other)
-        assert not socket_linger.turn_off(("127.0.0.1", 1), ("127.0.0.1", 2))
+            assert socket_linger.reset_on_close(one.getsockname(), one.getpeername())
+            assert resets(one)
+            assert not resets(other)
+        assert not socket_linger.reset_on_close(("127.0.0.1", 1), ("127.0.0.1", 2))
 
 
 def test_no_tcp_link_of_the_bus_lingers_when_it_is_given_up(tmp_path: Path) -> None:
@@ -72,6 +72,6 @@ def test_no_tcp_link_of_the_bus_lingers_when_it_is_given_up(tmp_path: Path) -> N
     with open_session(robot, "knee_left", tmp_path), open_session(robot, "planner", tmp_path):
         deadline = time.monotonic() + 10.0
         # both ends of the one link are in this process
-        while (found := connections()) != [False, False] and time.monotonic() < deadline:
+        while (found := connections()) != [True, True] and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert found == [False, False]
+        assert found == [True, True]
