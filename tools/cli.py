@@ -26,12 +26,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     except XrlError as error:
         print(f"xrl: {error}", file=sys.stderr)
         return error.exit_code
-    except KeyboardInterrupt:
-        print("xrl: interrupted", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()  # else the interpreter complains about stdout once more
         return 128 + signal.SIGPIPE
+    except OSError as error:  # a path that cannot be, a full disk
+        if error.filename is None:
+            raise
+        print(f"xrl: {str(error.filename)[:200]}: {error.strerror}", file=sys.stderr)
+        return XrlError.exit_code
+    except KeyboardInterrupt:
+        print("xrl: interrupted", file=sys.stderr)
+        return INTERRUPTED
 
 
 def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:

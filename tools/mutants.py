@@ -25,6 +25,7 @@ from rich.console import Console
 
 from shared.config.toml_file import Section, read_toml
 from shared.exceptions import RunError, XrlError
+from tools.number_arguments import count
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 FILE: Final = ROOT / "tests" / "mutants.toml"
@@ -119,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     which.add_argument("--sample", action="store_true", help="a fixed sample of the first group")
     which.add_argument("--survivors", action="store_true", help="those that lived the last time")
     which.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
-    parser.add_argument("--children", type=int, default=os.cpu_count(), help="processes")
+    parser.add_argument("--children", type=count, default=os.cpu_count(), help="processes")
     parser.add_argument(
         "--out", type=Path, default=ROOT / "out" / "mutants", help="folder (out/mutants)"
     )

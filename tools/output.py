@@ -34,6 +34,8 @@ def write_atomically(out: Path, content: bytes) -> None:
         RunError: the file cannot be written.
     """
     part = out.with_name(f".{out.name}.part")
+    if out.exists() and not out.is_file():
+        raise RunError(f"{out}: is no ordinary file; give another -o")
     try:
         part.write_bytes(content)
         part.replace(out)

@@ -13,6 +13,7 @@ from types import UnionType
 from typing import (
     Annotated,
     Any,
+    Final,
     Literal,
     NamedTuple,
     TypeVar,
@@ -37,6 +38,9 @@ class Range(NamedTuple):
     unit: str
 
 
+SIZE_MAX: Final = 1 << 24
+
+
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table of the file; unknown keys are refused."""
 
@@ -49,6 +53,10 @@ def read_toml(path: Path, into: type[S]) -> S:
     """
     file = str(path)
     try:
+        if path.exists() and not path.is_file():  # a pipe would be waited on for ever
+            raise ConfigError(file, "(file)", "no ordinary file", "give the path of a TOML file")
+        if path.exists() and path.stat().st_size > SIZE_MAX:
+            raise ConfigError(file, "(file)", f"over {SIZE_MAX >> 20} MiB", "a TOML file")
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(file, "(file)", "not found", "give the path of a TOML file") from None
@@ -67,6 +75,8 @@ def parse_toml(text: str, file: str, into: type[S]) -> S:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(file, "(syntax)", str(error), "TOML 1.0 is read") from None
+    except RecursionError:
+        raise ConfigError(file, "(syntax)", "nested too deeply", "a few levels are right") from None
     try:
         config = msgspec.convert(raw, into)
     except msgspec.ValidationError as error:

@@ -45,6 +45,12 @@ _CHANNEL: Final = struct.Struct("<H")  # of a message index
 _LOOSE_HEAD: Final = struct.Struct("<HIQQ")  # of a message that is in no chunk
 
 
+EXPANSION_MAX: Final = 50
+"""A run's chunks are four to ten times as large as they are compressed."""
+EXPANDED_MIN: Final = 1 << 28
+"""Bytes that any file may expand to."""
+
+
 class LogRecord(NamedTuple):
     """One record that could be read."""
 
@@ -110,6 +116,7 @@ class LogReader:
         """Places in the middle that could not be read."""
         self._encodings: dict[int, str] = {}
         self._marks = list(_CHUNK_MARKS)
+        self._expanded = 0
         self._end = self.size
         self._summary_start = self._find_summary()
 
@@ -156,9 +163,19 @@ class LogReader:
                 yield record
 
     def read_at(self, start: int) -> LogRecord | None:
-        """Return the record at a place that `skim` found; None if it turns out damaged."""
+        """Return the record at a place that `skim` found; None if it turns out damaged.
+
+        Raises:
+            RunError: what was read so far is far larger than any run of that size.
+        """
         damage, self.damage = self.damage, []
         record, _ = self._next(start)
+        self._expanded += len(record.body) if record is not None else 0
+        if self._expanded > max(EXPANDED_MIN, EXPANSION_MAX * self.size):
+            raise RunError(
+                f"its {self.size >> 10} KiB expand to over {self._expanded >> 20} MiB: that is no "
+                "record of this project"
+            )
         self.damage = damage + [loss for loss in self.damage if loss not in damage]
         if record is not None:
             self._learn(record)

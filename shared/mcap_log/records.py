@@ -42,7 +42,7 @@ MESSAGE_RECORD: Final = struct.Struct("<BQHIQQ")
 CHUNK_TIMES: Final = struct.Struct("<QQQI")
 """First log time, last log time, size and CRC before compression."""
 
-DECOMPRESSED_MAX: Final = 1 << 28
+DECOMPRESSED_MAX: Final = 1 << 26
 """Larger chunks are refused: a flipped bit in a size asks for exabytes."""
 _WINDOW_MAX: Final = 1 << 27
 _STEP: Final = 1 << 16

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from shared.exceptions import FleetError
+from tools.number_arguments import finite
 
 T = TypeVar("T")
 
@@ -33,7 +34,7 @@ def add_pace(parser: argparse.ArgumentParser) -> None:
     """Add `--pace`."""
     parser.add_argument(
         "--pace",
-        type=float,
+        type=finite,
         metavar="X",
         help="clock rate of a simulated fleet: 0.5 is slow motion at half speed, as on a machine "
         f"twice as fast (default: ${PACE_VARIABLE}, else 1; `demo` and `crashtest` lower it by "

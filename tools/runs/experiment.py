@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeVar, get_args, get_type_hints
 
 import msgspec
+from rich.console import Console
 
 from services.simulator import plant
 from services.simulator.plant import NAMED, PlantConfig
@@ -34,6 +35,8 @@ from shared.exceptions import FleetError, RunError
 from shared.process import DEFAULT_CONFIG
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
+from tools.number_arguments import finite, natural
+from tools.output import printable
 from tools.runs.describe_inject import in_words_of, parse_inject
 from tools.verb_table import add_config
 
@@ -65,7 +68,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         help="what happens: a name from deploy/scenarios, or a file (default: squat, "
         "the paper's Fig. 7)",
     )
-    parser.add_argument("--duration", type=float, metavar="S", help="scenario time to run, s")
+    parser.add_argument("--duration", type=finite, metavar="S", help="scenario time to run, s")
     parser.add_argument(
         "--kill",
         action="append",
@@ -119,7 +122,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--seed",
-        type=int,
+        type=natural,
         default=0,
         help="of the sensors' noise, and of what the network loses and how late it is",
     )
@@ -260,6 +263,12 @@ def describe(scenario: Scenario) -> str:
     done += [in_words_of(row) for row in scenario.inject]
     done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in scenario.push]
     return f"; {', '.join(done)}" if done else ""
+
+
+def introduce(scenario: Scenario, console: Console) -> None:
+    """Print what is about to happen."""
+    about = printable(f"{scenario.about}{describe(scenario)}")
+    console.print(f"[bold]{printable(scenario.name)}[/]: {about}")
 
 
 def make_robot(args: argparse.Namespace) -> RobotConfig:

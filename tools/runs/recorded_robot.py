@@ -19,14 +19,27 @@ def robot_of(log: RunLog | RunIndex) -> RobotConfig:
         RunError: the log does not hold it.
         ConfigError: it is of another version.
     """
-    try:
-        raw = log.attachments["robot.toml"].decode()
-    except KeyError:
-        raise RunError(f"{log.path}: holds no robot.toml; a run of this project has one") from None
+    raw = text_of(log, "robot.toml")
     robot = config_file.parse(raw, f"{log.path}: robot.toml")
     schedule = log.attachments.get("robot.gains.json")
     if schedule is None:
         return robot
-    return msgspec.structs.replace(
-        robot, gain_schedule=msgspec.json.decode(schedule, type=GainSchedule)
-    )
+    try:
+        table = msgspec.json.decode(schedule, type=GainSchedule)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise RunError(f"{log.path}: robot.gains.json in it is no gain schedule: {error}") from None
+    return msgspec.structs.replace(robot, gain_schedule=table)
+
+
+def text_of(log: RunLog | RunIndex, name: str) -> str:
+    """Return a text file that is in a log.
+
+    Raises:
+        RunError: the log does not hold it, or it is no text.
+    """
+    try:
+        return log.attachments[name].decode()
+    except KeyError:
+        raise RunError(f"{log.path}: holds no {name}; a run of this project has one") from None
+    except UnicodeDecodeError:
+        raise RunError(f"{log.path}: {name} in it is no UTF-8 text") from None

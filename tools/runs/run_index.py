@@ -6,15 +6,20 @@ once, and `tools/runs/run_log.py` reads the parts that are needed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from shared.exceptions import RunError
-from shared.mcap_log.reader import ChunkPlace, LogRecord, LostBytes, open_log
+from shared.mcap_log.reader import ChunkPlace, LogReader, LogRecord, LostBytes, open_log
 from shared.mcap_log.records import Attachment, Channel, Metadata
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.runs.run_files import files_in
+
+_OFFSET: Final = re.compile(r"-?[0-9]{1,19}")
+_CLOCK_MAX_NS: Final = 1 << 62
+"""More than any monotonic clock shows."""
 
 
 class FilePlaces(NamedTuple):
@@ -74,8 +79,8 @@ class RunIndex:
         self._check_version(self.required("run", "schema_version"))
         self.robot = self.required("run", "robot")
         offset = self.required("clock", "offset_ns")
-        if not offset.lstrip("-").isdecimal():
-            raise RunError(f"{path}: clock.offset_ns is {offset!r}; an integer is right")
+        if not _OFFSET.fullmatch(offset):
+            raise RunError(f"{path}: clock.offset_ns is {offset[:40]!r}; an integer is right")
         self.offset_ns = int(offset)
         """wall clock in ns since 1970 = `t_ns` of a message + `offset_ns`."""
         chunks = [chunk for file in self.places for chunk in file.chunks]
@@ -83,6 +88,8 @@ class RunIndex:
         """Log time of the first message."""
         self.ended_ns = max((chunk.last_ns for chunk in chunks), default=self.offset_ns)
         """Log time of the last message."""
+        if max(abs(t - self.offset_ns) for t in (self.began_ns, self.ended_ns)) > _CLOCK_MAX_NS:
+            raise RunError(f"{path}: its times and clock.offset_ns do not fit each other")
 
     @property
     def length_s(self) -> float:
@@ -116,11 +123,18 @@ class RunIndex:
                 continue
             with open_log(file.path) as reader:
                 for place in wanted:
-                    record = reader.read_at(place.start)
+                    record = self._read(reader, file.path, place)
                     if record is not None:
                         self._learn(record, file)
                         yield record, file
                 self.damage += [loss for loss in reader.damage if loss not in self.damage]
+
+    @staticmethod
+    def _read(reader: LogReader, path: Path, place: ChunkPlace) -> LogRecord | None:
+        try:
+            return reader.read_at(place.start)
+        except RunError as error:
+            raise RunError(f"{path}: {error}") from None
 
     def _skim(self, path: Path) -> FilePlaces:
         file = FilePlaces(path, [], {})

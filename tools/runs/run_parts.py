@@ -7,6 +7,7 @@ import math
 from typing import Final
 
 from shared.exceptions import RunError
+from tools.number_arguments import finite
 from tools.runs import verdict
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, RunPart, parts_of, read_part
@@ -21,7 +22,7 @@ def add_part(parser: argparse.ArgumentParser, what: str = "of the part to read")
         parser.add_argument(
             flag,
             dest=f"{name}_s",
-            type=float,
+            type=finite,
             default=default,
             metavar="S",
             help=f"{name} {what} (default: the run's): scenario time, or time since "

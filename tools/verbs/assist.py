@@ -24,6 +24,7 @@ from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 from shared.process import StopFlag
 from tools.fleet.supervise import SupervisedFleet
+from tools.number_arguments import finite
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 REPEAT_S: Final = 0.02
@@ -68,7 +69,7 @@ def add_parser(subparsers: Subparsers) -> None:
         """,
     )
     add_run_dir(parser)
-    parser.add_argument("assist", type=float, metavar="N", help="upward force on the person, N")
+    parser.add_argument("assist", type=finite, metavar="N", help="upward force on the person, N")
     parser.add_argument(
         "--shift",
         type=_shift,
@@ -77,7 +78,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="where COM (m) and torso (rad) are to be off a straight stand (0,0,0,0)",
     )
     parser.add_argument(
-        "--for", dest="for_s", type=float, metavar="S", help="seconds (default: until Ctrl-C)"
+        "--for", dest="for_s", type=finite, metavar="S", help="seconds (default: until Ctrl-C)"
     )
 
 

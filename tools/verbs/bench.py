@@ -28,6 +28,7 @@ from tools.bench.table import Row
 from tools.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
 from tools.bench.transports.base import TRANSPORTS, installed
 from tools.bench.worker import READY, Request
+from tools.number_arguments import count, finite
 from tools.verb_table import Subparsers, add_config, add_verb
 
 WARM_CALLS: Final = 200
@@ -60,7 +61,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "in this environment",
     )
     parser.add_argument(
-        "--rounds", type=int, metavar="N", help="turns of every measurement (9; of a transport 3)"
+        "--rounds", type=count, metavar="N", help="turns of every measurement (9; of a transport 3)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
     parser.add_argument("--strict", action="store_true", help="exit 1 if a target is missed")
@@ -82,10 +83,14 @@ def add_parser(subparsers: Subparsers) -> None:
         help="one of them; repeat it for several (default: all that are installed)",
     )
     bus_parser.add_argument(
-        "--seconds", type=float, default=10.0, metavar="S", help="of each run, s (10)"
+        "--seconds", type=finite, default=10.0, metavar="S", help="of each run, s (10)"
     )
     bus_parser.add_argument(
-        "--rounds", type=int, default=argparse.SUPPRESS, metavar="N", help="of every transport (3)"
+        "--rounds",
+        type=count,
+        default=argparse.SUPPRESS,
+        metavar="N",
+        help="of every transport (3)",
     )
     bus_parser.add_argument(
         "--json",

@@ -18,6 +18,7 @@ from shared.exceptions import RunError
 from shared.mcap_log import provenance
 from shared.process import CHECKOUT
 from tools.fleet import procfs
+from tools.number_arguments import natural
 from tools.runs import experiment
 from tools.runs.scenario_runner import LiveSnapshot
 from tools.studies.crash import report
@@ -65,7 +66,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help=f"where {RESULTS}, {JUNIT} and a folder for each case go (default: "
         "out/crashtest-<time>); a case that did not stand keeps its run.mcap",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
+    parser.add_argument("--seed", type=natural, default=0, help="of the sensors' noise")
 
 
 def run(args: argparse.Namespace) -> int:

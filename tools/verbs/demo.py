@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
     plant_from(args.plant)  # refused before anything is started
     out = experiment.make_out(args.out, "demo")
-    console.print(f"[bold]{scenario.name}[/]: {scenario.about}{experiment.describe(scenario)}")
+    experiment.introduce(scenario, console)
     for other in procfs.fleets():
         console.print(
             f"[yellow]another fleet runs in {other}: two do not fit on two cores; "

@@ -28,6 +28,7 @@ from shared.exceptions import RunError
 from shared.robot import gain_schedule
 from shared.robot.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
+from tools.number_arguments import finite
 from tools.runs import snapshot_text
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
@@ -73,7 +74,9 @@ def add_parser(subparsers: Subparsers) -> None:
         """,
     )
     parser.add_argument("log", nargs="?", type=Path, metavar="RUN", help=RUN_HELP)
-    parser.add_argument("--at", type=float, metavar="T", help="scenario time, s (default: the end)")
+    parser.add_argument(
+        "--at", type=finite, metavar="T", help="scenario time, s (default: the end)"
+    )
     parser.add_argument(
         "--q",
         metavar="ANGLES|FILE",
@@ -87,7 +90,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "separated by commas; write --p=-0.01,... if it begins with a minus",
     )
     parser.add_argument(
-        "--assist", type=float, default=0.0, metavar="N", help="with --q and --p (0 N)"
+        "--assist", type=finite, default=0.0, metavar="N", help="with --q and --p (0 N)"
     )
     add_config(parser)
 

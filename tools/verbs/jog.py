@@ -20,6 +20,7 @@ from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, limits
 from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_reading, jog_drive
 from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see
+from tools.number_arguments import count, finite
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 BY: Final = 0.05
@@ -48,24 +49,24 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--axis", choices=AXES, default="theta", help="default: %(default)s")
     parser.add_argument(
         "--by",
-        type=float,
+        type=finite,
         default=BY,
         metavar="RAD",
         help="how far, and back; positive theta leans forward (default: %(default)s)",
     )
     parser.add_argument(
         "--period",
-        type=float,
+        type=finite,
         default=PERIOD_S,
         metavar="S",
         help="time of one there and back (default: %(default)s)",
     )
     parser.add_argument(
-        "--cycles", type=int, default=CYCLES, metavar="N", help="default: %(default)s"
+        "--cycles", type=count, default=CYCLES, metavar="N", help="default: %(default)s"
     )
     parser.add_argument(
         "--torque-limit",
-        type=float,
+        type=finite,
         default=TORQUE_LIMIT,
         metavar="NM",
         help="of both axes together at the joint; the drive's own current limit is set to it "

@@ -15,6 +15,7 @@ from shared.exceptions import FleetError
 from shared.process import StopFlag
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, request_here, wait_here
+from tools.number_arguments import finite
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 EVERY_S: Final = 0.02
@@ -34,7 +35,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_run_dir(parser)
     parser.add_argument(
-        "--for", dest="for_s", type=float, metavar="S", help="lay it down after S seconds"
+        "--for", dest="for_s", type=finite, metavar="S", help="lay it down after S seconds"
     )
 
 

@@ -21,6 +21,7 @@ from tools.analysis.reexecution.compare import size
 from tools.analysis.reexecution.execution import Execution
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.analysis.reexecution.params import with_params
+from tools.number_arguments import finite
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, parts_of, read_part
@@ -69,7 +70,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument(
         "--tolerance",
-        type=float,
+        type=finite,
         default=0.0,
         metavar="T",
         help="largest accepted difference of numbers (default 0: equal to the last bit)",

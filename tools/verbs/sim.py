@@ -13,6 +13,7 @@ from services.simulator.plant import plant_from
 from shared.bus.messages import SimTruth
 from shared.exceptions import RunError
 from shared.network.impairment import Impairment
+from tools.number_arguments import finite
 from tools.runs import experiment, recorded_lockstep, verdict_table
 from tools.runs.centralised.fleet import CONTROLS, SHIPPED
 from tools.verb_table import Subparsers, add_verb
@@ -37,18 +38,18 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     experiment.add_flags(parser)
     parser.add_argument(
-        "--delay", type=float, default=1.0, metavar="MS", help="of every link, each way (1)"
+        "--delay", type=finite, default=1.0, metavar="MS", help="of every link, each way (1)"
     )
     parser.add_argument(
         "--jitter",
-        type=float,
+        type=finite,
         default=0.0,
         metavar="MS",
         help="half the width of a uniform spread (0)",
     )
     parser.add_argument(
         "--loss",
-        type=float,
+        type=finite,
         default=0.0,
         metavar="P",
         help="probability that a message is lost, 0 to 1 (0)",
@@ -74,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     true_plant = plant_from(args.plant)
     network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
     out = experiment.make_out(args.out, "sim")
-    console.print(f"[bold]{scenario.name}[/]: {scenario.about}{experiment.describe(scenario)}")
+    experiment.introduce(scenario, console)
     bar = Progress(
         BarColumn(), TextColumn("{task.completed:5.1f} of {task.total:g} s"),
         TimeRemainingColumn(), console=console, transient=True,

@@ -14,6 +14,7 @@ from shared.robot.joints import MODULES
 from tools.fleet.pace import add_pace
 from tools.fleet.process_table import check_known, load_table
 from tools.fleet.supervise import SupervisedFleet
+from tools.number_arguments import finite
 from tools.runs.experiment import add_plant, make_out, scenario_file
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
@@ -65,7 +66,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument(
         "--snapshot",
-        type=float,
+        type=finite,
         metavar="SECONDS",
         help="record nothing until a fault, then SECONDS before and after it",
     )

@@ -17,8 +17,9 @@ from shared.config.scenarios import Scenario
 from shared.config.toml_file import parse_toml
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES
+from tools.number_arguments import count, finite
 from tools.runs.experiment import PLANT_FILE
-from tools.runs.recorded_robot import robot_of
+from tools.runs.recorded_robot import robot_of, text_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog
 from tools.runs.run_parts import add_part, read_asked
@@ -55,17 +56,17 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_part(parser)
     parser.add_argument(
-        "--every", type=float, default=0.1, metavar="S", help="between two moments (0.1 s)"
+        "--every", type=finite, default=0.1, metavar="S", help="between two moments (0.1 s)"
     )
     parser.add_argument(
         "--for",
         dest="for_s",
-        type=float,
+        type=finite,
         default=4.0,
         metavar="S",
         help="duration of each continued run; pushes and hand as recorded (4 s)",
     )
-    parser.add_argument("--workers", type=int, default=cores(), metavar="N", help="processes")
+    parser.add_argument("--workers", type=count, default=cores(), metavar="N", help="processes")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="for whatif.json and whatif.png (beside the log)"
     )
@@ -122,10 +123,8 @@ def scenario_of(log: RunLog) -> Scenario:
     Raises:
         RunError: the log does not hold it.
     """
-    text = log.attachments.get("scenario.toml")
-    if text is None:
-        raise RunError(f"{log.path}: holds no scenarios.toml; a run that was led by one has it")
-    scenario = parse_toml(text.decode(), f"{log.path}: scenarios.toml", Scenario)
+    where = f"{log.path}: scenario.toml"
+    scenario = parse_toml(text_of(log, "scenario.toml"), where, Scenario)
     scenarios.check(str(log.path), scenario)
     return scenario
 
@@ -136,10 +135,7 @@ def plant_of(log: RunLog) -> PlantConfig:
     Raises:
         RunError: the log does not hold it.
     """
-    text = log.attachments.get(PLANT_FILE)
-    if text is None:
-        raise RunError(f"{log.path}: holds no {PLANT_FILE}; a run of `xrl sim` or `demo` has one")
-    return parse_toml(text.decode(), f"{log.path}: {PLANT_FILE}", PlantConfig)
+    return parse_toml(text_of(log, PLANT_FILE), f"{log.path}: {PLANT_FILE}", PlantConfig)
 
 
 def show(counterfactuals: list[Counterfactual], names: str, for_s: float, console: Console) -> None:

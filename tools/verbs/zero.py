@@ -29,6 +29,7 @@ from shared.robot.joints import MODULES
 from tools.bringup import bench
 from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, zero
 from tools.fleet.supervise import SupervisedFleet
+from tools.number_arguments import finite
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 DEGREES_FROM: Final = 7.0
@@ -63,7 +64,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser._negative_number_matcher = _NEGATIVE  # noqa: SLF001 - no public way
     where.add_argument(
         "--standing",
-        type=float,
+        type=finite,
         metavar="HEIGHT",
         help="the robot stands or hangs as if it stood: both soles flat and level, at their "
         "distance (geometry.w_base), torso upright, COM over the ankles, the hips' axis so many "

@@ -10,6 +10,7 @@ from typing import Final
 from shared.exceptions import RunError
 from tools.analysis.playback.schedule import RATE_MAX, RATE_MIN
 from tools.analysis.playback.selection import CLOCK
+from tools.number_arguments import finite
 from tools.verb_table import add_run_dir
 
 PREFIX: Final = "replay"
@@ -118,7 +119,7 @@ def _add_when(parser: argparse.ArgumentParser) -> None:
         ("--duration", "-d", None, "S", "length of the part to play, in recorded seconds"),
     )
     for flag, short, default, metavar, words in numbers:
-        parser.add_argument(flag, short, type=float, default=default, metavar=metavar, help=words)
+        parser.add_argument(flag, short, type=finite, default=default, metavar=metavar, help=words)
     parser.add_argument("--loop", "-l", action="store_true", help="again and again, until Ctrl-C")
     parser.add_argument(
         "--start-paused", "-p", action="store_true", help="until space is pressed; on a terminal"
@@ -130,14 +131,14 @@ def _add_when(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--clock-hz",
-        type=float,
+        type=finite,
         default=CLOCK_HZ,
         metavar="HZ",
         help="its rate, in real time (default: %(default)g)",
     )
     parser.add_argument(
         "--wait",
-        type=float,
+        type=finite,
         default=WAIT_S,
         metavar="S",
         help="longest wait for the first subscriber, seconds (default: %(default)g)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
@@ -16,6 +17,7 @@ from tools.runs.run_files import MetadataByName, files_in
 
 ROBOT_FILE: Final = "robot.toml"
 
+_OFFSET: Final = re.compile(r"-?[0-9]{1,19}")
 _EVER: Final = 1 << 63
 _CLOCKS_APART_NS: Final = NS_PER_S
 """Wall clocks are set right by less while a machine runs; a restart changes far more."""
@@ -168,7 +170,10 @@ class RecordedFile:
         with open_log(self.path) as reader:
             for place in self.chunks:
                 if place.last_ns >= begin_ns and place.first_ns < end_ns:
-                    record = reader.read_at(place.start)
+                    try:
+                        record = reader.read_at(place.start)
+                    except RunError as error:
+                        raise RunError(f"{self.path}: {error}") from None
                     if record is not None:
                         self._learn(record)
                         yield record
@@ -192,13 +197,9 @@ class RecordedFile:
         """
         robot = self.metadata.get("run", {}).get("robot", "")
         offset = self.metadata.get("clock", {}).get("offset_ns", "")
-        try:
-            offset_ns = int(offset)
-        except ValueError:
-            robot = ""
-        if not robot:
+        if not robot or not _OFFSET.fullmatch(offset):
             raise RunError(
                 f"{self.path}: no metadata run.robot and clock.offset_ns; an MCAP file written by "
                 "services.recorder, not cut off before its first message, is right"
             )
-        return offset_ns
+        return int(offset)

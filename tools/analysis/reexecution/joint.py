@@ -16,10 +16,10 @@ from shared.bus.messages import DriveStatus, JointCommand, JointState, Message
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.config.robot_config import RobotConfig
 from tools.analysis.reexecution.compare import Comparison
+from tools.analysis.reexecution.memory import memory_of
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.runs.run_log import RunLog
 
-_decode = msgspec.json.Decoder(DriveManagerState).decode
 _encode: Final = msgspec.json.Encoder().encode
 
 
@@ -72,7 +72,7 @@ class JointExecution:
         """Go on from a recorded memory, or hold ours to it."""
         if self._module is None:
             self._module = DriveManager(self._robot, self._name)
-            self._module.restore(_decode(trace.snapshot))
+            self._module.restore(memory_of(trace.snapshot, DriveManagerState))
             self._outcome.starts += 1
             return
         if self._outcome.exact:

@@ -16,10 +16,10 @@ from shared.bus.traces import PlannerCheckpoint
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
 from tools.analysis.reexecution.found import BySeq
+from tools.analysis.reexecution.memory import memory_of
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.runs.run_log import RunLog
 
-_decode = msgspec.json.Decoder(TickState).decode
 _encode: Final = msgspec.json.Encoder().encode
 
 
@@ -80,7 +80,7 @@ class PlannerExecution:
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is None:
             return
-        known = _decode(snapshot.snapshot)
+        known = memory_of(snapshot.snapshot, TickState)
         self._planner = Planner(self._robot, status.session)
         self._planner.restore(known)
         self._state_seq = [-1 if state is None else state.seq for state in known.states]

@@ -12,6 +12,7 @@ from services.planner.certificate import DIRECTIONS
 from services.simulator.plant import IDEAL, PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from tools.number_arguments import count
 from tools.studies.sweeps import certificate_study, study
 from tools.studies.sweeps.certificate_study import CertificateCases, CertificateResult
 from tools.studies.sweeps.table import code_of
@@ -45,7 +46,7 @@ class CaseBatch(NamedTuple):
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the study's flags."""
     add_config(parser)
-    parser.add_argument("--n", type=int, default=N, help=f"cases ({N})")
+    parser.add_argument("--n", type=count, default=N, help=f"cases ({N})")
     parser.add_argument(
         "--rigid", action="store_true", help="a floor as hard as the certificate takes it"
     )

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from services.planner.dynamic_certificate import HALF_NAMES
 from shared.config.robot_config import RobotConfig
+from tools.number_arguments import count, natural
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.dynamics_trial import (
@@ -50,8 +51,8 @@ EXAMPLES: Final = """
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the study's flags."""
     add_config(parser)
-    parser.add_argument("--n", type=int, default=N, help=f"cases ({N})")
-    parser.add_argument("--only", type=int, metavar="CASE", help="run this case alone")
+    parser.add_argument("--n", type=count, default=N, help=f"cases ({N})")
+    parser.add_argument("--only", type=natural, metavar="CASE", help="run this case alone")
     study.add_flags(parser, "dynamics", f"{TABLE} and {PICTURE}")
 
 

@@ -10,6 +10,7 @@ import msgspec
 from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
+from tools.number_arguments import count, natural
 from tools.runs import experiment
 from tools.studies.sweeps import cases, picture, plants, push_range, report, study
 from tools.studies.sweeps.figures import ENDINGS, Ending
@@ -39,7 +40,7 @@ EXAMPLES: Final = """
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the study's flags."""
     add_config(parser)
-    parser.add_argument("--n", type=int, default=N, help=f"cases ({N})")
+    parser.add_argument("--n", type=count, default=N, help=f"cases ({N})")
     parser.add_argument(
         "--split", choices=experiment.choices("split"), help="gain split of the law"
     )
@@ -50,7 +51,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     experiment.add_imu(parser)
     parser.add_argument(
         "--only",
-        type=int,
+        type=natural,
         metavar="CASE",
         help="run this case alone and print all of it; exit code 1 if it fell",
     )

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
 from shared.config.toml_file import check_ranges
+from tools.number_arguments import count, finite, natural
 from tools.runs import experiment
 from tools.studies.sweeps import latency_picture, latency_report, plants, study
 from tools.studies.sweeps.figures import ENDINGS, Ending
@@ -80,7 +81,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         help=f"share of the messages that is lost; several as for --delay ({LOSSES})",
     )
     parser.add_argument(
-        "--trials", type=int, default=TRIALS, help=f"for each of these networks ({TRIALS})"
+        "--trials", type=count, default=TRIALS, help=f"for each of these networks ({TRIALS})"
     )
     about = "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items())
     parser.add_argument(
@@ -91,11 +92,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         help=f"which to compare (all): {about}",
     )
     parser.add_argument(
-        "--lead-easing", type=float, metavar="ALPHA", help="law.lead_easing, for all controls"
+        "--lead-easing", type=finite, metavar="ALPHA", help="law.lead_easing, for all controls"
     )
     parser.add_argument(
         "--only",
-        type=int,
+        type=natural,
         metavar="NUMBER",
         help="run this trial alone; exit code 1 if it fell, whatever its control (the study's is 1 "
         "if distributed fell)",

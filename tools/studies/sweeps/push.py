@@ -20,6 +20,7 @@ from services.simulator import plant as plants
 from services.simulator.plant import PlantConfig, plant_from
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from tools.number_arguments import finite, natural
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial, run_trial
@@ -57,14 +58,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--angle",
         action="append",
-        type=int,
+        type=natural,
         metavar="DEG",
         help="push that way, 0 forwards, 90 to the left; may be repeated (0, 45, 90, 135, 180)",
     )
     parser.add_argument(
         "--duration",
         action="append",
-        type=float,
+        type=finite,
         metavar="S",
         help="of the pushes; may be repeated (0.3, 3)",
     )

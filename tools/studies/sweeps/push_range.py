@@ -12,6 +12,7 @@ from services.planner.push_limit import LoadedStand
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Push
 from shared.exceptions import RunError
+from tools.number_arguments import finite
 
 DIGITS: Final = 3
 REACHED_M: Final = 1e-4
@@ -76,7 +77,7 @@ def add_flag(parser: argparse.ArgumentParser) -> None:
     """Add `--push`."""
     parser.add_argument(
         "--push",
-        type=float,
+        type=finite,
         default=SHARE,
         metavar="SHARE",
         help="push up to this share of what soles and motors bear, standing, in each direction: 1 "

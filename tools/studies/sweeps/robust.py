@@ -18,6 +18,7 @@ from scipy.stats import spearmanr
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from tools.number_arguments import count, finite, natural
 from tools.runs import experiment
 from tools.studies.sweeps import plants, push_range, study
 from tools.studies.sweeps.figures import ENDINGS, Ending
@@ -67,17 +68,17 @@ EXAMPLES: Final = """
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the study's flags."""
     add_config(parser)
-    parser.add_argument("--n", type=int, default=N, help=f"trials ({N})")
+    parser.add_argument("--n", type=count, default=N, help=f"trials ({N})")
     parser.add_argument(
         "--beyond",
-        type=float,
+        type=finite,
         default=1.0,
         metavar="F",
         help="widen every range of deploy/plants/ranges.toml F times about its middle (1)",
     )
     parser.add_argument(
         "--slope",
-        type=float,
+        type=finite,
         default=0.0,
         metavar="DEG",
         help="a floor that slopes by DEG degrees in a drawn direction (default: up to 1 degree, as "
@@ -87,7 +88,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     experiment.add_imu(parser)
     parser.add_argument(
         "--only",
-        type=int,
+        type=natural,
         metavar="TRIAL",
         help="run this trial alone and print all of it; exit code 1 if it fell",
     )

@@ -18,6 +18,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
+from tools.number_arguments import count, natural
 from tools.studies.sweeps import cluster, pool
 from tools.studies.sweeps.table import CaseTable, Row, Words, code_digest
 
@@ -100,9 +101,9 @@ def add_flags(parser: argparse.ArgumentParser, name: str, files: str, more: str 
         files: what `--out` will hold, in words.
         more: what else there is to say of `--out`.
     """
-    parser.add_argument("--seed", type=int, default=1, help="of the cases (1)")
+    parser.add_argument("--seed", type=natural, default=1, help="of the cases (1)")
     parser.add_argument(
-        "--workers", type=int, help=f"processes of this machine (one a core: {pool.cores()})"
+        "--workers", type=count, help=f"processes of this machine (one a core: {pool.cores()})"
     )
     parser.add_argument(
         "--cluster",

@@ -1,0 +1,231 @@
+"""Bad input gets one line that says what is wrong, exit code 2, and leaves nothing half-written."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+
+from shared.exceptions import RunError
+from tests.tools.analysis.reexecution.test_golden import NEWEST
+from tools import cli
+from tools.output import write_atomically
+from tools.runs.run_log import RunLog, read_run
+
+RUN = str(NEWEST)
+LONG = "x" * 5000
+NUMBERS = ("nan", "inf", "-inf", "1e300", "one", "")
+
+CASES: list[list[str]] = [
+    *(["sim", f"--{name}", bad] for name in ("jitter", "delay", "loss", "duration")
+      for bad in NUMBERS),
+    *(["sim", "--seed", bad] for bad in ("-1", "1.5", "9" * 30, "")),
+    *(["explain", "--p", "0,0,0.87,0,0,0", "--assist", bad] for bad in NUMBERS),
+    *(["explain", RUN, "--at", bad] for bad in NUMBERS),
+    *(["report", RUN, flag, bad] for flag in ("--from", "--to") for bad in NUMBERS),
+    *(["whatif", RUN, "--kill", "planner", flag, bad] for flag in ("--every", "--for")
+      for bad in NUMBERS),
+    *(["resim", RUN, "--tolerance", bad] for bad in NUMBERS),
+    *(["play", RUN, flag, bad] for flag in ("--rate", "--duration") for bad in NUMBERS),
+    *(["sweep", "kill", "--n", bad] for bad in ("99999999999", "-1", "0", "1.5")),
+    ["sweep", "kill", "--n", "1", "--seed", "-1"],
+    ["sweep", "kill", "--n", "1", "--workers", "-3"],
+    ["whatif", RUN, "--kill", "planner", "--workers", "0"],
+    ["sim", "--push", "1:0.3:nan,0,0"],
+    ["sim", "--push", "1:nan:1,1,1"],
+    ["sim", "--kill", "planner@nan"],
+    ["sim", "--plant", "drivetrain.stiffness=nan"],
+    ["sim", "--inject", "all delay=nan"],
+    ["sim", "--inject", "[/red] delay=3"],
+    ["sim", "--scenario", "[/red]"],
+    *([verb, LONG] for verb in ("info", "report", "explain", "resim", "play", "recover", "export")),
+    *([verb, "/dev/zero"] for verb in ("info", "report", "explain", "resim", "play", "recover")),
+    *(["sim", flag, LONG] for flag in ("--config", "--scenario", "--plant", "--out")),
+    *(["sim", flag, "/dev/zero"] for flag in ("--config", "--scenario")),
+    ["report", RUN, "-o", LONG, "--open", "no"],
+    ["export", RUN, "--gif", LONG],
+    ["export", RUN, "--scene", "-o", LONG],
+    ["stiffness", "--config", "/dev/zero"],
+    ["status", "--run-dir", LONG],
+    ["down", "--run-dir", LONG],
+    ["assist", "nan"],
+]  # fmt: skip
+
+
+def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """Return the last line of what a refused command line is told."""
+    try:
+        code: object = cli.main(words)
+    except SystemExit as ended:
+        code = ended.code
+    err = capsys.readouterr().err
+    assert code == 2, err
+    return err.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize("words", CASES, ids=lambda words: " ".join(words)[:60])
+def test_a_bad_command_line_is_refused_in_words(
+    words: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    line = told(words, capsys)
+    assert line.startswith("xrl")
+    assert len(line) > 20
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("verb", ["info", "report", "explain", "resim", "play", "recover"])
+def test_a_pipe_is_not_waited_on(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    assert "no ordinary file" in told([verb, str(tmp_path / "pipe")], capsys)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"a = " + b"[" * 9000, "nested too deeply"),
+        (b"\xff\xfe", "cannot be read"),
+        (b"a" * (1 << 25), "over 16 MiB"),
+    ],
+)
+def test_a_robot_file_that_is_none_is_refused(
+    content: bytes, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_bytes(content)
+    assert words in told(["stiffness", "--config", str(path)], capsys)
+
+
+def test_a_device_is_never_replaced_by_an_output(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "device")
+    with pytest.raises(RunError, match="no ordinary file"):
+        write_atomically(tmp_path / "device", b"x")
+    assert (tmp_path / "device").is_fifo()
+
+
+# -- logs that somebody made up ------------------------------------------------------------
+
+
+def made_up(
+    path: Path,
+    metadata: Mapping[str, dict[str, str]] | None = None,
+    attachments: Mapping[str, bytes] | None = None,
+    change: Callable[[str, int, bytes], tuple[int, bytes]] = lambda _, t_ns, data: (t_ns, data),
+) -> str:
+    """Write a copy of a run with something wrong in it."""
+    log: RunLog = read_run(NEWEST)
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(profile="xrl")
+        for name, entries in log.metadata.items():
+            writer.add_metadata(name, entries | (metadata or {}).get(name, {}))
+        for name, content in log.attachments.items():
+            writer.add_attachment(0, 0, name, "", (attachments or {}).get(name, content))
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        for key in log.keys():  # noqa: SIM118 - a log is no mapping
+            channel = writer.register_channel(key, "json", schema)
+            for received_ns, payload, seq in log.raw(key):
+                t_ns, data = change(key, received_ns + log.offset_ns, payload)
+                writer.add_message(channel, t_ns, data, t_ns, seq)
+        writer.finish()
+    return str(path)
+
+
+@pytest.mark.parametrize("digits", [19, 20, 5000])
+def test_a_clock_that_no_machine_has_is_refused(
+    digits: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made_up(tmp_path / "a.mcap", {"clock": {"offset_ns": "9" * digits}})
+    for verb in ("report", "explain", "resim"):
+        assert "offset_ns" in told([verb, path], capsys)
+
+
+def test_times_beyond_64_bits_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made_up(tmp_path / "a.mcap", change=lambda _, t, data: (min(2**63 + t, 2**64 - 1), data))
+    assert "do not fit each other" in told(["report", path], capsys)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"a = " + b"[" * 9000, b"a = 1"])
+def test_a_robot_file_in_a_log_that_is_none_is_refused(
+    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made_up(tmp_path / "a.mcap", attachments={"robot.toml": content})
+    for verb in ("explain", "resim"):
+        assert "robot.toml" in told([verb, path], capsys)
+
+
+@pytest.mark.parametrize("content", [b"{}", b"\xff", b"["])
+def test_gains_in_a_log_that_are_none_are_refused(
+    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made_up(tmp_path / "a.mcap", attachments={"robot.gains.json": content})
+    assert "no gain schedule" in told(["resim", path], capsys)
+
+
+def test_the_memory_of_another_version_is_refused_with_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def foreign(_key: str, t_ns: int, data: bytes) -> tuple[int, bytes]:
+        return t_ns, re.sub(rb'"snapshot":"(?:[^"\\]|\\.)+"', b'"snapshot":"{\\\\"a\\\\":1}"', data)
+
+    path = made_up(tmp_path / "a.mcap", change=foreign)
+    assert "with the checkout that wrote it" in told(["resim", path], capsys)
+
+
+def test_a_small_file_that_expands_to_gigabytes_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "bomb.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=30 << 20, compression=CompressionType.ZSTD)
+        writer.start(profile="xrl")
+        writer.add_metadata("run", {"robot": "xrl", "schema_version": "6"})
+        writer.add_metadata("clock", {"offset_ns": "0"})
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        channel = writer.register_channel("xrl/xrl/planner/status", "json", schema)
+        for number in range(12):
+            writer.add_message(channel, number, b" " * (30 << 20), number, number)
+        writer.finish()
+    assert path.stat().st_size < 100_000
+    for verb in ("report", "resim", "play"):
+        assert "expand to over" in told([verb, str(path)], capsys)
+
+
+def test_a_million_false_marks_of_chunks_are_passed_in_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each claimed 50 MB, which were looked through anew for each."""
+    mark = b"\x06" + struct.pack("<Q", 50 << 20) + b"\0" * 28 + b"\x04\0\0\0zstd"
+    path = tmp_path / "marks.mcap"
+    path.write_bytes(NEWEST.read_bytes()[:20_000] + mark * 1_000_000)
+    assert cli.main(["info", str(path)]) == 0
+    assert "not finished" in capsys.readouterr().out
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    places=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=30),
+    kept=st.floats(0.0, 1.0),
+)
+def test_no_damage_ends_a_reader_without_words(
+    places: list[tuple[float, int]], kept: float, tmp_path: Path
+) -> None:
+    data = bytearray(NEWEST.read_bytes())
+    for place, byte in places:
+        data[int(place * (len(data) - 1))] = byte
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(data[: max(1, int(kept * len(data)))])
+    for words in (["info"], ["report", "--open", "no"]):
+        assert cli.main([words[0], str(path), *words[1:]]) in (0, 2)

@@ -1,0 +1,51 @@
+"""Numbers on a command line: finite ones, counts, seeds; each with its error in one line."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from typing import Final
+
+FINITE_MAX: Final = 1e12
+COUNT_MAX: Final = 1_000_000
+NATURAL_MAX: Final = 2**63 - 1
+
+
+def finite(text: str) -> float:
+    """Return a number.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none, not finite or beyond any use.
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not abs(number) <= FINITE_MAX:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: a finite number is right")
+    return number
+
+
+def count(text: str) -> int:
+    """Return a number of things.
+
+    Raises:
+        argparse.ArgumentTypeError: it is no whole number from 1 to a million.
+    """
+    return _whole(text, 1, COUNT_MAX)
+
+
+def natural(text: str) -> int:
+    """Return a whole number from 0 on: a seed, a case, an angle.
+
+    Raises:
+        argparse.ArgumentTypeError: it is no whole number from 0 on.
+    """
+    return _whole(text, 0, NATURAL_MAX)
+
+
+def _whole(text: str, low: int, high: int) -> int:
+    digits = text.strip()
+    if digits.isdecimal() and len(digits) < 20 and low <= int(digits) <= high:
+        return int(digits)
+    raise argparse.ArgumentTypeError(f"{text[:40]!r}: a whole number from {low} to {high} is right")
