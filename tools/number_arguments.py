@@ -48,4 +48,6 @@ def _whole(text: str, low: int, high: int) -> int:
     digits = text.strip()
     if digits.isdecimal() and len(digits) < 20 and low <= int(digits) <= high:
         return int(digits)
-    raise argparse.ArgumentTypeError(f"{text[:40]!r}: a whole number from {low} to {high} is right")
+    raise argparse.ArgumentTypeError(
+        f"{text[:40]!r}: must be a whole number of at least {low}, at most {high}"
+    )

@@ -204,6 +204,8 @@ def states(robot: RobotConfig, now_ns: int, seq: int) -> list[JointState]:
             tau=(float(tau[2 * i]), float(tau[2 * i + 1])),
             mode=int(Mode.TRACK),
             ready=True,
+            session=1,
+            age_ns=2 * NS_PER_MS,
         )
         for i, state in enumerate(blank)
     ]

@@ -104,8 +104,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    if args.rounds is not None and args.rounds < 1:
-        raise RunError(f"--rounds {args.rounds}: at least 1")
     code: int = args.bench(args)
     return code
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from shared.exceptions import RunError
-from tools import cli
+from tests.tools.exit_codes import exit_code
 from tools.bench import bus
 from tools.bench.bus import BusFigures
 from tools.bench.bus_process import PLANNER, BusReport
@@ -64,12 +64,15 @@ def test_over_datagrams_the_newest_payload_is_taken_once(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("flags", "wrong"),
-    [(["--rounds", "0"], "--rounds 0: at least 1"), (["--seconds", "0"], "--seconds 0: above 0")],
+    [
+        (["--rounds", "0"], "--rounds: '0': must be a whole number of at least 1"),
+        (["--seconds", "0"], "--seconds 0: above 0"),
+    ],
 )
 def test_bad_input_is_one_line(
     flags: list[str], wrong: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["bench", "bus", *flags]) == 2
+    assert exit_code(["bench", "bus", *flags]) == 2
     assert wrong in capsys.readouterr().err
 
 

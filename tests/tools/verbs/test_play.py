@@ -40,7 +40,6 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     ("words", "right"),
     [
         (("--rate", "0"), "0.001 .. 1000 is right"),
-        (("--rate", "nan"), "0.001 .. 1000 is right"),
         (("--rate", "-1"), "0.001 .. 1000 is right"),
         (("--start-offset", "-0.1"), "--start-offset -0.1"),
         (("--start-offset", "9"), "the log is 0.04 s long"),

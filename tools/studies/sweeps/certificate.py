@@ -60,7 +60,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study; 1 if a case fell that was said to stand."""
-    study.check_least(("--n", args.n, 1))
     executor = study.executor_of(args, CODE)
     robot = config_file.load(args.config)
     plant = IDEAL if args.friction else certificate_study.FRICTIONLESS

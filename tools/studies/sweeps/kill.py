@@ -61,7 +61,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one case of it; 1 if any fell."""
-    study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
     push_range.check(args)
     executor = study.executor_of(args, CODE)
     robot = experiment.make_robot(args)

@@ -98,7 +98,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study, or one trial of it; 1 if any fell."""
-    study.check_least(("--n", args.n, 1), ("--only", args.only or 0, 0))
     if not 0.0 <= args.slope <= SLOPE_MAX_DEG:
         raise RunError(f"--slope {args.slope:g}: 0 to {SLOPE_MAX_DEG:g} degrees")
     push_range.check(args)

@@ -126,24 +126,11 @@ def executor_of(args: argparse.Namespace, code: tuple[str, ...]) -> Executor:
     Raises:
         RunError: the flags do not go together, or make no sense.
     """
-    if args.workers is not None:
-        check_least(("--workers", args.workers, 1))
     if args.cluster is not None and args.workers is not None:
         raise RunError("--workers are of this machine, --cluster has its own; leave one out")
     if args.cluster is not None and getattr(args, "only", None) is not None:
         raise RunError("--only runs here, in one process; leave --cluster out")
     return Executor(args.workers or pool.cores(), args.cluster, code)
-
-
-def check_least(*flags: tuple[str, int, int]) -> None:
-    """Check numbers: name of the flag, value, least.
-
-    Raises:
-        RunError: one is less.
-    """
-    for flag, value, least in flags:
-        if value < least:
-            raise RunError(f"{flag} {value}: must be at least {least}")
 
 
 def digest_of(robot: RobotConfig) -> str:

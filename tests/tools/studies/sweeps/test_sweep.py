@@ -20,6 +20,7 @@ import pytest
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot import gain_schedule
+from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.studies.sweeps import cases, pool
 from tools.studies.sweeps.prepare import prepare
@@ -181,8 +182,9 @@ def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
 def test_a_number_that_makes_no_sense_is_refused(
     flags: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert sweep(*flags) == 2
-    assert re.fullmatch(rf"xrl: {flags[0]} -?\d: must be at least \d\n", capsys.readouterr().err)
+    assert exit_code(["sweep", "kill", "--split", "diagonal", *flags]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(rf"{flags[0]}: '{flags[1]}': must be a whole number of at least \d", error)
 
 
 def session(sid: int) -> list[int]:

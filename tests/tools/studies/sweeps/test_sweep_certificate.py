@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.tools.exit_codes import exit_code
 from tools import cli
 
 FEW = ("--n", "2", "--seed", "1", "--rigid", "--workers", "1")
@@ -41,5 +42,5 @@ def test_another_seed_is_refused_in_the_same_folder(
 
 
 def test_no_cases_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert sweep(tmp_path, "--n", "0") == 2
+    assert exit_code(["sweep", "certificate", "--n", "0", "--out", tmp_path]) == 2
     assert "at least 1" in capsys.readouterr().err

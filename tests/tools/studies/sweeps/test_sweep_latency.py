@@ -88,7 +88,7 @@ def test_values_that_make_no_sense_are_refused(text: str) -> None:
         (("--loss", "1.5"), "from 0 to 1"),
         (("--control", "distributed,mine"), "'mine'; some of distributed, diagonal, centralised"),
         (("--delay", "0-200"), "FROM:TO:STEP"),
-        (("--trials", "0"), "--trials 0: must be at least 1"),
+        (("--trials", "0"), "--trials: '0': must be a whole number of at least 1"),
         (("--lead-easing", "2"), "lead_easing"),
     ],
 )

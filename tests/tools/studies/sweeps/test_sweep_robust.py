@@ -11,6 +11,7 @@ import msgspec
 import pytest
 
 from shared.config.robot_config import RobotConfig
+from tests.tools.exit_codes import exit_code
 from tools import cli
 from tools.studies.sweeps import plants, robust
 from tools.studies.sweeps.figures import Ending
@@ -66,8 +67,8 @@ def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Pat
 
 
 def test_an_impossible_width_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["sweep", "robust", "--n", "0"]) == 2
-    assert "--n 0" in capsys.readouterr().err
+    assert exit_code(["sweep", "robust", "--n", "0"]) == 2
+    assert "--n: '0'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", [0, 1])
