@@ -124,7 +124,9 @@ class RunDir:
     def _foreign(self) -> str | None:
         """Return the name of a file that no fleet has left here, or None."""
         for entry in sorted(self.path.iterdir()):
-            ours = any(entry.match(pattern) for pattern in _OURS)
+            ours = any(entry.match(pattern) for pattern in _OURS) or (
+                entry == self.logs and self.supervisor_log.exists()
+            )
             if not ours and not stat.S_ISSOCK(entry.lstat().st_mode):
                 return entry.name
         return None

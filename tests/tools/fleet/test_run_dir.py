@@ -104,6 +104,13 @@ def test_sockets_of_services_started_by_hand_are_no_obstacle(run_dir: Path) -> N
     os.close(RunDir(run_dir).claim())
 
 
+def test_what_a_fleet_of_an_earlier_version_left_is_no_obstacle(run_dir: Path) -> None:
+    """It left its logs, and no mark."""
+    (run_dir / "logs").mkdir(parents=True)
+    (run_dir / "logs/supervisord.log").touch()
+    os.close(RunDir(run_dir).claim())
+
+
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702])
 def test_a_directory_that_others_may_write_to_is_refused(run_dir: Path, mode: int) -> None:
     run_dir.mkdir()

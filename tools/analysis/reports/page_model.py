@@ -156,6 +156,9 @@ class PageModel:
         self.window = PageWindow()
         """What of the data added is taken."""
         self._panels: dict[str, _Panel] = {}
+        self._encoded_panels: tuple[list[tuple[_Panel, dict[str, Any] | None]], _Signals] | None = (
+            None
+        )
 
     def plot(
         self,
@@ -264,14 +267,20 @@ class PageModel:
         return [(panel.title, panel.if_empty) for panel, data in panels if data is None]
 
     def _panel(self, kind: str, title: str, unit: str, note: str, if_empty: str) -> _Panel:
+        self._encoded_panels = None
         found = self._panels.get(title)
         if found is None:
             found = self._panels[title] = _Panel(kind, title, unit, note, if_empty)
+        elif unit:  # a part before it may have had nothing to show
+            found.unit, found.note, found.if_empty = unit, note, if_empty
         return found
 
     def _encoded(self) -> tuple[list[tuple[_Panel, dict[str, Any] | None]], _Signals]:
-        signals = _Signals(self.span)
-        return [(panel, _data(panel, signals)) for panel in self._panels.values()], signals
+        if self._encoded_panels is None:
+            signals = _Signals(self.span)
+            panels = [(panel, _data(panel, signals)) for panel in self._panels.values()]
+            self._encoded_panels = panels, signals
+        return self._encoded_panels
 
 
 class _Signals:

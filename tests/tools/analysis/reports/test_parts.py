@@ -14,6 +14,8 @@ from tests.tools.analysis.reports.runs import Made
 from tools import cli
 from tools.analysis.reports import scene
 from tools.analysis.reports.page import render_parts
+from tools.analysis.reports.page_model import Line, PageModel, PageWindow
+from tools.analysis.reports.signals import Span
 from tools.runs import verdict
 from tools.runs.judgement import summarise_parts
 from tools.runs.recorded_robot import robot_of
@@ -170,3 +172,31 @@ def test_events_are_in_every_part_and_all_other_messages_in_one(log: RunLog) -> 
 
 def test_time_zero_is_that_of_the_scenario(log: RunLog) -> None:
     assert zero_ns(log.index) == verdict.course(log).zero_ns
+
+
+def test_a_panel_without_data_in_the_first_part_has_its_unit_and_note_from_a_later_one() -> None:
+    model = PageModel(Span(0.0, 2.0))
+    model.leave_out("Age", "nothing yet")
+    assert model.left_out == [("Age", "nothing yet")]
+    line = Line("x", np.array([1.2, 1.4]), np.array([0.0, 3.0]), 0)
+    model.plot("Age", "ms", [line], note="how old", if_empty="none")
+    assert model.left_out == []
+    (panel,) = model.as_data([])["panels"]
+    assert (panel["unit"], panel["note"]) == ("ms", "how old")
+
+
+def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
+    """Each part counts from its margin on, which is the end of the part before."""
+    model = PageModel(Span(0.0, 2.0))
+    parts = (
+        (PageWindow(0.0, 1.0), [0.0, 0.5, 0.9, 1.1], [0.0, 1.0, 3.0, 4.0]),
+        (PageWindow(1.0, 2.0), [0.9, 1.1, 1.5, 1.9], [0.0, 1.0, 1.0, 6.0]),
+    )
+    for window, t, values in parts:
+        model.window = window
+        line = Line("late", np.array(t), np.array(values), 0, counts_up=True)
+        model.plot("Late", "count", [line], needs_count=True)
+    data = model.as_data([])
+    _, seen = pages.line(data, "Late", "late")
+    assert seen[-1] == pytest.approx(9.0, abs=1e-3), "3 in the first part, 6 in the second"
+    assert (np.diff(seen) >= 0.0).all()
