@@ -62,6 +62,7 @@ class Page:
         self._axis = axis
         self._model: PageModel | None = None
         self._about: RunData | None = None
+        self._has_first = self._has_last = False
         self._timeline = Timeline()
         self._judge = summary.Judge()
         self._losses = summary.MessageLosses()
@@ -73,6 +74,8 @@ class Page:
             RunError: a message has another version.
         """
         run = RunData(log, self._axis)
+        self._has_first |= log.is_first
+        self._has_last |= log.is_last
         if self._about is None or (self._about.course is None and run.course is not None):
             self._about = run  # a part in which the scenario runs names the time axis
         self._model = self._model or PageModel(run.span)
@@ -90,7 +93,7 @@ class Page:
         assert model is not None  # noqa: S101
         log = run.log
         events = self._timeline.events(run.span)
-        verdict = self._judge.verdict(log)
+        verdict = self._judge.verdict(log, whole=self._has_first and self._has_last)
         name = log.metadata["run"].get("scenario") or log.path.name
         fell_s = next((row.t for row in events if row.kind == "fall"), None)
         parts = (

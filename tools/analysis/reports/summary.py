@@ -71,17 +71,20 @@ class Judge:
         except XrlError as error:
             self._why_not = str(error)
 
-    def verdict(self, log: RunLog) -> RunVerdict:
+    def verdict(self, log: RunLog, *, whole: bool = True) -> RunVerdict:
         """Return the verdict.
 
         Args:
             log: the run, or any part of it.
+            whole: all of the run was taken; False gives the figures alone.
         """
         if not self._summaries:
             return RunVerdict(f"No verdict: {self._why_not}", None, [])
         summary = verdict.joined(self._summaries)
         if log.metadata["run"].get("lockstep"):
             summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
+        if not whole:
+            return RunVerdict("A part of a run, and its figures: no verdict", None, _rows(summary))
         lines = _verdict_lines(summary)
         caution = "" if summary["in_real_time"] else lines[-2]
         return RunVerdict(lines[-1], bool(summary["stood"]), _rows(summary), caution)

@@ -37,6 +37,13 @@ def section(page: str, name: str) -> list[str]:
     return re.findall(r"<(?:span|td)[^>]*>([^<]+)<", found[1])
 
 
+def test_the_sentence_of_the_verdict_is_that_of_the_whole(page: str, in_parts: str) -> None:
+    whole, parts = (re.search(r'id="verdict">([^<]+)<', one) for one in (page, in_parts))
+    assert whole is not None
+    assert parts is not None
+    assert parts[1] == whole[1]
+
+
 def test_the_timeline_is_that_of_the_whole(page: str, in_parts: str) -> None:
     assert len(section(page, "timeline")) > 10
     whole, parts = (
@@ -126,6 +133,7 @@ def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
     out = tmp_path / "part.html"
     words = ["--from", "1", "--to", "2", "-o", str(out), "--open", "no"]
     assert cli.main(["report", str(made.path), *words]) == 0
+    assert 'id="verdict">A part of a run, and its figures: no verdict<' in out.read_text()
     data = pages.data_of(out.read_text())
     assert data["span"] == pytest.approx([1.0, 2.0], abs=1e-6)
     t, values = pages.line(data, "COM", "x")
