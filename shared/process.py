@@ -12,7 +12,7 @@ from types import FrameType
 
 from shared import log
 from shared.exceptions import XrlError
-from shared.run_directory import default_run_dir, own_directory
+from shared.run_directory import default_run_dir
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 """Top of this checkout; where the packages are installed, the folder that holds them."""
@@ -33,8 +33,8 @@ def service_parser(description: str, example: str) -> argparse.ArgumentParser:
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, help="robot file (TOML)")
     parser.add_argument(
         "--run-dir",
-        type=own_directory,
-        default=str(default_run_dir()),
+        type=Path,
+        default=default_run_dir(),
         help="directory of the fleet's sockets",
     )
     return parser

@@ -22,8 +22,13 @@ def default_run_dir() -> Path:
     return Path(os.environ.get(RUN_DIR_VARIABLE) or f"/tmp/xrl-{os.getuid()}")  # noqa: S108 - short on purpose: socket paths have 107 bytes
 
 
-def check_own(path: Path) -> None:
-    """Refuse a directory that is not this user's alone; one that is not there is no fault.
+def check_own(path: Path, *, alone: bool = True) -> None:
+    """Refuse a directory that is not this user's; one that is not there is no fault.
+
+    Args:
+        path: the directory.
+        alone: refuse one that others may write to, too. A fleet is not started or acted on in
+            such a one; it can be stopped, for it may have become one while the fleet was up.
 
     Raises:
         FleetError: it is somebody else's, others may write to it, or it is no directory.
@@ -40,7 +45,7 @@ def check_own(path: Path) -> None:
     if not stat.S_ISDIR(found.st_mode):
         raise FleetError(f"{path}: is no directory; give another --run-dir")
     _check_owner(path, found.st_uid)
-    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+    if alone and found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise FleetError(
             f"{path}: others may write to it; `chmod go-w {path}`, or give another --run-dir"
         )
@@ -50,11 +55,11 @@ def own_directory(text: str) -> Path:
     """Return a run directory named on a command line.
 
     Raises:
-        argparse.ArgumentTypeError: it is not this user's alone.
+        argparse.ArgumentTypeError: it is somebody else's.
     """
     path = Path(text)
     try:
-        check_own(path)
+        check_own(path, alone=False)
     except FleetError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return path

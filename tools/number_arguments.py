@@ -36,12 +36,22 @@ def count(text: str) -> int:
 
 
 def natural(text: str) -> int:
-    """Return a whole number from 0 on: a seed, a case, an angle.
+    """Return a whole number from 0 on: a seed, a case.
 
     Raises:
         argparse.ArgumentTypeError: it is no whole number from 0 on.
     """
     return _whole(text, 0, NATURAL_MAX)
+
+
+def degrees(text: str) -> int:
+    """Return a direction, degrees.
+
+    Raises:
+        argparse.ArgumentTypeError: it is no whole number from -360 to 360.
+    """
+    sign = -1 if text.strip().startswith("-") else 1
+    return sign * _whole(text.strip().removeprefix("-"), 0, 360)
 
 
 def _whole(text: str, low: int, high: int) -> int:

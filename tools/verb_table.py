@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
@@ -78,11 +79,19 @@ def add_verb(subparsers: Subparsers, name: str, examples: str) -> argparse.Argum
     )
 
 
-def add_run_dir(parser: argparse.ArgumentParser) -> None:
-    """Add `--run-dir`: which fleet is meant."""
+def add_run_dir(
+    parser: argparse.ArgumentParser, check: Callable[[str], Path] = own_directory
+) -> None:
+    """Add `--run-dir`: which fleet is meant.
+
+    Args:
+        parser: of the verb.
+        check: takes the directory's name; that of another user is refused, but where a robot is
+            to be stopped.
+    """
     parser.add_argument(
         "--run-dir",
-        type=own_directory,
+        type=check,
         default=str(default_run_dir()),
         metavar="DIR",
         help="directory of the fleet's sockets and logs (default: "

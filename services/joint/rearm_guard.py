@@ -17,6 +17,7 @@ The file is mapped: reading and writing it are loads and stores, which the contr
 from __future__ import annotations
 
 import mmap
+import os
 import struct
 from collections.abc import Sequence
 from contextlib import suppress
@@ -101,9 +102,12 @@ def request_stop(run_dir: Path, module: str) -> bool:
     path = path_of(run_dir, module)
     if not path.exists():
         return False
-    with path.open("r+b") as file:
-        file.seek(_STOP)
-        file.write(b"\x01")
+    # whoever may stop the robot may not be the one who made the directory
+    descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+    try:
+        os.pwrite(descriptor, b"\x01", _STOP)
+    finally:
+        os.close(descriptor)
     return True
 
 

@@ -160,9 +160,7 @@ class Planner:
         if len(states) < N_MODULES:
             return []
         fresh = [now_ns - arrived <= self._stale_ns for arrived in self._arrived_ns]
-        self._watch_rival(
-            now_ns, [s for s, is_fresh in zip(states, fresh, strict=True) if is_fresh]
-        )
+        self._watch_rival([states[i] for i in range(N_MODULES) if fresh[i]])
         engagement = self._engagement
         engagement.advance(
             now_ns,
@@ -247,14 +245,9 @@ class Planner:
         self._law.restore(m.law)
         self._trips.restore(m.trips)
 
-    def _watch_rival(self, now_ns: int, states: Sequence[JointState]) -> None:
-        """Find out if another planner leads.
-
-        The modules may have retired this planner's session for the other's: once it may send again
-        it goes on in a new one.
-        """
-        changed = self._rival.advance(now_ns, self.session, states, self._command_age_ns)
-        if changed and not self._rival.yields:
+    def _watch_rival(self, states: Sequence[JointState]) -> None:
+        """Find out if another planner leads, and if modules have retired this one's session."""
+        if self._rival.advance(self.session, states, self._command_age_ns):
             self.session += 1
 
     def _commands(

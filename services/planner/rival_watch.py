@@ -8,17 +8,17 @@ planner that sees modules follow another one sends nothing until that one has en
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
 
-from shared.bus.messages import JointState
+from shared.bus.messages import JointState, Refusal
 from shared.clock import NS_PER_MS
 
 AGAIN_NS: Final = 500 * NS_PER_MS
-"""Time without a module that follows another planner, until this one may lead again: the other may
-only have been held up."""
+"""Age of another planner's newest command from which one that nobody follows may lead: younger, the
+other may only have been held up."""
 
 
 class RivalWatch(msgspec.Struct):
@@ -28,31 +28,37 @@ class RivalWatch(msgspec.Struct):
     """True while this planner sends nothing."""
     session: int = 0
     """Session of the other planner; 0 if none was seen."""
-    seen_ns: int = 0
-    """When a module was last seen to follow it."""
 
-    def advance(self, now_ns: int, own: int, states: Iterable[JointState], age_max_ns: int) -> bool:
-        """Advance by one tick; return True if this planner stops or begins to send.
+    def advance(self, own: int, states: Sequence[JointState], age_max_ns: int) -> bool:
+        """Advance by one tick.
 
         Args:
-            now_ns: the planner's clock.
-            own: its session.
+            own: this planner's session; the one below it was its own before.
             states: of the modules that have sent one lately.
-            age_max_ns: a module with an older command follows nobody.
+            age_max_ns: a module with an older command holds.
+
+        Returns:
+            True if this planner has to go on in a new session: a module has retired its own for
+            another's, and refuses it for good.
         """
+        mine = (own, own - 1)
+        followed = any(state.session in mine and _is_in_use(state, age_max_ns) for state in states)
+        within_ns = age_max_ns if followed else AGAIN_NS
         follow = Counter(
-            state.session for state in states if state.session and 0 <= state.age_ns <= age_max_ns
+            state.session for state in states if state.session and _is_in_use(state, within_ns)
         )
-        own_count = follow.pop(own, 0)
+        own_count = sum(follow.pop(session, 0) for session in mine)
         # of planners with equally many modules, as after a start at the same time, one goes on
         rival, count = min(follow.items(), key=lambda row: (-row[1], row[0]), default=(0, 0))
-        before = self.yields
-        if count:
-            self.session, self.seen_ns = rival, now_ns
-            self.yields = (count, -rival) > (own_count, -own)
-        elif self.yields:
-            self.yields = now_ns - self.seen_ns < AGAIN_NS
-        return self.yields is not before
+        self.session = rival or self.session
+        self.yields = count > 0 and (count, -rival) > (own_count, -own)
+        return not self.yields and any(
+            state.refusal == Refusal.FOREIGN_SESSION
+            and state.refused_session == own
+            and state.session not in mine
+            and not _is_in_use(state, age_max_ns)
+            for state in states
+        )
 
     def describe(self) -> str:
         """Return what to say while it yields; else nothing."""
@@ -62,3 +68,7 @@ class RivalWatch(msgspec.Struct):
             f"another planner leads (session {self.session}), and this one sends nothing; end one "
             "of them: this one goes on when the other has ended"
         )
+
+
+def _is_in_use(state: JointState, age_max_ns: int) -> bool:
+    return 0 <= state.age_ns <= age_max_ns

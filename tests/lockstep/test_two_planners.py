@@ -126,6 +126,36 @@ def test_one_that_was_held_up_lets_the_other_lead_and_leads_when_that_ends(
     assert fleet.modes == {Mode.TRACK}
 
 
+def test_one_that_was_held_up_past_the_others_end_leads_again(robot: RobotConfig) -> None:
+    """It never saw the other, for which all six had retired it: they refused it for good."""
+    scenario = variant(
+        "stand",
+        duration=6.0,
+        keyframe=SQUAT,
+        push=(),
+        kill=(Kill(service="planner", at=1.0, signal="STOP"),),
+        restart=(Restart(service="planner", at=4.0),),
+    )
+    fleet = TwoPlanners(robot, scenario, 0.5, 3.5)
+    run(fleet)
+    assert fleet.sent > 0
+    assert fleet.planner is not None
+    assert fleet.accepted[-1][1] == (fleet.planner.session,) * 6
+    assert fleet.modes == {Mode.TRACK}
+
+
+def test_a_second_one_that_starts_while_the_first_is_held_up_for_a_moment_waits(
+    robot: RobotConfig,
+) -> None:
+    """It caught some modules in the gap, and neither led any more."""
+    lost = (Inject(link="planner->joints", at=1.0, duration=0.3, partition=True),)
+    scenario = variant("stand", duration=4.0, keyframe=SQUAT, kill=(), push=(), inject=lost)
+    fleet = TwoPlanners(robot, scenario, 1.1, 9.0)
+    run(fleet)
+    assert fleet.sent == 0
+    assert fleet.modes == {Mode.TRACK}
+
+
 def test_two_that_start_at_once_agree_on_one(robot: RobotConfig) -> None:
     scenario = variant("stand", duration=3.0, keyframe=SQUAT, kill=(), push=())
     fleet = TwoPlanners(robot, scenario, -100.0, 9.0)

@@ -68,18 +68,21 @@ class RunDir:
 
     @property
     def is_marked(self) -> bool:
-        """True for a directory that is this user's alone, and a fleet's.
+        """True for a directory that is this user's, and a fleet's.
 
         Raises:
-            FleetError: the directory is there, and is not this user's alone.
+            FleetError: the directory is there, and is not this user's.
         """
-        check_own(self.path)
+        check_own(self.path, alone=False)
         return self.marker.exists()
 
-    def claim(self) -> int:
+    def claim(self, *, alone: bool = True) -> int:
         """Make the directory, or take one that is empty or a fleet's; mark and lock it.
 
         The supervisor inherits the descriptor, so the lock lives as long as it does.
+
+        Args:
+            alone: refuse a directory that others may write to.
 
         Returns:
             The descriptor that holds the lock.
@@ -89,7 +92,7 @@ class RunDir:
                 files that are no fleet's.
         """
         while True:
-            descriptor = self._open()
+            descriptor = self._open(alone=alone)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -102,8 +105,8 @@ class RunDir:
                 return self._marked(descriptor)
             os.close(descriptor)  # removed by a `down` before we had the lock: again
 
-    def _open(self) -> int:
-        check_own(self.path)
+    def _open(self, *, alone: bool) -> int:
+        check_own(self.path, alone=alone)
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             return os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)

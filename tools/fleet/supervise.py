@@ -19,6 +19,7 @@ from typing import Self
 from services.joint import rearm_guard
 from services.simulator import usb_standin
 from shared.exceptions import FleetError
+from shared.run_directory import check_own
 from tools.fleet import process_table, procfs
 from tools.fleet.pace import check_pace, usual_pace
 from tools.fleet.run_dir import Manifest, RunDir, supervisor_config
@@ -123,6 +124,7 @@ class SupervisedFleet:
             FleetError: none is.
         """
         attached = cls(run_dir)
+        check_own(attached.run.path)
         if (
             not attached.run.is_marked
             or attached.run.read_manifest() is None
@@ -207,7 +209,7 @@ class SupervisedFleet:
         if not self.run.is_marked:
             return  # no fleet was ever here: nothing in it is ours
         try:
-            lock = self.run.claim()
+            lock = self.run.claim(alone=False)
         except FleetError:
             return  # the next fleet is starting here already, and has cleared up
         try:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from shared.exceptions import RunError
+from shared.mcap_log.sequence_stats import KeyCount
 from tools.runs import figure, verdict
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import PICTURE_MAX_S, RunLog, RunPart, parts_of
@@ -51,12 +52,14 @@ def summarise_parts(index: RunIndex, duration_s: float) -> Summary:
         RunError: none of them can be judged; says why the first cannot.
     """
     found: list[Summary] = []
+    counts: dict[str, KeyCount] = {}
     why: RunError | None = None
     for part in parts_of(index):
+        part.count_into(counts)
         try:
             found.append(verdict.summarise(part, duration_s))
         except RunError as error:  # the scenario has not begun in it
             why = why or error
     if not found:
         raise why or RunError(f"{index.path}: holds nothing to judge")
-    return verdict.joined(found)
+    return verdict.joined(found, counts.values())

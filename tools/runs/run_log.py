@@ -153,6 +153,22 @@ class RunLog:
         """
         return self._of(self._key(topic, module)).received_ns
 
+    def holds(self, received_ns: int) -> bool:
+        """Return True for a message of this part, False for one of its margins."""
+        return (self.is_first or self.begin_ns <= received_ns) and (
+            self.is_last or received_ns < self.end_ns
+        )
+
+    def count_into(self, counts: dict[str, KeyCount]) -> None:
+        """Count the messages of this part, without its margins, after those of the parts before."""
+        for key in self.keys():
+            count = counts.setdefault(key, KeyCount())
+            for t_ns, _, seq in self.raw(key):
+                if (self.is_first or self.begin_ns <= t_ns) and (
+                    self.is_last or t_ns < self.end_ns
+                ):
+                    count.feed(seq)
+
     def gaps(self) -> dict[str, KeyCount]:
         """Return counts, gaps and restarts of every key with messages, from the file itself."""
         found = {}

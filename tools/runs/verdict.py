@@ -5,7 +5,7 @@ Everything is read from the MCAP file, so that a run can be judged again at any 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -26,6 +26,7 @@ from shared.bus.messages import (
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError, RunError
+from shared.mcap_log.sequence_stats import KeyCount
 from shared.robot.joints import MODULES
 from tools.runs.impairment_intervals import Impaired, impairments, touches
 from tools.runs.recorded_robot import robot_of
@@ -149,11 +150,12 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
 
 LAST_COUNTS: Final = ("world_time_lost_s", "real_time_factor", "duration_s", "pace", "began")
 """Figures that a later part has of the whole run."""
-SUMS: Final = ("messages_recorded", "sequence_gaps")
+COUNTED: Final = ("messages_recorded", "sequence_gaps")
+"""Figures that parts with margins cannot tell: `joined` is given them."""
 LEAST: Final = ("torso_height_min_m",)
 
 
-def joined(parts: Sequence[Summary]) -> Summary:
+def joined(parts: Sequence[Summary], counts: Iterable[KeyCount]) -> Summary:
     """Return the figures of a run from those of its parts, in their order.
 
     Extremes are those of the run. A percentile or a mean is that of the worst part, a median
@@ -161,9 +163,11 @@ def joined(parts: Sequence[Summary]) -> Summary:
 
     Args:
         parts: at least one; the scenario of each is that of the whole run.
+        counts: of every key, over the whole run.
     """
     if len(parts) == 1:
         return parts[0]
+    counted = list(counts)
     last, summary = parts[-1], dict(parts[-1])
     for key in last:
         found = [part[key] for part in parts if part[key] is not None]
@@ -175,10 +179,10 @@ def joined(parts: Sequence[Summary]) -> Summary:
                     "median": float(np.median([one["median"] for one in found])),
                     "p99": max(one["p99"] for one in found),
                 }
-        elif key in SUMS:
-            summary[key] = sum(found)
         elif not isinstance(found[0], bool):
             summary[key] = min(found) if key in LEAST else max(found)
+    totals = sum(one.count for one in counted), sum(one.missing for one in counted)
+    summary |= dict(zip(COUNTED, totals, strict=True))
     fallen = [part["fallen_at_s"] for part in parts if part["fallen_at_s"] is not None]
     summary["fallen_at_s"] = min(fallen, default=None)
     stands = (last["stood"] or bool(last["unsound"])) and not fallen

@@ -26,7 +26,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl estop --local       # on the robot's own host: needs no bus
         """,
     )
-    add_run_dir(parser)
+    add_run_dir(parser, Path)  # whoever can reach the robot may stop it
     parser.add_argument(
         "--local",
         action="store_true",

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from services.joint.rearm_guard import RearmGuard, request_stop
 from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
 from shared.run_directory import check_own
@@ -119,6 +120,27 @@ def test_a_directory_that_others_may_write_to_is_refused(run_dir: Path, mode: in
         RunDir(run_dir).claim()
 
 
+def test_a_fleet_whose_directory_became_writable_for_others_can_be_stopped(
+    claimed: RunDir, capsys: pytest.CaptureFixture[str]
+) -> None:
+    claimed.path.chmod(0o777)
+    with pytest.raises(FleetError, match="others may write to it"):
+        SupervisedFleet.attach(claimed.path)
+    RearmGuard(claimed.path, "knee_left")
+    assert cli.main(["estop", "--local", "--run-dir", str(claimed.path)]) != 0
+    assert "not stopped" in capsys.readouterr().err, "asked, but no service is there"
+    assert RearmGuard(claimed.path, "knee_left").stop_requested
+
+
+def test_a_stop_is_written_into_no_file_that_a_link_leads_to(run_dir: Path) -> None:
+    run_dir.mkdir()
+    (run_dir / "mine").write_bytes(b"0123456789abcdef")
+    (run_dir / "knee_left.rearm").symlink_to(run_dir / "mine")
+    with pytest.raises(OSError, match="symbolic links"):
+        request_stop(run_dir, "knee_left")
+    assert (run_dir / "mine").read_bytes() == b"0123456789abcdef"
+
+
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a directory away")
 @pytest.mark.parametrize("linked", [False, True])
 def test_a_strangers_directory_is_refused_by_every_verb(
@@ -132,7 +154,7 @@ def test_a_strangers_directory_is_refused_by_every_verb(
         os.chown(run_dir, 12345, 12345, follow_symlinks=False)
     else:
         theirs.rename(run_dir)
-    for words in (["up"], ["down"], ["status"], ["kill", "planner"], ["estop"]):
+    for words in (["up"], ["down"], ["status"], ["kill", "planner"]):
         with pytest.raises(SystemExit) as ended:
             cli.main([*words, "--run-dir", str(run_dir)])
         assert ended.value.code == 2

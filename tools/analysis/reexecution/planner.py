@@ -48,7 +48,7 @@ class PlannerExecution:
             if not log.begin_ns <= received_ns < log.end_ns:
                 continue
             last, self._last = self._last, status
-            if last is not None and (status.session != last.session or status.seq > last.seq + 1):
+            if last is not None and not _follows(status, last):
                 self._planner = None  # another planner, or ticks that the log lacks
             if self._planner is None or not self._receive(self._planner, status):
                 self._planner = None
@@ -140,3 +140,9 @@ class PlannerExecution:
             text = _encode(planner.snapshot()).decode()
             mine_then = msgspec.structs.replace(snapshot, snapshot=text)
             compare("planner/checkpoint", tick, snapshot, mine_then)
+
+
+def _follows(status: PlannerStatus, last: PlannerStatus) -> bool:
+    """Return True for the same planner's next tick; a new session is one more than the last."""
+    renewed = status.session == last.session + 1 and status.seq == last.seq + 1
+    return renewed or (status.session == last.session and status.seq <= last.seq + 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import tomllib
+from collections.abc import Iterable
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
@@ -71,16 +72,17 @@ class Judge:
         except XrlError as error:
             self._why_not = str(error)
 
-    def verdict(self, log: RunLog, *, whole: bool = True) -> RunVerdict:
+    def verdict(self, log: RunLog, counts: Iterable[KeyCount], *, whole: bool = True) -> RunVerdict:
         """Return the verdict.
 
         Args:
             log: the run, or any part of it.
+            counts: of every key, over the run.
             whole: all of the run was taken; False gives the figures alone.
         """
         if not self._summaries:
             return RunVerdict(f"No verdict: {self._why_not}", None, [])
-        summary = verdict.joined(self._summaries)
+        summary = verdict.joined(self._summaries, counts)
         if log.metadata["run"].get("lockstep"):
             summary |= dict.fromkeys(REAL_TIME_ONLY) | {"in_real_time": True}
         if not whole:
@@ -181,30 +183,24 @@ class MessageLosses:
     """Recorded and lost messages of each topic, by sequence numbers."""
 
     def __init__(self) -> None:
-        self._counts: dict[str, KeyCount] = {}
+        self.counts: dict[str, KeyCount] = {}
         self._times_ns: dict[str, tuple[int, int]] = {}
 
     def take(self, run: RunData) -> None:
         """Take a run, or the next part of it."""
         log = run.log
+        log.count_into(self.counts)
         for key in log.keys():  # noqa: SIM118 - a log is no mapping
-            rows = [
-                (t_ns, seq)
-                for t_ns, _, seq in log.raw(key)
-                if (log.is_first or log.begin_ns <= t_ns) and (log.is_last or t_ns < log.end_ns)
-            ]
-            if not rows:
+            times = [t_ns for t_ns, _, _ in log.raw(key) if log.holds(t_ns)]
+            if not times:
                 continue
-            count = self._counts.setdefault(key, KeyCount())
-            for _, seq in rows:
-                count.feed(seq)
-            first_ns, last_ns = min(rows)[0], max(rows)[0]
+            first_ns, last_ns = min(times), max(times)
             self._times_ns[key] = (self._times_ns.get(key, (first_ns, 0))[0], last_ns)
 
     def rows(self, robot: str) -> list[TopicLoss]:
         """Return a row for each topic that has messages."""
         known, rows = topics.all_keys(robot), []
-        for key, count in sorted(self._counts.items()):
+        for key, count in sorted((key, one) for key, one in self.counts.items() if one.count):
             first_ns, last_ns = self._times_ns[key]
             span_s = (last_ns - first_ns) / NS_PER_S
             nominal_hz = known[key].rate_hz if key in known else 0.0

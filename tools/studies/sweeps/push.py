@@ -20,7 +20,7 @@ from services.simulator import plant as plants
 from services.simulator.plant import PlantConfig, plant_from
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from tools.number_arguments import finite, natural
+from tools.number_arguments import degrees, finite
 from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial, run_trial
@@ -58,7 +58,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--angle",
         action="append",
-        type=natural,
+        type=degrees,
         metavar="DEG",
         help="push that way, 0 forwards, 90 to the left; may be repeated (0, 45, 90, 135, 180)",
     )

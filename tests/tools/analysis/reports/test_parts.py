@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -94,16 +95,18 @@ def test_the_bars_are_those_of_the_whole(page: str, in_parts: str) -> None:
         np.testing.assert_allclose(edges, edges_all, atol=0.005)
 
 
-def test_the_verdict_is_that_of_the_whole(log: RunLog) -> None:
+def test_the_verdict_is_that_of_the_whole(log: RunLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tools.runs.judgement.parts_of", partial(parts_of, part_s=PART_S))
     duration_s = 6.0
     whole = verdict.summarise(log, duration_s)
+    cut = parts_of(log.index, RunPart(4.0), part_s=PART_S)
     parts = verdict.joined(
-        [
-            verdict.summarise(part, duration_s)
-            for part in parts_of(log.index, RunPart(4.0), part_s=PART_S)
-        ]
+        [verdict.summarise(part, duration_s) for part in cut], log.gaps().values()
     )
     assert set(parts) == set(whole)
+    counted = summarise_parts(log.index, duration_s)
+    for key in ("messages_recorded", "sequence_gaps"):
+        assert counted[key] == whole[key], key
     for key in ("stood", "why_not", "hold_entries", "handover_ms", "reengage_s", "links_impaired"):
         assert parts[key] == whole[key], key
     for key in ("operator_peak_n", "alive_com_x_max_mm", "hold_com_x_max_mm", "torso_height_min_m"):
