@@ -7,6 +7,7 @@ What does not fit is refused with the file, the key, the value and what would be
 from __future__ import annotations
 
 import re
+import stat
 import tomllib
 from pathlib import Path
 from types import UnionType
@@ -53,9 +54,10 @@ def read_toml(path: Path, into: type[S]) -> S:
     """
     file = str(path)
     try:
-        if path.exists() and not path.is_file():  # a pipe would be waited on for ever
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):  # a pipe would be waited on for ever
             raise ConfigError(file, "(file)", "no ordinary file", "give the path of a TOML file")
-        if path.exists() and path.stat().st_size > SIZE_MAX:
+        if found.st_size > SIZE_MAX:
             raise ConfigError(file, "(file)", f"over {SIZE_MAX >> 20} MiB", "a TOML file")
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -20,6 +20,7 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord
 
+from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.records import (
     CHUNK_TIMES,
@@ -41,6 +42,8 @@ _TAIL: Final = PREFIX.size + _FOOTER_LENGTH + len(MAGIC)
 _CHUNK_MARKS: Final = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
 _MARK_AT: Final = PREFIX.size + CHUNK_TIMES.size
 """Offset of a chunk's compression from its start."""
+IN_LINE_NS: Final = 10 * NS_PER_S
+"""A recorder flushes four times a second: a chunk with longer times, or so far off, is opened."""
 _CHANNEL: Final = struct.Struct("<H")  # of a message index
 _LOOSE_HEAD: Final = struct.Struct("<HIQQ")  # of a message that is in no chunk
 
@@ -139,15 +142,18 @@ class LogReader:
     def skim(self) -> Iterator[LogRecord | ChunkPlace]:
         """Yield what iteration does, but the places of the chunks in place of their contents.
 
-        Only the heads of chunks are touched: damage within one shows when it is read.
+        Only the heads of chunks are touched: damage within one shows when it is read. No CRC
+        covers the times in a head, so a chunk with times out of line is opened for those of its
+        messages.
         """
         yield from self._summary()
         at = len(MAGIC)
+        last_ns: int | None = None
         while at < self._end:
             place, following = self._place(at)
-            if place is not None:
+            if place is not None and _is_in_line(place, last_ns):
                 yield place
-                at = following
+                at, last_ns = following, place.last_ns
                 continue
             start = at
             record, at = self._next(at)
@@ -158,7 +164,9 @@ class LogReader:
             self._learn(record)
             if record.rows:
                 channels = frozenset(row.channel_id for row in record.rows)
-                yield ChunkPlace(start, record.rows[0].log_ns, record.rows[-1].log_ns, channels)
+                times = [row.log_ns for row in record.rows]
+                last_ns = max(times)
+                yield ChunkPlace(start, min(times), last_ns, channels)
             else:
                 yield record
 
@@ -193,11 +201,7 @@ class LogReader:
             opcode, end = self._head(following)
             if opcode != Opcode.MESSAGE_INDEX or end > self._end:
                 break
-            channels.add(
-                int.from_bytes(
-                    self.raw(following + PREFIX.size, following + PREFIX.size + 2), "little"
-                )
-            )
+            channels.add(_CHANNEL.unpack_from(self._data, following + PREFIX.size)[0])
             following = end
         return ChunkPlace(at, first_ns, last_ns, frozenset(channels) or None), following
 
@@ -357,6 +361,15 @@ def _definitions(records: Sequence[tuple[int, bytes]]) -> tuple[LogRecord, ...]:
             with contextlib.suppress(Malformed):
                 found.append(LogRecord(opcode, 0, 0, body, decode(opcode, body)))
     return tuple(found)
+
+
+def _is_in_line(place: ChunkPlace, before_ns: int | None) -> bool:
+    """Return True for a chunk whose times are believed: it follows the one before it closely."""
+    began_ns = place.first_ns if before_ns is None else before_ns
+    return (
+        place.first_ns <= place.last_ns <= place.first_ns + IN_LINE_NS
+        and abs(place.first_ns - began_ns) <= IN_LINE_NS
+    )
 
 
 def _times(body: bytes, opcode: int) -> tuple[int, int]:

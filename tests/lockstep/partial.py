@@ -13,19 +13,15 @@ from typing import Final, Literal
 import msgspec
 
 from services.joint.differential import joint_torque
-from services.joint.snapshots import DriveManagerState
-from services.planner.snapshots import TickState
-from services.simulator.state import taken
 from shared.bus.links import Pair as Link
 from shared.bus.messages import Message, Mode, Pair, PlannerStatus, SimTruth
 from shared.bus.topics import Topic
-from shared.bus.traces import SimState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.robot.joints import MODULE_INDEX, MODULES
-from tools.runs.lockstep import Lockstep, Record, forget
+from tools.runs.lockstep import FleetMoment, Lockstep, Record, forget
 from tools.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 
 FailureKind = Literal["links", "commands", "states", "frozen"]
@@ -85,14 +81,6 @@ class PartialResult(msgspec.Struct, frozen=True, kw_only=True):
 
     While they HOLD it leads on against them and comes to its limit, whatever failed.
     """
-
-
-class PartialStart(msgspec.Struct, frozen=True):
-    """What every case goes on from."""
-
-    state: SimState
-    modules: dict[str, DriveManagerState]
-    planner: tuple[int, TickState]
 
 
 def cases() -> Iterator[PartialCase]:
@@ -165,7 +153,7 @@ class PartialFleet(Lockstep):
         return joint_torque((a * a_sign, b * b_sign), self.config.joint.gear_ratio)
 
 
-def start_of(robot: RobotConfig) -> PartialStart:
+def start_of(robot: RobotConfig) -> FleetMoment:
     """Run to the moment that all cases go on from.
 
     Raises:
@@ -177,12 +165,10 @@ def start_of(robot: RobotConfig) -> PartialStart:
             break
     if fleet.world.scenario_s < BEGIN_S or fleet.planner is None:
         raise RunError(f"the robot did not stand and track until {BEGIN_S:g} s")
-    modules = {name: fleet.snapshot_of(name) for name in MODULES}
-    state = taken(fleet.world, fleet.bank, fleet.now_ns, 0)
-    return PartialStart(state, modules, (fleet.planner.session, fleet.planner.snapshot()))
+    return fleet.moment()
 
 
-def run_case(case: PartialCase, robot: RobotConfig, start: PartialStart) -> PartialResult:
+def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> PartialResult:
     """Go on from the common moment, with the case's failure, to its end or to the fall.
 
     Args:
@@ -197,7 +183,7 @@ def run_case(case: PartialCase, robot: RobotConfig, start: PartialStart) -> Part
             statuses.append(message)
 
     fleet = PartialFleet(robot, scenario_of(case), record=receive)
-    fleet.resume(start.state, start.modules, start.planner)
+    fleet.resume(start)
     begin_ns = fleet.now_ns - round(fleet.world.scenario_s * NS_PER_S)
     rows: list[SimTruth] = []
     led_ns = None

@@ -21,9 +21,9 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
 from tests.lockstep import partial
-from tests.lockstep.partial import PartialCase, PartialStart
+from tests.lockstep.partial import PartialCase
 from tools.runs.host_clock import HostClock
-from tools.runs.lockstep import Lockstep
+from tools.runs.lockstep import FleetMoment, Lockstep
 
 HOUR_NS = 3600 * NS_PER_S
 HOSTS = ("planner", "harness", *MODULES)
@@ -81,7 +81,7 @@ def plain(robot: RobotConfig) -> Run:
 
 
 @pytest.fixture(scope="module")
-def start(robot: RobotConfig) -> PartialStart:
+def start(robot: RobotConfig) -> FleetMoment:
     return partial.start_of(robot)
 
 
@@ -161,10 +161,10 @@ def put_again(fleet: Fleet, module: int, sent: JointCommand) -> None:
     fleet.network.commands()[module].put(fleet.now_ns, sent)
 
 
-def gone_on(robot: RobotConfig, start: PartialStart, *, led: bool, again: Run | None) -> Fleet:
+def gone_on(robot: RobotConfig, start: FleetMoment, *, led: bool, again: Run | None) -> Fleet:
     """Go on for 0.6 s, with or without a planner, with a record's commands played on top."""
     fleet = Fleet(robot, SQUAT)
-    fleet.resume(start.state, start.modules, start.planner if led else None)
+    fleet.resume(start if led else msgspec.structs.replace(start, planner=None))
     records = again.by_module if again is not None else {name: [] for name in MODULES}
     rows = [itertools.cycle(records[name] or [None]) for name in MODULES]
     for ms in range(600):
@@ -180,7 +180,7 @@ def gone_on(robot: RobotConfig, start: PartialStart, *, led: bool, again: Run | 
 
 @pytest.mark.parametrize("led", [True, False], ids=["led", "held"])
 def test_yesterdays_commands_put_onto_the_bus_move_nothing(
-    led: bool, robot: RobotConfig, plain: Run, start: PartialStart
+    led: bool, robot: RobotConfig, plain: Run, start: FleetMoment
 ) -> None:
     """A record of the same robot, same session, in the same pose: older by a day."""
     day_ns = 24 * HOUR_NS

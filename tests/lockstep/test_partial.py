@@ -23,8 +23,9 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES, SIDES
 from tests.lockstep import partial
-from tests.lockstep.partial import KINDS, SUBSETS, PartialCase, PartialStart, run_case
+from tests.lockstep.partial import KINDS, SUBSETS, PartialCase, run_case
 from tests.shared.mcap_log.runs import sample as sample_of
+from tools.runs.lockstep import FleetMoment
 
 LEGS = [tuple(module for module in MODULES if module.endswith(side)) for side in SIDES]
 ALWAYS = {"links": [*((module,) for module in MODULES), *LEGS]}
@@ -46,13 +47,13 @@ def words(case: PartialCase) -> str:
 
 
 @pytest.fixture(scope="module")
-def start(robot: RobotConfig) -> PartialStart:
+def start(robot: RobotConfig) -> FleetMoment:
     return partial.start_of(robot)
 
 
 @pytest.mark.parametrize("case", [case for kind in KINDS for case in sample(kind)], ids=words)
 def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_again(
-    case: PartialCase, robot: RobotConfig, start: PartialStart
+    case: PartialCase, robot: RobotConfig, start: FleetMoment
 ) -> None:
     outcome = run_case(case, robot, start)
     age_ms = robot.joint_service.max_command_age_ms
@@ -70,7 +71,7 @@ def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_
     assert outcome.operator_end_n < 75.0, "44 to 50 measured: it leads, and is not at its limit"
 
 
-def test_with_nothing_failed_no_module_holds(robot: RobotConfig, start: PartialStart) -> None:
+def test_with_nothing_failed_no_module_holds(robot: RobotConfig, start: FleetMoment) -> None:
     outcome = run_case(PartialCase("links", ()), robot, start)
     assert outcome.stood
     assert outcome.hold_shown_ms is None
@@ -129,6 +130,6 @@ def test_there_are_64_subsets_and_each_kind_fails_as_named() -> None:
     assert not cut["frozen"]
 
 
-def test_a_case_gone_on_with_is_the_same_each_time(robot: RobotConfig, start: PartialStart) -> None:
+def test_a_case_gone_on_with_is_the_same_each_time(robot: RobotConfig, start: FleetMoment) -> None:
     case = PartialCase("states", ("knee_left",))
     assert run_case(case, robot, start) == run_case(case, robot, start)

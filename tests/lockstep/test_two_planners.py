@@ -11,7 +11,7 @@ from shared.bus.topics import Topic
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Kill, Restart, Scenario
 from shared.robot.joints import MODULE_INDEX
-from tests.lockstep.runs import variant
+from tests.lockstep.runs import kill, variant
 from tools.runs.lockstep import Lockstep
 from tools.runs.standing_start import begin_standing
 
@@ -22,6 +22,20 @@ SQUAT = (
     Keyframe(at=4.0, height=1.188),
     Keyframe(at=6.0, height=1.0),
 )
+
+
+def squat(duration: float, **changes: object) -> Scenario:
+    return variant(
+        "stand", **{"duration": duration, "keyframe": SQUAT, "kill": (), "push": ()} | changes
+    )
+
+
+def held_up(from_s: float, to_s: float) -> dict[str, object]:
+    """Return what stops the first planner for a while."""
+    return {
+        "kill": (Kill(service="planner", at=from_s, signal="STOP"),),
+        "restart": (Restart(service="planner", at=to_s),),
+    }
 
 
 class TwoPlanners(Lockstep):
@@ -84,7 +98,7 @@ def changes_after(fleet: TwoPlanners, at_s: float) -> list[tuple[float, tuple[in
 def test_60_ms_of_loss_give_the_second_planner_no_module(robot: RobotConfig, link: str) -> None:
     """It took one knee for good, while the others followed the first."""
     lost = (Inject(link=link, at=1.0, duration=0.06, partition=True),)
-    scenario = variant("stand", duration=5.0, keyframe=SQUAT, kill=(), push=(), inject=lost)
+    scenario = squat(5.0, inject=lost)
     fleet = TwoPlanners(robot, scenario, 0.5, 4.0)
     run(fleet)
     assert fleet.sent == 0
@@ -93,9 +107,7 @@ def test_60_ms_of_loss_give_the_second_planner_no_module(robot: RobotConfig, lin
 
 
 def test_when_the_first_ends_the_second_leads(robot: RobotConfig) -> None:
-    scenario = variant(
-        "stand", duration=5.0, keyframe=SQUAT, push=(), kill=(Kill(service="planner", at=1.5),)
-    )
+    scenario = squat(5.0, kill=kill(1.5))
     fleet = TwoPlanners(robot, scenario, 0.5, 9.0)
     run(fleet)
     assert fleet.modes == {Mode.TRACK}
@@ -109,14 +121,7 @@ def test_one_that_was_held_up_lets_the_other_lead_and_leads_when_that_ends(
     robot: RobotConfig,
 ) -> None:
     """Its session was retired, and all stayed in HOLD."""
-    scenario = variant(
-        "stand",
-        duration=7.5,
-        keyframe=SQUAT,
-        push=(),
-        kill=(Kill(service="planner", at=1.0, signal="STOP"),),
-        restart=(Restart(service="planner", at=3.5),),
-    )
+    scenario = squat(7.5, **held_up(1.0, 3.5))
     fleet = TwoPlanners(robot, scenario, 0.5, 5.0)
     run(fleet)
     led = [sessions for _, sessions in changes_after(fleet, 0.1) if len(set(sessions)) == 1]
@@ -128,14 +133,7 @@ def test_one_that_was_held_up_lets_the_other_lead_and_leads_when_that_ends(
 
 def test_one_that_was_held_up_past_the_others_end_leads_again(robot: RobotConfig) -> None:
     """It never saw the other, for which all six had retired it: they refused it for good."""
-    scenario = variant(
-        "stand",
-        duration=6.0,
-        keyframe=SQUAT,
-        push=(),
-        kill=(Kill(service="planner", at=1.0, signal="STOP"),),
-        restart=(Restart(service="planner", at=4.0),),
-    )
+    scenario = squat(6.0, **held_up(1.0, 4.0))
     fleet = TwoPlanners(robot, scenario, 0.5, 3.5)
     run(fleet)
     assert fleet.sent > 0
@@ -149,7 +147,7 @@ def test_a_second_one_that_starts_while_the_first_is_held_up_for_a_moment_waits(
 ) -> None:
     """It caught some modules in the gap, and neither led any more."""
     lost = (Inject(link="planner->joints", at=1.0, duration=0.3, partition=True),)
-    scenario = variant("stand", duration=4.0, keyframe=SQUAT, kill=(), push=(), inject=lost)
+    scenario = squat(4.0, inject=lost)
     fleet = TwoPlanners(robot, scenario, 1.1, 9.0)
     run(fleet)
     assert fleet.sent == 0
@@ -157,7 +155,7 @@ def test_a_second_one_that_starts_while_the_first_is_held_up_for_a_moment_waits(
 
 
 def test_two_that_start_at_once_agree_on_one(robot: RobotConfig) -> None:
-    scenario = variant("stand", duration=3.0, keyframe=SQUAT, kill=(), push=())
+    scenario = squat(3.0)
     fleet = TwoPlanners(robot, scenario, -100.0, 9.0)
     for row in fleet.run():
         assert not row.fallen

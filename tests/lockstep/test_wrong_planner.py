@@ -10,23 +10,17 @@ eight minutes of two cores by
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
 import pytest
 
-from services.joint.snapshots import DriveManagerState
-from services.planner.snapshots import TickState
-from services.simulator.state import taken
 from shared.bus.messages import Mode, Outside
-from shared.bus.traces import SimState
 from shared.config.robot_config import RobotConfig
 from shared.robot.gain_schedule import believing
-from shared.robot.joints import MODULES
 from tests.lockstep.runs import push, variant
 from tests.lockstep.wrong_planners import faults, wrong
-from tools.runs.lockstep import Lockstep
+from tools.runs.lockstep import FleetMoment, Lockstep
 from tools.runs.network import BASE
 
 NAMES: Final = tuple(faults())
@@ -42,9 +36,7 @@ class Begin(NamedTuple):
 
     name: str
     at: float
-    state: SimState
-    modules: Mapping[str, DriveManagerState]
-    planner: tuple[int, TickState]
+    moment: FleetMoment
 
 
 class End(NamedTuple):
@@ -67,29 +59,26 @@ def begin(robot: RobotConfig, name: str, at: float) -> Begin:
     for row in fleet.run():
         if row.scenario_s >= at:
             break
-    assert fleet.planner is not None
-    planner = fleet.planner.session, fleet.planner.snapshot()
-    modules = {module: fleet.snapshot_of(module) for module in MODULES}
-    return Begin(name, at, taken(fleet.world, fleet.bank, fleet.now_ns, 0), modules, planner)
+    return Begin(name, at, fleet.moment())
 
 
-def end(robot: RobotConfig, moment: Begin, name: str) -> End:
+def end(robot: RobotConfig, begin: Begin, name: str) -> End:
     """Be wrong for two seconds, pushed from the side after the first."""
 
     class Fleet(Lockstep):
         planner_type = wrong(faults()[name])
 
-    at = moment.at
+    at = begin.at
     pushed = (push(at + 0.8, 0.0, 30.0, 0.0),)
-    fleet = Fleet(robot, variant(moment.name, duration=at + WRONG_S, kill=(), push=pushed), BASE)
-    fleet.resume(moment.state, moment.modules, moment.planner)
+    fleet = Fleet(robot, variant(begin.name, duration=at + WRONG_S, kill=(), push=pushed), BASE)
+    fleet.resume(begin.moment)
     fell, outside = False, set()
     for row in fleet.run():
         fell = row.fallen
         outside |= {Outside(c.failsafe.outside) for c in fleet.controllers}
         if fell:
             break
-    events = [event for _, event in fleet.events if event.t_ns > moment.state.t_ns]
+    events = [event for _, event in fleet.events if event.t_ns > begin.moment.state.t_ns]
     steps = [np.abs(np.subtract(e.tau_after, e.tau_before)).max() for e in events]
     modes = {c.failsafe.mode for c in fleet.controllers}
     return End(fell, float(max(steps, default=0.0)), outside - {Outside.NOTHING}, modes)

@@ -206,7 +206,7 @@ def test_a_small_file_that_expands_to_gigabytes_is_refused(
 def test_a_million_false_marks_of_chunks_are_passed_in_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each claimed 50 MB, which were looked through anew for each."""
+    """Each claims 50 MB; the reader searched all of them for every mark."""
     mark = b"\x06" + struct.pack("<Q", 50 << 20) + b"\0" * 28 + b"\x04\0\0\0zstd"
     path = tmp_path / "marks.mcap"
     path.write_bytes(NEWEST.read_bytes()[:20_000] + mark * 1_000_000)

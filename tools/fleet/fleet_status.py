@@ -153,7 +153,7 @@ class RateMonitor:
         return age_s is not None and age_s < _FRESH_S
 
     def refused_hz(self) -> float:
-        """Return commands refused per second in this window; 0 of what is no joint service."""
+        """Return commands refused per second in this window; 0 for other services than joints."""
         first, newest = self._first, self.newest
         if not isinstance(first, JointState) or not isinstance(newest, JointState):
             return 0.0

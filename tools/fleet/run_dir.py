@@ -16,6 +16,7 @@ import msgspec
 from services.joint import neighbours, rearm_guard
 from services.simulator import usb_standin
 from shared.clock import PACE_FILE
+from shared.config.robot_config import SERVICES
 from shared.exceptions import FleetError
 from shared.robot.joints import MODULES
 from shared.run_directory import check_own
@@ -24,10 +25,11 @@ from tools.fleet.process_table import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_lis
 MARKER: Final = ".xrl-run"
 """Lies in every run directory: nothing is removed, and nobody attached to, where it does not."""
 
-_OURS: Final = ("*.lock", "*.rearm", "*.near", "*.pid", MARKER, PACE_FILE, "supervisord.conf",
-                "fleet.json", usb_standin.FOLDER, usb_standin.BUILT)  # fmt: skip
-"""Names in a run directory that services started by hand, or an earlier version, may have left."""
-_LOGS: Final = ("*.log", "*.log.1", "supervisord.stderr")
+_BY_HAND: Final = ("*.zenoh.lock", "*.rearm", "*.near", PACE_FILE, usb_standin.FOLDER,
+                   usb_standin.BUILT)  # fmt: skip
+"""Names that services started by hand leave in a run directory, beside sockets."""
+_LOGGED: Final = (*SERVICES, "network_proxy", "supervisord")
+"""What has a log in a run directory."""
 
 _NEVER_GIVE_UP = 1_000_000
 """Starts that may fail in a row; each waits a second longer than the one before."""
@@ -126,11 +128,11 @@ class RunDir:
 
     def _foreign(self) -> str | None:
         """Return the name of a file that no fleet has left here, or None."""
+        if self.supervisor_log.exists():
+            return None  # a fleet of a version that left no mark
         for entry in sorted(self.path.iterdir()):
-            ours = any(entry.match(pattern) for pattern in _OURS) or (
-                entry == self.logs and self.supervisor_log.exists()
-            )
-            if not ours and not stat.S_ISSOCK(entry.lstat().st_mode):
+            by_hand = any(entry.match(pattern) for pattern in _BY_HAND)
+            if not by_hand and not stat.S_ISSOCK(entry.lstat().st_mode):
                 return entry.name
         return None
 
@@ -195,9 +197,9 @@ class RunDir:
 
     def _remove_logs(self) -> None:
         """Remove the services' logs, and their folder if it is then empty."""
-        for pattern in _LOGS:
-            for log in self.logs.glob(pattern):
-                log.unlink(missing_ok=True)
+        for name in _LOGGED:
+            for ending in (".log", ".log.1", ".stderr"):
+                (self.logs / f"{name}{ending}").unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # none there, or it holds files of others
             self.logs.rmdir()
 

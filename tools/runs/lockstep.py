@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import ClassVar
 
+import msgspec
+
 from services.joint.controller import JointController
 from services.joint.drive_manager import DriveManager
 from services.joint.snapshots import DriveManagerState
@@ -54,6 +56,17 @@ Watch = Callable[[SimTruth], None]
 
 def forget(_topic: Topic, _module: str, _message: Message) -> None:
     """Record nothing."""
+
+
+class FleetMoment(msgspec.Struct, frozen=True):
+    """What the simulated world and each service are at one moment of a run."""
+
+    state: SimState
+    """World and drives."""
+    modules: Mapping[str, DriveManagerState]
+    """State of each joint service; one that is not named is dead."""
+    planner: tuple[int, TickState] | None
+    """Session and state of the planner; None: it is dead."""
 
 
 class Lockstep:
@@ -167,23 +180,18 @@ class Lockstep:
         """Each module's control law."""
         return [joint.manager.controller for joint in self.joints]
 
-    def snapshot_of(self, module: str) -> DriveManagerState:
-        """Return a joint service's state, for `resume`; it shares what still changes."""
-        return self.joints[MODULE_INDEX[module]].manager.snapshot()
+    def moment(self) -> FleetMoment:
+        """Return what world and services are now, for `resume`; it shares what still changes."""
+        planner = self.planner
+        return FleetMoment(
+            taken(self.world, self.bank, self.now_ns, 0),
+            {joint.name: joint.manager.snapshot() for joint in self.joints},
+            None if planner is None else (planner.session, planner.snapshot()),
+        )
 
-    def resume(
-        self,
-        state: SimState,
-        modules: Mapping[str, DriveManagerState],
-        planner: tuple[int, TickState] | None,
-    ) -> None:
-        """Continue from a moment of another run, before the first step; links are empty then.
-
-        Args:
-            state: world and drives.
-            modules: state of each joint service; one that is not named is dead.
-            planner: session and state of the planner; None: it is dead.
-        """
+    def resume(self, moment: FleetMoment) -> None:
+        """Continue from a moment of another run, before the first step; links are empty then."""
+        state, modules = moment.state, moment.modules
         self.now_ns = -(-state.t_ns // self._step_ns) * self._step_ns
         restored(self.world, self.bank, state)
         for joint in self.joints:
@@ -191,7 +199,7 @@ class Lockstep:
                 joint.manager.restore(modules[joint.name])
             else:
                 joint.kill(for_good=True)
-        self._planner.resume(planner)
+        self._planner.resume(moment.planner)
         for drive in self._drives:
             drive.assume_heard(self.now_ns)
         self.harness.assume_tared()

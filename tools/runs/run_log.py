@@ -164,9 +164,7 @@ class RunLog:
         for key in self.keys():
             count = counts.setdefault(key, KeyCount())
             for t_ns, _, seq in self.raw(key):
-                if (self.is_first or self.begin_ns <= t_ns) and (
-                    self.is_last or t_ns < self.end_ns
-                ):
+                if self.holds(t_ns):
                     count.feed(seq)
 
     def gaps(self) -> dict[str, KeyCount]:
@@ -179,7 +177,7 @@ class RunLog:
         return found
 
     def forget(self) -> None:
-        """Let go of all messages; what is said about the run stays."""
+        """Drop all messages; metadata and attachments stay."""
         self._series = {}
 
     def _key(self, topic: Topic, module: str) -> str:
@@ -218,11 +216,13 @@ class RunLog:
         """
         offset_ns = self.offset_ns
         first_ns, last_ns = first_ns + offset_ns, last_ns + offset_ns
-        for record, file in self.index.records(first_ns, last_ns, None if others else keys):
+        for record, keys_by_channel in self.index.records(
+            first_ns, last_ns, None if others else keys
+        ):
             body = record.body
             by_channel = {
                 number: self._series.setdefault(key, Series())
-                for number, key in file.keys.items()
+                for number, key in keys_by_channel.items()
                 if (key in keys) != others
             }
             for channel, seq, log_ns, _, start, end in record.rows:  # the hot loop of reading
@@ -233,19 +233,17 @@ class RunLog:
                     series.seq.append(seq)
 
 
-def read_run(path: Path, part: RunPart | None = None) -> RunLog:
+def read_run(path: Path) -> RunLog:
     """Read a run, finished or killed.
 
     Args:
         path: a file; or a directory: all files of the run in it.
-        part: what of it to read; None: all.
 
     Raises:
         RunError: a file is missing, empty, no MCAP file or no run; or the directory holds no
-            run, or several; or the part is empty, or longer than is read at once.
+            run, or several; or the run is longer than is read at once.
     """
-    index = RunIndex(path)
-    return read_part(index, part or WHOLE)
+    return read_part(RunIndex(path), WHOLE)
 
 
 def read_part(index: RunIndex, part: RunPart) -> RunLog:

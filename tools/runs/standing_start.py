@@ -8,35 +8,19 @@ hoist.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Final
 
-import msgspec
-
-from services.joint.snapshots import DriveManagerState
-from services.planner.snapshots import TickState
 from services.simulator.plant import PlantConfig
 from services.simulator.plant import to_toml as plant_to_toml
-from services.simulator.state import taken
-from shared.bus.traces import SimState
 from shared.config.files import to_toml
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
-from shared.robot.joints import MODULES
-from tools.runs.lockstep import Lockstep
+from tools.runs.lockstep import FleetMoment, Lockstep
 from tools.runs.network import BASE
 
 NOTHING_HAPPENS: Final = Scenario(
     name="stand", about="nothing happens", duration=1.0, keyframe=(Keyframe(at=0.0, height=1.188),)
 )
-
-
-class StandingStart(msgspec.Struct, frozen=True):
-    """What the simulated world and each service are at one moment of a run."""
-
-    state: SimState
-    modules: Mapping[str, DriveManagerState]
-    planner: tuple[int, TickState]
 
 
 def begin_standing(fleet: Lockstep) -> bool:
@@ -47,11 +31,11 @@ def begin_standing(fleet: Lockstep) -> bool:
     """
     start = standing(fleet.config, fleet.plant)
     if start is not None:
-        fleet.resume(start.state, start.modules, start.planner)
+        fleet.resume(start)
     return start is not None
 
 
-def standing(robot: RobotConfig, plant: PlantConfig) -> StandingStart | None:
+def standing(robot: RobotConfig, plant: PlantConfig) -> FleetMoment | None:
     """Return the moment at which a scenario begins; None if it never does.
 
     Args:
@@ -65,15 +49,11 @@ def standing(robot: RobotConfig, plant: PlantConfig) -> StandingStart | None:
     return _known[key]
 
 
-_known: dict[tuple[str, str, str], StandingStart | None] = {}
+_known: dict[tuple[str, str, str], FleetMoment | None] = {}
 
 
-def _stood_up(robot: RobotConfig, plant: PlantConfig) -> StandingStart | None:
+def _stood_up(robot: RobotConfig, plant: PlantConfig) -> FleetMoment | None:
     fleet = Lockstep(robot, NOTHING_HAPPENS, BASE, plant=plant)
     if not any(row.scenario_s >= 0.0 for row in fleet.run()) or fleet.planner is None:
         return None
-    return StandingStart(
-        taken(fleet.world, fleet.bank, fleet.now_ns, 0),
-        {module: fleet.snapshot_of(module) for module in MODULES},
-        (fleet.planner.session, fleet.planner.snapshot()),
-    )
+    return fleet.moment()

@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 AWAY_S = 0.1
 """s; a tick that much older than the requested time does not describe the robot then."""
 LONG_S: Final = 60.0
-"""Of a longer run only what is around the tick is read."""
+"""A longer run is read only within `AROUND_S` of the tick."""
 AROUND_S: Final = 5.0
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 SPLIT_DESCRIPTION = {

@@ -74,7 +74,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Go on from every moment; 0 if the robot would have stood each time."""
-    if not (args.every >= 0.1 - 1e-9 and args.for_s > 0.0 and args.workers >= 1):
+    if not (args.every >= 0.1 - 1e-9 and args.for_s > 0.0):
         raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
     console = Console()
     log = read_asked(args, RunIndex(args.log))

@@ -55,14 +55,15 @@ def test_the_run_directory_has_one_owner_at_a_time(run_dir: Path) -> None:
 
 def test_clearing_leaves_foreign_files_and_sockets_alone(claimed: RunDir) -> None:
     (claimed.path / "notes.txt").write_text("mine")
-    (claimed.logs / "thesis.tex").write_text("mine")
+    for name in ("thesis.tex", "notes.log"):
+        (claimed.logs / name).write_text("mine")
     claimed.log_of("planner").write_text("a line")
     for name in ("planner.zenoh", "foreign.sock"):
         with closing(socket.socket(socket.AF_UNIX)) as dead:
             dead.bind(str(claimed.path / name))
     claimed.clear(keep_logs=False)
     assert files_in(claimed.path) == [
-        MARKER, "foreign.sock", "logs", "logs/thesis.tex", "notes.txt",
+        MARKER, "foreign.sock", "logs", "logs/notes.log", "logs/thesis.tex", "notes.txt",
     ]  # fmt: skip
 
 
@@ -89,6 +90,15 @@ def test_a_folder_of_a_persons_own_files_is_refused_and_stays_as_it_is(run_dir: 
     SupervisedFleet(run_dir).stop()
     assert cli.main(["down", "--run-dir", str(run_dir)]) == 0
     assert files_in(run_dir) == ["logs", "logs/run.log", "supervisord.conf"]
+
+
+@pytest.mark.parametrize("name", ["supervisord.conf", "fleet.json", "poetry.lock", "x.pid"])
+def test_one_file_with_a_name_that_a_fleet_uses_too_is_a_persons(run_dir: Path, name: str) -> None:
+    run_dir.mkdir()
+    (run_dir / name).write_text("mine")
+    with pytest.raises(FleetError, match=f"holds {name}, which is no fleet's"):
+        RunDir(run_dir).claim()
+    assert (run_dir / name).read_text() == "mine"
 
 
 def test_down_where_nothing_is_makes_nothing(run_dir: Path) -> None:

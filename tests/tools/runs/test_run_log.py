@@ -8,10 +8,13 @@ import pytest
 from shared.bus import codec, topics
 from shared.bus.messages import Wrench
 from shared.exceptions import RunError
+from shared.mcap_log.reader import ChunkPlace, LogReader
+from shared.mcap_log.records import PREFIX
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Queue, item
-from tools.runs.run_log import read_run
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import parts_of, read_run
 
 WRENCH_KEY = topics.WRENCH.key(ROBOT)
 
@@ -144,3 +147,30 @@ def test_a_module_is_asked_for_exactly_where_there_is_one(tmp_path: Path) -> Non
         log.messages(topics.JOINT_STATE)
     with pytest.raises(RunError, match="name none"):
         log.messages(topics.WRENCH, "knee_right")
+
+
+def heads_of_chunks(data: bytes) -> list[int]:
+    """Return where the two times of each chunk with messages are."""
+    reader = LogReader(data)
+    return [found.start + PREFIX.size for found in reader.skim() if isinstance(found, ChunkPlace)]
+
+
+@pytest.mark.parametrize("which", [0, 1, -1])
+@pytest.mark.parametrize("bit", [34, 40, 50, 60])
+@pytest.mark.parametrize("time", ["first", "last"])
+def test_a_flipped_bit_in_the_times_of_a_chunk_loses_none_of_its_messages(
+    tmp_path: Path, which: int, bit: int, time: str
+) -> None:
+    """No CRC covers them: 34 is the first bit of more than 10 s."""
+    path, _ = runs.killed_file(tmp_path)
+    data = bytearray(path.read_bytes())
+    sent = read_run(path).messages(topics.JOINT_STATE, "knee_right")
+    at = heads_of_chunks(bytes(data))[which] + (8 if time == "last" else 0) + bit // 8
+    data[at] ^= 1 << bit % 8
+    flipped = tmp_path / "flipped.mcap"
+    flipped.write_bytes(data)
+    index = RunIndex(flipped)
+    found = []
+    for part in parts_of(index, part_s=index.length_s / 5, margin_s=0.0):
+        found += part.messages(topics.JOINT_STATE, "knee_right")
+    assert found == sent

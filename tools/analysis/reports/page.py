@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
@@ -63,6 +64,7 @@ class Page:
         self._model: PageModel | None = None
         self._about: RunData | None = None
         self._has_first = self._has_last = False
+        self._armed_s: float | None = None
         self._timeline = Timeline()
         self._judge = summary.Judge()
         self._losses = summary.MessageLosses()
@@ -73,7 +75,9 @@ class Page:
         Raises:
             RunError: a message has another version.
         """
-        run = RunData(log, self._axis)
+        run = RunData(log, self._axis, self._armed_s)
+        armed_s = run.armed_s()
+        self._armed_s = armed_s if math.isfinite(armed_s) else None
         self._has_first |= log.is_first
         self._has_last |= log.is_last
         if self._about is None or (self._about.course is None and run.course is not None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,13 +34,17 @@ class TimeAxis(NamedTuple):
 class RunData:
     """A log or a part of one, its time axis and its robot."""
 
-    def __init__(self, log: RunLog, axis: TimeAxis | None = None) -> None:
+    def __init__(
+        self, log: RunLog, axis: TimeAxis | None = None, armed_before_s: float | None = None
+    ) -> None:
         """Take a log.
 
         Args:
             log: a run; or a part of one, read with a margin.
             axis: of the page; None: that of the log alone.
+            armed_before_s: when all six drives were armed first, in a part before this one.
         """
+        self.armed_before_s = armed_before_s
         self.log = log
         self.course: Course | None = None
         """Trajectory of the simulated world; None if the log has none or its scenario never
@@ -118,14 +123,17 @@ class RunData:
     def armed_s(self) -> float:
         """Return when all six drives were armed for the first time, s; if never, the begin.
 
-        Earlier figures describe a robot that does not stand yet.
+        Earlier figures describe a robot that does not stand yet. A part of a run before that has
+        no time from which they count: it is infinite.
         """
+        if self.armed_before_s is not None:
+            return self.armed_before_s
         found = []
         for module in MODULES:
             (drive,) = self.columns(topics.JOINT_STATE, module, "drive")
             armed = np.flatnonzero(drive == DriveStatus.ARMED)
             if not len(armed):
-                return self.span.begin
+                return self.span.begin if self.log.is_whole else math.inf
             found.append(float(self.times(topics.JOINT_STATE, module)[armed[0]]))
         return max(found)
 

@@ -22,6 +22,7 @@ from shared.bus.messages import (
     Tare,
     Wrench,
 )
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.robot.joints import MODULES
 from tools.analysis.reports.limit_violations import LimitViolations
@@ -58,15 +59,16 @@ class Timeline:
         self._found: list[TimelineEvent] = []
         self._violations = LimitViolations()
         self._silences = Silences()
+        self._successive = Successive()
 
     def take(self, run: RunData) -> None:
         """Take a run, or the next part of it."""
         found = (
             *_run_events(run),
             *_mode_changes(run),
-            *_drives(run),
-            *_planner(run),
-            *_harness(run),
+            *_drives(run, self._successive),
+            *_planner(run, self._successive),
+            *_harness(run, self._successive),
             *_world(run),
             *_network(run),
         )
@@ -202,14 +204,34 @@ def _describe_mode_change(group: Sequence[tuple[float, str, JointEvent]]) -> str
     return f"{text}; torque step {step:.2f} N m"
 
 
-def _drives(run: RunData) -> Iterator[TimelineEvent]:
+class Successive:
+    """Gives a topic's messages in parts of a run, each with the last message before the part."""
+
+    def __init__(self) -> None:
+        self._last: dict[tuple[str, str], tuple[float, Any]] = {}
+
+    def of(self, run: RunData, topic: Topic, module: str = "") -> list[tuple[float, Any]]:
+        """Return (time, message) of what is inside the part, after the last one before it."""
+        rows = [
+            (t, message)
+            for t, message in zip(
+                run.times(topic, module).tolist(), run.log.messages(topic, module), strict=True
+            )
+            if run.is_inside(t)
+        ]
+        before = self._last.get((topic.name, module))
+        if rows:
+            self._last[topic.name, module] = rows[-1]
+        return rows if before is None else [before, *rows]
+
+
+def _drives(run: RunData, successive: Successive) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointState, JointState]] = []
     for module in MODULES:
-        states: list[JointState] = run.log.messages(topics.JOINT_STATE, module)
-        t = run.times(topics.JOINT_STATE, module)
+        rows = successive.of(run, topics.JOINT_STATE, module)
         changes += [
-            (float(t[index]), module, states[index - 1], states[index])
-            for index in _changes([(state.drive, state.drive_error) for state in states])
+            (rows[index][0], module, rows[index - 1][1], rows[index][1])
+            for index in _changes([(state.drive, state.drive_error) for _, state in rows])
         ]
     changes.sort(key=lambda row: row[0])
     for group in _together(changes, _describe_drive_change):
@@ -233,30 +255,29 @@ def _describe_drive_change(row: tuple[float, str, JointState, JointState]) -> st
     return ", ".join(parts)
 
 
-def _planner(run: RunData) -> Iterator[TimelineEvent]:
-    rows: list[PlannerStatus] = run.log.messages(topics.PLANNER_STATUS)
-    t = run.times(topics.PLANNER_STATUS)
-    for index in _changes([(row.mode, row.session) for row in rows]):
-        before, after = rows[index - 1], rows[index]
+def _planner(run: RunData, successive: Successive) -> Iterator[TimelineEvent]:
+    rows: list[tuple[float, PlannerStatus]] = successive.of(run, topics.PLANNER_STATUS)
+    for index in _changes([(row.mode, row.session) for _, row in rows]):
+        (_, before), (t, after) = rows[index - 1], rows[index]
         fresh = " in a new session" if before.session != after.session else ""
         text = f"planner: {_name(PlannerMode, before.mode)} to {_name(PlannerMode, after.mode)}"
         bad = after.mode not in _NORMAL_MODES
-        yield TimelineEvent(float(t[index]), "bad" if bad else "note", text + fresh)
-    for index in _changes([row.wait_s > 0.0 for row in rows]):
-        if rows[index].wait_s >= BACKOFF_MIN_S:
-            text = f"planner: backs off for {rows[index].wait_s:.1f} s or more, after drop-outs"
-            yield TimelineEvent(float(t[index]), "note", text)
+        yield TimelineEvent(t, "bad" if bad else "note", text + fresh)
+    for index in _changes([row.wait_s > 0.0 for _, row in rows]):
+        t, row = rows[index]
+        if row.wait_s >= BACKOFF_MIN_S:
+            text = f"planner: backs off for {row.wait_s:.1f} s or more, after drop-outs"
+            yield TimelineEvent(t, "note", text)
 
 
-def _harness(run: RunData) -> Iterator[TimelineEvent]:
-    rows: list[Wrench] = run.log.messages(topics.WRENCH)
-    t = run.times(topics.WRENCH)
-    for index in _changes([(row.valid, row.saturated, row.tare) for row in rows]):
-        row = rows[index]
+def _harness(run: RunData, successive: Successive) -> Iterator[TimelineEvent]:
+    rows: list[tuple[float, Wrench]] = successive.of(run, topics.WRENCH)
+    for index in _changes([(row.valid, row.saturated, row.tare) for _, row in rows]):
+        t, row = rows[index]
         state = "valid" if row.valid else "saturated" if row.saturated else "not valid"
         tare = "" if row.tare == Tare.DONE else f", tare {_name(Tare, row.tare)}"
         kind = "note" if row.valid else "bad"
-        yield TimelineEvent(float(t[index]), kind, f"harness sensor {state}{tare}")
+        yield TimelineEvent(t, kind, f"harness sensor {state}{tare}")
 
 
 def _world(run: RunData) -> Iterator[TimelineEvent]:

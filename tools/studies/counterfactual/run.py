@@ -10,7 +10,7 @@ from services.simulator.plant import PlantConfig
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Scenario
-from tools.runs.lockstep import Lockstep
+from tools.runs.lockstep import FleetMoment, Lockstep
 from tools.runs.network import BASE
 from tools.studies.counterfactual.moments import Moment
 
@@ -69,7 +69,7 @@ def counterfactual_of(task: Task) -> Counterfactual:
     moment = task.moment
     scenario = scenario_from(task.scenario, moment.at_s, task.kill, task.for_s)
     fleet = Lockstep(task.robot, scenario, BASE, plant=task.plant)
-    fleet.resume(moment.state, moment.modules, moment.planner)
+    fleet.resume(FleetMoment(moment.state, moment.modules, moment.planner))
     fell_at_s = None
     rows: list[SimTruth] = []
     for truth in fleet.run():

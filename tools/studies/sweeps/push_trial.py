@@ -8,24 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 
-from services.joint.snapshots import DriveManagerState
 from services.planner.poses import Poses
 from services.planner.push_limit import LoadedStand, PushLimits, limits_along
-from services.planner.snapshots import TickState
 from services.planner.split import ScheduledGains
 from services.simulator.plant import PlantConfig
-from services.simulator.state import taken
 from shared.bus.messages import SimTruth
-from shared.bus.traces import SimState
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.exceptions import RunError
-from shared.robot.joints import MODULES
-from tools.runs.lockstep import Lockstep
+from tools.runs.lockstep import FleetMoment, Lockstep
 from tools.runs.network import BASE
 from tools.studies.sweeps.figures import Ending, ending_of
 from tools.studies.sweeps.push_range import com_height
@@ -70,14 +65,6 @@ class PushResult(msgspec.Struct, frozen=True, kw_only=True):
     """What gives way then."""
     body_limit_n: float
     """What soles and motors bear in this pose if the push lasts, whatever the control."""
-
-
-class PushStart(NamedTuple):
-    """The moment before the push."""
-
-    state: SimState
-    modules: dict[str, DriveManagerState]
-    planner: tuple[int, TickState] | None
 
 
 def scenario_of(trial: PushTrial, force_n: float) -> Scenario:
@@ -150,7 +137,7 @@ def limits_of(trial: PushTrial, robot: RobotConfig) -> PushLimits:
     return limits_along(stand, robot, D, scheduled.D_B, direction)
 
 
-def _start_of(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushStart:
+def _start_of(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> FleetMoment:
     fleet = Lockstep(robot, scenario_of(trial, 0.0), BASE, plant=plant)
     for truth in fleet.run():
         if truth.fallen:
@@ -159,18 +146,16 @@ def _start_of(trial: PushTrial, robot: RobotConfig, plant: PlantConfig) -> PushS
             break
     if fleet.world.scenario_s < BEGIN_S - 0.1:
         raise RunError(f"{trial.pose}: the six modules never came to track")
-    modules = {name: fleet.snapshot_of(name) for name in MODULES}
-    planner = fleet.planner if trial.mode == "led" else None
-    memory = None if planner is None else (planner.session, planner.snapshot())
-    return PushStart(taken(fleet.world, fleet.bank, fleet.now_ns, 0), modules, memory)
+    moment = fleet.moment()
+    return moment if trial.mode == "led" else msgspec.structs.replace(moment, planner=None)
 
 
 def _stands(
-    trial: PushTrial, robot: RobotConfig, plant: PlantConfig, start: PushStart, force_n: float
+    trial: PushTrial, robot: RobotConfig, plant: PlantConfig, start: FleetMoment, force_n: float
 ) -> bool:
     scenario = scenario_of(trial, force_n)
     fleet = Lockstep(robot, msgspec.structs.replace(scenario, kill=()), BASE, plant=plant)
-    fleet.resume(start.state, start.modules, start.planner)
+    fleet.resume(start)
     rows = list(_until_down(fleet.run()))
     return bool(rows) and ending_of(rows[-1], scenario.duration, robot) is Ending.STOOD
 

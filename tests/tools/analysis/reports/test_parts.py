@@ -6,16 +6,21 @@ import re
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
+from shared.bus import topics
+from shared.bus.messages import DriveStatus, JointState
+from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tests.tools.analysis.reports import pages
+from tests.tools.analysis.reports import pages, runs
 from tests.tools.analysis.reports.runs import Made
 from tools import cli
 from tools.analysis.reports import scene
-from tools.analysis.reports.page import render_parts
+from tools.analysis.reports.page import render, render_parts
 from tools.analysis.reports.page_model import Line, PageModel, PageWindow
+from tools.analysis.reports.run_data import RunData
 from tools.analysis.reports.signals import Span
 from tools.runs import verdict
 from tools.runs.judgement import summarise_parts
@@ -71,19 +76,6 @@ def test_panels_and_lines_are_those_of_the_whole(page: str, in_parts: str) -> No
         assert np.nanmin(values) == pytest.approx(np.nanmin(values_all), abs=1e-3)
         assert np.nanmax(values) == pytest.approx(np.nanmax(values_all), abs=1e-3)
         assert (t[0], t[-1]) == pytest.approx((t_all[0], t_all[-1]), abs=0.01)
-
-
-def test_counters_go_on_from_part_to_part(page: str, in_parts: str) -> None:
-    for title in ("Late control cycles", "Refused commands"):
-        ends = []
-        for data in (pages.data_of(page), pages.data_of(in_parts)):
-            found = [panel for panel in data["panels"] if panel["title"] == title]
-            lines = found[0]["lines"] if found else []
-            ends.append(
-                [pages.decode_signal(data["signals"][line["signal"]], data["grid"])[1][-1]
-                 for line in lines]
-            )  # fmt: skip
-        assert ends[0] == pytest.approx(ends[1])
 
 
 def test_the_bars_are_those_of_the_whole(page: str, in_parts: str) -> None:
@@ -211,3 +203,42 @@ def test_a_counter_goes_on_from_where_the_part_before_it_ended() -> None:
     _, seen = pages.line(data, "Late", "late")
     assert seen[-1] == pytest.approx(9.0, abs=1e-3), "3 in the first part, 6 in the second"
     assert (np.diff(seen) >= 0.0).all()
+
+
+def test_before_the_drives_are_armed_no_soft_stop_is_passed(log: RunLog, tmp_path: Path) -> None:
+    """A robot that hangs unarmed has its joints anywhere."""
+
+    def hanging(name: str, payload: bytes) -> bytes:
+        if not name.endswith("/state") or "joint" not in name:
+            return payload
+        state = msgspec.json.decode(payload, type=JointState)
+        if state.t_ns > armed_ns:
+            return payload
+        beyond = msgspec.structs.replace(state, q=(9.0, 9.0), drive=int(DriveStatus.IDLE))
+        return msgspec.json.encode(beyond)
+
+    armed_ns = RunData(log).zero_ns - NS_PER_S
+    hung = runs.rewritten(log, tmp_path, payload=hanging)
+    for page in (render(hung), render_parts(hung.index, part_s=PART_S)):
+        assert "beyond a soft stop" not in page
+
+
+def test_a_change_across_a_silence_at_the_edge_of_a_part_has_its_row(
+    log: RunLog, tmp_path: Path
+) -> None:
+    """The planner is dead for longer than a part and its margins."""
+    begin_ns = RunData(log).zero_ns + NS_PER_S
+    key = topics.PLANNER_STATUS.key(log.robot)
+    heard = [
+        (t_ns, topics.PLANNER_STATUS.name, body)
+        for t_ns, body, _ in log.raw(key)
+        if not begin_ns <= t_ns < begin_ns + 4 * NS_PER_S
+    ]
+    others = lambda name: name != topics.PLANNER_STATUS.name  # noqa: E731
+    quiet = runs.rewritten(log, tmp_path, keep=others, more=heard)
+    whole, parts = (
+        [row for row in section(page, "timeline") if "planner: " in row]
+        for page in (render(quiet), render_parts(quiet.index, part_s=PART_S))
+    )
+    assert whole
+    assert parts == whole
