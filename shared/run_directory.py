@@ -7,8 +7,10 @@ else's, or that others may write to, is refused wherever one is named.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 from shared.exceptions import FleetError
@@ -49,6 +51,16 @@ def check_own(path: Path, *, alone: bool = True) -> None:
         raise FleetError(
             f"{path}: others may write to it; `chmod go-w {path}`, or give another --run-dir"
         )
+
+
+@contextlib.contextmanager
+def private_files() -> Iterator[None]:
+    """Make what is created meanwhile this user's alone, whatever the umask: sockets."""
+    before = os.umask(0o077)
+    try:
+        yield
+    finally:
+        os.umask(before)
 
 
 def own_directory(text: str) -> Path:

@@ -27,8 +27,13 @@ def progress_along(what: str, length_s: float) -> Iterator[Callable[[float], Non
         yield lambda done_s: shown.update(bar, completed=done_s)
 
 
-def write_atomically(out: Path, content: bytes) -> None:
+def write_atomically(out: Path, content: bytes, *, private: bool = False) -> None:
     """Write a file whole or not at all.
+
+    Args:
+        out: the file.
+        content: of it.
+        private: for this user alone.
 
     Raises:
         RunError: the file cannot be written.
@@ -37,6 +42,8 @@ def write_atomically(out: Path, content: bytes) -> None:
     if out.exists() and not out.is_file():
         raise RunError(f"{out}: is no ordinary file; give another -o")
     try:
+        if private:
+            part.touch(mode=0o600)
         part.write_bytes(content)
         part.replace(out)
     except OSError as error:

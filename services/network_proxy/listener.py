@@ -9,6 +9,7 @@ import socket
 from pathlib import Path
 
 from shared.exceptions import BusError
+from shared.run_directory import private_files
 
 
 class SocketListener:
@@ -26,7 +27,8 @@ class SocketListener:
         self.socket = socket.socket(socket.AF_UNIX)
         try:
             path.unlink(missing_ok=True)
-            self.socket.bind(str(path))
+            with private_files():
+                self.socket.bind(str(path))
             self.socket.listen()
         except OSError as error:
             self.socket.close()

@@ -16,6 +16,7 @@ from typing import Final
 
 from services.simulator.fibre_front import FibreFront
 from shared.exceptions import FleetError
+from shared.run_directory import private_files
 
 PACKET_BYTES: Final = 64
 """A full-speed bulk transfer."""
@@ -56,7 +57,8 @@ class FibrePort:
         listener.setblocking(False)
         try:
             self._clear_stale()
-            listener.bind(str(self.path))
+            with private_files():
+                listener.bind(str(self.path))
             listener.listen(_BACKLOG)
         except OSError as error:
             listener.close()

@@ -13,6 +13,7 @@ from typing import Protocol
 
 from shared.can.unix_can import PACKET_BYTES, Frame, pack_frames, unpack_frames
 from shared.exceptions import FleetError
+from shared.run_directory import private_files
 
 _PATH_BYTES = 107  # sun_path less its closing zero
 _BACKLOG = 16
@@ -157,7 +158,8 @@ def _listen(path: Path) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.setblocking(False)
     try:
-        listener.bind(str(path))
+        with private_files():
+            listener.bind(str(path))
         listener.listen(_BACKLOG)
     except OSError as error:
         listener.close()

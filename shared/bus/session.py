@@ -23,7 +23,8 @@ from typing import Final, Generic, Self, TypeAlias, TypeVar
 
 import zenoh
 
-from shared.bus import socket_linger
+from shared.bus import security, socket_linger
+from shared.bus.access import alive_prefix, token_key
 from shared.bus.codec import Decoder, encode
 from shared.bus.links import PAIRS, Pair, endpoint_through
 from shared.bus.messages import Message
@@ -33,6 +34,7 @@ from shared.config.robot_config import SERVICES, RobotConfig, expand
 from shared.exceptions import BusError, NonFiniteError
 from shared.process import SOCKET_PATH_MAX
 from shared.robot.joints import MODULES
+from shared.run_directory import private_files
 
 M = TypeVar("M", bound=Message)
 _Subscriber: TypeAlias = "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
@@ -72,8 +74,6 @@ _PRIORITIES: Final = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
-_UNIX: Final = "unixsock-stream/"
-_TCP: Final = ("tcp/", "tls/")
 _ALIVE_TIMEOUT_S: Final = 0.2
 
 
@@ -194,8 +194,8 @@ class Session:
         self.robot = robot
         self.name = name
         self._session = session
-        self._alive_prefix = f"xrl/{robot}/alive/"
-        self._token = session.liveliness().declare_token(self._alive_prefix + name)
+        self._alive_prefix = f"{alive_prefix(robot)}/"
+        self._token = session.liveliness().declare_token(token_key(robot, name))
         if over_tcp:  # held, or it would end
             self._links = session.info.declare_link_events_listener(_meet_link, history=True)
 
@@ -289,7 +289,7 @@ class Session:
             raise BusError(f"{', '.join(key_expressions)}: {_reason(error)}") from None
 
     def alive(self) -> set[str]:
-        """Return the names of the processes that this one has a link with, and its own.
+        """Return the services that this process has a link with, and itself if it is one.
 
         For display only: a stopped process counts as alive until its lease is over.
         Takes up to 0.2 s; not for a control loop.
@@ -356,6 +356,7 @@ def open_session(
     dialling = [_endpoint(text, run_dir) for text in (*peers, *connect)]
     settings = {
         **_SETTINGS,
+        **security.settings(config, name, (*listening, *dialling)),
         "transport/link/tx/lease": config.bus.lease_ms,
         # A stopped process takes a call but never answers; close() waits for that answer.
         "transport/unicast/open_timeout": config.bus.lease_ms,
@@ -371,8 +372,10 @@ def open_session(
         zenoh_config = zenoh.Config()
         for key, value in settings.items():
             zenoh_config.insert_json5(key, json.dumps(value))
-        over_tcp = any(endpoint.startswith(_TCP) for endpoint in (*listening, *dialling))
-        return Session(zenoh.open(zenoh_config), config.name, name, over_tcp=over_tcp)
+        over_tcp = any(endpoint.startswith(security.TCP) for endpoint in (*listening, *dialling))
+        with private_files():
+            opened = zenoh.open(zenoh_config)
+        return Session(opened, config.name, name, over_tcp=over_tcp)
     except (zenoh.ZError, OSError) as error:
         raise _open_error(name, listening, error) from None
 
@@ -384,7 +387,7 @@ def _meet_link(event: zenoh.LinkEvent) -> None:
     than the lease, all links of the process stalled for up to 10 s for each lost link.
     """
     link = event.link
-    if event.kind == zenoh.SampleKind.PUT and link.src.startswith(_TCP):
+    if event.kind == zenoh.SampleKind.PUT and link.src.startswith(security.TCP):
         socket_linger.reset_on_close(_address(link.src), _address(link.dst))
 
 
@@ -403,8 +406,8 @@ def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
 def _endpoint(text: str, run_dir: Path) -> str:
     """Return an endpoint with `{run}` filled in; a path too long for a UNIX socket is refused."""
     endpoint = expand(text, run_dir)
-    length = len(os.fsencode(endpoint.removeprefix(_UNIX)))
-    if endpoint.startswith(_UNIX) and length > SOCKET_PATH_MAX:
+    length = len(os.fsencode(endpoint.removeprefix(security.UNIX)))
+    if endpoint.startswith(security.UNIX) and length > SOCKET_PATH_MAX:
         raise BusError(
             f"{endpoint}: a socket path of {length} bytes; "
             f"at most {SOCKET_PATH_MAX}: take a shorter run directory"
@@ -414,8 +417,8 @@ def _endpoint(text: str, run_dir: Path) -> str:
 
 def _make_directory(endpoint: str) -> None:
     """Make the directory of a UNIX socket, for its owner only."""
-    if endpoint.startswith(_UNIX):
-        directory = Path(endpoint.removeprefix(_UNIX)).parent
+    if endpoint.startswith(security.UNIX):
+        directory = Path(endpoint.removeprefix(security.UNIX)).parent
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
 
 

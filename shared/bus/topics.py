@@ -1,4 +1,4 @@
-"""The one table of topics: key, type, rate, priority, recorded (docs/networks.md)."""
+"""The one table of topics: key, type, rate, priority, who writes, who reads (docs/networks.md)."""
 
 from __future__ import annotations
 
@@ -19,6 +19,14 @@ class Priority(IntEnum):
     BACKGROUND = 7
 
 
+OPERATOR: Final = "operator"
+"""Who leads by a tool: `xrl estop`, `xrl demo`, ..."""
+VIEWER: Final = "viewer"
+"""Who only looks."""
+RECORDER: Final = "recorder"
+READERS_OF_ALL: Final = (RECORDER, OPERATOR, VIEWER)
+
+
 class Topic(msgspec.Struct, frozen=True, kw_only=True):
     """One row of the table."""
 
@@ -29,6 +37,10 @@ class Topic(msgspec.Struct, frozen=True, kw_only=True):
     """Nominal rate, as `deploy/robot.toml` sets it; 0 for events."""
     priority: Priority
     recorded: bool
+    writers: tuple[str, ...]
+    """Who may put it: services, `operator`, or `*`, the module of the key (docs/security.md)."""
+    readers: tuple[str, ...] = ()
+    """Services that use it; `READERS_OF_ALL` may read every topic."""
     why: str
 
     def key(self, robot: str, module: str = "") -> str:
@@ -47,6 +59,8 @@ JOINT_STATE: Final = Topic(
     rate_hz=250.0,
     priority=Priority.REAL_TIME,
     recorded=True,
+    writers=("*",),
+    readers=("planner",),
     why="the planner's input; its stamp is echoed",
 )
 JOINT_COMMAND: Final = Topic(
@@ -55,6 +69,8 @@ JOINT_COMMAND: Final = Topic(
     rate_hz=250.0,
     priority=Priority.REAL_TIME,
     recorded=True,
+    writers=("planner",),
+    readers=("*",),
     why="references, gains and torques of the law",
 )
 JOINT_EVENT: Final = Topic(
@@ -63,6 +79,7 @@ JOINT_EVENT: Final = Topic(
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=("*",),
     why="every change of state, with its cause and torque step",
 )
 JOINT_TRACE: Final = Topic(
@@ -71,6 +88,7 @@ JOINT_TRACE: Final = Topic(
     rate_hz=50.0,
     priority=Priority.BACKGROUND,
     recorded=True,
+    writers=("*",),
     why="every cycle's inputs: a joint service can be re-executed from them, bit for bit",
 )
 PLANNER_CHECKPOINT: Final = Topic(
@@ -79,6 +97,7 @@ PLANNER_CHECKPOINT: Final = Topic(
     rate_hz=1.0,
     priority=Priority.BACKGROUND,
     recorded=True,
+    writers=("planner",),
     why="the planner's state: re-execution can start here",
 )
 WRENCH: Final = Topic(
@@ -87,6 +106,8 @@ WRENCH: Final = Topic(
     rate_hz=250.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=("harness",),
+    readers=("planner",),
     why="wrench of the operator on the torso",
 )
 ATTITUDE: Final = Topic(
@@ -95,6 +116,8 @@ ATTITUDE: Final = Topic(
     rate_hz=100.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=("imu",),
+    readers=("planner",),
     why="direction of up, where an IMU is fitted",
 )
 HARNESS_TARE: Final = Topic(
@@ -103,6 +126,8 @@ HARNESS_TARE: Final = Topic(
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=(OPERATOR,),
+    readers=("harness",),
     why="request for a new zero of the harness sensor",
 )
 PLANNER_STATUS: Final = Topic(
@@ -111,6 +136,7 @@ PLANNER_STATUS: Final = Topic(
     rate_hz=250.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=("planner",),
     why="inputs and decisions of the law",
 )
 OPERATOR_INTENT: Final = Topic(
@@ -119,6 +145,8 @@ OPERATOR_INTENT: Final = Topic(
     rate_hz=50.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=(OPERATOR, "simulator"),
+    readers=("planner", "simulator"),
     why="assist and shift that the person requests",
 )
 ESTOP: Final = Topic(
@@ -127,6 +155,8 @@ ESTOP: Final = Topic(
     rate_hz=0.0,
     priority=Priority.REAL_TIME,
     recorded=True,
+    writers=(OPERATOR,),
+    readers=MODULES,
     why="emergency stop: every module to DAMP",
 )
 SIM_TRUTH: Final = Topic(
@@ -135,6 +165,7 @@ SIM_TRUTH: Final = Topic(
     rate_hz=100.0,
     priority=Priority.BACKGROUND,
     recorded=True,
+    writers=("simulator",),
     why="true state of the world, for the verdict; no controller reads it",
 )
 SIM_STATE: Final = Topic(
@@ -143,6 +174,7 @@ SIM_STATE: Final = Topic(
     rate_hz=10.0,
     priority=Priority.BACKGROUND,
     recorded=True,
+    writers=("simulator",),
     why="complete simulated world: `xrl whatif` continues from it",
 )
 SIM_CONTROL: Final = Topic(
@@ -151,6 +183,8 @@ SIM_CONTROL: Final = Topic(
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=(OPERATOR,),
+    readers=("simulator",),
     why="starts the scenario",
 )
 RUN_EVENT: Final = Topic(
@@ -159,6 +193,7 @@ RUN_EVENT: Final = Topic(
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=(OPERATOR,),
     why="kills, restarts, faults and pushes, for the verdict",
 )
 LINK_EVENT: Final = Topic(
@@ -167,6 +202,7 @@ LINK_EVENT: Final = Topic(
     rate_hz=0.0,
     priority=Priority.DATA,
     recorded=True,
+    writers=("network_proxy",),
     why="impairments of the network on purpose: a log without them is no evidence",
 )
 
@@ -200,3 +236,21 @@ def keys(topic: Topic, robot: str) -> tuple[str, ...]:
 def all_keys(robot: str) -> dict[str, Topic]:
     """Return the topic of every full key of a robot."""
     return {key: topic for topic in TOPICS for key in keys(topic, robot)}
+
+
+def written_keys(robot: str, name: str) -> tuple[str, ...]:
+    """Return the full keys that a service, `operator` or `viewer` may put."""
+    return tuple(key for topic in TOPICS for key in _keys_of(topic, robot, name, topic.writers))
+
+
+def read_keys(robot: str, name: str) -> tuple[str, ...]:
+    """Return the full keys that a service, `operator` or `viewer` may receive."""
+    if name in READERS_OF_ALL:
+        return (f"xrl/{robot}/**",)
+    return tuple(key for topic in TOPICS for key in _keys_of(topic, robot, name, topic.readers))
+
+
+def _keys_of(topic: Topic, robot: str, name: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    if name in names:
+        return keys(topic, robot)
+    return (topic.key(robot, name),) if "*" in names and name in MODULES else ()

@@ -13,7 +13,7 @@ import msgspec
 
 from shared.can.can_load import check_buses
 from shared.can.drive_settings import CURRENT_RANGE
-from shared.config.robot_config import SERVICES, RobotConfig
+from shared.config.robot_config import ENDPOINTS_OF_MODE, SERVICES, RobotConfig
 from shared.config.sections import LimitConfig
 from shared.exceptions import ConfigError
 from shared.robot.joints import KINDS, MODULES
@@ -47,6 +47,32 @@ def check(file: str, config: RobotConfig) -> None:
     _check_drive(file, config)
     _check_timing(file, config)
     check_buses(file, config)
+
+
+def check_security(file: str, config: RobotConfig) -> None:
+    """Check that the endpoints are those of `bus.security.mode`; not done for a robot of a log.
+
+    Raises:
+        ConfigError: a port would be open to anyone, and the file does not say so.
+    """
+    security = config.bus.security
+    if not re.match(r"[~/]", security.keys):
+        found = f"{security.keys!r} depends on where a service is started"
+        raise ConfigError(file, "bus.security.keys", found, "a path that begins with / or ~")
+    for service, endpoint in config.bus.endpoints.items():
+        if not endpoint.startswith(ENDPOINTS_OF_MODE[security.mode]):
+            words = _words(f"{start}..." for start in ENDPOINTS_OF_MODE[security.mode])
+            found = f"{endpoint!r} is not one of bus.security.mode = {security.mode!r}"
+            right = f"{words}; or mode = " + _OTHER_MODE[endpoint.partition("/")[0]]
+            raise ConfigError(file, f"bus.endpoints.{service}", found, right)
+
+
+_OTHER_MODE: Final = {
+    "unixsock-stream": '"local", for one host',
+    "tls": '"mtls", with `xrl keys make`',
+    "tcp": '"open", and anyone who reaches the port commands the robot (docs/security.md)',
+}
+"""By the kind of an endpoint: the mode in which it would be right."""
 
 
 def _check_names(file: str, config: RobotConfig) -> None:

@@ -35,7 +35,9 @@ def load_without_schedule(path: Path) -> RobotConfig:
     Raises:
         ConfigError: the file cannot be read, or a key or value is not as it should be.
     """
-    return _checked(read_toml(path, RobotConfig), str(path))
+    config = _checked(read_toml(path, RobotConfig), str(path))
+    config_check.check_security(str(path), config)
+    return config
 
 
 def parse(text: str, file: str) -> RobotConfig:

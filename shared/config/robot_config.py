@@ -38,6 +38,13 @@ SERVICES = ("planner", "harness", "imu", "recorder", "simulator", *MODULES)
 OPTIONAL = ("imu",)
 """Those that not every robot has: `RobotConfig.services`."""
 
+ENDPOINTS_OF_MODE = {
+    "local": ("unixsock-stream/",),
+    "mtls": ("tls/",),
+    "open": ("unixsock-stream/", "tcp/"),
+}
+"""What the bus's endpoints begin with under each `bus.security.mode` (docs/security.md)."""
+
 GRAVITY = 9.81
 """m/s^2"""
 

@@ -360,11 +360,21 @@ class CanConfig(Section, frozen=True):
     channel: str
 
 
+class BusSecurityConfig(Section, frozen=True):
+    """Who may link to the bus (docs/security.md)."""
+
+    mode: Literal["local", "mtls", "open"] = "local"
+    """UNIX sockets of this user; TLS by certificates on both sides; anyone who reaches a port."""
+    keys: str = "~/.config/xrl/{robot}/keys"
+    """Folder of this host's certificates and keys, for `mtls`: `xrl keys pack` fills it."""
+
+
 class BusConfig(Section, frozen=True):
     """The Zenoh bus: fixed endpoints, no scouting."""
 
     lease_ms: Annotated[int, Range(100, 60_000, "ms")]
     endpoints: dict[str, str]
+    security: BusSecurityConfig = BusSecurityConfig()
 
 
 class RecorderConfig(Section, frozen=True):

@@ -7,12 +7,11 @@ import struct
 import time
 from pathlib import Path
 
-import msgspec
-
 from shared.bus import socket_linger
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.process import DEFAULT_CONFIG
+from tests.certified import opened
 
 ON_FOR_10_S = struct.pack("ii", 1, 10)
 
@@ -67,8 +66,7 @@ def test_only_the_connection_between_the_two_addresses_is_changed() -> None:
 def test_no_tcp_link_of_the_bus_lingers_when_it_is_given_up(tmp_path: Path) -> None:
     robot = config_file.load(DEFAULT_CONFIG)
     endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in robot.bus.endpoints}
-    bus = msgspec.structs.replace(robot.bus, endpoints=endpoints)
-    robot = msgspec.structs.replace(robot, bus=bus)
+    robot = opened(robot, endpoints)
     with open_session(robot, "knee_left", tmp_path), open_session(robot, "planner", tmp_path):
         deadline = time.monotonic() + 10.0
         # both ends of the one link are in this process

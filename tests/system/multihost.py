@@ -32,6 +32,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Push, Scenario
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
+from tests.certified import certified
 from tests.system.namespaces import Network
 from tools.fleet import process_table
 from tools.fleet.pace import run_at_fitting_pace
@@ -142,14 +143,13 @@ def host_of(service: str) -> str:
     return next((leg for leg, modules in LEGS.items() if service in modules), BODY)
 
 
-def spread(robot: RobotConfig, network: Network) -> RobotConfig:
-    """Return the robot with every bus endpoint on its host."""
+def spread(robot: RobotConfig, network: Network, folder: Path) -> RobotConfig:
+    """Return the robot with every bus endpoint on its host, under `mtls`."""
     endpoints = {
-        service: f"tcp/{network.address(host_of(service))}:{port}"
+        service: f"tls/{network.address(host_of(service))}:{port}"
         for port, service in enumerate(robot.bus.endpoints, start=_FIRST_PORT)
     }
-    bus = msgspec.structs.replace(robot.bus, endpoints=endpoints)
-    return msgspec.structs.replace(robot, bus=bus)
+    return certified(robot, folder, endpoints)[0]
 
 
 def write_table(path: Path, network: Network) -> Path:
@@ -182,7 +182,9 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report, pace: float
     """
     # Before it starts a service, the supervisor tries whether its endpoint can be bound.
     network.allow_foreign_addresses()
-    robot = spread(experiment.load_robot(DEFAULT_CONFIG), network)
+    keyring = run_dir.parent / "keyring"
+    shutil.rmtree(keyring, ignore_errors=True)  # of an earlier try
+    robot = spread(experiment.load_robot(DEFAULT_CONFIG), network, keyring)
     told = scenario()
     robot_path, scenario_path, *_ = experiment.write_inputs(out, robot, told, PlantConfig())
     started = SupervisedFleet.start(

@@ -1,30 +1,31 @@
 """A robot whose services run on several hosts: `xrl up --only` on each.
 
-Three run directories stand for the hosts; they share the bus over TCP, and, as they are one
-machine after all, the emulated drives.
+Three run directories stand for the hosts; they share the bus over TLS, each with the keys of its
+own services only, and, as they are one machine after all, the emulated drives.
 """
 
 from __future__ import annotations
 
 import json
-import socket
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from shared.bus.topics import OPERATOR, VIEWER
 from shared.config import files as config_file
-from shared.config.robot_config import SERVICES, RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
+from tests.certified import certified, install_all
 from tests.system.waiting import wait_for
 from tools import cli
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
+from tools.keys.authority import Authority
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
@@ -45,31 +46,35 @@ def run_dirs() -> Iterator[dict[str, Path]]:
             SupervisedFleet(path).stop()
 
 
-def spread(robot: RobotConfig, drives: Path) -> RobotConfig:
-    """Return the robot with its endpoints at free TCP ports, and its drives in one place."""
-    with ExitStack() as stack:
-        sockets = {name: stack.enter_context(socket.socket()) for name in SERVICES}
-        for probe in sockets.values():
-            probe.bind(("127.0.0.1", 0))
-        endpoints = {
-            name: f"tcp/127.0.0.1:{probe.getsockname()[1]}" for name, probe in sockets.items()
-        }
+def with_drives_in(robot: RobotConfig, drives: Path) -> RobotConfig:
+    """Return the robot with its drives in one place."""
     can = {
         name: msgspec.structs.replace(bus, channel=bus.channel.replace("{run}", str(drives)))
         for name, bus in robot.can.items()
     }
-    bus = msgspec.structs.replace(robot.bus, endpoints=endpoints)
-    return msgspec.structs.replace(robot, bus=bus, can=can)
+    return msgspec.structs.replace(robot, can=can)
+
+
+def robot_file(robot: RobotConfig, made: Authority, folder: Path, names: tuple[str, ...]) -> Path:
+    """Write the robot file of one host, which has the keys of these names only."""
+    install_all(made, folder / "keys", *names)
+    security = msgspec.structs.replace(robot.bus.security, keys=str(folder / "keys"))
+    bus = msgspec.structs.replace(robot.bus, security=security)
+    path = folder / "robot.toml"
+    own = msgspec.structs.replace(robot, bus=bus)
+    path.write_text(config_file.to_toml(own), encoding="utf-8")
+    schedule = DEFAULT_CONFIG.with_suffix(".gains.json")
+    (folder / "robot.gains.json").write_bytes(schedule.read_bytes())
+    return path
 
 
 def test_each_host_starts_its_own_services_and_all_six_modules_track(
     robot: RobotConfig, run_dirs: dict[str, Path], tmp_path: Path, capsys: Any
 ) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(config_file.to_toml(spread(robot, run_dirs["body"])), encoding="utf-8")
-    schedule = DEFAULT_CONFIG.with_suffix(".gains.json")
-    (tmp_path / "robot.gains.json").write_bytes(schedule.read_bytes())
+    everywhere, made = certified(with_drives_in(robot, run_dirs["body"]), tmp_path / "authority")
     for host, services in HOSTS.items():
+        tools = (OPERATOR,) if host == "body" else (VIEWER,)
+        path = robot_file(everywhere, made, tmp_path / f"keys-{host}", (*services, *tools))
         where = ["--config", str(path), "--run-dir", str(run_dirs[host])]
         assert (
             cli.main(["up", *where, "--out", str(tmp_path / host), "--only", ",".join(services)])

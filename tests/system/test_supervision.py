@@ -228,6 +228,7 @@ def test_a_port_in_use_is_refused_before_anything_starts(run_dir: Path, tmp_path
         other.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
         config = tmp_path / "robot.toml"
+        text = text.replace("[bus.endpoints]", '[bus.security]\nmode = "open"\n[bus.endpoints]')
         config.write_text(text.replace("unixsock-stream/{run}/planner.zenoh", endpoint))
         table = write_table(tmp_path / "p.toml", {"planner": SLEEPER})
         with pytest.raises(FleetError, match=f"planner: {endpoint}: port in use"):

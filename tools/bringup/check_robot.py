@@ -66,6 +66,7 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
     listeners = [
         ListenPoint(service, f"bus.endpoints.{service}", expand(endpoint, run_dir))
         for service, endpoint in robot.bus.endpoints.items()
+        if not process_table.is_elsewhere(expand(endpoint, run_dir))
     ]
     try:
         process_table.check_free(listeners)

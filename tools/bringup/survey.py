@@ -11,7 +11,14 @@ from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError, FleetError
 from shared.robot.joints import MODULES
-from tools.bringup import check_alike, check_board, check_can, check_machine, check_robot
+from tools.bringup import (
+    check_alike,
+    check_board,
+    check_can,
+    check_keys,
+    check_machine,
+    check_robot,
+)
 from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, number
 from tools.bringup.can_monitor import BusTraffic, listen, long_enough
 from tools.bringup.reach import boards_on_usb, drives_within_reach, is_up
@@ -53,6 +60,7 @@ def survey(
         ROBOT: [
             *check_robot.robot_rows(robot, config_path),
             *check_robot.endpoint_rows(robot, run_dir, fleet_is_up=fleet_is_up),
+            *check_keys.security_rows(robot),
         ],
     }
     services_up = bool(check_robot.joint_services(check_robot.services_up(robot, run_dir)))

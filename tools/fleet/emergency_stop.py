@@ -10,6 +10,7 @@ from typing import Final
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import request_stop
 from shared.bus import topics
+from shared.bus.credentials import read_credentials
 from shared.bus.messages import Estop, JointState, Mode
 from shared.bus.session import open_session
 from shared.clock import now_ns
@@ -81,7 +82,11 @@ def stop_all(robot: RobotConfig, run_dir: Path) -> list[str]:
             going = [
                 m for m in going if modes.get(m) not in STOPPED and not _is_stopped(run_dir, m)
             ]
-    return [f"{m} {Mode(modes[m]).name if m in modes else 'silent'}" for m in going]
+    going = [f"{m} {Mode(modes[m]).name if m in modes else 'silent'}" for m in going]
+    if going and robot.bus.security.mode == "mtls":
+        name = read_credentials(robot, "estop").name
+        going += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
+    return going
 
 
 def _is_stopped(run_dir: Path, module: str) -> bool:

@@ -38,6 +38,8 @@ mode the joint service does not, and the mode says why."""
 PLANNER: Final = "planner"
 SILENT_PROXY: Final = "not known, for the network proxy does not answer"
 
+OPEN: Final = "bus.security.mode is open: anyone who reaches its ports commands this robot"
+
 _LINKS_S: Final = 1.0
 """Longest wait for the first message of each service."""
 _WINDOW_S: Final = 0.5
@@ -119,6 +121,8 @@ class FleetStatus(msgspec.Struct, frozen=True):
     """Active impairments of the network proxy, as text."""
     pace: float = 1.0
     """How fast the fleet's clock goes; below 1 it is in slow motion."""
+    security: str = "local"
+    """`bus.security.mode` of the robot file."""
 
 
 class RateMonitor:
@@ -191,8 +195,14 @@ def listen_for_all(monitors: Mapping[str, RateMonitor]) -> None:
     _listen(monitors, _LINKS_S, until=lambda: all(monitor.newest for monitor in monitors.values()))
 
 
-def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor]) -> FleetStatus:
-    """Listen for one window and return the fleet's status."""
+def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str) -> FleetStatus:
+    """Listen for one window and return the fleet's status.
+
+    Args:
+        fleet: by its supervisor.
+        monitors: of `ears_of`.
+        security: `bus.security.mode` of its robot file.
+    """
     for monitor in monitors.values():
         monitor.new_window()
     _listen(monitors, _WINDOW_S)
@@ -220,7 +230,9 @@ def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor]) -> FleetSt
     }
     lead = lead_status(monitors[PLANNER].newest if PLANNER in fresh else None)
     config, network = fleet.manifest.config, impairments(fleet)
-    return FleetStatus(str(fleet.run.path), config, services, modules, lead, network, pace())
+    return FleetStatus(
+        str(fleet.run.path), config, services, modules, lead, network, pace(), security
+    )
 
 
 def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:

@@ -35,6 +35,7 @@ SUPERVISOR_SOCKET = "supervisor.sock"
 """Name of the supervisor's own socket in the run directory."""
 
 UNIX = "unixsock-stream/"
+_ELSEWHERE = "an address of another host (`--only` starts the services of this one)"
 """Prefix of a bus endpoint on a UNIX socket."""
 
 
@@ -289,6 +290,11 @@ def check_free(listeners: Iterable[ListenPoint]) -> None:
             )
 
 
+def is_elsewhere(endpoint: str) -> bool:
+    """Return True for the endpoint of a service that runs on another host."""
+    return not endpoint.startswith(UNIX) and _tcp_fault(endpoint) == _ELSEWHERE
+
+
 def is_listening(endpoint: str) -> bool:
     """Return True if some process listens on a bus endpoint."""
     if endpoint.startswith(UNIX):
@@ -328,7 +334,7 @@ def _tcp_fault(endpoint: str) -> str:
             if error.errno == errno.EADDRINUSE:
                 return "port in use"
             if error.errno == errno.EADDRNOTAVAIL:
-                return "an address of another host (`--only` starts the services of this one)"
+                return _ELSEWHERE
             return f"cannot be listened on: {error.strerror or error}"
     return ""
 

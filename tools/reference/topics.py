@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import IntEnum
 from typing import Final, get_args, get_origin, get_type_hints
 
@@ -11,6 +11,7 @@ import msgspec
 from shared.bus import messages, topics
 from shared.bus.topics import Topic
 from shared.mcap_log.schema import ENUMERATIONS
+from shared.robot.joints import MODULES
 from tools.reference.field_docs import field_docs, one_line, summary
 
 ENUMS: Final[tuple[type[IntEnum], ...]] = tuple(
@@ -34,8 +35,8 @@ def page() -> str:
 
 def _lines() -> Iterator[str]:
     yield _INTRODUCTION
-    yield "| topic | message | rate | priority | purpose |"
-    yield "|---|---|---|---|---|"
+    yield "| topic | message | rate | priority | from | to | purpose |"
+    yield "|---|---|---|---|---|---|---|"
     for topic in topics.TOPICS:
         yield _topic_row(topic)
     yield ""
@@ -54,7 +55,15 @@ def _topic_row(topic: Topic) -> str:
     recorded = "" if topic.recorded else " (not recorded)"
     link = f"[{topic.type.__name__}](#{topic.type.__name__.lower()})"
     priority = topic.priority.name.lower().replace("_", " ")
-    return f"| `{topic.name}` | {link} | {rate} | {priority} | {one_line(topic.why)}{recorded} |"
+    why = f"{one_line(topic.why)}{recorded}"
+    sides = f"{_names(topic.writers)} | {_names(topic.readers)}"
+    return f"| `{topic.name}` | {link} | {rate} | {priority} | {sides} | {why} |"
+
+
+def _names(names: Sequence[str]) -> str:
+    if tuple(names) == MODULES:
+        return "all modules"
+    return ", ".join("its module" if name == "*" else name for name in names)
 
 
 def _message(kind: type[msgspec.Struct]) -> Iterator[str]:

@@ -17,6 +17,7 @@ from shared.bus.messages import DriveStatus, Refusal
 from shared.bus.session import open_session
 from shared.config.files import load
 from tools.fleet.fleet_status import (
+    OPEN,
     SILENT_PROXY,
     FleetStatus,
     LeadStatus,
@@ -52,13 +53,15 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Look at the fleet once, or until interrupted."""
     fleet = SupervisedFleet.attach(args.run_dir)
-    with open_session(load(Path(fleet.manifest.config)), "status", fleet.run.path) as session:
+    robot = load(Path(fleet.manifest.config))
+    security = robot.bus.security.mode
+    with open_session(robot, "status", fleet.run.path) as session:
         monitors = ears_of(session, fleet.manifest.topics)
         listen_for_all(monitors)
         if args.watch:
-            _watch(fleet, monitors)
+            _watch(fleet, monitors, security)
         else:
-            status = look(fleet, monitors)
+            status = look(fleet, monitors, security)
             if args.json:
                 print(msgspec.json.format(msgspec.json.encode(status)).decode())
             else:
@@ -168,6 +171,7 @@ def tables(status: FleetStatus) -> Group:
     line = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
     slow = f" in slow motion: the fleet's clock goes at {status.pace:g} of real time"
     lines = [f" {describe_lead(status.lead)}"]
+    lines += [f" [bold red]{OPEN}[/]"] if status.security == "open" else []
     lines += [slow] if status.pace != 1.0 else []
     lines += [line] if status.network else []
     lines += [f" [bold yellow]{text}[/]" for text in describe_refusals(status)]
@@ -176,7 +180,9 @@ def tables(status: FleetStatus) -> Group:
     return Group(services, modules, *lines)
 
 
-def _watch(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor]) -> None:
-    with Live(tables(look(fleet, monitors)), console=Console(), auto_refresh=False) as live:
+def _watch(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str) -> None:
+    with Live(
+        tables(look(fleet, monitors, security)), console=Console(), auto_refresh=False
+    ) as live:
         while True:
-            live.update(tables(look(fleet, monitors)), refresh=True)
+            live.update(tables(look(fleet, monitors, security)), refresh=True)

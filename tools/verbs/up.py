@@ -6,11 +6,14 @@ import argparse
 import time
 from pathlib import Path
 
+from rich.console import Console
+
 from services.simulator.plant import plant_from
 from shared.config import files as config_file
 from shared.exceptions import FleetError
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
+from tools.fleet.fleet_status import OPEN
 from tools.fleet.pace import add_pace
 from tools.fleet.process_table import check_known, load_table
 from tools.fleet.supervise import SupervisedFleet
@@ -89,7 +92,8 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start the fleet and say where it is."""
-    gain_schedule.require(config_file.load(args.config), args.config)
+    robot = config_file.load(args.config)
+    gain_schedule.require(robot, args.config)
     services = _services(args)
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
     overrides = _overrides(args, out)
@@ -114,6 +118,8 @@ def run(args: argparse.Namespace) -> int:
         f"{up} service{'s are' if up != 1 else ' is'} up in {fleet.run.path} "
         f"(logs: {fleet.run.logs}{record}); `xrl status` shows them, `xrl down` stops them"
     )
+    if robot.bus.security.mode == "open":
+        Console().print(f"[bold red]{OPEN}[/]")
     return 0
 
 

@@ -1,0 +1,94 @@
+"""Access rules of the bus under `mtls`: who may put and receive which key (docs/security.md).
+
+Each process checks what its peers send by the name in their certificate: service and generation.
+The rules follow from the topics' columns `writers` and `readers`; whatever no rule allows is denied.
+Zenoh has no list of revoked certificates: the rules name the current generation of each name only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+from shared.bus import topics
+from shared.config.robot_config import SERVICES
+
+PRINCIPALS: Final = (*SERVICES, topics.OPERATOR, topics.VIEWER)
+"""Every name that a certificate can have under `mtls`; the network proxy is no part of it."""
+
+_RECEIVED: Final = ("declare_subscriber",)
+_TOKENS: Final = ("liveliness_token",)
+_QUERIES: Final = ("liveliness_query", "declare_liveliness_subscriber")
+
+
+def alive_prefix(robot: str) -> str:
+    """Return what the keys of the liveliness tokens begin with."""
+    return f"xrl/{robot}/alive"
+
+
+def token_key(robot: str, name: str) -> str:
+    """Return the key of a process's liveliness token; a tool's is apart from the services'."""
+    kind = "" if name in SERVICES else "tool/"
+    return f"{alive_prefix(robot)}/{kind}{name}"
+
+
+def access_control(robot: str, own: str, generations: Mapping[str, int]) -> dict[str, Any]:
+    """Return Zenoh's setting `access_control` of one process.
+
+    Args:
+        robot: its name.
+        own: the process, one of `PRINCIPALS`.
+        generations: the current generation of each certified name.
+    """
+    rules = [
+        _rule("send", "egress", ("put",), topics.written_keys(robot, own)),
+        _rule("subscribe", "egress", _RECEIVED, topics.read_keys(robot, own)),
+        _rule("show-me", "egress", _TOKENS, _token_keys(robot, own)),
+        _rule("look-round", "egress", _QUERIES, (f"{alive_prefix(robot)}/*",)),
+        _rule("be-looked-at", "ingress", _QUERIES, (f"{alive_prefix(robot)}/*",)),
+    ]
+    everybody = [rule["id"] for rule in rules if rule is not None]
+    subjects, policies = [], []
+    for name, generation in generations.items():
+        own_rules = [
+            _rule(f"{name}-puts", "ingress", ("put",), topics.written_keys(robot, name)),
+            _rule(f"{name}-subscribes", "ingress", _RECEIVED, topics.read_keys(robot, name)),
+            _rule(f"{name}-shows", "ingress", _TOKENS, _token_keys(robot, name)),
+        ]
+        rules += own_rules
+        subjects.append({"id": name, "cert_common_names": [common_name(name, generation)]})
+        own_ids = [rule["id"] for rule in own_rules if rule is not None]
+        policies.append({"rules": [*everybody, *own_ids], "subjects": [name]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [rule for rule in rules if rule is not None],
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def common_name(name: str, generation: int) -> str:
+    """Return the name in a certificate, for example `planner.2`."""
+    return f"{name}.{generation}"
+
+
+def _token_keys(robot: str, name: str) -> tuple[str, ...]:
+    if name in SERVICES:
+        return (token_key(robot, name),)
+    return (f"{alive_prefix(robot)}/tool/*",)
+
+
+def _rule(
+    name: str, flow: str, messages: Iterable[str], keys: tuple[str, ...]
+) -> dict[str, Any] | None:
+    """Return a rule; None where there is nothing to allow, which Zenoh refuses as a rule."""
+    if not keys:
+        return None
+    return {
+        "id": name,
+        "permission": "allow",
+        "flows": [flow],
+        "messages": list(messages),
+        "key_exprs": list(keys),
+    }

@@ -1,0 +1,137 @@
+"""A host's certificates and keys, as `xrl keys pack` packs them (docs/security.md).
+
+authority.pem     certificate of the robot's authority
+names.toml        the robot, and the current generation of each name
+NAME.pem          certificate of NAME.GENERATION, for each process that this host runs
+NAME.key          its private key, readable by its owner alone
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import msgspec
+
+from shared.bus.access import PRINCIPALS
+from shared.bus.topics import OPERATOR, VIEWER
+from shared.config.robot_config import SERVICES, RobotConfig
+from shared.config.toml_file import Section, read_toml
+from shared.exceptions import BusError, ConfigError
+
+AUTHORITY: Final = "authority.pem"
+NAMES: Final = "names.toml"
+_HELP: Final = "`xrl keys pack` makes this host's keys (docs/security.md)"
+
+
+class Names(Section, frozen=True):
+    """`names.toml`: whose keys these are."""
+
+    robot: str
+    generations: dict[str, int]
+    """Current generation of each name; certificates of earlier ones are no longer let in."""
+
+
+class Credentials(NamedTuple):
+    """What one process proves itself with, and whom it believes."""
+
+    name: str
+    """One of `PRINCIPALS`."""
+    certificate: Path
+    key: Path
+    authority: Path
+    generations: dict[str, int]
+
+
+def keys_folder(robot: RobotConfig) -> Path:
+    """Return the folder that `bus.security.keys` names."""
+    return Path(robot.bus.security.keys.replace("{robot}", robot.name)).expanduser()
+
+
+def certificate_file(folder: Path, name: str) -> Path:
+    """Return where a name's certificate lies."""
+    return folder / f"{name}.pem"
+
+
+def key_file(folder: Path, name: str) -> Path:
+    """Return where a name's private key lies."""
+    return folder / f"{name}.key"
+
+
+def read_names(folder: Path) -> Names:
+    """Return whose keys a folder holds.
+
+    Raises:
+        BusError: there are none, or `names.toml` is not as it should be.
+    """
+    file = folder / NAMES
+    if not file.is_file():
+        raise BusError(f"{folder}: no keys for `mtls` here ({NAMES} is missing); {_HELP}")
+    try:
+        names = read_toml(file, Names)
+    except ConfigError as error:
+        raise BusError(str(error)) from None
+    strange = sorted(set(names.generations) - set(PRINCIPALS))
+    if strange:
+        right = f"one of {', '.join(PRINCIPALS)}"
+        raise BusError(f"{file}: generations.{strange[0]}: no such name; {right}")
+    return names
+
+
+def read_credentials(robot: RobotConfig, process: str) -> Credentials:
+    """Return what a process of this host proves itself with.
+
+    Args:
+        robot: its `bus.security.keys` names the folder.
+        process: a service, or a tool: it is the operator if this host has the operator's key,
+            else a viewer.
+
+    Raises:
+        BusError: something is missing, another robot's, or readable for others.
+    """
+    folder = keys_folder(robot)
+    names = read_names(folder)
+    if names.robot != robot.name:
+        raise BusError(
+            f"{folder}: keys of robot {names.robot!r}; those of {robot.name!r} are right"
+        )
+    wanted = (process,) if process in SERVICES else (OPERATOR, VIEWER)
+    name = next((name for name in wanted if key_file(folder, name).exists()), wanted[-1])
+    credentials = Credentials(
+        name,
+        certificate_file(folder, name),
+        key_file(folder, name),
+        folder / AUTHORITY,
+        names.generations,
+    )
+    for file in (credentials.certificate, credentials.key, credentials.authority):
+        if not file.is_file():
+            raise BusError(
+                f"{file}: missing: this host has no key for {' or '.join(wanted)}; {_HELP}"
+            )
+    check_private(credentials.key)
+    return credentials
+
+
+def check_private(key: Path) -> None:
+    """Refuse a private key that is not this user's alone.
+
+    Raises:
+        BusError: it is somebody else's, or others may read it.
+    """
+    found = key.stat()
+    if found.st_uid != os.geteuid():
+        raise BusError(f"{key}: belongs to another user; a private key is its service's own")
+    if stat.S_IMODE(found.st_mode) & 0o077:
+        raise BusError(f"{key}: others may read it; `chmod 600 {key}`")
+    try:
+        key.read_bytes()
+    except OSError as error:
+        raise BusError(f"{key}: {error.strerror}") from None
+
+
+def to_toml(names: Names) -> bytes:
+    """Return the text of `names.toml`."""
+    return msgspec.toml.encode(names)

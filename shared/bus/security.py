@@ -1,0 +1,76 @@
+"""Zenoh's settings for each `bus.security.mode` (docs/security.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+from shared.bus.access import access_control
+from shared.bus.credentials import read_credentials
+from shared.config.robot_config import ENDPOINTS_OF_MODE, RobotConfig
+from shared.exceptions import BusError
+
+UNIX: Final = "unixsock-stream/"
+TCP: Final = ("tcp/", "tls/")
+
+MESSAGE_MAX: Final = 1 << 20
+"""Largest message that is put together from its fragments, bytes."""
+PAYLOAD_MAX: Final = 1 << 16
+"""Largest payload that is let in, bytes; the largest of the topics is a third of it."""
+SESSIONS_MAX: Final = 32
+"""Peers at a time; a fleet has 11 services, and each tool is one."""
+
+
+def settings(robot: RobotConfig, process: str, endpoints: Sequence[str]) -> dict[str, object]:
+    """Return the settings that keep strangers off.
+
+    Args:
+        robot: its `bus.security`.
+        process: its name on the bus.
+        endpoints: all that it listens on or dials, as Zenoh takes them.
+
+    Raises:
+        BusError: an endpoint is none of the mode's, or a key is missing.
+    """
+    mode = robot.bus.security.mode
+    for endpoint in endpoints:
+        if not endpoint.startswith(ENDPOINTS_OF_MODE[mode]):
+            right = " or ".join(f"{start}..." for start in ENDPOINTS_OF_MODE[mode])
+            raise BusError(f"{endpoint}: not under bus.security.mode = {mode!r}; {right} is right")
+    found: dict[str, object] = {
+        "transport/unicast/max_sessions": SESSIONS_MAX,
+        "transport/link/rx/max_message_size": MESSAGE_MAX,
+        "low_pass_filter": [_LOW_PASS],
+    }
+    if mode == "mtls":
+        found |= _mutual_tls(robot, process)
+    return found
+
+
+_LOW_PASS: Final[dict[str, Any]] = {
+    "id": "payloads",
+    "flows": ["ingress"],
+    "messages": ["put"],
+    "key_exprs": ["**"],
+    "size_limit": PAYLOAD_MAX,
+}
+
+
+def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
+    own = read_credentials(robot, process)
+    certificate, key = str(own.certificate), str(own.key)
+    return {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(own.authority),
+            "listen_certificate": certificate,
+            "listen_private_key": key,
+            "connect_certificate": certificate,
+            "connect_private_key": key,
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            # An expiry must not cut a robot that stands; `xrl doctor` warns before.
+            "close_link_on_expiration": False,
+        },
+        "access_control": access_control(robot.name, own.name, own.generations),
+    }

@@ -1,0 +1,51 @@
+"""A robot whose bus is `mtls`, with its authority and keys in a test's own folder."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+
+from shared.config.robot_config import SERVICES, RobotConfig
+from shared.config.sections import BusSecurityConfig
+from tools.keys import authority, bundle
+from tools.keys.authority import Authority
+from tools.keys.certificates import CERTIFICATE_DAYS
+
+
+def tls_endpoints(host: str = "127.0.0.1") -> dict[str, str]:
+    """Return an endpoint at a free port for each service."""
+    with ExitStack() as stack:
+        probes = {name: stack.enter_context(socket.socket()) for name in SERVICES}
+        for probe in probes.values():
+            probe.bind((host, 0))
+        return {name: f"tls/{host}:{probe.getsockname()[1]}" for name, probe in probes.items()}
+
+
+def certified(
+    robot: RobotConfig, folder: Path, endpoints: Mapping[str, str] | None = None
+) -> tuple[RobotConfig, Authority]:
+    """Return the robot under `mtls`, all of its keys installed in `folder`/keys."""
+    security = BusSecurityConfig(mode="mtls", keys=str(folder / "keys"))
+    bus = msgspec.structs.replace(
+        robot.bus, endpoints=dict(endpoints or tls_endpoints()), security=security
+    )
+    robot = msgspec.structs.replace(robot, bus=bus)
+    made = authority.make(folder / "authority", robot, CERTIFICATE_DAYS)
+    install_all(made, folder / "keys")
+    return robot, made
+
+
+def install_all(made: Authority, folder: Path, *names: str) -> None:
+    """Install a bundle of these names, or of all."""
+    bundle.install(bundle.bundle(made, names or made.names.generations), folder)
+
+
+def opened(robot: RobotConfig, endpoints: Mapping[str, str]) -> RobotConfig:
+    """Return the robot with these endpoints under `mode = "open"`."""
+    security = BusSecurityConfig(mode="open")
+    bus = msgspec.structs.replace(robot.bus, endpoints=dict(endpoints), security=security)
+    return msgspec.structs.replace(robot, bus=bus)

@@ -1,0 +1,460 @@
+"""Who gets onto the bus under `mtls`, and what each may put and receive there."""
+
+from __future__ import annotations
+
+import datetime as dt
+import fnmatch
+import json
+import os
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zenoh
+
+from shared.bus import credentials, topics
+from shared.bus.access import PRINCIPALS, access_control, token_key
+from shared.bus.messages import Estop
+from shared.bus.session import open_session
+from shared.bus.topics import all_keys
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import BusSecurityConfig
+from shared.exceptions import BusError, ConfigError
+from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
+from tests.certified import certified, install_all, opened
+from tools.keys import certificates
+from tools.keys.authority import Authority
+from tools.keys.certificates import Issued
+
+ROBOT = config_file.load(DEFAULT_CONFIG)
+TRIES_S = 8.0
+
+PUTS = {
+    "planner": ["joint/*/command", "planner/status", "planner/checkpoint"],
+    "harness": ["harness/wrench"],
+    "imu": ["imu/attitude"],
+    "recorder": [],
+    "simulator": ["sim/truth", "sim/state", "operator/intent"],
+    "operator": ["estop", "harness/tare", "operator/intent", "sim/control", "run/event"],
+    "viewer": [],
+    **{m: [f"joint/{m}/state", f"joint/{m}/event", f"joint/{m}/trace"] for m in MODULES},
+}
+"""What each may put, by hand: not from the topic table."""
+READS = {
+    "planner": ["joint/*/state", "harness/wrench", "imu/attitude", "operator/intent"],
+    "harness": ["harness/tare"],
+    "imu": [],
+    "recorder": ["*"],
+    "simulator": ["operator/intent", "sim/control"],
+    "operator": ["*"],
+    "viewer": ["*"],
+    **{m: [f"joint/{m}/command", "estop"] for m in MODULES},
+}
+"""What each may receive, by hand."""
+
+
+class Bus:
+    """A certified robot in a folder of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        fitted = msgspec.structs.replace(ROBOT, imu=msgspec.structs.replace(ROBOT.imu, fitted=True))
+        self.folder = folder
+        self.robot, self.authority = certified(fitted, folder)
+        self.keys = folder / "keys"
+
+    def endpoint(self, service: str) -> str:
+        return self.robot.bus.endpoints[service]
+
+
+@pytest.fixture(scope="module")
+def bus() -> Iterator[Bus]:
+    folder = Path(tempfile.mkdtemp(prefix="xrl-t-", dir="/tmp"))
+    yield Bus(folder)
+    shutil.rmtree(folder)
+
+
+def stranger(endpoint: str, tls: dict[str, Any]) -> zenoh.Session:
+    """Open a session without any rule of ours: what somebody with a Zenoh of his own does."""
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "open/return_conditions/connect_scouted": False,
+        "transport/link/tls": tls,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def identity(folder: Path, name: str, authority: Path | None = None) -> dict[str, Any]:
+    certificate, key = str(folder / f"{name}.pem"), str(folder / f"{name}.key")
+    return {
+        "root_ca_certificate": str(authority or folder / credentials.AUTHORITY),
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": False,
+    }
+
+
+def waits_for(condition: Callable[[], bool], limit_s: float = TRIES_S) -> bool:
+    deadline = time.monotonic() + limit_s
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return condition()
+
+
+def fits(key: str, patterns: list[str]) -> bool:
+    topic = key.removeprefix(f"xrl/{ROBOT.name}/")
+    return any(fnmatch.fnmatchcase(topic, pattern) for pattern in patterns)
+
+
+def linked(session: zenoh.Session) -> bool:
+    return len(list(session.info.peers_zid())) > 0
+
+
+@pytest.mark.parametrize("name", PRINCIPALS)
+def test_a_peer_is_heard_on_its_own_keys_and_on_no_other(bus: Bus, name: str) -> None:
+    keys = [*all_keys(ROBOT.name), f"xrl/{ROBOT.name}/something/else", f"xrl/other/{name}"]
+    with (
+        open_session(bus.robot, "recorder", bus.folder) as recorder,
+        stranger(bus.endpoint("recorder"), identity(bus.keys, name)) as peer,
+    ):
+        ear = recorder.stream([f"xrl/{ROBOT.name}/**"])
+        assert waits_for(lambda: linked(peer))
+        expected = {key for key in keys if fits(key, PUTS[name])}
+        heard: set[str] = set()
+
+        def all_heard() -> bool:
+            for key in keys:
+                peer.put(key, b"{}")
+            while (sample := ear.take()) is not None:
+                heard.add(sample[0])
+            return heard >= expected
+
+        assert waits_for(all_heard)
+        time.sleep(0.2)  # what is not to come would have come by now
+        all_heard()
+        assert heard == expected
+
+
+@pytest.mark.parametrize("name", PRINCIPALS)
+def test_a_peer_receives_what_its_row_of_the_table_says(bus: Bus, name: str) -> None:
+    sender = "planner" if name != "planner" else "knee_left"
+    keys = [key for key in all_keys(ROBOT.name) if fits(key, PUTS[sender])]
+    with (
+        open_session(bus.robot, sender, bus.folder) as session,
+        stranger(bus.endpoint(sender), identity(bus.keys, name)) as peer,
+    ):
+        heard: set[str] = set()
+        ears = [
+            peer.declare_subscriber(key, lambda sample: heard.add(str(sample.key_expr)))
+            for key in (*keys, "**")
+        ]
+        assert waits_for(lambda: linked(peer))
+        publishers = [session.raw_publisher(key, patient=False) for key in keys]
+        expected = {key for key in keys if fits(key, READS[name])}
+
+        def all_heard() -> bool:
+            for publisher in publishers:
+                publisher.put(b"{}")
+            return heard >= expected
+
+        assert waits_for(all_heard)
+        time.sleep(0.2)
+        all_heard()
+        time.sleep(0.1)
+        assert heard == expected
+        assert len(ears) == len(keys) + 1
+
+
+def test_services_show_themselves_by_their_own_name_only(bus: Bus) -> None:
+    with (
+        open_session(bus.robot, "recorder", bus.folder) as recorder,
+        stranger(bus.endpoint("recorder"), identity(bus.keys, "viewer")) as peer,
+    ):
+        tokens = [
+            peer.liveliness().declare_token(token_key(ROBOT.name, name))
+            for name in ("planner", "a-tool")
+        ]
+        assert waits_for(lambda: linked(peer))
+        time.sleep(0.5)
+        assert recorder.alive() == {"recorder"}
+        assert len(tokens) == 2
+
+
+def signer_of(authority: Authority) -> Issued:
+    return Issued(authority.certificate, (authority.folder / "authority.key").read_bytes())
+
+
+def _foreign(bus: Bus, folder: Path) -> dict[str, Any]:
+    """Return the identity of somebody with an authority of his own, who knows ours by sight."""
+    _, other = certified(bus.robot, folder, bus.robot.bus.endpoints)
+    install_all(other, folder)
+    return identity(folder, "planner", bus.keys / credentials.AUTHORITY)
+
+
+def _expired(bus: Bus, folder: Path) -> dict[str, Any]:
+    return _issued_then(bus, folder, dt.timedelta(days=-30), days=10)
+
+
+def _not_yet(bus: Bus, folder: Path) -> dict[str, Any]:
+    return _issued_then(bus, folder, dt.timedelta(days=30), days=10)
+
+
+def _issued_then(bus: Bus, folder: Path, when: dt.timedelta, days: int) -> dict[str, Any]:
+    signer = signer_of(bus.authority)
+    now = dt.datetime.now(dt.UTC) + when
+    issued = certificates.issue(signer, "planner.1", ("127.0.0.1",), now, days)
+    folder.mkdir()
+    (folder / "planner.pem").write_bytes(issued.certificate)
+    (folder / "planner.key").write_bytes(issued.key)
+    return identity(folder, "planner", bus.keys / credentials.AUTHORITY)
+
+
+def _none(bus: Bus, _folder: Path) -> dict[str, Any]:
+    return {
+        "root_ca_certificate": str(bus.keys / credentials.AUTHORITY),
+        "verify_name_on_connect": False,
+    }
+
+
+@pytest.mark.parametrize("kind", [_none, _foreign, _expired, _not_yet])
+def test_without_a_valid_certificate_there_is_no_link(
+    bus: Bus, tmp_path: Path, kind: Callable[[Bus, Path], dict[str, Any]]
+) -> None:
+    with (
+        open_session(bus.robot, "recorder", bus.folder),
+        stranger(bus.endpoint("recorder"), identity(bus.keys, "planner")) as friend,
+        stranger(bus.endpoint("recorder"), kind(bus, tmp_path / "s")) as enemy,
+    ):
+        assert waits_for(lambda: linked(friend)), "the same try with a valid one"
+        time.sleep(0.5)
+        assert not linked(enemy)
+
+
+def test_a_revoked_certificate_links_and_is_not_heard(bus: Bus, tmp_path: Path) -> None:
+    robot, authority = certified(bus.robot, tmp_path, bus.robot.bus.endpoints)
+    old = tmp_path / "old"
+    shutil.copytree(tmp_path / "keys", old)
+    authority.revoke(robot, ["planner"], days=10)
+    install_all(authority, tmp_path / "keys")
+    assert authority.names.generations["planner"] == 2
+    with (
+        open_session(robot, "recorder", tmp_path) as recorder,
+        stranger(robot.bus.endpoints["recorder"], identity(old, "planner")) as lost,
+        stranger(robot.bus.endpoints["recorder"], identity(tmp_path / "keys", "planner")) as now,
+    ):
+        ear = recorder.stream([f"xrl/{ROBOT.name}/**"])
+        assert waits_for(lambda: linked(lost) and linked(now))
+        heard: list[bytes] = []
+
+        def is_heard() -> bool:
+            lost.put(f"xrl/{ROBOT.name}/planner/status", b"lost")
+            now.put(f"xrl/{ROBOT.name}/planner/status", b"now")
+            while (sample := ear.take()) is not None:
+                heard.append(sample[1])
+            return b"now" in heard
+
+        assert waits_for(is_heard)
+        time.sleep(0.2)
+        is_heard()
+        assert set(heard) == {b"now"}
+
+
+def test_a_service_is_dialled_only_where_its_certificate_says(bus: Bus, tmp_path: Path) -> None:
+    """A peer with another host's certificate, at the planner's place, is not believed."""
+    robot, authority = certified(bus.robot, tmp_path, bus.robot.bus.endpoints)
+    signer = signer_of(authority)
+    now = dt.datetime.now(dt.UTC)
+    elsewhere = certificates.issue(signer, "knee_left.1", ("10.9.9.9",), now, 10)
+    other = tmp_path / "other"
+    shutil.copytree(tmp_path / "keys", other)
+    (other / "knee_left.pem").write_bytes(elsewhere.certificate)
+    (other / "knee_left.key").write_bytes(elsewhere.key)
+    with (
+        open_session(_with_keys(robot, other), "knee_left", tmp_path),
+        open_session(robot, "knee_right", tmp_path),
+        open_session(robot, "planner", tmp_path) as planner,
+    ):
+        assert waits_for(lambda: "knee_right" in planner.alive())
+        time.sleep(0.5)
+        assert "knee_left" not in planner.alive()
+
+
+def test_a_tool_is_the_operator_where_the_host_has_that_key_and_else_a_viewer(
+    bus: Bus, tmp_path: Path
+) -> None:
+    assert credentials.read_credentials(bus.robot, "status").name == "operator"
+    install_all(bus.authority, tmp_path / "keys", "viewer")
+    looks = _with_keys(bus.robot, tmp_path / "keys")
+    assert credentials.read_credentials(looks, "estop").name == "viewer"
+
+
+def test_a_viewer_cannot_stop_the_robot_and_an_operator_can(bus: Bus, tmp_path: Path) -> None:
+    install_all(bus.authority, tmp_path / "keys", "viewer")
+    with (
+        open_session(bus.robot, "knee_left", bus.folder) as knee,
+        open_session(_with_keys(bus.robot, tmp_path / "keys"), "estop", bus.folder) as viewer,
+        open_session(bus.robot, "estop", bus.folder) as operator,
+    ):
+        stops = knee.latest(topics.ESTOP, Estop)
+        calls = [s.publisher(topics.ESTOP, Estop) for s in (viewer, operator)]
+        heard: set[str] = set()
+
+        def is_heard() -> bool:
+            for source, call in zip(("viewer", "operator"), calls, strict=True):
+                call.put(Estop(t_ns=1, seq=1, source=source))
+                time.sleep(0.02)
+                stop = stops.take()
+                if stop is not None:
+                    heard.add(stop.source)
+            return "operator" in heard
+
+        assert waits_for(is_heard)
+        for _ in range(5):
+            is_heard()
+        assert heard == {"operator"}
+
+
+def _with_keys(robot: RobotConfig, folder: Path) -> RobotConfig:
+    security = msgspec.structs.replace(robot.bus.security, keys=str(folder))
+    return msgspec.structs.replace(robot, bus=msgspec.structs.replace(robot.bus, security=security))
+
+
+def _remove(name: str) -> Callable[[Path], None]:
+    return lambda keys: (keys / name).unlink()
+
+
+def _rename(keys: Path) -> None:
+    text = (keys / "names.toml").read_text().replace(f'"{ROBOT.name}"', '"somebody"')
+    (keys / "names.toml").write_text(text)
+
+
+def _unknown(keys: Path) -> None:
+    with (keys / "names.toml").open("a") as file:
+        file.write("cook = 1\n")
+
+
+SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no folder": (shutil.rmtree, "no keys for `mtls` here"),
+    "no names": (_remove("names.toml"), "names.toml is missing"),
+    "another robot's": (_rename, "keys of robot 'somebody'"),
+    "an unknown name": (_unknown, "generations.cook: no such name"),
+    "no names in it": (lambda keys: (keys / "names.toml").write_text("x ="), "names.toml"),
+    "no certificate": (_remove("planner.pem"), "planner.pem: missing"),
+    "no key": (_remove("planner.key"), "planner.key: missing"),
+    "no authority": (_remove("authority.pem"), "authority.pem: missing"),
+    "a key that others can read": (
+        lambda keys: (keys / "planner.key").chmod(0o640),
+        "chmod 600",
+    ),
+    "a key that is none": (lambda keys: (keys / "planner.key").write_bytes(b"x"), "planner"),
+}
+
+
+@pytest.mark.parametrize("fault", SPOILT)
+def test_a_service_whose_keys_are_not_right_does_not_start_and_says_why(
+    bus: Bus, tmp_path: Path, fault: str
+) -> None:
+    keys = tmp_path / "keys"
+    install_all(bus.authority, keys)
+    spoil, words = SPOILT[fault]
+    spoil(keys)
+    with (
+        pytest.raises(BusError, match=words),
+        open_session(_with_keys(bus.robot, keys), "planner", tmp_path),
+    ):
+        pass
+
+
+def _file_with(tmp_path: Path, robot: RobotConfig) -> Path:
+    path = tmp_path / "robot.toml"
+    path.write_text(config_file.to_toml(robot), encoding="utf-8")
+    return path
+
+
+PORT = {**ROBOT.bus.endpoints, "planner": "tcp/127.0.0.1:7447"}
+
+
+@pytest.mark.parametrize(
+    ("mode", "endpoint", "words"),
+    [
+        ("local", "tcp/127.0.0.1:7447", 'mode = "open", and anyone'),
+        ("local", "tls/10.0.0.1:7447", 'mode = "mtls"'),
+        ("mtls", "tcp/10.0.0.1:7447", "tls/"),
+        ("mtls", "unixsock-stream/{run}/planner.zenoh", 'mode = "local"'),
+        ("open", "tls/10.0.0.1:7447", 'mode = "mtls"'),
+    ],
+)
+def test_an_endpoint_that_is_none_of_the_mode_is_refused(
+    tmp_path: Path, mode: str, endpoint: str, words: str
+) -> None:
+    robot = opened(ROBOT, {**ROBOT.bus.endpoints, "planner": endpoint})
+    security = BusSecurityConfig(mode=mode)  # type: ignore[arg-type]  # one of them
+    bus = msgspec.structs.replace(robot.bus, security=security)
+    with pytest.raises(ConfigError, match=words):
+        config_file.load(_file_with(tmp_path, msgspec.structs.replace(robot, bus=bus)))
+
+
+def test_a_port_opened_in_so_many_words_is_taken_and_a_log_of_one_is_read(tmp_path: Path) -> None:
+    robot = opened(ROBOT, PORT)
+    assert config_file.load(_file_with(tmp_path, robot)).bus.security.mode == "open"
+    silent = msgspec.structs.replace(
+        robot, bus=msgspec.structs.replace(robot.bus, security=BusSecurityConfig())
+    )
+    assert config_file.parse(config_file.to_toml(silent), "log").bus.endpoints == PORT
+
+
+def test_keys_are_named_by_a_path_that_is_the_same_from_everywhere(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="begins with / or ~"):
+        config_file.load(_file_with(tmp_path, _with_keys(ROBOT, Path("keys"))))
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o022])
+def test_a_local_socket_is_its_users_alone_whatever_the_umask(tmp_path: Path, umask: int) -> None:
+    folder = Path(tempfile.mkdtemp(prefix="xrl-t-", dir="/tmp"))
+    before = os.umask(umask)
+    try:
+        with open_session(ROBOT, "planner", folder):
+            mode = stat.S_IMODE((folder / "planner.zenoh").stat().st_mode)
+            assert mode & 0o077 == 0
+            (folder / "after").touch()
+            assert stat.S_IMODE((folder / "after").stat().st_mode) == 0o666 & ~umask
+    finally:
+        os.umask(before)
+        shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("own", PRINCIPALS)
+def test_whatever_no_rule_allows_is_denied_and_no_rule_names_an_unknown_peer(own: str) -> None:
+    control = access_control("lab", own, {"planner": 3, "operator": 1})
+    assert control["enabled"]
+    assert control["default_permission"] == "deny"
+    assert all(rule["permission"] == "allow" for rule in control["rules"])
+    named = [name for subject in control["subjects"] for name in subject["cert_common_names"]]
+    assert named == ["planner.3", "operator.1"]
+    assert all(subject["cert_common_names"] for subject in control["subjects"])
+
+
+def test_a_topic_has_a_writer_and_only_known_names() -> None:
+    for topic in topics.TOPICS:
+        names = {*topic.writers, *topic.readers} - {"*", "network_proxy"}
+        assert topic.writers, topic.name
+        assert names <= set(PRINCIPALS), topic.name

@@ -1,0 +1,128 @@
+"""The folder of a robot's authority: it signs certificates, and never leaves its machine.
+
+authority.key, authority.pem    the authority
+names.toml                      the current generation of each name
+NAME.pem, NAME.key              the current certificate of each name
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+from shared.bus import credentials
+from shared.bus.access import PRINCIPALS, common_name
+from shared.bus.credentials import Names, certificate_file, key_file
+from shared.config.robot_config import SERVICES, RobotConfig
+from shared.exceptions import BusError
+from tools.keys import certificates
+from tools.keys.certificates import Issued
+
+_KEY: Final = "authority.key"
+
+
+class Authority:
+    """A robot's authority, as its folder holds it."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open a folder.
+
+        Raises:
+            BusError: it holds no authority, or one that others may read.
+        """
+        self.folder = folder
+        self.names = credentials.read_names(folder)
+        key = folder / _KEY
+        if not key.is_file():
+            raise BusError(f"{key}: missing: this folder cannot sign; give its --authority")
+        credentials.check_private(key)
+        self._issued = Issued((folder / credentials.AUTHORITY).read_bytes(), key.read_bytes())
+
+    @property
+    def certificate(self) -> bytes:
+        """The authority's own certificate, PEM."""
+        return self._issued.certificate
+
+    def renew(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
+        """Make new certificates and keys in the current generation; the old ones stay valid."""
+        for name in names:
+            self._issue(name, hosts_of(robot, name), days)
+
+    def revoke(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
+        """Go on to the next generation; once all hosts know of it the old one is let in nowhere."""
+        wanted = tuple(names)
+        generations = dict(self.names.generations)
+        for name in wanted:
+            generations[name] = generations.get(name, 0) + 1
+        self.names = Names(self.names.robot, generations)
+        write_private(self.folder / credentials.NAMES, credentials.to_toml(self.names))
+        self.renew(robot, wanted, days)
+
+    def _issue(self, name: str, hosts: Sequence[str], days: int) -> None:
+        now = dt.datetime.now(dt.UTC)
+        common = common_name(name, self.names.generations[name])
+        issued = certificates.issue(self._issued, common, hosts, now, days)
+        write_private(key_file(self.folder, name), issued.key)
+        write_private(certificate_file(self.folder, name), issued.certificate)
+
+
+def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
+    """Make a robot's authority and a certificate for each name.
+
+    Raises:
+        BusError: there is an authority already, the folder cannot be written, or a service's
+            endpoint has no certificate.
+    """
+    if (folder / _KEY).exists():
+        right = "`xrl keys renew` makes new certificates, `xrl keys revoke` shuts old ones out"
+        raise BusError(f"{folder}: holds an authority already; {right}")
+    names = Names(robot.name, dict.fromkeys(principals_of(robot), 1))
+    for name in names.generations:
+        hosts_of(robot, name)  # before anything is written
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.chmod(0o700)
+    except OSError as error:
+        raise BusError(f"{folder}: cannot be made: {error.strerror}") from None
+    own = certificates.make_authority(robot.name, dt.datetime.now(dt.UTC))
+    write_private(folder / credentials.AUTHORITY, own.certificate)
+    write_private(folder / credentials.NAMES, credentials.to_toml(names))
+    write_private(folder / _KEY, own.key)
+    authority = Authority(folder)
+    authority.renew(robot, names.generations, days)
+    return authority
+
+
+def principals_of(robot: RobotConfig) -> tuple[str, ...]:
+    """Return every name that a robot's certificates have."""
+    return tuple(n for n in PRINCIPALS if n not in SERVICES or n in robot.services)
+
+
+def hosts_of(robot: RobotConfig, name: str) -> tuple[str, ...]:
+    """Return what a service is dialled by: the host of its endpoint. Tools listen nowhere.
+
+    Raises:
+        BusError: the endpoint is none of TLS.
+    """
+    if name not in SERVICES:
+        return ()
+    endpoint = robot.bus.endpoints[name]
+    found = re.fullmatch(r"tls/\[?([^\]]+?)\]?:\d+", endpoint)
+    if found is None:
+        raise BusError(
+            f"bus.endpoints.{name}: {endpoint!r} has no certificate; tls/HOST:PORT is right"
+        )
+    return (found[1],)
+
+
+def write_private(file: Path, content: bytes) -> None:
+    """Write a file that only this user can read, whole or not at all."""
+    part = file.with_name(f".{file.name}.part")
+    part.unlink(missing_ok=True)
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
+        opened.write(content)
+    part.replace(file)

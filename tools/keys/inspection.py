@@ -1,0 +1,77 @@
+"""Are a host's keys right? For `xrl keys check` and `xrl doctor`."""
+
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from shared.bus import credentials
+from shared.bus.access import common_name
+from shared.bus.credentials import Names, certificate_file, key_file
+from shared.config.robot_config import SERVICES, RobotConfig
+from shared.exceptions import BusError
+from tools.keys import certificates
+from tools.keys.authority import hosts_of
+
+WARN_DAYS: Final = 60
+"""An expiry within so many days is told."""
+
+
+class KeyRow(NamedTuple):
+    """What there is to say about one certificate."""
+
+    name: str
+    expires: str
+    hosts: tuple[str, ...]
+    wrong: str = ""
+    """Why it cannot be used; empty if it can."""
+    warning: str = ""
+
+
+def look(folder: Path, robot: RobotConfig) -> list[KeyRow]:
+    """Return a row for each certificate in a folder.
+
+    Raises:
+        BusError: the folder holds no keys, or another robot's.
+    """
+    names = credentials.read_names(folder)
+    if names.robot != robot.name:
+        right = f"those of {robot.name!r} are right"
+        raise BusError(f"{folder}: keys of robot {names.robot!r}; {right}")
+    try:
+        authority = (folder / credentials.AUTHORITY).read_bytes()
+        certificates.read(authority)
+    except (OSError, ValueError) as error:
+        raise BusError(f"{folder / credentials.AUTHORITY}: no certificate: {error}") from None
+    held = [name for name in names.generations if key_file(folder, name).exists()]
+    if not held:
+        raise BusError(f"{folder}: holds no certificate of a process; `xrl keys pack` makes some")
+    return [_look(folder, robot, names, name, authority) for name in held]
+
+
+def _look(folder: Path, robot: RobotConfig, names: Names, name: str, authority: bytes) -> KeyRow:
+    now = dt.datetime.now(dt.UTC)
+    try:
+        credentials.check_private(key_file(folder, name))
+        certificate = certificate_file(folder, name).read_bytes()
+        found = certificates.read(certificate)
+    except (OSError, ValueError, BusError) as error:
+        return KeyRow(name, "-", (), str(error))
+    current = common_name(name, names.generations[name])
+    wrong, warning = "", ""
+    wanted = hosts_of(robot, name)
+    left = found.expires - now
+    if not certificates.is_signed_by(certificate, authority):
+        wrong = "signed by another authority; `xrl keys pack` anew"
+    elif not certificates.is_key_of(key_file(folder, name).read_bytes(), certificate):
+        wrong = "its key is another's; `xrl keys pack` anew"
+    elif found.common_name != current:
+        wrong = f"{found.common_name}, and {current} is let in; `xrl keys pack` anew"
+    elif left < dt.timedelta():
+        wrong = "expired: no new link; `xrl keys renew`, then pack"
+    elif name in SERVICES and not set(wanted) <= set(found.hosts):
+        wrong = f"not for {wanted[0]}, where the robot file has it; `xrl keys renew {name}`"
+    elif left < dt.timedelta(days=WARN_DAYS):
+        warning = f"expires in {left.days} days; `xrl keys renew {name}`, then pack"
+    return KeyRow(found.common_name, f"{found.expires:%Y-%m-%d}", found.hosts, wrong, warning)
