@@ -1,7 +1,7 @@
 """Access rules of the bus under `mtls`: who may put and receive which key (docs/security.md).
 
 Each process checks what its peers send by the name in their certificate: service and generation.
-The rules follow from the topics' columns `writers` and `readers`; whatever no rule allows is denied.
+The rules follow from the topics' columns `writers` and `readers`; what no rule allows is denied.
 Zenoh has no list of revoked certificates: the rules name the current generation of each name only.
 """
 
