@@ -10,12 +10,25 @@ graphs=$venv/xrl-graphs/stamp  # what the law's graphs were translated into C fr
 say() { printf '%s\n' "deploy: $*" >&2; }
 die() { say "$*"; exit 1; }
 
+full=$root/requirements.lock
+runtime=$root/requirements.runtime.lock  # what a robot runs: no test tools
+
 # The environment is right while this stays the same; scripts in it hold its absolute path.
-fingerprint() {
-  { printf '%s\n' "$root"; cat "$root/requirements.lock" "$root/pyproject.toml"; } | sha256sum
+fingerprint() {  # LOCK
+  { printf '%s\n' "$root"; cat "$1" "$root/pyproject.toml"; } | sha256sum
 }
 
-is_current() { [ -x "$venv/bin/python" ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(fingerprint)" ]; }
+is_made_from() {  # LOCK
+  [ -x "$venv/bin/python" ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(fingerprint "$1")" ]
+}
+
+is_current() {  # full, runtime, or any: as it is
+  case "$1" in
+    full) is_made_from "$full" ;;
+    runtime) is_made_from "$runtime" ;;
+    *) is_made_from "$full" || is_made_from "$runtime" ;;
+  esac
+}
 
 # Not the first of its name only: a version manager's shim may stand before the real one.
 find_python() {
@@ -33,10 +46,10 @@ find_python() {
 
 venv_is_sound() { [ ! -e "$half_made" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1; }
 
-make_environment() {
-  local python
+make_environment() {  # LOCK
+  local python lock=$1
   rm -f "$stamp"
-  if ! venv_is_sound; then
+  if [ "$lock" = "$runtime" ] || ! venv_is_sound; then  # nothing else is left in a robot's
     python=$(find_python) || exit 1
     say "making .venv with $("$python" --version) (once; a minute or two)"
     mkdir -p "$venv" && : >"$half_made"  # the mark stands while what was there before goes
@@ -46,10 +59,10 @@ make_environment() {
     say "bringing .venv up to date"
     : >"$half_made"
   fi
-  "$venv/bin/python" -m pip install --quiet --requirement "$root/requirements.lock" &&
-    "$venv/bin/python" -m pip install --quiet --no-deps --editable "$root" ||
+  "$venv/bin/python" -m pip install --quiet --require-hashes --only-binary :all: --requirement "$lock" &&
+    "$venv/bin/python" -m pip install --quiet --no-deps --no-build-isolation --editable "$root" ||
     die "pip could not install the locked packages, see above; the next try starts afresh"
-  fingerprint >"$stamp"
+  fingerprint "$lock" >"$stamp"
   rm -f "$half_made"
 }
 
@@ -72,12 +85,14 @@ translate_graphs() {
 
 # Make `.venv` from the lock file, or do nothing, quickly, if it is right already.
 # Two at once: the second waits. Stopped in the middle: the next one starts afresh.
-environment() {
-  is_current && graphs_are_current && return
+environment() {  # [full | runtime]: either is right without
+  local wanted=${1:-any} lock=$full
+  [ "$wanted" != runtime ] || lock=$runtime
+  is_current "$wanted" && graphs_are_current && return
   command -v flock >/dev/null || die "flock is missing (package util-linux)"
   exec 9<"$root"
   flock --nonblock 9 || { say "waiting for another script that is making .venv"; flock 9; }
-  is_current || make_environment
+  is_current "$wanted" || make_environment "$lock"
   graphs_are_current || translate_graphs
   exec 9<&-
 }

@@ -23,11 +23,11 @@ def root(tmp_path: Path) -> Path:
     """Return a project of which nothing is there but its scripts and what they make it from."""
     real = DEFAULT_CONFIG.parents[1]
     shutil.copytree(real / "deploy", tmp_path / "deploy")
-    for name in ("requirements.lock", "pyproject.toml"):
+    for name in ("requirements.lock", "requirements.runtime.lock", "pyproject.toml"):
         shutil.copy(real / name, tmp_path)
     (tmp_path / ".venv/bin").mkdir(parents=True)
     subprocess.run(
-        ["bash", "-c", "source deploy/lib.sh; fingerprint >.venv/xrl.stamp"],
+        ["bash", "-c", "source deploy/lib.sh; fingerprint requirements.lock >.venv/xrl.stamp"],
         cwd=tmp_path,
         check=True,
     )

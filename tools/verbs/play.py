@@ -12,6 +12,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import msgspec
 from rich.console import Console
 from rich.markup import escape
 
@@ -105,23 +106,34 @@ def part_of(recording: Recording, args: argparse.Namespace) -> Window:
 def bus_of(recording: Recording, args: argparse.Namespace) -> Bus:
     """Return the robot whose bus to join: as given, of the fleet that is up, or of the log.
 
+    Endpoints are never taken from a log, which may be a stranger's: the player would dial them.
+
     Raises:
         ConfigError: the file given cannot be used.
+        RunError: nobody may put another's keys on that bus.
     """
-    if args.config is not None:
-        return Bus(config_file.load_without_schedule(args.config), "")
+    file: Path | None = args.config
     with contextlib.suppress(FleetError):
-        fleet = SupervisedFleet.attach(args.run_dir)
-        return Bus(config_file.load_without_schedule(Path(fleet.manifest.config)), "")
+        file = file or Path(SupervisedFleet.attach(args.run_dir).manifest.config)
+    shipped = config_file.load_without_schedule(DEFAULT_CONFIG)
+    if file is not None:
+        robot = config_file.load_without_schedule(file)
+        if robot.bus.security.mode != "mtls":
+            return Bus(robot, "")
+        if not args.prefix.strip("/"):
+            right = "leave --prefix as it is: subscribers dial the player"
+            raise RunError(f"{file}: under mtls nobody may put another's keys; {right}")
+        note = "the fleet's bus is mtls, where nobody may put another's keys: on a bus of its own"
+        return Bus(msgspec.structs.replace(robot, bus=shipped.bus), note)
     why = "the log holds no robot file"
     if recording.robot_file is not None:
         try:
             robot = config_file.parse(recording.robot_file, f"{reading.ROBOT_FILE} in the log")
-            return Bus(robot, "")
+            return Bus(msgspec.structs.replace(robot, bus=shipped.bus), "")
         except ConfigError as error:
             why = f"{error}: of another version"
     note = f"{why}; the bus is that of {DEFAULT_CONFIG.name} as shipped (--config: another)"
-    return Bus(config_file.load_without_schedule(DEFAULT_CONFIG), note)
+    return Bus(shipped, note)
 
 
 def schedule_of(

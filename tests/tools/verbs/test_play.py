@@ -11,7 +11,9 @@ import pytest
 
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
 from shared.process import DEFAULT_CONFIG
+from tests.certified import certified, opened
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import item, write
 from tools import cli
@@ -116,6 +118,33 @@ def test_the_bus_is_that_of_the_robot_file_given_else_of_the_log_else_as_shipped
     new = write(tmp_path / "new", [item(0)])
     found = play.bus_of(reading.read([new]), arguments_of(new, *words))
     assert (found.robot.name, found.note) == ("lab", "")
+
+
+def test_no_endpoint_of_a_log_is_dialled(
+    tmp_path: Path, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    endpoints = {name: f"tcp/10.9.9.9:{port}" for port, name in enumerate(robot.bus.endpoints, 1)}
+    strange = opened(robot, endpoints)
+    monkeypatch.setitem(runs.ATTACHMENTS, "robot.toml", config_file.to_toml(strange).encode())
+    log = write(tmp_path / "log", [item(0)])
+    found = play.bus_of(reading.read([log]), arguments_of(log, "--run-dir", str(tmp_path / "r")))
+    assert found.note == "", "its robot file was taken, but for the bus"
+    assert found.robot.bus == robot.bus
+
+
+def test_beside_a_certified_fleet_a_log_is_played_on_a_bus_of_its_own(
+    tmp_path: Path, robot: RobotConfig
+) -> None:
+    own, _ = certified(robot, tmp_path)
+    file = tmp_path / "robot.toml"
+    file.write_text(config_file.to_toml(own), encoding="utf-8")
+    log = write(tmp_path / "log", [item(0)])
+    words = ("--run-dir", str(tmp_path / "r"), "--config", str(file))
+    found = play.bus_of(reading.read([log]), arguments_of(log, *words))
+    assert found.robot.bus == robot.bus
+    assert "mtls" in found.note
+    with pytest.raises(RunError, match="nobody may put another's keys"):
+        play.bus_of(reading.read([log]), arguments_of(log, *words, "--prefix", ""))
 
 
 def test_a_part_of_the_log_is_counted_from_its_first_message_of_all_topics(log: Path) -> None:

@@ -76,7 +76,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="robot file with the bus's endpoints (default: that of the fleet in --run-dir, else "
-        "the one in the log)",
+        "as shipped: never a log's)",
     )
     add_run_dir(parser)
 
