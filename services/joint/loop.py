@@ -18,7 +18,7 @@ from services.joint.drive_manager import (
 from services.joint.drivers.base import Drive
 from services.joint.neighbours import UNKNOWN, Neighbours
 from services.joint.pendant import PendantWatch
-from services.joint.rearm_guard import LastState, RearmGuard
+from services.joint.rearm_guard import PENDANT, LastState, RearmGuard
 from services.joint.tracer import Tracer
 from shared import log
 from shared.bus.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode
@@ -113,7 +113,7 @@ class JointLoop:
         module, ports, tracer = self._module, self._ports, self._tracer
         reading = self._drive.read(READ_TIMEOUT_S)
         now = now_ns()
-        estop = ports.estops.take() is not None or self._is_stopped_here(now)
+        estop = self._is_stopped(now)
         command = ports.commands.take()
         near = UNKNOWN
         if self._neighbours is not None and module.needs_neighbours:
@@ -135,12 +135,15 @@ class JointLoop:
         if step.event is not None or step.inhibit is not ArmingInhibit.NONE:
             self._report(now, step)
 
-    def _is_stopped_here(self, now: int) -> bool:
-        """Return True if a local emergency stop is set, or the pendant is silent."""
-        guard = self._rearm_guard
+    def _is_stopped(self, now: int) -> bool:
+        """Return True if an emergency stop has come or is set here, or the pendant is silent."""
+        stop, guard = self._ports.estops.take(), self._rearm_guard
         if guard is None:
-            return False
-        return self._pendant.is_lost(now, guard.beats) or guard.stop_requested
+            return stop is not None
+        silent = self._pendant.is_lost(now, guard.beats)
+        if stop is not None or silent:
+            guard.note_stop(PENDANT if stop is None else stop.source)
+        return stop is not None or silent or guard.stop_requested
 
     def _write(self, step: DriveAction) -> None:
         """Send this cycle's command to the drive."""

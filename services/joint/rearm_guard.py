@@ -1,4 +1,4 @@
-"""State that a joint service keeps in shared memory, without a bus: three things in a few bytes.
+"""State that a joint service keeps in shared memory, without a bus: four things in a few bytes.
 
 The first is the last state of a service, for its successor. A module that lost torque is never
 re-armed automatically (`shared.robot.fault_table`). The supervisor restarts a service that crashed,
@@ -9,7 +9,8 @@ module (`xrl kill`, `xrl start`, `xrl up`) clears it.
 The second is the emergency stop of someone on the robot's own host (`xrl estop`). It works with the
 planner dead and every link of the bus cut, and holds until a person restarts the module.
 
-The third is the pendant's count of beats (`services.joint.pendant`).
+The third is the pendant's count of beats (`services.joint.pendant`), the fourth who engaged the
+emergency stop that holds, however it came, for `xrl status`.
 
 The file is mapped: reading and writing it are loads and stores, which the control path may do.
 """
@@ -29,7 +30,11 @@ _LAST_STATE, _STOP = range(2)
 _BEATS: Final = struct.Struct("<Q")
 _BEATS_AT: Final = 8
 """Aligned, so that a store of it is whole."""
-_NEW: Final = bytes(_BEATS_AT + _BEATS.size)
+_SOURCE_AT: Final = _BEATS_AT + _BEATS.size
+SOURCE_MAX: Final = 80
+"""Bytes of a stop's source that are kept."""
+_NEW: Final = bytes(_SOURCE_AT + SOURCE_MAX)
+PENDANT: Final = "a pendant that went silent"
 
 
 class LastState(IntEnum):
@@ -73,6 +78,12 @@ class RearmGuard:
         if last_state is not self._written:
             self._memory[_LAST_STATE] = self._written = last_state
 
+    def note_stop(self, source: str) -> None:
+        """Keep who engaged the emergency stop; the first one that is named stays."""
+        if self._memory[_SOURCE_AT] == 0 and source:
+            kept = _kept(source)
+            self._memory[_SOURCE_AT : _SOURCE_AT + len(kept)] = kept
+
     @property
     def stop_requested(self) -> bool:
         """True if someone on this host has set the emergency stop."""
@@ -93,8 +104,27 @@ def clear(run_dir: Path, module: str) -> None:
         file.write(_NEW)
 
 
-def request_stop(run_dir: Path, module: str) -> bool:
+def stop_source(run_dir: Path, module: str) -> str:
+    """Return who engaged a module's emergency stop; empty: nobody, or he was not named."""
+    try:
+        with path_of(run_dir, module).open("rb") as file:
+            file.seek(_SOURCE_AT)
+            return file.read(SOURCE_MAX).rstrip(b"\0").decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def _kept(source: str) -> bytes:
+    return source.encode()[:SOURCE_MAX]
+
+
+def request_stop(run_dir: Path, module: str, source: str = "") -> bool:
     """Stop a module, with or without a bus; return False if it has no service on this host.
+
+    Args:
+        run_dir: of its fleet.
+        module: its name.
+        source: who asks for it.
 
     Raises:
         OSError: the file is there and cannot be written.
@@ -105,6 +135,8 @@ def request_stop(run_dir: Path, module: str) -> bool:
     # whoever may stop the robot may not be the one who made the directory
     descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     try:
+        if source and not os.pread(descriptor, 1, _SOURCE_AT).strip(b"\0"):
+            os.pwrite(descriptor, _kept(source), _SOURCE_AT)
         os.pwrite(descriptor, b"\x01", _STOP)
     finally:
         os.close(descriptor)

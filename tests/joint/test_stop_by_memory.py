@@ -6,10 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.rearm_guard import RearmGuard, clear, request_stop
-from shared.bus.messages import Mode
+from services.joint.rearm_guard import (
+    PENDANT,
+    SOURCE_MAX,
+    Pendant,
+    RearmGuard,
+    clear,
+    request_stop,
+    stop_source,
+)
+from shared.bus.messages import Estop, Mode
 from shared.config.robot_config import RobotConfig
 from tests.joint.test_loop import Rig
+
+MODULE = "knee_right"
 
 
 def test_a_stop_by_shared_memory_acts_in_the_next_cycle_of_a_service_without_a_bus(
@@ -29,3 +39,40 @@ def test_a_stop_by_shared_memory_acts_in_the_next_cycle_of_a_service_without_a_b
     asked_for = Rig(robot, monkeypatch, RearmGuard(tmp_path, "knee_right"))
     asked_for.run(20)
     assert asked_for.controller.failsafe.mode is Mode.HOLD
+
+
+def test_the_first_named_source_of_a_stop_is_kept_until_a_person_asks_for_the_module(
+    tmp_path: Path,
+) -> None:
+    guard = RearmGuard(tmp_path, MODULE)
+    assert stop_source(tmp_path, MODULE) == ""
+    guard.note_stop("")
+    request_stop(tmp_path, MODULE, "xrl estop by anna")
+    guard.note_stop("somebody else")
+    assert stop_source(tmp_path, MODULE) == "xrl estop by anna"
+    clear(tmp_path, MODULE)
+    guard.note_stop("é" * SOURCE_MAX)
+    assert stop_source(tmp_path, MODULE) == "é" * (SOURCE_MAX // 2)
+    assert not guard.stop_requested, "a long name reaches nothing else"
+    assert guard.beats == 0
+
+
+def test_the_source_of_a_stop_that_nobody_made_is_empty(tmp_path: Path) -> None:
+    assert stop_source(tmp_path, MODULE) == ""
+
+
+def test_a_stop_over_the_bus_is_told_by_its_sender_and_a_silent_pendant_by_itself(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    rig = Rig(robot, monkeypatch, RearmGuard(tmp_path, MODULE))
+    rig.run(20)
+    rig.estops.waiting.append(Estop(t_ns=0, seq=1, source="anna"))
+    rig.run(1)
+    assert rig.mode is Mode.DAMP
+    assert stop_source(tmp_path, MODULE) == "anna"
+    clear(tmp_path, MODULE)
+    held = Rig(robot, monkeypatch, RearmGuard(tmp_path, MODULE))
+    Pendant(tmp_path, [MODULE]).beat()
+    held.run(1000)
+    assert held.mode is Mode.DAMP
+    assert stop_source(tmp_path, MODULE) == PENDANT

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from services.joint.neighbours import Neighbours
-from services.joint.rearm_guard import Pendant
+from services.joint.rearm_guard import PENDANT, Pendant, stop_source
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode, SimTruth
 from shared.bus.session import open_session
@@ -74,6 +74,7 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(
         assert "all six modules are stopped" in done.stdout
         assert {Neighbours.mode_of(run_dir, module) for module in MODULES} == {Mode.DAMP}
         wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.DAMP))
+        assert all("xrl estop by" in stop_source(run_dir, module) for module in MODULES)
         before, after = truth(robot, run_dir), truth(robot, run_dir, wait_s=6.0)
         assert not after.fallen
         assert after.torso[2] < before.torso[2] - 0.05, "it sinks"
@@ -102,6 +103,8 @@ def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(
             finally:
                 held.kill()
         wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.DAMP))
+        said = xrl("status", run_dir=run_dir).stdout
+        assert f"emergency stop by {PENDANT}: {', '.join(MODULES)}" in " ".join(said.split())
     finally:
         fleet.stop()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import platform
 import time
 from pathlib import Path
 from typing import Final
@@ -32,7 +33,7 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
     here, errors = [], []
     for module in MODULES:
         try:
-            if request_stop(run_dir, module):
+            if request_stop(run_dir, module, _source()):
                 here.append(module)
         except OSError as error:
             errors.append(f"{module}: no stop by shared memory: {error.strerror}")
@@ -65,7 +66,6 @@ def stop_all(robot: RobotConfig, run_dir: Path) -> list[str]:
     Raises:
         BusError: the bus cannot be opened.
     """
-    source = f"xrl estop by {getpass.getuser()}"
     modes: dict[str, int] = {}
     with open_session(robot, "estop", run_dir) as session:
         publisher = session.publisher(topics.ESTOP, Estop)
@@ -73,7 +73,7 @@ def stop_all(robot: RobotConfig, run_dir: Path) -> list[str]:
         seq, deadline, going = 0, time.monotonic() + GIVE_UP_S, list(MODULES)
         while going and time.monotonic() < deadline:
             seq += 1
-            publisher.put(Estop(t_ns=now_ns(), seq=seq, source=source))
+            publisher.put(Estop(t_ns=now_ns(), seq=seq, source=_source()))
             time.sleep(REPEAT_S)
             for module, latest in states.items():
                 state = latest.take()
@@ -87,6 +87,10 @@ def stop_all(robot: RobotConfig, run_dir: Path) -> list[str]:
         name = read_credentials(robot, "estop").name
         going += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
     return going
+
+
+def _source() -> str:
+    return f"xrl estop by {getpass.getuser()} on {platform.node()}"
 
 
 def _is_stopped(run_dir: Path, module: str) -> bool:

@@ -8,6 +8,7 @@ from typing import Final
 
 import msgspec
 
+from services.joint.rearm_guard import stop_source
 from shared.bus.messages import (
     Cause,
     DriveStatus,
@@ -92,6 +93,8 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """Name of the cause of the newest refusal (`Refusal`), while it refuses any."""
     refused_session: int = 0
     """Session of the planner that sent it."""
+    stopped_by: str = ""
+    """Who engaged the emergency stop that holds, if its service is on this host."""
 
 
 class LeadStatus(msgspec.Struct, frozen=True):
@@ -223,7 +226,9 @@ def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: 
         )
     modules = {
         module: module_status(
-            monitors[module].newest if module in fresh else None, monitors[module].refused_hz()
+            monitors[module].newest if module in fresh else None,
+            monitors[module].refused_hz(),
+            stop_source(fleet.run.path, module),
         )
         for module in MODULES
         if module in monitors
@@ -245,12 +250,15 @@ def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
         return (SILENT_PROXY,)
 
 
-def module_status(state: Message | None, refused_hz: float = 0.0) -> ModuleStatus:
+def module_status(
+    state: Message | None, refused_hz: float = 0.0, stopped_by: str = ""
+) -> ModuleStatus:
     """Return a module's mode and tier from the newest state of its joint service.
 
     Args:
         state: that state; None: it sends nothing now.
         refused_hz: commands that it refuses, per second.
+        stopped_by: who engaged its emergency stop, if one holds.
     """
     if not isinstance(state, JointState):
         return ModuleStatus(None, None, None, None, None, "")
@@ -280,6 +288,7 @@ def module_status(state: Message | None, refused_hz: float = 0.0) -> ModuleStatu
         mode.name, tier, cause.name, drive.name, q, way_out, stiffened, outside,
         state.session, refused_hz, Refusal(state.refusal).name if refused_hz else "",
         state.refused_session if refused_hz else 0,
+        stopped_by if cause is Cause.ESTOP else "",
     )  # fmt: skip
 
 

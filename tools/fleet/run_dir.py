@@ -14,6 +14,7 @@ from typing import Final
 import msgspec
 
 from services.joint import neighbours, rearm_guard
+from services.joint.rearm_guard import LastState, RearmGuard
 from services.simulator import usb_standin
 from shared.clock import PACE_FILE
 from shared.config.robot_config import SERVICES
@@ -142,8 +143,14 @@ class RunDir:
         except FileNotFoundError:
             return False
 
-    def prepare(self, plan: FleetPlan, pace: float = 1.0) -> None:
-        """Start with empty logs and no dead sockets; write the manifest and the clock's pace."""
+    def prepare(self, plan: FleetPlan, pace: float = 1.0, *, disarmed: bool = False) -> None:
+        """Start with empty logs and no dead sockets; write the manifest and the clock's pace.
+
+        Args:
+            plan: of the fleet.
+            pace: clock rate.
+            disarmed: no person asks for this start: a drive that does not hold stays idle.
+        """
         self.pace.unlink(missing_ok=True)
         if pace != 1.0:
             self.pace.write_text(f"{pace:g}\n", encoding="ascii")
@@ -161,6 +168,9 @@ class RunDir:
         for path in (*manifest.sockets, str(self.supervisor_socket)):
             _remove_socket(Path(path))
         self._remove_shared_memory()
+        if disarmed:
+            for module in (name for name in manifest.services if name in MODULES):
+                RearmGuard(self.path, module).write(LastState.HELD)
 
     def _remove_shared_memory(self) -> None:
         """Remove the rearm guards of an earlier fleet: a person has started a new one."""

@@ -54,6 +54,7 @@ class SupervisedFleet:
         injected: bool = False,
         pace: float | None = None,
         leashed: bool = False,
+        disarmed: bool = False,
         table_path: Path = process_table.TABLE,
         timeout_s: float = 30.0,
     ) -> Self:
@@ -72,6 +73,8 @@ class SupervisedFleet:
             injected: with the network proxy on the links of planner, joints and sensors.
             pace: clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1.
             leashed: stop the fleet if this process dies.
+            disarmed: arm no drive; those that hold are taken over. For a start that no person asks
+                for.
             table_path: the process table.
             timeout_s: time in which every service has to be up.
 
@@ -99,7 +102,7 @@ class SupervisedFleet:
         lock = started.run.claim()
         try:
             process_table.check_free(plan.listeners)
-            started.run.prepare(plan, clock_pace)
+            started.run.prepare(plan, clock_pace, disarmed=disarmed)
             text = supervisor_config(started.run, plan, no_restart)
             started.run.supervisor_config.write_text(text, encoding="utf-8")
             environment = dict(plan.environment)

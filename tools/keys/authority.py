@@ -25,6 +25,11 @@ from tools.keys.certificates import Issued
 _KEY: Final = "authority.key"
 
 
+def default_folder(robot: RobotConfig) -> Path:
+    """Return where a robot's authority lies unless a command says otherwise."""
+    return Path("~/.config/xrl").expanduser() / robot.name / "authority"
+
+
 class Authority:
     """A robot's authority, as its folder holds it."""
 

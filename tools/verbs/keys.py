@@ -14,7 +14,7 @@ from shared.bus.credentials import keys_folder
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError
-from tools.keys.authority import Authority, make, principals_of
+from tools.keys.authority import Authority, default_folder, make, principals_of
 from tools.keys.bundle import bundle, install, to_tar
 from tools.keys.certificates import CERTIFICATE_DAYS
 from tools.keys.inspection import KeyRow, look
@@ -99,8 +99,7 @@ def _add_days(parser: argparse.ArgumentParser) -> None:
 
 
 def _authority_folder(args: argparse.Namespace, robot: RobotConfig) -> Path:
-    own = Path("~/.config/xrl").expanduser() / robot.name / "authority"
-    folder: Path = own if args.authority is None else args.authority
+    folder: Path = default_folder(robot) if args.authority is None else args.authority
     return folder
 
 

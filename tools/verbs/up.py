@@ -36,6 +36,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl up --injectable                            # then: xrl inject --link ... --delay 30
         xrl up --config lab.toml --no-sim
         xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # of one host
+        xrl up --config lab.toml --no-sim --disarmed   # from a systemd unit
         xrl up --config lab.toml --no-sim --readonly   # move the joints by hand, and look
         """,
     )
@@ -84,6 +85,12 @@ def add_parser(subparsers: Subparsers) -> None:
         help="put the network proxy between planner, joints and sensors, for `xrl inject`",
     )
     parser.add_argument(
+        "--disarmed",
+        action="store_true",
+        help="arm no drive until a person asks (xrl kill MODULE); one that holds is taken over: "
+        "for a start by itself, after a power cut",
+    )
+    parser.add_argument(
         "--readonly",
         action="store_true",
         help="the joint services listen to their drives and publish, and send them nothing",
@@ -111,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
         simulation=not args.no_sim,
         injected=args.injectable,
         pace=args.pace,
+        disarmed=args.disarmed,
     )
     up = len(fleet.manifest.services) - not_started
     record = f", record: {out}" if "recorder" in fleet.manifest.services else ""

@@ -21,7 +21,7 @@ from tools.fleet.fleet_status import (
     lead_status,
     module_status,
 )
-from tools.verbs.status import describe_lead, describe_refusals, describe_sessions
+from tools.fleet.status_table import describe_lead, describe_refusals, describe_sessions
 
 
 def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:

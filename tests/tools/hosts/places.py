@@ -1,0 +1,101 @@
+"""Three hosts on one machine: a stand-in for ssh, with a root folder for each host.
+
+What a command names in /etc, /run and /var is the host's own; `systemctl`, `nft`, `runuser`,
+`chown` and `install` are scripts that do the little that `xrl hosts` needs of them.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from pathlib import Path
+
+import tomli_w
+
+from shared.process import CHECKOUT
+from shared.robot.joints import MODULES
+
+BODY = ["planner", "harness", "recorder"]
+LEGS = {side: [m for m in MODULES if m.endswith(f"_{side}")] for side in ("right", "left")}
+
+SSH = """#!/bin/bash
+# HOST COMMAND: what is rooted on the host is looked for there
+set -u
+host=$1; shift
+root={base}/$host
+[ -d "$root" ] || {{ echo "ssh: connect to host $host: No route to host" >&2; exit 255; }}
+command=$(sed -E "s#(^|[ '=])/(etc|run|var)/#\\1$root/\\2/#g" <<<"$*")
+export PATH={base}/bin:$PATH ROOT=$root
+cd "$root" && exec bash -c "$command"
+"""
+
+TOOLS = {
+    "runuser": 'while [ "$1" != -- ]; do shift; done; shift; exec "$@"',
+    "chown": "exit 0",
+    "install": (
+        'words=(); while [ $# -gt 0 ]; do [ "$1" = -o ] && shift 2 && continue; '
+        'words+=("$1"); shift; done; exec /usr/bin/install "${words[@]}"'
+    ),
+    "nft": 'echo "nft $*" >>"$ROOT/calls"',
+    "systemctl": """echo "systemctl $*" >>"$ROOT/calls"
+unit=$ROOT/etc/systemd/system/xrl.service
+line() { sed -e ':a' -e '/\\\\$/N; s/\\\\\\n *//; ta' "$unit" | sed -n "s/^$1=//p" |
+  sed -E "s#(^| )/(etc|run|var)/#\\1$ROOT/\\2/#g"; }
+case "$1" in
+  start) mkdir -p "$ROOT/var/lib/xrl"; cd "$ROOT/var/lib/xrl" && exec $(line ExecStart) ;;
+  stop) exec $(line ExecStop) ;;
+  is-active) [ -e "$ROOT/run/xrl/supervisord.pid" ] && echo active || echo inactive ;;
+esac
+exit 0""",
+}
+
+
+def make_hosts(base: Path, *, real: bool = False) -> Path:
+    """Make three hosts and return their hosts file.
+
+    Args:
+        base: an empty folder; a short path, for sockets are in it.
+        real: the hosts have this checkout with its environment; else scripts that only call back.
+    """
+    (base / "bin").mkdir(parents=True)
+    _script(base / "bin" / "ssh", SSH.format(base=base))
+    for name, body in TOOLS.items():
+        _script(base / "bin" / name, f"#!/bin/bash\n{body}\n")
+    rows = []
+    for number, (name, services) in enumerate({"body": BODY, **LEGS}.items(), start=2):
+        for folder in ("etc/systemd/system", "run", "var/lib"):
+            (base / name / folder).mkdir(parents=True)
+        tools = ["operator"] if name == "body" else ["viewer"]
+        rows.append(
+            {"name": name, "address": f"127.0.0.{number}", "ssh": name, "services": services,
+             "tools": tools}
+        )  # fmt: skip
+    checkout = _checkout(base) if real else base
+    file = base / "hosts.toml"
+    table = {
+        "host": rows,
+        "first_port": 20_000 + os.getpid() % 20_000,
+        "checkout": str(checkout),
+        "folder": "/etc/xrl",
+        "ssh": [str(base / "bin" / "ssh")],
+    }
+    file.write_text(tomli_w.dumps(table), encoding="utf-8")
+    return file
+
+
+def _checkout(base: Path) -> Path:
+    """Return a folder with this environment where a host's is."""
+    binaries = base / "co" / ".venv" / "bin"
+    binaries.mkdir(parents=True)
+    for name, words in (("python", ""), ("xrl", "-m tools.cli")):
+        _script(
+            binaries / name,
+            f'#!/bin/bash\nPYTHONPATH={CHECKOUT} exec {sys.executable} {words} "$@"\n',
+        )
+    return base / "co"
+
+
+def _script(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)

@@ -1,0 +1,226 @@
+"""`xrl hosts`: the file, what each host gets, and what is told of a host that is not right."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import stat
+import subprocess
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import ConfigError
+from shared.process import DEFAULT_CONFIG
+from tests.tools.hosts.places import LEGS, make_hosts
+from tools import cli
+from tools.hosts import hosts_file, layout
+from tools.hosts.hosts_file import Hosts, principals_on
+from tools.keys.authority import principals_of
+
+
+@pytest.fixture
+def base() -> Iterator[Path]:
+    folder = Path(tempfile.mkdtemp(prefix="xrl-h-", dir="/tmp"))
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def file(base: Path) -> Path:
+    return make_hosts(base, real=True)
+
+
+@pytest.fixture
+def hosts(file: Path, robot: RobotConfig) -> Hosts:
+    return hosts_file.load(file, robot)
+
+
+def xrl(order: str, base: Path, *words: str) -> int:
+    where = ["--hosts", str(base / "hosts.toml"), "--authority", str(base / "authority")]
+    return cli.main(["hosts", order, *words, *where])
+
+
+def changed(file: Path, **changes: Any) -> Path:
+    """Write the hosts file anew; `services0` is a key of the first host."""
+    table = tomllib.loads(file.read_text(encoding="utf-8"))
+    for key, value in changes.items():
+        found = re.fullmatch(r"([a-z]+)(\d)", key)
+        if found:
+            table["host"][int(found[2])][found[1]] = value
+        else:
+            table[key] = value
+    file.write_text(tomli_w.dumps(table), encoding="utf-8")
+    return file
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "a service nowhere": ({"services0": ["planner", "harness"]}, "recorder runs nowhere"),
+    "a service twice": ({"services0": ["planner", "harness", "recorder", "knee_left"]}, "body's"),
+    "an unknown service": ({"services0": ["planner", "cook"]}, "no service 'cook'"),
+    "a simulator": ({"services0": ["simulator"]}, "no service 'simulator'"),
+    "a split leg": (
+        {
+            "services1": [*LEGS["right"], "hip_left"],
+            "services2": ["ankle_left", "knee_left"],
+        },
+        "the left leg's services are on several hosts",
+    ),
+    "a name for an address": ({"address0": "body.local"}, "an IP address"),
+    "an address of all": ({"address0": "0.0.0.0"}, "of one host"),  # noqa: S104 - refused
+    "an address twice": ({"address0": "127.0.0.3"}, "stands twice"),
+    "a name twice": ({"name0": "right"}, "stands twice"),
+    "a name with a slash": ({"name0": "../x"}, "letters, digits"),
+    "an option as a host": ({"ssh0": "-oProxyCommand=x"}, "as ssh takes it"),
+    "an unknown tool": ({"tools0": ["root"]}, "one of operator, viewer"),
+    "processors": ({"processors0": "all; x"}, "as systemd takes them"),
+    "a relative checkout": ({"checkout": "xrl"}, "an absolute path"),
+    "a folder with a quote": ({"folder": "/etc/x'"}, "an absolute path"),
+    "a user": ({"user": "a b"}, "a user's name"),
+    "an unknown key": ({"colour": "red"}, "colour"),
+}
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_hosts_file_that_cannot_be_right_is_refused(
+    file: Path, robot: RobotConfig, fault: str
+) -> None:
+    changes, words = REFUSED[fault]
+    with pytest.raises(ConfigError, match=words):
+        hosts_file.load(changed(file, **changes), robot)
+
+
+def test_each_service_is_dialled_at_its_hosts_address_and_the_file_is_one_that_loads(
+    hosts: Hosts, robot: RobotConfig, tmp_path: Path
+) -> None:
+    spread = layout.robot_on_hosts(robot, hosts)
+    path = tmp_path / "robot.toml"
+    path.write_text(config_file.to_toml(spread), encoding="utf-8")
+    assert config_file.load(path).bus.security.mode == "mtls"
+    for host in hosts.host:
+        for service in host.services:
+            assert spread.bus.endpoints[service].startswith(f"tls/{host.address}:")
+    assert len(set(spread.bus.endpoints.values())) == len(spread.bus.endpoints)
+
+
+def test_a_host_gets_the_keys_of_what_it_runs_and_of_nothing_else(
+    hosts: Hosts, robot: RobotConfig
+) -> None:
+    held = {host.name: set(principals_on(host)) for host in hosts.host}
+    assert held["body"] == {"planner", "harness", "recorder", "operator"}
+    assert held["left"] == {*LEGS["left"], "viewer"}
+    assert set.union(*held.values()) == set(principals_of(robot)) - {"simulator"}
+
+
+def test_systemd_takes_the_unit_and_it_arms_nothing(hosts: Hosts, tmp_path: Path) -> None:
+    for host in hosts.host:
+        text = layout.unit(hosts, host)
+        assert "--disarmed" in text
+        assert f"--only {','.join(host.services)}" in text
+        # what systemd cannot look for on this machine: the user, and the program's file
+        text = text.replace("User=xrl", "User=root")
+        text = re.sub(r"^(Exec\w+=)\S+", r"\1/bin/true", text, flags=re.MULTILINE)
+        unit = tmp_path / "xrl.service"
+        unit.write_text(text, encoding="utf-8")
+        if shutil.which("systemd-analyze") is None:
+            pytest.skip("no systemd-analyze on this machine")
+        words = ["systemd-analyze", "verify", "--man=no", str(unit)]
+        said = subprocess.run(words, capture_output=True, text=True, check=False)
+        complaints = [line for line in said.stderr.splitlines() if "xrl.service" in line]
+        assert complaints == []
+
+
+def test_the_allow_list_opens_a_hosts_own_ports_to_the_robots_hosts_alone(
+    hosts: Hosts, robot: RobotConfig
+) -> None:
+    ports = hosts_file.ports(hosts, robot)
+    for host in hosts.host:
+        text = layout.allow_list(hosts, host, robot)
+        rules = [line.split() for line in text.splitlines() if "dport" in line]
+        assert rules[-1][-1] == "drop"
+        assert [rule[-1] for rule in rules[:-1]] == ["accept", "accept"]
+        numbers = {int(word.strip(",")) for word in rules[-1] if word.strip(",").isdecimal()}
+        assert numbers == {ports[service] for service in host.services}
+        four = next(line for line in text.splitlines() if " ip saddr" in line)
+        assert all(other.address in four for other in hosts.host)
+
+
+def test_files_are_written_as_they_will_be_and_private_keys_for_their_owner_alone(
+    file: Path, base: Path
+) -> None:
+    assert xrl("files", base, "-o", str(base / "without")) == 0
+    assert not list((base / "without").rglob("*.key")), "there is no authority yet"
+    assert xrl("keys", base) == 0
+    assert xrl("files", base, "-o", str(base / "out")) == 0
+    body = base / "out" / "body"
+    keys = {path.name for path in (body / "etc/xrl/keys").glob("*.key")}
+    assert keys == {"planner.key", "harness.key", "recorder.key", "operator.key"}
+    for path in body.rglob("*.key"):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert (body / "etc/systemd/system/xrl.service").is_file()
+    assert (body / "etc/xrl/robot.gains.json").read_bytes() == (
+        DEFAULT_CONFIG.with_suffix(".gains.json").read_bytes()
+    )
+
+
+def test_update_brings_all_and_check_then_finds_nothing_wrong(
+    file: Path, base: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert xrl("update", base) == 2
+    assert "`xrl hosts keys` makes one" in capsys.readouterr().err
+    assert xrl("keys", base) == 0
+    assert xrl("update", base) == 0
+    for host in ("body", "right", "left"):
+        keys = base / host / "etc/xrl/keys"
+        assert stat.S_IMODE(keys.stat().st_mode) == 0o700
+        assert stat.S_IMODE((keys / "names.toml").stat().st_mode) == 0o600
+        assert not (keys / "authority.key").exists()
+        calls = (base / host / "calls").read_text()
+        assert "systemctl daemon-reload" in calls
+        assert "nft -f" in calls
+    capsys.readouterr()
+    code = xrl("check", base)
+    said = capsys.readouterr().out
+    # the probe looks for the keys where the robot file says, which is no place of this machine
+    assert all(name in said for name in ("body", "right", "left", "inactive"))
+    assert "another" not in said
+    assert code == 1
+    assert "/etc/xrl/keys" in " ".join(said.split())
+
+
+def test_a_host_that_differs_is_told_by_name(
+    file: Path, base: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert xrl("keys", base) == 0
+    assert xrl("update", base) == 0
+    robot = base / "left/etc/xrl/robot.toml"
+    robot.write_text(robot.read_text().replace("payload = ", "payload = 1"), encoding="utf-8")
+    (base / "right/etc/systemd/system/xrl.service").write_text("[Unit]\n")
+    capsys.readouterr()
+    assert xrl("check", base) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "another robot file" in said
+    assert "another unit" in said
+
+
+def test_a_host_that_is_not_reached_is_told_and_the_others_go_on(
+    file: Path, base: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert xrl("keys", base) == 0
+    shutil.rmtree(base / "left")
+    capsys.readouterr()
+    assert xrl("update", base) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "left: left is not reached: ssh: connect to host left: No route to host" in said
+    assert "body: " in said
+    assert (base / "body/etc/xrl/robot.toml").is_file()
+    assert xrl("status", base, "left") == 1
+    assert xrl("up", base, "elsewhere") == 2
+    assert "no such host; one of body, right, left" in capsys.readouterr().err

@@ -1,0 +1,112 @@
+"""Each host's files: robot file, systemd unit, list of allowed addresses. Pure: text from text."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+from shared.config.robot_config import RobotConfig
+from shared.config.sections import BusSecurityConfig
+from tools.hosts.hosts_file import Host, Hosts, ports
+
+ROBOT_FILE: Final = "robot.toml"
+SCHEDULE: Final = "robot.gains.json"
+KEYS: Final = "keys"
+UNIT: Final = "xrl.service"
+ALLOW_LIST: Final = "xrl.nft"
+RUN_DIR: Final = "/run/xrl"
+
+_SIMULATOR_HOST: Final = "127.0.0.1"
+
+
+def robot_on_hosts(robot: RobotConfig, hosts: Hosts) -> RobotConfig:
+    """Return the robot with each service at its host's address, under `mtls`."""
+    endpoints = {}
+    for service, port in ports(hosts, robot).items():
+        address = _SIMULATOR_HOST if service == "simulator" else hosts.host_of(service).address
+        shown = f"[{address}]" if ":" in address else address
+        endpoints[service] = f"tls/{shown}:{port}"
+    security = BusSecurityConfig(mode="mtls", keys=f"{hosts.folder}/{KEYS}")
+    bus = msgspec.structs.replace(robot.bus, endpoints=endpoints, security=security)
+    return msgspec.structs.replace(robot, bus=bus)
+
+
+def unit(hosts: Hosts, host: Host) -> str:
+    """Return the systemd unit that runs a host's services.
+
+    It comes back after a crash and after a power cut, and arms no drive then: a drive that still
+    holds is taken over, and any other waits for a person.
+    """
+    xrl = f"{hosts.checkout}/.venv/bin/xrl"
+    processors = f"CPUAffinity={host.processors}\n" if host.processors else ""
+    return f"""\
+# Made by `xrl hosts`; what it is for stands in docs/hosts.md.
+[Unit]
+Description=Extra Robotic Legs: {", ".join(host.services)}
+After=network-online.target
+Wants=network-online.target
+
+[Service]
+Type=forking
+PIDFile={RUN_DIR}/supervisord.pid
+ExecStart={xrl} up --no-sim --disarmed --config {hosts.folder}/{ROBOT_FILE} \\
+  --run-dir {RUN_DIR} --only {",".join(host.services)}
+ExecStop={xrl} down --run-dir {RUN_DIR}
+Restart=always
+RestartSec=2
+TimeoutStartSec=60
+TimeoutStopSec=30
+User={hosts.user}
+RuntimeDirectory=xrl
+RuntimeDirectoryMode=0700
+StateDirectory=xrl
+StateDirectoryMode=0750
+WorkingDirectory=/var/lib/xrl
+UMask=0027
+LimitRTPRIO=40
+LimitMEMLOCK=infinity
+LimitCORE=0
+{processors}NoNewPrivileges=yes
+CapabilityBoundingSet=
+ProtectSystem=strict
+ProtectHome=yes
+ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectControlGroups=yes
+PrivateTmp=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_CAN AF_NETLINK
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def allow_list(hosts: Hosts, host: Host, robot: RobotConfig) -> str:
+    """Return nftables rules: a host's ports are for the robot's hosts alone.
+
+    A stranger's failed handshakes hold up those of others; here they do not begin.
+    """
+    numbers = ports(hosts, robot)
+    own = ", ".join(str(numbers[service]) for service in host.services)
+    lines = []
+    for family, is_six in (("ip", False), ("ip6", True)):
+        allowed = [other.address for other in hosts.host if (":" in other.address) is is_six]
+        local = "::1" if is_six else "127.0.0.1"
+        addresses = ", ".join([local, *allowed])
+        lines.append(f"    tcp dport {{ {own} }} {family} saddr {{ {addresses} }} accept")
+    rules = "\n".join(lines)
+    return f"""\
+# Made by `xrl hosts`: who may begin a link with this host's services (docs/hosts.md).
+table inet xrl
+delete table inet xrl
+table inet xrl {{
+  chain input {{
+    type filter hook input priority 0; policy accept;
+{rules}
+    tcp dport {{ {own} }} drop
+  }}
+}}
+"""

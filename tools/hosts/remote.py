@@ -1,0 +1,160 @@
+"""Commands on a host, over the system's ssh."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final, NamedTuple, TypeVar
+
+from shared.exceptions import FleetError
+from tools.hosts.hosts_file import Host, Hosts
+
+R = TypeVar("R")
+
+TIMEOUT_S: Final = 90.0
+ECHOES: Final = 20
+
+
+class Said(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    error: str
+
+
+class ClockOffset(NamedTuple):
+    """A host's clock against this computer's."""
+
+    offset_s: float
+    """Positive: the host's clock is ahead."""
+    round_trip_s: float
+    """Shortest of `ECHOES`; half of it bounds the offset's error."""
+
+
+class Remote:
+    """One host, by ssh."""
+
+    def __init__(self, hosts: Hosts, host: Host) -> None:
+        self.host = host
+        self._begin = [*hosts.ssh, host.ssh]
+        self._as_user = ["runuser", "-u", hosts.user, "--"]
+
+    def run(self, *words: str, content: bytes = b"", as_user: bool = False) -> Said:
+        """Run a command and wait for it.
+
+        Args:
+            words: the command; no shell takes them apart.
+            content: for its standard input.
+            as_user: as the user who runs the services, not as the one who logs in.
+
+        Raises:
+            FleetError: the host is not reached, or the command does not end.
+        """
+        command = [*self._begin, shlex.join([*(self._as_user if as_user else []), *words])]
+        name = self.host.name
+        try:
+            done = subprocess.run(
+                command, input=content, capture_output=True, timeout=TIMEOUT_S, check=False
+            )
+        except subprocess.TimeoutExpired:
+            raise FleetError(f"{name}: {words[0]}: no end after {TIMEOUT_S:g} s") from None
+        except OSError as error:
+            raise FleetError(f"{name}: {command[0]}: {error.strerror}") from None
+        told = done.stderr.decode(errors="replace").strip()
+        if done.returncode == 255:  # ssh's own
+            raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(told)}")
+        return Said(done.returncode, done.stdout.decode(errors="replace"), told)
+
+    def must(self, *words: str, content: bytes = b"", as_user: bool = False) -> str:
+        """Run a command that has to succeed, and return what it printed.
+
+        Raises:
+            FleetError: it failed, or as `run`.
+        """
+        said = self.run(*words, content=content, as_user=as_user)
+        if said.code != 0:
+            why = _last(said.error) or f"exit status {said.code}"
+            raise FleetError(f"{self.host.name}: {shlex.join(words)[:120]}: {why}")
+        return said.out
+
+    def write(self, path: str, content: bytes, mode: int, owner: str) -> None:
+        """Write a file whole or not at all.
+
+        Raises:
+            FleetError: it cannot be written.
+        """
+        part = shlex.quote(f"{path}.part")
+        script = (
+            f"umask 077 && cat > {part} && chmod {mode:o} {part} && "
+            f"chown {shlex.quote(owner)} {part} && mv {part} {shlex.quote(path)}"
+        )
+        self.must("sh", "-c", script, content=content)
+
+    def echoed(self, *words: str) -> tuple[str, ClockOffset]:
+        """Return the first line of a command that then answers each line with its clock.
+
+        Raises:
+            FleetError: it does not answer.
+        """
+        command = [*self._begin, shlex.join([*self._as_user, *words])]
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+            limit = threading.Timer(TIMEOUT_S, process.kill)
+            limit.start()
+            try:
+                first, found = _talk(process)
+            except (OSError, ValueError):
+                process.kill()
+                _, told = process.communicate()
+                text = f"{self.host.ssh} does not answer: {_last(told)}"
+                raise FleetError(f"{self.host.name}: {text}") from None
+            finally:
+                limit.cancel()
+        return first, min(found, key=lambda row: row.round_trip_s)
+
+
+def _talk(process: subprocess.Popen[str]) -> tuple[str, list[ClockOffset]]:
+    """Return the first line, and the answers.
+
+    Raises:
+        OSError, ValueError: it has ended, or answers something else.
+    """
+    there, back = process.stdin, process.stdout
+    if there is None or back is None:
+        raise ValueError
+    first = back.readline()
+    found = []
+    for _ in range(ECHOES):
+        before = time.time()
+        there.write("\n")
+        there.flush()
+        answer = int(back.readline())
+        after = time.time()
+        found.append(ClockOffset(answer / 1e9 - (before + after) / 2, after - before))
+    there.close()
+    return first, found
+
+
+def on_all(remotes: Sequence[Remote], work: Callable[[Remote], R]) -> dict[str, R | FleetError]:
+    """Do the same on all hosts at a time; a host that fails gives its error."""
+
+    def attempt(remote: Remote) -> R | FleetError:
+        try:
+            return work(remote)
+        except FleetError as error:
+            return error
+
+    with ThreadPoolExecutor(len(remotes)) as pool:
+        results = list(pool.map(attempt, remotes))
+    return {remote.host.name: result for remote, result in zip(remotes, results, strict=True)}
+
+
+def _last(text: str) -> str:
+    """Return the last line of what a command said, without its control characters."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    return "".join(c if c.isprintable() else "?" for c in lines[-1]) if lines else "it said nothing"

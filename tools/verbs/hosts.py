@@ -1,0 +1,207 @@
+"""`xrl hosts`: a robot whose services run on several hosts, as one thing."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import FleetError, RunError
+from shared.robot import gain_schedule
+from tools.fleet.status_table import tables
+from tools.hosts import hosts_file, installation
+from tools.hosts.hosts_file import Hosts
+from tools.hosts.installation import HostFile, HostRow
+from tools.hosts.layout import robot_on_hosts
+from tools.hosts.remote import Remote, on_all
+from tools.keys import authority as authorities
+from tools.keys.authority import Authority
+from tools.keys.certificates import CERTIFICATE_DAYS
+from tools.output import write_atomically
+from tools.verb_table import Subparsers, add_config, add_verb
+
+DEFAULT_HOSTS: Final = Path("hosts.toml")
+_EXAMPLES = """
+xrl hosts files -o out/hosts               # write what each host will have, and look at it
+xrl hosts keys                             # once: the authority, and a certificate for each service
+xrl hosts update                           # bring it there, over ssh
+xrl hosts check                            # versions, keys, clocks, units, who may reach the ports
+xrl hosts up
+xrl hosts status
+xrl hosts down
+"""
+
+
+class _Given(NamedTuple):
+    """What every order works with."""
+
+    hosts: Hosts
+    robot: RobotConfig
+    schedule: bytes
+    authority: Authority | None
+    remotes: list[Remote]
+
+    def files(self, remote: Remote) -> list[HostFile]:
+        return installation.files_of(
+            self.hosts, remote.host, self.robot, self.schedule, self.authority
+        )
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb and its orders."""
+    parser = add_verb(subparsers, "hosts", _EXAMPLES)
+    orders = parser.add_subparsers(metavar="WHAT", required=True)
+    words = {
+        "files": (_files, "write each host's files into a folder, and bring nothing anywhere"),
+        "keys": (_keys, "make the authority for these hosts, where there is none"),
+        "update": (_update, "bring each host its files: robot file, keys, unit, allowed addresses"),
+        "check": (_check, "look whether the hosts are as they should be; 0: they are"),
+        "up": (_up, "start the services on all hosts, and arm the drives"),
+        "status": (_status, "show the services of all hosts in one table"),
+        "down": (_down, "stop the services on all hosts"),
+    }
+    for name, (order, text) in words.items():
+        one = orders.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        one.add_argument("names", nargs="*", metavar="HOST", help="these only (default: all)")
+        one.add_argument(
+            "--hosts",
+            type=Path,
+            default=DEFAULT_HOSTS,
+            metavar="FILE",
+            help="which host runs what (default: %(default)s)",
+        )
+        add_config(one)
+        one.add_argument(
+            "--authority",
+            type=Path,
+            metavar="DIR",
+            help="folder of the authority (default: ~/.config/xrl/ROBOT/authority)",
+        )
+        if name == "files":
+            one.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="folder")
+        if name == "up":
+            one.add_argument(
+                "--disarmed", action="store_true", help="leave drives that do not hold idle"
+            )
+        one.set_defaults(order=order)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what was asked for, on all hosts at a time."""
+    robot = config_file.load(args.config)
+    gain_schedule.require(robot, args.config)
+    schedule = gain_schedule.path_beside(args.config).read_bytes()
+    hosts = hosts_file.load(args.hosts, robot)
+    folder = authorities.default_folder(robot) if args.authority is None else args.authority
+    authority = Authority(folder) if folder.is_dir() else None
+    remotes = [Remote(hosts, host) for host in hosts.named(tuple(args.names))]
+    given = _Given(hosts, robot, schedule, authority, remotes)
+    return int(args.order(args, given))
+
+
+def _files(args: argparse.Namespace, given: _Given) -> int:
+    for remote in given.remotes:
+        for file in given.files(remote):
+            path = args.out / remote.host.name / file.path.lstrip("/")
+            try:
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            except OSError as error:
+                raise RunError(f"{path.parent}: cannot be made: {error.strerror}") from None
+            write_atomically(path, file.content, private=file.of_service)
+        print(f"{args.out / remote.host.name}: {', '.join(remote.host.services)}")
+    if given.authority is None:
+        print("without keys: there is no authority yet; `xrl hosts keys`")
+    return 0
+
+
+def _keys(args: argparse.Namespace, given: _Given) -> int:
+    spread = robot_on_hosts(given.robot, given.hosts)
+    folder = authorities.default_folder(spread) if args.authority is None else args.authority
+    made = authorities.make(folder, spread, CERTIFICATE_DAYS)
+    print(f"{made.folder}: authority of {spread.name!r}; `xrl hosts update` brings the keys")
+    return 0
+
+
+def _update(_args: argparse.Namespace, given: _Given) -> int:
+    if given.authority is None:
+        raise RunError("there is no authority yet; `xrl hosts keys` makes one")
+    return _each(
+        given, lambda remote: installation.update(given.hosts, remote, given.files(remote))
+    )
+
+
+def _up(args: argparse.Namespace, given: _Given) -> int:
+    armed = not args.disarmed
+    return _each(given, lambda remote: installation.up(given.hosts, remote, armed=armed))
+
+
+def _down(_args: argparse.Namespace, given: _Given) -> int:
+    return _each(given, installation.down)
+
+
+def _status(_args: argparse.Namespace, given: _Given) -> int:
+    found = on_all(given.remotes, lambda remote: installation.status(given.hosts, remote))
+    good = {name: one for name, one in found.items() if not isinstance(one, FleetError)}
+    console = Console()
+    if good:
+        console.print(tables(installation.joined(good)))
+    for error in found.values():
+        if isinstance(error, FleetError):
+            console.print(f"[bold red]{escape(str(error))}[/]")
+    return 0 if len(good) == len(found) else 1
+
+
+def _check(_args: argparse.Namespace, given: _Given) -> int:
+    found = on_all(
+        given.remotes, lambda remote: installation.check(given.hosts, remote, given.files(remote))
+    )
+    rows = [
+        HostRow(name, "-", None, "-", (str(row),), ()) if isinstance(row, FleetError) else row
+        for name, row in found.items()
+    ]
+    console = Console()
+    console.print(_table(rows))
+    others = installation.disagreements([row for row in rows if row.clock is not None])
+    for text in others:
+        console.print(f"[bold red]{escape(text)}[/]")
+    return 1 if others or any(row.wrong for row in rows) else 0
+
+
+def _each(given: _Given, work: Callable[[Remote], str]) -> int:
+    """Do the same on all hosts and say how it went; 1 if it failed on one."""
+    console = Console()
+    failed = False
+    with console.status(f"{len(given.remotes)} hosts"):
+        found = on_all(given.remotes, work)
+    for name, result in found.items():
+        failed |= isinstance(result, FleetError)
+        text = str(result) if isinstance(result, FleetError) else f"{name}: {result}"
+        console.print(f"[bold red]{escape(text)}[/]" if isinstance(result, FleetError) else text)
+    return 1 if failed else 0
+
+
+def _table(rows: list[HostRow]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("host", "version", "unit", "clock", "round trip", ""):
+        table.add_column(heading, no_wrap=heading != "")
+    for row in rows:
+        clock = row.clock
+        words = [f"[bold red]{escape(text)}[/]" for text in row.wrong]
+        words += [f"[yellow]{escape(text)}[/]" for text in row.warnings]
+        table.add_row(
+            row.name,
+            row.revision or "-",
+            row.unit,
+            "-" if clock is None else f"{1e3 * clock.offset_s:+.1f} ms",
+            "-" if clock is None else f"{1e3 * clock.round_trip_s:.1f} ms",
+            "\n".join(words) or "ok",
+        )
+    return table
