@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any, Final
 
+from shared.bus import allow_list
 from shared.bus.access import access_control
 from shared.bus.credentials import read_credentials
 from shared.config.robot_config import ENDPOINTS_OF_MODE, RobotConfig
@@ -54,6 +56,26 @@ _LOW_PASS: Final[dict[str, Any]] = {
     "key_exprs": ["**"],
     "size_limit": PAYLOAD_MAX,
 }
+
+
+def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
+    """Under `mtls`, have this process hear the hosts of the endpoints and of `allow` only.
+
+    Raises:
+        BusError: a host is not known, or the kernel takes no filter.
+    """
+    if robot.bus.security.mode != "mtls" or not listening:
+        return
+    hosts = {host_and_port(endpoint)[0] for endpoint in robot.bus.endpoints.values()}
+    ports = {host_and_port(endpoint)[1] for endpoint in listening}
+    allow_list.restrict(ports, allow_list.resolved([*hosts, *robot.bus.security.allow]))
+
+
+def host_and_port(locator: str) -> tuple[str, int]:
+    """Return the host and the port of tcp/HOST:PORT, tls/[HOST]:PORT and the like."""
+    address = re.split("[?#]", locator.partition("/")[2])[0]
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), int(port)
 
 
 def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:

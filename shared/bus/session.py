@@ -375,9 +375,15 @@ def open_session(
         over_tcp = any(endpoint.startswith(security.TCP) for endpoint in (*listening, *dialling))
         with private_files():
             opened = zenoh.open(zenoh_config)
-        return Session(opened, config.name, name, over_tcp=over_tcp)
+        session = Session(opened, config.name, name, over_tcp=over_tcp)
     except (zenoh.ZError, OSError) as error:
         raise _open_error(name, listening, error) from None
+    try:
+        security.allow_robots_hosts(config, listening)
+    except BusError:
+        session.close()
+        raise
+    return session
 
 
 def _meet_link(event: zenoh.LinkEvent) -> None:
@@ -388,14 +394,8 @@ def _meet_link(event: zenoh.LinkEvent) -> None:
     """
     link = event.link
     if event.kind == zenoh.SampleKind.PUT and link.src.startswith(security.TCP):
-        socket_linger.reset_on_close(_address(link.src), _address(link.dst))
-
-
-def _address(locator: str) -> socket_linger.Address:
-    """Return the numeric host and port of tcp/HOST:PORT, as Zenoh reports them for a link."""
-    address = re.split("[?#]", locator.partition("/")[2])[0]
-    host, _, port = address.rpartition(":")
-    return host.strip("[]"), int(port)
+        ends = security.host_and_port(link.src), security.host_and_port(link.dst)
+        socket_linger.reset_on_close(*ends)
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:

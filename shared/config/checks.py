@@ -59,6 +59,10 @@ def check_security(file: str, config: RobotConfig) -> None:
     if not re.match(r"[~/]", security.keys):
         found = f"{security.keys!r} depends on where a service is started"
         raise ConfigError(file, "bus.security.keys", found, "a path that begins with / or ~")
+    for index, host in enumerate(security.allow):
+        if not re.fullmatch(r"[A-Za-z0-9.:_-]+", host):
+            right = "an address or a host's name, without a port"
+            raise ConfigError(file, f"bus.security.allow[{index}]", f"{host!r}", right)
     for service, endpoint in config.bus.endpoints.items():
         if not endpoint.startswith(ENDPOINTS_OF_MODE[security.mode]):
             words = _words(f"{start}..." for start in ENDPOINTS_OF_MODE[security.mode])

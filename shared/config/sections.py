@@ -367,6 +367,8 @@ class BusSecurityConfig(Section, frozen=True):
     """UNIX sockets of this user; TLS by certificates on both sides; anyone who reaches a port."""
     keys: str = "~/.config/xrl/{robot}/keys"
     """Folder of this host's certificates and keys, for `mtls`: `xrl keys pack` fills it."""
+    allow: tuple[str, ...] = ()
+    """Under `mtls`: who may begin a link beside the hosts of the endpoints, such as laptops."""
 
 
 class BusConfig(Section, frozen=True):

@@ -86,7 +86,7 @@ def test_hosts_come_up_take_over_after_a_power_cut_and_arm_only_when_asked(
     place: Place, capsys: Any
 ) -> None:
     assert place.xrl("keys") == 0
-    assert place.xrl("update") == 0
+    assert [place.xrl("update", host) for host in NAMES] == [0, 0, 0], "they share a folder here"
     keys = place.base / "etc/keys"
     install_all(Authority(place.base / "auth"), keys, "simulator")
     assert place.xrl("check") == 0, capsys.readouterr().out

@@ -38,6 +38,8 @@ class Hosts(Section, frozen=True):
     host: tuple[Host, ...]
     first_port: Annotated[int, Range(1024, 65_000, "1")] = 7447
     """The services' ports follow from here, in the order of the robot's services."""
+    allow: tuple[str, ...] = ()
+    """Further addresses that may link to the services: those of laptops with tools."""
     user: str = "xrl"
     """Who runs the services."""
     checkout: str = "/opt/xrl"
@@ -115,6 +117,8 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
             found = f"the {side} leg's services are on several hosts"
             right = "one: they see each other's failures in shared memory (docs/hosts.md)"
             raise ConfigError(file, "host", found, right)
+    for index, address in enumerate(hosts.allow):
+        _check_address(file, f"allow[{index}]", address)
     for key, value in (("checkout", hosts.checkout), ("folder", hosts.folder)):
         if not re.fullmatch(r"/[A-Za-z0-9_./-]+", value):
             raise ConfigError(file, key, f"{value!r}", "an absolute path without spaces")

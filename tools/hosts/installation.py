@@ -14,13 +14,11 @@ from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import FleetStatus, ModuleStatus
 from tools.hosts.hosts_file import Host, Hosts, principals_on
 from tools.hosts.layout import (
-    ALLOW_LIST,
     KEYS,
     ROBOT_FILE,
     RUN_DIR,
     SCHEDULE,
     UNIT,
-    allow_list,
     robot_on_hosts,
     unit,
 )
@@ -69,7 +67,6 @@ def files_of(
     files = [
         HostFile(f"{folder}/{ROBOT_FILE}", config_file.to_toml(spread).encode(), 0o644, False),
         HostFile(f"{folder}/{SCHEDULE}", schedule, 0o644, False),
-        HostFile(f"{folder}/{ALLOW_LIST}", allow_list(hosts, host, robot).encode(), 0o644, False),
         HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode(), 0o644, False),
     ]
     if authority is not None:
@@ -92,10 +89,7 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile]) -> str:
         remote.write(file.path, file.content, file.mode, owner)
     remote.must("systemctl", "daemon-reload")
     remote.must("systemctl", "enable", "--quiet", UNIT)
-    loaded = remote.run("nft", "-f", f"{folder}/{ALLOW_LIST}")
-    if loaded.code == 0:
-        return f"{len(files)} files"
-    return f"{len(files)} files; the list of allowed addresses is not loaded: nft is missing"
+    return f"{len(files)} files"
 
 
 def up(hosts: Hosts, remote: Remote, *, armed: bool) -> str:
@@ -176,8 +170,6 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     warnings = list(probe.warnings)
     if abs(clock.offset_s) > CLOCK_MAX_S + clock.round_trip_s:
         warnings.append(f"its clock is {clock.offset_s:+.1f} s off: certificates go by it")
-    if remote.run("nft", "list", "table", "inet", "xrl").code != 0:
-        warnings.append("its ports are open to everybody's handshakes: nft or its list is missing")
     state = remote.run("systemctl", "is-active", UNIT).out.strip() or "no systemd"
     return HostRow(remote.host.name, probe.revision, clock, state, tuple(wrong), tuple(warnings))
 

@@ -1,4 +1,4 @@
-"""Each host's files: robot file, systemd unit, list of allowed addresses. Pure: text from text."""
+"""Each host's files: robot file and systemd unit. Pure: text from text."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ ROBOT_FILE: Final = "robot.toml"
 SCHEDULE: Final = "robot.gains.json"
 KEYS: Final = "keys"
 UNIT: Final = "xrl.service"
-ALLOW_LIST: Final = "xrl.nft"
 RUN_DIR: Final = "/run/xrl"
 
 _SIMULATOR_HOST: Final = "127.0.0.1"
@@ -27,7 +26,7 @@ def robot_on_hosts(robot: RobotConfig, hosts: Hosts) -> RobotConfig:
         address = _SIMULATOR_HOST if service == "simulator" else hosts.host_of(service).address
         shown = f"[{address}]" if ":" in address else address
         endpoints[service] = f"tls/{shown}:{port}"
-    security = BusSecurityConfig(mode="mtls", keys=f"{hosts.folder}/{KEYS}")
+    security = BusSecurityConfig("mtls", f"{hosts.folder}/{KEYS}", hosts.allow)
     bus = msgspec.structs.replace(robot.bus, endpoints=endpoints, security=security)
     return msgspec.structs.replace(robot, bus=bus)
 
@@ -81,32 +80,4 @@ RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_CAN AF_NETLINK
 
 [Install]
 WantedBy=multi-user.target
-"""
-
-
-def allow_list(hosts: Hosts, host: Host, robot: RobotConfig) -> str:
-    """Return nftables rules: a host's ports are for the robot's hosts alone.
-
-    A stranger's failed handshakes hold up those of others; here they do not begin.
-    """
-    numbers = ports(hosts, robot)
-    own = ", ".join(str(numbers[service]) for service in host.services)
-    lines = []
-    for family, is_six in (("ip", False), ("ip6", True)):
-        allowed = [other.address for other in hosts.host if (":" in other.address) is is_six]
-        local = "::1" if is_six else "127.0.0.1"
-        addresses = ", ".join([local, *allowed])
-        lines.append(f"    tcp dport {{ {own} }} {family} saddr {{ {addresses} }} accept")
-    rules = "\n".join(lines)
-    return f"""\
-# Made by `xrl hosts`: who may begin a link with this host's services (docs/hosts.md).
-table inet xrl
-delete table inet xrl
-table inet xrl {{
-  chain input {{
-    type filter hook input priority 0; policy accept;
-{rules}
-    tcp dport {{ {own} }} drop
-  }}
-}}
 """

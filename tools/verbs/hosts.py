@@ -33,7 +33,7 @@ _EXAMPLES = """
 xrl hosts files -o out/hosts               # write what each host will have, and look at it
 xrl hosts keys                             # once: the authority, and a certificate for each service
 xrl hosts update                           # bring it there, over ssh
-xrl hosts check                            # versions, keys, clocks, units, who may reach the ports
+xrl hosts check                            # versions, keys, clocks, units
 xrl hosts up
 xrl hosts status
 xrl hosts down
@@ -62,7 +62,7 @@ def add_parser(subparsers: Subparsers) -> None:
     words = {
         "files": (_files, "write each host's files into a folder, and bring nothing anywhere"),
         "keys": (_keys, "make the authority for these hosts, where there is none"),
-        "update": (_update, "bring each host its files: robot file, keys, unit, allowed addresses"),
+        "update": (_update, "bring each host its files: robot file, keys, unit"),
         "check": (_check, "look whether the hosts are as they should be; 0: they are"),
         "up": (_up, "start the services on all hosts, and arm the drives"),
         "status": (_status, "show the services of all hosts in one table"),

@@ -1,6 +1,6 @@
 """Three hosts on one machine: a stand-in for ssh, with a root folder for each host.
 
-What a command names in /etc, /run and /var is the host's own; `systemctl`, `nft`, `runuser`,
+What a command names in /etc, /run and /var is the host's own; `systemctl`, `runuser`,
 `chown` and `install` are scripts that do the little that `xrl hosts` needs of them.
 """
 
@@ -37,7 +37,6 @@ TOOLS = {
         'words=(); while [ $# -gt 0 ]; do [ "$1" = -o ] && shift 2 && continue; '
         'words+=("$1"); shift; done; exec /usr/bin/install "${words[@]}"'
     ),
-    "nft": 'echo "nft $*" >>"$ROOT/calls"',
     "systemctl": """echo "systemctl $*" >>"$ROOT/calls"
 unit=$ROOT/etc/systemd/system/xrl.service
 line() { sed -e ':a' -e '/\\\\$/N; s/\\\\\\n *//; ta' "$unit" | sed -n "s/^$1=//p" |

@@ -83,6 +83,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "processors": ({"processors0": "all; x"}, "as systemd takes them"),
     "a relative checkout": ({"checkout": "xrl"}, "an absolute path"),
     "a folder with a quote": ({"folder": "/etc/x'"}, "an absolute path"),
+    "a name that is allowed": ({"allow": ["laptop"]}, "an IP address"),
     "a user": ({"user": "a b"}, "a user's name"),
     "an unknown key": ({"colour": "red"}, "colour"),
 }
@@ -137,19 +138,9 @@ def test_systemd_takes_the_unit_and_it_arms_nothing(hosts: Hosts, tmp_path: Path
         assert complaints == []
 
 
-def test_the_allow_list_opens_a_hosts_own_ports_to_the_robots_hosts_alone(
-    hosts: Hosts, robot: RobotConfig
-) -> None:
-    ports = hosts_file.ports(hosts, robot)
-    for host in hosts.host:
-        text = layout.allow_list(hosts, host, robot)
-        rules = [line.split() for line in text.splitlines() if "dport" in line]
-        assert rules[-1][-1] == "drop"
-        assert [rule[-1] for rule in rules[:-1]] == ["accept", "accept"]
-        numbers = {int(word.strip(",")) for word in rules[-1] if word.strip(",").isdecimal()}
-        assert numbers == {ports[service] for service in host.services}
-        four = next(line for line in text.splitlines() if " ip saddr" in line)
-        assert all(other.address in four for other in hosts.host)
+def test_laptops_are_let_in_beside_the_hosts(file: Path, robot: RobotConfig) -> None:
+    hosts = hosts_file.load(changed(file, allow=["10.0.0.9"]), robot)
+    assert layout.robot_on_hosts(robot, hosts).bus.security.allow == ("10.0.0.9",)
 
 
 def test_files_are_written_as_they_will_be_and_private_keys_for_their_owner_alone(
@@ -184,7 +175,6 @@ def test_update_brings_all_and_check_then_finds_nothing_wrong(
         assert not (keys / "authority.key").exists()
         calls = (base / host / "calls").read_text()
         assert "systemctl daemon-reload" in calls
-        assert "nft -f" in calls
     capsys.readouterr()
     code = xrl("check", base)
     said = capsys.readouterr().out

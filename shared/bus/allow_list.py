@@ -1,0 +1,145 @@
+"""Who may begin a link: a packet filter on this process's own listening sockets (Linux).
+
+A TLS listener of Zenoh sleeps for 100 ms after each failed handshake, so a stranger who can reach
+its port keeps new links off. The kernel drops the packets of addresses that are not allowed before
+there is a connection. A process may filter its own sockets without privilege (socket(7),
+SO_ATTACH_FILTER); links inherit the filter.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import ipaddress
+import socket
+import struct
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+from typing import Final, NamedTuple, TypeAlias
+
+from shared.exceptions import BusError
+
+IpAddress: TypeAlias = "ipaddress.IPv4Address | ipaddress.IPv6Address"
+
+ADDRESSES_MAX: Final = 64
+"""Of each family; the kernel takes programs of 4096 instructions."""
+
+_SO_ATTACH_FILTER: Final = 26
+# Classic BPF, <linux/bpf_common.h> and <linux/filter.h>
+_LOAD_WORD, _LOAD_BYTE, _AND, _JUMP, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x30, 0x54, 0x05, 0x15, 0x06
+_NETWORK_HEADER: Final = 0xFFF00000
+"""SKF_NET_OFF: where an IP header begins, seen from any protocol."""
+_SOURCE_4, _SOURCE_6 = 12, 8
+_WHOLE: Final = 0xFFFFFFFF
+_INSTRUCTION: Final = struct.Struct("HBBI")
+_PROGRAM: Final = struct.Struct("HP")
+
+
+class Instruction(NamedTuple):
+    """One instruction of classic BPF."""
+
+    code: int
+    if_true: int
+    if_false: int
+    value: int
+
+
+def program(allowed: Collection[IpAddress]) -> list[Instruction]:
+    """Return a filter that keeps the packets of these source addresses and drops all others.
+
+    Raises:
+        BusError: there are more addresses than it takes.
+    """
+    four = [address for address in allowed if isinstance(address, ipaddress.IPv4Address)]
+    six = [address for address in allowed if isinstance(address, ipaddress.IPv6Address)]
+    if max(len(four), len(six)) > ADDRESSES_MAX:
+        raise BusError(f"bus.security.allow: over {ADDRESSES_MAX} addresses")
+    for_four = [Instruction(_LOAD_WORD, 0, 0, _NETWORK_HEADER + _SOURCE_4)]
+    for address in four:
+        for_four += [Instruction(_JUMP_IF_EQUAL, 0, 1, int(address)), _keep()]
+    for_four.append(_drop())
+    for_six: list[Instruction] = []
+    for each in six:
+        words = struct.unpack(">4I", each.packed)
+        for index, word in enumerate(words):
+            left = 2 * (len(words) - index - 1) + 1  # to the instruction after this address's
+            load = Instruction(_LOAD_WORD, 0, 0, _NETWORK_HEADER + _SOURCE_6 + 4 * index)
+            for_six += [load, Instruction(_JUMP_IF_EQUAL, 0, left, word)]
+        for_six.append(_keep())
+    for_six.append(_drop())
+    return [
+        Instruction(_LOAD_BYTE, 0, 0, _NETWORK_HEADER),
+        Instruction(_AND, 0, 0, 0xF0),
+        Instruction(_JUMP_IF_EQUAL, 1, 0, 0x40),  # over the jump: IPv4
+        Instruction(_JUMP, 0, 0, len(for_four)),
+        *for_four,
+        *for_six,
+    ]
+
+
+def restrict(ports: Collection[int], allowed: Collection[IpAddress]) -> None:
+    """Have this process's listening sockets at these ports hear allowed addresses only.
+
+    Raises:
+        BusError: one of the ports has no such socket, or the kernel takes no filter.
+    """
+    code = program(allowed)
+    left = set(ports)
+    try:
+        for listener in _listeners():
+            port = listener.getsockname()[1]
+            if port in ports:
+                _attach(listener, code)
+                left.discard(port)
+    except OSError as error:
+        raise BusError(f"no filter of addresses for mtls: {error.strerror}") from None
+    if left:
+        raise BusError(f"no filter of addresses for mtls: nothing listens at {sorted(left)}")
+
+
+def resolved(hosts: Iterable[str]) -> set[IpAddress]:
+    """Return the addresses of hosts; a name lookup may block: at the start only.
+
+    Raises:
+        BusError: a host is not known.
+    """
+    found = set()
+    for host in hosts:
+        try:
+            rows = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError) as error:
+            raise BusError(f"{host}: {error}; a host that can be found is needed") from None
+        found |= {ipaddress.ip_address(row[4][0]) for row in rows}
+    return found
+
+
+def _listeners() -> Iterator[socket.socket]:
+    """Yield this process's listening TCP sockets; they stay their owner's."""
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            if not str(entry.readlink()).startswith("socket:"):
+                continue
+            found = socket.socket(fileno=int(entry.name))
+            try:
+                if (
+                    found.family in (socket.AF_INET, socket.AF_INET6)
+                    and found.type == socket.SOCK_STREAM
+                    and found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+                ):
+                    yield found
+            finally:
+                found.detach()
+
+
+def _attach(listener: socket.socket, code: list[Instruction]) -> None:
+    text = ctypes.create_string_buffer(b"".join(_INSTRUCTION.pack(*row) for row in code))
+    packed = _PROGRAM.pack(len(code), ctypes.addressof(text))
+    listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
+
+
+def _keep() -> Instruction:
+    return Instruction(_RETURN, 0, 0, _WHOLE)
+
+
+def _drop() -> Instruction:
+    return Instruction(_RETURN, 0, 0, 0)

@@ -1,0 +1,174 @@
+"""Floods a fleet's bus until it is ended: what `test_floods` starts.
+
+    python -m tests.system.flooder KIND CONFIG RUN_DIR
+
+As somebody who can link would: by a Zenoh of his own, without any of our rules, with whatever
+certificate CONFIG's keys have.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import random
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import zenoh
+
+from shared.bus.codec import encode
+from shared.bus.messages import RunEvent, RunEventKind
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig, expand
+from shared.robot.joints import MODULES
+
+PER_S: Final = 10_000
+HELD: Final = 500
+STRANGER: Final = "127.0.0.66"
+"""Address of somebody without a key, where the fleet is at 127.0.0.1."""
+LARGE: Final = 200_000_000
+VICTIMS: Final = ("planner", *MODULES, "recorder")
+
+
+def link(robot: RobotConfig, run_dir: Path, name: str = "operator") -> zenoh.Session:
+    """Link to every process of the fleet."""
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "connect/endpoints": [expand(e, run_dir) for e in robot.bus.endpoints.values()],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "open/return_conditions/connect_scouted": False,
+    }
+    if robot.bus.security.mode == "mtls":
+        keys = Path(robot.bus.security.keys)
+        settings["transport/link/tls"] = {
+            "root_ca_certificate": str(keys / "authority.pem"),
+            "connect_certificate": str(keys / f"{name}.pem"),
+            "connect_private_key": str(keys / f"{name}.key"),
+            "enable_mtls": True,
+        }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def steadily(work: Callable[[], object], per_s: int = PER_S) -> Iterator[None]:
+    """Do it so many times a second, in bursts of 5 ms."""
+    burst, due = per_s // 200, time.monotonic()
+    while True:
+        for _ in range(burst):
+            work()
+        due = max(due + 0.005, time.monotonic() - 0.1)
+        time.sleep(max(0.0, due - time.monotonic()))
+        yield
+
+
+def messages(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
+    """Put messages that are right in every way, on a key that an operator may use."""
+    session = link(robot, run_dir)
+    publisher = session.declare_publisher(f"xrl/{robot.name}/run/event")
+    seq = itertools.count()
+
+    def put() -> None:
+        t_ns, words = time.monotonic_ns(), "x" * 200
+        publisher.put(
+            encode(
+                RunEvent(
+                    t_ns=t_ns,
+                    seq=next(seq),
+                    kind=RunEventKind.RESTARTED,
+                    subject="flood",
+                    detail=words,
+                    scenario_s=0.0,
+                )
+            )
+        )
+
+    yield from steadily(put)
+
+
+def garbage(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
+    """Put what is no message on the commands' keys."""
+    session = link(robot, run_dir)
+    publishers = [session.declare_publisher(f"xrl/{robot.name}/joint/{m}/command") for m in MODULES]
+    each = itertools.cycle(publishers)
+    yield from steadily(lambda: next(each).put(os.urandom(300)))
+
+
+def large(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
+    """Put a huge message again and again."""
+    session = link(robot, run_dir)
+    publisher = session.declare_publisher(
+        f"xrl/{robot.name}/run/event", congestion_control=zenoh.CongestionControl.BLOCK
+    )
+    payload = bytes(LARGE)
+    while True:
+        publisher.put(payload)
+        yield
+
+
+def connect(endpoint: str) -> socket.socket:
+    """Open a bare connection to an endpoint of the bus."""
+    kind, _, rest = endpoint.partition("/")
+    if kind == "unixsock-stream":
+        one = socket.socket(socket.AF_UNIX)
+        one.settimeout(0.2)
+        one.connect(rest)
+        return one
+    host, _, port = rest.rpartition(":")
+    return socket.create_connection((host, int(port)), timeout=0.2, source_address=(STRANGER, 0))
+
+
+def held(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
+    """Hold connections, and say nothing; each that is closed is opened anew."""
+    endpoints = itertools.cycle(expand(robot.bus.endpoints[name], run_dir) for name in VICTIMS)
+    kept: list[socket.socket] = []
+    for endpoint in endpoints:
+        try:
+            kept.append(connect(endpoint))
+        except OSError:
+            time.sleep(0.001)
+        if len(kept) > HELD:
+            kept.pop(0).close()
+        if len(kept) % 20 == 0:
+            time.sleep(0.005)
+        yield
+
+
+def noise(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
+    """Connect, say nonsense, and leave."""
+    endpoints = itertools.cycle(expand(robot.bus.endpoints[name], run_dir) for name in VICTIMS)
+    for endpoint in endpoints:
+        try:
+            with connect(endpoint) as one:
+                one.sendall(random.randbytes(2000))
+        except OSError:
+            pass
+        time.sleep(0.005)
+        yield
+
+
+KINDS: Final = {
+    "messages": messages, "garbage": garbage, "large": large, "held": held, "noise": noise
+}  # fmt: skip
+
+
+def main() -> None:
+    """Flood until the process is ended."""
+    kind, config, run_dir = sys.argv[1:]
+    for number, _ in enumerate(KINDS[kind](config_file.load(Path(config)), Path(run_dir))):
+        if number == 0:
+            sys.stdout.write("flooding\n")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
