@@ -117,6 +117,7 @@ def test_hosts_come_up_take_over_after_a_power_cut_and_arm_only_when_asked(
     for pid in procfs.fleet_pids(place.run_dir("left")):
         os.kill(pid, signal.SIGKILL)
     place.boot("left")
-    assert wait_for(lambda: modes() == {"TRACK"}, timeout_s=60.0), "its drives held, and are led"
+    taken = wait_for(lambda: modes() == {"TRACK"}, timeout_s=60.0)
+    assert taken, place.modules(capsys)
     assert place.xrl("down") == 0
     assert [procfs.fleet_pids(place.run_dir(host)) for host in NAMES] == [set(), set(), set()]

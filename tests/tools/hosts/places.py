@@ -41,8 +41,10 @@ TOOLS = {
 unit=$ROOT/etc/systemd/system/xrl.service
 line() { sed -e ':a' -e '/\\\\$/N; s/\\\\\\n *//; ta' "$unit" | sed -n "s/^$1=//p" |
   sed -E "s#(^| )/(etc|run|var)/#\\1$ROOT/\\2/#g"; }
+pid=$(cat "$ROOT/run/xrl/supervisord.pid" 2>/dev/null)
 case "$1" in
-  start) mkdir -p "$ROOT/var/lib/xrl"; cd "$ROOT/var/lib/xrl" && exec $(line ExecStart) ;;
+  start) grep -qs '^State:.[RSD]' "/proc/$pid/status" && exit 0
+    mkdir -p "$ROOT/var/lib/xrl"; cd "$ROOT/var/lib/xrl" && exec $(line ExecStart) ;;
   stop) exec $(line ExecStop) ;;
   is-active) [ -e "$ROOT/run/xrl/supervisord.pid" ] && echo active || echo inactive ;;
 esac
