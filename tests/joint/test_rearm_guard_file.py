@@ -10,7 +10,15 @@ from typing import cast
 import pytest
 
 from services.joint import neighbours
-from services.joint.rearm_guard import LastState, Pendant, RearmGuard, clear, path_of, request_stop
+from services.joint.rearm_guard import (
+    SOURCE_MAX,
+    LastState,
+    Pendant,
+    RearmGuard,
+    clear,
+    path_of,
+    request_stop,
+)
 from shared.robot.joints import MODULES
 from tools.fleet import process_table, procfs, supervise
 from tools.fleet.run_dir import RunDir
@@ -147,7 +155,7 @@ def test_the_file_does_not_grow_and_a_stop_is_one_byte_of_it(tmp_path: Path) -> 
     for _ in range(3):
         RearmGuard(tmp_path, MODULE)
         request_stop(tmp_path, MODULE)
-    assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14)
+    assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14 + SOURCE_MAX)
 
 
 def test_a_found_error_is_not_reported_again(tmp_path: Path, left: RearmGuard) -> None:

@@ -152,10 +152,12 @@ def squats(seconds: float) -> tuple[Keyframe, ...]:
 
 @pytest.mark.timeout(600)  # a minute of virtual time, on a machine that may be busy
 @pytest.mark.parametrize(
-    ("ordered", "tracked"), [(True, 0.06), (False, 0.9)], ids=["stream", "datagrams"]
+    ("ordered", "seconds", "tracked"),
+    [(True, 60.0, 0.06), (False, 20.0, 0.9)],
+    ids=["a minute of a stream", "datagrams"],
 )
-def test_a_minute_of_20_ms_jitter_and_10_percent_loss(
-    ordered: bool, tracked: float, robot: RobotConfig
+def test_20_ms_jitter_and_10_percent_loss(
+    ordered: bool, seconds: float, tracked: float, robot: RobotConfig
 ) -> None:
     """Before ages were watched and the planner waited, the robot fell in 12 s on streams.
 
@@ -167,14 +169,15 @@ def test_a_minute_of_20_ms_jitter_and_10_percent_loss(
     left out, 99 % with one drop-out, and the coupled torques faded to a quarter.
     """
     link = Inject(link="all", at=0.0, jitter_ms=20.0, loss=0.1, ordered=ordered)
-    scenario = Scenario(name="flap", about="", duration=60.0, keyframe=squats(60.0), inject=(link,))
+    frames = squats(seconds)
+    scenario = Scenario(name="flap", about="", duration=seconds, keyframe=frames, inject=(link,))
     fleet = Lockstep(robot, scenario)
     rows, tracking = list[SimTruth](), list[bool]()
     for row in fleet.run():
         if row.scenario_s >= 0.0:
             rows.append(row)
             tracking.append(all(c.failsafe.mode == Mode.TRACK for c in fleet.controllers))
-    assert rows[-1].scenario_s >= 59.9
+    assert rows[-1].scenario_s >= seconds - 0.1
     assert not any(row.fallen for row in rows)
     assert sum(tracking) > tracked * len(tracking), "it comes back, and does not only HOLD"
     began_ns = rows[0].t_ns

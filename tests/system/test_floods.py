@@ -73,7 +73,13 @@ def fleet_of(robot: RobotConfig, session: Session, up: SupervisedFleet, config: 
     return Fleet(up, config, states, session.latest(topics.SIM_TRUTH, SimTruth), {})
 
 
-@pytest.fixture(scope="module", params=["local", "mtls"])
+SAMPLE = [("local", "messages"), ("local", "held")] + [
+    ("mtls", kind) for kind in KINDS if kind != "messages"
+]
+"""Under each mode what differs there."""
+
+
+@pytest.fixture(scope="module")
 def fleet(request: pytest.FixtureRequest, robot: RobotConfig) -> Iterator[Fleet]:
     folder = Path(tempfile.mkdtemp(prefix="xrl-t-", dir="/tmp"))
     config = folder / "robot.toml"
@@ -92,7 +98,7 @@ def fleet(request: pytest.FixtureRequest, robot: RobotConfig) -> Iterator[Fleet]
         shutil.rmtree(folder)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("fleet", "kind"), SAMPLE, indirect=["fleet"], scope="module")
 def test_it_stands_and_its_planner_leads_again_while_somebody_floods_the_bus(
     fleet: Fleet, kind: str
 ) -> None:
