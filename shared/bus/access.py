@@ -41,7 +41,6 @@ def access_control(robot: str, own: str, generations: Mapping[str, int]) -> dict
         generations: the current generation of each certified name.
     """
     rules = [
-        _rule("send", "egress", ("put",), topics.written_keys(robot, own)),
         _rule("subscribe", "egress", _RECEIVED, topics.read_keys(robot, own)),
         _rule("show-me", "egress", _TOKENS, _token_keys(robot, own)),
         _rule("look-round", "egress", _QUERIES, (f"{alive_prefix(robot)}/*",)),
@@ -51,6 +50,8 @@ def access_control(robot: str, own: str, generations: Mapping[str, int]) -> dict
     subjects, policies = [], []
     for name, generation in generations.items():
         own_rules = [
+            # By receiver: until a new peer has told its subscriptions, Zenoh sends it everything.
+            _rule(f"to-{name}", "egress", ("put",), topics.keys_between(robot, own, name)),
             _rule(f"{name}-puts", "ingress", ("put",), topics.written_keys(robot, name)),
             _rule(f"{name}-subscribes", "ingress", _RECEIVED, topics.read_keys(robot, name)),
             _rule(f"{name}-shows", "ingress", _TOKENS, _token_keys(robot, name)),

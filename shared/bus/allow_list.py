@@ -13,7 +13,7 @@ import ctypes
 import ipaddress
 import socket
 import struct
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
@@ -85,14 +85,11 @@ def restrict(ports: Collection[int], allowed: Collection[IpAddress]) -> None:
     """
     code = program(allowed)
     left = set(ports)
-    try:
-        for listener in _listeners():
-            port = listener.getsockname()[1]
-            if port in ports:
-                _attach(listener, code)
-                left.discard(port)
-    except OSError as error:
-        raise BusError(f"no filter of addresses for mtls: {error.strerror}") from None
+    for entry in Path("/proc/self/fd").iterdir():
+        port = _listening_port(int(entry.name))
+        if port in ports:
+            _attach(int(entry.name), code)
+            left.discard(port)
     if left:
         raise BusError(f"no filter of addresses for mtls: nothing listens at {sorted(left)}")
 
@@ -113,28 +110,29 @@ def resolved(hosts: Iterable[str]) -> set[IpAddress]:
     return found
 
 
-def _listeners() -> Iterator[socket.socket]:
-    """Yield this process's listening TCP sockets; they stay their owner's."""
-    for entry in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
-            if not str(entry.readlink()).startswith("socket:"):
-                continue
-            found = socket.socket(fileno=int(entry.name))
-            try:
-                if (
-                    found.family in (socket.AF_INET, socket.AF_INET6)
-                    and found.type == socket.SOCK_STREAM
-                    and found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-                ):
-                    yield found
-            finally:
-                found.detach()
+def _listening_port(descriptor: int) -> int | None:
+    """Return the TCP port at which a descriptor of this process listens; None: at none."""
+    with contextlib.suppress(OSError):  # another thread has closed it meanwhile; or no socket
+        found = socket.socket(fileno=descriptor)
+        try:
+            of_ip = found.family in (socket.AF_INET, socket.AF_INET6)
+            if of_ip and found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+                return int(found.getsockname()[1])
+        finally:
+            found.detach()  # it is not ours to close
+    return None
 
 
-def _attach(listener: socket.socket, code: list[Instruction]) -> None:
+def _attach(descriptor: int, code: list[Instruction]) -> None:
     text = ctypes.create_string_buffer(b"".join(_INSTRUCTION.pack(*row) for row in code))
     packed = _PROGRAM.pack(len(code), ctypes.addressof(text))
-    listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
+    listener = socket.socket(fileno=descriptor)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
+    except OSError as error:
+        raise BusError(f"no filter of addresses for mtls: {error.strerror}") from None
+    finally:
+        listener.detach()
 
 
 def _keep() -> Instruction:

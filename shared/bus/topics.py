@@ -250,6 +250,15 @@ def read_keys(robot: str, name: str) -> tuple[str, ...]:
     return tuple(key for topic in TOPICS for key in _keys_of(topic, robot, name, topic.readers))
 
 
+def keys_between(robot: str, writer: str, reader: str) -> tuple[str, ...]:
+    """Return the full keys that one may put and the other may receive."""
+    written = written_keys(robot, writer)
+    if reader in READERS_OF_ALL:
+        return written
+    read = read_keys(robot, reader)
+    return tuple(key for key in written if key in read)
+
+
 def _keys_of(topic: Topic, robot: str, name: str, names: tuple[str, ...]) -> tuple[str, ...]:
     if name in names:
         return keys(topic, robot)

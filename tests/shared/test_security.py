@@ -458,3 +458,20 @@ def test_a_topic_has_a_writer_and_only_known_names() -> None:
         names = {*topic.writers, *topic.readers} - {"*", "network_proxy"}
         assert topic.writers, topic.name
         assert names <= set(PRINCIPALS), topic.name
+
+
+@pytest.mark.parametrize("own", PRINCIPALS)
+def test_nothing_is_sent_to_a_peer_but_what_it_may_receive(own: str) -> None:
+    """Not even before it has told its subscriptions: until then Zenoh sends a peer everything."""
+    control = access_control(ROBOT.name, own, dict.fromkeys(PRINCIPALS, 1))
+    rules = {rule["id"]: rule for rule in control["rules"]}
+    for policy in control["policies"]:
+        (peer,) = policy["subjects"]
+        sent = {
+            key
+            for rule in map(rules.__getitem__, policy["rules"])
+            if "egress" in rule["flows"] and "put" in rule["messages"]
+            for key in rule["key_exprs"]
+        }
+        keys = all_keys(ROBOT.name)
+        assert sent == {key for key in keys if fits(key, PUTS[own]) and fits(key, READS[peer])}
