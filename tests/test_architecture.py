@@ -55,6 +55,7 @@ VENDORS = {
         "services/simulator/foot_placement.py",
     ],
     "pinocchio": ["services/planner/model.py"],
+    "aiohttp": ["tools/view/server.py"],
     "cryptography": ["tools/keys/certificates.py"],
     "cvxpy": ["services/planner/split_program.py"],
     "casadi": [

@@ -49,6 +49,7 @@ VERBS: Final = (
     Verb("recover", "finish a log that was cut off"),
     Verb("play", "put a log back onto the bus, beside the live robot"),
     Verb("explain", "break one planner tick down: gains, margins, torque by origin"),
+    Verb("view", "show the robot in a browser: live, a record, or one to lead and push"),
     Verb("report", "write a run as one page: plots, timeline, torques, versions"),
     Verb("export", "copy a log with a 3-D scene in it, or write a viewer's layout"),
     Verb("resim", "run a log's services again and compare, bit for bit or changed"),

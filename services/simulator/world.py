@@ -61,6 +61,10 @@ class World:
         self.load_n = 0.0
         self.asked: tuple[float, Vector4] | None = None
         """Assist, N, and shift that somebody asks for in place of the scenario."""
+        self.led: Lead | None = None
+        """Where somebody leads the hand in place of the scenario."""
+        self.pushed: Vector3 | None = None
+        """Push of somebody in place of the scenario's, N, world."""
         self.push: Vector3 = (0.0, 0.0, 0.0)
         self.harness_force: Vector3 = (0.0, 0.0, 0.0)
         """The operator's force on the torso at the harness point, N, torso axes."""
@@ -186,7 +190,7 @@ class World:
 
     def lead(self) -> Lead:
         """Return the operator's present request."""
-        wanted = lead(self._scenario, self.scenario_s)
+        wanted = self.led or lead(self._scenario, self.scenario_s)
         return wanted if self.asked is None else Lead(*wanted[:4], *self.asked)
 
     def _apply_outside_forces(self) -> None:
@@ -215,6 +219,8 @@ class World:
         self._wearer.step(self._dt, self.hand.force_z, wanted.assist)
         self.load_n = self._wearer.load_n
         self.push = push_at(self._scenario, t) if t >= 0.0 else (0.0, 0.0, 0.0)
+        if self.pushed is not None:
+            self.push = self.pushed
         f, m = self.hand.force_z - self.load_n, self.hand.moment_pitch
         # in torso axes, as the harness sensor feels it: f along world z, m about torso y
         self.harness_force = (r[6] * f, r[7] * f, r[8] * f)

@@ -213,7 +213,7 @@ class Lockstep:
         """
         while self.world.scenario_s < self.scenario.duration:
             while self._todo and self.world.scenario_s >= self._todo[0].at:
-                self._act(self._todo.pop(0))
+                self.act(self._todo.pop(0))
             self.advance()
             if self._traces and self.now_ns % self._sim_state_ns == 0:
                 self._sim_states += 1
@@ -258,8 +258,8 @@ class Lockstep:
             if event is not None:
                 self.events.append((joint.name, event))
 
-    def _act(self, row: Kill | Restart | Push) -> None:
-        """Carry out a row of the scenario, and record it."""
+    def act(self, row: Kill | Restart | Push) -> None:
+        """Carry out a row of the scenario, or of somebody who looks on, and record it."""
         if isinstance(row, Push):
             x, y, z = row.force
             detail = f"{x:g},{y:g},{z:g} N for {row.duration:g} s"

@@ -1,0 +1,101 @@
+"""The robot of `xrl view --sim`: what a page asks of it, it does, and no more."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from shared.bus.messages import Mode
+from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
+from tools.runs.experiment import load_robot
+from tools.view.frame import Frame
+from tools.view.lockstep import HEIGHTS, PUSH_MAX, LockstepSource
+from tools.view.source import Order
+
+LIMIT_S = 40.0
+
+
+@pytest.fixture
+def source() -> Iterator[LockstepSource]:
+    made = LockstepSource(load_robot(DEFAULT_CONFIG))
+    yield made
+    made.close()
+
+
+def until(source: LockstepSource, holds: Callable[[Frame], bool]) -> Frame:
+    """Wait for a frame, and return it."""
+    deadline = time.monotonic() + LIMIT_S
+    while True:
+        frame = source.frame(0.0)
+        if frame is not None and holds(frame):
+            return frame
+        assert time.monotonic() < deadline, frame
+        time.sleep(0.005)
+
+
+def test_the_torso_follows_the_hand_through_a_squat_and_nobody_leads_it_into_the_floor(
+    source: LockstepSource,
+) -> None:
+    until(source, lambda frame: frame.modes == (Mode.TRACK,) * 6)
+    for wanted in (0.95, 1.15):
+        assert source.carry_out(Order(order="hand", height=wanted)) == ""
+        frame = until(source, lambda f, w=wanted: abs(f.torso[2] - w) < 0.01)  # type: ignore[misc]
+        assert frame.modes == (Mode.TRACK,) * 6
+    source.carry_out(Order(order="hand", height=-5.0))
+    low = until(source, lambda f: f.torso[2] < HEIGHTS[0] + 0.03)
+    until(source, lambda f: f.t_s > low.t_s + 1.0)
+    frame = until(source, lambda _: True)
+    assert frame.torso[2] > HEIGHTS[0] - 0.03
+    assert not frame.fallen
+
+
+def test_a_killed_planner_is_held_and_a_started_one_leads(source: LockstepSource) -> None:
+    until(source, lambda frame: frame.planner is not None and frame.planner.mode == "LEADING")
+    source.carry_out(Order(order="kill", service="planner"))
+    frame = until(source, lambda f: f.modes == (Mode.HOLD,) * 6)
+    frame = until(source, lambda f: f.planner is None)
+    assert frame.q_ref == ()
+    source.carry_out(Order(order="start", service="planner"))
+    until(source, lambda f: f.modes == (Mode.TRACK,) * 6)
+
+
+def test_a_push_has_a_limit_and_ends_when_it_is_not_repeated(source: LockstepSource) -> None:
+    until(source, lambda frame: frame.modes == (Mode.TRACK,) * 6)
+    source.carry_out(Order(order="push", force=(0.0, 1e6, 0.0)))
+    pushed = until(source, lambda frame: any(frame.push))
+    assert pushed.push == (0.0, PUSH_MAX, 0.0)
+    ended = until(source, lambda frame: frame.t_s > pushed.t_s and not any(frame.push))
+    assert ended.t_s - pushed.t_s < 1.0
+
+
+def test_an_emergency_stop_sinks_it(source: LockstepSource) -> None:
+    until(source, lambda frame: frame.modes == (Mode.TRACK,) * 6)
+    source.carry_out(Order(order="estop"))
+    stopped = until(source, lambda frame: frame.modes == (Mode.DAMP,) * 6)
+    until(source, lambda frame: frame.torso[2] < stopped.torso[2] - 0.05)
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        (Order(order="dance"), "'dance' is no order; one of hand, push"),
+        (Order(order="kill", service="simulator"), "'simulator' has no process here"),
+        (Order(order="start"), "'' has no process here"),
+    ],
+)
+def test_what_it_cannot_do_is_refused_in_words(
+    source: LockstepSource, order: Order, words: str
+) -> None:
+    assert source.carry_out(order).startswith(words)
+
+
+def test_its_model_has_every_body_and_joint(source: LockstepSource) -> None:
+    model = source.model()
+    assert set(model.joints) == set(MODULES)
+    assert {body.frame for body in model.bodies} == {"torso", *MODULES}
+    assert model.end_s == model.begin_s, "it has no timeline"
+    assert np.all(np.array(model.foot) > 0.0)

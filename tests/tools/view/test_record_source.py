@@ -1,0 +1,78 @@
+"""Frames of a record: those of its messages, at any time, in any order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shared.bus import topics
+from shared.bus.messages import JointState, SimTruth
+from shared.robot.joints import MODULES
+from tests.tools.analysis.reports.runs import make
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog, read_run
+from tools.view.record import RecordSource
+from tools.view.source import Order
+
+LOG = Path(__file__).parents[1] / "analysis" / "reexecution" / "golden" / "stand-v6b.mcap"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> RunLog:
+    """Return four seconds in virtual time: a planner killed and started, a push, a fault."""
+    return read_run(make(tmp_path_factory.mktemp("run")).path)
+
+
+@pytest.fixture(scope="module")
+def source(log: RunLog) -> RecordSource:
+    return RecordSource(log, robot_of(log))
+
+
+def test_a_frame_holds_the_newest_messages_at_its_time(log: RunLog, source: RecordSource) -> None:
+    truths: list[SimTruth] = log.messages(topics.SIM_TRUTH)
+    states: dict[str, list[JointState]] = {
+        module: log.messages(topics.JOINT_STATE, module) for module in MODULES
+    }
+    model = source.model()
+    moments = [row for row in truths if row.scenario_s >= 0.0][::7]
+    assert len(moments) > 20
+    for truth in reversed(moments):  # backwards: a frame depends on no other
+        frame = source.frame(truth.scenario_s + 1e-6)
+        assert frame is not None
+        assert frame.torso == truth.torso
+        assert frame.is_true
+        for index, module in enumerate(MODULES):
+            newest = [row for row in states[module] if row.t_ns <= truth.t_ns + 1000][-1]
+            assert frame.q[2 * index : 2 * index + 2] == newest.q
+            assert frame.modes[index] == newest.mode
+    assert model.begin_s <= 0.0 < model.end_s
+    assert {"kill", "push", "fault"} <= {mark.kind for mark in model.marks}
+
+
+def test_before_all_modules_were_heard_there_is_no_frame(source: RecordSource) -> None:
+    assert source.frame(-1e6) is None
+
+
+def test_behind_the_end_the_modules_are_silent(source: RecordSource) -> None:
+    frame = source.frame(source.model().end_s + 10.0)
+    assert frame is not None
+    assert frame.modes == (-1,) * 6
+    assert frame.planner is None
+
+
+def test_a_record_takes_no_order(source: RecordSource) -> None:
+    assert source.carry_out(Order(order="kill", service="planner")) == "kill is not possible here"
+
+
+def test_without_a_simulated_world_the_pose_is_what_the_legs_know(log: RunLog) -> None:
+    """The planner's own kinematics: within a centimetre of the truth."""
+    with_truth = RecordSource(log, robot_of(log))
+    without = RecordSource(log, robot_of(log))
+    without._keys = [key for key in without._keys if key.topic is not topics.SIM_TRUTH]
+    t_s = with_truth.model().end_s - 0.2
+    known, true = without.frame(t_s), with_truth.frame(t_s)
+    assert known is not None
+    assert true is not None
+    assert not known.is_true
+    assert max(abs(a - b) for a, b in zip(known.torso, true.torso, strict=True)) < 0.01

@@ -1,0 +1,148 @@
+"""The page in a real Chromium, if one is installed: led, pushed, killed, stopped, scrubbed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shared.process import DEFAULT_CONFIG
+from tests.tools.view.browser import BROWSER, Page, browser
+from tests.tools.view.test_record_source import LOG
+from tools.runs.experiment import load_robot
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import read_run
+from tools.view.lockstep import LockstepSource
+from tools.view.record import RecordSource
+from tools.view.server import ViewServer
+from tools.view.source import Source
+
+pytestmark = [
+    pytest.mark.skipif(BROWSER is None, reason="needs a Chromium"),
+    pytest.mark.timeout(180),
+]
+
+HEIGHT = "Number(document.getElementById('height')?.textContent)"
+MODES = "document.getElementById('modules')?.textContent ?? ''"
+WIDE = """JSON.stringify([...document.querySelectorAll('body *')].filter((node) => {
+  const { left, right, width } = node.getBoundingClientRect();
+  return width > 0 && (right > innerWidth + 0.5 || left < -0.5);
+}).map((node) => node.tagName + node.id))"""
+
+
+def with_page(source: Source, work: Callable[[Page, str], Awaitable[None]]) -> None:
+    async def main() -> None:
+        server = ViewServer(source, 0)
+        async with server.running(), browser() as page:
+            await work(page, server.address)
+            assert page.complaints == []
+
+    asyncio.run(main())
+
+
+@pytest.fixture
+def lockstep() -> Any:
+    made = LockstepSource(load_robot(DEFAULT_CONFIG))
+    yield made
+    made.close()
+
+
+async def drag(
+    page: Page, x: float, y: float, dx: float, dy: float, *, shift: bool = False
+) -> None:
+    """Press at a place, go on by so much, and hold."""
+    await page.mouse("down", x, y, shift=shift)
+    for part in range(1, 11):
+        await page.mouse("move", x + dx * part / 10, y + dy * part / 10, shift=shift)
+
+
+def test_a_person_leads_pushes_kills_and_stops_it_with_the_mouse(
+    lockstep: LockstepSource, tmp_path: Path
+) -> None:
+    async def work(page: Page, address: str) -> None:
+        await page.open(address)
+        await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
+        begin = await page.value(HEIGHT)
+        await drag(page, 640.0, 200.0, 0.0, 90.0)
+        low = await page.until(HEIGHT, lambda height: height < begin - 0.1)
+        await page.mouse("up", 640.0, 290.0)
+        await drag(page, 640.0, 260.0, 0.0, -60.0)
+        await page.until(HEIGHT, lambda height: height > low + 0.05)
+        await page.mouse("up", 640.0, 200.0)
+        pushed = "document.getElementById('plots').querySelectorAll('canvas').length"
+        assert await page.value(pushed) == 6
+        await page.value("document.querySelector('[data-service=planner]').click()")
+        await page.until(MODES, lambda text: text.count("HOLD") == 6)
+        await page.until("document.getElementById('mode').textContent", lambda w: w == "silent")
+        start = "document.querySelectorAll('[data-service=planner]')[1].click()"
+        await page.value(start)
+        await page.until(MODES, lambda text: text.count("TRACK") == 6)
+        await page.key("ArrowDown")
+        await page.value("document.getElementById('estop').click()")
+        await page.until(MODES, lambda text: text.count("DAMP") == 6)
+        await page.picture(tmp_path / "stopped.png")
+        assert (tmp_path / "stopped.png").stat().st_size > 20_000
+
+    with_page(lockstep, work)
+
+
+def test_a_shove_shows_and_ends_with_the_hand(lockstep: LockstepSource) -> None:
+    async def work(page: Page, address: str) -> None:
+        await page.open(address)
+        await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
+        await drag(page, 640.0, 200.0, 80.0, 0.0, shift=True)
+        await until(lambda: any(force_of(lockstep)))
+        await page.mouse("up", 720.0, 200.0, shift=True)
+        await until(lambda: not any(force_of(lockstep)))
+
+    with_page(lockstep, work)
+
+
+def force_of(source: LockstepSource) -> tuple[float, float, float]:
+    frame = source.frame(0.0)
+    return frame.push if frame is not None else (0.0, 0.0, 0.0)
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    async with asyncio.timeout(30.0):
+        while not holds():
+            await asyncio.sleep(0.01)
+
+
+def test_a_record_is_scrubbed_stepped_and_played(tmp_path: Path) -> None:
+    log = read_run(LOG)
+    source = RecordSource(log, robot_of(log))
+    end_s = source.model().end_s
+
+    async def work(page: Page, address: str) -> None:
+        await page.open(address)
+        place = "document.getElementById('place')"
+        seek = f"{place}.value = {end_s - 0.2}; {place}.dispatchEvent(new Event('input'))"
+        await page.until(f"{place}?.max", lambda text: text not in (None, "", "100"))
+        await page.value(seek)
+        await page.until(MODES, lambda text: text.count("TRACK") + text.count("HOLD") == 6)
+        marks = await page.value("document.querySelectorAll('#marks i').length")
+        assert marks == len(source.model().marks)
+        assert await page.value("document.getElementById('estop').hidden"), "nothing to stop"
+        await page.value("document.getElementById('play').click()")
+        await page.until(f"Number({place}.value)", lambda at: abs(at - end_s) < 0.02)
+        await page.until("document.getElementById('play').textContent", lambda text: text == "▶")
+        await page.picture(tmp_path / "record.png")
+
+    with_page(source, work)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1400, 800), (400, 800)])
+def test_nothing_is_cut_off_on_a_wide_or_a_narrow_screen(
+    lockstep: LockstepSource, width: int, height: int
+) -> None:
+    async def work(page: Page, address: str) -> None:
+        await page.open(address, width, height)
+        await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
+        assert json.loads(await page.value(WIDE)) == []
+
+    with_page(lockstep, work)

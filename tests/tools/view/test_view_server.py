@@ -1,0 +1,293 @@
+"""The page's server: who gets in, what goes through, and what a page may ask for."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import aiohttp
+import msgspec
+import pytest
+
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import FleetError
+from tools.view.frame import Frame
+from tools.view.server import CLIENTS_MAX, MESSAGE_MAX, ViewServer
+from tools.view.source import Model, Order, Source
+
+TOKEN = "known-to-this-test"  # noqa: S105 - of a server that ends with its test
+
+
+def frame_at(t_s: float) -> Frame:
+    zero = (0.0, 0.0, 0.0)
+    return Frame(
+        t_s=t_s, torso=zero, angles=zero, com=zero, q=(0.0,) * 12, q_ref=(), modes=(2,) * 6,
+        drives=(0,) * 6, ages_ms=(1.0,) * 6, tau=(0.0,) * 12, force=zero, push=zero,
+        planner=None, is_true=True, fallen=False,
+    )  # fmt: skip
+
+
+class Recorded(Source):
+    """A source of ten seconds, that writes down what is asked of it."""
+
+    kind = "record"
+    title = "test"
+
+    def __init__(self, robot: RobotConfig) -> None:
+        super().__init__(robot)
+        self.connected: list[bool] = []
+        self.orders_taken: list[Order] = []
+
+    def model(self) -> Model:
+        return msgspec.structs.replace(super().model(), begin_s=0.0, end_s=10.0)
+
+    def connect(self) -> None:
+        self.connected.append(True)
+
+    def disconnect(self) -> None:
+        self.connected.append(False)
+
+    def frame(self, t_s: float) -> Frame | None:
+        return frame_at(t_s)
+
+    def carry_out(self, order: Order) -> str:
+        self.orders_taken.append(order)
+        return "" if order.order == "push" else "not here"
+
+
+class Bench:
+    def __init__(self, source: Recorded, server: ViewServer, http: aiohttp.ClientSession) -> None:
+        self.source, self.server, self.http = source, server, http
+
+    @property
+    def origin(self) -> str:
+        return "/".join(self.server.address.split("/")[:3])
+
+    async def page(self) -> aiohttp.ClientWebSocketResponse:
+        address = self.server.address + "ws"
+        return await self.http.ws_connect(address, headers={"Origin": self.origin})
+
+    async def status(self, path: str = "", **headers: str) -> int:
+        async with self.http.get(self.server.address + path, headers=headers) as answer:
+            return answer.status
+
+
+async def message_with(
+    page: aiohttp.ClientWebSocketResponse, key: str, holds: Callable[[Any], bool] = bool
+) -> Any:
+    """Return the first message that has a key whose value is as it should be."""
+    async with asyncio.timeout(20.0):
+        while True:
+            value = (await page.receive_json()).get(key)
+            if value is not None and holds(value):
+                return value
+
+
+def with_server(
+    robot: RobotConfig, work: Callable[[Bench], Awaitable[None]], port: int = 0
+) -> Recorded:
+    source = Recorded(robot)
+
+    @contextlib.asynccontextmanager
+    async def bench() -> AsyncIterator[Bench]:
+        server = ViewServer(source, port, TOKEN)
+        async with server.running(), aiohttp.ClientSession() as http:
+            yield Bench(source, server, http)
+
+    async def main() -> None:
+        async with bench() as found:
+            await work(found)
+
+    asyncio.run(main())
+    return source
+
+
+def test_the_page_and_all_it_loads_are_served_here_and_nothing_from_elsewhere(
+    robot: RobotConfig,
+) -> None:
+    async def work(bench: Bench) -> None:
+        loaded = [
+            "", "main.js", "scene.js", "plots.js", "style.css",
+            "vendor/three/three.module.min.js", "vendor/uplot/uPlot.iife.min.js",
+            "vendor/uplot/uPlot.min.css",
+        ]  # fmt: skip
+        size = 0
+        for path in loaded:
+            async with bench.http.get(bench.server.address + path) as answer:
+                assert answer.status == 200, path
+                assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
+                text = await answer.text()
+                size += len(text)
+                if "vendor" not in path:
+                    assert "http://" not in text
+                    assert "https://" not in text
+        assert size < 700_000
+        assert await bench.status("no-such-file") == 404
+        assert await bench.status("..%2f..%2fserver.py") == 404
+
+    with_server(robot, work)
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Host": "evil.example"}, 403),
+        ({"Host": "evil.example:8417"}, 403),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Origin": "https://127.0.0.1"}, 403),
+    ],
+)
+def test_another_host_or_origin_is_refused(
+    robot: RobotConfig, headers: dict[str, str], status: int
+) -> None:
+    async def work(bench: Bench) -> None:
+        assert await bench.status(**headers) == status
+        address = bench.server.address + "ws"
+        if status != 200:
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await bench.http.ws_connect(address, headers={"Origin": bench.origin} | headers)
+            assert refused.value.status == 403
+
+    assert with_server(robot, work).connected == []
+
+
+def test_without_the_token_or_an_origin_there_is_nothing(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        for token in ("", "x", TOKEN[:-1], TOKEN + "x", "%00"):
+            async with bench.http.get(f"{bench.origin}/{token}/") as answer:
+                assert answer.status in (403, 404), token
+                assert TOKEN not in await answer.text()
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await bench.http.ws_connect(bench.server.address + "ws")
+        assert refused.value.status == 403
+
+    assert with_server(robot, work).connected == []
+
+
+def test_a_source_listens_only_while_a_page_is_open(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        assert bench.source.connected == []
+        one, two = await bench.page(), await bench.page()
+        for page in (one, two):
+            assert (await message_with(page, "model"))["robot"] == "xrl"
+            await message_with(page, "frame")
+        await one.close()
+        await two.send_json({"seek_s": 2.0})
+        await message_with(two, "frame", lambda frame: frame["t_s"] == 2.0)
+        assert False not in bench.source.connected
+        await two.close()
+        async with asyncio.timeout(10.0):
+            while bench.source.connected[-1]:
+                await asyncio.sleep(0.01)
+
+    with_server(robot, work)
+
+
+def test_each_page_has_a_place_in_the_record_of_its_own(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        one, two = await bench.page(), await bench.page()
+        await one.send_json({"seek_s": 7.5})
+        await message_with(one, "frame", lambda frame: frame["t_s"] == 7.5)
+        assert (await message_with(two, "frame"))["t_s"] == 0.0
+        await two.send_json({"play": True, "rate": 20.0})
+        await message_with(two, "frame", lambda frame: frame["t_s"] == 10.0)
+        await one.send_json({"seek_s": -99.0})
+        await message_with(one, "frame", lambda frame: frame["t_s"] == 0.0)
+        await one.close()
+        await two.close()
+
+    with_server(robot, work)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", "3", '{"seek_s": "far"}', '{"play": 7}', '{"order": 3}',
+     '{"order": "push", "force": [1, 2]}', '{"order": "push", "force": [1, 2, "x"]}',
+     '{"order": "push", "force": null}'],
+)  # fmt: skip
+def test_what_is_not_understood_is_told_and_the_page_stays_open(
+    robot: RobotConfig, text: str
+) -> None:
+    async def work(bench: Bench) -> None:
+        page = await bench.page()
+        await page.send_str(text)
+        assert "not understood" in await message_with(page, "error")
+        await page.send_json({"seek_s": 1.0})
+        await message_with(page, "frame", lambda frame: frame["t_s"] == 1.0)
+        await page.close()
+
+    assert with_server(robot, work).orders_taken == []
+
+
+def test_orders_go_to_the_source_and_its_refusal_to_the_page(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        page = await bench.page()
+        await page.send_json({"order": "push", "force": [1.0, 2.0, 3.0]})
+        await page.send_json({"order": "dance"})
+        assert await message_with(page, "error") == "not here"
+        await page.close()
+
+    source = with_server(robot, work)
+    assert source.orders_taken[0] == Order(order="push", force=(1.0, 2.0, 3.0))
+
+
+def test_a_message_that_is_too_long_ends_the_page_and_no_other(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        one, two = await bench.page(), await bench.page()
+        await one.send_str("x" * (MESSAGE_MAX + 1))
+        async with asyncio.timeout(20.0):
+            while (await one.receive()).type is not aiohttp.WSMsgType.CLOSE:
+                pass
+        await two.send_json({"seek_s": 2.0})
+        await message_with(two, "frame", lambda frame: frame["t_s"] == 2.0)
+        await two.close()
+
+    with_server(robot, work)
+
+
+def test_so_many_pages_and_no_more(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        pages = [await bench.page() for _ in range(CLIENTS_MAX)]
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await bench.page()
+        assert refused.value.status == 503
+        for page in pages:
+            await page.close()
+
+    with_server(robot, work)
+
+
+def test_a_page_that_does_not_drain_holds_up_no_other(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        port = int(bench.origin.rpartition(":")[2])
+        reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1)
+        writer.write(
+            f"GET /{TOKEN}/ws HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nOrigin: {bench.origin}\r\n"
+            "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n".encode()
+        )
+        await writer.drain()
+        page = await bench.page()
+        await page.send_json({"play": True, "rate": 5.0})
+        await message_with(page, "frame", lambda frame: frame["t_s"] == 10.0)
+        await page.close()
+        writer.close()
+        assert reader is not None
+
+    with_server(robot, work)
+
+
+def test_a_port_in_use_is_told(robot: RobotConfig) -> None:
+    async def work(_bench: Bench) -> None:
+        raise AssertionError("it is in use")
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        with pytest.raises(FleetError, match="give another --port"):
+            with_server(robot, work, other.getsockname()[1])

@@ -1,0 +1,176 @@
+"""What the page shows at one moment, wherever it comes from; made from the newest messages."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from services.planner.kinematics import Kinematics
+from shared.bus import topics
+from shared.bus.messages import (
+    JointCommand,
+    JointState,
+    Message,
+    PlannerMode,
+    PlannerStatus,
+    SimTruth,
+    Vector3,
+    Wrench,
+)
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULE_INDEX, MODULES
+
+STALE_NS: Final = NS_PER_S // 2
+"""An older message is not shown: its sender is dead, stopped or cut off."""
+_NOWHERE: Final = (0.0, 0.0, 0.0)
+
+
+class PlannerShown(msgspec.Struct, frozen=True):
+    """What the page shows of the planner."""
+
+    mode: str
+    """Name of its `PlannerMode`."""
+    why: str
+    """Why it does not lead."""
+    wait_s: float
+    margin: float
+    margin_onboard: float
+    tick_us: float
+    assist_n: float
+    height_ref: float
+    """COM height that it follows, m."""
+
+
+class Frame(msgspec.Struct, frozen=True):
+    """One moment of the robot; SI units, world axes unless it says otherwise."""
+
+    t_s: float
+    """Scenario time if there is one, else since the first frame."""
+    torso: Vector3
+    """Origin of the torso, m."""
+    angles: Vector3
+    """Its roll, pitch, yaw (3-1-2), rad."""
+    com: Vector3
+    q: tuple[float, ...]
+    """Joint angles (12,), rad."""
+    q_ref: tuple[float, ...]
+    """Their references (12,), rad; empty if no planner is heard."""
+    modes: tuple[int, ...]
+    """`Mode` of each module; -1: silent."""
+    drives: tuple[int, ...]
+    ages_ms: tuple[float, ...]
+    """Age of the command that each module uses; -1: none."""
+    tau: tuple[float, ...]
+    """Joint torques (12,), N m."""
+    force: Vector3
+    """Of the person on the torso, N, torso axes."""
+    push: Vector3
+    """N."""
+    planner: PlannerShown | None
+    """None: not heard."""
+    is_true: bool
+    """True: the pose is that of the simulated world; else what the legs' kinematics know."""
+    fallen: bool
+
+
+class Newest:
+    """The newest message of each key that a frame is made of."""
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self._states: list[JointState | None] = [None] * len(MODULES)
+        self._commands: list[JointCommand | None] = [None] * len(MODULES)
+        self._status: PlannerStatus | None = None
+        self._wrench: Wrench | None = None
+        self._truth: SimTruth | None = None
+        self._kinematics = Kinematics(robot)
+        self._first_ns: int | None = None
+
+    def take(self, topic: Topic, module: str, message: Message) -> None:
+        """Take a message; those that no frame shows are ignored."""
+        if topic is topics.JOINT_STATE and isinstance(message, JointState):
+            self._states[MODULE_INDEX[module]] = message
+        elif topic is topics.JOINT_COMMAND and isinstance(message, JointCommand):
+            self._commands[MODULE_INDEX[module]] = message
+        elif isinstance(message, PlannerStatus):
+            self._status = message
+        elif isinstance(message, Wrench):
+            self._wrench = message
+        elif isinstance(message, SimTruth):
+            self._truth = message
+
+    def frame(self, now_ns: int) -> Frame | None:
+        """Return what is known now; None until each module was heard once.
+
+        Args:
+            now_ns: on the clock of the messages.
+        """
+        states = [state for state in self._states if state is not None and state.t_ns > 0]
+        if len(states) < len(MODULES):
+            return None
+        if self._first_ns is None:
+            self._first_ns = now_ns
+        status, wrench, truth = (
+            row if row is not None and now_ns - row.t_ns < STALE_NS else None
+            for row in (self._status, self._wrench, self._truth)
+        )
+        heard = [now_ns - state.t_ns < STALE_NS for state in states]
+        q = tuple(angle for state in states for angle in state.q)
+        torso, angles, com = self._pose(truth, q)
+        commands = [row for row in self._commands if row is not None]
+        led = isinstance(status, PlannerStatus) and len(commands) == len(MODULES)
+        t_s = (now_ns - self._first_ns) / NS_PER_S
+        if isinstance(truth, SimTruth):
+            t_s = truth.scenario_s
+        return Frame(
+            t_s=t_s,
+            torso=torso,
+            angles=angles,
+            com=com,
+            q=q,
+            q_ref=tuple(angle for row in commands for angle in row.q_ref) if led else (),
+            modes=tuple(s.mode if here else -1 for s, here in zip(states, heard, strict=True)),
+            drives=tuple(state.drive for state in states),
+            ages_ms=tuple(
+                state.age_ns / NS_PER_MS if here and state.age_ns >= 0 else -1.0
+                for state, here in zip(states, heard, strict=True)
+            ),
+            tau=tuple(torque for state in states for torque in state.tau),
+            force=wrench.force if isinstance(wrench, Wrench) and wrench.valid else _NOWHERE,
+            push=truth.push if isinstance(truth, SimTruth) else _NOWHERE,
+            is_true=isinstance(truth, SimTruth),
+            fallen=isinstance(truth, SimTruth) and truth.fallen,
+            planner=_shown(status) if isinstance(status, PlannerStatus) else None,
+        )
+
+    def _pose(
+        self, truth: Message | None, q: tuple[float, ...]
+    ) -> tuple[Vector3, Vector3, Vector3]:
+        if isinstance(truth, SimTruth):
+            return truth.torso, truth.angles, truth.com
+        known = self._kinematics
+        if self._status is not None:
+            known.stance[:] = self._status.stance
+        known.update(np.array(q))
+        return _vector(known.r_torso), _vector(known.p[3:]), _vector(known.p[:3])
+
+
+def _shown(status: PlannerStatus) -> PlannerShown:
+    return PlannerShown(
+        mode=PlannerMode(status.mode).name,
+        why=status.why,
+        wait_s=status.wait_s,
+        margin=status.margin,
+        margin_onboard=status.margin_onboard,
+        tick_us=status.tick_us,
+        assist_n=status.assist_n,
+        height_ref=status.p_ref[2],
+    )
+
+
+def _vector(values: object) -> Vector3:
+    x, y, z = np.asarray(values).tolist()
+    return x, y, z

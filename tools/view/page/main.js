@@ -1,0 +1,202 @@
+// The page: takes frames from the server, shows them, and sends what a person does.
+import { Plots } from "./plots.js";
+import { MODE_COLOURS, RobotScene } from "./scene.js";
+
+const $ = (id) => document.getElementById(id);
+const css = (colour) => `#${colour.toString(16).padStart(6, "0")}`;
+const HINTS = {
+  record: "drag: turn · wheel: closer · space: play or pause · ← →: a frame",
+  live: "looking only · drag: turn · wheel: closer",
+  lockstep: "drag the torso up and down: lead · shift and drag: push · drag beside it: turn",
+};
+const HEIGHT_STEP = 0.02, PITCH_STEP = 0.05, PUSH_PER_PIXEL = 0.6, FRAME_S = 1 / 30;
+
+let model, scene, plots, newest, socket;
+const hand = { height: 0, pitch: 0, led: false };
+
+function send(message) {
+  if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+}
+
+function complain(text) {
+  $("error").textContent = text;
+  $("error").hidden = !text;
+}
+
+function connect() {
+  const here = new URL("ws", location.href);
+  here.protocol = "ws:";
+  socket = new WebSocket(here);
+  socket.onmessage = ({ data }) => {
+    const message = JSON.parse(data);
+    if (message.model) begin(message.model);
+    if (message.error) complain(message.error);
+    if (message.frame) show(message.frame);
+    if (message.playing !== undefined) $("play").textContent = message.playing ? "⏸" : "▶";
+  };
+  socket.onclose = () => {
+    complain("the server is gone; this page looks for it");
+    setTimeout(connect, 1000);
+  };
+  socket.onopen = () => complain("");
+}
+
+function row(list, name) {
+  const item = document.createElement("li");
+  const dot = Object.assign(document.createElement("span"), { className: "dot" });
+  const label = Object.assign(document.createElement("span"), { className: "name", textContent: name });
+  const word = Object.assign(document.createElement("span"), { className: "word" });
+  item.append(dot, label, word);
+  list.append(item);
+  return { item, dot, word };
+}
+
+let moduleRows = [];
+
+function begin(given) {
+  if (model) return;
+  model = given;
+  $("source").textContent = model.title;
+  document.title = `XRL: ${model.robot}, ${model.source}`;
+  $("hint").textContent = HINTS[model.source];
+  moduleRows = model.modules.map((name) => row($("modules"), name.replace("_", " ")));
+  plots = new Plots($("plots"));
+  try {
+    scene = new RobotScene($("scene"), model);
+  } catch (error) {
+    complain(`no three-dimensional picture: ${error.message}`);
+  }
+  if (model.end_s > model.begin_s) beginTimeline();
+  if (model.orders.includes("estop")) beginOrders();
+  steer();
+}
+
+function beginTimeline() {
+  $("timeline").hidden = false;
+  Object.assign($("place"), { min: model.begin_s, max: model.end_s, value: 0 });
+  for (const mark of model.marks) {
+    const tick = document.createElement("i");
+    tick.className = mark.kind;
+    tick.title = `${mark.t_s.toFixed(2)} s: ${mark.text}`;
+    tick.style.left = `${100 * (mark.t_s - model.begin_s) / (model.end_s - model.begin_s)}%`;
+    $("marks").append(tick);
+  }
+  $("play").onclick = () => send({ play: $("play").textContent === "▶" });
+  $("place").oninput = () => send({ play: false, seek_s: Number($("place").value) });
+  $("rate").onchange = () => send({ rate: Number($("rate").value) });
+  $("back").onclick = () => step(-FRAME_S);
+  $("forth").onclick = () => step(FRAME_S);
+}
+
+const step = (by_s) => send({ play: false, seek_s: (newest?.t_s ?? 0) + by_s });
+
+function beginOrders() {
+  $("estop").hidden = $("hardware").hidden = false;
+  $("estop").onclick = () => send({ order: "estop" });
+  $("processes").hidden = false;
+  for (const name of ["planner", ...model.modules]) {
+    const { item, dot } = row($("processes").querySelector("ul"), name);
+    dot.remove();
+    for (const order of ["kill", "start"]) {
+      const button = document.createElement("button");
+      button.textContent = order;
+      button.dataset.service = name;
+      button.onclick = () => send({ order, service: name });
+      item.append(button);
+    }
+  }
+}
+
+function show(frame) {
+  newest = frame;
+  $("time").textContent = frame.t_s.toFixed(1);
+  $("height").textContent = frame.torso[2].toFixed(3);
+  $("hand").textContent = frame.force[2].toFixed(0);
+  const planner = frame.planner;
+  $("mode").textContent = planner ? planner.mode.toLowerCase() : "silent";
+  $("planner").textContent = planner
+    ? [planner.why, planner.wait_s > 0 ? `leads again in ${planner.wait_s.toFixed(0)} s at the earliest` : "",
+      `tick ${(planner.tick_us).toFixed(0)} µs, assist ${planner.assist_n.toFixed(0)} N`]
+      .filter(Boolean).join("; ")
+    : "not heard: each module holds by itself";
+  frame.modes.forEach((mode, index) => {
+    const name = model.modes[mode] ?? "SILENT";
+    moduleRows[index].word.textContent = name;
+    moduleRows[index].dot.style.background = css(MODE_COLOURS[name]);
+  });
+  if (frame.fallen) complain("it has fallen");
+  if (!$("timeline").hidden && document.activeElement !== $("place")) $("place").value = frame.t_s;
+  if (!hand.led) Object.assign(hand, { height: frame.torso[2], pitch: frame.angles[1] });
+  scene?.show(frame);
+  plots.take(frame);
+}
+
+function lead(height, pitch) {
+  Object.assign(hand, { height, pitch, led: true });
+  send({ order: "hand", height, pitch });
+}
+
+// Pointers: the torso leads or is pushed, everything else turns the picture.
+function steer() {
+  const canvas = $("scene"), pointers = new Map();
+  const leads = model.orders.includes("hand");
+  let grip, pushing;
+  const stop = () => {
+    clearInterval(pushing);
+    pushing = grip = undefined;
+    if (leads) send({ order: "push", force: [0, 0, 0] });
+  };
+  canvas.onpointerdown = (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    canvas.focus();
+    pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    const held = leads && pointers.size === 1 && scene?.isTorso(event.offsetX, event.offsetY);
+    grip = held ? { x: event.clientX, y: event.clientY, force: [0, 0, 0], ...hand } : undefined;
+    if (grip && event.shiftKey)  // again and again: a push that is not repeated ends by itself
+      pushing = setInterval(() => send({ order: "push", force: grip.force }), 50);
+  };
+  canvas.onpointermove = (event) => {
+    const last = pointers.get(event.pointerId);
+    if (!last || !scene) return;
+    const dx = event.clientX - last.x, dy = event.clientY - last.y;
+    Object.assign(last, { x: event.clientX, y: event.clientY });
+    if (pushing) {
+      const right = scene.right(), size = PUSH_PER_PIXEL * (event.clientX - grip.x);
+      const up = -PUSH_PER_PIXEL * (event.clientY - grip.y);
+      grip.force = [right.x * size, right.y * size, up];
+    } else if (grip) {
+      lead(grip.height - (event.clientY - grip.y) * scene.metresPerPixel(), grip.pitch);
+    } else {
+      scene.look.azimuth -= dx * 0.006;
+      scene.look.elevation = Math.min(1.4, Math.max(-0.1, scene.look.elevation + dy * 0.006));
+      scene.draw();
+    }
+  };
+  canvas.onpointerup = canvas.onpointercancel = (event) => {
+    pointers.delete(event.pointerId);
+    if (grip) stop();
+  };
+  canvas.onwheel = (event) => {
+    event.preventDefault();
+    if (!scene) return;
+    scene.look.distance = Math.min(9, Math.max(1.2, scene.look.distance * Math.exp(event.deltaY * 0.001)));
+    scene.draw();
+  };
+  addEventListener("keydown", (event) => {
+    if (event.target instanceof HTMLSelectElement || event.target instanceof HTMLInputElement) return;
+    const recorded = !$("timeline").hidden;
+    const { height, pitch } = hand;
+    const actions = recorded
+      ? { " ": () => $("play").click(), ArrowLeft: () => step(-FRAME_S), ArrowRight: () => step(FRAME_S) }
+      : leads ? {
+        ArrowUp: () => lead(height + HEIGHT_STEP, pitch), ArrowDown: () => lead(height - HEIGHT_STEP, pitch),
+        ArrowLeft: () => lead(height, pitch - PITCH_STEP), ArrowRight: () => lead(height, pitch + PITCH_STEP),
+      } : {};
+    const action = actions[event.key];
+    if (!action || (event.target instanceof HTMLButtonElement && event.key === " ")) return;
+    event.preventDefault();
+    action();
+  });
+}
+
+connect();

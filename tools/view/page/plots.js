@@ -1,0 +1,62 @@
+// Plots of the last seconds, beside the robot.
+const KEPT_S = 20, EVERY_MS = 200;
+const COLOURS = ["#e0702a", "#2f8fe0", "#2e8a5c", "#b46ae0", "#d98f1f", "#6b7684"];
+
+const PANELS = [
+  ["hand, N", ["hand", "push"], (f) => [f.force[2], Math.hypot(...f.push)]],
+  ["COM, mm", ["x", "y"], (f) => [1e3 * f.com[0], 1e3 * f.com[1]]],
+  ["height, m", ["torso", "COM", "COM asked for"],
+    (f) => [f.torso[2], f.com[2], f.planner ? f.planner.height_ref : null]],
+  ["age of commands, ms", ["oldest"],
+    (f) => [Math.max(...f.ages_ms) >= 0 ? Math.max(...f.ages_ms) : null]],
+  ["margin", ["with the services", "drives alone"],
+    (f) => f.planner ? [f.planner.margin, f.planner.margin_onboard] : [null, null]],
+  ["torque, N m", ["largest"], (f) => [Math.max(...f.tau.map(Math.abs))]],
+];
+
+export class Plots {
+  constructor(root) {
+    this.drawn = 0;
+    this.panels = PANELS.map(([title, names, values]) => {
+      const box = document.createElement("div");
+      box.className = "panel";
+      const heading = document.createElement("h3");
+      heading.textContent = title;
+      box.append(heading);
+      root.append(box);
+      const ink = getComputedStyle(document.documentElement);
+      const axis = { stroke: ink.getPropertyValue("--faint"), size: 36, font: "11px system-ui",
+        grid: { stroke: ink.getPropertyValue("--line") }, ticks: { show: false } };
+      const plot = new uPlot({
+        width: 100, height: 96, cursor: { show: false }, legend: { show: names.length > 1, live: false },
+        scales: { x: { time: false } },
+        axes: [{ ...axis, size: 22 }, axis],
+        series: [{}, ...names.map((label, n) => ({ label, stroke: COLOURS[n], width: 1.5 }))],
+      }, [[], ...names.map(() => [])], box);
+      return { plot, values, data: [[], ...names.map(() => [])], box };
+    });
+    new ResizeObserver(() => this.resize(root)).observe(root);
+  }
+
+  resize(root) {
+    const width = Math.max(120, root.clientWidth - 20);
+    for (const { plot } of this.panels) plot.setSize({ width, height: 96 });
+  }
+
+  clear() {
+    for (const panel of this.panels) panel.data = panel.data.map(() => []);
+  }
+
+  take(frame) {
+    const last = this.panels[0].data[0].at(-1);
+    if (last !== undefined && (frame.t_s < last || frame.t_s > last + KEPT_S)) this.clear();
+    for (const { values, data } of this.panels) {
+      [frame.t_s, ...values(frame)].forEach((value, n) => data[n].push(value));
+      while (data[0][0] < frame.t_s - KEPT_S) data.forEach((column) => column.shift());
+    }
+    const now = performance.now();
+    if (now - this.drawn < EVERY_MS) return;
+    this.drawn = now;
+    for (const { plot, data } of this.panels) plot.setData(data);
+  }
+}

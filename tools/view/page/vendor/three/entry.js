@@ -1,0 +1,2 @@
+export {
+  WebGLRenderer, Scene, PerspectiveCamera, Group, Mesh, BoxGeometry, CylinderGeometry, SphereGeometry, ConeGeometry, RingGeometry, CircleGeometry, MeshLambertMaterial, MeshBasicMaterial, LineBasicMaterial, LineDashedMaterial, Line, LineLoop, LineSegments, BufferGeometry, BufferAttribute, Float32BufferAttribute, GridHelper, HemisphereLight, DirectionalLight, Vector3, Vector2, Quaternion, Plane, Raycaster, Color, DoubleSide, Shape, ShapeGeometry } from "three";

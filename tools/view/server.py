@@ -1,0 +1,203 @@
+"""The page's server: one asyncio loop, on this computer only, for who knows the token.
+
+Every request needs the token in its path, and this server's own name as Host; a WebSocket also its
+own Origin. A page of a stranger in the same browser has none of them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from aiohttp import WSMsgType, web
+
+from shared.exceptions import FleetError, XrlError
+from tools.view.cursor import TimelineCursor
+from tools.view.source import Order, Source
+
+HOST: Final = "127.0.0.1"
+PORT: Final = 8417
+FRAMES_S: Final = 30.0
+MESSAGE_MAX: Final = 4096
+"""Largest message of a page, bytes."""
+CLIENTS_MAX: Final = 8
+PAGE: Final = Path(__file__).parent / "page"
+UPLOT: Final = Path(__file__).parents[1] / "analysis" / "reports" / "vendor" / "uplot"
+_TYPES: Final = {
+    ".html": "text/html", ".js": "text/javascript", ".css": "text/css",
+}  # fmt: skip
+_HEADERS: Final = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+_Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Control(msgspec.Struct, frozen=True):
+    """What a page asks of its own cursor; a field that is left out stays as it is."""
+
+    play: bool | None = None
+    seek_s: float | None = None
+    rate: float | None = None
+
+
+class ViewServer:
+    """Serves one source to some pages."""
+
+    def __init__(self, source: Source, port: int = PORT, token: str = "") -> None:
+        """Make a server; `running` starts it.
+
+        Args:
+            source: of the frames.
+            port: 0 for a free one.
+            token: of the address; made up if empty.
+        """
+        self._source = source
+        self._port = port
+        self._token = token or secrets.token_urlsafe(16)
+        self._model = msgspec.json.encode({"model": source.model()}).decode()
+        self._files = _files()
+        self._clients = 0
+        self._sockets: set[web.WebSocketResponse] = set()
+        self._lock = asyncio.Lock()
+
+    @property
+    def address(self) -> str:
+        """What a person opens."""
+        return f"http://{HOST}:{self._port}/{self._token}/"
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Serve meanwhile.
+
+        Raises:
+            FleetError: the port is in use.
+        """
+        app = web.Application(middlewares=[self._guard], client_max_size=MESSAGE_MAX)
+        app.router.add_get("/{token}/ws", self._socket)
+        app.router.add_get("/{token}/{file:.*}", self._file)
+        runner = web.AppRunner(app, access_log=None, handle_signals=False)
+        await runner.setup()
+        try:
+            await web.TCPSite(runner, HOST, self._port, reuse_address=True).start()
+        except OSError as error:
+            await runner.cleanup()
+            text = f"port {self._port} of {HOST}: {error.strerror}; give another --port"
+            raise FleetError(text) from None
+        self._port = runner.addresses[0][1]
+        try:
+            yield
+        finally:
+            for socket in set(self._sockets):
+                await socket.close()
+            await runner.cleanup()
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+        own = {f"{HOST}:{self._port}", f"localhost:{self._port}"}
+        origin = request.headers.get("Origin")
+        token = request.match_info.get("token", "")
+        if (
+            request.headers.get("Host") not in own
+            or (origin is not None and origin not in {f"http://{name}" for name in own})
+            or not secrets.compare_digest(token.encode(), self._token.encode())
+        ):
+            return web.Response(status=403, text="open the address that `xrl view` printed\n")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers.update(_HEADERS)
+        return response
+
+    async def _file(self, request: web.Request) -> web.Response:
+        found = self._files.get(request.match_info["file"] or "index.html")
+        if found is None:
+            return web.Response(status=404, text="no such file\n")
+        content, kind = found
+        return web.Response(body=content, content_type=kind, charset="utf-8")
+
+    async def _socket(self, request: web.Request) -> web.StreamResponse:
+        if request.headers.get("Origin") is None:
+            return web.Response(status=403, text="a page's own Origin is needed\n")
+        if self._clients >= CLIENTS_MAX:
+            return web.Response(status=503, text=f"{CLIENTS_MAX} pages are open already\n")
+        socket = web.WebSocketResponse(max_msg_size=MESSAGE_MAX, heartbeat=20.0)
+        await socket.prepare(request)
+        self._clients += 1
+        self._sockets.add(socket)
+        try:
+            async with self._lock:
+                await asyncio.to_thread(self._source.connect)
+            await socket.send_str(self._model)
+            model = self._source.model()
+            cursor = TimelineCursor(model.begin_s, model.end_s)
+            sender = asyncio.create_task(self._send(socket, cursor))
+            try:
+                await self._receive(socket, cursor)
+            finally:
+                sender.cancel()
+                with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                    await sender
+        except XrlError as error:
+            with contextlib.suppress(ConnectionError):
+                await socket.send_json({"error": str(error)})
+        finally:
+            self._clients -= 1
+            self._sockets.discard(socket)
+            async with self._lock:
+                if not self._clients:
+                    await asyncio.to_thread(self._source.disconnect)
+        return socket
+
+    async def _send(self, socket: web.WebSocketResponse, cursor: TimelineCursor) -> None:
+        """Send a frame 30 times a second; while a page does not drain, the next are skipped."""
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        sent = b""
+        while not socket.closed:
+            frame = self._source.frame(cursor.at(loop.time()))
+            text = msgspec.json.encode({"frame": frame, "playing": cursor.playing})
+            if text != sent:
+                await socket.send_str(text.decode())
+                sent = text
+            due = max(due + 1.0 / FRAMES_S, loop.time())
+            await asyncio.sleep(due - loop.time())
+
+    async def _receive(self, socket: web.WebSocketResponse, cursor: TimelineCursor) -> None:
+        """Take what the page asks for, until it is gone."""
+        loop = asyncio.get_running_loop()
+        async for message in socket:
+            if message.type is not WSMsgType.TEXT:
+                continue
+            why = ""
+            try:
+                asked = msgspec.json.decode(message.data, type=dict)
+                if "order" in asked:
+                    why = self._source.carry_out(msgspec.convert(asked, Order))
+                else:
+                    control = msgspec.convert(asked, Control)
+                    cursor.control(loop.time(), control.play, control.seek_s, control.rate)
+            except (msgspec.DecodeError, msgspec.ValidationError) as error:
+                why = f"not understood: {error}"
+            if why:
+                await socket.send_json({"error": why})
+
+
+def _files() -> dict[str, tuple[bytes, str]]:
+    """Return every file of the page by its name in the address."""
+    found = {}
+    for folder, prefix in ((PAGE, ""), (UPLOT, "vendor/uplot/")):
+        for path in sorted(folder.rglob("*")):
+            if path.suffix in _TYPES and path.name != "entry.js":
+                name = prefix + path.relative_to(folder).as_posix()
+                found[name] = path.read_bytes(), _TYPES[path.suffix]
+    return found
