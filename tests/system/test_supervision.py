@@ -228,7 +228,7 @@ def test_a_port_in_use_is_refused_before_anything_starts(run_dir: Path, tmp_path
         other.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
         config = tmp_path / "robot.toml"
-        text = text.replace("[bus.endpoints]", '[bus.security]\nmode = "open"\n[bus.endpoints]')
+        text = text.replace('mode = "local"', 'mode = "open"', 1)
         config.write_text(text.replace("unixsock-stream/{run}/planner.zenoh", endpoint))
         table = write_table(tmp_path / "p.toml", {"planner": SLEEPER})
         with pytest.raises(FleetError, match=f"planner: {endpoint}: port in use"):
@@ -303,7 +303,7 @@ def test_status_shows_mode_tier_age_and_rate(
     assert status["modules"]["ankle_right"] == {
         "mode": "HOLD", "tier": 2, "cause": "NONE", "drive": "ARMED", "q": [0.0, 0.0],
         "way_out": "", "stiffened": False, "outside": "", "session": 0, "refused_hz": 0.0,
-        "refusal": "", "refused_session": 0,
+        "refusal": "", "refused_session": 0, "stopped_by": "",
     }  # fmt: skip
     assert status["services"]["planner"]["rate_hz"] is None
     assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
