@@ -68,7 +68,7 @@ def test_a_person_leads_pushes_kills_and_stops_it_with_the_mouse(
         await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
         begin = await page.value(HEIGHT)
         await drag(page, 640.0, 200.0, 0.0, 90.0)
-        low = await page.until(HEIGHT, lambda height: height < begin - 0.1)
+        low = await page.until(HEIGHT, lambda height: height < begin - 0.2)
         await page.mouse("up", 640.0, 290.0)
         await drag(page, 640.0, 260.0, 0.0, -60.0)
         await page.until(HEIGHT, lambda height: height > low + 0.05)

@@ -1,5 +1,5 @@
 // Plots of the last seconds, beside the robot.
-const KEPT_S = 20, EVERY_MS = 200;
+const KEPT_S = 20, EVERY_MS = 200, JUMP_S = 1;
 const COLOURS = ["#e0702a", "#2f8fe0", "#2e8a5c", "#b46ae0", "#d98f1f", "#6b7684"];
 
 const PANELS = [
@@ -16,7 +16,6 @@ const PANELS = [
 
 export class Plots {
   constructor(root) {
-    this.drawn = 0;
     this.panels = PANELS.map(([title, names, values]) => {
       const box = document.createElement("div");
       box.className = "panel";
@@ -49,14 +48,15 @@ export class Plots {
 
   take(frame) {
     const last = this.panels[0].data[0].at(-1);
-    if (last !== undefined && (frame.t_s < last || frame.t_s > last + KEPT_S)) this.clear();
+    if (last !== undefined && (frame.t_s < last || frame.t_s > last + JUMP_S)) this.clear();
     for (const { values, data } of this.panels) {
       [frame.t_s, ...values(frame)].forEach((value, n) => data[n].push(value));
       while (data[0][0] < frame.t_s - KEPT_S) data.forEach((column) => column.shift());
     }
-    const now = performance.now();
-    if (now - this.drawn < EVERY_MS) return;
-    this.drawn = now;
-    for (const { plot, data } of this.panels) plot.setData(data);
+    // after the last frame, too: a record may stand still from here on
+    this.due ??= setTimeout(() => {
+      this.due = undefined;
+      for (const { plot, data } of this.panels) plot.setData(data);
+    }, EVERY_MS);
   }
 }
