@@ -115,7 +115,7 @@ def stop_source(run_dir: Path, module: str) -> str:
 
 
 def _kept(source: str) -> bytes:
-    return source.encode()[:SOURCE_MAX]
+    return source.encode(errors="replace")[:SOURCE_MAX]
 
 
 def request_stop(run_dir: Path, module: str, source: str = "") -> bool:

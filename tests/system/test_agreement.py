@@ -63,6 +63,7 @@ BANDS = {
 of these."""
 
 
+TRIES = 5
 SLOWER_S = 1.5
 """A planner's process takes so much longer than a planner in lockstep to lead again, at most."""
 
@@ -97,7 +98,7 @@ def test_live_and_lockstep_agree_on_a_kill_a_restart_and_two_pushes(tmp_path: Pa
     exit_lockstep, lockstep = summary_of("sim", tmp_path / "lockstep", *EXPERIMENT)
     assert exit_lockstep == 0
     began_ns, apart = time.monotonic_ns(), []
-    for attempt in range(3):
+    for attempt in range(TRIES):
         exit_live, live = summary_of("demo", tmp_path / f"live{attempt}", *EXPERIMENT)
         assert exit_live == 0
         if not undisturbed(live, lockstep):
@@ -114,8 +115,8 @@ def test_live_and_lockstep_agree_on_a_kill_a_restart_and_two_pushes(tmp_path: Pa
         if not apart[-1]:
             return  # a planner's process that is slow to come up has the hand lead against HOLD
     assert not apart, "in no run did live and lockstep agree"
-    assert has_stalled(began_ns), "three runs were disturbed, and not by the machine"
-    pytest.skip("this machine stalled, and none of three live runs has figures to compare")
+    assert has_stalled(began_ns), f"{TRIES} runs were disturbed, and not by the machine"
+    pytest.skip(f"this machine stalled, and none of {TRIES} live runs has figures to compare")
 
 
 IMPAIRED = "all delay=8 jitter=4 loss=0.05 at=1.5 for=3"
@@ -163,8 +164,8 @@ def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
         if undisturbed(live, lockstep):
             break
     else:
-        assert has_stalled(began_ns), "three runs were disturbed, and not by the machine"
-        pytest.skip("this machine stalled, and none of three live runs has figures to compare")
+        assert has_stalled(began_ns), f"{TRIES} runs were disturbed, and not by the machine"
+        pytest.skip(f"this machine stalled, and none of {TRIES} live runs has figures to compare")
     measured = ages_ms(tmp_path / f"live{attempt}")
     assert np.abs(np.subtract(measured, modelled)).max() < AGES_MS, (measured, modelled)
     shares = [lost_share(tmp_path / name) for name in ("lockstep", f"live{attempt}")]
