@@ -158,7 +158,7 @@ def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
     modelled = ages_ms(tmp_path / "lockstep")
     assert modelled[1] > 16.0, "the impairment is felt"
     began_ns = time.monotonic_ns()
-    for attempt in range(3):
+    for attempt in range(TRIES):
         exit_live, live = summary_of("demo", tmp_path / f"live{attempt}", *flags)
         assert exit_live == 0, "it stands, whatever the machine does besides"
         if undisturbed(live, lockstep):
