@@ -135,9 +135,9 @@ def request_stop(run_dir: Path, module: str, source: str = "") -> bool:
     # whoever may stop the robot may not be the one who made the directory
     descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     try:
+        os.pwrite(descriptor, b"\x01", _STOP)  # first: a name is worth less than a stop
         if source and not os.pread(descriptor, 1, _SOURCE_AT).strip(b"\0"):
             os.pwrite(descriptor, _kept(source), _SOURCE_AT)
-        os.pwrite(descriptor, b"\x01", _STOP)
     finally:
         os.close(descriptor)
     return True

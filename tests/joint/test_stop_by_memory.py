@@ -18,6 +18,7 @@ from services.joint.rearm_guard import (
 from shared.bus.messages import Estop, Mode
 from shared.config.robot_config import RobotConfig
 from tests.joint.test_loop import Rig
+from tools.fleet import emergency_stop
 
 MODULE = "knee_right"
 
@@ -55,6 +56,22 @@ def test_the_first_named_source_of_a_stop_is_kept_until_a_person_asks_for_the_mo
     assert stop_source(tmp_path, MODULE) == "é" * (SOURCE_MAX // 2)
     assert not guard.stop_requested, "a long name reaches nothing else"
     assert guard.beats == 0
+
+
+@pytest.mark.parametrize("name", [KeyError("uid not found: 12345"), "l\udce9a"])
+def test_a_user_without_a_name_or_with_a_broken_one_stops_the_robot_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: KeyError | str
+) -> None:
+    def who() -> str:
+        if isinstance(name, KeyError):
+            raise name
+        return name
+
+    monkeypatch.setattr(emergency_stop.getpass, "getuser", who)
+    guard = RearmGuard(tmp_path, MODULE)
+    assert emergency_stop.request_here(tmp_path) == ([MODULE], [])
+    assert guard.stop_requested
+    assert stop_source(tmp_path, MODULE).startswith("xrl estop by ")
 
 
 def test_the_source_of_a_stop_that_nobody_made_is_empty(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import os
 import platform
 import time
 from pathlib import Path
@@ -90,7 +91,13 @@ def stop_all(robot: RobotConfig, run_dir: Path) -> list[str]:
 
 
 def _source() -> str:
-    return f"xrl estop by {getpass.getuser()} on {platform.node()}"
+    """Return who asks for the stop; never raises, for nothing may keep a stop from going out."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user without a name, as in a container
+        user = f"uid {os.getuid()}"
+    text = f"xrl estop by {user} on {platform.node()}"
+    return text.encode(errors="replace").decode()
 
 
 def _is_stopped(run_dir: Path, module: str) -> bool:
