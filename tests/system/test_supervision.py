@@ -215,6 +215,18 @@ def test_a_service_that_ends_at_once_fails_the_start_with_its_log(
     assert_nothing_left(run_dir, [])
 
 
+def test_a_start_that_nobody_asked_for_ends_nothing_when_a_service_fails(start: Start) -> None:
+    """To end the others would idle the drives of those that hold a person."""
+    fleet = start({"harness": SLEEPER, "planner": FAILING}, disarmed=True)
+    try:
+        assert wait_for(lambda: service(fleet, "harness").state == "running")
+        before = fleet.pids()["harness"]
+        assert wait_for(lambda: service(fleet, "planner").restarts > 0), "it is tried again"
+        assert fleet.pids()["harness"] == before
+    finally:
+        fleet.stop()
+
+
 def test_a_service_that_never_listens_fails_the_start(run_dir: Path, tmp_path: Path) -> None:
     table = write_table(tmp_path / "p.toml", {"planner": SLEEPER}, ready="endpoint")
     with pytest.raises(FleetError, match="not up after 2 s: planner"):

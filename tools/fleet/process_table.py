@@ -35,8 +35,8 @@ SUPERVISOR_SOCKET = "supervisor.sock"
 """Name of the supervisor's own socket in the run directory."""
 
 UNIX = "unixsock-stream/"
-_ELSEWHERE = "an address of another host (`--only` starts the services of this one)"
 """Prefix of a bus endpoint on a UNIX socket."""
+_ELSEWHERE = "an address of another host (`--only` starts the services of this one)"
 
 
 class Process(Section, frozen=True):

@@ -149,12 +149,15 @@ class RunDir:
         Args:
             plan: of the fleet.
             pace: clock rate.
-            disarmed: no person asks for this start: a drive that does not hold stays idle.
+            disarmed: no person asks for this start: a drive that does not hold stays idle, an
+                emergency stop holds on, and the logs of what ended are kept.
         """
         self.pace.unlink(missing_ok=True)
         if pace != 1.0:
             self.pace.write_text(f"{pace:g}\n", encoding="ascii")
-        self._remove_logs()
+        if not disarmed:
+            self._remove_logs()
+        self._remove_shared_memory(keep_stops=disarmed)
         self.logs.mkdir(exist_ok=True)
         sockets = [item.endpoint for item in plan.listeners if item.endpoint.startswith(UNIX)]
         manifest = Manifest(
@@ -167,14 +170,15 @@ class RunDir:
         self.manifest.write_bytes(msgspec.json.format(msgspec.json.encode(manifest)))
         for path in (*manifest.sockets, str(self.supervisor_socket)):
             _remove_socket(Path(path))
-        self._remove_shared_memory()
         if disarmed:
             for module in (name for name in manifest.services if name in MODULES):
-                RearmGuard(self.path, module).write(LastState.HELD)
+                guard = RearmGuard(self.path, module)
+                if guard.read() is LastState.NOTHING:
+                    guard.write(LastState.HELD)
 
-    def _remove_shared_memory(self) -> None:
-        """Remove the rearm guards of an earlier fleet: a person has started a new one."""
-        for module in MODULES:
+    def _remove_shared_memory(self, *, keep_stops: bool) -> None:
+        """Remove what an earlier fleet shared; its rearm guards only where a person asks."""
+        for module in () if keep_stops else MODULES:
             rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
         neighbours.path_of(self.path).unlink(missing_ok=True)
 
@@ -185,10 +189,14 @@ class RunDir:
         except (OSError, msgspec.DecodeError):
             return None
 
-    def clear(self, *, keep_logs: bool) -> None:
+    def clear(self, *, keep_logs: bool, keep_stops: bool = False) -> None:
         """Remove the fleet's files, and the directory itself if it is then empty.
 
         In a directory that is no fleet's nothing is removed.
+
+        Args:
+            keep_logs: leave the services' logs.
+            keep_stops: leave what the joint services' successors must know, such as a stop.
         """
         if not self.is_marked:
             return
@@ -196,7 +204,7 @@ class RunDir:
         for path in manifest.sockets if manifest else ():
             _remove_socket(Path(path))
         _remove_socket(self.supervisor_socket)
-        self._remove_shared_memory()
+        self._remove_shared_memory(keep_stops=keep_stops)
         for file in (self.supervisor_config, self.supervisor_pid, self.manifest, self.pace):
             file.unlink(missing_ok=True)
         if not keep_logs:

@@ -18,6 +18,7 @@ from typing import Self
 
 from services.joint import rearm_guard
 from services.simulator import usb_standin
+from shared import log
 from shared.exceptions import FleetError
 from shared.run_directory import check_own
 from tools.fleet import process_table, procfs
@@ -73,8 +74,9 @@ class SupervisedFleet:
             injected: with the network proxy on the links of planner, joints and sensors.
             pace: clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1.
             leashed: stop the fleet if this process dies.
-            disarmed: arm no drive; those that hold are taken over. For a start that no person asks
-                for.
+            disarmed: for a start that no person asks for: it arms no drive, takes those over that
+                hold, keeps an emergency stop, and ends nothing if a service does not come up, for
+                the drives of the others would be idled: the supervisor goes on trying.
             table_path: the process table.
             timeout_s: time in which every service has to be up.
 
@@ -109,11 +111,16 @@ class SupervisedFleet:
             if plan.emulated_usb:
                 environment |= usb_standin.prepare(started.run.path)
             started._launch(environment, lock, leashed=leashed)
-            started._wait_until_up(plan, timeout_s)
+            try:
+                started._wait_until_up(plan, timeout_s)
+            except FleetError as error:
+                if not (disarmed and started._is_supervised):
+                    raise
+                log.get("xrl").warning("%s; the supervisor goes on trying", error)
         except BaseException as error:
             with _uninterrupted():
                 started._end()
-                started._clear(keep_logs=isinstance(error, FleetError))
+                started._clear(keep_logs=isinstance(error, FleetError), keep_stops=disarmed)
             raise
         finally:
             os.close(lock)
@@ -198,7 +205,7 @@ class SupervisedFleet:
         elif procfs.is_suspended(pid):
             os.kill(pid, signal.SIGCONT)
 
-    def stop(self, *, keep_logs: bool = False) -> None:
+    def stop(self, *, keep_logs: bool = False, keep_stops: bool = False) -> None:
         """Stop every service and the supervisor, and remove their files.
 
         Each gets its own signal first, a suspended one too, and SIGKILL if it does not end in its
@@ -216,14 +223,19 @@ class SupervisedFleet:
         except FleetError:
             return  # the next fleet is starting here already, and has cleared up
         try:
-            self._clear(keep_logs=keep_logs)
+            self._clear(keep_logs=keep_logs, keep_stops=keep_stops)
         finally:
             os.close(lock)
 
-    def _clear(self, *, keep_logs: bool) -> None:
+    @property
+    def _is_supervised(self) -> bool:
+        """True while the supervisor that this process has started is alive."""
+        return self._process is not None and self._process.poll() is None
+
+    def _clear(self, *, keep_logs: bool, keep_stops: bool) -> None:
         """Remove the fleet's files from the run directory."""
         usb_standin.clear(self.run.path)
-        self.run.clear(keep_logs=keep_logs)
+        self.run.clear(keep_logs=keep_logs, keep_stops=keep_stops)
 
     def _end(self) -> None:
         """End every process of the fleet."""

@@ -51,14 +51,19 @@ Type=forking
 PIDFile={RUN_DIR}/supervisord.pid
 ExecStart={xrl} up --no-sim --disarmed --config {hosts.folder}/{ROBOT_FILE} \\
   --run-dir {RUN_DIR} --only {",".join(host.services)}
-ExecStop={xrl} down --run-dir {RUN_DIR}
+ExecStop={xrl} down --keep-stops --run-dir {RUN_DIR}
 Restart=always
 RestartSec=2
-TimeoutStartSec=60
+# A start that were cut short would idle the drives of what is up.
+TimeoutStartSec=infinity
 TimeoutStopSec=30
+# Nor are they all to go because one process took too much memory.
+OOMPolicy=continue
+OOMScoreAdjust=-500
 User={hosts.user}
 RuntimeDirectory=xrl
 RuntimeDirectoryMode=0700
+RuntimeDirectoryPreserve=yes
 StateDirectory=xrl
 StateDirectoryMode=0750
 WorkingDirectory=/var/lib/xrl

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.rearm_guard import RearmGuard, request_stop
+from services.joint.rearm_guard import LastState, RearmGuard, request_stop, stop_source
 from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
 from shared.run_directory import check_own
 from tools import cli
 from tools.fleet import process_table, procfs
@@ -200,3 +201,35 @@ def test_a_process_of_the_fleet_is_known_by_its_mark(claimed: RunDir) -> None:
         assert procfs.fleet_pids(claimed.path) == {member.pid}
         assert procfs.fleet_pids(claimed.path.with_name("other")) == set()
         member.communicate(b"\n")
+
+
+@pytest.mark.parametrize("last", [LastState.HELD, LastState.DAMP])
+def test_a_start_that_nobody_asked_for_keeps_what_a_module_was_and_a_stop(
+    claimed: RunDir, last: LastState
+) -> None:
+    RearmGuard(claimed.path, "knee_left").write(last)
+    request_stop(claimed.path, "knee_left", "anna")
+    claimed.log_of("knee_left").write_text("why it ended")
+    claimed.prepare(plan(claimed.path), disarmed=True)
+    guard = RearmGuard(claimed.path, "knee_left")
+    assert (guard.read(), guard.stop_requested) == (last, True)
+    assert stop_source(claimed.path, "knee_left") == "anna"
+    assert claimed.log_of("knee_left").read_text() == "why it ended"
+
+
+def test_a_start_that_nobody_asked_for_arms_nothing_that_was_down(claimed: RunDir) -> None:
+    claimed.prepare(plan(claimed.path), disarmed=True)
+    found = {module: RearmGuard(claimed.path, module).read() for module in MODULES}
+    assert set(found.values()) == {LastState.HELD}
+
+
+def test_a_persons_start_forgets_a_stop_and_so_does_down_unless_it_is_told_not_to(
+    claimed: RunDir,
+) -> None:
+    request = ("knee_left", "anna")
+    RearmGuard(claimed.path, "knee_left")
+    request_stop(claimed.path, *request)
+    claimed.clear(keep_logs=True, keep_stops=True)
+    assert stop_source(claimed.path, "knee_left") == "anna"
+    claimed.prepare(plan(claimed.path))
+    assert stop_source(claimed.path, "knee_left") == ""
