@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -42,9 +43,10 @@ def write_atomically(out: Path, content: bytes, *, private: bool = False) -> Non
     if out.exists() and not out.is_file():
         raise RunError(f"{out}: is no ordinary file; give another -o")
     try:
-        if private:
-            part.touch(mode=0o600)
-        part.write_bytes(content)
+        part.unlink(missing_ok=True)  # of an earlier try, with whatever rights
+        mode = 0o600 if private else 0o666
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+            file.write(content)
         part.replace(out)
     except OSError as error:
         with contextlib.suppress(OSError):

@@ -94,20 +94,21 @@ def restrict(ports: Collection[int], allowed: Collection[IpAddress]) -> None:
         raise BusError(f"no filter of addresses for mtls: nothing listens at {sorted(left)}")
 
 
-def resolved(hosts: Iterable[str]) -> set[IpAddress]:
-    """Return the addresses of hosts; a name lookup may block: at the start only.
+def resolved(hosts: Iterable[str]) -> tuple[set[IpAddress], list[str]]:
+    """Return the addresses of hosts, and those that are not known.
 
-    Raises:
-        BusError: a host is not known.
+    A name lookup may block: at the start only.
     """
-    found = set()
+    found: set[IpAddress] = set()
+    unknown = []
     for host in hosts:
         try:
             rows = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
-        except (OSError, UnicodeError) as error:
-            raise BusError(f"{host}: {error}; a host that can be found is needed") from None
-        found |= {ipaddress.ip_address(row[4][0]) for row in rows}
-    return found
+        except (OSError, UnicodeError):
+            unknown.append(host)
+        else:
+            found |= {ipaddress.ip_address(row[4][0]) for row in rows}
+    return found, unknown
 
 
 def _listening_port(descriptor: int) -> int | None:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, Final
 
+from shared import log
 from shared.bus import allow_list
 from shared.bus.access import access_control
 from shared.bus.credentials import read_credentials
@@ -19,8 +20,8 @@ MESSAGE_MAX: Final = 1 << 20
 """Largest message that is put together from its fragments, bytes."""
 PAYLOAD_MAX: Final = 1 << 16
 """Largest payload that is let in, bytes; the largest of the topics is a third of it."""
-SESSIONS_MAX: Final = 32
-"""Peers at a time; a fleet has 11 services, and each tool is one."""
+SESSIONS_MAX: Final = 128
+"""Peers at a time, of all names together: viewers that hang are not to shut a planner out."""
 
 
 def settings(robot: RobotConfig, process: str, endpoints: Sequence[str]) -> dict[str, object]:
@@ -61,14 +62,19 @@ _LOW_PASS: Final[dict[str, Any]] = {
 def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
     """Under `mtls`, have this process hear the hosts of the endpoints and of `allow` only.
 
+    A host whose name is not known now is left out, and told: its own link fails, and no other.
+
     Raises:
-        BusError: a host is not known, or the kernel takes no filter.
+        BusError: the kernel takes no filter.
     """
     if robot.bus.security.mode != "mtls" or not listening:
         return
     hosts = {host_and_port(endpoint)[0] for endpoint in robot.bus.endpoints.values()}
     ports = {host_and_port(endpoint)[1] for endpoint in listening}
-    allow_list.restrict(ports, allow_list.resolved([*hosts, *robot.bus.security.allow]))
+    addresses, unknown = allow_list.resolved([*hosts, *robot.bus.security.allow])
+    for name in unknown:
+        log.get("xrl").warning("%s: no such host now; what comes from it is dropped", name)
+    allow_list.restrict(ports, addresses)
 
 
 def host_and_port(locator: str) -> tuple[str, int]:

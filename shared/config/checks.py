@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import math
 import re
 from collections.abc import Iterable
@@ -25,6 +26,9 @@ INTERFACES: Final = (
 )  # fmt: skip
 """What python-can brings itself, and this package; other packages may declare more."""
 
+_ENDPOINT: Final = re.compile(
+    r"unixsock-stream/.+|(tcp|tls)/(\[[0-9A-Fa-f:.%]+\]|[^\[\]:/]+):\d{1,5}([?#].*)?"
+)
 LEADABLE: Final = (2, 4)
 """Rows of p that a person may lead: height and pitch."""
 _POWER_UP_TURNS: Final = 1.0
@@ -60,8 +64,8 @@ def check_security(file: str, config: RobotConfig) -> None:
         found = f"{security.keys!r} depends on where a service is started"
         raise ConfigError(file, "bus.security.keys", found, "a path that begins with / or ~")
     for index, host in enumerate(security.allow):
-        if not re.fullmatch(r"[A-Za-z0-9.:_-]+", host):
-            right = "an address or a host's name, without a port"
+        if not _is_address(host):
+            right = "an IP address, without a port: a name may not be known when a service starts"
             raise ConfigError(file, f"bus.security.allow[{index}]", f"{host!r}", right)
     for service, endpoint in config.bus.endpoints.items():
         if not endpoint.startswith(ENDPOINTS_OF_MODE[security.mode]):
@@ -69,6 +73,14 @@ def check_security(file: str, config: RobotConfig) -> None:
             found = f"{endpoint!r} is not one of bus.security.mode = {security.mode!r}"
             right = f"{words}; or mode = " + _OTHER_MODE[endpoint.partition("/")[0]]
             raise ConfigError(file, f"bus.endpoints.{service}", found, right)
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
 
 
 _OTHER_MODE: Final = {
@@ -157,7 +169,7 @@ def _check_endpoints(file: str, config: RobotConfig) -> None:
         where = f"bus.endpoints.{service}"
         if service not in SERVICES:
             raise ConfigError(file, where, "no such service", f"one of {_words(SERVICES)}")
-        if not re.match(r"(unixsock-stream|tcp|tls)/.", endpoint):
+        if not _ENDPOINT.fullmatch(endpoint):
             right = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
             raise ConfigError(file, where, f"{endpoint!r}", right)
         if endpoint in seen:

@@ -117,6 +117,8 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (on_one_bus, "module[1].node_ids", "node 1", "free"),
     (without("bus.endpoints.planner"), "bus.endpoints.planner", "missing", "each service"),
     (setting("bus.endpoints.wheel", "tcp/a:1"), "bus.endpoints.wheel", "no such", "recorder"),
+    (setting("bus.endpoints.planner", "tls/10.0.0.1"), "bus.endpoints.planner", "", "HOST:PORT"),
+    (setting("bus.endpoints.planner", "tcp/a:x"), "bus.endpoints.planner", "", "HOST:PORT"),
     (setting("bus.endpoints.planner", "udp/a:1"), "bus.endpoints.planner", "'udp/a:1'", "tcp/"),
     (
         setting("bus.endpoints.harness", RAW["bus"]["endpoints"]["planner"]),

@@ -427,6 +427,24 @@ def test_keys_are_named_by_a_path_that_is_the_same_from_everywhere(tmp_path: Pat
         config_file.load(_file_with(tmp_path, _with_keys(ROBOT, Path("keys"))))
 
 
+@pytest.mark.parametrize("allowed", ["laptop.local", "10.0.0.1:22", "", "10.0.0.0/8"])
+def test_only_addresses_are_allowed(tmp_path: Path, allowed: str) -> None:
+    security = msgspec.structs.replace(ROBOT.bus.security, allow=(allowed,))
+    bus = msgspec.structs.replace(ROBOT.bus, security=security)
+    with pytest.raises(ConfigError, match="an IP address, without a port"):
+        config_file.load(_file_with(tmp_path, msgspec.structs.replace(ROBOT, bus=bus)))
+
+
+def test_a_service_starts_though_another_hosts_name_is_not_known(
+    bus: Bus, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    endpoints = bus.robot.bus.endpoints | {"imu": "tls/no-such-host.invalid:7447"}
+    other = msgspec.structs.replace(bus.robot.bus, endpoints=endpoints)
+    with open_session(msgspec.structs.replace(bus.robot, bus=other), "planner", tmp_path):
+        pass
+    assert "no-such-host.invalid" in caplog.text
+
+
 @pytest.mark.parametrize("umask", [0o000, 0o022])
 def test_a_local_socket_is_its_users_alone_whatever_the_umask(tmp_path: Path, umask: int) -> None:
     folder = Path(tempfile.mkdtemp(prefix="xrl-t-", dir="/tmp"))

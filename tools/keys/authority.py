@@ -10,7 +10,7 @@ from __future__ import annotations
 import datetime as dt
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -53,26 +53,35 @@ class Authority:
         return self._issued.certificate
 
     def renew(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Make new certificates and keys in the current generation; the old ones stay valid."""
-        for name in names:
-            self._issue(name, hosts_of(robot, name), days)
+        """Make new certificates and keys in the current generation; the old ones stay valid.
+
+        Raises:
+            BusError: the endpoint of a service has no certificate; nothing is changed.
+        """
+        self._issue(robot, {name: self.names.generations.get(name, 1) for name in names}, days)
 
     def revoke(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Go on to the next generation; once all hosts know of it the old one is let in nowhere."""
-        wanted = tuple(names)
-        generations = dict(self.names.generations)
-        for name in wanted:
-            generations[name] = generations.get(name, 0) + 1
-        self.names = Names(self.names.robot, generations)
-        write_private(self.folder / credentials.NAMES, credentials.to_toml(self.names))
-        self.renew(robot, wanted, days)
+        """Go on to the next generation; once all hosts know of it the old one is let in nowhere.
 
-    def _issue(self, name: str, hosts: Sequence[str], days: int) -> None:
+        Raises:
+            BusError: the endpoint of a service has no certificate; nothing is changed.
+        """
+        self._issue(robot, {n: self.names.generations.get(n, 0) + 1 for n in names}, days)
+
+    def _issue(self, robot: RobotConfig, generations: Mapping[str, int], days: int) -> None:
+        """Issue all, then write all, and last who is let in."""
         now = dt.datetime.now(dt.UTC)
-        common = common_name(name, self.names.generations[name])
-        issued = certificates.issue(self._issued, common, hosts, now, days)
-        write_private(key_file(self.folder, name), issued.key)
-        write_private(certificate_file(self.folder, name), issued.certificate)
+        issued = {
+            name: certificates.issue(
+                self._issued, common_name(name, generation), hosts_of(robot, name), now, days
+            )
+            for name, generation in generations.items()
+        }
+        for name, made in issued.items():
+            write_private(key_file(self.folder, name), made.key)
+            write_private(certificate_file(self.folder, name), made.certificate)
+        self.names = Names(self.names.robot, {**self.names.generations, **generations})
+        write_private(self.folder / credentials.NAMES, credentials.to_toml(self.names))
 
 
 def make(folder: Path, robot: RobotConfig, days: int) -> Authority:

@@ -47,8 +47,13 @@ def to_tar(files: dict[str, bytes]) -> bytes:
     return written.getvalue()
 
 
+def held_files(folder: Path) -> list[str]:
+    """Return the names of the certificates and keys in a folder."""
+    return sorted(path.name for path in folder.iterdir() if path.suffix in (".pem", ".key"))
+
+
 def install(files: dict[str, bytes], folder: Path) -> None:
-    """Write a bundle into this host's folder of keys.
+    """Write a bundle into this host's folder of keys, and take away keys that are not in it.
 
     Raises:
         BusError: the folder cannot be written.
@@ -58,5 +63,7 @@ def install(files: dict[str, bytes], folder: Path) -> None:
         folder.chmod(0o700)
         for name, content in files.items():
             write_private(folder / name, content)
+        for old in set(held_files(folder)) - set(files):
+            (folder / old).unlink()
     except OSError as error:
         raise BusError(f"{folder}: cannot be written: {error.strerror}") from None
