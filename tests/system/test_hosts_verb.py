@@ -8,13 +8,11 @@ import shutil
 import signal
 import subprocess
 import tempfile
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-import tomli_w
 
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
@@ -23,7 +21,7 @@ from shared.robot.joints import MODULES
 from tests.certified import install_all
 from tests.system.test_hosts import with_drives_in
 from tests.system.waiting import wait_for
-from tests.tools.hosts.places import make_hosts
+from tests.tools.hosts.places import SHARED, make_hosts
 from tools import cli
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
@@ -39,14 +37,10 @@ class Place(NamedTuple):
 
     base: Path
 
-    def xrl(self, order: str, *words: str) -> int:
-        where = [
-            "--hosts",
-            str(self.base / "hosts.toml"),
-            "--config",
-            str(self.base / "robot.toml"),
-        ]
-        return cli.main(["hosts", order, *words, *where, "--authority", str(self.base / "auth")])
+    def xrl(self, order: str, *words: str, verb: str = "hosts") -> int:
+        files = {"--hosts": "hosts.toml", "--config": "robot.toml", "--authority": "auth"}
+        where = [word for flag, name in files.items() for word in (flag, str(self.base / name))]
+        return cli.main([verb, order, *words, *where])
 
     def run_dir(self, host: str) -> Path:
         return self.base / host / "run/xrl"
@@ -55,6 +49,12 @@ class Place(NamedTuple):
         """Do what systemd does at a host's start: nobody asked for it."""
         words = [str(self.base / "bin/ssh"), host, "systemctl start xrl.service"]
         assert subprocess.run(words, capture_output=True, check=False).returncode == 0
+
+    def cut_power(self, host: str) -> None:
+        """Kill all that runs on a host, and boot it again; its drives have power of their own."""
+        for pid in procfs.fleet_pids(self.run_dir(host)):
+            os.kill(pid, signal.SIGKILL)
+        self.boot(host)
 
     def modules(self, capsys: Any) -> dict[str, dict[str, Any]]:
         capsys.readouterr()
@@ -67,10 +67,7 @@ class Place(NamedTuple):
 @pytest.fixture
 def place(robot: RobotConfig) -> Iterator[Place]:
     base = Path(tempfile.mkdtemp(prefix="xrl-h-", dir="/tmp"))
-    file = make_hosts(base, real=True)
-    table = tomllib.loads(file.read_text(encoding="utf-8"))
-    table["folder"] = str(base / "etc")  # files name it, and so it is one for all
-    file.write_text(tomli_w.dumps(table), encoding="utf-8")
+    make_hosts(base, real=True, running=True)
     own = with_drives_in(robot, base / "sim")
     (base / "robot.toml").write_text(config_file.to_toml(own), encoding="utf-8")
     shutil.copy(DEFAULT_CONFIG.with_suffix(".gains.json"), base / "robot.gains.json")
@@ -82,18 +79,20 @@ def place(robot: RobotConfig) -> Iterator[Place]:
     shutil.rmtree(base)
 
 
-def test_hosts_come_up_take_over_after_a_power_cut_and_arm_only_when_asked(
+def test_hosts_come_up_take_over_after_a_power_cut_and_stay_stopped_until_somebody_ends_it(
     place: Place, capsys: Any
 ) -> None:
-    assert place.xrl("keys") == 0
-    assert [place.xrl("update", host) for host in NAMES] == [0, 0, 0], "they share a folder here"
-    keys = place.base / "etc/keys"
-    install_all(Authority(place.base / "auth"), keys, "simulator")
+    assert place.xrl("make", verb="keys") == 0
+    assert place.xrl("update") == 0
     assert place.xrl("check") == 0, capsys.readouterr().out
+    for host in NAMES:  # each has its own keys, though all files name one folder
+        assert (place.base / host / SHARED / "keys/hip_left.key").exists() == (host == "left")
 
-    SupervisedFleet.start(
-        place.base / "etc/robot.toml", place.base / "sim", services=("simulator",)
-    )
+    of_simulator = place.base / SHARED
+    install_all(Authority(place.base / "auth"), of_simulator / "keys", "simulator", "operator")
+    for name in ("robot.toml", "robot.gains.json"):
+        shutil.copy(place.base / "body" / SHARED / name, of_simulator)
+    SupervisedFleet.start(of_simulator / "robot.toml", place.base / "sim", services=("simulator",))
     for host in NAMES:
         place.boot(host)
     assert wait_for(lambda: {row["drive"] for row in place.modules(capsys).values()} == {"IDLE"}), (
@@ -113,11 +112,24 @@ def test_hosts_come_up_take_over_after_a_power_cut_and_arm_only_when_asked(
     assert "body: planner" in said
     assert "left: knee_left" in said
     assert all(f"\n  {module} " in said for module in MODULES)
+    assert place.xrl("update") == 1
+    assert "`xrl hosts down` first" in " ".join(capsys.readouterr().out.split())
 
-    for pid in procfs.fleet_pids(place.run_dir("left")):
-        os.kill(pid, signal.SIGKILL)
-    place.boot("left")
-    taken = wait_for(lambda: modes() == {"TRACK"}, timeout_s=60.0)
-    assert taken, place.modules(capsys)
+    before = procfs.fleet_pids(place.run_dir("right"))
+    place.cut_power("left")
+    assert wait_for(lambda: modes() == {"TRACK"}, timeout_s=60.0), place.modules(capsys)
+    assert place.xrl("up") == 0, "asked for again it restarts nothing"
+    assert procfs.fleet_pids(place.run_dir("right")) == before
+
+    assert place.xrl("estop") == 0
+    assert modes() == {"DAMP"}
+    place.cut_power("left")
+    assert wait_for(lambda: "TRACK" not in modes() and None not in modes())
+    assert modes() == {"DAMP"}, "the stop holds on"
+    capsys.readouterr()
+    assert place.xrl("up") == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "an emergency stop by xrl estop by" in said
+    assert modes() == {"DAMP"}
     assert place.xrl("down") == 0
     assert [procfs.fleet_pids(place.run_dir(host)) for host in NAMES] == [set(), set(), set()]

@@ -41,12 +41,13 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
     return here, errors
 
 
-def wait_here(run_dir: Path, here: list[str]) -> list[str]:
+def wait_here(run_dir: Path, here: list[str], *, partly: bool = False) -> list[str]:
     """Wait until the services on this host have stopped.
 
     Args:
         run_dir: of the fleet.
         here: the modules that have a service on this host.
+        partly: the others have theirs on other hosts, and are not asked after.
 
     Returns:
         One line for each module that has not stopped, or has no service here.
@@ -55,7 +56,8 @@ def wait_here(run_dir: Path, here: list[str]) -> list[str]:
     while time.monotonic() < deadline and not all(_is_stopped(run_dir, m) for m in here):
         time.sleep(REPEAT_S)
     going = [module for module in here if not _is_stopped(run_dir, module)]
-    return going + [f"{m} has no service on this host" for m in MODULES if m not in here]
+    absent = [] if partly else [module for module in MODULES if module not in here]
+    return going + [f"{module} has no service on this host" for module in absent]
 
 
 def stop_all(robot: RobotConfig, run_dir: Path) -> list[str]:

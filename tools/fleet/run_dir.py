@@ -23,6 +23,8 @@ from shared.robot.joints import MODULES
 from shared.run_directory import check_own
 from tools.fleet.process_table import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_listening
 
+SUPERVISOR_PID: Final = "supervisord.pid"
+"""Written when the fleet starts."""
 MARKER: Final = ".xrl-run"
 """Lies in every run directory: nothing is removed, and nobody attached to, where it does not."""
 
@@ -59,7 +61,7 @@ class RunDir:
         self.pace = self.path / PACE_FILE
         self.supervisor_socket = self.path / SUPERVISOR_SOCKET
         self.supervisor_config = self.path / "supervisord.conf"
-        self.supervisor_pid = self.path / "supervisord.pid"
+        self.supervisor_pid = self.path / SUPERVISOR_PID
         self.manifest = self.path / "fleet.json"
         self.logs = self.path / "logs"
         self.supervisor_log = self.logs / "supervisord.log"

@@ -95,6 +95,8 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
         if host.processors and not re.fullmatch(r"\d+(-\d+)?([ ,]\d+(-\d+)?)*", host.processors):
             found = f"{host.processors!r}"
             raise ConfigError(file, f"{where}.processors", found, "as systemd takes them: 0-1,3")
+        if not host.services:
+            raise ConfigError(file, f"{where}.services", "none", "at least one")
         for service in host.services:
             if service not in services:
                 right = f"one of {', '.join(services)}"

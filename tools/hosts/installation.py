@@ -1,17 +1,17 @@
-"""Brings each host's files there, starts and stops its unit, and looks whether all hosts agree."""
+"""Brings each host's files there, and looks whether they are as they should be."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import msgspec
 
+from shared.bus.credentials import NAMES
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
-from shared.robot.joints import MODULES
-from tools.fleet.fleet_status import FleetStatus, ModuleStatus
 from tools.hosts.hosts_file import Host, Hosts, principals_on
 from tools.hosts.layout import (
     KEYS,
@@ -46,12 +46,15 @@ class HostRow(NamedTuple):
     """One host in the table of `xrl hosts check`."""
 
     name: str
-    revision: str
-    clock: ClockOffset | None
-    unit: str
+    revision: str = ""
+    clock: ClockOffset | None = None
+    """None: it was not reached."""
+    unit: str = "-"
     """State of its unit by systemd."""
-    wrong: tuple[str, ...]
-    warnings: tuple[str, ...]
+    made_from: tuple[str, str] = ("", "")
+    """Hash of the lock file, and Python's version."""
+    wrong: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def files_of(
@@ -75,74 +78,38 @@ def files_of(
     return files
 
 
-def update(hosts: Hosts, remote: Remote, files: list[HostFile]) -> str:
-    """Bring files to a host; its services take them at their next start.
+def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: bool) -> str:
+    """Bring files to a host, and take away keys that it is not to have; a start takes them.
+
+    Args:
+        hosts: all of them.
+        remote: the host.
+        files: all that it is to have.
+        while_up: do so although its services are running.
 
     Raises:
-        FleetError: the host is not reached, or a file cannot be written.
+        FleetError: the host is not reached, its services are running, or a file cannot be written.
     """
+    if not while_up and _state(remote) != "inactive":
+        raise FleetError(
+            f"{remote.host.name}: its unit is {_state(remote)}: a service that crashes would come "
+            "back with the new files beside the old; `xrl hosts down` first, or --while-up"
+        )
     folder = hosts.folder
+    keys = f"{folder}/{KEYS}"
     remote.must("install", "-d", "-m", "755", folder)
-    remote.must("install", "-d", "-m", "700", "-o", hosts.user, f"{folder}/{KEYS}")
+    remote.must("install", "-d", "-m", "700", "-o", hosts.user, keys)
     for file in files:
-        owner = hosts.user if file.of_service else "root"
-        remote.write(file.path, file.content, file.mode, owner)
+        remote.write(file.path, file.content, file.mode, as_user=file.of_service)
+    names = [Path(file.path).name for file in files if file.of_service]
+    others = [word for name in names for word in ("!", "-name", name)]
+    remote.must(
+        "find", keys, "-maxdepth", "1", "(", "-name", "*.pem", "-o", "-name", "*.key", ")",
+        *others, "-delete", as_user=True,
+    )  # fmt: skip
     remote.must("systemctl", "daemon-reload")
     remote.must("systemctl", "enable", "--quiet", UNIT)
     return f"{len(files)} files"
-
-
-def up(hosts: Hosts, remote: Remote, *, armed: bool) -> str:
-    """Start a host's services; a person asks for them, so their drives are armed.
-
-    Raises:
-        FleetError: the unit does not start, or a service cannot be asked for.
-    """
-    remote.must("systemctl", "start", UNIT)
-    modules = [name for name in remote.host.services if name in MODULES] if armed else []
-    for module in modules:
-        remote.must(_xrl(hosts), "kill", module, "--run-dir", RUN_DIR, as_user=True)
-    return f"up: {', '.join(remote.host.services)}{'' if armed else '; no drive armed'}"
-
-
-def down(remote: Remote) -> str:
-    """Stop a host's services.
-
-    Raises:
-        FleetError: they do not stop.
-    """
-    remote.must("systemctl", "stop", UNIT)
-    return "down"
-
-
-def status(hosts: Hosts, remote: Remote) -> FleetStatus:
-    """Return a host's status.
-
-    Raises:
-        FleetError: no fleet is up there.
-    """
-    said = remote.must(_xrl(hosts), "status", "--json", "--run-dir", RUN_DIR, as_user=True)
-    try:
-        return msgspec.json.decode(said.encode(), type=FleetStatus)
-    except msgspec.DecodeError as error:
-        raise FleetError(f"{remote.host.name}: no status: {error}") from None
-
-
-def joined(found: dict[str, FleetStatus]) -> FleetStatus:
-    """Return one status of all hosts: a module as the first host that hears it has it."""
-    services = {
-        f"{host}: {name}": row for host, one in found.items() for name, row in one.services.items()
-    }
-    modules: dict[str, ModuleStatus] = {}
-    for one in found.values():
-        for name, row in one.modules.items():
-            if name not in modules or (modules[name].mode is None and row.mode is not None):
-                modules[name] = row
-    first = next(iter(found.values()))
-    lead = next((one.lead for one in found.values() if one.lead is not None), None)
-    return msgspec.structs.replace(
-        first, run_dir=", ".join(found), services=services, modules=modules, lead=lead
-    )
 
 
 def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
@@ -153,34 +120,69 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     """
     python, config = f"{hosts.checkout}/.venv/bin/python", f"{hosts.folder}/{ROBOT_FILE}"
     # the module is found in the installed package, wherever the command starts
-    line, clock = remote.echoed(python, "-m", "tools.hosts.probe", "--config", config)
+    words = ("-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)
+    line, clock = remote.echoed(python, *words)
     try:
         probe = msgspec.json.decode(line.encode(), type=Probe)
     except msgspec.DecodeError:
         raise FleetError(f"{remote.host.name}: {hosts.checkout} is of another version") from None
-    wanted = {Path(file.path).name: digest(file.content) for file in files}
+    wanted = {Path(file.path).name: digest(file.content) for file in files if not file.of_service}
     wrong = list(probe.wrong)
     if probe.robot != wanted[ROBOT_FILE]:
         wrong.append("another robot file; `xrl hosts update`")
     if probe.schedule != wanted[SCHEDULE]:
         wrong.append("another gain schedule; `xrl hosts update`")
+    wrong += _about_keys(probe, {Path(f.path).name: f.content for f in files if f.of_service})
     own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{UNIT}").out
     if digest(own_unit.encode()) != wanted[UNIT]:
         wrong.append("another unit; `xrl hosts update`")
+    if not probe.revision:
+        wrong.append(f"of no known version: {hosts.checkout} is no git checkout that can be read")
     warnings = list(probe.warnings)
+    if probe.revision.endswith("+"):
+        warnings.append(f"{hosts.checkout} has changes of its own")
     if abs(clock.offset_s) > CLOCK_MAX_S + clock.round_trip_s:
         warnings.append(f"its clock is {clock.offset_s:+.1f} s off: certificates go by it")
-    state = remote.run("systemctl", "is-active", UNIT).out.strip() or "no systemd"
-    return HostRow(remote.host.name, probe.revision, clock, state, tuple(wrong), tuple(warnings))
+    return HostRow(
+        remote.host.name, probe.revision, clock, _state(remote), (probe.lock, probe.python),
+        tuple(wrong), tuple(warnings),
+    )  # fmt: skip
+
+
+def _about_keys(probe: Probe, wanted: dict[str, bytes]) -> list[str]:
+    """Return what is wrong with a host's keys against those that it is to have."""
+    told = []
+    wanted_now = {name: digest(content) for name, content in wanted.items()}
+    other = sorted(n for n, found in wanted_now.items() if probe.keys.get(n) != found)
+    extra = sorted(set(probe.keys) - set(wanted))
+    if NAMES in other:
+        told.append("lets in other generations than the authority; `xrl hosts update`")
+        other.remove(NAMES)
+    if other:
+        told.append(f"other keys than the authority's: {', '.join(other)}; `xrl hosts update`")
+    if wanted and extra:
+        told.append(f"keys that it is not to have: {', '.join(extra)}; `xrl hosts update`")
+    return told
+
+
+def _state(remote: Remote) -> str:
+    """Return the state of a host's unit by systemd."""
+    return remote.run("systemctl", "is-active", UNIT).out.strip() or "no systemd"
 
 
 def disagreements(rows: list[HostRow]) -> list[str]:
-    """Return what is not the same on all hosts."""
-    revisions = {row.revision for row in rows}
-    if len(revisions) < 2:
-        return []
-    return [f"several versions: {', '.join(f'{row.name} {row.revision}' for row in rows)}"]
+    """Return what is not the same on all hosts that were reached."""
+    told = []
+    for word, value_of in _SAME_ON_ALL.items():
+        found = {row.name: value_of(row) for row in rows if row.clock is not None}
+        if len(set(found.values())) > 1:
+            rest = ", ".join(f"{name} {value or 'none'}" for name, value in found.items())
+            told.append(f"several {word}: {rest}")
+    return told
 
 
-def _xrl(hosts: Hosts) -> str:
-    return f"{hosts.checkout}/.venv/bin/xrl"
+_SAME_ON_ALL: Final[dict[str, Callable[[HostRow], str]]] = {
+    "versions": lambda row: row.revision,
+    "lock files": lambda row: row.made_from[0],
+    "Pythons": lambda row: row.made_from[1],
+}

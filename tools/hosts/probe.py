@@ -1,6 +1,6 @@
 """What `xrl hosts check` asks a host: one line of JSON, then its clock for each line it is sent.
 
-python -m tools.hosts.probe --config /etc/xrl/robot.toml
+python -m tools.hosts.probe --config /etc/xrl/robot.toml --run-dir /run/xrl
 """
 
 from __future__ import annotations
@@ -12,15 +12,20 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
-from shared.bus.credentials import keys_folder
+from shared.bus.credentials import NAMES, keys_folder
 from shared.config import files as config_file
 from shared.exceptions import XrlError
 from shared.process import CHECKOUT
 from shared.robot import gain_schedule
+from tools.fleet.run_dir import SUPERVISOR_PID
+from tools.keys.bundle import held_files
 from tools.keys.inspection import look
+
+LOCKS: Final = ("requirements.lock", "requirements.runtime.lock")
 
 
 class Probe(msgspec.Struct, frozen=True):
@@ -35,27 +40,41 @@ class Probe(msgspec.Struct, frozen=True):
     """Hash of the robot file."""
     schedule: str
     """Hash of the gain schedule; empty: there is none."""
+    keys: dict[str, str]
+    """Hash of each file of keys, by its name."""
     wrong: tuple[str, ...]
     """What keeps the services from starting: the robot file, keys."""
     warnings: tuple[str, ...]
 
 
-def probe(config: Path) -> Probe:
-    """Look at this host."""
-    wrong, warnings = [], []
+def probe(config: Path, run_dir: Path) -> Probe:
+    """Look at this host.
+
+    Args:
+        config: robot file.
+        run_dir: of the fleet that runs here, if one does.
+    """
+    wrong, warnings, keys = [], [], dict[str, str]()
     try:
         robot = config_file.load(config)
-        for row in look(keys_folder(robot), robot):
+        folder = keys_folder(robot)
+        for row in look(folder, robot):
             wrong += [f"{row.name}: {row.wrong}"] if row.wrong else []
             warnings += [f"{row.name}: {row.warning}"] if row.warning else []
-    except XrlError as error:
+        keys = {name: _hash_of(folder / name) for name in (NAMES, *held_files(folder))}
+        if _is_older(run_dir / SUPERVISOR_PID, folder / NAMES):
+            warnings.append("its services run since before it knew who is let in: restart them")
+    except (XrlError, OSError) as error:
         wrong.append(str(error))
+    if not _environment_is_current():
+        warnings.append(f"{CHECKOUT}: the environment is not that of this version: deploy/install")
     return Probe(
         revision=_revision(),
         lock=_hash_of(CHECKOUT / "requirements.runtime.lock"),
         python=platform.python_version(),
         robot=_hash_of(config),
         schedule=_hash_of(gain_schedule.path_beside(config)),
+        keys=keys,
         wrong=tuple(wrong),
         warnings=tuple(warnings),
     )
@@ -73,6 +92,26 @@ def _hash_of(path: Path) -> str:
         return ""
 
 
+def _is_older(path: Path, other: Path) -> bool:
+    """Return True if a file is there and was written before another."""
+    try:
+        return path.stat().st_mtime < other.stat().st_mtime
+    except OSError:
+        return False
+
+
+def _environment_is_current() -> bool:
+    """Return True if this environment was made from this checkout's lock file (deploy/lib.sh)."""
+    try:
+        made_from = Path(sys.prefix, "xrl.stamp").read_text(encoding="utf-8").split()
+        rest = (CHECKOUT / "pyproject.toml").read_bytes()
+        locks = [(CHECKOUT / name).read_bytes() for name in LOCKS]
+    except OSError:
+        return False
+    begin = f"{CHECKOUT}\n".encode()
+    return made_from[:1] in [[hashlib.sha256(begin + lock + rest).hexdigest()] for lock in locks]
+
+
 def _revision() -> str:
     words = ["git", "-c", f"safe.directory={CHECKOUT}", "-C", str(CHECKOUT), "describe"]
     words += ["--always", "--dirty=+", "--abbrev=12"]
@@ -87,8 +126,10 @@ def main() -> None:
     """Print what there is to say, then answer until the input ends."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--run-dir", type=Path, required=True)
     args = parser.parse_args()
-    sys.stdout.write(msgspec.json.encode(probe(args.config)).decode() + "\n")
+    found = probe(args.config, args.run_dir)
+    sys.stdout.write(msgspec.json.encode(found).decode() + "\n")
     sys.stdout.flush()
     for _ in sys.stdin:
         sys.stdout.write(f"{time.time_ns()}\n")

@@ -82,18 +82,18 @@ class Remote:
             raise FleetError(f"{self.host.name}: {shlex.join(words)[:120]}: {why}")
         return said.out
 
-    def write(self, path: str, content: bytes, mode: int, owner: str) -> None:
-        """Write a file whole or not at all.
+    def write(self, path: str, content: bytes, mode: int, *, as_user: bool) -> None:
+        """Write a file whole or not at all; it belongs to who writes it.
 
         Raises:
             FleetError: it cannot be written.
         """
         part = shlex.quote(f"{path}.part")
         script = (
-            f"umask 077 && cat > {part} && chmod {mode:o} {part} && "
-            f"chown {shlex.quote(owner)} {part} && mv {part} {shlex.quote(path)}"
+            f"umask 077 && rm -f {part} && set -C && cat > {part} && chmod {mode:o} {part} && "
+            f"mv {part} {shlex.quote(path)}"
         )
-        self.must("sh", "-c", script, content=content)
+        self.must("sh", "-c", script, content=content, as_user=as_user)
 
     def echoed(self, *words: str) -> tuple[str, ClockOffset]:
         """Return the first line of a command that then answers each line with its clock.

@@ -23,7 +23,8 @@ def add_parser(subparsers: Subparsers) -> None:
         """
         xrl estop
         xrl estop --run-dir /tmp/lab
-        xrl estop --local       # on the robot's own host: needs no bus
+        xrl estop --local                       # on the robot's own host: needs no bus
+        xrl estop --config lab.toml             # from another computer, with an operator's key
         """,
     )
     add_run_dir(parser, Path)  # whoever can reach the robot may stop it
@@ -32,22 +33,35 @@ def add_parser(subparsers: Subparsers) -> None:
         action="store_true",
         help="only by shared memory, to the joint services on this host (default: both ways)",
     )
+    parser.add_argument(
+        "--partly",
+        action="store_true",
+        help="with --local: the other modules are on other hosts (default: all six must stop)",
+    )
+    parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="robot file (default: that of the fleet in the run directory)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Repeat the stop until every module has stopped; only a restart leaves DAMP."""
     run_dir: Path = args.run_dir
+    if args.partly and not args.local:
+        raise FleetError("--partly goes with --local: over the bus all six have to stop")
     here, errors = request_here(run_dir)  # first: it needs no bus and no supervisor
     for line in errors:
         print(f"xrl: {line}", file=sys.stderr)
     if args.local:
         if not here:
             raise FleetError(f"{run_dir}: no joint service of a fleet is on this host")
-        going = wait_here(run_dir, here)
+        going = wait_here(run_dir, here, partly=args.partly)
     else:
         try:
-            fleet = SupervisedFleet.attach(run_dir)
-            going = stop_all(load(Path(fleet.manifest.config)), run_dir)
+            config = args.config or Path(SupervisedFleet.attach(run_dir).manifest.config)
+            going = stop_all(load(config), run_dir)
         except XrlError as error:
             if not here:
                 raise
@@ -55,8 +69,9 @@ def run(args: argparse.Namespace) -> int:
             going = wait_here(run_dir, here)
     if going:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
+    which = ", ".join(here) if args.partly else "all six modules"
     Console().print(
-        "all six modules are stopped: DAMP. It sinks slowly, or holds beside a limp or dead "
+        f"{which} are stopped: DAMP. The robot sinks slowly, or holds beside a limp or dead "
         "module; `xrl down` ends it"
     )
     return 0

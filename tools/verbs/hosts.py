@@ -17,25 +17,24 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from shared.robot import gain_schedule
 from tools.fleet.status_table import tables
-from tools.hosts import hosts_file, installation
+from tools.hosts import hosts_file, installation, running
 from tools.hosts.hosts_file import Hosts
 from tools.hosts.installation import HostFile, HostRow
-from tools.hosts.layout import robot_on_hosts
 from tools.hosts.remote import Remote, on_all
 from tools.keys import authority as authorities
 from tools.keys.authority import Authority
-from tools.keys.certificates import CERTIFICATE_DAYS
 from tools.output import write_atomically
 from tools.verb_table import Subparsers, add_config, add_verb
 
 DEFAULT_HOSTS: Final = Path("hosts.toml")
 _EXAMPLES = """
 xrl hosts files -o out/hosts               # write what each host will have, and look at it
-xrl hosts keys                             # once: the authority, and a certificate for each service
+xrl keys make --hosts hosts.toml           # once: the authority, and a certificate for each service
 xrl hosts update                           # bring it there, over ssh
 xrl hosts check                            # versions, keys, clocks, units
 xrl hosts up
 xrl hosts status
+xrl hosts estop
 xrl hosts down
 """
 
@@ -61,11 +60,11 @@ def add_parser(subparsers: Subparsers) -> None:
     orders = parser.add_subparsers(metavar="WHAT", required=True)
     words = {
         "files": (_files, "write each host's files into a folder, and bring nothing anywhere"),
-        "keys": (_keys, "make the authority for these hosts, where there is none"),
         "update": (_update, "bring each host its files: robot file, keys, unit"),
         "check": (_check, "look whether the hosts are as they should be; 0: they are"),
         "up": (_up, "start the services on all hosts, and arm the drives"),
         "status": (_status, "show the services of all hosts in one table"),
+        "estop": (_estop, "every module to DAMP, by each host's own shared memory"),
         "down": (_down, "stop the services on all hosts"),
     }
     for name, (order, text) in words.items():
@@ -87,6 +86,12 @@ def add_parser(subparsers: Subparsers) -> None:
         )
         if name == "files":
             one.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="folder")
+        if name == "update":
+            one.add_argument(
+                "--while-up",
+                action="store_true",
+                help="although services are running: one that crashes starts with the new files",
+            )
         if name == "up":
             one.add_argument(
                 "--disarmed", action="store_true", help="leave drives that do not hold idle"
@@ -118,41 +123,43 @@ def _files(args: argparse.Namespace, given: _Given) -> int:
             write_atomically(path, file.content, private=file.of_service)
         print(f"{args.out / remote.host.name}: {', '.join(remote.host.services)}")
     if given.authority is None:
-        print("without keys: there is no authority yet; `xrl hosts keys`")
+        print("without keys: there is no authority yet; `xrl keys make --hosts FILE`")
     return 0
 
 
-def _keys(args: argparse.Namespace, given: _Given) -> int:
-    spread = robot_on_hosts(given.robot, given.hosts)
-    folder = authorities.default_folder(spread) if args.authority is None else args.authority
-    made = authorities.make(folder, spread, CERTIFICATE_DAYS)
-    print(f"{made.folder}: authority of {spread.name!r}; `xrl hosts update` brings the keys")
-    return 0
-
-
-def _update(_args: argparse.Namespace, given: _Given) -> int:
+def _update(args: argparse.Namespace, given: _Given) -> int:
     if given.authority is None:
-        raise RunError("there is no authority yet; `xrl hosts keys` makes one")
-    return _each(
-        given, lambda remote: installation.update(given.hosts, remote, given.files(remote))
-    )
+        raise RunError("there is no authority yet; `xrl keys make --hosts FILE` makes one")
+
+    def one(remote: Remote) -> str:
+        files = given.files(remote)
+        return installation.update(given.hosts, remote, files, while_up=args.while_up)
+
+    return _each(given, one)
 
 
 def _up(args: argparse.Namespace, given: _Given) -> int:
     armed = not args.disarmed
-    return _each(given, lambda remote: installation.up(given.hosts, remote, armed=armed))
+    return _each(given, lambda remote: running.up(given.hosts, remote, armed=armed))
+
+
+def _estop(_args: argparse.Namespace, given: _Given) -> int:
+    failed = _each(given, lambda remote: running.estop(given.hosts, remote))
+    if failed:
+        Console().print("[bold red]not all have stopped: cut the power[/]")
+    return failed
 
 
 def _down(_args: argparse.Namespace, given: _Given) -> int:
-    return _each(given, installation.down)
+    return _each(given, running.down)
 
 
 def _status(_args: argparse.Namespace, given: _Given) -> int:
-    found = on_all(given.remotes, lambda remote: installation.status(given.hosts, remote))
+    found = on_all(given.remotes, lambda remote: running.status(given.hosts, remote))
     good = {name: one for name, one in found.items() if not isinstance(one, FleetError)}
     console = Console()
     if good:
-        console.print(tables(installation.joined(good)))
+        console.print(tables(running.joined(good)))
     for error in found.values():
         if isinstance(error, FleetError):
             console.print(f"[bold red]{escape(str(error))}[/]")
@@ -164,12 +171,12 @@ def _check(_args: argparse.Namespace, given: _Given) -> int:
         given.remotes, lambda remote: installation.check(given.hosts, remote, given.files(remote))
     )
     rows = [
-        HostRow(name, "-", None, "-", (str(row),), ()) if isinstance(row, FleetError) else row
+        HostRow(name, wrong=(str(row),)) if isinstance(row, FleetError) else row
         for name, row in found.items()
     ]
     console = Console()
     console.print(_table(rows))
-    others = installation.disagreements([row for row in rows if row.clock is not None])
+    others = installation.disagreements(rows)
     for text in others:
         console.print(f"[bold red]{escape(text)}[/]")
     return 1 if others or any(row.wrong for row in rows) else 0

@@ -14,6 +14,8 @@ from shared.bus.credentials import keys_folder
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError
+from tools.hosts import hosts_file
+from tools.hosts.layout import robot_on_hosts
 from tools.keys.authority import Authority, default_folder, make, principals_of
 from tools.keys.bundle import bundle, install, to_tar
 from tools.keys.certificates import CERTIFICATE_DAYS
@@ -24,6 +26,7 @@ from tools.verb_table import Subparsers, add_config, add_verb
 
 _EXAMPLES = """
 xrl keys make --config lab.toml                       # once, where the keys are kept
+xrl keys make --hosts hosts.toml                      # ... of a robot on several hosts
 xrl keys pack planner harness recorder operator -o body.keys.tar
 xrl keys pack --install                               # all, onto this host
 xrl keys check                                        # this host's keys
@@ -64,7 +67,10 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do what was asked for."""
-    return int(args.order(args, config_file.load(args.config)))
+    robot = config_file.load(args.config)
+    if args.hosts is not None:
+        robot = robot_on_hosts(robot, hosts_file.load(args.hosts, robot))
+    return int(args.order(args, robot))
 
 
 def _order(
@@ -74,6 +80,12 @@ def _order(
 ) -> argparse.ArgumentParser:
     order = orders.add_parser(name, help=words, description=f"{words[0].upper()}{words[1:]}.")
     add_config(order)
+    order.add_argument(
+        "--hosts",
+        type=Path,
+        metavar="FILE",
+        help="services are at the addresses of this hosts file (default: as the robot file has it)",
+    )
     order.add_argument(
         "--authority",
         type=Path,
@@ -121,7 +133,8 @@ def _pack(args: argparse.Namespace, robot: RobotConfig) -> int:
         return 0
     write_atomically(args.out, to_tar(files), private=True)
     folder = Path(robot.bus.security.keys.replace("{robot}", robot.name)).parent
-    print(f"{args.out}: {_count(names)}; on that host: tar -xf {args.out.name} -C {folder}")
+    print(f"{args.out}: {_count(names)}; on that host:")
+    print(f"mkdir -p {folder} && tar -xf {args.out.name} -C {folder}")
     return 0
 
 
@@ -144,7 +157,8 @@ def _revoke(args: argparse.Namespace, robot: RobotConfig) -> int:
     authority.revoke(robot, names, args.days)
     current = ", ".join(f"{name}.{authority.names.generations[name]}" for name in names)
     print(f"{authority.folder}: now {current}")
-    print("pack anew for ALL hosts and restart the fleet: until then it lets the old ones in")
+    print("pack for ALL hosts (or `xrl hosts update`) and restart the fleet; until then it lets")
+    print("the old ones in")
     return 0
 
 

@@ -1,7 +1,8 @@
 """Three hosts on one machine: a stand-in for ssh, with a root folder for each host.
 
-What a command names in /etc, /run and /var is the host's own; `systemctl`, `runuser`,
-`chown` and `install` are scripts that do the little that `xrl hosts` needs of them.
+What a command names in /etc, /run and /var is the host's own, and so is what programs read in
+SHARED, by a mount in a namespace of the command's; `systemctl`, `runuser` and `install` are
+scripts that do the little that `xrl hosts` needs of them.
 """
 
 from __future__ import annotations
@@ -27,12 +28,17 @@ root={base}/$host
 [ -d "$root" ] || {{ echo "ssh: connect to host $host: No route to host" >&2; exit 255; }}
 command=$(sed -E "s#(^|[ '=])/(etc|run|var)/#\\1$root/\\2/#g" <<<"$*")
 export PATH={base}/bin:$PATH ROOT=$root
-cd "$root" && exec bash -c "$command"
+cd "$root" || exit
+[ -d "$root/{shared}" ] || exec bash -c "$command"
+[ "$EUID" = 0 ] || user="--user --map-root-user"
+exec unshare ${{user-}} --mount bash -c 'mount --bind "$1" "$2" && exec bash -c "$3"' - \\
+  "$root/{shared}" "{base}/{shared}" "$command"
 """
+SHARED = "etc-xrl"
+"""Folder of robot file and keys of hosts whose services run: files name it."""
 
 TOOLS = {
     "runuser": 'while [ "$1" != -- ]; do shift; done; shift; exec "$@"',
-    "chown": "exit 0",
     "install": (
         'words=(); while [ $# -gt 0 ]; do [ "$1" = -o ] && shift 2 && continue; '
         'words+=("$1"); shift; done; exec /usr/bin/install "${words[@]}"'
@@ -52,33 +58,38 @@ exit 0""",
 }
 
 
-def make_hosts(base: Path, *, real: bool = False) -> Path:
+def make_hosts(base: Path, *, real: bool = False, running: bool = False) -> Path:
     """Make three hosts and return their hosts file.
 
     Args:
         base: an empty folder; a short path, for sockets are in it.
         real: the hosts have this checkout with its environment; else scripts that only call back.
+        running: their services are to run, so what files name has to be each host's own.
     """
     (base / "bin").mkdir(parents=True)
-    _script(base / "bin" / "ssh", SSH.format(base=base))
+    _script(base / "bin" / "ssh", SSH.format(base=base, shared=SHARED))
     for name, body in TOOLS.items():
         _script(base / "bin" / name, f"#!/bin/bash\n{body}\n")
     rows = []
     for number, (name, services) in enumerate({"body": BODY, **LEGS}.items(), start=2):
         for folder in ("etc/systemd/system", "run", "var/lib"):
             (base / name / folder).mkdir(parents=True)
+        if running:
+            (base / name / SHARED).mkdir()
         tools = ["operator"] if name == "body" else ["viewer"]
         rows.append(
             {"name": name, "address": f"127.0.0.{number}", "ssh": name, "services": services,
              "tools": tools}
         )  # fmt: skip
+    if running:
+        (base / SHARED).mkdir()
     checkout = _checkout(base) if real else base
     file = base / "hosts.toml"
     table = {
         "host": rows,
         "first_port": 20_000 + os.getpid() % 20_000,
         "checkout": str(checkout),
-        "folder": "/etc/xrl",
+        "folder": str(base / SHARED) if running else "/etc/xrl",
         "ssh": [str(base / "bin" / "ssh")],
     }
     file.write_text(tomli_w.dumps(table), encoding="utf-8")

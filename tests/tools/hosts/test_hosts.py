@@ -19,7 +19,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.process import DEFAULT_CONFIG
-from tests.tools.hosts.places import LEGS, make_hosts
+from tests.tools.hosts.places import LEGS, SHARED, make_hosts
 from tools import cli
 from tools.hosts import hosts_file, layout
 from tools.hosts.hosts_file import Hosts, principals_on
@@ -43,9 +43,13 @@ def hosts(file: Path, robot: RobotConfig) -> Hosts:
     return hosts_file.load(file, robot)
 
 
-def xrl(order: str, base: Path, *words: str) -> int:
+def xrl(order: str, base: Path, *words: str, verb: str = "hosts") -> int:
     where = ["--hosts", str(base / "hosts.toml"), "--authority", str(base / "authority")]
-    return cli.main(["hosts", order, *words, *where])
+    return cli.main([verb, order, *words, *where])
+
+
+def make_keys(base: Path) -> None:
+    assert xrl("make", base, verb="keys") == 0
 
 
 def changed(file: Path, **changes: Any) -> Path:
@@ -62,6 +66,7 @@ def changed(file: Path, **changes: Any) -> Path:
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "a host without services": ({"services0": []}, "at least one"),
     "a service nowhere": ({"services0": ["planner", "harness"]}, "recorder runs nowhere"),
     "a service twice": ({"services0": ["planner", "harness", "recorder", "knee_left"]}, "body's"),
     "an unknown service": ({"services0": ["planner", "cook"]}, "no service 'cook'"),
@@ -148,7 +153,7 @@ def test_files_are_written_as_they_will_be_and_private_keys_for_their_owner_alon
 ) -> None:
     assert xrl("files", base, "-o", str(base / "without")) == 0
     assert not list((base / "without").rglob("*.key")), "there is no authority yet"
-    assert xrl("keys", base) == 0
+    make_keys(base)
     assert xrl("files", base, "-o", str(base / "out")) == 0
     body = base / "out" / "body"
     keys = {path.name for path in (body / "etc/xrl/keys").glob("*.key")}
@@ -165,8 +170,8 @@ def test_update_brings_all_and_check_then_finds_nothing_wrong(
     file: Path, base: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert xrl("update", base) == 2
-    assert "`xrl hosts keys` makes one" in capsys.readouterr().err
-    assert xrl("keys", base) == 0
+    assert "`xrl keys make --hosts FILE` makes one" in capsys.readouterr().err
+    make_keys(base)
     assert xrl("update", base) == 0
     for host in ("body", "right", "left"):
         keys = base / host / "etc/xrl/keys"
@@ -188,7 +193,7 @@ def test_update_brings_all_and_check_then_finds_nothing_wrong(
 def test_a_host_that_differs_is_told_by_name(
     file: Path, base: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert xrl("keys", base) == 0
+    make_keys(base)
     assert xrl("update", base) == 0
     robot = base / "left/etc/xrl/robot.toml"
     robot.write_text(robot.read_text().replace("payload = ", "payload = 1"), encoding="utf-8")
@@ -203,7 +208,7 @@ def test_a_host_that_differs_is_told_by_name(
 def test_a_host_that_is_not_reached_is_told_and_the_others_go_on(
     file: Path, base: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert xrl("keys", base) == 0
+    make_keys(base)
     shutil.rmtree(base / "left")
     capsys.readouterr()
     assert xrl("update", base) == 1
@@ -214,3 +219,31 @@ def test_a_host_that_is_not_reached_is_told_and_the_others_go_on(
     assert xrl("status", base, "left") == 1
     assert xrl("up", base, "elsewhere") == 2
     assert "no such host; one of body, right, left" in capsys.readouterr().err
+
+
+def test_a_key_that_is_lost_is_told_until_every_host_knows(
+    base: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make_hosts(base, real=True, running=True)
+    make_keys(base)
+    assert xrl("update", base) == 0
+    assert xrl("check", base) == 0, capsys.readouterr().out
+
+    def told() -> str:
+        capsys.readouterr()
+        assert xrl("check", base) == 1
+        return " ".join(capsys.readouterr().out.split())
+
+    assert xrl("revoke", base, "operator", verb="keys") == 0
+    said = told()
+    assert said.count("lets in other generations than the authority") == 3
+    assert "other keys than the authority's: operator.key, operator.pem" in said
+    assert xrl("update", base) == 0
+    assert xrl("check", base) == 0, capsys.readouterr().out
+
+    keys = base / "left" / SHARED / "keys"
+    shutil.copy(base / "authority" / "planner.key", keys)
+    assert "keys that it is not to have: planner.key" in told()
+    assert xrl("update", base, "left") == 0
+    assert not (keys / "planner.key").exists()
+    assert xrl("check", base) == 0, capsys.readouterr().out
