@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import signal
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,8 +47,17 @@ def run_dir() -> Iterator[Path]:
         yield Path(path) / "r"
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the slowest files; the order within a file stays."""
+    """Begin with the slowest files, the order within a file stays; mark what is wide."""
+    met: Counter[str] = Counter()
+    for item in items:
+        mark = item.get_closest_marker("sampled")
+        if mark is not None:
+            claim = item.nodeid.partition("[")[0]
+            if met[claim] % mark.args[0]:
+                item.add_marker(pytest.mark.wide)
+            met[claim] += 1
     place = {name: number for number, name in enumerate(SLOWEST)}
     items.sort(key=lambda item: place.get(item.path.name, len(SLOWEST)))
 

@@ -21,7 +21,7 @@ from services.simulator.usb_standin import FOLDER
 from services.simulator.world import World
 from shared import log, scheduling
 from shared.bus import topics
-from shared.bus.messages import OperatorIntent, SimControl, SimTruth
+from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth
 from shared.bus.session import open_session
 from shared.bus.traces import SimState
 from shared.config import files as config_file
@@ -84,6 +84,7 @@ def main() -> int:
             control=session.latest(topics.SIM_CONTROL, SimControl),
             state=session.publisher(topics.SIM_STATE, SimState),
             asked=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
+            hand=session.latest(topics.OPERATOR_HAND, HandLead),
         )
         hubs = open_hubs(robot, arguments.run_dir, stack)
         bank = AxisBank(

@@ -14,7 +14,7 @@ from services.simulator.harness_front import HarnessFront
 from services.simulator.imu_front import ImuFront
 from services.simulator.state import taken
 from services.simulator.world import World
-from shared.bus.messages import OperatorIntent, SimControl, SimTruth
+from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth
 from shared.bus.session import Latest, Publisher
 from shared.bus.topics import SIM_STATE
 from shared.bus.traces import SimState
@@ -38,6 +38,7 @@ class SimulatorPorts(msgspec.Struct, frozen=True):
     control: Latest[SimControl]
     state: Publisher[SimState]
     asked: Latest[OperatorIntent]
+    hand: Latest[HandLead]
 
 
 class SimulatorLoop:
@@ -153,7 +154,9 @@ class SimulatorLoop:
     def _publish_truth(self) -> None:
         """Publish the truth, and look at what needs no more than its rate."""
         world, now = self._world, now_ns()
-        control = self._ports.control.take()
+        control, hand = self._ports.control.take(), self._ports.hand.take()
+        if hand is not None:
+            world.take_hand(hand)
         if world.hoist > 0.0:
             self._hoisted_step = self._steps
         down_s = (self._steps - self._hoisted_step) * world.timestep

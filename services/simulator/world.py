@@ -17,9 +17,10 @@ from services.simulator.actuation import Actuation
 from services.simulator.body import Body
 from services.simulator.foot_placement import FootPlacement
 from services.simulator.hoist import Hoist
+from services.simulator.led_hand import LedHand
 from services.simulator.operator import HandForce, Operator, Wearer
 from services.simulator.posture import as_vector, measure_posture
-from shared.bus.messages import SimTruth, Vector3, Vector4
+from shared.bus.messages import HandLead, SimTruth, Vector3, Vector4
 from shared.config.scenarios import Lead, Scenario, lead, push_at
 
 Array = NDArray[np.float64]
@@ -61,10 +62,8 @@ class World:
         self.load_n = 0.0
         self.asked: tuple[float, Vector4] | None = None
         """Assist, N, and shift that somebody asks for in place of the scenario."""
-        self.led: Lead | None = None
-        """Where somebody leads the hand in place of the scenario."""
-        self.pushed: Vector3 | None = None
-        """Push of somebody in place of the scenario's, N, world."""
+        self.led_hand: LedHand | None = None
+        """The hand that somebody leads in place of the scenario."""
         self.push: Vector3 = (0.0, 0.0, 0.0)
         self.harness_force: Vector3 = (0.0, 0.0, 0.0)
         """The operator's force on the torso at the harness point, N, torso axes."""
@@ -190,8 +189,16 @@ class World:
 
     def lead(self) -> Lead:
         """Return the operator's present request."""
-        wanted = self.led or lead(self._scenario, self.scenario_s)
+        wanted = lead(self._scenario, self.scenario_s)
+        if self.led_hand is not None:
+            wanted = self.led_hand.over(wanted)
         return wanted if self.asked is None else Lead(*wanted[:4], *self.asked)
+
+    def take_hand(self, asked: HandLead) -> None:
+        """Let somebody lead the hand from where it is, or push."""
+        if self.led_hand is None:
+            self.led_hand = LedHand()
+        self.led_hand.take(asked, self.lead())
 
     def _apply_outside_forces(self) -> None:
         """Set the wrench on the torso: hand, load, push and hoist.
@@ -200,6 +207,8 @@ class World:
         would cost more than the physics.
         """
         t = self.scenario_s
+        if self.led_hand is not None:
+            self.led_hand.advance(self._dt)
         wanted = self.lead()
         r = self._torso_rotation.tolist()  # row by row
         x, y, z = self._harness_point
@@ -219,8 +228,8 @@ class World:
         self._wearer.step(self._dt, self.hand.force_z, wanted.assist)
         self.load_n = self._wearer.load_n
         self.push = push_at(self._scenario, t) if t >= 0.0 else (0.0, 0.0, 0.0)
-        if self.pushed is not None:
-            self.push = self.pushed
+        if self.led_hand is not None:
+            self.push = self.led_hand.push or self.push
         f, m = self.hand.force_z - self.load_n, self.hand.moment_pitch
         # in torso axes, as the harness sensor feels it: f along world z, m about torso y
         self.harness_force = (r[6] * f, r[7] * f, r[8] * f)

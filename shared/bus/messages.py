@@ -439,6 +439,21 @@ class OperatorIntent(Message, frozen=True):
     """Name of the sender."""
 
 
+class HandLead(Message, frozen=True):
+    """Where somebody leads the simulated hand in place of the scenario, and how they push."""
+
+    leads: bool
+    """False: height and pitch are nothing; whoever leads goes on."""
+    height: float = 0.0
+    """Torso origin above the ankles, m."""
+    pitch: float = 0.0
+    """Of the torso, rad."""
+    push: Vector3 = (0.0, 0.0, 0.0)
+    """Push on the torso, N, world; it ends 0.3 s after the last message."""
+    source: str = ""
+    """Name of the sender."""
+
+
 class Estop(Message, frozen=True):
     """Emergency stop: every module goes to DAMP; only a restart leaves it."""
 

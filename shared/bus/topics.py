@@ -149,6 +149,16 @@ OPERATOR_INTENT: Final = Topic(
     readers=("planner", "simulator"),
     why="assist and shift that the person requests",
 )
+OPERATOR_HAND: Final = Topic(
+    name="operator/hand",
+    type=messages.HandLead,
+    rate_hz=0.0,
+    priority=Priority.DATA,
+    recorded=True,
+    writers=(OPERATOR,),
+    readers=("simulator",),
+    why="leads and pushes the simulated robot by hand; nothing on a real one reads it",
+)
 ESTOP: Final = Topic(
     name="estop",
     type=messages.Estop,
@@ -217,6 +227,7 @@ TOPICS: Final = (
     PLANNER_STATUS,
     PLANNER_CHECKPOINT,
     OPERATOR_INTENT,
+    OPERATOR_HAND,
     ESTOP,
     SIM_TRUTH,
     SIM_STATE,

@@ -97,6 +97,8 @@ class SimState(Message, frozen=True):
     hidden: tuple[float, ...]
     """Hidden state of the plant: the person, the rotors and torques on their way, as
     `World.hidden`."""
+    hand: tuple[float, ...] = ()
+    """State of the hand that somebody leads in place of the scenario; empty: nobody does."""
 
 
 class LinkEvent(Message, frozen=True):

@@ -52,6 +52,7 @@ def test_with_the_load_found_it_comes_true_without_the_integral(robot: RobotConf
     assert given == pytest.approx(200.0, abs=10.0)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [1.0, 20.0])
 def test_the_eased_lead_is_lighter_and_as_steady(robot: RobotConfig, delay_ms: float) -> None:
     plain_law, easy_law = (

@@ -35,6 +35,7 @@ def test_the_assist_carries_the_operators_weight(crawl: Run) -> None:
     assert given == pytest.approx(200.0, abs=10.0)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("at", [3.5, 8.0])
 def test_the_robot_stands_if_the_planner_dies_in_the_crawl(robot: RobotConfig, at: float) -> None:
     outcome = run(robot, variant("crawl", duration=at + 3.0, kill=kill(at)))

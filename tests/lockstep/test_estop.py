@@ -19,6 +19,7 @@ from tools.runs.standing_start import begin_standing
 from tools.studies.sweeps import plants
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("height", [1.188, 0.9])
 @pytest.mark.parametrize("hand", [True, False])
 def test_the_robot_sinks_slowly_and_does_not_topple(
@@ -119,6 +120,7 @@ def stop(
     return Stopped(truth.fallen, turned, heights[0] - heights[-1], speed.max())
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("height", "pitch", "errors"), STOPPED)
 def test_without_a_holder_the_torso_stays_as_it_stood(
     robot: RobotConfig, height: float, pitch: float, errors: dict[str, Any]
@@ -131,6 +133,7 @@ def test_without_a_holder_the_torso_stays_as_it_stood(
     assert found.sank > 0.05 or height < 0.85, "it sinks"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(4))
 def test_so_it_does_on_drawn_plants(robot: RobotConfig, number: int) -> None:
     found = stop(robot, 0.9 + 0.07 * number, 0.3 * number, plants.draw(f"estop {number}"))
@@ -139,6 +142,7 @@ def test_so_it_does_on_drawn_plants(robot: RobotConfig, number: int) -> None:
     assert found.speed < 0.25
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("dead", ["planner", *MODULES[:3]])
 def test_it_comes_down_on_its_feet_with_one_service_dead(robot: RobotConfig, dead: str) -> None:
     """A knee that sank beside one that its drive held tipped the robot sideways."""
@@ -151,6 +155,7 @@ def test_it_comes_down_on_its_feet_with_one_service_dead(robot: RobotConfig, dea
         assert found.sank > 0.1
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("limp", ["ankle_left", "hip_right"])
 def test_it_does_not_fall_with_an_ankle_or_a_hip_limp(robot: RobotConfig, limp: str) -> None:
     fault = Fault(module=limp, kind="disarmed", at=3.7)
@@ -159,6 +164,7 @@ def test_it_does_not_fall_with_an_ankle_or_a_hip_limp(robot: RobotConfig, limp: 
     assert found.turned < 0.1
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("height", [0.9, 1.1])
 @pytest.mark.parametrize("planner", ["alive", "dead"])
 @pytest.mark.parametrize("at", [3.7, 5.0], ids=["before the stop", "after it"])
@@ -197,6 +203,7 @@ def test_a_knee_that_crashes_on_the_way_down_and_is_started_again_tips_nothing(
     assert found.turned < 0.1
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("dead", ["ankle_left", "knee_right"])
 def test_a_hip_whose_leg_falls_silent_on_the_way_down_goes_on_without_a_step(
     robot: RobotConfig, dead: str

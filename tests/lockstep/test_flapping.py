@@ -153,8 +153,11 @@ def squats(seconds: float) -> tuple[Keyframe, ...]:
 @pytest.mark.timeout(600)  # a minute of virtual time, on a machine that may be busy
 @pytest.mark.parametrize(
     ("ordered", "seconds", "tracked"),
-    [(True, 60.0, 0.06), (False, 20.0, 0.9)],
-    ids=["a minute of a stream", "datagrams"],
+    [
+        pytest.param(True, 60.0, 0.06, id="a minute of a stream", marks=pytest.mark.wide),
+        pytest.param(True, 15.0, 0.06, id="a stream"),
+        pytest.param(False, 15.0, 0.9, id="datagrams"),
+    ],
 )
 def test_20_ms_jitter_and_10_percent_loss(
     ordered: bool, seconds: float, tracked: float, robot: RobotConfig

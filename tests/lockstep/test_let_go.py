@@ -64,6 +64,7 @@ def not_led(robot: RobotConfig, errors: dict[str, Any]) -> tuple[Lockstep, list[
     raise AssertionError(status_of(fleet))
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(
     ("errors", "kg"),
     [

@@ -104,6 +104,7 @@ def test_for_a_limp_ankle_the_knees_alone_brace(robot: RobotConfig) -> None:
     assert abs(outcome.com_mm[:, 0]).max() < 120.0, "within the sole that is left"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(8, 16))
 def test_on_drawn_plants_a_limp_knee_stands_with_a_hand_and_without(
     robot: RobotConfig, number: int

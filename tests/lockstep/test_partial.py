@@ -51,6 +51,7 @@ def start(robot: RobotConfig) -> FleetMoment:
     return partial.start_of(robot)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", [case for kind in KINDS for case in sample(kind)], ids=words)
 def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_again(
     case: PartialCase, robot: RobotConfig, start: FleetMoment

@@ -97,6 +97,7 @@ def test_through_a_killed_planner_and_its_successor(robot: RobotConfig, judged: 
     assert fleet.planner.status(fleet.now_ns, 0.0).mode == PlannerMode.LEADING
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "network",
     [
@@ -112,6 +113,7 @@ def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairm
     believed(judged)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, -1, 1), (-1, -1, 1, -1)])
 def test_at_the_corners_of_a_lean(
     robot: RobotConfig, judged: Judged, signs: tuple[int, ...]
@@ -122,6 +124,7 @@ def test_at_the_corners_of_a_lean(
     believed(judged)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("right", [(0.1, 0.12, -0.3), (-0.1, -0.12, 0.3)])
 def test_at_the_corners_of_a_stance(
     robot: RobotConfig, judged: Judged, right: tuple[float, float, float]
@@ -132,6 +135,7 @@ def test_at_the_corners_of_a_stance(
     believed(judged)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(4))
 def test_on_drawn_plants_under_pushes_of_three_quarters_of_the_physical_limit(
     robot: RobotConfig, judged: Judged, number: int
@@ -144,6 +148,7 @@ def test_on_drawn_plants_under_pushes_of_three_quarters_of_the_physical_limit(
     believed(judged)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)])
 def test_held_off_centre_it_is_believed_and_leads_again(
     robot: RobotConfig, judged: Judged, direction: tuple[float, float]

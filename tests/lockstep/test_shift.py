@@ -56,6 +56,7 @@ def test_a_planner_that_comes_back_to_a_leaning_robot_leads_it_to_the_same_lean(
     assert moved < 2.0, "it goes there, it does not jump"
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("drawn", "signs"), [("shift-15", (-1, -1, 1, -1)), ("shift-21", (-1, 1, -1, 1))]
 )

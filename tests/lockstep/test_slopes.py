@@ -27,6 +27,7 @@ def over_mm(outcome: Run) -> float:
     return 1e3 * max(math.hypot(*row.over) for row in outcome.rows)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("slope", [(5.0, 0.0), (-5.0, 0.0), (0.0, 5.0), (-3.5, -3.5)])
 def test_with_an_imu_it_squats_on_five_degrees_is_pushed_and_stands_when_the_planner_dies(
     robot: RobotConfig, slope: tuple[float, float]

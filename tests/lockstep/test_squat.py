@@ -74,6 +74,7 @@ def test_runs_are_bit_identical(robot: RobotConfig) -> None:
     assert first.rows == second.rows
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("at", [0.7, 1.3, 2.5, 3.9])
 def test_the_robot_stands_whenever_the_planner_dies(robot: RobotConfig, at: float) -> None:
     pushes = (push(at + 0.5, 40, 0, 0), push(at + 1.5, 0, -40, 0))
@@ -108,6 +109,7 @@ def test_a_plain_average_of_the_legs_tips_the_soles(robot: RobotConfig) -> None:
     assert tilt > 0.02, "with load sharing 0.0005"
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [0.0, 5.0, 10.0])
 def test_the_robot_stands_at_any_delay_of_the_bus(robot: RobotConfig, delay_ms: float) -> None:
     scenario = variant("squat", duration=5.0, kill=(), push=(push(2.0, 40, 0, 0),))

@@ -24,6 +24,7 @@ def with_foot(plant: PlantConfig, right: Foot, step: float = 0.0) -> PlantConfig
     return msgspec.structs.replace(plant, feet=feet, floor=floor)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("drawn", "right", "step"),
     [
@@ -58,6 +59,7 @@ def test_a_planner_that_comes_back_leads_on_in_the_same_stance(robot: RobotConfi
     assert status.stance[5] == pytest.approx(0.2, abs=0.02)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("right", "words"),
     [((0.2, 0.0, 0.0), "ahead of the left"), ((0.0, 0.0, -0.5), "turned outwards")],

@@ -31,6 +31,7 @@ class Sent:
         return max(last) - min(last)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("skewed", [(1,), (0, 2, 4), (1, 2, 3, 4, 5)])
 def test_after_one_comparison_all_six_are_in_step_and_stay_so_with_the_next_planner(
     robot: RobotConfig, skewed: tuple[int, ...]

@@ -53,6 +53,7 @@ def causes(fleet: Lockstep) -> set[Cause]:
     return {Cause(event.cause) for _, event in fleet.events}
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", SHAKEN)
 def test_a_robot_that_shook_itself_down_stands_in_hold(robot: RobotConfig, name: str) -> None:
     shaky = unfiltered(robot)
@@ -98,6 +99,7 @@ def test_what_keeps_shaking_is_led_ever_more_rarely(robot: RobotConfig) -> None:
     assert fleet.planner.status(fleet.now_ns, 0.0).wait_s > 2.0
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("delay_ms", [1.0, 20.0])
 @pytest.mark.parametrize("height", [1.1, 0.85])
 def test_a_person_who_sags_is_caught(robot: RobotConfig, height: float, delay_ms: float) -> None:
@@ -162,6 +164,7 @@ def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
     assert not causes(fleet) & set(JOINT_TRIPS)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("height", "pitch", "ways_s"),
     [(0.85, 0.0, 1.5), (1.29, 0.0, 1.5), (0.79, 1.2, 2.0), (0.7, 0.0, 3.0)],

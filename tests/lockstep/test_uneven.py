@@ -48,6 +48,7 @@ def assert_it_stood_and_tracked(result: Run) -> None:
     assert np.abs(result.operator_n).max() < 45.0
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("pushes", [IN_STEP, ALL_WAYS], ids=["in_step", "all_ways"])
 @pytest.mark.parametrize("network", UNEVEN)
 def test_it_stands_through_pushes_while_all_six_track(
@@ -57,6 +58,7 @@ def test_it_stands_through_pushes_while_all_six_track(
     assert_it_stood_and_tracked(run(robot, scenario))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("module", ["ankle_left", "hip_left"])
 def test_so_it_does_with_any_other_module_late(robot: RobotConfig, module: str) -> None:
     scenario = still(
@@ -88,6 +90,7 @@ def steps(robot: RobotConfig, told: Scenario) -> float:
     return fleet.largest_nm
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [3.5, 4.7])
 def test_two_hips_a_little_late_do_not_make_the_legs_shake(
     robot: RobotConfig, delay_ms: float

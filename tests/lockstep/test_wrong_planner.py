@@ -88,6 +88,7 @@ def test_there_are_300_wrong_planners() -> None:
     assert len(NAMES) >= 300
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("number", range(0, len(NAMES), EVERY))
 def test_it_stands_whatever_its_planner_sends(
     robot: RobotConfig, begins: list[Begin], number: int

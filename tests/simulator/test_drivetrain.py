@@ -103,6 +103,7 @@ def test_a_stiff_drivetrain_is_the_rigid_one(robot: RobotConfig) -> None:
     np.testing.assert_allclose(courses[0], courses[1], atol=1e-4)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("stiffness", [2000.0, 20000.0])
 def test_one_step_of_a_millisecond_does_as_well_as_four(
     robot: RobotConfig, stiffness: float

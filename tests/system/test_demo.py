@@ -95,15 +95,6 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
     assert set(fleet_processes()) <= before
 
 
-def test_a_frozen_planner_is_survived_and_taken_back(tmp_path: Path) -> None:
-    flags = ("--duration", "7", "--kill", "planner@2:STOP", "--restart", "planner@4")
-    result = demo(tmp_path, *flags)
-    assert result.returncode == 0, result.stdout + result.stderr
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["stood"] is True
-    assert summary["reengage_s"] is not None
-
-
 def test_a_robot_that_cannot_stand_is_a_finding_and_not_an_error(tmp_path: Path) -> None:
     result = demo(tmp_path, "--push", "1:3:0,250,0", "--duration", "6")
     assert result.returncode == 1, result.stdout + result.stderr

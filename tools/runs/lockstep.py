@@ -7,7 +7,7 @@ process, clock or bus: two runs with one seed are equal to the last bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import ClassVar
 
 import msgspec
@@ -25,7 +25,15 @@ from services.simulator.plant import PlantConfig
 from services.simulator.state import restored, taken
 from services.simulator.world import World
 from shared.bus import topics
-from shared.bus.messages import JointEvent, Message, Mode, RunEvent, RunEventKind, SimTruth
+from shared.bus.messages import (
+    HandLead,
+    JointEvent,
+    Message,
+    Mode,
+    RunEvent,
+    RunEventKind,
+    SimTruth,
+)
 from shared.bus.topics import Topic
 from shared.bus.traces import SimState
 from shared.clock import NS_PER_S
@@ -34,6 +42,7 @@ from shared.config.scenarios import SCENARIO, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.network.impairment import Impairment
 from shared.robot.joints import MODULE_INDEX, MODULES
+from tools.runs.hand_path import HandRow
 from tools.runs.host_clock import HostClock
 from tools.runs.network import BASE
 from tools.runs.virtual_drive import VirtualDrive
@@ -94,6 +103,7 @@ class Lockstep:
         record: Record = forget,
         clocks: Mapping[str, HostClock] | None = None,
         plant: PlantConfig | None = None,
+        hand: Sequence[HandRow] = (),
     ) -> None:
         """Put the robot on the hoist, drives idle.
 
@@ -106,6 +116,7 @@ class Lockstep:
             record: takes every message.
             clocks: by service, of a host whose clock is not virtual time; not the simulator's.
             plant: how the true robot differs from `config`; None: the realistic default.
+            hand: how somebody leads the hand in place of the scenario.
 
         Raises:
             RunError: the scenario kills a service that has no process here.
@@ -161,9 +172,10 @@ class Lockstep:
         self._sim_state_ns = round(NS_PER_S / topics.SIM_STATE.rate_hz)
         self._sim_states = 0
         self._tracked_since_ns = 0
-        self._todo: list[Kill | Restart | Push] = sorted(
-            (*scenario.kill, *scenario.restart, *scenario.push), key=lambda row: row.at
+        self._todo: list[Kill | Restart | Push | HandRow] = sorted(
+            (*scenario.kill, *scenario.restart, *scenario.push, *hand), key=lambda row: row.at
         )
+        self._led = 0
         self._run_events = 0
 
     @property
@@ -258,8 +270,18 @@ class Lockstep:
             if event is not None:
                 self.events.append((joint.name, event))
 
-    def act(self, row: Kill | Restart | Push) -> None:
+    def lead(self, hand: HandLead) -> None:
+        """Let somebody lead the hand in place of the scenario, and record it."""
+        self._led += 1
+        hand = msgspec.structs.replace(hand, t_ns=self.now_ns, seq=self._led)
+        self.world.take_hand(hand)
+        self._record(topics.OPERATOR_HAND, "", hand)
+
+    def act(self, row: Kill | Restart | Push | HandRow) -> None:
         """Carry out a row of the scenario, or of somebody who looks on, and record it."""
+        if isinstance(row, HandRow):
+            self.lead(row.hand)
+            return
         if isinstance(row, Push):
             x, y, z = row.force
             detail = f"{x:g},{y:g},{z:g} N for {row.duration:g} s"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -24,6 +24,7 @@ from shared.process import CHECKOUT
 from shared.robot.robot_model import mjcf
 from tools.runs import experiment
 from tools.runs.centralised.fleet import CONTROLS, SHIPPED
+from tools.runs.hand_path import HandRow
 from tools.runs.judgement import judge_run
 from tools.runs.lockstep import Record, Watch
 from tools.runs.verdict import Summary
@@ -139,6 +140,7 @@ def simulate(
     watch: Watch = _look_away,
     control: str = SHIPPED,
     true_plant: PlantConfig | None = None,
+    hand: Sequence[HandRow] = (),
 ) -> float:
     """Record a run of the fleet in virtual time, to its end or a second past a fall.
 
@@ -151,6 +153,7 @@ def simulate(
         watch: sees the world at its rate.
         control: a name of `CONTROLS`.
         true_plant: the simulated robot; None: the robot file's.
+        hand: how somebody leads the hand in place of the scenario.
 
     Returns:
         The simulated time, s.
@@ -162,7 +165,7 @@ def simulate(
 
     def run(record: Record, drain: Watch) -> float:
         fleet = CONTROLS[control](
-            robot, scenario, network, seed=seed, record=record, plant=true_plant
+            robot, scenario, network, seed=seed, record=record, plant=true_plant, hand=hand
         )
         end_s = math.inf
         for truth in fleet.run():

@@ -63,6 +63,16 @@ class LiveSnapshot(NamedTuple):
     note: str
 
 
+class EndOfRun(NamedTuple):
+    """How a run ended."""
+
+    cpu_pct: float | None
+    """CPU use of all processes together, %: 100 is one core; None: the robot fell before the
+    scenario could begin."""
+    scenario_s: float
+    """So long it was to stand."""
+
+
 class TriggeredKill(NamedTuple):
     """A kill at no fixed time: when modules track again after a drop-out."""
 
@@ -133,10 +143,11 @@ class ScenarioRunner:
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
 
-    def run(self) -> float | None:
-        """Wait until the robot stands, run the scenario to its end; return the CPU use, %.
+    def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
+        """Wait until the robot stands, run the scenario to its end.
 
-        None if the robot fell before the scenario could begin.
+        Args:
+            is_over: returns True to end it sooner.
 
         Raises:
             CoresFullError: the cores do not carry the fleet at its pace, so it does not come to
@@ -144,10 +155,10 @@ class ScenarioRunner:
             RunError: the robot did not come to stand, or the simulated world went silent.
             FleetError: a service that was to be restarted could not be.
         """
-        if not self._wait_until_tracking():
+        if not self._wait_until_tracking(is_over):
             self._say(RunEventKind.FINISHED, self._scenario.name, "fell before the start")
             time.sleep(LAST_WORDS_S)
-            return None
+            return EndOfRun(None, self._scenario.duration)
         self._start()
         todo: list[Kill | Restart | Push | Fault | Inject] = [
             *self._scenario.kill,
@@ -157,7 +168,7 @@ class ScenarioRunner:
             *self._scenario.inject,
         ]
         todo.sort(key=lambda row: row.at)
-        fallen_at_s = None
+        fallen_at_s, ended_at_s = None, self._scenario.duration
         meter = CpuMeter()
         while True:
             self._listen()
@@ -173,6 +184,9 @@ class ScenarioRunner:
                     limit = min(limit, fallen_at_s + AFTER_FALL_S)
                 if truth.scenario_s >= limit:
                     break
+                if is_over():
+                    ended_at_s = truth.scenario_s
+                    break
             scenario_s = (now_ns() - self._start_ns) / NS_PER_S
             while todo and scenario_s >= todo[0].at:
                 self._act(todo.pop(0))
@@ -181,7 +195,7 @@ class ScenarioRunner:
         meter.sample(self._pids.values())
         self._say(RunEventKind.FINISHED, self._scenario.name, "")
         time.sleep(LAST_WORDS_S)
-        return meter.share_pct
+        return EndOfRun(meter.share_pct, ended_at_s)
 
     def _look_at_processes(self, meter: CpuMeter) -> None:
         """Once a second: a kill must not wait for the supervisor to tell the process."""
@@ -191,10 +205,13 @@ class ScenarioRunner:
             self._pids = self._fleet.pids()
             meter.sample(self._pids.values())
 
-    def _wait_until_tracking(self) -> bool:
+    def _wait_until_tracking(self, is_over: Callable[[], bool]) -> bool:
         """Wait until the hoist is down and all six modules have tracked for a while.
 
         Returns False if the robot falls first: that is a finding, not an error.
+
+        Raises:
+            KeyboardInterrupt: it is over before that.
         """
         begin_s = time.monotonic()
         deadline, next_look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s
@@ -203,6 +220,8 @@ class ScenarioRunner:
         self._note = "waiting for six modules to track"
         while since is None or time.monotonic() - since < machine_s(SETTLE_S):
             self._listen()
+            if is_over():
+                raise KeyboardInterrupt
             if time.monotonic() >= next_look_s:
                 next_look_s += IDLE_EVERY_S
                 idle = meter.look()

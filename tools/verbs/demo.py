@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -20,10 +24,13 @@ from tools.runs import experiment, verdict_table
 from tools.runs.judgement import judge_run
 from tools.runs.live import run_live
 from tools.runs.live_view import LiveView
-from tools.runs.scenario_runner import ScenarioRunner
+from tools.runs.scenario_runner import EndOfRun, ScenarioRunner
 from tools.verb_table import Subparsers, add_verb
+from tools.view.serving import add_port, served_beside
 
 EXIT_FELL = 1
+VIEW_S = 3600.0
+"""Longest run that a page leads, s of scenario time."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -35,6 +42,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl demo
         xrl demo --out out/b --kill planner@6.2 --restart planner@9
         xrl demo --kill planner@3.1:STOP --restart planner@7
+        xrl demo --view                        # lead, push and stop it by hand, in a browser
         xrl demo --scenario crawl --kill planner@8
         xrl demo --jacobian average
         xrl demo --plant drivetrain.stiffness=3000
@@ -51,6 +59,14 @@ def add_parser(subparsers: Subparsers) -> None:
         "them. What --kill kills stays down until its --restart either way",
     )
     parser.add_argument(
+        "--view",
+        action="store_true",
+        help="show it in a browser, and let a page act on it; without --scenario and --duration it "
+        "stands until Ctrl-C, and is judged then",
+    )
+    add_port(parser)
+    parser.set_defaults(scenario=None)
+    parser.add_argument(
         "--out", type=Path, metavar="DIR", help="where results go (default: out/demo-<time>)"
     )
 
@@ -58,6 +74,9 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
     console = Console()
+    args.scenario = args.scenario or ("stand" if args.view else "squat")
+    if args.view and args.duration is None:
+        args.duration = VIEW_S
     robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
     plant_from(args.plant)  # refused before anything is started
     out = experiment.make_out(args.out, "demo")
@@ -68,31 +87,33 @@ def run(args: argparse.Namespace) -> int:
             f"`xrl down --run-dir {other}` stops it[/]"
         )
     try:
-        cpu_pct = lead_run(args, robot, scenario, out, console)
+        ended = lead_run(args, robot, scenario, out, console)
     except KeyboardInterrupt:
         console.print(f"interrupted; what was recorded until then is in {out}")
         raise
-    return judge(out, scenario, cpu_pct, console)
+    return judge(out, scenario, ended, console)
 
 
 def lead_run(
     args: argparse.Namespace, robot: RobotConfig, scenario: Scenario, out: Path, console: Console
-) -> float | None:
-    """Run the scenario on a fleet of its own, and show it.
-
-    Returns:
-        CPU use of all processes together, %: 100 is one core; None if the scenario never started.
-    """
+) -> EndOfRun:
+    """Run the scenario on a fleet of its own, and show it."""
     console.print(
         f"starting {len(robot.services)} services; modes below: right ankle, knee, hip, then left; "
         "D disarmed, H hold, T track, F fault, - silent",
         style="dim",
     )
 
-    def lead(fleet: SupervisedFleet, session: Session) -> float | None:
+    def lead(fleet: SupervisedFleet, session: Session) -> EndOfRun:
         planner = session.latest(topics.PLANNER_STATUS, PlannerStatus)
-        with LiveView(console, scenario.inject, planner) as view:
-            return ScenarioRunner(fleet, session, scenario, view.show).run()
+        with contextlib.ExitStack() as stack:
+            ended = threading.Event()
+            if args.view:
+                address = stack.enter_context(served_beside(fleet.run.path, args.port))
+                console.print(f"{address}  (Ctrl-C ends the run)", soft_wrap=True)
+                stack.enter_context(_interrupts_set(ended))
+            view = stack.enter_context(LiveView(console, scenario.inject, planner))
+            return ScenarioRunner(fleet, session, scenario, view.show).run(ended.is_set)
 
     return run_live(
         out,
@@ -108,9 +129,20 @@ def lead_run(
     )
 
 
-def judge(out: Path, scenario: Scenario, cpu_pct: float | None, console: Console) -> int:
+@contextlib.contextmanager
+def _interrupts_set(event: threading.Event) -> Iterator[None]:
+    """Have Ctrl-C set an event meanwhile: the run ends there, and is judged."""
+    before = signal.signal(signal.SIGINT, lambda *_: event.set())
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def judge(out: Path, scenario: Scenario, ended: EndOfRun, console: Console) -> int:
     """Write summary and picture from the log, print the verdict, return the exit code."""
-    summary = judge_run(out, scenario.name, scenario.duration, {"fleet_cpu_pct": cpu_pct})
+    figures = {"fleet_cpu_pct": ended.cpu_pct}
+    summary = judge_run(out, scenario.name, ended.scenario_s, figures)
     verdict_table.show(summary, console)
     console.print(f"{out}/run.mcap, run.png, summary.json, logs/", style="dim", highlight=False)
     return 0 if summary["stood"] else EXIT_FELL

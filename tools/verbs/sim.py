@@ -16,6 +16,8 @@ from shared.network.impairment import Impairment
 from tools.number_arguments import finite
 from tools.runs import experiment, recorded_lockstep, verdict_table
 from tools.runs.centralised.fleet import CONTROLS, SHIPPED
+from tools.runs.hand_path import HandRow, hand_path
+from tools.runs.run_log import read_run
 from tools.verb_table import Subparsers, add_verb
 
 
@@ -32,6 +34,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl sim --delay 50 --control centralised
         xrl sim --plant drivetrain.stiffness=3000 --plant drivetrain.play=0.01
         xrl sim --plant ideal
+        xrl sim --scenario stand --hand out/view/run.mcap     # as a person led it there
         xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
         xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
         """,
@@ -62,6 +65,13 @@ def add_parser(subparsers: Subparsers) -> None:
         "compare with (default: distributed)",
     )
     parser.add_argument(
+        "--hand",
+        type=Path,
+        metavar="RUN",
+        help="lead and push as somebody did in this record (`operator/hand`), in place of the "
+        "scenario's path",
+    )
+    parser.add_argument(
         "--out", type=Path, metavar="DIR", help="where results go (default: out/sim-<time>)"
     )
 
@@ -73,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
     console = Console()
     robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
     true_plant = plant_from(args.plant)
+    hand = _path_of(args.hand) if args.hand is not None else ()
     network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
     out = experiment.make_out(args.out, "sim")
     experiment.introduce(scenario, console)
@@ -88,10 +99,22 @@ def run(args: argparse.Namespace) -> int:
             progress.update(task, completed=max(0.0, truth.scenario_s))
 
         simulated_s = recorded_lockstep.simulate(
-            robot, scenario, network, args.seed, out, watch, args.control, true_plant
+            robot, scenario, network, args.seed, out, watch, args.control, true_plant, hand
         )
     factor = simulated_s / (time.monotonic() - begin)
     summary = recorded_lockstep.judge_in_lockstep(scenario, out, speed=factor)
     verdict_table.show(summary, console)
     console.print(f"{factor:.1f} x real time; {out}/run.mcap, run.png, summary.json", style="dim")
     return 0 if summary["stood"] else 1
+
+
+def _path_of(record: Path) -> tuple[HandRow, ...]:
+    """Return how the hand was led in a record.
+
+    Raises:
+        RunError: it cannot be read, or nobody led it there.
+    """
+    path = hand_path(read_run(record))
+    if not path:
+        raise RunError(f"{record}: nobody led the hand there; `xrl view --act` or --sim does")
+    return path

@@ -20,6 +20,8 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.number_arguments import finite
 from tools.runs.experiment import add_plant, make_out, scenario_file
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+from tools.view.live import LiveSource
+from tools.view.serving import add_port, serve
 
 SETTLE_S = 3.0
 """A scenario starts so long after the hoist is down."""
@@ -33,6 +35,7 @@ def add_parser(subparsers: Subparsers) -> None:
         """
         xrl up
         xrl up --scenario crawl --out out/crawl
+        xrl up --view                                  # and lead it by hand, in a browser
         xrl up --injectable                            # then: xrl inject --link ... --delay 30
         xrl up --config lab.toml --no-sim
         xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # of one host
@@ -91,6 +94,13 @@ def add_parser(subparsers: Subparsers) -> None:
         "for a start by itself, after a power cut",
     )
     parser.add_argument(
+        "--view",
+        action="store_true",
+        help="then show it in a browser until Ctrl-C, as `xrl view` does; a page may act on a "
+        "simulated robot. The fleet stays up",
+    )
+    add_port(parser)
+    parser.add_argument(
         "--readonly",
         action="store_true",
         help="the joint services listen to their drives and publish, and send them nothing",
@@ -128,6 +138,12 @@ def run(args: argparse.Namespace) -> int:
     )
     if robot.bus.security.mode == "open":
         Console().print(f"[bold red]{OPEN}[/]")
+    if args.view:
+        live = LiveSource(robot, fleet, act="simulator" in fleet.manifest.services)
+        try:
+            serve(live, args.port)
+        finally:
+            live.disconnect()
     return 0
 
 

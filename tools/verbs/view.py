@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import contextlib
-import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from rich.console import Console
 
 from shared.config import files as config_file
-from shared.exceptions import RunError
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import FleetError, RunError
 from tools.fleet.supervise import SupervisedFleet
-from tools.number_arguments import natural
 from tools.runs.experiment import load_robot
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
@@ -23,7 +22,7 @@ from tools.verb_table import RUN_HELP, Subparsers, add_config, add_run_dir, add_
 from tools.view.live import LiveSource
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource
-from tools.view.server import PORT, ViewServer
+from tools.view.serving import add_port, serve
 from tools.view.source import Source
 
 
@@ -34,6 +33,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "view",
         """
         xrl view                       # the fleet that is up: look, and touch nothing
+        xrl view --act                 # ... and lead, push, kill, freeze, start, cut, stop
         xrl view out/demo/run.mcap     # a record: play, pause, step, scrub
         xrl view --sim                 # a robot in this process: lead it, push it, kill its planner
         """,
@@ -41,8 +41,11 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("record", nargs="?", type=Path, metavar="RUN", help=RUN_HELP)
     parser.add_argument("--sim", action="store_true", help="a robot of its own, in virtual time")
     parser.add_argument(
-        "--port", type=natural, default=PORT, help="of 127.0.0.1 (default: %(default)s); 0: any"
+        "--act",
+        action="store_true",
+        help="let the page act on the fleet that is up; a real robot's name has to be typed first",
     )
+    add_port(parser)
     add_part(parser)
     add_config(parser)
     add_run_dir(parser)
@@ -50,24 +53,13 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    if args.port > 65_535:
-        raise RunError(f"--port {args.port}: up to 65535 is right")
     if args.sim and args.record is not None:
         raise RunError("a record and --sim do not go together; leave one out")
+    if args.act and (args.sim or args.record is not None):
+        raise RunError("--act is for the fleet that is up; --sim needs none, a record takes none")
     with _source(args) as source:
-        asyncio.run(_serve(source, args.port))
+        serve(source, args.port)
     return 0
-
-
-async def _serve(source: Source, port: int) -> None:
-    server = ViewServer(source, port)
-    ended = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, ended.set)
-    async with server.running():
-        Console().print(f"{server.address}  (Ctrl-C ends it)", soft_wrap=True)
-        await ended.wait()
 
 
 @contextlib.contextmanager
@@ -83,8 +75,29 @@ def _source(args: argparse.Namespace) -> Iterator[Source]:
         yield RecordSource(log, robot_of(log))
     else:
         fleet = SupervisedFleet.attach(args.run_dir)
-        live = LiveSource(config_file.load(Path(fleet.manifest.config)), fleet.run.path)
+        robot = config_file.load(Path(fleet.manifest.config))
+        if args.act and "simulator" not in fleet.manifest.services:
+            confirm(robot)
+        live = LiveSource(robot, fleet, act=args.act)
         try:
             yield live
         finally:
             live.disconnect()
+
+
+def confirm(robot: RobotConfig) -> None:
+    """Have a person type the name of a real robot that a page may act on.
+
+    Raises:
+        FleetError: there is nobody to ask, or it is another name.
+    """
+    if not sys.stdin.isatty():
+        raise FleetError("a page may act on a real robot only if somebody types its name here")
+    console = Console()
+    console.print(
+        "[bold red]This is a real robot.[/] A page can kill its services and stop it, and replaces "
+        "no switch that cuts the power."
+    )
+    typed = console.input(f"Type its name ({robot.name}) to go on: ")
+    if typed.strip() != robot.name:
+        raise FleetError(f"{typed.strip()!r} is another name; nothing was started")

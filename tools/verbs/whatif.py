@@ -19,6 +19,7 @@ from shared.exceptions import RunError
 from shared.robot.joints import MODULES
 from tools.number_arguments import count, finite
 from tools.runs.experiment import PLANT_FILE
+from tools.runs.hand_path import hand_path
 from tools.runs.recorded_robot import robot_of, text_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog
@@ -82,7 +83,8 @@ def run(args: argparse.Namespace) -> int:
     moments = moments_of(log, robot, args.every)
     kill = tuple(dict.fromkeys(args.kill))
     true_plant = plant_of(log)
-    tasks = [Task(robot, scenario, true_plant, moment, kill, args.for_s) for moment in moments]
+    led = hand_path(log)
+    tasks = [Task(robot, scenario, true_plant, moment, kill, args.for_s, led) for moment in moments]
     counterfactuals: list[Counterfactual] = []
     bar = Progress(
         TextColumn("{task.fields[fell]}"), BarColumn(), MofNCompleteColumn(),

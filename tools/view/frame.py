@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 import msgspec
@@ -23,9 +24,12 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULE_INDEX, MODULES
+from tools.fleet.fleet_status import module_status
 
 STALE_NS: Final = NS_PER_S // 2
 """An older message is not shown: its sender is dead, stopped or cut off."""
+DIGITS: Final = 5
+"""Behind the point: 0.01 mm."""
 _NOWHERE: Final = (0.0, 0.0, 0.0)
 
 
@@ -45,11 +49,21 @@ class PlannerShown(msgspec.Struct, frozen=True):
     """COM height that it follows, m."""
 
 
+class Process(msgspec.Struct, frozen=True):
+    """One process of a live fleet, by its supervisor."""
+
+    name: str
+    state: str
+    restarts: int
+
+
 class Frame(msgspec.Struct, frozen=True):
     """One moment of the robot; SI units, world axes unless it says otherwise."""
 
     t_s: float
-    """Scenario time if there is one, else since the first frame."""
+    """Scenario time while there is one, else since the first frame."""
+    begun: bool
+    """True: a scenario runs."""
     torso: Vector3
     """Origin of the torso, m."""
     angles: Vector3
@@ -75,18 +89,28 @@ class Frame(msgspec.Struct, frozen=True):
     is_true: bool
     """True: the pose is that of the simulated world; else what the legs' kinematics know."""
     fallen: bool
+    ways_out: tuple[str, ...]
+    """For each module what lets it track again; empty if nothing is needed."""
+    processes: tuple[Process, ...] = ()
+    """Of a live fleet on this host."""
+    network: tuple[str, ...] = ()
+    """Active impairments of a live fleet's network, in words."""
 
 
 class Newest:
     """The newest message of each key that a frame is made of."""
 
     def __init__(self, robot: RobotConfig) -> None:
+        self._kinematics = Kinematics(robot)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget every message."""
         self._states: list[JointState | None] = [None] * len(MODULES)
         self._commands: list[JointCommand | None] = [None] * len(MODULES)
         self._status: PlannerStatus | None = None
         self._wrench: Wrench | None = None
         self._truth: SimTruth | None = None
-        self._kinematics = Kinematics(robot)
         self._first_ns: int | None = None
 
     def take(self, topic: Topic, module: str, message: Message) -> None:
@@ -101,6 +125,11 @@ class Newest:
             self._wrench = message
         elif isinstance(message, SimTruth):
             self._truth = message
+
+    @property
+    def scenario_s(self) -> float:
+        """Scenario time of the newest truth, s; negative: no scenario runs."""
+        return self._truth.scenario_s if self._truth is not None else -1.0
 
     def frame(self, now_ns: int) -> Frame | None:
         """Return what is known now; None until each module was heard once.
@@ -122,27 +151,33 @@ class Newest:
         torso, angles, com = self._pose(truth, q)
         commands = [row for row in self._commands if row is not None]
         led = isinstance(status, PlannerStatus) and len(commands) == len(MODULES)
-        t_s = (now_ns - self._first_ns) / NS_PER_S
-        if isinstance(truth, SimTruth):
-            t_s = truth.scenario_s
+        begun = isinstance(truth, SimTruth) and truth.scenario_s >= 0.0
+        t_s = self.scenario_s if begun else (now_ns - self._first_ns) / NS_PER_S
         return Frame(
             t_s=t_s,
-            torso=torso,
-            angles=angles,
-            com=com,
-            q=q,
-            q_ref=tuple(angle for row in commands for angle in row.q_ref) if led else (),
+            begun=begun,
+            torso=_vector(torso),
+            angles=_vector(angles),
+            com=_vector(com),
+            q=_short(q),
+            q_ref=_short(angle for row in commands for angle in row.q_ref) if led else (),
             modes=tuple(s.mode if here else -1 for s, here in zip(states, heard, strict=True)),
             drives=tuple(state.drive for state in states),
-            ages_ms=tuple(
+            ages_ms=_short(
                 state.age_ns / NS_PER_MS if here and state.age_ns >= 0 else -1.0
                 for state, here in zip(states, heard, strict=True)
             ),
-            tau=tuple(torque for state in states for torque in state.tau),
-            force=wrench.force if isinstance(wrench, Wrench) and wrench.valid else _NOWHERE,
+            tau=_short(torque for state in states for torque in state.tau),
+            force=_vector(wrench.force)
+            if isinstance(wrench, Wrench) and wrench.valid
+            else _NOWHERE,
             push=truth.push if isinstance(truth, SimTruth) else _NOWHERE,
             is_true=isinstance(truth, SimTruth),
             fallen=isinstance(truth, SimTruth) and truth.fallen,
+            ways_out=tuple(
+                module_status(state if here else None).way_out.replace("MODULE", name)
+                for state, here, name in zip(states, heard, MODULES, strict=True)
+            ),
             planner=_shown(status) if isinstance(status, PlannerStatus) else None,
         )
 
@@ -155,7 +190,8 @@ class Newest:
         if self._status is not None:
             known.stance[:] = self._status.stance
         known.update(np.array(q))
-        return _vector(known.r_torso), _vector(known.p[3:]), _vector(known.p[:3])
+        torso, angles, com = (part.tolist() for part in (known.r_torso, known.p[3:], known.p[:3]))
+        return torso, angles, com
 
 
 def _shown(status: PlannerStatus) -> PlannerShown:
@@ -171,6 +207,11 @@ def _shown(status: PlannerStatus) -> PlannerShown:
     )
 
 
-def _vector(values: object) -> Vector3:
-    x, y, z = np.asarray(values).tolist()
+def _short(values: Iterable[float]) -> tuple[float, ...]:
+    """Return numbers as a picture needs them: half as long on their way as with all digits."""
+    return tuple(round(value, DIGITS) for value in values)
+
+
+def _vector(values: Iterable[float]) -> Vector3:
+    x, y, z = _short(values)
     return x, y, z

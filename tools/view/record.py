@@ -50,6 +50,7 @@ class RecordSource(Source):
         super().__init__(robot)
         self.title = str(log.path)
         self._data = RunData(log)
+        self._newest = Newest(robot)
         wanted = [(topic, "") for topic in _SHOWN]
         wanted += [(topic, module) for topic in _SHOWN_OF_MODULES for module in MODULES]
         self._keys = [_Key(topic, m, log.messages(topic, m)) for topic, m in wanted]
@@ -67,7 +68,8 @@ class RecordSource(Source):
     def frame(self, t_s: float) -> Frame | None:
         """Return the frame at a time of the timeline; None before each module was heard."""
         t_ns = self._data.zero_ns + round(t_s * NS_PER_S)
-        newest = Newest(self.robot)
+        newest = self._newest
+        newest.clear()
         for key in self._keys:
             message = key.at(t_ns)
             if message is not None:

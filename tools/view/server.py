@@ -164,7 +164,11 @@ class ViewServer:
         due = loop.time()
         sent = b""
         while not socket.closed:
-            frame = self._source.frame(cursor.at(loop.time()))
+            try:
+                frame = self._source.frame(cursor.at(loop.time()))
+            except XrlError as error:
+                await socket.send_json({"error": str(error)})
+                return
             text = msgspec.json.encode({"frame": frame, "playing": cursor.playing})
             if text != sent:
                 await socket.send_str(text.decode())
@@ -182,7 +186,9 @@ class ViewServer:
             try:
                 asked = msgspec.json.decode(message.data, type=dict)
                 if "order" in asked:
-                    why = self._source.carry_out(msgspec.convert(asked, Order))
+                    why = await asyncio.to_thread(
+                        self._source.carry_out, msgspec.convert(asked, Order)
+                    )
                 else:
                     control = msgspec.convert(asked, Control)
                     cursor.control(loop.time(), control.play, control.seek_s, control.rate)

@@ -41,9 +41,9 @@ class Order(msgspec.Struct, frozen=True):
     """What a person does on the page; which orders a source takes is in `Model.orders`."""
 
     order: str
-    """`kill`, `start`, `estop`, `hand` or `push`."""
+    """`kill`, `freeze`, `start`, `cut`, `estop`, `hand` or `push`."""
     service: str = ""
-    """Of `kill` and `start`."""
+    """Of `kill`, `freeze` and `start`; of `cut` what is cut off."""
     height: float = 0.0
     """Of `hand`: where to lead the torso, m above the ankles."""
     pitch: float = 0.0
@@ -69,6 +69,8 @@ class Model(msgspec.Struct, frozen=True):
     foot: tuple[float, float, float]
     """Length, width, and height of the ankle's axis above the floor, m."""
     orders: tuple[str, ...] = ()
+    processes: tuple[str, ...] = ()
+    """That `kill`, `freeze` and `start` are for."""
     begin_s: float = 0.0
     end_s: float = 0.0
     """Of a record, on its timeline; equal to `begin_s`: there is no timeline."""
@@ -81,6 +83,7 @@ class Source(ABC):
     kind: str
     title: str
     orders: tuple[str, ...] = ()
+    processes: tuple[str, ...] = ()
 
     def __init__(self, robot: RobotConfig) -> None:
         self.robot = robot
@@ -104,6 +107,7 @@ class Source(ABC):
             harness=geometry.harness_point,
             foot=(geometry.l_foot, geometry.w_foot, geometry.foot_height),
             orders=self.orders,
+            processes=self.processes,
         )
 
     def connect(self) -> None:
@@ -116,8 +120,12 @@ class Source(ABC):
 
     @abstractmethod
     def frame(self, t_s: float) -> Frame | None:
-        """Return the newest frame, or of a record that at a time of its timeline; None: not yet."""
+        """Return the newest frame, or of a record that at a time of its timeline; None: not yet.
+
+        Raises:
+            XrlError: there will be no more.
+        """
 
     def carry_out(self, order: Order) -> str:
-        """Do what a person asks for; return why not, or nothing."""
+        """Do what a person asks for; return why not, or nothing. May block."""
         return f"{order.order} is not possible here"

@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from services.simulator.led_hand import HEIGHTS, PUSH_MAX
 from shared.bus.messages import Mode
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.runs.experiment import load_robot
 from tools.view.frame import Frame
-from tools.view.lockstep import HEIGHTS, PUSH_MAX, LockstepSource
+from tools.view.lockstep import LockstepSource
 from tools.view.source import Order
 
 LIMIT_S = 40.0

@@ -40,11 +40,12 @@ def test_a_frame_holds_the_newest_messages_at_its_time(log: RunLog, source: Reco
     for truth in reversed(moments):  # backwards: a frame depends on no other
         frame = source.frame(truth.scenario_s + 1e-6)
         assert frame is not None
-        assert frame.torso == truth.torso
+        assert frame.torso == pytest.approx(truth.torso, abs=1e-5)
         assert frame.is_true
         for index, module in enumerate(MODULES):
             newest = [row for row in states[module] if row.t_ns <= truth.t_ns + 1000][-1]
-            assert frame.q[2 * index : 2 * index + 2] == newest.q
+            shown = frame.q[2 * index : 2 * index + 2]
+            assert shown == pytest.approx(newest.q, abs=1e-5)
             assert frame.modes[index] == newest.mode
     assert model.begin_s <= 0.0 < model.end_s
     assert {"kill", "push", "fault"} <= {mark.kind for mark in model.marks}

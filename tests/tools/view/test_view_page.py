@@ -51,6 +51,10 @@ def lockstep() -> Any:
     made.close()
 
 
+def button(order: str) -> str:
+    return f"document.querySelector('[data-service=planner][data-order={order}]').click()"
+
+
 async def drag(
     page: Page, x: float, y: float, dx: float, dy: float, *, shift: bool = False
 ) -> None:
@@ -67,19 +71,18 @@ def test_a_person_leads_pushes_kills_and_stops_it_with_the_mouse(
         await page.open(address)
         await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
         begin = await page.value(HEIGHT)
-        await drag(page, 640.0, 200.0, 0.0, 90.0)
+        await drag(page, 665.0, 185.0, 0.0, 90.0)  # where the hand's arrow is, too
         low = await page.until(HEIGHT, lambda height: height < begin - 0.2)
-        await page.mouse("up", 640.0, 290.0)
+        await page.mouse("up", 665.0, 275.0)
         await drag(page, 640.0, 260.0, 0.0, -60.0)
         await page.until(HEIGHT, lambda height: height > low + 0.05)
         await page.mouse("up", 640.0, 200.0)
         pushed = "document.getElementById('plots').querySelectorAll('canvas').length"
         assert await page.value(pushed) == 6
-        await page.value("document.querySelector('[data-service=planner]').click()")
+        await page.value(button("kill"))
         await page.until(MODES, lambda text: text.count("HOLD") == 6)
         await page.until("document.getElementById('mode').textContent", lambda w: w == "silent")
-        start = "document.querySelectorAll('[data-service=planner]')[1].click()"
-        await page.value(start)
+        await page.value(button("start"))
         await page.until(MODES, lambda text: text.count("TRACK") == 6)
         await page.key("ArrowDown")
         await page.value("document.getElementById('estop').click()")

@@ -24,9 +24,10 @@ TOKEN = "known-to-this-test"  # noqa: S105 - of a server that ends with its test
 def frame_at(t_s: float) -> Frame:
     zero = (0.0, 0.0, 0.0)
     return Frame(
-        t_s=t_s, torso=zero, angles=zero, com=zero, q=(0.0,) * 12, q_ref=(), modes=(2,) * 6,
+        t_s=t_s, begun=True, torso=zero, angles=zero, com=zero, q=(0.0,) * 12, q_ref=(),
+        modes=(2,) * 6,
         drives=(0,) * 6, ages_ms=(1.0,) * 6, tau=(0.0,) * 12, force=zero, push=zero,
-        planner=None, is_true=True, fallen=False,
+        planner=None, is_true=True, fallen=False, ways_out=("",) * 6,
     )  # fmt: skip
 
 

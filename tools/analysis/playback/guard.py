@@ -31,6 +31,7 @@ commands.
 ACTED_ON: Final = (
     *IN_THE_LOOP,
     topics.OPERATOR_INTENT,
+    topics.OPERATOR_HAND,
     topics.ESTOP,
     topics.HARNESS_TARE,
     topics.SIM_CONTROL,

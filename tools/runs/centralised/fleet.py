@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -14,6 +14,7 @@ from shared.network.impairment import Impairment
 from shared.robot.gain_schedule import believing
 from shared.robot.trip_table import untripped
 from tools.runs.centralised.control import CentralPlanner, PassThrough
+from tools.runs.hand_path import HandRow
 from tools.runs.lockstep import Lockstep, Record, forget
 
 
@@ -42,11 +43,13 @@ class CentralisedLockstep(Lockstep):
         seed: int = 0,
         record: Record = forget,
         plant: PlantConfig | None = None,
+        hand: Sequence[HandRow] = (),
     ) -> None:
         """Put the robot on the hoist; arguments as for `Lockstep`."""
         super().__init__(
-            torques_only(config), scenario, network, seed=seed, record=record, plant=plant
-        )
+            torques_only(config), scenario, network,
+            seed=seed, record=record, plant=plant, hand=hand,
+        )  # fmt: skip
 
 
 SHIPPED: Final = "distributed"

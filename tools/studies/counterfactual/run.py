@@ -10,6 +10,7 @@ from services.simulator.plant import PlantConfig
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Scenario
+from tools.runs.hand_path import HandRow
 from tools.runs.lockstep import FleetMoment, Lockstep
 from tools.runs.network import BASE
 from tools.studies.counterfactual.moments import Moment
@@ -27,6 +28,8 @@ class Task(msgspec.Struct, frozen=True):
     kill: tuple[str, ...]
     for_s: float
     """Duration of the continued run, s."""
+    hand: tuple[HandRow, ...] = ()
+    """How somebody led the hand in the run."""
 
 
 class Counterfactual(msgspec.Struct, frozen=True):
@@ -68,7 +71,7 @@ def counterfactual_of(task: Task) -> Counterfactual:
     """Go on from the moment, and judge."""
     moment = task.moment
     scenario = scenario_from(task.scenario, moment.at_s, task.kill, task.for_s)
-    fleet = Lockstep(task.robot, scenario, BASE, plant=task.plant)
+    fleet = Lockstep(task.robot, scenario, BASE, plant=task.plant, hand=task.hand)
     fleet.resume(FleetMoment(moment.state, moment.modules, moment.planner))
     fell_at_s = None
     rows: list[SimTruth] = []

@@ -7,8 +7,10 @@ const css = (colour) => `#${colour.toString(16).padStart(6, "0")}`;
 const HINTS = {
   record: "drag: turn · wheel: closer · space: play or pause · ← →: a frame",
   live: "looking only · drag: turn · wheel: closer",
-  lockstep: "drag the torso up and down: lead · shift and drag: push · drag beside it: turn",
+  led: "drag the torso up and down: lead · shift and drag: push · drag beside it: turn",
 };
+const WORDS = { suspended: "frozen; start lets it go on" };
+const CUTS = ["left leg", "right leg", "all"];
 const HEIGHT_STEP = 0.02, PITCH_STEP = 0.05, PUSH_PER_PIXEL = 0.6, FRAME_S = 1 / 30;
 
 let model, scene, plots, newest, socket;
@@ -58,8 +60,13 @@ function begin(given) {
   model = given;
   $("source").textContent = model.title;
   document.title = `XRL: ${model.robot}, ${model.source}`;
-  $("hint").textContent = HINTS[model.source];
-  moduleRows = model.modules.map((name) => row($("modules"), name.replace("_", " ")));
+  $("hint").textContent = HINTS[model.orders.includes("hand") ? "led" : model.source];
+  moduleRows = model.modules.map((name) => {
+    const made = row($("modules"), name.replace("_", " "));
+    const way = Object.assign(document.createElement("span"), { className: "way" });
+    made.item.append(way);
+    return { ...made, way };
+  });
   plots = new Plots($("plots"));
   try {
     scene = new RobotScene($("scene"), model);
@@ -67,7 +74,7 @@ function begin(given) {
     complain(`no three-dimensional picture: ${error.message}`);
   }
   if (model.end_s > model.begin_s) beginTimeline();
-  if (model.orders.includes("estop")) beginOrders();
+  if (model.orders.length || model.source === "live") beginOrders();
   steer();
 }
 
@@ -91,20 +98,46 @@ function beginTimeline() {
 const step = (by_s) => send({ play: false, seek_s: (newest?.t_s ?? 0) + by_s });
 
 function beginOrders() {
-  $("estop").hidden = $("hardware").hidden = false;
+  const acts = model.orders.includes("estop");
+  $("estop").hidden = $("hardware").hidden = !acts;
   $("estop").onclick = () => send({ order: "estop" });
-  $("processes").hidden = false;
-  for (const name of ["planner", ...model.modules]) {
-    const { item, dot } = row($("processes").querySelector("ul"), name);
-    dot.remove();
-    for (const order of ["kill", "start"]) {
-      const button = document.createElement("button");
-      button.textContent = order;
-      button.dataset.service = name;
-      button.onclick = () => send({ order, service: name });
-      item.append(button);
-    }
+  $("processes").hidden = !acts;
+  for (const name of model.processes) addProcess(name);
+  $("cuts").hidden = !model.orders.includes("cut");
+  for (const service of CUTS) $("cuts").append(button(`cut ${service}`, { order: "cut", service }));
+}
+
+const processRows = new Map();
+
+function button(text, message) {
+  const made = document.createElement("button");
+  made.textContent = text;
+  Object.assign(made.dataset, message);
+  made.onclick = () => send(message);
+  return made;
+}
+
+function addProcess(service) {
+  const made = row($("processes").querySelector("ul"), service);
+  made.dot.remove();
+  for (const order of ["kill", "freeze", "start"])
+    if (model.orders.includes(order)) made.item.append(button(order, { order, service }));
+  const way = Object.assign(document.createElement("span"), { className: "way" });
+  made.item.append(way);
+  made.word = way;
+  processRows.set(service, made);
+  return made;
+}
+
+function showProcesses(frame) {
+  if (frame.processes.length) $("processes").hidden = false;
+  for (const process of frame.processes) {
+    const { word, item } = processRows.get(process.name) ?? addProcess(process.name);
+    word.textContent = process.state === "running" ? "" : WORDS[process.state] ?? process.state;
+    item.title = `${process.state}, started again ${process.restarts} times`;
   }
+  $("network").hidden = model.source !== "live" || !(frame.network.length || model.orders.includes("cut"));
+  $("impaired").textContent = frame.network.length ? frame.network.join("; ") : "as it is";
 }
 
 function show(frame) {
@@ -122,11 +155,13 @@ function show(frame) {
   frame.modes.forEach((mode, index) => {
     const name = model.modes[mode] ?? "SILENT";
     moduleRows[index].word.textContent = name;
+    moduleRows[index].way.textContent = frame.ways_out[index];
     moduleRows[index].dot.style.background = css(MODE_COLOURS[name]);
   });
   if (frame.fallen) complain("it has fallen");
   if (!$("timeline").hidden && document.activeElement !== $("place")) $("place").value = frame.t_s;
   if (!hand.led) Object.assign(hand, { height: frame.torso[2], pitch: frame.angles[1] });
+  showProcesses(frame);
   scene?.show(frame);
   plots.take(frame);
 }

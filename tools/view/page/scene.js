@@ -212,8 +212,9 @@ export class RobotScene {
     const { width, height } = this.canvas.getBoundingClientRect();
     const ray = new T.Raycaster();
     ray.setFromCamera(new T.Vector2(2 * x / width - 1, 1 - 2 * y / height), this.camera);
-    const hit = ray.intersectObject(this.robot, true)[0];
-    return hit !== undefined && (hit.object.userData.frame === "torso");
+    // of the robot's bodies: an arrow before them, seen or not, is nothing to take hold of
+    const hit = ray.intersectObject(this.robot, true).find(({ object }) => object.userData.frame);
+    return hit?.object.userData.frame === "torso";
   }
 
   // Metres in the plane of the picture, at the torso, for a pixel.

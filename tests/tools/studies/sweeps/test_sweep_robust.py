@@ -71,6 +71,7 @@ def test_an_impossible_width_is_refused(capsys: pytest.CaptureFixture[str]) -> N
     assert "--n: '0'" in capsys.readouterr().err
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("number", [0, 1])
 def test_with_every_error_drawn_it_is_led_pushed_killed_and_stands(
     robot: RobotConfig, pushes: PushRange, number: int

@@ -1,0 +1,89 @@
+"""A person's path by hand: recorded, and led again bit for bit."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from services.simulator.led_hand import HEIGHT_MAX_RATE
+from shared.bus import topics
+from shared.bus.messages import HandLead, Mode, SimTruth
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from tests.lockstep.runs import still
+from tools import cli
+from tools.runs import recorded_lockstep
+from tools.runs.hand_path import HandRow, hand_path
+from tools.runs.lockstep import FleetMoment, Lockstep
+from tools.runs.network import BASE
+from tools.runs.run_log import read_run
+
+PUSH = (0.0, 30.0, 0.0)
+PATH = (
+    (0.2, HandLead(t_ns=0, seq=0, leads=False, push=PUSH, source="test")),
+    (0.5, HandLead(t_ns=0, seq=0, leads=True, height=1.0, pitch=0.1, source="test")),
+    (1.7, HandLead(t_ns=0, seq=0, leads=True, height=1.1, pitch=0.0, push=PUSH, source="test")),
+)
+DURATION_S = 3.0
+
+
+@pytest.fixture(scope="module")
+def run_of_a_person(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("hand")
+    rows = tuple(HandRow(at, hand) for at, hand in PATH)
+    recorded_lockstep.simulate(robot, still(DURATION_S), BASE, 0, out, hand=rows)
+    return out / "run.mcap"
+
+
+def test_the_robot_follows_the_hand_that_is_led_and_is_pushed_by_it(run_of_a_person: Path) -> None:
+    truths: list[SimTruth] = read_run(run_of_a_person).messages(topics.SIM_TRUTH)
+    at = {round(row.scenario_s, 2): row for row in truths}
+    assert at[0.1].push == (0.0, 0.0, 0.0)
+    assert at[0.3].push == PUSH
+    assert at[0.6].push == (0.0, 0.0, 0.0), "it ended by itself"
+    assert at[1.6].torso[2] < at[0.4].torso[2] - 0.12
+    assert at[2.9].torso[2] == pytest.approx(1.1, abs=0.015)
+    assert not truths[-1].fallen
+    fastest = max(abs(b.torso[2] - a.torso[2]) for a, b in itertools.pairwise(truths))
+    assert fastest < 2.0 * HEIGHT_MAX_RATE * 0.01
+
+
+def test_the_same_path_again_is_the_same_run_bit_for_bit(
+    run_of_a_person: Path, tmp_path: Path
+) -> None:
+    log = read_run(run_of_a_person)
+    assert [row.at for row in hand_path(log)] == pytest.approx([0.2, 0.5, 1.7], abs=0.002)
+    scenario = run_of_a_person.parent / "scenario.toml"
+    words = ["--scenario", str(scenario), "--hand", str(run_of_a_person), "--out", str(tmp_path)]
+    assert cli.main(["sim", *words]) == 0
+    again = read_run(tmp_path / "run.mcap")
+    for topic in (topics.SIM_TRUTH, topics.SIM_STATE, topics.OPERATOR_HAND, topics.PLANNER_STATUS):
+        assert again.messages(topic) == log.messages(topic)
+
+
+def test_a_moment_of_it_has_the_hand_and_what_follows_is_led_on(
+    robot: RobotConfig, run_of_a_person: Path
+) -> None:
+    log = read_run(run_of_a_person)
+    state = next(row for row in log.messages(topics.SIM_STATE) if row.scenario_s >= 1.0)
+    assert state.hand[0] == 1.0, "somebody leads"
+    fleet = Lockstep(robot, still(DURATION_S), BASE, hand=hand_path(log))
+    fleet.resume(FleetMoment(state, {}, None))
+    assert fleet.world.led_hand is not None
+    assert fleet.world.led_hand.state() == state.hand
+    led = Lockstep(robot, still(DURATION_S), BASE, hand=hand_path(log))
+    seen = [row for row in led.run() if row.scenario_s >= 1.0]
+    moment = led.moment()
+    assert moment.state.hand != state.hand
+    assert {c.failsafe.mode for c in led.controllers} == {Mode.TRACK}
+    assert seen[-1].t_ns - seen[0].t_ns > 1.9 * NS_PER_S
+
+
+def test_a_record_in_which_nobody_led_is_refused_in_words(
+    robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded_lockstep.simulate(robot, still(0.1), BASE, 0, tmp_path)
+    assert cli.main(["sim", "--hand", str(tmp_path / "run.mcap")]) == 2
+    assert "nobody led the hand there" in capsys.readouterr().err

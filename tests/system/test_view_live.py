@@ -1,0 +1,116 @@
+"""`xrl demo --view`: a page leads, pushes, freezes and kills a live fleet, and is recorded."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from shared.bus import topics
+from shared.bus.messages import Mode, RunEventKind
+from shared.process import CHECKOUT
+from tools.runs.hand_path import hand_path
+from tools.runs.run_log import read_run
+
+pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
+
+PATIENCE_S = 60.0
+HAND_S = 0.05
+
+
+class Client:
+    """A page without a browser."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self._socket = socket
+        self.complaints: list[str] = []
+
+    async def order(self, order: str, **fields: Any) -> None:
+        await self._socket.send_json({"order": order, **fields})
+
+    async def until(
+        self, holds: Callable[[dict[str, Any]], bool], again: dict[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """Wait for a frame, repeating an order meanwhile, and return it."""
+        async with asyncio.timeout(PATIENCE_S):
+            while True:
+                if again is not None:
+                    await self._socket.send_json(again)
+                message = await self._socket.receive_json()
+                if "error" in message:
+                    self.complaints.append(message["error"])
+                frame = message.get("frame")
+                if frame is not None and holds(frame):
+                    return frame  # type: ignore[no-any-return]  # JSON
+
+
+def all_in(mode: Mode) -> Callable[[dict[str, Any]], bool]:
+    return lambda frame: frame["modes"] == [mode] * 6
+
+
+async def lead(address: str) -> None:
+    origin = "/".join(address.split("/")[:3])
+    async with (
+        aiohttp.ClientSession() as http,
+        http.ws_connect(address + "ws", headers={"Origin": origin}) as socket,
+    ):
+        model = (await socket.receive_json())["model"]
+        assert {"hand", "push", "kill", "freeze", "start", "estop"} <= set(model["orders"])
+        client = Client(socket)
+        await client.until(lambda frame: all_in(Mode.TRACK)(frame) and frame["begun"])
+        hand = {"order": "hand", "height": 1.0, "pitch": 0.0}
+        await client.until(lambda frame: frame["torso"][2] < 1.02, hand)
+        push = {"order": "push", "force": [0.0, 30.0, 0.0]}
+        await client.until(lambda frame: frame["push"][1] == 30.0, push)
+        await client.until(lambda frame: frame["push"][1] == 0.0)
+        await client.order("freeze", service="planner")
+        await client.until(all_in(Mode.HOLD))
+        await client.order("start", service="planner")
+        await client.until(all_in(Mode.TRACK))
+        await client.order("kill", service="planner")
+        await client.until(all_in(Mode.HOLD))
+        await client.until(
+            lambda f: any(p["name"] == "planner" and p["restarts"] for p in f["processes"])
+        )
+        await client.until(all_in(Mode.TRACK))
+        assert client.complaints == []
+        await client.order("kill", service="cook")
+        await client.until(lambda _: client.complaints != [])
+        assert "no service 'cook'" in client.complaints[0]
+
+
+def test_a_page_leads_pushes_freezes_and_kills_and_the_log_has_it_all(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tools.cli", "demo", "--view", "--port", "0"]
+    with subprocess.Popen(
+        [*command, "--out", str(tmp_path)], cwd=CHECKOUT, stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            lines = iter(process.stdout.readline, "")
+            address = next(line.split()[0] for line in lines if line.startswith("http://"))
+            asyncio.run(lead(address))
+            os.kill(process.pid, signal.SIGINT)
+            said, _ = process.communicate(timeout=90)
+        finally:
+            process.kill()
+    assert process.returncode == 0, said
+    assert "STOOD" in said
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["stood"] is True
+    log = read_run(tmp_path / "run.mcap")
+    path = hand_path(log)
+    assert {row.hand.height for row in path if row.hand.leads} == {1.0}
+    assert any(row.hand.push == (0.0, 30.0, 0.0) for row in path)
+    done = [(RunEventKind(e.kind).name, e.subject) for e in log.messages(topics.RUN_EVENT)]
+    assert [what for what in done if what[1] == "planner"] == [
+        ("KILLED", "planner"), ("RESTARTED", "planner"), ("KILLED", "planner"),
+    ]  # fmt: skip

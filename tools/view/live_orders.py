@@ -1,0 +1,158 @@
+"""What a page may do to a fleet that is up."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from shared.bus import topics
+from shared.bus.credentials import read_credentials
+from shared.bus.messages import HandLead, RunEvent, RunEventKind
+from shared.bus.session import Publisher, Session
+from shared.clock import now_ns
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Inject
+from shared.exceptions import FleetError, XrlError
+from shared.robot.joints import MODULES
+from tools.fleet.emergency_stop import request_here, stop_all
+from tools.fleet.proxy_client import ProxyClient
+from tools.fleet.supervise import SupervisedFleet
+from tools.view.hand import HandOrders
+from tools.view.source import Order
+
+CUTS: Final[Mapping[str, tuple[str, ...]]] = {
+    "left leg": ("planner->left", "left->planner"),
+    "right leg": ("planner->right", "right->planner"),
+    "all": ("all",),
+}
+"""What a page can cut off from the planner: links by name."""
+CUT_S: Final = 2.0
+
+
+class LiveOrders:
+    """Carries out a page's orders.
+
+    Attributes:
+        services: that can be killed, frozen and started; the planner first.
+        orders: that this fleet takes: `hand` and `push` only with a simulator.
+    """
+
+    def __init__(
+        self, robot: RobotConfig, fleet: SupervisedFleet, scenario_s: Callable[[], float]
+    ) -> None:
+        """Take a fleet that is up.
+
+        Args:
+            robot: its robot file.
+            fleet: the fleet.
+            scenario_s: returns the scenario time, s; negative: no scenario runs.
+
+        Raises:
+            BusError, FleetError: this host has no key that may act.
+        """
+        if robot.bus.security.mode == "mtls":
+            name = read_credentials(robot, "view").name
+            if name != topics.OPERATOR:
+                raise FleetError(f"this host has the key of a {name}; to act takes an operator's")
+        self._robot, self._fleet, self._scenario_s = robot, fleet, scenario_s
+        self.services = tuple(sorted(fleet.manifest.services, key=lambda name: name != "planner"))
+        self._carriers: dict[str, Callable[[Order], None]] = {
+            "estop": self._estop,
+            "kill": self._kill,
+            "freeze": self._freeze,
+            "start": self._start,
+        }
+        if "network_proxy" in self.services:
+            self._carriers["cut"] = self._cut
+        if "simulator" in self.services:
+            self._carriers |= {"hand": self._lead, "push": self._lead}
+        self.orders = tuple(self._carriers)
+        self._hand = HandOrders()
+        self._publisher: Publisher[HandLead] | None = None
+        self._events: Publisher[RunEvent] | None = None
+        self._seq = 0
+
+    def begin(self, session: Session) -> None:
+        """Take the session that is open while somebody looks."""
+        self._hand = HandOrders()
+        self._publisher = session.publisher(topics.OPERATOR_HAND, HandLead)
+        self._events = session.publisher(topics.RUN_EVENT, RunEvent)
+
+    def end(self) -> None:
+        """The session is about to be closed."""
+        self._publisher = self._events = None
+
+    def carry_out(self, order: Order) -> str:
+        """Do it, and return why not, or nothing; may block for some seconds."""
+        carrier = self._carriers.get(order.order)
+        if carrier is None:
+            return f"{order.order!r} is no order here; one of {', '.join(self.orders)}"
+        try:
+            carrier(order)
+        except XrlError as error:
+            return str(error)
+        return ""
+
+    def _lead(self, order: Order) -> None:
+        if self._publisher is None:
+            raise FleetError("the hand is not linked yet")
+        self._seq += 1
+        asked = self._hand.message(order)
+        self._publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._seq))
+
+    def _estop(self, _order: Order) -> None:
+        """Stop all, first by shared memory.
+
+        Raises:
+            FleetError: a module has not stopped.
+        """
+        run_dir: Path = self._fleet.run.path
+        request_here(run_dir)
+        going = stop_all(self._robot, run_dir)
+        if going:
+            raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
+
+    def _kill(self, order: Order) -> None:
+        if order.service in MODULES:
+            self._fleet.forget(order.service)  # a person asked for its next process
+        self._fleet.kill(order.service, signal.SIGKILL)
+        self._tell(RunEventKind.KILLED, order.service, "KILL")
+
+    def _freeze(self, order: Order) -> None:
+        self._fleet.kill(order.service, signal.SIGSTOP)
+        self._tell(RunEventKind.KILLED, order.service, "STOP")
+
+    def _start(self, order: Order) -> None:
+        self._fleet.start_service(order.service)
+        self._tell(RunEventKind.RESTARTED, order.service, "")
+
+    def _tell(self, kind: RunEventKind, subject: str, detail: str) -> None:
+        """Have it in the log."""
+        if self._events is not None:
+            self._seq += 1
+            event = RunEvent(
+                t_ns=now_ns(),
+                seq=self._seq,
+                kind=int(kind),
+                subject=subject,
+                detail=detail,
+                scenario_s=self._scenario_s(),
+            )
+            self._events.put(event)
+
+    def _cut(self, order: Order) -> None:
+        """Cut links for a while.
+
+        Raises:
+            FleetError: there are no such links, or the network proxy refuses.
+        """
+        links = CUTS.get(order.service)
+        if links is None:
+            raise FleetError(f"{order.service!r}: one of {', '.join(CUTS)}")
+        proxy = ProxyClient(self._fleet.run.path)
+        for link in links:
+            proxy.begin(Inject(link=link, at=0.0, duration=CUT_S, partition=True))

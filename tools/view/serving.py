@@ -1,0 +1,92 @@
+"""Serves a source until Ctrl-C, in this process or in one of its own."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from rich.console import Console
+
+from shared.exceptions import FleetError
+from tools.number_arguments import natural
+from tools.view.server import PORT, ViewServer
+from tools.view.source import Source
+
+_END_S = 5.0
+_PORT_MAX = 65_535
+
+
+def add_port(parser: argparse.ArgumentParser) -> None:
+    """Add `--port`."""
+    parser.add_argument(
+        "--port", type=_port, default=PORT, help="of 127.0.0.1 (default: %(default)s); 0: any"
+    )
+
+
+def _port(text: str) -> int:
+    port = natural(text)
+    if port > _PORT_MAX:
+        raise argparse.ArgumentTypeError(f"{text!r}: up to {_PORT_MAX} is right")
+    return port
+
+
+def serve(source: Source, port: int) -> None:
+    """Serve until Ctrl-C or SIGTERM, and print the address.
+
+    Raises:
+        FleetError: the port is in use.
+    """
+    asyncio.run(_serve(source, port))
+
+
+async def _serve(source: Source, port: int) -> None:
+    server = ViewServer(source, port)
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ended.set)
+    async with server.running():
+        Console().print(f"{server.address}  (Ctrl-C ends it)", soft_wrap=True)
+        await ended.wait()
+
+
+@contextlib.contextmanager
+def served_beside(run_dir: Path, port: int) -> Iterator[str]:
+    """Serve a fleet that is up from a process of its own, in which a page may act; end it after.
+
+    Yields:
+        The address.
+
+    Raises:
+        FleetError: it does not begin.
+    """
+    command = [sys.executable, "-m", "tools.cli", "view", "--act"]
+    command += ["--run-dir", str(run_dir), "--port", str(port)]
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C in the terminal is for who has started it
+    )
+    try:
+        assert process.stdout is not None  # noqa: S101 - a pipe was asked for
+        address = process.stdout.readline().partition(" ")[0]
+        if not address:
+            _, said = process.communicate()
+            raise FleetError(said.strip().removeprefix("xrl: ") or "the page's server has ended")
+        yield address
+    finally:
+        process.terminate()
+        try:
+            process.communicate(timeout=_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
