@@ -49,7 +49,7 @@ class PlannerShown(msgspec.Struct, frozen=True):
     """COM height that it follows, m."""
 
 
-class Process(msgspec.Struct, frozen=True):
+class ShownProcess(msgspec.Struct, frozen=True):
     """One process of a live fleet, by its supervisor."""
 
     name: str
@@ -91,7 +91,7 @@ class Frame(msgspec.Struct, frozen=True):
     fallen: bool
     ways_out: tuple[str, ...]
     """For each module what lets it track again; empty if nothing is needed."""
-    processes: tuple[Process, ...] = ()
+    processes: tuple[ShownProcess, ...] = ()
     """Of a live fleet on this host."""
     network: tuple[str, ...] = ()
     """Active impairments of a live fleet's network, in words."""

@@ -16,7 +16,7 @@ from shared.exceptions import FleetError
 from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import impairments
 from tools.fleet.supervise import SupervisedFleet
-from tools.view.frame import Frame, Newest, Process
+from tools.view.frame import Frame, Newest, ShownProcess
 from tools.view.live_orders import LiveOrders
 from tools.view.source import Order, Source
 
@@ -50,7 +50,7 @@ class LiveSource(Source):
         if self._acting is not None:
             self.orders = self._acting.orders
             self.processes = self._acting.services
-        self._processes: tuple[Process, ...] = ()
+        self._processes: tuple[ShownProcess, ...] = ()
         self._network: tuple[str, ...] = ()
         self._left = threading.Event()
         self._looker: threading.Thread | None = None
@@ -111,7 +111,7 @@ class LiveSource(Source):
         while not self._left.is_set():
             try:
                 rows = self._fleet.info()
-                self._processes = tuple(Process(r.name, r.state, r.restarts) for r in rows)
+                self._processes = tuple(ShownProcess(r.name, r.state, r.restarts) for r in rows)
                 self._network = impairments(self._fleet)
             except FleetError as error:
                 self._processes, self._network = (), (str(error),)
