@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -123,6 +124,33 @@ def test_it_needs_no_supervisor(run_dir: Path, robot: RobotConfig) -> None:
     finally:
         os.kill(pid, signal.SIGCONT)
         fleet.stop()
+
+
+@pytest.mark.parametrize(("typed", "ends_in"), [(b"q\n", Mode.HOLD), (b"\n", Mode.DAMP)])
+def test_one_that_waits_says_whom_it_hears_and_stops_at_enter_but_not_at_q(
+    typed: bytes, ends_in: Mode, run_dir: Path, robot: RobotConfig
+) -> None:
+    fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
+    person, terminal = pty.openpty()
+    command = [sys.executable, "-u", "-m", "tools.cli", "estop", "--wait", "--run-dir"]
+    try:
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.HOLD))
+        with subprocess.Popen(
+            [*command, str(run_dir)], cwd=ROOT, stdin=terminal, stdout=subprocess.PIPE, text=True
+        ) as waiting:
+            try:
+                assert waiting.stdout is not None
+                told = iter(waiting.stdout.readline, "")
+                assert any("all six heard" in line for line in told)
+                os.write(person, typed)
+                assert waiting.wait(timeout=40.0) == 0
+            finally:
+                waiting.kill()
+        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, ends_in))
+    finally:
+        fleet.stop()
+        os.close(person)
+        os.close(terminal)
 
 
 def test_a_module_without_a_service_here_is_named(run_dir: Path, robot: RobotConfig) -> None:

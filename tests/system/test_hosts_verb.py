@@ -43,7 +43,7 @@ class Place(NamedTuple):
         return cli.main([verb, order, *words, *where])
 
     def run_dir(self, host: str) -> Path:
-        return self.base / host / "run/xrl"
+        return self.base / host / "var/lib/xrl/run"
 
     def boot(self, host: str) -> None:
         """Do what systemd does at a host's start: nobody asked for it."""
@@ -133,3 +133,4 @@ def test_hosts_come_up_take_over_after_a_power_cut_and_stay_stopped_until_somebo
     assert modes() == {"DAMP"}
     assert place.xrl("down") == 0
     assert [procfs.fleet_pids(place.run_dir(host)) for host in NAMES] == [set(), set(), set()]
+    assert not list(place.base.rglob("*.rearm")), "the stop is over: a person has asked for that"

@@ -6,6 +6,7 @@ import getpass
 import os
 import platform
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +15,7 @@ from services.joint.rearm_guard import request_stop
 from shared.bus import topics
 from shared.bus.credentials import read_credentials
 from shared.bus.messages import Estop, JointState, Mode
-from shared.bus.session import open_session
+from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
@@ -22,6 +23,8 @@ from shared.robot.joints import MODULES
 REPEAT_S: Final = 0.05
 """The bus may drop a message: the stop is repeated until all six have stopped."""
 GIVE_UP_S: Final = 3.0
+UNHEARD_S: Final = 0.5
+"""A module whose last state is older is not heard."""
 STOPPED: Final = (Mode.DAMP, Mode.FAULT)
 
 
@@ -41,27 +44,85 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
     return here, errors
 
 
-def wait_here(run_dir: Path, here: list[str], *, partly: bool = False) -> list[str]:
+def wait_here(run_dir: Path, here: list[str], wanted: Sequence[str] = MODULES) -> list[str]:
     """Wait until the services on this host have stopped.
 
     Args:
         run_dir: of the fleet.
-        here: the modules that have a service on this host.
-        partly: the others have theirs on other hosts, and are not asked after.
+        here: the modules that were asked.
+        wanted: the modules that have to stop.
 
     Returns:
-        One line for each module that has not stopped, or has no service here.
+        One line for each of them that has not stopped, or was not asked.
     """
     deadline = time.monotonic() + GIVE_UP_S
     while time.monotonic() < deadline and not all(_is_stopped(run_dir, m) for m in here):
         time.sleep(REPEAT_S)
     going = [module for module in here if not _is_stopped(run_dir, module)]
-    absent = [] if partly else [module for module in MODULES if module not in here]
+    absent = [module for module in wanted if module not in here]
     return going + [f"{module} has no service on this host" for module in absent]
 
 
-def stop_all(robot: RobotConfig, run_dir: Path) -> list[str]:
-    """Publish the stop until all six modules have stopped.
+class BusStop:
+    """The way over the bus, on a session that is open: nothing is dialled when it is asked for."""
+
+    def __init__(self, robot: RobotConfig, session: Session, here: Path | None) -> None:
+        """Take an open session.
+
+        Args:
+            robot: the robot.
+            session: on its bus.
+            here: run directory of this robot's services on this host, whose shared memory tells of
+                them too; None: none of its services is here.
+        """
+        self._robot, self._here = robot, here
+        self._publisher = session.publisher(topics.ESTOP, Estop)
+        self._states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
+        self._modes: dict[str, int] = {}
+        self._heard_s: dict[str, float] = {}
+        self._seq = 0
+
+    def listen(self) -> list[str]:
+        """Receive the modules' states; return those that were not heard just now."""
+        now_s = time.monotonic()
+        for module, latest in self._states.items():
+            state = latest.take()
+            if state is not None:
+                self._modes[module], self._heard_s[module] = state.mode, now_s
+        return [m for m in MODULES if now_s - self._heard_s.get(m, -UNHEARD_S) >= UNHEARD_S]
+
+    def stop(self) -> list[str]:
+        """Publish the stop until all six modules have stopped; return each that has not.
+
+        What was heard before does not count: a module may be silent since.
+        """
+        self.listen()
+        self._modes.clear()
+        deadline, going = time.monotonic() + GIVE_UP_S, list(MODULES)
+        while going and time.monotonic() < deadline:
+            self._seq += 1
+            self._publisher.put(Estop(t_ns=now_ns(), seq=self._seq, source=_source()))
+            time.sleep(REPEAT_S)
+            self.listen()
+            going = [module for module in going if not self._has_stopped(module)]
+        told = [f"{m} {Mode(self._modes[m]).name if m in self._modes else 'silent'}" for m in going]
+        if told and self._robot.bus.security.mode == "mtls":
+            name = read_credentials(self._robot, "estop").name
+            told += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
+        return told
+
+    def _has_stopped(self, module: str) -> bool:
+        by_memory = self._here is not None and _is_stopped(self._here, module)
+        return by_memory or self._modes.get(module) in STOPPED
+
+
+def stop_all(robot: RobotConfig, run_dir: Path, *, here: bool) -> list[str]:
+    """Open a session and publish the stop until all six modules have stopped.
+
+    Args:
+        robot: the robot.
+        run_dir: where the sockets of a fleet on this host are.
+        here: the robot's services are in that run directory.
 
     Returns:
         Each module that has not stopped, with its mode.
@@ -69,27 +130,8 @@ def stop_all(robot: RobotConfig, run_dir: Path) -> list[str]:
     Raises:
         BusError: the bus cannot be opened.
     """
-    modes: dict[str, int] = {}
     with open_session(robot, "estop", run_dir) as session:
-        publisher = session.publisher(topics.ESTOP, Estop)
-        states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
-        seq, deadline, going = 0, time.monotonic() + GIVE_UP_S, list(MODULES)
-        while going and time.monotonic() < deadline:
-            seq += 1
-            publisher.put(Estop(t_ns=now_ns(), seq=seq, source=_source()))
-            time.sleep(REPEAT_S)
-            for module, latest in states.items():
-                state = latest.take()
-                if state is not None:
-                    modes[module] = state.mode
-            going = [
-                m for m in going if modes.get(m) not in STOPPED and not _is_stopped(run_dir, m)
-            ]
-    going = [f"{m} {Mode(modes[m]).name if m in modes else 'silent'}" for m in going]
-    if going and robot.bus.security.mode == "mtls":
-        name = read_credentials(robot, "estop").name
-        going += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
-    return going
+        return BusStop(robot, session, run_dir if here else None).stop()
 
 
 def _source() -> str:

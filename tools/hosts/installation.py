@@ -29,6 +29,8 @@ from tools.keys.bundle import bundle
 
 CLOCK_MAX_S: Final = 1.0
 """Certificates and the names of records go by the clock; ages do not."""
+_AT_REST: Final = ("inactive", "failed", "unknown")
+"""States of a unit whose services are down."""
 _UNIT_FOLDER: Final = "/etc/systemd/system"
 
 
@@ -90,9 +92,10 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: boo
     Raises:
         FleetError: the host is not reached, its services are running, or a file cannot be written.
     """
-    if not while_up and _state(remote) != "inactive":
+    state = _state(remote)
+    if not while_up and state not in _AT_REST:
         raise FleetError(
-            f"{remote.host.name}: its unit is {_state(remote)}: a service that crashes would come "
+            f"{remote.host.name}: its unit is {state}: a service that crashes would come "
             "back with the new files beside the old; `xrl hosts down` first, or --while-up"
         )
     folder = hosts.folder

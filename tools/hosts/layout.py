@@ -14,7 +14,9 @@ ROBOT_FILE: Final = "robot.toml"
 SCHEDULE: Final = "robot.gains.json"
 KEYS: Final = "keys"
 UNIT: Final = "xrl.service"
-RUN_DIR: Final = "/run/xrl"
+RUN_DIR: Final = "/var/lib/xrl/run"
+"""On the disk and not in memory: an emergency stop outlasts a power cut, once the kernel has
+written it, within half a minute."""
 
 _SIMULATOR_HOST: Final = "127.0.0.1"
 
@@ -61,9 +63,6 @@ TimeoutStopSec=30
 OOMPolicy=continue
 OOMScoreAdjust=-500
 User={hosts.user}
-RuntimeDirectory=xrl
-RuntimeDirectoryMode=0700
-RuntimeDirectoryPreserve=yes
 StateDirectory=xrl
 StateDirectoryMode=0750
 WorkingDirectory=/var/lib/xrl

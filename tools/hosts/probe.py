@@ -1,6 +1,6 @@
 """What `xrl hosts check` asks a host: one line of JSON, then its clock for each line it is sent.
 
-python -m tools.hosts.probe --config /etc/xrl/robot.toml --run-dir /run/xrl
+python -m tools.hosts.probe --config /etc/xrl/robot.toml --run-dir /var/lib/xrl/run
 """
 
 from __future__ import annotations

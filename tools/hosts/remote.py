@@ -7,7 +7,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Final, NamedTuple, TypeVar
 
 from shared.exceptions import FleetError
@@ -42,15 +42,23 @@ class Remote:
     def __init__(self, hosts: Hosts, host: Host) -> None:
         self.host = host
         self._begin = [*hosts.ssh, host.ssh]
-        self._as_user = ["runuser", "-u", hosts.user, "--"]
+        # from a folder that every user may enter: find and others go back to where they began
+        self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
-    def run(self, *words: str, content: bytes = b"", as_user: bool = False) -> Said:
+    def run(
+        self,
+        *words: str,
+        content: bytes = b"",
+        as_user: bool = False,
+        timeout_s: float = TIMEOUT_S,
+    ) -> Said:
         """Run a command and wait for it.
 
         Args:
             words: the command; no shell takes them apart.
             content: for its standard input.
             as_user: as the user who runs the services, not as the one who logs in.
+            timeout_s: time in which it has to end.
 
         Raises:
             FleetError: the host is not reached, or the command does not end.
@@ -59,10 +67,10 @@ class Remote:
         name = self.host.name
         try:
             done = subprocess.run(
-                command, input=content, capture_output=True, timeout=TIMEOUT_S, check=False
+                command, input=content, capture_output=True, timeout=timeout_s, check=False
             )
         except subprocess.TimeoutExpired:
-            raise FleetError(f"{name}: {words[0]}: no end after {TIMEOUT_S:g} s") from None
+            raise FleetError(f"{name}: {words[0]}: no end after {timeout_s:g} s") from None
         except OSError as error:
             raise FleetError(f"{name}: {command[0]}: {error.strerror}") from None
         told = done.stderr.decode(errors="replace").strip()
@@ -70,13 +78,19 @@ class Remote:
             raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(told)}")
         return Said(done.returncode, done.stdout.decode(errors="replace"), told)
 
-    def must(self, *words: str, content: bytes = b"", as_user: bool = False) -> str:
+    def must(
+        self,
+        *words: str,
+        content: bytes = b"",
+        as_user: bool = False,
+        timeout_s: float = TIMEOUT_S,
+    ) -> str:
         """Run a command that has to succeed, and return what it printed.
 
         Raises:
             FleetError: it failed, or as `run`.
         """
-        said = self.run(*words, content=content, as_user=as_user)
+        said = self.run(*words, content=content, as_user=as_user, timeout_s=timeout_s)
         if said.code != 0:
             why = _last(said.error) or f"exit status {said.code}"
             raise FleetError(f"{self.host.name}: {shlex.join(words)[:120]}: {why}")
@@ -140,8 +154,21 @@ def _talk(process: subprocess.Popen[str]) -> tuple[str, list[ClockOffset]]:
     return first, found
 
 
-def on_all(remotes: Sequence[Remote], work: Callable[[Remote], R]) -> dict[str, R | FleetError]:
-    """Do the same on all hosts at a time; a host that fails gives its error."""
+def on_all(
+    remotes: Sequence[Remote],
+    work: Callable[[Remote], R],
+    tell: Callable[[str, R | FleetError], None] = lambda _name, _result: None,
+) -> dict[str, R | FleetError]:
+    """Do the same on all hosts at a time; a host that fails gives its error.
+
+    Args:
+        remotes: the hosts.
+        work: what to do.
+        tell: takes a host's name and result as soon as it has one.
+
+    Returns:
+        Each host's result, in the order of the hosts.
+    """
 
     def attempt(remote: Remote) -> R | FleetError:
         try:
@@ -149,9 +176,13 @@ def on_all(remotes: Sequence[Remote], work: Callable[[Remote], R]) -> dict[str, 
         except FleetError as error:
             return error
 
+    found: dict[str, R | FleetError] = {}
     with ThreadPoolExecutor(len(remotes)) as pool:
-        results = list(pool.map(attempt, remotes))
-    return {remote.host.name: result for remote, result in zip(remotes, results, strict=True)}
+        names = {pool.submit(attempt, remote): remote.host.name for remote in remotes}
+        for future in as_completed(names):
+            found[names[future]] = future.result()
+            tell(names[future], found[names[future]])
+    return {remote.host.name: found[remote.host.name] for remote in remotes}
 
 
 def _last(text: str) -> str:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from typing import Final
 
 import msgspec
 
+from services.joint.drivers.base import DriveStatus
 from shared.bus.messages import Mode
 from shared.exceptions import FleetError
 from shared.robot.joints import MODULES
@@ -17,55 +19,69 @@ from tools.hosts.remote import Remote
 
 HEARD_S: Final = 10.0
 """A joint service that is up is heard within this time."""
-_LEADING: Final = (Mode.TRACK.name, Mode.HOLD.name)
+ESTOP_S: Final = 10.0
+"""A host that has not answered by then has not stopped."""
+_ARMABLE: Final = (DriveStatus.IDLE.name, DriveStatus.ERROR.name)
 
 
-def up(hosts: Hosts, remote: Remote, *, armed: bool) -> str:
-    """Start a host's services; a person asks for them, so idle drives are armed.
-
-    A module that tracks or holds is left alone, and so is one that an emergency stop holds.
+def start(remote: Remote) -> str:
+    """Start a host's services; a drive that holds is taken over, and none is armed.
 
     Raises:
-        FleetError: the unit does not start, a joint service is not heard, or an emergency stop
-            holds.
+        FleetError: the unit does not start.
     """
     remote.must("systemctl", "start", UNIT)
-    mine = [name for name in remote.host.services if name in MODULES] if armed else []
-    found = _heard(hosts, remote, mine)
-    stopped = {name: row for name, row in found.items() if row.mode == Mode.DAMP.name}
-    idle = [name for name, row in found.items() if row.mode not in (*_LEADING, Mode.DAMP.name)]
-    for module in idle:
-        remote.must(_xrl(hosts), "kill", module, "--run-dir", RUN_DIR, as_user=True)
-    if stopped:
-        who = next((row.stopped_by for row in stopped.values() if row.stopped_by), "somebody")
-        raise FleetError(
-            f"{remote.host.name}: {', '.join(stopped)}: an emergency stop by {who} holds; "
-            "`xrl hosts down`, then `up`, ends it"
-        )
-    rest = "" if armed else "; no drive armed"
-    rest += f"; drives of {', '.join(idle)} are armed" if idle else ""
-    return f"up: {', '.join(remote.host.services)}{rest}"
+    return f"up: {', '.join(remote.host.services)}"
 
 
-def _heard(hosts: Hosts, remote: Remote, mine: list[str]) -> dict[str, ModuleStatus]:
-    """Return the status of a host's modules, once all are heard.
+def heard(hosts: Hosts, remote: Remote) -> FleetStatus:
+    """Return a host's status, once each of its own modules is heard.
 
     Raises:
         FleetError: one is not.
     """
-    if not mine:
-        return {}
     deadline = time.monotonic() + HEARD_S
     while True:
-        modules = status(hosts, remote).modules
-        silent = [name for name in mine if modules[name].mode is None]
+        found = status(hosts, remote)
+        silent = [name for name in _modules_of(remote) if found.modules[name].mode is None]
         if not silent:
-            return {name: modules[name] for name in mine}
+            return found
         if time.monotonic() > deadline:
             raise FleetError(
-                f"{remote.host.name}: {', '.join(silent)}: not heard for {HEARD_S:g} s, so not "
-                "armed; `journalctl -u xrl` there"
+                f"{remote.host.name}: {', '.join(silent)}: not heard for {HEARD_S:g} s, so nothing "
+                "is armed; `journalctl -u xrl` there"
             )
+
+
+def stopped_in(found: Iterable[FleetStatus]) -> dict[str, str]:
+    """Return each module that an emergency stop holds, with who engaged it, or ""."""
+    stopped: dict[str, str] = {}
+    for one in found:
+        for name, row in one.modules.items():
+            if row.mode == Mode.DAMP.name or row.stopped_by:
+                stopped[name] = stopped.get(name) or row.stopped_by
+    return stopped
+
+
+def arm(hosts: Hosts, remote: Remote, found: FleetStatus) -> str:
+    """Have the host's joint services arm the drives that are idle; what holds is left alone.
+
+    Args:
+        hosts: all of them.
+        remote: the host.
+        found: its status.
+
+    Raises:
+        FleetError: a service cannot be asked for.
+    """
+    idle = [name for name in _modules_of(remote) if found.modules[name].drive in _ARMABLE]
+    for module in idle:
+        remote.must(_xrl(hosts), "kill", module, "--run-dir", RUN_DIR, as_user=True)
+    return f"drives of {', '.join(idle)} are armed" if idle else "no drive to arm"
+
+
+def _modules_of(remote: Remote) -> list[str]:
+    return [name for name in remote.host.services if name in MODULES]
 
 
 def estop(hosts: Hosts, remote: Remote) -> str:
@@ -74,19 +90,21 @@ def estop(hosts: Hosts, remote: Remote) -> str:
     Raises:
         FleetError: the host is not reached, or a module has not stopped.
     """
-    if not set(remote.host.services) & set(MODULES):
+    mine = _modules_of(remote)
+    if not mine:
         return "no module here"
-    words = ("estop", "--local", "--partly", "--run-dir", RUN_DIR)
-    return remote.must(_xrl(hosts), *words, as_user=True).strip()
+    words = ("estop", "--local", "--partly", ",".join(mine), "--run-dir", RUN_DIR)
+    return remote.must(_xrl(hosts), *words, as_user=True, timeout_s=ESTOP_S).strip()
 
 
-def down(remote: Remote) -> str:
-    """Stop a host's services.
+def down(hosts: Hosts, remote: Remote) -> str:
+    """Stop a host's services, and forget an emergency stop: a person asks for that.
 
     Raises:
         FleetError: they do not stop.
     """
     remote.must("systemctl", "stop", UNIT)
+    remote.must(_xrl(hosts), "down", "--run-dir", RUN_DIR, as_user=True)
     return "down"
 
 

@@ -128,7 +128,8 @@ def hosts_of(robot: RobotConfig, name: str) -> tuple[str, ...]:
     found = re.fullmatch(r"tls/\[?([^\]]+?)\]?:\d+", endpoint)
     if found is None:
         raise BusError(
-            f"bus.endpoints.{name}: {endpoint!r} has no certificate; tls/HOST:PORT is right"
+            f"bus.endpoints.{name}: {endpoint!r} has no certificate; tls/HOST:PORT is "
+            "right, or --hosts FILE for a robot on several hosts"
         )
     return (found[1],)
 

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from pathlib import Path
+from typing import Final
 
 from rich.console import Console
 
+from shared.bus.session import open_session
 from shared.config.files import load
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, XrlError
-from tools.fleet.emergency_stop import GIVE_UP_S, request_here, stop_all, wait_here
+from shared.process import StopFlag
+from shared.robot.joints import MODULES
+from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
+from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
+from tools.typed_line import typed_line
 from tools.verb_table import Subparsers, add_run_dir, add_verb
+
+EVERY_S: Final = 0.02
+LINKS_S: Final = 2.0
+"""Time that the links may take to come up before a silent module is told, s."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -25,6 +37,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl estop --run-dir /tmp/lab
         xrl estop --local                       # on the robot's own host: needs no bus
         xrl estop --config lab.toml             # from another computer, with an operator's key
+        xrl estop --config lab.toml --wait      # open the links now; Enter or Ctrl-C is the stop
         """,
     )
     add_run_dir(parser, Path)  # whoever can reach the robot may stop it
@@ -35,8 +48,15 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument(
         "--partly",
+        type=_modules,
+        metavar="MODULE,...",
+        help="with --local: only these have to stop, the others are on other hosts (default: all)",
+    )
+    parser.add_argument(
+        "--wait",
         action="store_true",
-        help="with --local: the other modules are on other hosts (default: all six must stop)",
+        help="open the links now, say whether all six modules are heard, and stop at Enter, Ctrl-C "
+        "or the terminal's end; q and Enter leaves without a stop",
     )
     parser.add_argument(
         "--config",
@@ -51,27 +71,94 @@ def run(args: argparse.Namespace) -> int:
     run_dir: Path = args.run_dir
     if args.partly and not args.local:
         raise FleetError("--partly goes with --local: over the bus all six have to stop")
-    here, errors = request_here(run_dir)  # first: it needs no bus and no supervisor
+    if args.wait and args.local:
+        raise FleetError("--wait is for the bus; `xrl pendant` waits by shared memory")
+    is_here = _is_here(args)
+    if args.wait:
+        return _wait(_robot(args), run_dir, here=is_here)
+    here, errors = request_here(run_dir) if is_here else ([], [])  # first: it needs no bus
     for line in errors:
         print(f"xrl: {line}", file=sys.stderr)
+    wanted = args.partly or MODULES
     if args.local:
         if not here:
-            raise FleetError(f"{run_dir}: no joint service of a fleet is on this host")
-        going = wait_here(run_dir, here, partly=args.partly)
+            raise FleetError(f"{run_dir}: no joint service of this robot is on this host")
+        going = wait_here(run_dir, here, wanted)
     else:
         try:
-            config = args.config or Path(SupervisedFleet.attach(run_dir).manifest.config)
-            going = stop_all(load(config), run_dir)
+            going = stop_all(_robot(args), run_dir, here=is_here)
         except XrlError as error:
             if not here:
                 raise
             print(f"xrl: not over the bus: {error}", file=sys.stderr)
             going = wait_here(run_dir, here)
+    _conclude(going, ", ".join(args.partly) if args.partly else "all six modules")
+    return 0
+
+
+def _is_here(args: argparse.Namespace) -> bool:
+    """Return True if the run directory is of the robot that is meant: any, if none was named."""
+    if args.config is None:
+        return True
+    manifest = RunDir(args.run_dir).read_manifest()
+    return manifest is not None and Path(manifest.config).resolve() == args.config.resolve()
+
+
+def _modules(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+    for name in names:
+        if name not in MODULES:
+            raise argparse.ArgumentTypeError(f"{name!r}: one of {', '.join(MODULES)}")
+    return names
+
+
+def _robot(args: argparse.Namespace) -> RobotConfig:
+    """Return the robot that is asked for, or whose fleet is up.
+
+    Raises:
+        ConfigError, FleetError: there is none.
+    """
+    config = args.config or Path(SupervisedFleet.attach(args.run_dir).manifest.config)
+    return load(config)
+
+
+def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
+    """Keep the links open until a person asks for the stop, or leaves."""
+    console, asked = Console(), StopFlag()
+    with open_session(robot, "estop", run_dir) as session:
+        stop = BusStop(robot, session, run_dir if here else None)
+        console.print("Enter, Ctrl-C, or this terminal's end stops all modules; q and Enter leaves")
+        told: list[str] | None = None
+        since_s = time.monotonic()
+        typed = None
+        while not asked and typed is None:
+            typed = typed_line(EVERY_S)
+            silent = stop.listen()
+            if silent != told and time.monotonic() - since_s > LINKS_S:
+                told = silent
+                words = (
+                    f"[bold red]not heard: {', '.join(silent)}[/]" if silent else "all six heard"
+                )
+                console.print(words)
+        if not asked and typed is not None and typed.strip().lower() == "q":
+            console.print("left without a stop")
+            return 0
+        if here:
+            request_here(run_dir)
+        going = stop.stop()
+    _conclude(going, "all six modules")
+    return 0
+
+
+def _conclude(going: list[str], which: str) -> None:
+    """Say how it ended.
+
+    Raises:
+        FleetError: a module has not stopped.
+    """
     if going:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
-    which = ", ".join(here) if args.partly else "all six modules"
     Console().print(
         f"{which} are stopped: DAMP. The robot sinks slowly, or holds beside a limp or dead "
         "module; `xrl down` ends it"
     )
-    return 0

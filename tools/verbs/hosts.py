@@ -42,16 +42,39 @@ xrl hosts down
 class _Given(NamedTuple):
     """What every order works with."""
 
+    args: argparse.Namespace
     hosts: Hosts
     robot: RobotConfig
-    schedule: bytes
-    authority: Authority | None
     remotes: list[Remote]
 
-    def files(self, remote: Remote) -> list[HostFile]:
-        return installation.files_of(
-            self.hosts, remote.host, self.robot, self.schedule, self.authority
-        )
+    def files(self) -> dict[str, list[HostFile]]:
+        """Return the files of each host by its name; without an authority all but the keys.
+
+        Raises:
+            ConfigError, RunError, BusError: the gain schedule or the authority cannot be used.
+        """
+        config: Path = self.args.config
+        gain_schedule.require(self.robot, config)
+        try:
+            schedule = gain_schedule.path_beside(config).read_bytes()
+        except OSError as error:
+            raise RunError(f"{gain_schedule.path_beside(config)}: {error.strerror}") from None
+        authority = self.authority()
+        return {
+            remote.host.name: installation.files_of(
+                self.hosts, remote.host, self.robot, schedule, authority
+            )
+            for remote in self.remotes
+        }
+
+    def authority(self) -> Authority | None:
+        """Return the authority of this robot's keys; None if there is none yet.
+
+        Raises:
+            BusError: its folder cannot be used.
+        """
+        folder = self.args.authority or authorities.default_folder(self.robot)
+        return Authority(folder) if folder.is_dir() else None
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -100,75 +123,91 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what was asked for, on all hosts at a time."""
+    """Do what was asked for, on all hosts at a time.
+
+    Only what an order needs is read: a stop must not fail for want of a gain schedule.
+    """
     robot = config_file.load(args.config)
-    gain_schedule.require(robot, args.config)
-    schedule = gain_schedule.path_beside(args.config).read_bytes()
     hosts = hosts_file.load(args.hosts, robot)
-    folder = authorities.default_folder(robot) if args.authority is None else args.authority
-    authority = Authority(folder) if folder.is_dir() else None
     remotes = [Remote(hosts, host) for host in hosts.named(tuple(args.names))]
-    given = _Given(hosts, robot, schedule, authority, remotes)
-    return int(args.order(args, given))
+    return int(args.order(_Given(args, hosts, robot, remotes)))
 
 
-def _files(args: argparse.Namespace, given: _Given) -> int:
+def _files(given: _Given) -> int:
+    out: Path = given.args.out
     for remote in given.remotes:
-        for file in given.files(remote):
-            path = args.out / remote.host.name / file.path.lstrip("/")
+        for file in given.files()[remote.host.name]:
+            path = out / remote.host.name / file.path.lstrip("/")
             try:
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             except OSError as error:
                 raise RunError(f"{path.parent}: cannot be made: {error.strerror}") from None
             write_atomically(path, file.content, private=file.of_service)
-        print(f"{args.out / remote.host.name}: {', '.join(remote.host.services)}")
-    if given.authority is None:
+        print(f"{out / remote.host.name}: {', '.join(remote.host.services)}")
+    if given.authority() is None:
         print("without keys: there is no authority yet; `xrl keys make --hosts FILE`")
     return 0
 
 
-def _update(args: argparse.Namespace, given: _Given) -> int:
-    if given.authority is None:
+def _update(given: _Given) -> int:
+    if given.authority() is None:
         raise RunError("there is no authority yet; `xrl keys make --hosts FILE` makes one")
+    files = given.files()
 
     def one(remote: Remote) -> str:
-        files = given.files(remote)
-        return installation.update(given.hosts, remote, files, while_up=args.while_up)
+        mine = files[remote.host.name]
+        return installation.update(given.hosts, remote, mine, while_up=given.args.while_up)
 
     return _each(given, one)
 
 
-def _up(args: argparse.Namespace, given: _Given) -> int:
-    armed = not args.disarmed
-    return _each(given, lambda remote: running.up(given.hosts, remote, armed=armed))
+def _up(given: _Given) -> int:
+    """Start all, look at all, and only then arm: an emergency stop on one host is one for all."""
+    failed_to_start = _each(given, running.start)
+    if failed_to_start or given.args.disarmed:
+        return failed_to_start
+    found = on_all(given.remotes, lambda remote: running.heard(given.hosts, remote))
+    failed = [one for one in found.values() if isinstance(one, FleetError)]
+    statuses = {name: one for name, one in found.items() if not isinstance(one, FleetError)}
+    for error in failed:
+        _tell("", error)
+    stopped = running.stopped_in(statuses.values())
+    if stopped:
+        who = next((name for name in stopped.values() if name), "somebody")
+        words = f"an emergency stop by {who} holds {', '.join(stopped)}: nothing is armed; "
+        _tell("", FleetError(f"{words}`xrl hosts down`, then `up`, ends it"))
+    if failed or stopped:
+        return 1
+    return _each(given, lambda r: running.arm(given.hosts, r, statuses[r.host.name]))
 
 
-def _estop(_args: argparse.Namespace, given: _Given) -> int:
+def _estop(given: _Given) -> int:
     failed = _each(given, lambda remote: running.estop(given.hosts, remote))
     if failed:
         Console().print("[bold red]not all have stopped: cut the power[/]")
     return failed
 
 
-def _down(_args: argparse.Namespace, given: _Given) -> int:
-    return _each(given, running.down)
+def _down(given: _Given) -> int:
+    return _each(given, lambda remote: running.down(given.hosts, remote))
 
 
-def _status(_args: argparse.Namespace, given: _Given) -> int:
+def _status(given: _Given) -> int:
     found = on_all(given.remotes, lambda remote: running.status(given.hosts, remote))
     good = {name: one for name, one in found.items() if not isinstance(one, FleetError)}
-    console = Console()
     if good:
-        console.print(tables(running.joined(good)))
-    for error in found.values():
-        if isinstance(error, FleetError):
-            console.print(f"[bold red]{escape(str(error))}[/]")
+        Console().print(tables(running.joined(good)))
+    for name, one in found.items():
+        if isinstance(one, FleetError):
+            _tell(name, one)
     return 0 if len(good) == len(found) else 1
 
 
-def _check(_args: argparse.Namespace, given: _Given) -> int:
+def _check(given: _Given) -> int:
+    files = given.files()
     found = on_all(
-        given.remotes, lambda remote: installation.check(given.hosts, remote, given.files(remote))
+        given.remotes,
+        lambda remote: installation.check(given.hosts, remote, files[remote.host.name]),
     )
     rows = [
         HostRow(name, wrong=(str(row),)) if isinstance(row, FleetError) else row
@@ -183,16 +222,15 @@ def _check(_args: argparse.Namespace, given: _Given) -> int:
 
 
 def _each(given: _Given, work: Callable[[Remote], str]) -> int:
-    """Do the same on all hosts and say how it went; 1 if it failed on one."""
-    console = Console()
-    failed = False
-    with console.status(f"{len(given.remotes)} hosts"):
-        found = on_all(given.remotes, work)
-    for name, result in found.items():
-        failed |= isinstance(result, FleetError)
-        text = str(result) if isinstance(result, FleetError) else f"{name}: {result}"
-        console.print(f"[bold red]{escape(text)}[/]" if isinstance(result, FleetError) else text)
-    return 1 if failed else 0
+    """Do the same on all hosts, and say of each how it went as soon as it has; 1 if one failed."""
+    found = on_all(given.remotes, work, _tell)
+    return int(any(isinstance(result, FleetError) for result in found.values()))
+
+
+def _tell(name: str, result: str | FleetError) -> None:
+    bad = isinstance(result, FleetError)
+    text = escape(str(result)) if bad else f"{name}: {result}"
+    Console().print(f"[bold red]{text}[/]" if bad else text, highlight=False, soft_wrap=True)
 
 
 def _table(rows: list[HostRow]) -> Table:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import select
-import sys
 import time
 from typing import Final
 
@@ -16,6 +14,7 @@ from shared.process import StopFlag
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, request_here, wait_here
 from tools.number_arguments import finite
+from tools.typed_line import typed_line
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 EVERY_S: Final = 0.02
@@ -69,27 +68,16 @@ def run(args: argparse.Namespace) -> int:
     shown = None
     while not stop and shown != "":
         pendant.beat()
-        shown = _line(EVERY_S)
+        shown = typed_line(EVERY_S)
         if shown or (ends is not None and time.monotonic() >= ends):
             pendant.lay_down()
             console.print("laid down: the robot continues without it")
             return 0
     request_here(args.run_dir)  # faster than the pendant's silence
-    going = wait_here(args.run_dir, list(pendant.modules))
-    if going := [words for words in going if words in pendant.modules]:
+    going = wait_here(args.run_dir, list(pendant.modules), pendant.modules)
+    if going:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
     console.print(
         "stopped: DAMP. It sinks slowly, or holds beside a limp or dead module; `xrl down` ends it"
     )
     return 0
-
-
-def _line(wait_s: float) -> str | None:
-    """Return the line that a person enters within a time, s; None: none, "": the terminal is gone.
-
-    Without a terminal there is nobody to enter one.
-    """
-    if not sys.stdin.isatty():
-        time.sleep(wait_s)
-        return None
-    return sys.stdin.readline() if select.select([sys.stdin], [], [], wait_s)[0] else None

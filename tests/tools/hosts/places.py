@@ -38,7 +38,8 @@ SHARED = "etc-xrl"
 """Folder of robot file and keys of hosts whose services run: files name it."""
 
 TOOLS = {
-    "runuser": 'while [ "$1" != -- ]; do shift; done; shift; exec "$@"',
+    "runuser": '[ "$PWD" = / ] || { echo "may not stay in $PWD" >&2; exit 1; }; '
+    'while [ "$1" != -- ]; do shift; done; shift; exec "$@"',
     "install": (
         'words=(); while [ $# -gt 0 ]; do [ "$1" = -o ] && shift 2 && continue; '
         'words+=("$1"); shift; done; exec /usr/bin/install "${words[@]}"'
@@ -47,12 +48,12 @@ TOOLS = {
 unit=$ROOT/etc/systemd/system/xrl.service
 line() { sed -e ':a' -e '/\\\\$/N; s/\\\\\\n *//; ta' "$unit" | sed -n "s/^$1=//p" |
   sed -E "s#(^| )/(etc|run|var)/#\\1$ROOT/\\2/#g"; }
-pid=$(cat "$ROOT/run/xrl/supervisord.pid" 2>/dev/null)
+pid=$(cat "$ROOT/var/lib/xrl/run/supervisord.pid" 2>/dev/null)
 case "$1" in
   start) grep -qs '^State:.[RSD]' "/proc/$pid/status" && exit 0
     mkdir -p "$ROOT/var/lib/xrl"; cd "$ROOT/var/lib/xrl" && exec $(line ExecStart) ;;
-  stop) exec $(line ExecStop) ;;
-  is-active) [ -e "$ROOT/run/xrl/supervisord.pid" ] && echo active || echo inactive ;;
+  stop) cd / && exec $(line ExecStop) ;;
+  is-active) [ -e "$ROOT/var/lib/xrl/run/supervisord.pid" ] && echo active || echo inactive ;;
 esac
 exit 0""",
 }

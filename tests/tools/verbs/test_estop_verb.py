@@ -1,0 +1,73 @@
+"""`xrl estop`: which robot it stops, and of what it does not say that it has stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from services.joint.neighbours import NeighbourRow, Neighbours
+from services.joint.rearm_guard import RearmGuard
+from shared.bus.messages import Mode
+from shared.process import DEFAULT_CONFIG
+from shared.robot.joints import MODULES
+from tests.tools.exit_codes import exit_code
+from tools.fleet.run_dir import Manifest, RunDir
+
+
+@pytest.fixture
+def fleet(run_dir: Path) -> list[RearmGuard]:
+    """Return what the six services of a fleet of the shipped robot have open; all are in DAMP."""
+    run_dir.mkdir()
+    manifest = Manifest(str(DEFAULT_CONFIG), MODULES, {}, (), 1.0)
+    RunDir(run_dir).manifest.write_bytes(msgspec.json.encode(manifest))
+    for module in MODULES:
+        Neighbours(run_dir, module).write(NeighbourRow(1, 0.0, 0.0, Mode.DAMP))
+    return [RearmGuard(run_dir, module) for module in MODULES]
+
+
+def test_another_robots_stop_leaves_the_fleet_of_this_host_alone_and_is_not_taken_for_done(
+    run_dir: Path, fleet: list[RearmGuard], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "lab.toml"
+    other.write_text(DEFAULT_CONFIG.read_text(encoding="utf-8"), encoding="utf-8")
+    assert exit_code(["estop", "--config", other, "--run-dir", run_dir]) == 2
+    assert not any(guard.stop_requested for guard in fleet)
+    said = capsys.readouterr().err
+    assert all(f"{module} silent" in said for module in MODULES)
+
+
+def test_the_robot_of_this_hosts_fleet_is_stopped_by_shared_memory_too(
+    run_dir: Path, fleet: list[RearmGuard]
+) -> None:
+    assert exit_code(["estop", "--config", DEFAULT_CONFIG, "--run-dir", run_dir]) == 0
+    assert all(guard.stop_requested for guard in fleet)
+
+
+def test_of_several_hosts_one_answers_for_its_own_modules_and_for_each_of_them(
+    run_dir: Path, fleet: list[RearmGuard], capsys: pytest.CaptureFixture[str]
+) -> None:
+    local = ["estop", "--local", "--run-dir", run_dir]
+    assert exit_code([*local, "--partly", "knee_left,hip_left"]) == 0
+    assert "knee_left, hip_left are stopped" in capsys.readouterr().out
+    for path in run_dir.glob("knee_left*"):
+        path.unlink()
+    del fleet
+    assert exit_code([*local, "--partly", "knee_left,hip_left"]) == 2
+    assert "knee_left has no service on this host" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--partly", "knee_left"], "--partly goes with --local"),
+        (["--local", "--partly", "elbow"], "'elbow': one of"),
+        (["--local", "--wait"], "--wait is for the bus"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    words: list[str], said: str, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code(["estop", *words, "--run-dir", run_dir]) == 2
+    assert said in capsys.readouterr().err
