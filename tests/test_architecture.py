@@ -53,6 +53,7 @@ VENDORS = {
         "services/simulator/world.py",
         "services/simulator/body.py",
         "services/simulator/foot_placement.py",
+        "services/simulator/soles.py",
     ],
     "pinocchio": ["services/planner/model.py"],
     "aiohttp": ["tools/view/server.py"],

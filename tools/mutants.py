@@ -168,8 +168,8 @@ def _prepare(group: Group, folder: Path) -> None:
             "-m", "not system", "-p", "no:cacheprovider", "--hypothesis-profile", "mutants",
         ],
         "pytest_add_cli_args_test_selection": list(group.tests),
-        "timeout_multiplier": 4.0,
-        "timeout_constant": 5.0,
+        "timeout_multiplier": 8.0,
+        "timeout_constant": 20.0,  # beside other work
     }  # fmt: skip
     text = tomli_w.dumps({"tool": {"pytest": project["tool"]["pytest"], "mutmut": settings}})
     (folder / "pyproject.toml").write_text(text, encoding="utf-8")

@@ -46,7 +46,7 @@ def taken(world: World, bank: AxisBank, t_ns: int, seq: int) -> SimState:
         vel_gain=inputs[4],
         counts_from=inputs[5],
         hidden=world.hidden(),
-        hand=() if world.led_hand is None else world.led_hand.state(),
+        hand=(world.led_hand or LedHand()).state(),
     )
 
 
@@ -63,7 +63,7 @@ def restored(world: World, bank: AxisBank, state: SimState) -> None:
     world.go_on(
         state.qpos, state.qvel, state.warmstart, state.scenario_s, state.hoist, state.hidden
     )
-    world.led_hand = LedHand.restored(state.hand) if state.hand else None
+    world.led_hand = LedHand.restored(state.hand) if any(state.hand) else None
     bank.counts_from[:] = state.counts_from
     bank.step(world.time, *world.motor_turns())
     for axis in range(N_JOINTS):

@@ -20,6 +20,7 @@ from services.simulator.hoist import Hoist
 from services.simulator.led_hand import LedHand
 from services.simulator.operator import HandForce, Operator, Wearer
 from services.simulator.posture import as_vector, measure_posture
+from services.simulator.soles import sole_loads
 from shared.bus.messages import HandLead, SimTruth, Vector3, Vector4
 from shared.config.scenarios import Lead, Scenario, lead, push_at
 
@@ -253,6 +254,7 @@ class World:
         posture = measure_posture(self.data, self._torso, placement.feet, placement.ankles)
         self._fallen |= posture.fallen
         moment = self.data.xmat[self._torso].reshape(3, 3)[:, 1] * self.hand.moment_pitch
+        right, left = sole_loads(self.model, self.data, placement.feet)
         self._truths += 1
         return SimTruth(
             t_ns=t_ns,
@@ -274,6 +276,10 @@ class World:
             real_time_factor=real_time_factor,
             late_s=late_s,
             lean=self._lean,
+            foot_right_force=right.force,
+            foot_left_force=left.force,
+            foot_right_cop=right.cop,
+            foot_left_cop=left.cop,
         )
 
 

@@ -444,11 +444,11 @@ class HandLead(Message, frozen=True):
 
     leads: bool
     """False: height and pitch are nothing; whoever leads goes on."""
-    height: float = 0.0
+    height: float
     """Torso origin above the ankles, m."""
-    pitch: float = 0.0
+    pitch: float
     """Of the torso, rad."""
-    push: Vector3 = (0.0, 0.0, 0.0)
+    push: Vector3
     """Push on the torso, N, world; it ends 0.3 s after the last message."""
     source: str = ""
     """Name of the sender."""
@@ -498,6 +498,14 @@ class SimTruth(Message, frozen=True):
     """World time lost so far because the machine was too slow, s."""
     lean: Pair = (0.0, 0.0)
     """Lean of up against the floor's normal along x and y, m/m; not zero on a slope."""
+    foot_right_force: Vector3 = (0.0, 0.0, 0.0)
+    """Force of the floor on the right sole, N, world."""
+    foot_left_force: Vector3 = (0.0, 0.0, 0.0)
+    """N"""
+    foot_right_cop: Pair = (0.0, 0.0)
+    """Centre of pressure on the right sole, x and y, m, world; (0, 0) if it bears nothing."""
+    foot_left_cop: Pair = (0.0, 0.0)
+    """m"""
 
     @property
     def over(self) -> Pair:

@@ -97,8 +97,9 @@ class SimState(Message, frozen=True):
     hidden: tuple[float, ...]
     """Hidden state of the plant: the person, the rotors and torques on their way, as
     `World.hidden`."""
-    hand: tuple[float, ...] = ()
-    """State of the hand that somebody leads in place of the scenario; empty: nobody does."""
+    hand: tuple[float, ...] = (0.0,) * 11
+    """State of the hand that somebody leads in place of the scenario, as `LedHand.state`; all zero:
+    nobody does."""
 
 
 class LinkEvent(Message, frozen=True):

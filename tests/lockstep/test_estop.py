@@ -142,7 +142,6 @@ def test_so_it_does_on_drawn_plants(robot: RobotConfig, number: int) -> None:
     assert found.speed < 0.25
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("dead", ["planner", *MODULES[:3]])
 def test_it_comes_down_on_its_feet_with_one_service_dead(robot: RobotConfig, dead: str) -> None:
     """A knee that sank beside one that its drive held tipped the robot sideways."""
@@ -155,7 +154,6 @@ def test_it_comes_down_on_its_feet_with_one_service_dead(robot: RobotConfig, dea
         assert found.sank > 0.1
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("limp", ["ankle_left", "hip_right"])
 def test_it_does_not_fall_with_an_ankle_or_a_hip_limp(robot: RobotConfig, limp: str) -> None:
     fault = Fault(module=limp, kind="disarmed", at=3.7)
@@ -203,7 +201,6 @@ def test_a_knee_that_crashes_on_the_way_down_and_is_started_again_tips_nothing(
     assert found.turned < 0.1
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("dead", ["ankle_left", "knee_right"])
 def test_a_hip_whose_leg_falls_silent_on_the_way_down_goes_on_without_a_step(
     robot: RobotConfig, dead: str

@@ -20,10 +20,10 @@ from tools.runs.lockstep import FleetMoment, Lockstep
 from tools.runs.network import BASE
 from tools.runs.run_log import read_run
 
-PUSH = (0.0, 30.0, 0.0)
+PUSH, NO_PUSH = (0.0, 30.0, 0.0), (0.0, 0.0, 0.0)
 PATH = (
-    (0.2, HandLead(t_ns=0, seq=0, leads=False, push=PUSH, source="test")),
-    (0.5, HandLead(t_ns=0, seq=0, leads=True, height=1.0, pitch=0.1, source="test")),
+    (0.2, HandLead(t_ns=0, seq=0, leads=False, height=0.0, pitch=0.0, push=PUSH, source="test")),
+    (0.5, HandLead(t_ns=0, seq=0, leads=True, height=1.0, pitch=0.1, push=NO_PUSH, source="test")),
     (1.7, HandLead(t_ns=0, seq=0, leads=True, height=1.1, pitch=0.0, push=PUSH, source="test")),
 )
 DURATION_S = 3.0

@@ -59,7 +59,6 @@ def test_a_planner_that_comes_back_leads_on_in_the_same_stance(robot: RobotConfi
     assert status.stance[5] == pytest.approx(0.2, abs=0.02)
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("right", "words"),
     [((0.2, 0.0, 0.0), "ahead of the left"), ((0.0, 0.0, -0.5), "turned outwards")],

@@ -164,7 +164,6 @@ def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
     assert not causes(fleet) & set(JOINT_TRIPS)
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("height", "pitch", "ways_s"),
     [(0.85, 0.0, 1.5), (1.29, 0.0, 1.5), (0.79, 1.2, 2.0), (0.7, 0.0, 3.0)],

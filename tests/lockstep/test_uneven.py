@@ -48,7 +48,7 @@ def assert_it_stood_and_tracked(result: Run) -> None:
     assert np.abs(result.operator_n).max() < 45.0
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("pushes", [IN_STEP, ALL_WAYS], ids=["in_step", "all_ways"])
 @pytest.mark.parametrize("network", UNEVEN)
 def test_it_stands_through_pushes_while_all_six_track(
@@ -58,7 +58,6 @@ def test_it_stands_through_pushes_while_all_six_track(
     assert_it_stood_and_tracked(run(robot, scenario))
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("module", ["ankle_left", "hip_left"])
 def test_so_it_does_with_any_other_module_late(robot: RobotConfig, module: str) -> None:
     scenario = still(

@@ -20,7 +20,8 @@ NUMBER = st.floats(allow_nan=True, allow_infinity=True)
 
 
 def asked(**fields: object) -> HandLead:
-    return msgspec.convert({"t_ns": 1, "seq": 1, "leads": True} | fields, HandLead)
+    rest = {"t_ns": 1, "seq": 1, "leads": True, "height": 0.0, "pitch": 0.0, "push": (0, 0, 0)}
+    return msgspec.convert(rest | fields, HandLead)
 
 
 @given(st.lists(st.tuples(NUMBER, NUMBER), min_size=1, max_size=20))

@@ -1,4 +1,4 @@
-"""`xrl demo --view`: a page leads, pushes, freezes and kills a live fleet, and is recorded."""
+"""`xrl demo --view`: a page leads, pushes, freezes, kills and stops a live fleet, recorded."""
 
 from __future__ import annotations
 
@@ -86,6 +86,8 @@ async def lead(address: str) -> None:
         await client.order("kill", service="cook")
         await client.until(lambda _: client.complaints != [])
         assert "no service 'cook'" in client.complaints[0]
+        await client.order("estop")
+        await client.until(all_in(Mode.DAMP))
 
 
 def test_a_page_leads_pushes_freezes_and_kills_and_the_log_has_it_all(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from typing import Final
 
 import msgspec
@@ -25,14 +26,28 @@ class HandRow(msgspec.Struct, frozen=True):
 def hand_path(log: RunLog) -> tuple[HandRow, ...]:
     """Return how the hand was led while the scenario ran, in order; empty if nobody led it.
 
+    Where it was led last before the scenario began is its first row: there it stayed.
+
     Raises:
         RunError: a message of the record cannot be read.
     """
     led: list[HandLead] = log.messages(topics.OPERATOR_HAND)
     truths: list[SimTruth] = log.messages(topics.SIM_TRUTH) if led else []
-    begin = next((truth for truth in truths if truth.scenario_s >= 0.0), None)
-    if begin is None:
+    truths = [truth for truth in truths if truth.scenario_s >= 0.0]
+    if not truths:
         return ()
-    zero_ns = begin.t_ns - round(begin.scenario_s * NS_PER_S)
-    rows = (HandRow((hand.t_ns - zero_ns - EARLY_NS) / NS_PER_S, hand) for hand in led)
-    return tuple(sorted((row for row in rows if row.at >= 0.0), key=lambda row: row.at))
+    stamps = [truth.t_ns for truth in truths]
+    begin_ns = stamps[0] - round(truths[0].scenario_s * NS_PER_S)
+    before = [hand for hand in led if hand.t_ns < begin_ns and hand.leads]
+    rows = [HandRow(0.0, _without_push(before[-1]))] if before else []
+    for hand in led:
+        if hand.t_ns >= begin_ns:
+            # by the newest truth: a simulator that is late leaves time out
+            truth = truths[max(0, bisect.bisect_right(stamps, hand.t_ns) - 1)]
+            after_ns = hand.t_ns - truth.t_ns - EARLY_NS
+            rows.append(HandRow(max(0.0, truth.scenario_s + after_ns / NS_PER_S), hand))
+    return tuple(rows)
+
+
+def _without_push(hand: HandLead) -> HandLead:
+    return msgspec.structs.replace(hand, push=(0.0, 0.0, 0.0))

@@ -174,7 +174,9 @@ class ScenarioRunner:
             self._listen()
             self._look_at_processes(meter)
             truth = self._truth
-            if truth is not None and truth.scenario_s >= 0.0:
+            if truth is not None and truth.scenario_s < 0.0:
+                raise RunError("the simulator was started again, and its scenario is gone")
+            if truth is not None:
                 # between two truths the scenario's clock runs on with ours
                 self._start_ns = truth.t_ns - round(truth.scenario_s * NS_PER_S)
                 if truth.fallen and fallen_at_s is None:

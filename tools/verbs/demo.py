@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 
 from rich.console import Console
 
@@ -131,8 +132,14 @@ def lead_run(
 
 @contextlib.contextmanager
 def _interrupts_set(event: threading.Event) -> Iterator[None]:
-    """Have Ctrl-C set an event meanwhile: the run ends there, and is judged."""
-    before = signal.signal(signal.SIGINT, lambda *_: event.set())
+    """Have Ctrl-C set an event meanwhile: the run ends there, and is judged. Twice interrupts."""
+
+    def interrupted(number: int, frame: FrameType | None) -> None:
+        if event.is_set():
+            signal.default_int_handler(number, frame)
+        event.set()
+
+    before = signal.signal(signal.SIGINT, interrupted)
     try:
         yield
     finally:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from services.simulator.plant import plant_from
+from shared.bus import topics
 from shared.bus.messages import SimTruth
 from shared.exceptions import RunError
 from shared.network.impairment import Impairment
@@ -114,7 +115,10 @@ def _path_of(record: Path) -> tuple[HandRow, ...]:
     Raises:
         RunError: it cannot be read, or nobody led it there.
     """
-    path = hand_path(read_run(record))
+    log = read_run(record)
+    path = hand_path(log)
+    if not path and log.messages(topics.OPERATOR_HAND):
+        raise RunError(f"{record}: no scenario ran while somebody led; `xrl demo --view` runs one")
     if not path:
-        raise RunError(f"{record}: nobody led the hand there; `xrl view --act` or --sim does")
+        raise RunError(f"{record}: nobody led the hand there; in `xrl demo --view` a person does")
     return path

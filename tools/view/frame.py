@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import msgspec
 import numpy as np
 
 from services.planner.kinematics import Kinematics
+from services.simulator.soles import SoleLoad
 from shared.bus import topics
 from shared.bus.messages import (
     JointCommand,
@@ -25,6 +26,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULE_INDEX, MODULES
 from tools.fleet.fleet_status import module_status
+from tools.view.sole_estimate import SoleEstimate
 
 STALE_NS: Final = NS_PER_S // 2
 """An older message is not shown: its sender is dead, stopped or cut off."""
@@ -55,6 +57,15 @@ class ShownProcess(msgspec.Struct, frozen=True):
     name: str
     state: str
     restarts: int
+
+
+class SoleShown(msgspec.Struct, frozen=True):
+    """What the floor does to one sole."""
+
+    force: Vector3
+    """N, world."""
+    cop: tuple[float, ...]
+    """Centre of pressure, x and y, m, world."""
 
 
 class Frame(msgspec.Struct, frozen=True):
@@ -89,6 +100,9 @@ class Frame(msgspec.Struct, frozen=True):
     is_true: bool
     """True: the pose is that of the simulated world; else what the legs' kinematics know."""
     fallen: bool
+    soles: tuple[SoleShown, ...]
+    """Right and left; empty if not known. Without a simulated world they are estimated from the
+    legs' torques."""
     ways_out: tuple[str, ...]
     """For each module what lets it track again; empty if nothing is needed."""
     processes: tuple[ShownProcess, ...] = ()
@@ -101,7 +115,7 @@ class Newest:
     """The newest message of each key that a frame is made of."""
 
     def __init__(self, robot: RobotConfig) -> None:
-        self._kinematics = Kinematics(robot)
+        self._kinematics, self._soles = Kinematics(robot), SoleEstimate(robot)
         self.clear()
 
     def clear(self) -> None:
@@ -174,12 +188,25 @@ class Newest:
             push=truth.push if isinstance(truth, SimTruth) else _NOWHERE,
             is_true=isinstance(truth, SimTruth),
             fallen=isinstance(truth, SimTruth) and truth.fallen,
+            soles=self._soles_of(truth, states),
             ways_out=tuple(
                 module_status(state if here else None).way_out.replace("MODULE", name)
                 for state, here, name in zip(states, heard, MODULES, strict=True)
             ),
             planner=_shown(status) if isinstance(status, PlannerStatus) else None,
         )
+
+    def _soles_of(self, truth: Message | None, states: list[JointState]) -> tuple[SoleShown, ...]:
+        if isinstance(truth, SimTruth):
+            loads: Sequence[SoleLoad] = (
+                SoleLoad(truth.foot_right_force, truth.foot_right_cop),
+                SoleLoad(truth.foot_left_force, truth.foot_left_cop),
+            )
+        else:
+            q = [angle for state in states for angle in state.q]
+            tau = [torque for state in states for torque in state.tau]
+            loads = self._soles.of(q, tau) or ()
+        return tuple(SoleShown(_vector(load.force), _short(load.cop)) for load in loads)
 
     def _pose(
         self, truth: Message | None, q: tuple[float, ...]

@@ -12,7 +12,6 @@ from shared.bus.session import Latest, Session, open_session
 from shared.bus.topics import Topic
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import FleetError
 from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import impairments
 from tools.fleet.supervise import SupervisedFleet
@@ -113,6 +112,6 @@ class LiveSource(Source):
                 rows = self._fleet.info()
                 self._processes = tuple(ShownProcess(r.name, r.state, r.restarts) for r in rows)
                 self._network = impairments(self._fleet)
-            except FleetError as error:
-                self._processes, self._network = (), (str(error),)
+            except Exception as error:  # noqa: BLE001 - told on the page, whatever it is
+                self._processes, self._network = (), (f"not known: {error}",)
             self._left.wait(LOOK_S)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -18,7 +17,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject
 from shared.exceptions import FleetError, XrlError
 from shared.robot.joints import MODULES
-from tools.fleet.emergency_stop import request_here, stop_all
+from tools.fleet.emergency_stop import BusStop, request_here
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.view.hand import HandOrders
@@ -74,6 +73,7 @@ class LiveOrders:
         self._hand = HandOrders()
         self._publisher: Publisher[HandLead] | None = None
         self._events: Publisher[RunEvent] | None = None
+        self._stop: BusStop | None = None
         self._seq = 0
 
     def begin(self, session: Session) -> None:
@@ -81,10 +81,11 @@ class LiveOrders:
         self._hand = HandOrders()
         self._publisher = session.publisher(topics.OPERATOR_HAND, HandLead)
         self._events = session.publisher(topics.RUN_EVENT, RunEvent)
+        self._stop = BusStop(self._robot, session, self._fleet.run.path)
 
     def end(self) -> None:
         """The session is about to be closed."""
-        self._publisher = self._events = None
+        self._publisher = self._events = self._stop = None
 
     def carry_out(self, order: Order) -> str:
         """Do it, and return why not, or nothing; may block for some seconds."""
@@ -93,16 +94,17 @@ class LiveOrders:
             return f"{order.order!r} is no order here; one of {', '.join(self.orders)}"
         try:
             carrier(order)
-        except XrlError as error:
+        except (XrlError, OSError) as error:  # a process may end while it is signalled
             return str(error)
         return ""
 
     def _lead(self, order: Order) -> None:
-        if self._publisher is None:
+        publisher = self._publisher
+        if publisher is None:
             raise FleetError("the hand is not linked yet")
         self._seq += 1
         asked = self._hand.message(order)
-        self._publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._seq))
+        publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._seq))
 
     def _estop(self, _order: Order) -> None:
         """Stop all, first by shared memory.
@@ -110,9 +112,11 @@ class LiveOrders:
         Raises:
             FleetError: a module has not stopped.
         """
-        run_dir: Path = self._fleet.run.path
-        request_here(run_dir)
-        going = stop_all(self._robot, run_dir)
+        request_here(self._fleet.run.path)
+        stop = self._stop
+        if stop is None:
+            raise FleetError("by shared memory only: the bus is not linked")
+        going = stop.stop()
         if going:
             raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
 
@@ -132,7 +136,8 @@ class LiveOrders:
 
     def _tell(self, kind: RunEventKind, subject: str, detail: str) -> None:
         """Have it in the log."""
-        if self._events is not None:
+        events = self._events
+        if events is not None:
             self._seq += 1
             event = RunEvent(
                 t_ns=now_ns(),
@@ -142,7 +147,7 @@ class LiveOrders:
                 detail=detail,
                 scenario_s=self._scenario_s(),
             )
-            self._events.put(event)
+            events.put(event)
 
     def _cut(self, order: Order) -> None:
         """Cut links for a while.

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -26,6 +27,10 @@ FRAMES_S: Final = 30.0
 MESSAGE_MAX: Final = 4096
 """Largest message of a page, bytes."""
 CLIENTS_MAX: Final = 8
+ORDERS_MAX: Final = 64
+"""Orders of a page that wait; a hand is moved 60 times a second."""
+STOPS_MAX: Final = 4
+"""Emergency stops under way at a time; each repeats itself for up to three seconds."""
 PAGE: Final = Path(__file__).parent / "page"
 UPLOT: Final = Path(__file__).parents[1] / "analysis" / "reports" / "vendor" / "uplot"
 _TYPES: Final = {
@@ -70,6 +75,8 @@ class ViewServer:
         self._clients = 0
         self._sockets: set[web.WebSocketResponse] = set()
         self._lock = asyncio.Lock()
+        self._stopper = ThreadPoolExecutor(STOPS_MAX, "stop")
+        """An emergency stop waits for no other order."""
 
     @property
     def address(self) -> str:
@@ -101,6 +108,7 @@ class ViewServer:
             for socket in set(self._sockets):
                 await socket.close()
             await runner.cleanup()
+            self._stopper.shutdown(wait=False)
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
@@ -179,23 +187,53 @@ class ViewServer:
     async def _receive(self, socket: web.WebSocketResponse, cursor: TimelineCursor) -> None:
         """Take what the page asks for, until it is gone."""
         loop = asyncio.get_running_loop()
-        async for message in socket:
-            if message.type is not WSMsgType.TEXT:
-                continue
-            why = ""
-            try:
-                asked = msgspec.json.decode(message.data, type=dict)
-                if "order" in asked:
-                    why = await asyncio.to_thread(
-                        self._source.carry_out, msgspec.convert(asked, Order)
-                    )
-                else:
-                    control = msgspec.convert(asked, Control)
-                    cursor.control(loop.time(), control.play, control.seek_s, control.rate)
-            except (msgspec.DecodeError, msgspec.ValidationError) as error:
-                why = f"not understood: {error}"
-            if why:
-                await socket.send_json({"error": why})
+        waiting: asyncio.Queue[Order] = asyncio.Queue(ORDERS_MAX)
+        worker = asyncio.create_task(self._work(socket, waiting))
+        stops = set[asyncio.Task[None]]()
+        try:
+            async for message in socket:
+                if message.type is not WSMsgType.TEXT:
+                    continue
+                try:
+                    asked = msgspec.json.decode(message.data, type=dict)
+                    if "order" in asked:
+                        order = msgspec.convert(asked, Order)
+                        if order.order == "estop":
+                            stops.add(asyncio.create_task(self._stop(socket, order)))
+                        else:
+                            waiting.put_nowait(order)
+                    else:
+                        control = msgspec.convert(asked, Control)
+                        cursor.control(loop.time(), control.play, control.seek_s, control.rate)
+                except (msgspec.DecodeError, msgspec.ValidationError) as error:
+                    await socket.send_json({"error": f"not understood: {error}"})
+                except asyncio.QueueFull:
+                    await socket.send_json({"error": "too many orders at once: some are left out"})
+        finally:
+            worker.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                await worker
+            if stops:
+                await asyncio.wait(stops)
+
+    async def _work(self, socket: web.WebSocketResponse, waiting: asyncio.Queue[Order]) -> None:
+        """Carry out a page's orders, one after the other."""
+        while True:
+            order = await waiting.get()
+            await _told(socket, await asyncio.to_thread(self._source.carry_out, order))
+
+    async def _stop(self, socket: web.WebSocketResponse, order: Order) -> None:
+        """Carry out an emergency stop at once."""
+        loop = asyncio.get_running_loop()
+        why = await loop.run_in_executor(self._stopper, self._source.carry_out, order)
+        await _told(socket, why)
+
+
+async def _told(socket: web.WebSocketResponse, why: str) -> None:
+    """Tell a page why an order was not carried out, if it was not and the page is there."""
+    if why and not socket.closed:
+        with contextlib.suppress(ConnectionError):
+            await socket.send_json({"error": why})
 
 
 def _files() -> dict[str, tuple[bytes, str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -66,22 +67,24 @@ def served_beside(run_dir: Path, port: int) -> Iterator[str]:
     Raises:
         FleetError: it does not begin.
     """
-    command = [sys.executable, "-m", "tools.cli", "view", "--act"]
-    command += ["--run-dir", str(run_dir), "--port", str(port)]
-    process = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,  # Ctrl-C in the terminal is for who has started it
-    )
+    command = [sys.executable, "-m", "tools.view.leashed", str(os.getpid())]
+    command += ["view", "--act", "--run-dir", str(run_dir), "--port", str(port)]
+    log = run_dir / "logs" / "view.log"
+    with log.open("wb") as said:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=said,
+            text=True,
+            start_new_session=True,  # Ctrl-C in the terminal is for who has started it
+        )
     try:
         assert process.stdout is not None  # noqa: S101 - a pipe was asked for
         address = process.stdout.readline().partition(" ")[0]
         if not address:
-            _, said = process.communicate()
-            raise FleetError(said.strip().removeprefix("xrl: ") or "the page's server has ended")
+            why = log.read_text(encoding="utf-8", errors="replace").strip()
+            raise FleetError(why.removeprefix("xrl: ") or "the page's server has ended")
         yield address
     finally:
         process.terminate()

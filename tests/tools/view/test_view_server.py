@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
@@ -15,10 +16,13 @@ import pytest
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from tools.view.frame import Frame
-from tools.view.server import CLIENTS_MAX, MESSAGE_MAX, ViewServer
+from tools.view.server import CLIENTS_MAX, MESSAGE_MAX, ORDERS_MAX, ViewServer
 from tools.view.source import Model, Order, Source
 
 TOKEN = "known-to-this-test"  # noqa: S105 - of a server that ends with its test
+
+
+SLOW_S = 1.0
 
 
 def frame_at(t_s: float) -> Frame:
@@ -27,7 +31,7 @@ def frame_at(t_s: float) -> Frame:
         t_s=t_s, begun=True, torso=zero, angles=zero, com=zero, q=(0.0,) * 12, q_ref=(),
         modes=(2,) * 6,
         drives=(0,) * 6, ages_ms=(1.0,) * 6, tau=(0.0,) * 12, force=zero, push=zero,
-        planner=None, is_true=True, fallen=False, ways_out=("",) * 6,
+        planner=None, is_true=True, fallen=False, soles=(), ways_out=("",) * 6,
     )  # fmt: skip
 
 
@@ -55,6 +59,8 @@ class Recorded(Source):
         return frame_at(t_s)
 
     def carry_out(self, order: Order) -> str:
+        if order.service == "slow":
+            time.sleep(SLOW_S)
         self.orders_taken.append(order)
         return "" if order.order == "push" else "not here"
 
@@ -235,6 +241,32 @@ def test_orders_go_to_the_source_and_its_refusal_to_the_page(robot: RobotConfig)
 
     source = with_server(robot, work)
     assert source.orders_taken[0] == Order(order="push", force=(1.0, 2.0, 3.0))
+
+
+def test_an_emergency_stop_waits_for_no_other_order(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        page = await bench.page()
+        await page.send_json({"order": "cut", "service": "slow"})
+        await page.send_json({"order": "estop"})
+        async with asyncio.timeout(20.0):
+            while len(bench.source.orders_taken) < 2:
+                await asyncio.sleep(0.01)
+        await page.close()
+
+    taken = with_server(robot, work).orders_taken
+    assert [order.order for order in taken] == ["estop", "cut"]
+
+
+def test_of_too_many_orders_some_are_left_out_and_that_is_said(robot: RobotConfig) -> None:
+    async def work(bench: Bench) -> None:
+        page = await bench.page()
+        await page.send_json({"order": "cut", "service": "slow"})
+        for _ in range(ORDERS_MAX + 2):
+            await page.send_json({"order": "push"})
+        assert "too many orders" in await message_with(page, "error")
+        await page.close()
+
+    assert len(with_server(robot, work).orders_taken) <= ORDERS_MAX + 2
 
 
 def test_a_message_that_is_too_long_ends_the_page_and_no_other(robot: RobotConfig) -> None:

@@ -20,6 +20,15 @@ function send(message) {
   if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
 }
 
+// Not linked now: it is sent as soon as the link is back, and said at once.
+let stopWaits = false;
+
+function stop() {
+  stopWaits = socket.readyState !== WebSocket.OPEN;
+  if (stopWaits) complain("E-STOP not sent, the server is gone: cut the power");
+  else send({ order: "estop" });
+}
+
 function complain(text) {
   $("error").textContent = text;
   $("error").hidden = !text;
@@ -37,10 +46,13 @@ function connect() {
     if (message.playing !== undefined) $("play").textContent = message.playing ? "⏸" : "▶";
   };
   socket.onclose = () => {
-    complain("the server is gone; this page looks for it");
+    if (!stopWaits) complain("the server is gone; this page looks for it");
     setTimeout(connect, 1000);
   };
-  socket.onopen = () => complain("");
+  socket.onopen = () => {
+    complain("");
+    if (stopWaits) stop();
+  };
 }
 
 function row(list, name) {
@@ -100,7 +112,7 @@ const step = (by_s) => send({ play: false, seek_s: (newest?.t_s ?? 0) + by_s });
 function beginOrders() {
   const acts = model.orders.includes("estop");
   $("estop").hidden = $("hardware").hidden = !acts;
-  $("estop").onclick = () => send({ order: "estop" });
+  $("estop").onclick = stop;
   $("processes").hidden = !acts;
   for (const name of model.processes) addProcess(name);
   $("cuts").hidden = !model.orders.includes("cut");
@@ -161,6 +173,9 @@ function show(frame) {
   if (frame.fallen) complain("it has fallen");
   if (!$("timeline").hidden && document.activeElement !== $("place")) $("place").value = frame.t_s;
   if (!hand.led) Object.assign(hand, { height: frame.torso[2], pitch: frame.angles[1] });
+  const [right, left] = frame.soles.map((sole) => `${sole.force[2].toFixed(0)} N`);
+  $("soles").textContent = !right ? "not known: a leg is straight"
+    : `right ${right}, left ${left}${frame.is_true ? "" : "; estimated from the legs' torques"}`;
   showProcesses(frame);
   scene?.show(frame);
   plots.take(frame);
@@ -176,7 +191,7 @@ function steer() {
   const canvas = $("scene"), pointers = new Map();
   const leads = model.orders.includes("hand");
   let grip, pushing;
-  const stop = () => {
+  const letGo = () => {
     clearInterval(pushing);
     pushing = grip = undefined;
     if (leads) send({ order: "push", force: [0, 0, 0] });
@@ -185,6 +200,7 @@ function steer() {
     canvas.setPointerCapture(event.pointerId);
     canvas.focus();
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    if (pushing) letGo();
     const held = leads && pointers.size === 1 && scene?.isTorso(event.offsetX, event.offsetY);
     grip = held ? { x: event.clientX, y: event.clientY, force: [0, 0, 0], ...hand } : undefined;
     if (grip && event.shiftKey)  // again and again: a push that is not repeated ends by itself
@@ -209,7 +225,7 @@ function steer() {
   };
   canvas.onpointerup = canvas.onpointercancel = (event) => {
     pointers.delete(event.pointerId);
-    if (grip) stop();
+    if (grip || pushing) letGo();
   };
   canvas.onwheel = (event) => {
     event.preventDefault();

@@ -5,7 +5,7 @@ export const MODE_COLOURS = {
   DISARMED: 0xb3bdc4, HOLD: 0xd98f1f, TRACK: 0x2e8a5c, DAMP: 0x8254b8, FAULT: 0xbf382b,
   SILENT: 0x666666,
 };
-const METRES_PER_NEWTON = 0.005, FORCE_MIN_N = 2;
+const METRES_PER_NEWTON = 0.005, SOLES_METRES_PER_NEWTON = 0.0008, FORCE_MIN_N = 2;
 const X = new T.Vector3(1, 0, 0), Y = new T.Vector3(0, 1, 0), Z = new T.Vector3(0, 0, 1);
 
 const turn = (axis, angle) => new T.Quaternion().setFromAxisAngle(axis, angle);
@@ -18,8 +18,9 @@ const torsoTurn = ([roll, pitch, yaw]) =>
   turn(Z, yaw).multiply(turn(X, roll)).multiply(turn(Y, pitch));
 
 class Arrow extends T.Group {
-  constructor(colour) {
+  constructor(colour, metresPerNewton = METRES_PER_NEWTON) {
     super();
+    this.metresPerNewton = metresPerNewton;
     // seen through the torso, in which it begins
     const paint = new T.MeshBasicMaterial({ color: colour, depthTest: false, transparent: true });
     this.shaft = new T.Mesh(new T.CylinderGeometry(0.012, 0.012, 1, 12), paint);
@@ -34,7 +35,7 @@ class Arrow extends T.Group {
     const vector = new T.Vector3(...force), size = vector.length();
     this.visible = size >= FORCE_MIN_N;
     if (!this.visible) return;
-    const length = Math.max(0.02, size * METRES_PER_NEWTON);
+    const length = Math.max(0.02, size * this.metresPerNewton);
     this.position.copy(place);
     this.quaternion.setFromUnitVectors(Y, vector.normalize());
     this.shaft.scale.y = length;
@@ -150,6 +151,8 @@ export class RobotScene {
     this.support = new Polygon(8, MODE_COLOURS.TRACK);
     this.hand = new Arrow(0xe0702a);
     this.push = new Arrow(0xb46ae0);
+    this.soles = [0, 1].map(() => new Arrow(0x1f9d9d, SOLES_METRES_PER_NEWTON));
+    this.world.add(...this.soles);
     this.robot.frames.torso.add(this.hand);
     this.world.add(this.com, this.plumb, this.below, this.support, this.push);
     this.harness = new T.Vector3(...model.harness);
@@ -181,6 +184,10 @@ export class RobotScene {
     this.below.position.copy(under);
     this.hand.show(frame.force, this.harness);
     this.push.show(frame.push, this.robot.frames.torso.position);
+    this.soles.forEach((arrow, index) => {
+      const { force = [0, 0, 0], cop = [0, 0] } = frame.soles[index] ?? {};
+      arrow.show(force, new T.Vector3(cop[0], cop[1], floor));
+    });
     this.robot.updateMatrixWorld(true);
     this.support.show(hull(this.corners()));
     this.draw();

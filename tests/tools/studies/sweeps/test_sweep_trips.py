@@ -24,7 +24,6 @@ def row(trouble: str, **changes: str) -> dict[str, str]:
     return begin | dict.fromkeys(TripResult.__struct_fields__, "") | {"led": "True"} | changes
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("trouble", [name for name in TROUBLES if not TROUBLES[name].unfiltered])
 def test_on_a_plant_of_many_errors_what_is_to_trip_trips_and_stands(
     trouble: str, robot: RobotConfig

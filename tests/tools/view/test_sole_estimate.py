@@ -1,0 +1,76 @@
+"""What the legs' torques say of the soles, against the simulated floor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.planner.kinematics import Kinematics
+from services.planner.model import leg_geometry
+from shared.bus.messages import SimTruth
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.robot.robot_model import stand_pose
+from tests.lockstep.runs import still
+from tools.runs.lockstep import Lockstep
+from tools.runs.standing_start import begin_standing
+from tools.view.sole_estimate import SoleEstimate, jacobian
+
+
+def standing(robot: RobotConfig, height: float) -> tuple[SimTruth, list[float], list[float]]:
+    """Return the world, the joints' angles and their torques, at rest at a height."""
+    fleet = Lockstep(robot, still(4.0, height))
+    begin_standing(fleet)
+    truth = list(fleet.run())[-1]
+    samples = [controller.samples for controller in fleet.controllers]
+    return (
+        truth,
+        [angle for sample in samples for angle in sample.q],
+        [torque for controller in fleet.controllers for torque in controller.tau],
+    )
+
+
+@pytest.mark.parametrize("height", [1.15, 0.95])
+def test_at_rest_it_is_within_4_percent_and_5_millimetres(
+    robot: RobotConfig, height: float
+) -> None:
+    truth, q, tau = standing(robot, height)
+    estimated = SoleEstimate(robot).of(q, tau)
+    assert estimated is not None
+    true = (
+        (truth.foot_right_force, truth.foot_right_cop),
+        (truth.foot_left_force, truth.foot_left_cop),
+    )
+    for found, (force, cop) in zip(estimated, true, strict=True):
+        assert found.force[2] == pytest.approx(force[2], rel=0.04)
+        assert found.cop == pytest.approx(cop, abs=0.005)
+
+
+def test_the_two_soles_bear_the_whole_robot_and_who_holds_it(robot: RobotConfig) -> None:
+    truth, _, _ = standing(robot, 1.0)
+    fleet = Lockstep(robot, still(0.1))
+    weight = float(fleet.world.model.body_mass.sum()) * GRAVITY
+    borne = truth.foot_right_force[2] + truth.foot_left_force[2]
+    assert borne == pytest.approx(weight + truth.load_n - truth.operator_force[2], rel=0.01)
+    middle = 0.5 * (np.array(truth.foot_right_cop) + truth.foot_left_cop)
+    assert middle == pytest.approx(truth.com[:2], abs=0.01), "standing still"
+
+
+def test_the_legs_jacobian_is_that_of_the_law(robot: RobotConfig) -> None:
+    """Of the pose's torso part, of each leg alone: the other leg's share is nothing."""
+    q = np.array(stand_pose(robot, 1.05)) + np.random.default_rng(3).uniform(-0.1, 0.1, 12)
+    known = Kinematics(robot)
+    for index, leg in enumerate(leg_geometry(robot)):
+        known.update(q, np.eye(6) * index)
+        own = slice(6 * index, 6 * index + 6)
+        J, r_torso = jacobian(leg, q[own])
+        assert r_torso == pytest.approx(known.r_torso, abs=1e-9)
+        step = 1e-6
+        for joint in range(6):
+            moved = q.copy()
+            moved[own.start + joint] += step
+            _, r_moved = jacobian(leg, moved[own])
+            assert (r_moved - r_torso) / step == pytest.approx(J[:3, joint], abs=1e-5)
+
+
+def test_straight_legs_say_nothing(robot: RobotConfig) -> None:
+    assert SoleEstimate(robot).of([0.0] * 12, [1.0] * 12) is None
