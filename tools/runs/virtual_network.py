@@ -64,6 +64,25 @@ class VirtualNetwork:
             for link in self._links.values():
                 link.release(now_ns)
 
+    def cut(self, link: str, for_s: float, scenario_s: float, now_ns: int) -> None:
+        """Cut links off now, for a while: somebody who looks on wants it.
+
+        Args:
+            link: of `shared.bus.links`.
+            for_s: how long, s.
+            scenario_s: scenario time.
+            now_ns: virtual time.
+        """
+        self._injections.begin(link, Impairment(partition=True), scenario_s + for_s, now_ns)
+
+    def active(self, scenario_s: float) -> tuple[str, ...]:
+        """Return the impairments that are active at a scenario time, in words."""
+        return tuple(
+            f"{row.link}: {row.what.describe()}"
+            for row in self._injections.requested.values()
+            if row.begins <= scenario_s
+        )
+
     def end(self, now_ns: int) -> None:
         """End all impairments, so that their counts are recorded: the run is over."""
         self._injections.clear("all", now_ns)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Mapping
-from typing import Final
+from collections.abc import Callable
 
 import msgspec
 
@@ -21,15 +20,7 @@ from tools.fleet.emergency_stop import BusStop, request_here
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.view.hand import HandOrders
-from tools.view.source import Order
-
-CUTS: Final[Mapping[str, tuple[str, ...]]] = {
-    "left leg": ("planner->left", "left->planner"),
-    "right leg": ("planner->right", "right->planner"),
-    "all": ("all",),
-}
-"""What a page can cut off from the planner: links by name."""
-CUT_S: Final = 2.0
+from tools.view.source import CUT_S, CUTS, Order
 
 
 class LiveOrders:

@@ -7,6 +7,8 @@ import threading
 import time
 from typing import ClassVar, Final
 
+import msgspec
+
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
@@ -17,7 +19,7 @@ from tools.runs.lockstep import Lockstep
 from tools.runs.standing_start import begin_standing
 from tools.view.frame import Frame, Newest
 from tools.view.hand import HandOrders
-from tools.view.source import Order, Source
+from tools.view.source import CUT_S, CUTS, Order, Source
 
 _FOREVER_S: Final = 1e9
 _STEP_S: Final = 0.01
@@ -34,7 +36,7 @@ class LockstepSource(Source):
     """A robot in virtual time that keeps to real time, in a thread of its own."""
 
     kind = "lockstep"
-    orders = ("hand", "push", "kill", "freeze", "start", "estop")
+    orders = ("hand", "push", "kill", "freeze", "start", "cut", "estop")
     processes = ("planner", *MODULES)
 
     def __init__(self, robot: RobotConfig) -> None:
@@ -72,6 +74,8 @@ class LockstepSource(Source):
         named = order.order in ("kill", "freeze", "start")
         if named and order.service not in self.processes:
             return f"{order.service!r} has no process here; planner or a module"
+        if order.order == "cut" and order.service not in CUTS:
+            return f"{order.service!r}: one of {', '.join(CUTS)}"
         self._orders.put(order)
         return ""
 
@@ -101,6 +105,9 @@ class LockstepSource(Source):
             truth = fleet.world.truth(fleet.now_ns, 1.0, 0.0)
             self._newest.take(topics.SIM_TRUTH, "", truth)
             found = self._newest.frame(fleet.now_ns)
+            if found is not None:
+                network = fleet.network.active(fleet.world.scenario_s)
+                found = msgspec.structs.replace(found, network=network)
             with self._lock:
                 self._frame = found
             due = max(due + _STEP_S, time.monotonic() - 0.2)  # a slow machine: slow motion
@@ -115,6 +122,9 @@ class LockstepSource(Source):
             fleet.act(Kill(service=order.service, at=now_s))
         elif order.order == "freeze":
             fleet.act(Kill(service=order.service, at=now_s, signal="STOP"))
+        elif order.order == "cut":
+            for link in CUTS[order.service]:
+                fleet.network.cut(link, CUT_S, now_s, fleet.now_ns)
         elif order.order == "start":
             fleet.act(Restart(service=order.service, at=now_s))
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Final
 
 import msgspec
@@ -17,6 +18,15 @@ from tools.view.frame import Frame
 _STILL: Final = RobotPose(
     0, (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, (0.0,) * 12, (-1,) * 6, (0.0,) * 3, (0.0,) * 3
 )
+
+
+CUTS: Final[Mapping[str, tuple[str, ...]]] = {
+    "left leg": ("planner->left", "left->planner"),
+    "right leg": ("planner->right", "right->planner"),
+    "all": ("all",),
+}
+"""What a page can cut off from the planner: links by name."""
+CUT_S: Final = 2.0
 
 
 class Mark(msgspec.Struct, frozen=True):

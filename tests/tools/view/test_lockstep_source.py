@@ -73,6 +73,17 @@ def test_a_push_has_a_limit_and_ends_when_it_is_not_repeated(source: LockstepSou
     assert ended.t_s - pushed.t_s < 1.0
 
 
+def test_a_leg_that_is_cut_off_makes_all_hold_and_comes_back(source: LockstepSource) -> None:
+    until(source, lambda frame: frame.modes == (Mode.TRACK,) * 6)
+    assert "one of left leg" in source.carry_out(Order(order="cut", service="cable"))
+    assert source.carry_out(Order(order="cut", service="left leg")) == ""
+    cut = until(source, lambda frame: frame.network != ())
+    assert cut.network == ("planner->left: partition", "left->planner: partition")
+    until(source, lambda frame: frame.modes == (Mode.HOLD,) * 6)
+    until(source, lambda frame: frame.network == ())
+    until(source, lambda frame: frame.modes == (Mode.TRACK,) * 6)
+
+
 def test_an_emergency_stop_sinks_it(source: LockstepSource) -> None:
     until(source, lambda frame: frame.modes == (Mode.TRACK,) * 6)
     source.carry_out(Order(order="estop"))

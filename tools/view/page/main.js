@@ -148,7 +148,7 @@ function showProcesses(frame) {
     word.textContent = process.state === "running" ? "" : WORDS[process.state] ?? process.state;
     item.title = `${process.state}, started again ${process.restarts} times`;
   }
-  $("network").hidden = model.source !== "live" || !(frame.network.length || model.orders.includes("cut"));
+  $("network").hidden = !(frame.network.length || model.orders.includes("cut"));
   $("impaired").textContent = frame.network.length ? frame.network.join("; ") : "as it is";
 }
 
