@@ -14,6 +14,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from tools.fleet.supervise import SupervisedFleet
+from tools.output import progress_along, write_atomically
 from tools.runs.experiment import load_robot
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
@@ -23,6 +24,7 @@ from tools.view.live import LiveSource
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource
 from tools.view.serving import add_port, serve
+from tools.view.single_file import single_file
 from tools.view.source import Source
 
 
@@ -35,11 +37,18 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl view                       # the fleet that is up: look, and touch nothing
         xrl view --act                 # ... and lead, push, kill, freeze, start, cut, stop
         xrl view out/demo/run.mcap     # a record: play, pause, step, scrub
+        xrl view out/demo/run.mcap --html run.html     # ... as one file that opens anywhere
         xrl view --sim                 # a robot in this process: lead it, push it, kill its planner
         """,
     )
     parser.add_argument("record", nargs="?", type=Path, metavar="RUN", help=RUN_HELP)
     parser.add_argument("--sim", action="store_true", help="a robot of its own, in virtual time")
+    parser.add_argument(
+        "--html",
+        type=Path,
+        metavar="FILE",
+        help="write the record into one HTML file that needs no server, and end",
+    )
     parser.add_argument(
         "--act",
         action="store_true",
@@ -57,6 +66,10 @@ def run(args: argparse.Namespace) -> int:
         raise RunError("a record and --sim do not go together; leave one out")
     if args.act and (args.sim or args.record is not None):
         raise RunError("--act is for the fleet that is up; --sim needs none, a record takes none")
+    if args.html is not None:
+        if args.record is None:
+            raise RunError("--html is for a record: name one")
+        return _write(args)
     with _source(args) as source:
         serve(source, args.port)
     return 0
@@ -83,6 +96,18 @@ def _source(args: argparse.Namespace) -> Iterator[Source]:
             yield live
         finally:
             live.disconnect()
+
+
+def _write(args: argparse.Namespace) -> int:
+    """Write a record into one file."""
+    log = read_asked(args, RunIndex(args.record))
+    source = RecordSource(log, robot_of(log))
+    model = source.model()
+    with progress_along("frames", model.end_s - model.begin_s) as done:
+        content = single_file(source, done)
+    write_atomically(args.html, content)
+    print(f"{args.html}: {model.end_s - model.begin_s:.1f} s, {len(content) / 1e6:.1f} MB")
+    return 0
 
 
 def confirm(robot: RobotConfig) -> None:

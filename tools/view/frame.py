@@ -101,8 +101,9 @@ class Frame(msgspec.Struct, frozen=True):
     """True: the pose is that of the simulated world; else what the legs' kinematics know."""
     fallen: bool
     soles: tuple[SoleShown, ...]
-    """Right and left; empty if not known. Without a simulated world they are estimated from the
-    legs' torques."""
+    """Right and left; empty if not known."""
+    soles_estimated: bool
+    """True: from the legs' torques; False: the simulated world's own."""
     ways_out: tuple[str, ...]
     """For each module what lets it track again; empty if nothing is needed."""
     processes: tuple[ShownProcess, ...] = ()
@@ -165,6 +166,7 @@ class Newest:
         torso, angles, com = self._pose(truth, q)
         commands = [row for row in self._commands if row is not None]
         led = isinstance(status, PlannerStatus) and len(commands) == len(MODULES)
+        soles, estimated = self._soles_of(truth, states)
         begun = isinstance(truth, SimTruth) and truth.scenario_s >= 0.0
         t_s = self.scenario_s if begun else (now_ns - self._first_ns) / NS_PER_S
         return Frame(
@@ -188,7 +190,8 @@ class Newest:
             push=truth.push if isinstance(truth, SimTruth) else _NOWHERE,
             is_true=isinstance(truth, SimTruth),
             fallen=isinstance(truth, SimTruth) and truth.fallen,
-            soles=self._soles_of(truth, states),
+            soles=soles,
+            soles_estimated=estimated,
             ways_out=tuple(
                 module_status(state if here else None).way_out.replace("MODULE", name)
                 for state, here, name in zip(states, heard, MODULES, strict=True)
@@ -196,17 +199,20 @@ class Newest:
             planner=_shown(status) if isinstance(status, PlannerStatus) else None,
         )
 
-    def _soles_of(self, truth: Message | None, states: list[JointState]) -> tuple[SoleShown, ...]:
-        if isinstance(truth, SimTruth):
+    def _soles_of(
+        self, truth: Message | None, states: list[JointState]
+    ) -> tuple[tuple[SoleShown, ...], bool]:
+        """Return the soles' loads, and whether they are estimated."""
+        # a world of before the soles were measured has zeros
+        if isinstance(truth, SimTruth) and any((*truth.foot_right_force, *truth.foot_left_force)):
             loads: Sequence[SoleLoad] = (
                 SoleLoad(truth.foot_right_force, truth.foot_right_cop),
                 SoleLoad(truth.foot_left_force, truth.foot_left_cop),
             )
-        else:
-            q = [angle for state in states for angle in state.q]
-            tau = [torque for state in states for torque in state.tau]
-            loads = self._soles.of(q, tau) or ()
-        return tuple(SoleShown(_vector(load.force), _short(load.cop)) for load in loads)
+            return _shown_soles(loads), False
+        q = [angle for state in states for angle in state.q]
+        tau = [torque for state in states for torque in state.tau]
+        return _shown_soles(self._soles.of(q, tau) or ()), True
 
     def _pose(
         self, truth: Message | None, q: tuple[float, ...]
@@ -232,6 +238,10 @@ def _shown(status: PlannerStatus) -> PlannerShown:
         assist_n=status.assist_n,
         height_ref=status.p_ref[2],
     )
+
+
+def _shown_soles(loads: Sequence[SoleLoad]) -> tuple[SoleShown, ...]:
+    return tuple(SoleShown(_vector(load.force), _short(load.cop)) for load in loads)
 
 
 def _short(values: Iterable[float]) -> tuple[float, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from shared.process import DEFAULT_CONFIG
 from tests.tools.view.browser import BROWSER, Page, browser
 from tests.tools.view.test_record_source import LOG
+from tools import cli
 from tools.runs.experiment import load_robot
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import read_run
@@ -137,6 +139,42 @@ def test_a_record_is_scrubbed_stepped_and_played(tmp_path: Path) -> None:
         await page.picture(tmp_path / "record.png")
 
     with_page(source, work)
+
+
+def test_a_record_in_one_file_opens_without_a_server_and_is_scrubbed_and_played(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "run.html"
+    assert cli.main(["view", str(LOG), "--html", str(file)]) == 0
+    text = file.read_text(encoding="utf-8")
+    assert not re.search(r'(src|href)="(?!data:)', text), "it loads nothing"
+    log = read_run(LOG)
+    source = RecordSource(log, robot_of(log))
+    end_s = source.model().end_s
+    wanted = source.frame(end_s - 0.2)
+    assert wanted is not None
+
+    async def work(page: Page) -> None:
+        await page.open(file.as_uri())
+        place = "document.getElementById('place')"
+        await page.until(f"{place}?.max", lambda text: text not in (None, "", "100"))
+        await page.value(
+            f"{place}.value = {end_s - 0.2}; {place}.dispatchEvent(new Event('input'))"
+        )
+        await page.until(HEIGHT, lambda at: at is not None and abs(at - wanted.torso[2]) < 0.002)
+        marks = await page.value("document.querySelectorAll('#marks i').length")
+        assert marks == len(source.model().marks)
+        await page.value("document.getElementById('play').click()")
+        await page.until("document.getElementById('play').textContent", lambda text: text == "▶")
+        await page.until(f"Number({place}.value)", lambda at: abs(at - end_s) < 0.02)
+        await page.picture(tmp_path / "file.png")
+        assert page.complaints == []
+
+    async def main() -> None:
+        async with browser() as page:
+            await work(page)
+
+    asyncio.run(main())
 
 
 @pytest.mark.parametrize(("width", "height"), [(1400, 800), (400, 800)])

@@ -1,5 +1,6 @@
 // The page: takes frames from the server, shows them, and sends what a person does.
 import { Plots } from "./plots.js";
+import { recordedRun } from "./recorded.js";
 import { MODE_COLOURS, RobotScene } from "./scene.js";
 
 const $ = (id) => document.getElementById(id);
@@ -34,10 +35,14 @@ function complain(text) {
   $("error").hidden = !text;
 }
 
-function connect() {
+function serverSocket() {
   const here = new URL("ws", location.href);
   here.protocol = "ws:";
-  socket = new WebSocket(here);
+  return new WebSocket(here);
+}
+
+async function connect() {
+  socket = await recordedRun() ?? serverSocket();
   socket.onmessage = ({ data }) => {
     const message = JSON.parse(data);
     if (message.model) begin(message.model);
@@ -175,7 +180,7 @@ function show(frame) {
   if (!hand.led) Object.assign(hand, { height: frame.torso[2], pitch: frame.angles[1] });
   const [right, left] = frame.soles.map((sole) => `${sole.force[2].toFixed(0)} N`);
   $("soles").textContent = !right ? "not known: a leg is straight"
-    : `right ${right}, left ${left}${frame.is_true ? "" : "; estimated from the legs' torques"}`;
+    : `right ${right}, left ${left}${!frame.soles_estimated ? "" : "; estimated from the legs' torques"}`;
   showProcesses(frame);
   scene?.show(frame);
   plots.take(frame);
