@@ -68,7 +68,7 @@ VENDORS = {
     ],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
     "mcap": ["shared/mcap_log/*.py", "tools/analysis/reexecution/rewritten.py"],
-    "foxglove": ["tools/analysis/reports/foxglove.py"],
+    "foxglove": ["tools/analysis/reports/foxglove.py", "tools/view/foxglove_server.py"],
     "supervisor": ["tools/fleet/*.py"],
     "can": [
         "shared/can/unix_can.py",

@@ -42,6 +42,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl export out/a/run.mcap --scene -o shown.mcap --layout layout.json
         xrl export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
         xrl export out/a/run.mcap --gif shove.gif --from 5 --to 9
+        xrl export out/a/run.mcap --gif fig7.gif --curves     # with curves, as the paper's Fig. 7
         """,
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a run's record; it is not touched")
@@ -71,6 +72,9 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="FILE",
         help="also draw the robot from the side and the front, as an animated picture",
     )
+    parser.add_argument(
+        "--curves", action="store_true", help="beside it COM, height and hand as they come"
+    )
     add_part(parser, "of the picture")
     parser.add_argument("--force", action="store_true", help="replace what exists")
 
@@ -79,6 +83,8 @@ def run(args: argparse.Namespace) -> int:
     """Write the requested files."""
     if not args.scene and args.layout is None and args.gif is None:
         raise RunError("say what to write: --scene, --layout FILE, --gif FILE, or several of them")
+    if args.curves and args.gif is None:
+        raise RunError("--curves go beside a picture: name it with --gif FILE")
     path: Path = args.file
     if path.is_dir():
         raise RunError(f"{path}: is a directory; give one of its files")
@@ -92,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         console.print(f"[bold]{escape(str(out))}[/]: {count} messages", soft_wrap=True)
     if args.gif is not None:
         _free(args.gif, path, force=args.force)
-        _draw(read_part(index, part), args.gif, console)
+        _draw(read_part(index, part), args.gif, console, with_curves=args.curves)
     if args.layout is not None:
         _free(args.layout, path, force=args.force)
         write_atomically(
@@ -102,11 +108,14 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _draw(log: RunLog, out: Path, console: Console) -> None:
+def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> None:
     """Draw the run's moving picture, with progress."""
     with Progress(console=console, transient=True) as shown:
         bar = shown.add_task("drawing", total=1.0)
-        count = write_gif(log, robot_of(log), out, lambda part: shown.update(bar, completed=part))
+        count = write_gif(
+            log, robot_of(log), out, lambda part: shown.update(bar, completed=part),
+            with_curves=with_curves,
+        )  # fmt: skip
     console.print(f"[bold]{escape(str(out))}[/]: {count} frames", soft_wrap=True)
 
 

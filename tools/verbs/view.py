@@ -13,6 +13,7 @@ from rich.console import Console
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
+from shared.process import StopFlag
 from tools.fleet.supervise import SupervisedFleet
 from tools.output import progress_along, write_atomically
 from tools.runs.experiment import load_robot
@@ -20,9 +21,12 @@ from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_parts import add_part, read_asked
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_run_dir, add_verb
+from tools.view import foxglove_server
+from tools.view.foxglove_server import FoxgloveServer
 from tools.view.live import LiveSource
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource
+from tools.view.server import HOST, PORT
 from tools.view.serving import add_port, serve
 from tools.view.single_file import single_file
 from tools.view.source import Source
@@ -38,6 +42,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl view --act                 # ... and lead, push, kill, freeze, start, cut, stop
         xrl view out/demo/run.mcap     # a record: play, pause, step, scrub
         xrl view out/demo/run.mcap --html run.html     # ... as one file that opens anywhere
+        xrl view --foxglove            # the same for Foxglove: connect it to the printed address
         xrl view --sim                 # a robot in this process: lead it, push it, kill its planner
         """,
     )
@@ -55,6 +60,11 @@ def add_parser(subparsers: Subparsers) -> None:
         help="let the page act on the fleet that is up; a real robot's name has to be typed first",
     )
     add_port(parser)
+    parser.add_argument(
+        "--foxglove",
+        action="store_true",
+        help=f"serve the frames to Foxglove in place of a page (port: {foxglove_server.PORT})",
+    )
     add_part(parser)
     add_config(parser)
     add_run_dir(parser)
@@ -70,6 +80,10 @@ def run(args: argparse.Namespace) -> int:
         if args.record is None:
             raise RunError("--html is for a record: name one")
         return _write(args)
+    if args.foxglove:
+        if args.record is not None or args.act:
+            raise RunError("--foxglove only looks, at a fleet or at --sim; it opens records itself")
+        return _serve_foxglove(args)
     with _source(args) as source:
         serve(source, args.port)
     return 0
@@ -96,6 +110,18 @@ def _source(args: argparse.Namespace) -> Iterator[Source]:
             yield live
         finally:
             live.disconnect()
+
+
+def _serve_foxglove(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    stop = StopFlag()
+    with _source(args) as source:
+        port = foxglove_server.PORT if args.port == PORT else args.port
+        server = FoxgloveServer(source, port)
+        print(f"ws://{HOST}:{server.port}  (in Foxglove: open a connection; Ctrl-C ends it)")
+        sys.stdout.flush()
+        server.serve(lambda: bool(stop))
+    return 0
 
 
 def _write(args: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -23,7 +24,7 @@ from shared.bus.messages import (
 )
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
+from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.joints import MODULE_INDEX, MODULES
 from tools.fleet.fleet_status import module_status
 from tools.view.sole_estimate import SoleEstimate
@@ -100,6 +101,8 @@ class Frame(msgspec.Struct, frozen=True):
     is_true: bool
     """True: the pose is that of the simulated world; else what the legs' kinematics know."""
     fallen: bool
+    capture: tuple[float, ...]
+    """Capture point: COM + its rate / sqrt(g / height), x and y, m; empty without a planner."""
     soles: tuple[SoleShown, ...]
     """Right and left; empty if not known."""
     soles_estimated: bool
@@ -190,6 +193,7 @@ class Newest:
             push=truth.push if isinstance(truth, SimTruth) else _NOWHERE,
             is_true=isinstance(truth, SimTruth),
             fallen=isinstance(truth, SimTruth) and truth.fallen,
+            capture=_capture_point(status) if isinstance(status, PlannerStatus) else (),
             soles=soles,
             soles_estimated=estimated,
             ways_out=tuple(
@@ -238,6 +242,15 @@ def _shown(status: PlannerStatus) -> PlannerShown:
         assist_n=status.assist_n,
         height_ref=status.p_ref[2],
     )
+
+
+def _capture_point(status: PlannerStatus) -> tuple[float, ...]:
+    """Return where the foot of a pendulum of the COM's height would have to be for it to rest."""
+    x, y, z = status.p[:3]
+    if z <= 0.0:
+        return ()
+    per_rate = math.sqrt(z / GRAVITY)
+    return _short((x + per_rate * status.pdot[0], y + per_rate * status.pdot[1]))
 
 
 def _shown_soles(loads: Sequence[SoleLoad]) -> tuple[SoleShown, ...]:

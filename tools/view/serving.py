@@ -16,7 +16,7 @@ from rich.console import Console
 
 from shared.exceptions import FleetError
 from tools.number_arguments import natural
-from tools.view.server import PORT, ViewServer
+from tools.view.server import HOST, PORT, ViewServer
 from tools.view.source import Source
 
 _END_S = 5.0
@@ -26,7 +26,7 @@ _PORT_MAX = 65_535
 def add_port(parser: argparse.ArgumentParser) -> None:
     """Add `--port`."""
     parser.add_argument(
-        "--port", type=_port, default=PORT, help="of 127.0.0.1 (default: %(default)s); 0: any"
+        "--port", type=_port, default=PORT, metavar="N", help=f"of {HOST} (default: {PORT}); 0: any"
     )
 
 

@@ -80,7 +80,7 @@ def test_a_person_leads_pushes_kills_and_stops_it_with_the_mouse(
         await page.until(HEIGHT, lambda height: height > low + 0.05)
         await page.mouse("up", 640.0, 200.0)
         pushed = "document.getElementById('plots').querySelectorAll('canvas').length"
-        assert await page.value(pushed) == 6
+        assert await page.value(pushed) == 8
         await page.value(button("kill"))
         await page.until(MODES, lambda text: text.count("HOLD") == 6)
         await page.until("document.getElementById('mode').textContent", lambda w: w == "silent")

@@ -31,7 +31,7 @@ def frame_at(t_s: float) -> Frame:
         t_s=t_s, begun=True, torso=zero, angles=zero, com=zero, q=(0.0,) * 12, q_ref=(),
         modes=(2,) * 6,
         drives=(0,) * 6, ages_ms=(1.0,) * 6, tau=(0.0,) * 12, force=zero, push=zero,
-        planner=None, is_true=True, fallen=False, soles=(), soles_estimated=False,
+        planner=None, is_true=True, fallen=False, capture=(), soles=(), soles_estimated=False,
         ways_out=("",) * 6,
     )  # fmt: skip
 

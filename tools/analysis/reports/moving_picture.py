@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw
 
 from shared.bus import topics
 from shared.bus.messages import Mode, RunEvent, RunEventKind
@@ -18,17 +18,16 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES, SIDES
 from tools.analysis.reports import scene
+from tools.analysis.reports.canvas import SCALE, Canvas, Point
+from tools.analysis.reports.moving_curves import WIDTH, Curves
 from tools.analysis.reports.scene import RobotPose
 from tools.runs.run_log import RunLog
 
 Array = NDArray[np.float64]
-Point = tuple[float, float]
 
 FRAMES_S: Final = 12.5
 """Frames per second; a GIF counts in hundredths of a second."""
 SIZE: Final = (640, 400)
-SCALE: Final = 2
-"""Drawn larger and reduced, so that lines are smooth."""
 COLOURS_MAX: Final = 64
 MIXTURES: Final = 4
 """Shades of each ink, for smooth edges."""
@@ -56,7 +55,12 @@ class Caption(NamedTuple):
 
 
 def write_gif(
-    log: RunLog, robot: RobotConfig, path: Path, progress: Callable[[float], None]
+    log: RunLog,
+    robot: RobotConfig,
+    path: Path,
+    progress: Callable[[float], None],
+    *,
+    with_curves: bool = False,
 ) -> int:
     """Draw a run, from its scenario's begin, and return the number of frames.
 
@@ -65,6 +69,7 @@ def write_gif(
         robot: its robot.
         path: the GIF; replaced if it exists.
         progress: takes the share that is drawn, 0 .. 1.
+        with_curves: beside it COM, height and hand as they come.
 
     Raises:
         RunError: the log lacks states, or the file cannot be written.
@@ -75,8 +80,17 @@ def write_gif(
         raise RunError(f"{log.path}: the scenario never began; there is nothing to draw")
     captions = _captions(log, began)
     images = []
+    curves = None
+    if with_curves:
+        curves = Curves(chosen, began, SIZE[0], (HAND_INK, COM_INK), INK)
     for number, pose in enumerate(chosen):
-        images.append(_frame(robot, pose, (pose.t_ns - began) / NS_PER_S, captions))
+        width = SIZE[0] + (WIDTH if curves is not None else 0)
+        image = Image.new("RGB", (width * SCALE, SIZE[1] * SCALE), BACKGROUND)
+        canvas = Canvas(ImageDraw.Draw(image))
+        _draw_frame(canvas, robot, pose, (pose.t_ns - began) / NS_PER_S, captions)
+        if curves is not None:
+            curves.draw(canvas, number)
+        images.append(image.resize((width, SIZE[1]), Image.Resampling.LANCZOS))
         progress((number + 1) / len(chosen))
     palette = _palette()
     flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -161,11 +175,13 @@ def _thinned(poses: Sequence[RobotPose]) -> Iterator[RobotPose]:
             yield pose
 
 
-def _frame(
-    robot: RobotConfig, pose: RobotPose, seconds: float, captions: Sequence[Caption]
-) -> Image.Image:
-    image = Image.new("RGB", (SIZE[0] * SCALE, SIZE[1] * SCALE), BACKGROUND)
-    canvas = _Canvas(ImageDraw.Draw(image))
+def _draw_frame(
+    canvas: Canvas,
+    robot: RobotConfig,
+    pose: RobotPose,
+    seconds: float,
+    captions: Sequence[Caption],
+) -> None:
     frames = world_frames(robot, pose)
     canvas.line([(20.0, GROUND_Y), (SIZE[0] - 20.0, GROUND_Y)], INK, 1.5)
     for centre, axis, sign in VIEWS:
@@ -179,11 +195,10 @@ def _frame(
     for number, mode in enumerate((Mode.TRACK, Mode.HOLD)):
         canvas.disc((520.0, 24.0 + 22.0 * number), 6.0, MODE_INK[mode])
         canvas.text((534.0, 15.0 + 22.0 * number), mode.name, INK, 14)
-    return image.resize(SIZE, Image.Resampling.LANCZOS)
 
 
 def _draw_robot(
-    canvas: _Canvas,
+    canvas: Canvas,
     robot: RobotConfig,
     pose: RobotPose,
     frames: dict[str, tuple[Array, Array]],
@@ -224,38 +239,3 @@ def _draw_robot(
         canvas.arrow(harness, (0.0, -PX_PER_N * pose.force[2]), HAND_INK)
     if pose.push[axis]:
         canvas.arrow(at(np.array(pose.torso)), (sign * PX_PER_N * pose.push[axis], 0.0), PUSH_INK)
-
-
-class _Canvas:
-    """Drawing in pixels of the picture, on an image that is larger."""
-
-    def __init__(self, draw: ImageDraw.ImageDraw) -> None:
-        self._draw = draw
-
-    def line(self, points: Sequence[Point], colour: str, width: float) -> None:
-        self._draw.line(_scaled(points), fill=colour, width=round(width * SCALE), joint="curve")
-
-    def polygon(self, points: Sequence[Point], colour: str) -> None:
-        self._draw.polygon(_scaled(points), fill=colour)
-
-    def disc(self, at: Point, radius: float, colour: str) -> None:
-        (x, y), r = at, radius
-        self._draw.ellipse(_scaled([(x - r, y - r), (x + r, y + r)]), fill=colour)
-
-    def arrow(self, at: Point, by: Point, colour: str) -> None:
-        length = float(np.hypot(*by))
-        if length < 1.0:
-            return
-        x, y = at[0] + by[0], at[1] + by[1]
-        ux, uy = by[0] / length, by[1] / length
-        self.line([at, (x, y)], colour, 4.0)
-        tip = [(x + 9 * ux, y + 9 * uy), (x - 7 * uy, y + 7 * ux), (x + 7 * uy, y - 7 * ux)]
-        self.polygon(tip, colour)
-
-    def text(self, at: Point, text: str, colour: str, size: int) -> None:
-        font = ImageFont.load_default(size * SCALE)
-        self._draw.text((at[0] * SCALE, at[1] * SCALE), text, fill=colour, font=font)
-
-
-def _scaled(points: Sequence[Point]) -> list[Point]:
-    return [(x * SCALE, y * SCALE) for x, y in points]

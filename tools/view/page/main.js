@@ -162,7 +162,9 @@ function show(frame) {
   $("time").textContent = frame.t_s.toFixed(1);
   $("height").textContent = frame.torso[2].toFixed(3);
   $("hand").textContent = frame.force[2].toFixed(0);
-  const planner = frame.planner;
+  const planner = frame.planner, age = Math.max(...frame.ages_ms);
+  $("age").textContent = age >= 0 ? age.toFixed(0) : "–";
+  $("margin").textContent = planner ? planner.margin.toFixed(2) : "–";
   $("mode").textContent = planner ? planner.mode.toLowerCase() : "silent";
   $("planner").textContent = planner
     ? [planner.why, planner.wait_s > 0 ? `leads again in ${planner.wait_s.toFixed(0)} s at the earliest` : "",

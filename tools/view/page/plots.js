@@ -7,11 +7,14 @@ const PANELS = [
   ["COM, mm", ["x", "y"], (f) => [1e3 * f.com[0], 1e3 * f.com[1]]],
   ["height, m", ["torso", "COM", "COM asked for"],
     (f) => [f.torso[2], f.com[2], f.planner ? f.planner.height_ref : null]],
+  ["pitch, rad", ["torso"], (f) => [f.angles[1]]],
   ["age of commands, ms", ["oldest"],
     (f) => [Math.max(...f.ages_ms) >= 0 ? Math.max(...f.ages_ms) : null]],
   ["margin", ["with the services", "drives alone"],
     (f) => f.planner ? [f.planner.margin, f.planner.margin_onboard] : [null, null]],
-  ["torque, N m", ["largest"], (f) => [Math.max(...f.tau.map(Math.abs))]],
+  ["largest torque, N m", ["ankle r", "knee r", "hip r", "ankle l", "knee l", "hip l"],
+    (f) => [0, 2, 4, 6, 8, 10].map((n) => Math.max(Math.abs(f.tau[n]), Math.abs(f.tau[n + 1])))],
+  ["tick, µs", ["tick"], (f) => [f.planner ? f.planner.tick_us : null]],
 ];
 
 export class Plots {

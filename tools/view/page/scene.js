@@ -148,12 +148,16 @@ export class RobotScene {
       new T.LineDashedMaterial({ color: blue, dashSize: 0.03, gapSize: 0.02 }));
     this.below = new T.Mesh(new T.RingGeometry(0.012, 0.02, 24),
       new T.MeshBasicMaterial({ color: blue, side: T.DoubleSide }));
+    this.capture = new T.Mesh(new T.RingGeometry(0.02, 0.028, 24),
+      new T.MeshBasicMaterial({ color: 0xe0702a, side: T.DoubleSide }));
+    this.assist = new Arrow(0x2e8a5c);
     this.support = new Polygon(8, MODE_COLOURS.TRACK);
     this.hand = new Arrow(0xe0702a);
     this.push = new Arrow(0xb46ae0);
     this.soles = [0, 1].map(() => new Arrow(0x1f9d9d, SOLES_METRES_PER_NEWTON));
     this.world.add(...this.soles);
-    this.robot.frames.torso.add(this.hand);
+    this.robot.frames.torso.add(this.hand, this.assist);
+    this.world.add(this.capture);
     this.world.add(this.com, this.plumb, this.below, this.support, this.push);
     this.harness = new T.Vector3(...model.harness);
     new ResizeObserver(() => this.resize()).observe(canvas);
@@ -183,6 +187,11 @@ export class RobotScene {
     this.plumb.computeLineDistances();
     this.below.position.copy(under);
     this.hand.show(frame.force, this.harness);
+    const back = new T.Quaternion().copy(this.robot.frames.torso.quaternion).invert();
+    const lift = new T.Vector3(0, 0, frame.planner?.assist_n ?? 0).applyQuaternion(back);
+    this.assist.show(lift.toArray(), this.harness);
+    this.capture.visible = frame.capture.length > 0;
+    this.capture.position.set(frame.capture[0] ?? 0, frame.capture[1] ?? 0, floor + 0.003);
     this.push.show(frame.push, this.robot.frames.torso.position);
     this.soles.forEach((arrow, index) => {
       const { force = [0, 0, 0], cop = [0, 0] } = frame.soles[index] ?? {};

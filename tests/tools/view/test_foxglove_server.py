@@ -1,0 +1,87 @@
+"""`xrl view --foxglove`: a client of Foxglove's protocol finds the robot and its frames."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+import threading
+from typing import Any
+
+import aiohttp
+import pytest
+
+from shared.config.robot_config import RobotConfig
+from tests.tools.exit_codes import exit_code
+from tests.tools.view.test_view_server import Recorded
+from tools.view.foxglove_server import FoxgloveServer
+
+PROTOCOL = "foxglove.sdk.v1"
+FRAMES = 5
+
+
+async def look(port: int) -> tuple[dict[str, str], list[dict[str, Any]], set[str]]:
+    """Return each topic's schema, some frames, and the topics from which something came."""
+    async with (
+        asyncio.timeout(30.0),
+        aiohttp.ClientSession() as http,
+        http.ws_connect(f"ws://127.0.0.1:{port}", protocols=[PROTOCOL], max_msg_size=0) as socket,
+    ):
+        channels: dict[int, dict[str, Any]] = {}
+        frames: list[dict[str, Any]] = []
+        came: set[str] = set()
+        asked = False
+        async for message in socket:
+            if message.type is aiohttp.WSMsgType.TEXT:
+                told = json.loads(message.data)
+                channels |= {row["id"]: row for row in told.get("channels", [])}
+            elif message.data[0] == 1:  # message data: subscription, time, payload
+                number, _ = struct.unpack_from("<IQ", message.data, 1)
+                topic = channels[number]["topic"]
+                came.add(topic)
+                if topic.endswith("/frame"):
+                    frames.append(json.loads(message.data[13:]))
+            if len(channels) == 4 and not asked:
+                asked = True
+                subscriptions = [{"id": number, "channelId": number} for number in channels]
+                await socket.send_json({"op": "subscribe", "subscriptions": subscriptions})
+            if len(frames) >= FRAMES and len(came) == 4:
+                break
+    return {row["topic"]: row["schemaName"] for row in channels.values()}, frames, came
+
+
+def test_a_client_finds_the_robots_frames_and_is_served_only_while_it_looks(
+    robot: RobotConfig,
+) -> None:
+    source, ended = Recorded(robot), threading.Event()
+    server = FoxgloveServer(source, 0)
+    serving = threading.Thread(target=server.serve, args=(ended.is_set,))
+    serving.start()
+    try:
+        assert source.connected == []
+        schemas, frames, came = asyncio.run(look(server.port))
+        below = f"xrl/{robot.name}/"
+        assert schemas == {
+            f"{below}frame": "Frame",
+            f"{below}scene/frames": "foxglove.FrameTransforms",
+            f"{below}scene/links": "foxglove.SceneUpdate",
+            f"{below}scene/state": "foxglove.SceneUpdate",
+        }
+        assert came == set(schemas)
+        assert frames[0]["modes"] == [2] * 6
+        for _ in range(400):
+            if source.connected == [True, False]:
+                break
+            threading.Event().wait(0.05)
+        assert source.connected == [True, False]
+    finally:
+        ended.set()
+        serving.join()
+
+
+@pytest.mark.parametrize("words", [["run.mcap"], ["--act"]])
+def test_it_only_looks_and_leaves_records_to_foxglove(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code(["view", "--foxglove", *words]) == 2
+    assert "--foxglove only looks" in capsys.readouterr().err
