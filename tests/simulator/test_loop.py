@@ -48,8 +48,8 @@ def make_loop(robot: RobotConfig, *faults: Fault) -> tuple[SimulatorLoop, World,
     front = CanSimpleFront(bank, [], [])
     ports = cast(
         "SimulatorPorts",
-        msgspec.defstruct("Fake", ["truth", "intent", "control", "state", "asked"])(
-            *[Silent()] * 5
+        msgspec.defstruct("Fake", list(SimulatorPorts.__struct_fields__))(
+            *[Silent()] * len(SimulatorPorts.__struct_fields__)
         ),
     )
     harness = cast("HarnessFront", cast("Any", Silent()))

@@ -20,6 +20,7 @@ from tools.runs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 
+NOT_HERE = (topics.ESTOP, topics.HARNESS_TARE, topics.LINK_EVENT, topics.OPERATOR_HAND)
 SUMMARY_KEYS = {
     "stood", "duration_s", "real_time_factor", "com_x_max_mm", "com_y_max_mm", "roll_max_rad",
     "pitch_max_rad", "yaw_max_rad", "torso_height_min_m", "torso_height_max_m",
@@ -79,9 +80,7 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
     silent = [
         key
         for key, topic in topics.all_keys(robot.name).items()
-        if topic.recorded
-        and topic not in (topics.ESTOP, topics.HARNESS_TARE, topics.LINK_EVENT)  # none of it here
-        and not log.count(key)
+        if topic.recorded and topic not in NOT_HERE and not log.count(key)
     ]
     assert not silent
     assert log.metadata["run"]["scenario"] == "squat"

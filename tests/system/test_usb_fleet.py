@@ -55,6 +55,7 @@ def xrl(*arguments: str | Path) -> str:
     return done.stdout
 
 
+@pytest.mark.wide  # the planner knows no drive; what ends on USB is in the next
 def test_it_stands_when_the_planner_is_killed(tmp_path: Path, robot_path: Path) -> None:
     out = tmp_path / "out"
     flags = ("--duration", "7", "--kill", "planner@3", "--push", "4:0.3:30,0,0")

@@ -10,6 +10,7 @@ from shared.bus import topics
 from shared.bus.messages import JointState, SimTruth
 from shared.robot.joints import MODULES
 from tests.tools.analysis.reports.runs import make
+from tests.tools.runs.split_runs import recorded_in_parts
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
 from tools.view.record import RecordSource
@@ -49,6 +50,31 @@ def test_a_frame_holds_the_newest_messages_at_its_time(log: RunLog, source: Reco
             assert frame.modes[index] == newest.mode
     assert model.begin_s <= 0.0 < model.end_s
     assert {"kill", "push", "fault"} <= {mark.kind for mark in model.marks}
+
+
+def test_an_unfinished_record_is_shown_as_far_as_it_goes(
+    log: RunLog, source: RecordSource, tmp_path: Path
+) -> None:
+    content = log.path.read_bytes()
+    cut = tmp_path / "run.mcap"
+    cut.write_bytes(content[: round(0.7 * len(content))])
+    found = read_run(cut)
+    shown = RecordSource(found, robot_of(found))
+    assert 1.0 < shown.model().end_s < source.model().end_s - 0.5
+    frame, same = shown.frame(1.0), source.frame(1.0)
+    assert frame is not None
+    assert frame == same
+
+
+def test_the_files_of_a_split_run_are_shown_as_one(
+    log: RunLog, source: RecordSource, tmp_path: Path
+) -> None:
+    found = read_run(recorded_in_parts(log, tmp_path))
+    shown = RecordSource(found, robot_of(found))
+    assert shown.model().end_s == source.model().end_s
+    assert shown.model().marks == source.model().marks
+    for t_s in (0.5, 2.0, 3.5):
+        assert shown.frame(t_s) == source.frame(t_s)
 
 
 def test_before_all_modules_were_heard_there_is_no_frame(source: RecordSource) -> None:

@@ -6,15 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from shared.bus import topics
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Restart
 from shared.exceptions import RunError
-from shared.mcap_log.writer import RunWriter
 from shared.robot.joints import MODULES
 from tests.lockstep.runs import still
-from tests.shared.mcap_log.runs import Queue
 from tests.tools.analysis.reexecution.executions import executed
+from tests.tools.runs.split_runs import recorded_in_parts
 from tools import cli
 from tools.runs.network import BASE
 from tools.runs.recorded_lockstep import simulate
@@ -36,28 +34,7 @@ def whole(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> RunLo
 
 @pytest.fixture(scope="module")
 def directory(whole: RunLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record the same messages once more, in three files."""
-    folder = tmp_path_factory.mktemp("split")
-    rows = sorted(
-        (received_ns, key, payload)
-        for key in whole.keys()  # noqa: SIM118 - a log is no mapping
-        for received_ns, payload, _ in whole.raw(key)
-    )
-    keys = {k: topic for k, topic in topics.all_keys(whole.robot).items() if topic.recorded}
-    about = {name: whole.metadata[name] for name in ("run", "packages")}
-    third = len(rows) // 3
-    with RunWriter(
-        folder, keys, offset_ns=0, metadata=about, attachments=whole.attachments, chunk_kib=64
-    ) as writer:
-        for begin in (0, third, 2 * third):
-            if begin:
-                writer.finish()
-                writer.begin()
-            end = len(rows) if begin == 2 * third else begin + third
-            part = Queue((key, payload, received) for received, key, payload in rows[begin:end])
-            writer.take_from(part, end - begin)
-    assert len(list(folder.glob("*.mcap"))) == 3
-    return folder
+    return recorded_in_parts(whole, tmp_path_factory.mktemp("split"))
 
 
 def test_the_directory_of_a_split_run_is_the_run(whole: RunLog, directory: Path) -> None:
