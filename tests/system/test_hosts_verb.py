@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
+from services.joint.drivers.base import DriveStatus
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode
+from shared.bus.session import Session, open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
@@ -30,6 +34,7 @@ from tools.keys.authority import Authority
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
 NAMES = ("body", "right", "left")
+SILENT_S = 0.3
 
 
 class Place(NamedTuple):
@@ -50,18 +55,42 @@ class Place(NamedTuple):
         words = [str(self.base / "bin/ssh"), host, "systemctl start xrl.service"]
         assert subprocess.run(words, capture_output=True, check=False).returncode == 0
 
-    def cut_power(self, host: str) -> None:
+    def cut_power(self, host: str, watch: Watch) -> None:
         """Kill all that runs on a host, and boot it again; its drives have power of their own."""
         for pid in procfs.fleet_pids(self.run_dir(host)):
             os.kill(pid, signal.SIGKILL)
+        watch.wait_for_silence()
         self.boot(host)
 
-    def modules(self, capsys: Any) -> dict[str, dict[str, Any]]:
-        capsys.readouterr()
-        run_dir = str(self.run_dir("body"))
-        assert cli.main(["status", "--json", "--run-dir", run_dir]) == 0
-        found: dict[str, dict[str, Any]] = json.loads(capsys.readouterr().out)["modules"]
-        return found
+
+class Watch:
+    """Hears the six modules by links that stay open."""
+
+    def __init__(self, session: Session) -> None:
+        self._latest = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
+        self._states: dict[str, JointState] = {}
+        self._heard_s: dict[str, float] = {}
+
+    def states(self) -> list[JointState | None]:
+        """Return each module's state; None of one that is silent."""
+        now_s = time.monotonic()
+        for module, latest in self._latest.items():
+            state = latest.take()
+            if state is not None:
+                self._states[module], self._heard_s[module] = state, now_s
+        return [
+            self._states[module] if now_s - self._heard_s.get(module, 0.0) < SILENT_S else None
+            for module in MODULES
+        ]
+
+    def all_in(self, *modes: Mode) -> bool:
+        return all(state is not None and state.mode in modes for state in self.states())
+
+    def wait_for(self, *modes: Mode) -> None:
+        assert wait_for(lambda: self.all_in(*modes), timeout_s=60.0), self.states()
+
+    def wait_for_silence(self) -> None:
+        assert wait_for(lambda: None in self.states()), "somebody was killed"
 
 
 @pytest.fixture
@@ -95,17 +124,20 @@ def test_hosts_come_up_take_over_after_a_power_cut_and_stay_stopped_until_somebo
     SupervisedFleet.start(of_simulator / "robot.toml", place.base / "sim", services=("simulator",))
     for host in NAMES:
         place.boot(host)
-    assert wait_for(lambda: {row["drive"] for row in place.modules(capsys).values()} == {"IDLE"}), (
-        "nobody has asked for the drives"
-    )
-    assert {row["mode"] for row in place.modules(capsys).values()} <= {"DISARMED", "FAULT"}
+    secured = config_file.load(of_simulator / "robot.toml")
+    with open_session(secured, "test", place.base / "sim") as session:
+        lead_through(place, Watch(session), capsys)
+    assert [procfs.fleet_pids(place.run_dir(host)) for host in NAMES] == [set(), set(), set()]
+    assert not list(place.base.rglob("*.rearm")), "the stop is over: a person has asked for that"
+
+
+def lead_through(place: Place, watch: Watch, capsys: Any) -> None:
+    watch.wait_for(Mode.DISARMED, Mode.FAULT)
+    drives = {state.drive for state in watch.states() if state is not None}
+    assert drives == {DriveStatus.IDLE}, "nobody has asked for them"
 
     assert place.xrl("up") == 0
-
-    def modes() -> set[str]:
-        return {row["mode"] for row in place.modules(capsys).values()}
-
-    assert wait_for(lambda: modes() == {"TRACK"}, timeout_s=60.0), modes()
+    watch.wait_for(Mode.TRACK)
     capsys.readouterr()
     assert place.xrl("status") == 0
     said = capsys.readouterr().out
@@ -116,21 +148,19 @@ def test_hosts_come_up_take_over_after_a_power_cut_and_stay_stopped_until_somebo
     assert "`xrl hosts down` first" in " ".join(capsys.readouterr().out.split())
 
     before = procfs.fleet_pids(place.run_dir("right"))
-    place.cut_power("left")
-    assert wait_for(lambda: modes() == {"TRACK"}, timeout_s=60.0), place.modules(capsys)
+    place.cut_power("left", watch)
+    watch.wait_for(Mode.TRACK)
     assert place.xrl("up") == 0, "asked for again it restarts nothing"
     assert procfs.fleet_pids(place.run_dir("right")) == before
 
     assert place.xrl("estop") == 0
-    assert modes() == {"DAMP"}
-    place.cut_power("left")
-    assert wait_for(lambda: "TRACK" not in modes() and None not in modes())
-    assert modes() == {"DAMP"}, "the stop holds on"
+    watch.wait_for(Mode.DAMP)
+    place.cut_power("left", watch)
+    assert wait_for(lambda: None not in watch.states(), timeout_s=60.0)
+    assert watch.all_in(Mode.DAMP), "the stop holds on"
     capsys.readouterr()
     assert place.xrl("up") == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "an emergency stop by xrl estop by" in said
-    assert modes() == {"DAMP"}
+    assert watch.all_in(Mode.DAMP)
     assert place.xrl("down") == 0
-    assert [procfs.fleet_pids(place.run_dir(host)) for host in NAMES] == [set(), set(), set()]
-    assert not list(place.base.rglob("*.rearm")), "the stop is over: a person has asked for that"
