@@ -39,16 +39,33 @@ def write_atomically(out: Path, content: bytes, *, private: bool = False) -> Non
     Raises:
         RunError: the file cannot be written.
     """
-    part = out.with_name(f".{out.name}.part")
     if out.exists() and not out.is_file():
         raise RunError(f"{out}: is no ordinary file; give another -o")
+    try:
+        replace_file(out, content, private=private)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be written: {error.strerror}; give another -o") from None
+
+
+def replace_file(path: Path, content: bytes, *, private: bool = False) -> None:
+    """Write a file whole or not at all.
+
+    Args:
+        path: the file.
+        content: of it.
+        private: for this user alone.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    part = path.with_name(f".{path.name}.part")
     try:
         part.unlink(missing_ok=True)  # of an earlier try, with whatever rights
         mode = 0o600 if private else 0o666
         with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(content)
-        part.replace(out)
-    except OSError as error:
+        part.replace(path)
+    except OSError:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
-        raise RunError(f"{out}: cannot be written: {error.strerror}; give another -o") from None
+        raise

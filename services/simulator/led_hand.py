@@ -15,8 +15,9 @@ HEIGHT_MAX_RATE: Final = 0.25
 PITCH_MAX_RATE: Final = 1.0
 """rad/s"""
 HEIGHTS: Final = (0.78, 1.2)
-"""Of the torso, m: within what the legs reach."""
+"""Range of the torso's height, m: within what the legs reach."""
 PITCHES: Final = (-0.3, 0.9)
+"""Range of the torso's pitch, rad."""
 PUSH_MAX: Final = 120.0
 """N, in each direction."""
 PUSH_EXPIRES_S: Final = 0.3
@@ -38,11 +39,11 @@ class LedHand:
         self._push_left_s = 0.0
 
     def take(self, asked: HandLead, now: Lead) -> None:
-        """Take what is asked for, within its limits; what is no number is ignored.
+        """Take a request, within the limits; a value that is not finite is ignored.
 
         Args:
             asked: where to lead and how to push.
-            now: where the hand is led now: who leads first takes it over from there.
+            now: where the hand is led now; the first request takes over from there.
         """
         if not all(map(math.isfinite, (asked.height, asked.pitch, *asked.push))):
             return

@@ -440,14 +440,14 @@ class OperatorIntent(Message, frozen=True):
 
 
 class HandLead(Message, frozen=True):
-    """Where somebody leads the simulated hand in place of the scenario, and how they push."""
+    """Where a person leads the simulated hand in place of the scenario, and how they push."""
 
     leads: bool
-    """False: height and pitch are nothing; whoever leads goes on."""
+    """False: height and pitch are not used; only the push is."""
     height: float
     """Torso origin above the ankles, m."""
     pitch: float
-    """Of the torso, rad."""
+    """Pitch of the torso, rad."""
     push: Vector3
     """Push on the torso, N, world; it ends 0.3 s after the last message."""
     source: str = ""

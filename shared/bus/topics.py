@@ -237,6 +237,14 @@ TOPICS: Final = (
 )
 
 
+def several_may_write(key: str) -> bool:
+    """Return True for a full key on which several tools may put, each with its own numbers."""
+    return key.split("/", 2)[-1] in _OF_TOOLS
+
+
+_OF_TOOLS: Final = frozenset(topic.name for topic in TOPICS if OPERATOR in topic.writers)
+
+
 def keys(topic: Topic, robot: str) -> tuple[str, ...]:
     """Return every full key of a topic."""
     if topic.per_module:

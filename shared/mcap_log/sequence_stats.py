@@ -18,6 +18,8 @@ class KeyCount(msgspec.Struct, gc=False, kw_only=True):
     """Times the sequence did not go up: a new sender counts from 0 again."""
     last_seq: int = -1
     """Newest sequence number; -1 before the first."""
+    several: bool = False
+    """Several senders number their messages on this key: their numbers tell nothing of losses."""
 
     def feed(self, seq: int) -> None:
         """Take the sequence number of the next message.
@@ -26,7 +28,7 @@ class KeyCount(msgspec.Struct, gc=False, kw_only=True):
         the sender's start, or after its own.
         """
         step = seq - self.last_seq
-        if step != 1 and self.count:
+        if step != 1 and self.count and not self.several:
             if step > 1:
                 self.gaps += 1
                 self.missing += step - 1

@@ -32,7 +32,7 @@ from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, Writer
 
-from shared.bus.topics import Topic
+from shared.bus.topics import Topic, several_may_write
 from shared.exceptions import RunError
 from shared.mcap_log import files, schema
 from shared.mcap_log.fsync_thread import FsyncThread
@@ -107,7 +107,9 @@ class RunWriter:
         """The file being written, or the last one."""
         self.begun = 0
         """Files started so far."""
-        self.counts: dict[str, KeyCount] = {key: KeyCount() for key in topics}
+        self.counts: dict[str, KeyCount] = {
+            key: KeyCount(several=several_may_write(key)) for key in topics
+        }
         """Counts of the whole run."""
         self.unknown: dict[str, int] = {}
         """Messages on keys that have no row in the table of topics; not written."""
@@ -340,4 +342,5 @@ def _since(before: KeyCount, now: KeyCount) -> KeyCount:
         missing=now.missing - before.missing,
         restarts=now.restarts - before.restarts,
         last_seq=now.last_seq,
+        several=now.several,
     )

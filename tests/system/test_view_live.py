@@ -108,6 +108,7 @@ def test_a_page_leads_pushes_freezes_and_kills_and_the_log_has_it_all(tmp_path: 
     assert "STOOD" in said
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["stood"] is True
+    assert summary["sequence_gaps"] == 0, "two tools tell events, each with its own numbers"
     log = read_run(tmp_path / "run.mcap")
     path = hand_path(log)
     assert {row.hand.height for row in path if row.hand.leads} == {1.0}

@@ -8,7 +8,6 @@ NAME.pem, NAME.key              the current certificate of each name
 from __future__ import annotations
 
 import datetime as dt
-import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError
 from tools.keys import certificates
 from tools.keys.certificates import Issued
+from tools.output import replace_file
 
 _KEY: Final = "authority.key"
 
@@ -78,10 +78,10 @@ class Authority:
             for name, generation in generations.items()
         }
         for name, made in issued.items():
-            write_private(key_file(self.folder, name), made.key)
-            write_private(certificate_file(self.folder, name), made.certificate)
+            replace_file(key_file(self.folder, name), made.key, private=True)
+            replace_file(certificate_file(self.folder, name), made.certificate, private=True)
         self.names = Names(self.names.robot, {**self.names.generations, **generations})
-        write_private(self.folder / credentials.NAMES, credentials.to_toml(self.names))
+        replace_file(self.folder / credentials.NAMES, credentials.to_toml(self.names), private=True)
 
 
 def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
@@ -103,9 +103,9 @@ def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
     except OSError as error:
         raise BusError(f"{folder}: cannot be made: {error.strerror}") from None
     own = certificates.make_authority(robot.name, dt.datetime.now(dt.UTC))
-    write_private(folder / credentials.AUTHORITY, own.certificate)
-    write_private(folder / credentials.NAMES, credentials.to_toml(names))
-    write_private(folder / _KEY, own.key)
+    replace_file(folder / credentials.AUTHORITY, own.certificate, private=True)
+    replace_file(folder / credentials.NAMES, credentials.to_toml(names), private=True)
+    replace_file(folder / _KEY, own.key, private=True)
     authority = Authority(folder)
     authority.renew(robot, names.generations, days)
     return authority
@@ -132,12 +132,3 @@ def hosts_of(robot: RobotConfig, name: str) -> tuple[str, ...]:
             "right, or --hosts FILE for a robot on several hosts"
         )
     return (found[1],)
-
-
-def write_private(file: Path, content: bytes) -> None:
-    """Write a file that only this user can read, whole or not at all."""
-    part = file.with_name(f".{file.name}.part")
-    part.unlink(missing_ok=True)
-    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
-        opened.write(content)
-    part.replace(file)

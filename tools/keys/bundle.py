@@ -10,7 +10,8 @@ from pathlib import Path
 from shared.bus import credentials
 from shared.bus.credentials import certificate_file, key_file
 from shared.exceptions import BusError
-from tools.keys.authority import Authority, write_private
+from tools.keys.authority import Authority
+from tools.output import replace_file
 
 
 def bundle(authority: Authority, names: Iterable[str]) -> dict[str, bytes]:
@@ -62,7 +63,7 @@ def install(files: dict[str, bytes], folder: Path) -> None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)
         for name, content in files.items():
-            write_private(folder / name, content)
+            replace_file(folder / name, content, private=True)
         for old in set(held_files(folder)) - set(files):
             (folder / old).unlink()
     except OSError as error:

@@ -162,7 +162,7 @@ class RunLog:
     def count_into(self, counts: dict[str, KeyCount]) -> None:
         """Count the messages of this part, without its margins, after those of the parts before."""
         for key in self.keys():
-            count = counts.setdefault(key, KeyCount())
+            count = counts.setdefault(key, KeyCount(several=topics.several_may_write(key)))
             for t_ns, _, seq in self.raw(key):
                 if self.holds(t_ns):
                     count.feed(seq)
@@ -171,7 +171,7 @@ class RunLog:
         """Return counts, gaps and restarts of every key with messages, from the file itself."""
         found = {}
         for key in self.keys():
-            found[key] = KeyCount()
+            found[key] = KeyCount(several=topics.several_may_write(key))
             for seq in self._of(key).seq:
                 found[key].feed(seq)
         return found

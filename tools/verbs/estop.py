@@ -17,6 +17,7 @@ from shared.exceptions import FleetError, XrlError
 from shared.process import StopFlag
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
+from tools.fleet.operator_key import require_operator
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
 from tools.typed_line import typed_line
@@ -123,7 +124,12 @@ def _robot(args: argparse.Namespace) -> RobotConfig:
 
 
 def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
-    """Keep the links open until a person asks for the stop, or leaves."""
+    """Keep the links open until a person asks for the stop, or leaves.
+
+    Raises:
+        FleetError: this host's key stops nobody: a person is not to rely on it.
+    """
+    require_operator(robot, "estop")
     console, asked = Console(), StopFlag()
     with open_session(robot, "estop", run_dir) as session:
         stop = BusStop(robot, session, run_dir if here else None)

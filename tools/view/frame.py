@@ -60,15 +60,6 @@ class ShownProcess(msgspec.Struct, frozen=True):
     restarts: int
 
 
-class SoleShown(msgspec.Struct, frozen=True):
-    """What the floor does to one sole."""
-
-    force: Vector3
-    """N, world."""
-    cop: tuple[float, ...]
-    """Centre of pressure, x and y, m, world."""
-
-
 class Frame(msgspec.Struct, frozen=True):
     """One moment of the robot; SI units, world axes unless it says otherwise."""
 
@@ -103,14 +94,14 @@ class Frame(msgspec.Struct, frozen=True):
     fallen: bool
     capture: tuple[float, ...]
     """Capture point: COM + its rate / sqrt(g / height), x and y, m; empty without a planner."""
-    soles: tuple[SoleShown, ...]
+    soles: tuple[SoleLoad, ...]
     """Right and left; empty if not known."""
     soles_estimated: bool
     """True: from the legs' torques; False: the simulated world's own."""
     ways_out: tuple[str, ...]
     """For each module what lets it track again; empty if nothing is needed."""
     processes: tuple[ShownProcess, ...] = ()
-    """Of a live fleet on this host."""
+    """Processes of a live fleet on this host; empty for the other sources."""
     network: tuple[str, ...] = ()
     """Active impairments of a live fleet's network, in words."""
 
@@ -205,7 +196,7 @@ class Newest:
 
     def _soles_of(
         self, truth: Message | None, states: list[JointState]
-    ) -> tuple[tuple[SoleShown, ...], bool]:
+    ) -> tuple[tuple[SoleLoad, ...], bool]:
         """Return the soles' loads, and whether they are estimated."""
         # a world of before the soles were measured has zeros
         if isinstance(truth, SimTruth) and any((*truth.foot_right_force, *truth.foot_left_force)):
@@ -253,8 +244,10 @@ def _capture_point(status: PlannerStatus) -> tuple[float, ...]:
     return _short((x + per_rate * status.pdot[0], y + per_rate * status.pdot[1]))
 
 
-def _shown_soles(loads: Sequence[SoleLoad]) -> tuple[SoleShown, ...]:
-    return tuple(SoleShown(_vector(load.force), _short(load.cop)) for load in loads)
+def _shown_soles(loads: Sequence[SoleLoad]) -> tuple[SoleLoad, ...]:
+    return tuple(
+        SoleLoad(_vector(force), (round(x, DIGITS), round(y, DIGITS))) for force, (x, y) in loads
+    )
 
 
 def _short(values: Iterable[float]) -> tuple[float, ...]:

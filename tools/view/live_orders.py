@@ -8,7 +8,6 @@ from collections.abc import Callable
 import msgspec
 
 from shared.bus import topics
-from shared.bus.credentials import read_credentials
 from shared.bus.messages import HandLead, RunEvent, RunEventKind
 from shared.bus.session import Publisher, Session
 from shared.clock import now_ns
@@ -17,6 +16,7 @@ from shared.config.scenarios import Inject
 from shared.exceptions import FleetError, XrlError
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import BusStop, request_here
+from tools.fleet.operator_key import require_operator
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.view.hand import HandOrders
@@ -44,10 +44,7 @@ class LiveOrders:
         Raises:
             BusError, FleetError: this host has no key that may act.
         """
-        if robot.bus.security.mode == "mtls":
-            name = read_credentials(robot, "view").name
-            if name != topics.OPERATOR:
-                raise FleetError(f"this host has the key of a {name}; to act takes an operator's")
+        require_operator(robot, "view")
         self._robot, self._fleet, self._scenario_s = robot, fleet, scenario_s
         self.services = tuple(sorted(fleet.manifest.services, key=lambda name: name != "planner"))
         self._carriers: dict[str, Callable[[Order], None]] = {
@@ -65,7 +62,7 @@ class LiveOrders:
         self._publisher: Publisher[HandLead] | None = None
         self._events: Publisher[RunEvent] | None = None
         self._stop: BusStop | None = None
-        self._seq = 0
+        self._led = self._told = 0
 
     def begin(self, session: Session) -> None:
         """Take the session that is open while somebody looks."""
@@ -93,9 +90,9 @@ class LiveOrders:
         publisher = self._publisher
         if publisher is None:
             raise FleetError("the hand is not linked yet")
-        self._seq += 1
+        self._led += 1
         asked = self._hand.message(order)
-        publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._seq))
+        publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._led))
 
     def _estop(self, _order: Order) -> None:
         """Stop all, first by shared memory.
@@ -129,10 +126,10 @@ class LiveOrders:
         """Have it in the log."""
         events = self._events
         if events is not None:
-            self._seq += 1
+            self._told += 1
             event = RunEvent(
                 t_ns=now_ns(),
-                seq=self._seq,
+                seq=self._told,
                 kind=int(kind),
                 subject=subject,
                 detail=detail,

@@ -53,7 +53,7 @@ class Order(msgspec.Struct, frozen=True):
     order: str
     """`kill`, `freeze`, `start`, `cut`, `estop`, `hand` or `push`."""
     service: str = ""
-    """Of `kill`, `freeze` and `start`; of `cut` what is cut off."""
+    """Service to `kill`, `freeze` or `start`; for `cut` a name in `CUTS`."""
     height: float = 0.0
     """Of `hand`: where to lead the torso, m above the ankles."""
     pitch: float = 0.0

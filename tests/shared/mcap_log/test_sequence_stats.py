@@ -5,7 +5,25 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shared.bus import topics
 from shared.mcap_log.sequence_stats import KeyCount
+
+
+def test_numbers_of_several_senders_tell_nothing_of_losses() -> None:
+    count = KeyCount(several=True)
+    for number in (1, 2, 40, 3, 41):
+        count.feed(number)
+    assert (count.count, count.gaps, count.missing, count.restarts) == (5, 0, 0, 0)
+
+
+def test_only_keys_of_tools_have_several_senders() -> None:
+    several = {key for key in topics.all_keys("lab") if topics.several_may_write(key)}
+    assert several == {
+        f"xrl/lab/{name}"
+        for name in (
+            "estop", "harness/tare", "operator/intent", "operator/hand", "sim/control", "run/event",
+        )
+    }  # fmt: skip
 
 
 def fed(numbers: Iterable[int]) -> KeyCount:

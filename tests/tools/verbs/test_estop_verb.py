@@ -10,8 +10,12 @@ import pytest
 from services.joint.neighbours import NeighbourRow, Neighbours
 from services.joint.rearm_guard import RearmGuard
 from shared.bus.messages import Mode
+from shared.bus.topics import VIEWER
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
+from tests.certified import certified, install_all
 from tests.tools.exit_codes import exit_code
 from tools.fleet.run_dir import Manifest, RunDir
 
@@ -56,6 +60,17 @@ def test_of_several_hosts_one_answers_for_its_own_modules_and_for_each_of_them(
     del fleet
     assert exit_code([*local, "--partly", "knee_left,hip_left"]) == 2
     assert "knee_left has no service on this host" in capsys.readouterr().err
+
+
+def test_a_viewers_key_stands_by_for_nothing(
+    robot: RobotConfig, run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    secured, made = certified(robot, tmp_path)
+    install_all(made, tmp_path / "keys", VIEWER)
+    file = tmp_path / "robot.toml"
+    file.write_text(config_file.to_toml(secured), encoding="utf-8")
+    assert exit_code(["estop", "--wait", "--config", file, "--run-dir", run_dir]) == 2
+    assert "to act takes an operator's" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def test_the_two_soles_bear_the_whole_robot_and_who_holds_it(robot: RobotConfig)
 
 
 def test_the_legs_jacobian_is_that_of_the_law(robot: RobotConfig) -> None:
-    """Of the pose's torso part, of each leg alone: the other leg's share is nothing."""
+    """Compared with the torso's position in `Kinematics`, with all of the load on one leg."""
     q = np.array(stand_pose(robot, 1.05)) + np.random.default_rng(3).uniform(-0.1, 0.1, 12)
     known = Kinematics(robot)
     for index, leg in enumerate(leg_geometry(robot)):

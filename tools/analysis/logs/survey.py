@@ -8,6 +8,7 @@ from typing import Final
 
 import msgspec
 
+from shared.bus.topics import several_may_write
 from shared.clock import NS_PER_S
 from shared.mcap_log.files import in_use
 from shared.mcap_log.reader import ChunkPlace, LogReader, LogRecord, LostBytes, open_log
@@ -178,7 +179,11 @@ class _Reading:
         nominal_hz = 0.0
         with contextlib.suppress(ValueError):
             nominal_hz = float(channel.metadata.get("rate_hz", "0"))
-        facts = TopicFacts(schema=self._schemas.get(channel.schema_id, ""), nominal_hz=nominal_hz)
+        facts = TopicFacts(
+            schema=self._schemas.get(channel.schema_id, ""),
+            nominal_hz=nominal_hz,
+            sequence=KeyCount(several=several_may_write(channel.topic)),
+        )
         self._channels[channel.id] = self._topics.setdefault(channel.topic, facts)
 
     def _count(self, record: LogRecord) -> None:

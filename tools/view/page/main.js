@@ -161,7 +161,7 @@ function show(frame) {
   newest = frame;
   $("time").textContent = frame.t_s.toFixed(1);
   $("height").textContent = frame.torso[2].toFixed(3);
-  $("hand").textContent = frame.force[2].toFixed(0);
+  $("hand").textContent = Math.round(frame.force[2]) || 0;  // never -0
   const planner = frame.planner, age = Math.max(...frame.ages_ms);
   $("age").textContent = age >= 0 ? age.toFixed(0) : "–";
   $("margin").textContent = planner ? planner.margin.toFixed(2) : "–";
@@ -180,7 +180,7 @@ function show(frame) {
   if (frame.fallen) complain("it has fallen");
   if (!$("timeline").hidden && document.activeElement !== $("place")) $("place").value = frame.t_s;
   if (!hand.led) Object.assign(hand, { height: frame.torso[2], pitch: frame.angles[1] });
-  const [right, left] = frame.soles.map((sole) => `${sole.force[2].toFixed(0)} N`);
+  const [right, left] = frame.soles.map(([force]) => `${force[2].toFixed(0)} N`);
   $("soles").textContent = !right ? "not known: a leg is straight"
     : `right ${right}, left ${left}${!frame.soles_estimated ? "" : "; estimated from the legs' torques"}`;
   showProcesses(frame);

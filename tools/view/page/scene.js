@@ -194,7 +194,7 @@ export class RobotScene {
     this.capture.position.set(frame.capture[0] ?? 0, frame.capture[1] ?? 0, floor + 0.003);
     this.push.show(frame.push, this.robot.frames.torso.position);
     this.soles.forEach((arrow, index) => {
-      const { force = [0, 0, 0], cop = [0, 0] } = frame.soles[index] ?? {};
+      const [force = [0, 0, 0], cop = [0, 0]] = frame.soles[index] ?? [];
       arrow.show(force, new T.Vector3(cop[0], cop[1], floor));
     });
     this.robot.updateMatrixWorld(true);
