@@ -55,7 +55,7 @@ def mjcf(config: RobotConfig) -> str:
           contype="1" conaffinity="1"/>
     <body name="torso" pos="0 0 {config.simulation.stand_height}">
       <freejoint name="torso"/>
-      {_inertial(config.torso_mass, _box_inertia(config.torso_mass, geometry.torso_size))}
+      {_inertial(config.torso_mass, box_inertia(config.torso_mass, geometry.torso_size))}
       <geom name="torso" type="box" size="{_numbers(*(s / 2 for s in geometry.torso_size))}"/>
       <site name="harness" pos="{harness}"/>{legs}
     </body>
@@ -67,9 +67,9 @@ def mjcf(config: RobotConfig) -> str:
 def _leg(config: RobotConfig, side: str) -> str:
     geometry, half = config.geometry, config.mass.module / 2
     hip = f"0 {side_sign(side) * geometry.w_hip / 2} 0"
-    module = _inertial(config.mass.module, _ball_inertia(config.mass.module))
-    half_at_origin = _inertial(half, _ball_inertia(half))
-    half_at_knee = _inertial(half, _ball_inertia(half), f"0 0 -{geometry.l1}")
+    module = _inertial(config.mass.module, ball_inertia(config.mass.module))
+    half_at_origin = _inertial(half, ball_inertia(half))
+    half_at_knee = _inertial(half, ball_inertia(half), f"0 0 -{geometry.l1}")
     sole = _numbers(geometry.l_foot / 2, geometry.w_foot / 2, geometry.foot_height / 4)
     sole_z = -0.75 * geometry.foot_height
     return f"""
@@ -105,12 +105,14 @@ def _inertial(mass: float, inertia: tuple[float, float, float], pos: str = "0 0 
     return f'<inertial pos="{pos}" mass="{mass}" diaginertia="{_numbers(*inertia)}"/>'
 
 
-def _box_inertia(mass: float, size: tuple[float, float, float]) -> tuple[float, float, float]:
+def box_inertia(mass: float, size: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return the principal inertia of a box about its centre, kg m^2; size in m."""
     x, y, z = (side * side for side in size)
     return mass * (y + z) / 12, mass * (x + z) / 12, mass * (x + y) / 12
 
 
-def _ball_inertia(mass: float) -> tuple[float, float, float]:
+def ball_inertia(mass: float) -> tuple[float, float, float]:
+    """Return the principal inertia of a module's ball, kg m^2."""
     inertia = 0.4 * mass * MODULE_RADIUS**2
     return inertia, inertia, inertia
 

@@ -20,15 +20,13 @@ from shared.bus.messages import (
     PlannerMode,
     PlannerStatus,
     Refusal,
-    Trip,
 )
 from shared.bus.session import Latest, Session
 from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOPICS
 from shared.clock import NS_PER_S, now_ns, pace
 from shared.exceptions import FleetError
-from shared.robot.fault_table import recovery_of
 from shared.robot.joints import MODULES
-from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS
+from shared.robot.remedies import reason_of, remedy_of
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 
@@ -48,8 +46,6 @@ _WINDOW_S: Final = 0.5
 _FRESH_S: Final = 1.0
 """An older message is history: its sender is dead, suspended or cut off."""
 _POLL_S: Final = 0.002
-RESTART: Final = "xrl kill MODULE"
-"""Its supervisor starts it again."""
 
 
 class ServiceStatus(msgspec.Struct, frozen=True):
@@ -263,29 +259,13 @@ def module_status(
     if not isinstance(state, JointState):
         return ModuleStatus(None, None, None, None, None, "")
     mode, cause, drive = Mode(state.mode), Cause(state.cause), DriveStatus(state.drive)
-    way_out = ""
-    if mode is Mode.FAULT:
-        way_out = f"{recovery_of(cause)}; then {RESTART}"
-    elif mode is Mode.DAMP:
-        way_out = RESTART
-    elif drive is DriveStatus.UNZEROED:
-        way_out = "hang the robot, xrl zero"
-    elif drive is DriveStatus.HOLDING:
-        way_out = "by itself, with the planner: the drive holds"
-    elif mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):
-        way_out = f"if it lasts: its log says why; hang the robot, then {RESTART}"
-    elif mode is Mode.HOLD and cause in JOINT_TRIPS:
-        way_out = f"by itself, after a wait; if again: {JOINT_TRIPS[cause].recovery}"
     outside = Outside(state.outside).name if state.outside else ""
-    if outside and not way_out:
-        refused = f"the planner's {outside.lower()} is refused"
-        way_out = f"{refused}: by itself after a push or a stall; if it lasts, xrl kill planner"
     knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
     q = state.q if knows else None
     stiffened = state.stiffened and mode in (Mode.HOLD, Mode.DAMP)
     tier = TIERS.get(mode)
     return ModuleStatus(
-        mode.name, tier, cause.name, drive.name, q, way_out, stiffened, outside,
+        mode.name, tier, cause.name, drive.name, q, remedy_of(state), stiffened, outside,
         state.session, refused_hz, Refusal(state.refusal).name if refused_hz else "",
         state.refused_session if refused_hz else 0,
         stopped_by if cause is Cause.ESTOP else "",
@@ -297,10 +277,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
     if not isinstance(message, PlannerStatus):
         return None
     mode = PlannerMode(message.mode).name
-    why = message.why
-    if message.trip:
-        why += f": {PLANNER_TRIPS[Trip(message.trip)].recovery}"
-    return LeadStatus(mode, message.wait_s, message.margin, why, message.session)
+    return LeadStatus(mode, message.wait_s, message.margin, reason_of(message), message.session)
 
 
 def _listen(

@@ -14,26 +14,14 @@ from foxglove import messages as well_known
 
 from shared.bus.messages import Vector3
 from shared.clock import NS_PER_S
+from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, Quaternion
 
-Quaternion: TypeAlias = tuple[float, float, float, float]
 Colour: TypeAlias = tuple[float, float, float, float]
 
 ENCODING: Final = "protobuf"
 """Encoding of the messages."""
 TRANSFORMS: Final = well_known.FrameTransforms.get_schema()
 SCENE: Final = well_known.SceneUpdate.get_schema()
-
-ORIGIN: Final[Vector3] = (0.0, 0.0, 0.0)
-UPRIGHT: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
-
-
-class FrameTransform(NamedTuple):
-    """Pose of a frame in its parent."""
-
-    parent: str
-    child: str
-    position: Vector3
-    rotation: Quaternion
 
 
 class Solid(NamedTuple):
@@ -69,7 +57,7 @@ class Entity(NamedTuple):
     arrows: tuple[Arrow, ...] = ()
 
 
-def transforms(ns: int, rows: Iterable[FrameTransform]) -> bytes:
+def transforms(ns: int, rows: Iterable[FramePose]) -> bytes:
     """Encode the poses of frames at a time, ns since 1970."""
     timestamp = _time(ns)
     return well_known.FrameTransforms(

@@ -1,8 +1,7 @@
 """3-D scene of the robot: a frame for each module, a body for each link, COM and forces.
 
-Frames (docs/law.md#the-robot): `world`; `torso`; below it on each leg `hip_*` (carries the
-thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso; `com` with the axes
-of the world. The links are those of `shared.robot.robot_model`.
+The frames are those of `shared.robot.frames`, and `com` with the axes of the world. The links are
+those of `shared.robot.robot_model`.
 """
 
 from __future__ import annotations
@@ -21,19 +20,18 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.mcap_log.extended_copy import NewChannel, NewMessage
-from shared.robot.joints import MODULES, SIDES
-from shared.robot.robot_model import MODULE_RADIUS, side_sign
-from tools.analysis.reports import foxglove, urdf
-from tools.analysis.reports.foxglove import (
+from shared.robot.frames import (
     ORIGIN,
     UPRIGHT,
-    Arrow,
-    Colour,
-    Entity,
-    FrameTransform,
+    FramePose,
     Quaternion,
-    Solid,
+    body_frames,
+    torso_rotation,
 )
+from shared.robot.joints import MODULES, SIDES
+from shared.robot.robot_model import MODULE_RADIUS
+from tools.analysis.reports import foxglove, urdf
+from tools.analysis.reports.foxglove import Arrow, Colour, Entity, Solid
 from tools.runs.run_log import RunLog
 
 RATE_HZ: Final = 30.0
@@ -211,60 +209,13 @@ def _thin(rows: list[Any], first_ns: int) -> Iterator[Any]:
             yield row
 
 
-def frames(robot: RobotConfig, pose: RobotPose) -> list[FrameTransform]:
+def frames(robot: RobotConfig, pose: RobotPose) -> list[FramePose]:
     """Return all frames of a pose."""
-    geometry = robot.geometry
-    found = [
-        FrameTransform("world", "torso", pose.torso, torso_rotation(pose.angles)),
-        FrameTransform("world", "com", pose.com, UPRIGHT),
-        FrameTransform("torso", "harness", geometry.harness_point, UPRIGHT),
+    return [
+        FramePose("world", "torso", pose.torso, torso_rotation(pose.angles)),
+        FramePose("world", "com", pose.com, UPRIGHT),
+        *body_frames(robot.geometry, pose.q),
     ]
-    for side in SIDES:
-        sign = side_sign(side)
-        parent = "torso"
-        for kind, position in (
-            ("hip", (0.0, sign * geometry.w_hip / 2, 0.0)),
-            ("knee", (0.0, 0.0, -geometry.l1)),
-            ("ankle", (0.0, 0.0, -geometry.l2)),
-        ):
-            module = f"{kind}_{side}"
-            number = 2 * MODULES.index(module)
-            phi, theta = pose.q[number], pose.q[number + 1]
-            found.append(FrameTransform(parent, module, position, module_rotation(phi, theta)))
-            parent = module
-    return found
-
-
-def torso_rotation(angles: Vector3) -> Quaternion:
-    """Return Rz(yaw) Rx(roll) Ry(pitch)."""
-    roll, pitch, yaw = angles
-    return product(product(_rotation(2, yaw), _rotation(0, roll)), _rotation(1, pitch))
-
-
-def module_rotation(phi: float, theta: float) -> Quaternion:
-    """Return the rotation of the part below a module in the part above it.
-
-    From the foot up a module is Rx(phi) Ry(theta); from the torso down it is the inverse.
-    """
-    return product(_rotation(1, -theta), _rotation(0, -phi))
-
-
-def _rotation(axis: int, angle: float) -> Quaternion:
-    values = [0.0, 0.0, 0.0, math.cos(angle / 2)]
-    values[axis] = math.sin(angle / 2)
-    return values[0], values[1], values[2], values[3]
-
-
-def product(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return the rotation b followed by the rotation a."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
 
 
 def rotation_to(direction: Vector3) -> Quaternion:

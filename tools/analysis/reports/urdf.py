@@ -11,7 +11,8 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from tools.analysis.reports.foxglove import Entity, FrameTransform, Solid
+from shared.robot.frames import FramePose
+from tools.analysis.reports.foxglove import Entity, Solid
 
 SCHEMA_NAME: Final = "std_msgs/msg/String"
 SCHEMA: Final = b"string data\n"
@@ -27,7 +28,7 @@ def message(text: str) -> bytes:
     return _LITTLE_ENDIAN + struct.pack("<I", len(data)) + data
 
 
-def urdf(robot: str, frames: Sequence[FrameTransform], entities: Iterable[Entity]) -> str:
+def urdf(robot: str, frames: Sequence[FramePose], entities: Iterable[Entity]) -> str:
     """Return the model: a link for each frame and its parents, a visual for each solid.
 
     Args:

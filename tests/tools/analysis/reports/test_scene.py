@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from shared.bus import codec, topics
 from shared.config.robot_config import RobotConfig
 from shared.mcap_log import schema
+from shared.robot.frames import UPRIGHT, FramePose
 from shared.robot.joints import JOINTS, MODULES, SIDES
 from shared.robot.robot_model import ankle_positions, mjcf
 from tests.shared.mcap_log.runs import sample
@@ -30,7 +31,7 @@ from tests.tools.analysis.reports import runs
 from tests.tools.analysis.reports.runs import Made
 from tools import cli
 from tools.analysis.reports import scene
-from tools.analysis.reports.foxglove import UPRIGHT, Arrow, Entity, FrameTransform, Solid
+from tools.analysis.reports.foxglove import Arrow, Entity, Solid
 from tools.analysis.reports.scene import RobotPose
 from tools.runs.run_log import RunLog, read_run
 
@@ -56,7 +57,7 @@ def matrix(turn: tuple[float, float, float, float]) -> Array:
     return out.reshape(3, 3)
 
 
-def in_world(frames: list[FrameTransform]) -> dict[str, tuple[Array, Array]]:
+def in_world(frames: list[FramePose]) -> dict[str, tuple[Array, Array]]:
     """Return (position, rotation) of each frame in the world."""
     found = {"world": (np.zeros(3), np.eye(3))}
     for row in frames:
@@ -243,7 +244,7 @@ def test_another_reader_of_protobuf_finds_all_frames_and_bodies_of_the_scene(
     assert len(found["links"]) == pytest.approx((poses[-1].t_ns - poses[0].t_ns) / 1e9, abs=1)
     for pose in poses:
         assert scene.frames(robot, pose) == [
-            FrameTransform(
+            FramePose(
                 row.parent_frame_id, row.child_frame_id,
                 numbers(row.translation, "xyz"), numbers(row.rotation, "xyzw"),
             )

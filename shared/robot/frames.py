@@ -1,0 +1,165 @@
+"""Frames of the robot: where torso, modules and harness are, one in the other. Pure.
+
+Rotations are unit quaternions (x, y, z, w). The frames are `world`; `torso`; below it on each leg
+`hip_*` (carries the thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso
+(docs/law.md#the-robot).
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Sequence
+from typing import Final, NamedTuple, TypeAlias
+
+from shared.bus.messages import Vector3, Vector6
+from shared.config.sections import GeometryConfig
+from shared.robot.joints import MODULE_INDEX, SIDES
+from shared.robot.robot_model import side_sign
+
+Quaternion: TypeAlias = tuple[float, float, float, float]
+
+ORIGIN: Final[Vector3] = (0.0, 0.0, 0.0)
+UPRIGHT: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+
+
+class FramePose(NamedTuple):
+    """Pose of a frame in its parent."""
+
+    parent: str
+    child: str
+    position: Vector3
+    rotation: Quaternion
+
+
+def body_frames(geometry: GeometryConfig, q: Sequence[float]) -> list[FramePose]:
+    """Return the frames on the torso and below it.
+
+    Args:
+        geometry: of the robot.
+        q: joint angles (12,), rad.
+    """
+    found = [FramePose("torso", "harness", geometry.harness_point, UPRIGHT)]
+    for side in SIDES:
+        parent = "torso"
+        for kind, position in leg_offsets(geometry, side):
+            module = f"{kind}_{side}"
+            phi, theta = joint_pair(q, module)
+            found.append(FramePose(parent, module, position, module_rotation(phi, theta)))
+            parent = module
+    return found
+
+
+def leg_offsets(geometry: GeometryConfig, side: str) -> tuple[tuple[str, Vector3], ...]:
+    """Return each module's kind and its position in the frame above it, m, from the torso down."""
+    return (
+        ("hip", (0.0, side_sign(side) * geometry.w_hip / 2, 0.0)),
+        ("knee", (0.0, 0.0, -geometry.l1)),
+        ("ankle", (0.0, 0.0, -geometry.l2)),
+    )
+
+
+def joint_pair(q: Sequence[float], module: str) -> tuple[float, float]:
+    """Return (phi, theta) of a module out of the joint angles (12,), rad."""
+    number = 2 * MODULE_INDEX[module]
+    return q[number], q[number + 1]
+
+
+def torso_pose(
+    geometry: GeometryConfig, q: Sequence[float], stance: Vector6
+) -> tuple[Vector3, Quaternion]:
+    """Return the torso's pose in the world, m: the mean of what the two legs say.
+
+    The world is midway between the feet, at the height of the ankles; both feet lie on the floor.
+
+    Args:
+        geometry: of the robot.
+        q: joint angles (12,), rad.
+        stance: place of the right foot relative to the left, as in `PlannerStatus`.
+    """
+    positions, rotations = [], []
+    for side in SIDES:
+        place, turned = _foot_place(geometry, side, stance)
+        ankle, rotation = _ankle_in_torso(geometry, q, side)
+        torso = product(turned, inverse(rotation))
+        x, y, z = rotated(torso, ankle)
+        positions.append((place[0] - x, place[1] - y, place[2] - z))
+        rotations.append(torso)
+    (a, b), (right, left) = positions, rotations
+    sign = math.copysign(1.0, sum(map(operator.mul, right, left)))  # q and -q are one rotation
+    mean = [r + sign * other for r, other in zip(right, left, strict=True)]
+    length = math.hypot(*mean)
+    x, y, z, w = (part / length for part in mean)
+    middle = (a[0] + b[0]) / 2, (a[1] + b[1]) / 2, (a[2] + b[2]) / 2
+    return middle, (x, y, z, w)
+
+
+def _foot_place(geometry: GeometryConfig, side: str, stance: Vector6) -> tuple[Vector3, Quaternion]:
+    """Return where a foot stands, world axes; each takes half of the stance."""
+    half, y = -side_sign(side) / 2, side_sign(side) * geometry.w_base / 2
+    dx, dy, dz, *turn = (half * part for part in stance)
+    angle = math.hypot(*turn)
+    if angle == 0.0:
+        return (dx, y + dy, dz), UPRIGHT
+    scale = math.sin(angle / 2) / angle
+    rx, ry, rz = turn
+    return (dx, y + dy, dz), (scale * rx, scale * ry, scale * rz, math.cos(angle / 2))
+
+
+def _ankle_in_torso(
+    geometry: GeometryConfig, q: Sequence[float], side: str
+) -> tuple[Vector3, Quaternion]:
+    """Return the pose of a foot in the torso's frame."""
+    position, rotation = ORIGIN, UPRIGHT
+    for kind, offset in leg_offsets(geometry, side):
+        x, y, z = rotated(rotation, offset)
+        position = position[0] + x, position[1] + y, position[2] + z
+        rotation = product(rotation, module_rotation(*joint_pair(q, f"{kind}_{side}")))
+    return position, rotation
+
+
+def torso_rotation(angles: Vector3) -> Quaternion:
+    """Return Rz(yaw) Rx(roll) Ry(pitch)."""
+    roll, pitch, yaw = angles
+    return product(
+        product(rotation_about(2, yaw), rotation_about(0, roll)), rotation_about(1, pitch)
+    )
+
+
+def module_rotation(phi: float, theta: float) -> Quaternion:
+    """Return the rotation of the part below a module in the part above it.
+
+    From the foot up a module is Rx(phi) Ry(theta); from the torso down it is the inverse.
+    """
+    return product(rotation_about(1, -theta), rotation_about(0, -phi))
+
+
+def rotation_about(axis: int, angle: float) -> Quaternion:
+    """Return the rotation about an axis (0, 1, 2 for x, y, z), rad."""
+    values = [0.0, 0.0, 0.0, math.cos(angle / 2)]
+    values[axis] = math.sin(angle / 2)
+    return values[0], values[1], values[2], values[3]
+
+
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Return the rotation b followed by the rotation a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def inverse(rotation: Quaternion) -> Quaternion:
+    """Return the rotation back."""
+    x, y, z, w = rotation
+    return -x, -y, -z, w
+
+
+def rotated(rotation: Quaternion, vector: Vector3) -> Vector3:
+    """Return a vector turned by a rotation."""
+    turned = product(product(rotation, (*vector, 0.0)), inverse(rotation))
+    return turned[0], turned[1], turned[2]

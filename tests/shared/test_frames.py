@@ -1,0 +1,124 @@
+"""Frames of the robot, and its URDF, against Pinocchio and the planner's kinematics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from services.planner.kinematics import Kinematics, Measured
+from services.planner.model import load_pinocchio, q_tree
+from shared.config.robot_config import RobotConfig
+from shared.robot import frames
+from shared.robot.joints import JOINTS, MODULES
+from shared.robot.robot_model import stand_pose
+from shared.robot.robot_urdf import cross_of, urdf
+
+
+def random_q(robot: RobotConfig, seed: int) -> list[float]:
+    low, high = np.array(robot.joint_limits()).T
+    drawn: list[float] = np.random.default_rng(seed).uniform(low, high).tolist()
+    return drawn
+
+
+def placed(model: pin.Model, q: list[float]) -> dict[str, pin.SE3]:
+    """Return the pose of every frame in the torso."""
+    values = pin.neutral(model)
+    for name, angle in zip(JOINTS, q, strict=True):
+        values[model.joints[model.getJointId(name)].idx_q] = angle
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, values)
+    return {frame.name: data.oMf[i] for i, frame in enumerate(model.frames)}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_frames_and_urdf_are_where_the_model_of_planner_and_simulator_is(
+    robot: RobotConfig, seed: int
+) -> None:
+    q = random_q(robot, seed)
+    by_urdf = placed(pin.buildModelFromXML(urdf(robot)), q)
+    torso = {"torso": (np.zeros(3), np.eye(3))}
+    for row in frames.body_frames(robot.geometry, q):
+        origin, rotation = torso[row.parent]
+        R = pin.Quaternion(np.array(row.rotation)).toRotationMatrix()
+        torso[row.child] = (origin + rotation @ row.position, rotation @ R)
+    assert set(torso) == {"torso", "harness", *MODULES}
+    for name, (origin, rotation) in torso.items():
+        np.testing.assert_allclose(by_urdf[name].translation, origin, atol=1e-12)
+        np.testing.assert_allclose(by_urdf[name].rotation, rotation, atol=1e-12)
+
+
+def test_the_urdf_moves_like_the_model_of_the_planner(robot: RobotConfig) -> None:
+    """Inertia matrix and gravity torques are equal: masses, their places and the joints' axes."""
+    ours = pin.buildModelFromXML(urdf(robot), pin.JointModelFreeFlyer())
+    theirs = load_pinocchio(robot)
+    theirs.armature[:] = 0.0  # URDF has none
+    q = np.array(random_q(robot, 7))
+    numbers = q_tree(np.arange(1.0, 1.0 + len(JOINTS)), theirs)[7:]
+    by_name = [ours.joints[ours.getJointId(name)].idx_q - 7 for name in JOINTS]
+    found = []
+    for model, places in ((ours, by_name), (theirs, np.argsort(numbers).tolist())):
+        values = pin.neutral(model)
+        values[[7 + place for place in places]] = q
+        order = [*range(6), *(6 + place for place in places)]
+        data = model.createData()
+        M = pin.crba(model, data, values)
+        M = np.triu(M) + np.triu(M, 1).T
+        gravity = pin.computeGeneralizedGravity(model, data, values)
+        found.append((M[np.ix_(order, order)], gravity[order]))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-9)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-9)
+
+
+def test_the_urdf_names_each_joint_and_the_link_between_the_two_of_a_module(
+    robot: RobotConfig,
+) -> None:
+    model = pin.buildModelFromXML(urdf(robot))
+    assert {model.names[i] for i in range(1, model.njoints)} == set(JOINTS)
+    links = {frame.name for frame in model.frames}
+    assert {*MODULES, *map(cross_of, MODULES), "torso", "harness"} <= links
+    low, high = np.array(robot.joint_limits()).T
+    for name, lower, upper in zip(JOINTS, low, high, strict=True):
+        at = model.joints[model.getJointId(name)].idx_q
+        assert (model.lowerPositionLimit[at], model.upperPositionLimit[at]) == (lower, upper)
+
+
+STANCES = [(0.0,) * 6, (0.03, -0.02, 0.01, 0.0, 0.0, 0.1)]
+
+
+@pytest.mark.parametrize("stance", STANCES)
+@pytest.mark.parametrize("height", [1.188, 0.95])
+def test_the_torso_is_where_the_planners_kinematics_has_it(
+    robot: RobotConfig, height: float, stance: tuple[float, ...]
+) -> None:
+    """Where the legs do not agree, either takes a mean of its own."""
+    q = list(stand_pose(robot, height))
+    shifted = (stance[0], stance[1], stance[2], stance[3], stance[4], stance[5])
+    kinematics = Kinematics(robot)
+    kinematics.stance[:] = stance
+    kinematics.update(np.array(q))
+    apart = np.abs(kinematics.closure).max()
+    position, rotation = frames.torso_pose(robot.geometry, q, shifted)
+    np.testing.assert_allclose(position, kinematics.r_torso, atol=1e-9 + apart)
+    roll, pitch, yaw = kinematics.p[3:]
+    wanted = frames.torso_rotation((roll, pitch, yaw))
+    assert abs(np.dot(rotation, wanted)) == pytest.approx(1.0, abs=1e-9 + apart**2)
+
+
+def test_with_legs_that_agree_it_is_there_to_rounding_whatever_the_stance(
+    robot: RobotConfig,
+) -> None:
+    """The stance in which the legs agree at drawn angles is found by the planner's own graph."""
+    q = [angle + 0.02 * (-1) ** i for i, angle in enumerate(stand_pose(robot, 1.0))]
+    measured = Measured(robot)
+    s = measured.stance_at(np.array(q)).tolist()
+    kinematics = Kinematics(robot)
+    kinematics.stance[:] = s
+    kinematics.update(np.array(q))
+    assert np.abs(kinematics.closure).max() < 1e-9
+    assert max(map(abs, s)) > 1e-3
+    position, rotation = frames.torso_pose(robot.geometry, q, (s[0], s[1], s[2], s[3], s[4], s[5]))
+    np.testing.assert_allclose(position, kinematics.r_torso, atol=1e-9)
+    roll, pitch, yaw = kinematics.p[3:]
+    wanted = frames.torso_rotation((roll, pitch, yaw))
+    assert abs(np.dot(rotation, wanted)) == pytest.approx(1.0, abs=1e-12)
