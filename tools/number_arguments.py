@@ -9,6 +9,8 @@ from typing import Final
 FINITE_MAX: Final = 1e12
 COUNT_MAX: Final = 1_000_000
 NATURAL_MAX: Final = 2**63 - 1
+RATE_MIN_HZ: Final = 1e-3
+RATE_MAX_HZ: Final = 1e4
 
 
 def finite(text: str) -> float:
@@ -42,6 +44,21 @@ def natural(text: str) -> int:
         argparse.ArgumentTypeError: it is no whole number from 0 on.
     """
     return _whole(text, 0, NATURAL_MAX)
+
+
+def rate(text: str) -> float:
+    """Return a rate, Hz.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none from 0.001 to 10 000 Hz.
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not RATE_MIN_HZ <= number <= RATE_MAX_HZ:
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: a rate in Hz is right, such as 100")
+    return number
 
 
 def degrees(text: str) -> int:

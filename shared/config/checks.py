@@ -26,6 +26,8 @@ INTERFACES: Final = (
 )  # fmt: skip
 """What python-can brings itself, and this package; other packages may declare more."""
 
+ROS2_DISTRIBUTIONS: Final = ("jazzy", "kilted", "lyrical")
+"""Those whose messages on Zenoh the gateway knows (`services.ros2_gateway`)."""
 _ENDPOINT: Final = re.compile(
     r"unixsock-stream/.+|(tcp|tls)/(\[[0-9A-Fa-f:.%]+\]|[^\[\]:/]+):\d{1,5}([?#].*)?"
 )
@@ -119,6 +121,7 @@ def _check_names(file: str, config: RobotConfig) -> None:
         buses = _words(config.can)
         raise ConfigError(file, "harness.bus", f"{config.harness.bus!r}", f"one of {buses}")
     _check_imu(file, config)
+    _check_ros2(file, config)
     _check_endpoints(file, config)
     table = msgspec.to_builtins(config)
     for index, key in enumerate(config.assumed):
@@ -127,6 +130,20 @@ def _check_names(file: str, config: RobotConfig) -> None:
             value = value.get(part) if isinstance(value, dict) else None
         if value is None:
             raise ConfigError(file, f"assumed[{index}]", f"{key!r} is no key", "a dotted key")
+
+
+def _check_ros2(file: str, config: RobotConfig) -> None:
+    ros2, right = config.ros2, _words(ROS2_DISTRIBUTIONS)
+    if ros2.distribution not in ROS2_DISTRIBUTIONS:
+        found = f"{ros2.distribution!r}"
+        if ros2.distribution == "humble":
+            found += ", whose topics have no type hash, so that nobody would find these"
+        raise ConfigError(file, "ros2.distribution", found, f"one of {right}")
+    if not re.fullmatch(r"(tcp|tls)/.+:\d+", ros2.router):
+        raise ConfigError(file, "ros2.router", f"{ros2.router!r}", "such as tcp/localhost:7447")
+    if not re.fullmatch(r"([A-Za-z]\w*(/[A-Za-z]\w*)*)?", ros2.namespace):
+        right = "letters, digits and _, such as legs; or nothing"
+        raise ConfigError(file, "ros2.namespace", f"{ros2.namespace!r}", right)
 
 
 def _check_imu(file: str, config: RobotConfig) -> None:

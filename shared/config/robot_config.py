@@ -24,6 +24,7 @@ from shared.config.sections import (
     PlannerConfig,
     RecorderConfig,
     RobustnessConfig,
+    Ros2Config,
     SimulationConfig,
     StandConfig,
     StandGains,
@@ -76,6 +77,7 @@ class RobotConfig(Section, frozen=True):
     imu: ImuConfig = ImuConfig()
     envelope: EnvelopeConfig = EnvelopeConfig()
     trips: TripsConfig = TripsConfig()
+    ros2: Ros2Config = Ros2Config()
     gain_schedule: GainSchedule | None = None
     """Not in this file but beside it; None if it has not been made."""
 

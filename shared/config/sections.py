@@ -338,6 +338,27 @@ class ImuConfig(Section, frozen=True):
     """Time constant of the slope."""
 
 
+class Ros2Config(Section, frozen=True):
+    """Gateway to ROS 2, a process of its own that publishes what the robot does (docs/ros2.md)."""
+
+    router: str = "tcp/localhost:7447"
+    """Endpoint of the Zenoh router of the ROS 2 network (`rmw_zenohd`)."""
+    distribution: str = "jazzy"
+    """Distribution of that network: jazzy, kilted or lyrical."""
+    namespace: str = ""
+    """Namespace of the topics, and what the names of the frames begin with; such as `legs`."""
+    joint_states_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
+    """Rate of `joint_states`; 0: not published."""
+    tf_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 30.0
+    """Rate of `/tf`; 0: not published."""
+    wrench_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
+    """Rate of `harness/wrench`; 0: not published."""
+    diagnostics_hz: Annotated[float, Range(0.0, 10.0, "Hz")] = 1.0
+    """Rate of `/diagnostics`; 0: not published."""
+    clock_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
+    """Rate of `/clock`, of a simulated robot only; 0: not published."""
+
+
 class DriveConfig(Section, frozen=True):
     """ODrive settings that the joint service relies on (docs/drives.md)."""
 

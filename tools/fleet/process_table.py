@@ -44,7 +44,16 @@ class Process(Section, frozen=True):
 
     name: str
     """Service name, or `{module}` for one service per module."""
-    kind: Literal["joint", "planner", "harness", "imu", "recorder", "simulator", "network_proxy"]
+    kind: Literal[
+        "joint",
+        "planner",
+        "harness",
+        "imu",
+        "recorder",
+        "simulator",
+        "network_proxy",
+        "ros2_gateway",
+    ]
     command: tuple[str, ...]
     """Arguments with the placeholders {python}, {config}, {run} and {module}."""
     autostart: bool
@@ -56,9 +65,9 @@ class Process(Section, frozen=True):
     settle_s: Annotated[int, Range(1, 60, "s")]
     """A start that ends sooner has failed, and the next one is delayed."""
     why: str
-    only: Literal["", "simulation", "injected", "imu"] = ""
+    only: Literal["", "simulation", "injected", "imu", "ros2"] = ""
     """`simulation`: not started where the drives are real; `injected`: only where the network is
-    to be impaired; `imu`: only on a robot that has one."""
+    to be impaired; `imu`: only on a robot that has one; `ros2`: only where ROS 2 is to see it."""
     topic: str = ""
     """Topic that it publishes steadily, as in `shared.bus.topics`; empty if there is none."""
 
@@ -104,6 +113,7 @@ def make_plan(
     not_started: Collection[str] = (),
     simulation: bool,
     injected: bool = False,
+    ros2: bool = False,
     table_path: Path,
 ) -> FleetPlan:
     """Return the processes to start; arguments as for `SupervisedFleet.start`.
@@ -117,8 +127,9 @@ def make_plan(
     table = load_table(table_path)
     emulated = simulation and is_simulated(config)
     rows = select(
-        table, simulation=emulated, injected=injected, imu=config.imu.fitted, services=services
-    )
+        table, simulation=emulated, injected=injected, imu=config.imu.fitted, ros2=ros2,
+        services=services,
+    )  # fmt: skip
     check_known([*overrides, *not_started], [row.name for row in rows])
     rows = tuple(
         msgspec.structs.replace(row, autostart=row.autostart and row.name not in not_started)
@@ -177,6 +188,7 @@ def select(
     simulation: bool,
     injected: bool = False,
     imu: bool = False,
+    ros2: bool = False,
     services: Collection[str] | None = None,
 ) -> tuple[Process, ...]:
     """Return the rows of a fleet.
@@ -186,6 +198,7 @@ def select(
         simulation: False leaves out the rows that are for a simulated robot only.
         injected: False leaves out those that impair the network.
         imu: False leaves out those of the IMU.
+        ros2: False leaves out the gateway to ROS 2.
         services: names; each is then started at once, whatever its row says. None for all.
 
     Raises:
@@ -194,7 +207,9 @@ def select(
     check_known(services or (), [row.name for row in table.process])
     if "imu" in (services or ()) and not imu:
         raise FleetError("imu: this robot has none; `fitted` of [imu] in the robot file says so")
-    wanted = {"": True, "simulation": simulation, "injected": injected, "imu": imu}
+    wanted = {
+        "": True, "simulation": simulation, "injected": injected, "imu": imu, "ros2": ros2,
+    }  # fmt: skip
     rows = [row for row in table.process if wanted[row.only]]
     if services is None:
         return tuple(rows)

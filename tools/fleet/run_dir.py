@@ -31,7 +31,7 @@ MARKER: Final = ".xrl-run"
 _BY_HAND: Final = ("*.zenoh.lock", "*.rearm", "*.near", PACE_FILE, usb_standin.FOLDER,
                    usb_standin.BUILT)  # fmt: skip
 """Names that services started by hand leave in a run directory, beside sockets."""
-_LOGGED: Final = (*SERVICES, "network_proxy", "supervisord", "view")
+_LOGGED: Final = (*SERVICES, "network_proxy", "ros2_gateway", "supervisord", "view")
 """What has a log in a run directory."""
 
 _NEVER_GIVE_UP = 1_000_000

@@ -53,6 +53,7 @@ class SupervisedFleet:
         not_started: Collection[str] = (),
         simulation: bool = True,
         injected: bool = False,
+        ros2: bool = False,
         pace: float | None = None,
         leashed: bool = False,
         disarmed: bool = False,
@@ -72,6 +73,7 @@ class SupervisedFleet:
             not_started: those that wait for `start_service`.
             simulation: False leaves the simulator out; where all drives are real it always is.
             injected: with the network proxy on the links of planner, joints and sensors.
+            ros2: with the gateway to ROS 2.
             pace: clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1.
             leashed: stop the fleet if this process dies.
             disarmed: for a start that no person asks for: it arms no drive, takes those over that
@@ -95,6 +97,7 @@ class SupervisedFleet:
             not_started=not_started,
             simulation=simulation,
             injected=injected,
+            ros2=ros2,
             table_path=table_path,
         )
         process_table.check_known(no_restart, list(plan.commands))

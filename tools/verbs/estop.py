@@ -10,6 +10,7 @@ from typing import Final
 
 from rich.console import Console
 
+from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
@@ -17,7 +18,6 @@ from shared.exceptions import FleetError, XrlError
 from shared.process import StopFlag
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
-from tools.fleet.operator_key import require_operator
 from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
 from tools.typed_line import typed_line

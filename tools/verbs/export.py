@@ -1,4 +1,4 @@
-"""`xrl export`: a run for other viewers: with a 3-D scene in it, and a layout for Foxglove."""
+"""`xrl export`: a run for others: a 3-D scene in it, a picture, tables, a bag of ROS 2."""
 
 from __future__ import annotations
 
@@ -19,17 +19,25 @@ from shared.mcap_log.files import SUFFIX
 from shared.process import DEFAULT_CONFIG
 from tools.analysis.reports import scene
 from tools.analysis.reports.moving_picture import write_gif
+from tools.export.folders import whole_folder
+from tools.export.parquet import ParquetFile
+from tools.export.parquet import require as require_parquet
+from tools.export.ros2_bag import write_bag
+from tools.export.tables import GRID_NAME, CsvFile, keys_matching, write_grid, write_tables
+from tools.number_arguments import rate
 from tools.output import progress_along, write_atomically
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog, parts_of, read_part
+from tools.runs.run_log import RunLog, RunPart, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
-from tools.verb_table import Subparsers, add_verb
+from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 SCENE_SUFFIX: Final = ".scene" + SUFFIX
 LAYOUT: Final = DEFAULT_CONFIG.parent / "foxglove" / "xrl.json"
 """For a robot of this name; `--layout` writes it for the name in the log."""
 LAYOUT_ROBOT: Final = "xrl"
+BAG_RATE_HZ: Final = 100.0
+"""Of joint states, transforms and wrench in a bag."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -43,9 +51,12 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
         xrl export out/a/run.mcap --gif shove.gif --from 5 --to 9
         xrl export out/a/run.mcap --gif fig7.gif --curves     # with curves, as the paper's Fig. 7
+        xrl export out/a --csv tables                         # a file for each topic and module
+        xrl export out/a --parquet t --rate 100 --topic 'joint/*/state' --topic harness/wrench
+        xrl export out/a --ros2bag bag                        # ros2 bag play bag
         """,
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="a run's record; it is not touched")
+    parser.add_argument("file", type=Path, metavar="FILE", help=f"{RUN_HELP}; it is not touched")
     parser.add_argument(
         "--scene",
         action="store_true",
@@ -75,19 +86,59 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--curves", action="store_true", help="beside it COM, height and hand as they come"
     )
-    add_part(parser, "of the picture")
+    for flag, what in (("--csv", "CSV"), ("--parquet", "Parquet")):
+        parser.add_argument(
+            flag,
+            type=Path,
+            metavar="DIR",
+            help=f"also write {what} tables: a file for each key, with all of its messages",
+        )
+    parser.add_argument(
+        "--topic",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="only these topics in the tables, such as 'joint/*/state'; may be repeated",
+    )
+    parser.add_argument(
+        "--ros2bag",
+        type=Path,
+        metavar="DIR",
+        help="also write a bag of ROS 2 (MCAP): joint states, transforms, wrench, diagnostics",
+    )
+    parser.add_argument(
+        "--rate",
+        type=rate,
+        metavar="HZ",
+        help="of the tables: all topics in one, at each time the newest messages; of the bag: "
+        f"default {BAG_RATE_HZ:g} Hz",
+    )
+    add_part(parser, "of picture, tables and bag")
     parser.add_argument("--force", action="store_true", help="replace what exists")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the requested files."""
-    if not args.scene and args.layout is None and args.gif is None:
-        raise RunError("say what to write: --scene, --layout FILE, --gif FILE, or several of them")
+    asked = (args.layout, args.gif, args.csv, args.parquet, args.ros2bag)
+    if not args.scene and all(out is None for out in asked):
+        raise RunError(
+            "say what to write: --scene, --layout FILE, --gif FILE, --csv DIR, --parquet DIR, "
+            "--ros2bag DIR, or several of them"
+        )
+    tables: list[tuple[Path | None, type[CsvFile] | type[ParquetFile]]] = [
+        (args.csv, CsvFile), (args.parquet, ParquetFile),
+    ]  # fmt: skip
+    if args.topic and args.csv is None and args.parquet is None:
+        raise RunError("--topic chooses what is in tables: add --csv DIR or --parquet DIR")
+    if args.rate is not None and all(out is None for out in asked[2:]):
+        raise RunError("--rate is that of tables or of a bag: add --csv, --parquet or --ros2bag")
+    if args.parquet is not None:
+        require_parquet()
     if args.curves and args.gif is None:
         raise RunError("--curves go beside a picture: name it with --gif FILE")
     path: Path = args.file
-    if path.is_dir():
-        raise RunError(f"{path}: is a directory; give one of its files")
+    if path.is_dir() and args.scene:
+        raise RunError(f"{path}: is a directory; give --scene one of its files")
     index = RunIndex(path)
     part = part_of(args, index)
     console = Console()
@@ -99,6 +150,11 @@ def run(args: argparse.Namespace) -> int:
     if args.gif is not None:
         _free(args.gif, path, force=args.force)
         _draw(read_part(index, part), args.gif, console, with_curves=args.curves)
+    for folder, kind in tables:
+        if folder is not None:
+            _write_tables(index, part, args, folder, kind, console)
+    if args.ros2bag is not None:
+        _write_bag(index, part, args, console)
     if args.layout is not None:
         _free(args.layout, path, force=args.force)
         write_atomically(
@@ -106,6 +162,44 @@ def run(args: argparse.Namespace) -> int:
         )
         console.print(f"[bold]{escape(str(args.layout))}[/]: import it in Foxglove")
     return 0
+
+
+def _write_tables(
+    index: RunIndex,
+    part: RunPart,
+    args: argparse.Namespace,
+    out: Path,
+    kind: type[CsvFile] | type[ParquetFile],
+    console: Console,
+) -> None:
+    """Write a folder of tables, with progress."""
+    keys = keys_matching(index, args.topic)
+    with (
+        whole_folder(out, force=args.force) as folder,
+        progress_along("writing", index.length_s) as done,
+    ):
+        folder.mkdir()
+        if args.rate is None:
+            rows = write_tables(index, part, keys, folder, kind, done)
+        else:
+            grid = write_grid(index, part, keys, args.rate, folder / GRID_NAME, kind, done)
+            rows = {GRID_NAME: grid}
+        if not any(rows.values()):
+            raise RunError(f"{index.path}: has no message of these topics in this part")
+    told = f"{len(rows)} table{'s' * (len(rows) != 1)}, {sum(rows.values())} rows"
+    console.print(f"[bold]{escape(str(out))}[/]: {told}", soft_wrap=True)
+
+
+def _write_bag(index: RunIndex, part: RunPart, args: argparse.Namespace, console: Console) -> None:
+    """Write a bag of ROS 2, with progress."""
+    with (
+        whole_folder(args.ros2bag, force=args.force) as folder,
+        progress_along("writing", index.length_s) as done,
+    ):
+        rate_hz = args.rate or BAG_RATE_HZ
+        count = write_bag(index, part, robot_of(index), folder, rate_hz, done)
+    told = f"{count} messages; ros2 bag play {args.ros2bag}"
+    console.print(f"[bold]{escape(str(args.ros2bag))}[/]: {escape(told)}", soft_wrap=True)
 
 
 def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> None:

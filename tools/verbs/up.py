@@ -8,14 +8,18 @@ from pathlib import Path
 
 from rich.console import Console
 
+from services.ros2_gateway.inbound import acceptable
+from services.ros2_gateway.rmw import domain
 from services.simulator.plant import plant_from
+from shared.bus.operator_key import require_operator
 from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import OPEN
 from tools.fleet.pace import add_pace
-from tools.fleet.process_table import check_known, load_table
+from tools.fleet.process_table import check_known, is_simulated, load_table
 from tools.fleet.supervise import SupervisedFleet
 from tools.number_arguments import finite
 from tools.runs.experiment import add_plant, make_out, scenario_file
@@ -36,6 +40,8 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl up
         xrl up --scenario crawl --out out/crawl
         xrl up --view                                  # and lead it by hand, in a browser
+        xrl up --ros2                                  # seen by ROS 2: docs/ros2.md
+        xrl up --ros2 --domain 7 --accept estop        # which may stop it, too
         xrl up --injectable                            # then: xrl inject --link ... --delay 30
         xrl up --config lab.toml --no-sim
         xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # of one host
@@ -101,6 +107,24 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_port(parser)
     parser.add_argument(
+        "--ros2",
+        action="store_true",
+        help="show it to ROS 2 over Zenoh: joint states, transforms, diagnostics (docs/ros2.md)",
+    )
+    parser.add_argument(
+        "--domain",
+        type=domain,
+        metavar="N",
+        help="with --ros2: its domain (default: $ROS_DOMAIN_ID, else 0)",
+    )
+    parser.add_argument(
+        "--accept",
+        type=acceptable,
+        metavar="TOPICS",
+        help="with --ros2: let ROS 2 ask for assist (intent), stop the robot (estop), or both "
+        "(intent,estop)",
+    )
+    parser.add_argument(
         "--readonly",
         action="store_true",
         help="the joint services listen to their drives and publish, and send them nothing",
@@ -114,6 +138,8 @@ def run(args: argparse.Namespace) -> int:
     services = _services(args)
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
     overrides = _overrides(args, out)
+    if args.ros2:
+        overrides["ros2_gateway"] = _ros2_words(args, robot)
     if services is not None:
         overrides = {name: words for name, words in overrides.items() if name in services}
     if services is None or "recorder" in services:
@@ -127,6 +153,7 @@ def run(args: argparse.Namespace) -> int:
         not_started=("planner",) if not_started else (),
         simulation=not args.no_sim,
         injected=args.injectable,
+        ros2=args.ros2,
         pace=args.pace,
         disarmed=args.disarmed,
     )
@@ -165,6 +192,21 @@ def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:
     return overrides
 
 
+def _ros2_words(args: argparse.Namespace, robot: RobotConfig) -> list[str]:
+    """Return the gateway's arguments.
+
+    Raises:
+        BusError, FleetError: ROS 2 may act, and this host has no key for that.
+    """
+    words = ["--simulated"] if is_simulated(robot) and not args.no_sim else []
+    if args.domain is not None:
+        words += ["--domain", str(args.domain)]
+    if args.accept:
+        require_operator(robot, "ros2_gateway")
+        words += ["--accept", ",".join(args.accept)]
+    return words
+
+
 def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
     """Return what `--only` names, None for all, if it goes with the other arguments.
 
@@ -187,9 +229,13 @@ def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
         if is_given and service in absent:
             why = "--no-sim" if only is None or service in only else "--only"
             raise FleetError(f"{option} is for the {service}, and {why} starts none; leave one")
-    if only is not None and args.injectable:
-        return (*only, "network_proxy")
-    return only
+    for option, given in (("--domain", args.domain), ("--accept", args.accept)):
+        if given is not None and not args.ros2:
+            raise FleetError(f"{option} is for the gateway to ROS 2: add --ros2")
+    if only is None:
+        return None
+    beside = {"network_proxy": args.injectable, "ros2_gateway": args.ros2}
+    return (*only, *(name for name, wanted in beside.items() if wanted))
 
 
 def _absolute(word: str) -> str:

@@ -9,6 +9,7 @@ import msgspec
 
 from shared.bus import topics
 from shared.bus.messages import HandLead, RunEvent, RunEventKind
+from shared.bus.operator_key import require_operator
 from shared.bus.session import Publisher, Session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
@@ -16,7 +17,6 @@ from shared.config.scenarios import Inject
 from shared.exceptions import FleetError, XrlError
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import BusStop, request_here
-from tools.fleet.operator_key import require_operator
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
 from tools.view.hand import HandOrders

@@ -37,7 +37,8 @@ def plan(run_dir: Path, **changes: object) -> process_table.FleetPlan:
 
 
 def test_the_table_has_one_row_for_each_service_of_the_bus() -> None:
-    names = [row.name for row in process_table.load_table().process if row.only != "injected"]
+    beside = ("injected", "ros2")
+    names = [row.name for row in process_table.load_table().process if row.only not in beside]
     assert sorted(names) == sorted(SERVICES)
 
 
@@ -53,6 +54,12 @@ def test_the_injector_stands_between_those_that_dial_only_where_it_is_asked_for(
     assert len(new) == len(PAIRS) + 1, "a socket for each pair, and its own"
     names = [row.name for row in injected.processes]
     assert names.index("network_proxy") < names.index("planner")
+
+
+def test_the_gateway_to_ros_2_is_there_only_where_it_is_asked_for(run_dir: Path) -> None:
+    assert "ros2_gateway" not in plan(run_dir).commands
+    words = plan(run_dir, ros2=True, overrides={"ros2_gateway": ["--domain", "7"]}).commands
+    assert words["ros2_gateway"][-2:] == ["--domain", "7"]
 
 
 def test_joint_commands_name_their_module_and_no_placeholder_is_left(run_dir: Path) -> None:

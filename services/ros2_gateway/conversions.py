@@ -1,0 +1,241 @@
+"""Messages of the robot as messages of ROS 2. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from services.ros2_gateway.ros_types import RosTypes
+from shared.bus.messages import (
+    Cause,
+    DriveStatus,
+    JointState,
+    Mode,
+    PlannerMode,
+    PlannerStatus,
+    Vector3,
+    Wrench,
+)
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.robot.frames import (
+    ORIGIN,
+    UPRIGHT,
+    FramePose,
+    leg_offsets,
+    rotation_about,
+    torso_pose,
+)
+from shared.robot.joints import AXES, MODULES, SIDES
+from shared.robot.remedies import reason_of, remedy_of
+from shared.robot.robot_urdf import cross_of
+
+JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
+WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
+DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
+TEXT: Final = "std_msgs/msg/String"
+CLOCK: Final = "rosgraph_msgs/msg/Clock"
+
+OK, WARN, ERROR, STALE = range(4)
+"""Levels of `diagnostic_msgs/msg/DiagnosticStatus`."""
+MODE_LEVEL: Final = {
+    Mode.TRACK: OK,
+    Mode.HOLD: WARN,
+    Mode.DISARMED: WARN,
+    Mode.DAMP: ERROR,
+    Mode.FAULT: ERROR,
+}
+_UNKNOWN_POSITION: Final = (DriveStatus.LOST, DriveStatus.UNZEROED)
+
+
+def knows_position(state: JointState) -> bool:
+    """Return True if a module's joint angles are those of the joint."""
+    return DriveStatus(state.drive) not in _UNKNOWN_POSITION
+
+
+class Conversions:
+    """Makes the messages of one robot. Each method returns a message in CDR.
+
+    Times are in ns since 1970, or of the log's clock.
+    """
+
+    def __init__(self, config: RobotConfig, types: RosTypes) -> None:
+        """Take the robot, whose namespace the names of the frames begin with."""
+        self._config, self._types = config, types
+        self._prefix = f"{config.ros2.namespace}/" if config.ros2.namespace else ""
+
+    def joint_states(self, ns: int, states: Mapping[str, JointState]) -> bytes:
+        """Return `sensor_msgs/msg/JointState`: rad, rad/s, N m.
+
+        Args:
+            ns: time.
+            states: newest state of each module that knows where it is.
+        """
+        modules = [name for name in MODULES if name in states]
+        q, v, tau = (
+            np.array([value for name in modules for value in getattr(states[name], part)], float)
+            for part in ("q", "v", "tau")
+        )
+        return self._encode(
+            JOINT_STATE,
+            header=self._header(ns, ""),
+            name=[f"{name}_{axis}" for name in modules for axis in AXES],
+            position=q,
+            velocity=v,
+            effort=tau,
+        )
+
+    def transforms(
+        self, ns: int, states: Mapping[str, JointState], status: PlannerStatus | None
+    ) -> bytes:
+        """Return `tf2_msgs/msg/TFMessage`: torso in the world, COM, and the links of the URDF.
+
+        Args:
+            ns: time.
+            states: as for `joint_states`; the torso is placed if there are all six.
+            status: newest status of the planner, for COM and stance; None: it is silent.
+        """
+        geometry = self._config.geometry
+        rows = [FramePose("torso", "harness", geometry.harness_point, UPRIGHT)]
+        if len(states) == len(MODULES):
+            q = [angle for name in MODULES for angle in states[name].q]
+            stance = status.stance if status is not None else (0.0,) * 6
+            rows.append(FramePose("world", "torso", *torso_pose(geometry, q, stance)))
+        if status is not None:
+            x, y, z, *_ = status.p
+            rows.append(FramePose("world", "com", (x, y, z), UPRIGHT))
+        for side in SIDES:
+            parent = "torso"
+            for kind, offset in leg_offsets(geometry, side):
+                module = f"{kind}_{side}"
+                if module in states:
+                    phi, theta = states[module].q
+                    cross = cross_of(module)
+                    rows.append(FramePose(parent, cross, offset, rotation_about(1, -theta)))
+                    rows.append(FramePose(cross, module, ORIGIN, rotation_about(0, -phi)))
+                parent = module
+        return self._encode(TRANSFORMS, transforms=[self._transform(ns, row) for row in rows])
+
+    def wrench(self, ns: int, wrench: Wrench) -> bytes:
+        """Return `geometry_msgs/msg/WrenchStamped`: of the person on the torso, at the harness."""
+        content = self._types.make(
+            "geometry_msgs/msg/Wrench",
+            force=self._vector(wrench.force),
+            torque=self._vector(wrench.moment),
+        )
+        return self._encode(
+            WRENCH, header=self._header(ns, f"{self._prefix}harness"), wrench=content
+        )
+
+    def diagnostics(
+        self,
+        ns: int,
+        states: Mapping[str, JointState],
+        status: PlannerStatus | None,
+        wrench: Wrench | None,
+        gateway: Mapping[str, object],
+    ) -> bytes:
+        """Return `diagnostic_msgs/msg/DiagnosticArray`: one row for each process.
+
+        Args:
+            ns: time.
+            states: newest state of each module that is not silent.
+            status: of the planner; None: it is silent.
+            wrench: of the harness; None: it is silent.
+            gateway: figures of the gateway itself.
+        """
+        rows = [self._module_row(name, states.get(name)) for name in MODULES]
+        rows += [self._planner_row(status), self._harness_row(wrench)]
+        rows.append(self._row("ros2_gateway", OK, "running", gateway))
+        return self._encode(DIAGNOSTICS, header=self._header(ns, ""), status=rows)
+
+    def text(self, text: str) -> bytes:
+        """Return `std_msgs/msg/String`."""
+        return self._encode(TEXT, data=text)
+
+    def clock(self, ns: int) -> bytes:
+        """Return `rosgraph_msgs/msg/Clock`."""
+        return self._encode(CLOCK, clock=self._time(ns))
+
+    def _module_row(self, name: str, state: JointState | None) -> Any:
+        if state is None:
+            return self._row(name, STALE, "silent: see `xrl status`", {})
+        mode, remedy = Mode(state.mode), remedy_of(state).replace("MODULE", name)
+        said = f"{mode.name}: {Cause(state.cause).name}"
+        values = {
+            "way out": remedy or "none needed",
+            "command age, ms": f"{state.age_ns / NS_PER_MS:.1f}" if state.age_ns >= 0 else "none",
+            "drive": DriveStatus(state.drive).name,
+            "drive error": f"{state.drive_error:#x}",
+            "commands refused": state.refused,
+            "recent drop-outs": state.dropouts,
+            "late cycles": f"{state.late} of {state.cycle}",
+        }
+        return self._row(name, MODE_LEVEL[mode], f"{said}; {remedy}" if remedy else said, values)
+
+    def _planner_row(self, status: PlannerStatus | None) -> Any:
+        if status is None:
+            return self._row("planner", STALE, "silent: each module holds by itself", {})
+        mode, reason = PlannerMode(status.mode), reason_of(status)
+        values = {
+            "margin": f"{status.margin:.2f}",
+            "margin, drives alone": f"{status.margin_onboard:.2f}",
+            "assist, N": f"{status.assist_n:.1f}",
+            "tick, us": f"{status.tick_us:.0f}",
+            "oldest state, ms": f"{max(status.state_age_ns) / NS_PER_MS:.1f}",
+            "leads again in, s": f"{status.wait_s:.0f}",
+        }
+        level = OK if mode is PlannerMode.LEADING else WARN
+        return self._row(
+            "planner", level, f"{mode.name}; {reason}" if reason else mode.name, values
+        )
+
+    def _harness_row(self, wrench: Wrench | None) -> Any:
+        if wrench is None:
+            return self._row("harness", STALE, "silent", {})
+        said = "valid" if wrench.valid else "not valid: saturated, stale or without a zero"
+        values = {"age, ms": f"{wrench.age_ns / NS_PER_MS:.1f}", "saturated": wrench.saturated}
+        return self._row("harness", OK if wrench.valid else WARN, said, values)
+
+    def _row(self, name: str, level: int, said: str, values: Mapping[str, object]) -> Any:
+        pairs = [
+            self._types.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
+            for key, value in values.items()
+        ]
+        return self._types.make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level, name=f"{self._config.name}: {name}", message=said,
+            hardware_id=self._config.name, values=pairs,
+        )  # fmt: skip
+
+    def _transform(self, ns: int, row: FramePose) -> Any:
+        x, y, z, w = row.rotation
+        content = self._types.make(
+            "geometry_msgs/msg/Transform",
+            translation=self._vector(row.position),
+            rotation=self._types.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+        world = "world" if row.parent == "world" else f"{self._prefix}{row.parent}"
+        return self._types.make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(ns, world),
+            child_frame_id=f"{self._prefix}{row.child}",
+            transform=content,
+        )
+
+    def _vector(self, values: Vector3 | Sequence[float]) -> Any:
+        x, y, z = values
+        return self._types.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    def _header(self, ns: int, frame: str) -> Any:
+        return self._types.make("std_msgs/msg/Header", stamp=self._time(ns), frame_id=frame)
+
+    def _time(self, ns: int) -> Any:
+        seconds, rest = divmod(ns, NS_PER_S)
+        return self._types.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+
+    def _encode(self, type_name: str, /, **fields: Any) -> bytes:
+        return self._types.encode(type_name, self._types.make(type_name, **fields))

@@ -1,0 +1,150 @@
+"""What rmw_zenoh makes of ROS 2 names: keys, liveliness tokens, attachments. Pure.
+
+The contract is the design page of rmw_zenoh, as of the distribution Jazzy:
+
+    key         <domain>/<topic>/<DDS type>/<type hash>
+    node        @ros2_lv/<domain>/<session>/0/0/NN/%/<namespace>/<node>
+    endpoint    @ros2_lv/<domain>/<session>/0/<number>/<kind>/%/<namespace>/<node>
+                /<topic>/<DDS type>/<type hash>/<QoS>
+    attachment  sequence number, time (int64, little endian), length of the GID, GID
+
+In tokens each / of a name is written %.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from typing import Final, Literal, NamedTuple, TypeAlias
+
+ADMIN_SPACE: Final = "@ros2_lv"
+GID_SIZE: Final = 16
+DOMAIN_MAX: Final = 232
+"""Largest ROS_DOMAIN_ID."""
+Kind: TypeAlias = Literal["MP", "MS"]
+"""Message publisher or message subscription."""
+
+
+class Qos(NamedTuple):
+    """Quality of service of an endpoint, as far as it is told to others."""
+
+    reliable: bool = True
+    transient_local: bool = False
+    """A subscription that comes later gets the newest messages."""
+    depth: int = 10
+    """Messages that are kept."""
+
+    def encode(self) -> str:
+        """Return it as in a token; what is rmw's default stays empty."""
+        reliability = "" if self.reliable else "2"
+        durability = "1" if self.transient_local else ""
+        return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
+
+
+class RosTopic(NamedTuple):
+    """A topic of ROS 2."""
+
+    name: str
+    """Full name, such as `/joint_states`."""
+    type: str
+    """Such as `sensor_msgs/msg/JointState`."""
+    qos: Qos = Qos()
+
+
+class RosNode(NamedTuple):
+    """A node of ROS 2."""
+
+    domain: int
+    """ROS_DOMAIN_ID."""
+    session: str
+    """Zenoh's id of its session."""
+    namespace: str
+    """`/`, or such as `/legs`."""
+    name: str
+
+
+def domain(text: str) -> int:
+    """Return a domain from a command line.
+
+    Raises:
+        ValueError: it is none: 0 to 232.
+    """
+    number = int(text)
+    if not 0 <= number <= DOMAIN_MAX:
+        raise ValueError(text)
+    return number
+
+
+def dds_type(name: str) -> str:
+    """Return `sensor_msgs::msg::dds_::JointState_` for `sensor_msgs/msg/JointState`."""
+    package, folder, kind = name.split("/")
+    return f"{package}::{folder}::dds_::{kind}_"
+
+
+def topic_key(domain: int, topic: RosTopic, type_hash: str) -> str:
+    """Return the key on which a topic's messages are put."""
+    return f"{domain}/{topic.name.strip('/')}/{dds_type(topic.type)}/{type_hash}"
+
+
+def node_token(node: RosNode) -> str:
+    """Return the key of a node's liveliness token."""
+    place = f"{ADMIN_SPACE}/{node.domain}/{node.session}/0/0/NN"
+    return f"{place}/%/{_mangled(node.namespace)}/{node.name}"
+
+
+def endpoint_token(node: RosNode, number: int, kind: Kind, topic: RosTopic, type_hash: str) -> str:
+    """Return the key of the liveliness token of a node's publisher or subscription.
+
+    Args:
+        node: of the endpoint.
+        number: of the endpoint within its session.
+        kind: of the endpoint.
+        topic: its topic.
+        type_hash: of the topic's type.
+    """
+    place = f"{ADMIN_SPACE}/{node.domain}/{node.session}/0/{number}/{kind}"
+    names = f"%/{_mangled(node.namespace)}/{node.name}/{_mangled(topic.name)}"
+    return f"{place}/{names}/{dds_type(topic.type)}/{type_hash}/{topic.qos.encode()}"
+
+
+def gid_of(token: str) -> bytes:
+    """Return the 16 bytes that tell an endpoint from all others, from its token."""
+    return hashlib.blake2b(token.encode(), digest_size=GID_SIZE).digest()
+
+
+def attachment(number: int, unix_ns: int, gid: bytes) -> bytes:
+    """Return what goes with a message: its number, when it was sent, by whom."""
+    return struct.pack(f"<qqB{GID_SIZE}s", number, unix_ns, GID_SIZE, gid)
+
+
+class SeenEndpoint(NamedTuple):
+    """A node or an endpoint of somebody, as read from its token."""
+
+    kind: str
+    """NN, MP, MS, SS or SC."""
+    node: str
+    """Full name of the node."""
+    topic: str = ""
+    type: str = ""
+    """DDS name of the topic's type."""
+    type_hash: str = ""
+
+
+def read_token(key: str) -> SeenEndpoint | None:
+    """Return what a token says; None if it is none."""
+    parts = key.split("/")
+    if len(parts) not in (9, 13) or parts[0] != ADMIN_SPACE:
+        return None
+    kind, namespace, name = parts[5], _unmangled(parts[7]), parts[8]
+    node = f"{namespace.rstrip('/')}/{name}"
+    if len(parts) == 9:
+        return SeenEndpoint(kind, node)
+    return SeenEndpoint(kind, node, _unmangled(parts[9]), parts[10], parts[11])
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def _unmangled(name: str) -> str:
+    return name.replace("%", "/")

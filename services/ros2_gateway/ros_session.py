@@ -1,0 +1,198 @@
+"""Session on the Zenoh network of ROS 2, as a node of it; apart from the robot's own bus."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Self, TypeAlias
+
+import zenoh
+import zenoh.ext
+
+from services.ros2_gateway import rmw
+from services.ros2_gateway.rmw import RosNode, RosTopic, SeenEndpoint
+from services.ros2_gateway.ros_types import RosTypes
+from shared.exceptions import BusError
+
+NODE: Final = "xrl"
+"""Name of the gateway's node."""
+_SETTINGS: Final[dict[str, object]] = {
+    # A router passes everything on to a client, and a client that has lost it dials it again. Two
+    # peers that listen nowhere, or on another host's loopback as ROS 2's do, find no way.
+    "mode": "client",
+    "scouting/multicast/enabled": False,
+    "connect/timeout_ms": 1000,
+    "connect/exit_on_failure": True,
+    "connect/retry": {
+        "period_init_ms": 200,
+        "period_max_ms": 2000,
+        "period_increase_factor": 2.0,
+    },
+    "timestamping/enabled": True,  # the cache of a transient-local publisher asks for it
+}
+_QUEUE: Final = 64
+_ANSWER_S: Final = 0.5
+_AGAIN_S: Final = 1.0
+_Subscriber: TypeAlias = "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
+
+
+class RosSession:
+    """A node with publishers and subscriptions. Use it in a `with` statement."""
+
+    def __init__(
+        self,
+        router: str,
+        domain: int,
+        types: RosTypes,
+        *,
+        namespace: str = "",
+        name: str = NODE,
+    ) -> None:
+        """Open the session; takes up to a second.
+
+        Args:
+            router: Zenoh endpoint of the network's router.
+            domain: ROS_DOMAIN_ID.
+            types: of the network's distribution.
+            namespace: of the node, such as `legs`.
+            name: of the node.
+
+        Raises:
+            BusError: the router does not answer.
+        """
+        config = zenoh.Config()
+        for key, value in {**_SETTINGS, "connect/endpoints": [router]}.items():
+            config.insert_json5(key, json.dumps(value))
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise BusError(f"{router}: no router of ROS 2 answers: {error}") from None
+        self._types, self._domain = types, domain
+        self._node = RosNode(domain, str(self._session.zid()), f"/{namespace}", name)
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._publishers: dict[RosTopic, _RosPublisher] = {}
+        self._subscribers: list[tuple[RosTopic, _Subscriber]] = []
+        self._endpoints = 0
+        self.failed = 0
+        """Messages that could not be sent."""
+
+    def __enter__(self) -> Self:
+        """Return the session."""
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Leave the network: node and topics are gone from its graph."""
+        with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
+            self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
+
+    @property
+    def is_linked(self) -> bool:
+        """True if a router is there; for display."""
+        return bool(list(self._session.info.routers_zid()))
+
+    def show_node(self) -> None:
+        """Appear in the graph as a node."""
+        self._show(rmw.node_token(self._node))
+
+    def publish(self, topics: Sequence[RosTopic]) -> None:
+        """Declare the publishers of topics."""
+        for topic in topics:
+            type_hash = self._types.hash(topic.type)
+            key = rmw.topic_key(self._domain, topic, type_hash)
+            token = self._endpoint("MP", topic, type_hash)
+            options: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.DROP}
+            if topic.qos.transient_local:
+                options["cache"] = zenoh.ext.CacheConfig(topic.qos.depth)
+                options["publisher_detection"] = True
+                publisher: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **options)
+            else:
+                publisher = self._session.declare_publisher(key, **options)
+            self._publishers[topic] = _RosPublisher(publisher, rmw.gid_of(token))
+
+    def subscribe(self, topics: Sequence[RosTopic]) -> None:
+        """Declare subscriptions of topics."""
+        for topic in topics:
+            type_hash = self._types.hash(topic.type)
+            key = rmw.topic_key(self._domain, topic, type_hash)
+            subscriber = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(_QUEUE))
+            self._subscribers.append((topic, subscriber))
+            self._endpoint("MS", topic, type_hash)
+
+    def put(self, topic: RosTopic, payload: bytes) -> None:
+        """Send a message in CDR; never blocks and never raises."""
+        try:
+            self._publishers[topic].put(payload)
+        except zenoh.ZError:
+            self.failed += 1
+
+    def take(self) -> list[tuple[RosTopic, Any | None]]:
+        """Return what has come since the last call; None for what could not be read."""
+        found = []
+        for topic, subscriber in self._subscribers:
+            while (sample := subscriber.try_recv()) is not None:
+                found.append((topic, self._types.decode(topic.type, sample.payload.to_bytes())))
+        return found
+
+    def graph(self) -> list[SeenEndpoint]:
+        """Return all nodes and endpoints of the domain; takes up to half a second."""
+        replies = self._session.liveliness().get(
+            f"{rmw.ADMIN_SPACE}/{self._domain}/**", timeout=_ANSWER_S
+        )
+        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        return [seen for seen in map(rmw.read_token, sorted(keys)) if seen is not None]
+
+    def _endpoint(self, kind: rmw.Kind, topic: RosTopic, type_hash: str) -> str:
+        self._endpoints += 1
+        token = rmw.endpoint_token(self._node, self._endpoints, kind, topic, type_hash)
+        self._show(token)
+        return token
+
+    def _show(self, token: str) -> None:
+        self._tokens.append(self._session.liveliness().declare_token(token))
+
+
+class RosLink:
+    """Opens a session in a thread of its own, again and again until the router is there."""
+
+    def __init__(self, opened: Callable[[], RosSession]) -> None:
+        """Begin; `opened` opens and declares, and raises BusError where there is no router."""
+        self._open = opened
+        self._left = threading.Event()
+        self.session: RosSession | None = None
+        """The session, once it is open; it then lasts, whether its router does or not."""
+        self._thread = threading.Thread(target=self._dial, name="ros2-router", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Leave the network."""
+        self._left.set()
+        self._thread.join()
+        if self.session is not None:
+            self.session.close()
+
+    def _dial(self) -> None:
+        while not self._left.is_set():
+            try:
+                self.session = self._open()
+                return
+            except BusError:
+                self._left.wait(_AGAIN_S)
+
+
+class _RosPublisher:
+    """A publisher that counts its messages."""
+
+    def __init__(self, publisher: Any, gid: bytes) -> None:
+        self._publisher, self._gid, self._number = publisher, gid, 0
+
+    def put(self, payload: bytes) -> None:
+        self._number += 1
+        attachment = rmw.attachment(self._number, time.time_ns(), self._gid)
+        self._publisher.put(payload, attachment=attachment)

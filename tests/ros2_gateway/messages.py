@@ -1,0 +1,60 @@
+"""Messages of the robot, for tests."""
+
+from __future__ import annotations
+
+import random
+
+from shared.bus.messages import (
+    DriveStatus,
+    JointState,
+    Mode,
+    PlannerMode,
+    PlannerStatus,
+    Tare,
+    Vector6,
+    Wrench,
+)
+from shared.robot.joints import MODULES
+
+ZERO6: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def joint_state(seed: int = 0, **changes: object) -> JointState:
+    """Return a module that tracks, at drawn angles."""
+    dice = random.Random(seed)
+    begin: dict[str, object] = {
+        "t_ns": 1, "seq": 1, "mode": int(Mode.TRACK), "cause": 2, "ready": True,
+        "age_ns": 4_000_000,
+        "q": (dice.uniform(-0.3, 0.3), dice.uniform(-1.5, 1.5)),
+        "v": (dice.uniform(-1, 1), dice.uniform(-1, 1)),
+        "tau": (dice.uniform(-9, 9), dice.uniform(-90, 90)),
+        "session": 5, "command_seq": 9, "cycle": 100, "late": 0, "dropouts": 0, "refused": 0,
+        "drive": int(DriveStatus.ARMED), "drive_error": 0,
+    }  # fmt: skip
+    return JointState(**begin | changes)  # type: ignore[arg-type]
+
+
+def all_states(**changes: object) -> dict[str, JointState]:
+    """Return six of them."""
+    return {name: joint_state(number, **changes) for number, name in enumerate(MODULES)}
+
+
+def planner_status(**changes: object) -> PlannerStatus:
+    """Return a planner that leads."""
+    begin: dict[str, object] = {
+        "t_ns": 1, "seq": 1, "session": 5, "mode": int(PlannerMode.LEADING), "hold": False,
+        "p": (0.01, 0.0, 0.9, 0.0, 0.1, 0.0), "pdot": ZERO6, "p_ref": ZERO6, "closure": ZERO6,
+        "assist_n": 0.0, "margin": 1.1, "margin_onboard": 1.0, "split": 1, "ik_iterations": 1,
+        "ik_residual": 0.0, "tick_us": 300.0, "state_seq": (1,) * 6, "wrench_seq": 1,
+        "assist_requested_n": 0.0, "state_age_ns": (2_000_000,) * 6,
+    }  # fmt: skip
+    return PlannerStatus(**begin | changes)  # type: ignore[arg-type]
+
+
+def wrench(**changes: object) -> Wrench:
+    """Return what the harness feels of a light hand."""
+    begin: dict[str, object] = {
+        "t_ns": 1, "seq": 1, "force": (1.0, -2.0, 30.0), "moment": (0.1, 0.2, 0.3), "valid": True,
+        "saturated": False, "tare": int(Tare.DONE), "age_ns": 1_000_000,
+    }  # fmt: skip
+    return Wrench(**begin | changes)  # type: ignore[arg-type]

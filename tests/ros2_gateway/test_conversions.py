@@ -1,0 +1,154 @@
+"""Messages for ROS 2, read and written again by another implementation."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.ros2_gateway import conversions
+from services.ros2_gateway.conversions import Conversions
+from services.ros2_gateway.ros_types import RosTypes
+from shared.bus.messages import Cause, DriveStatus, Mode, PlannerMode, Trip
+from shared.config.robot_config import RobotConfig
+from shared.robot import frames
+from shared.robot.frames import Quaternion
+from shared.robot.joints import JOINTS, MODULES
+from shared.robot.robot_urdf import cross_of
+from tests.ros2_gateway.messages import all_states, joint_state, planner_status, wrench
+from tests.ros2_gateway.others import read
+
+NS = 1_700_000_000_123_456_789
+
+
+@pytest.fixture(scope="module")
+def convert(robot: RobotConfig) -> Conversions:
+    return Conversions(robot, RosTypes("jazzy"))
+
+
+def test_joint_states_have_name_angle_rate_and_torque_of_every_joint(convert: Conversions) -> None:
+    states = all_states()
+    message = read(conversions.JOINT_STATE, convert.joint_states(NS, states))
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_000, 123_456_789)
+    assert tuple(message.name) == JOINTS
+    for part, values in (("q", message.position), ("v", message.velocity), ("tau", message.effort)):
+        assert list(values) == [x for name in MODULES for x in getattr(states[name], part)]
+
+
+def test_a_module_that_is_silent_is_left_out_and_none_is_made_up(convert: Conversions) -> None:
+    states = all_states()
+    del states["knee_left"]
+    message = read(conversions.JOINT_STATE, convert.joint_states(NS, states))
+    assert len(message.name) == len(message.position) == len(message.effort) == 10
+    assert "knee_left_phi" not in message.name
+    rows = read(conversions.TRANSFORMS, convert.transforms(NS, states, planner_status()))
+    children = [row.child_frame_id for row in rows.transforms]
+    assert {"torso", "knee_left", cross_of("knee_left")} & set(children) == set()
+    assert "ankle_left" in children
+
+
+def test_the_transforms_carry_every_frame_to_where_it_is(
+    convert: Conversions, robot: RobotConfig
+) -> None:
+    states, status = all_states(), planner_status(stance=(0.02, 0.0, 0.0, 0.0, 0.0, 0.05))
+    rows = read(conversions.TRANSFORMS, convert.transforms(NS, states, status)).transforms
+    assert {row.header.stamp.nanosec for row in rows} == {123_456_789}
+    q = [angle for name in MODULES for angle in states[name].q]
+    position, rotation = frames.torso_pose(robot.geometry, q, status.stance)
+    world = chain([(row.header.frame_id, row.child_frame_id, *pose(row)) for row in rows])
+    wanted = chain([("world", "torso", position, rotation), *frames.body_frames(robot.geometry, q)])
+    for name, (origin, turned) in wanted.items():
+        np.testing.assert_allclose(world[name][0], origin, atol=1e-12)
+        assert abs(np.dot(world[name][1], turned)) == pytest.approx(1.0, abs=1e-12)
+    assert world["com"][0] == status.p[:3]
+
+
+def pose(row: object) -> tuple[tuple[float, float, float], Quaternion]:
+    """Return position and rotation of a TransformStamped."""
+    t, r = row.transform.translation, row.transform.rotation  # type: ignore[attr-defined]
+    return (t.x, t.y, t.z), (r.x, r.y, r.z, r.w)
+
+
+def chain(rows: list[tuple[str, str, tuple[float, float, float], Quaternion]]) -> dict[str, tuple]:  # type: ignore[type-arg]
+    """Return every frame in the world."""
+    found = {"world": (frames.ORIGIN, frames.UPRIGHT)}
+    waiting = list(rows)
+    while waiting:
+        parent, child, position, rotation = waiting.pop(0)
+        if parent not in found:
+            waiting.append((parent, child, position, rotation))
+            continue
+        origin, turned = found[parent]
+        x, y, z = frames.rotated(turned, position)
+        place = (origin[0] + x, origin[1] + y, origin[2] + z)
+        found[child] = (place, frames.product(turned, rotation))
+    return found
+
+
+def test_the_wrench_is_at_the_harness_in_the_torsos_axes(convert: Conversions) -> None:
+    message = read(conversions.WRENCH, convert.wrench(NS, wrench()))
+    force, torque = message.wrench.force, message.wrench.torque
+    assert (force.x, force.y, force.z) == (1.0, -2.0, 30.0)
+    assert (torque.x, torque.y, torque.z) == (0.1, 0.2, 0.3)
+    assert message.header.frame_id == "harness"
+
+
+@pytest.mark.parametrize(("mode", "cause"), list(product(Mode, Cause)))
+def test_every_mode_and_cause_has_its_level_and_a_fault_its_way_out(
+    convert: Conversions, mode: Mode, cause: Cause
+) -> None:
+    states = {"knee_left": joint_state(mode=int(mode), cause=int(cause))}
+    payload = convert.diagnostics(NS, states, planner_status(), wrench(), {})
+    rows = {row.name: row for row in read(conversions.DIAGNOSTICS, payload).status}
+    knee = rows["xrl: knee_left"]
+    level = {Mode.TRACK: 0, Mode.HOLD: 1, Mode.DISARMED: 1, Mode.DAMP: 2, Mode.FAULT: 2}[mode]
+    assert ord(knee.level) if isinstance(knee.level, bytes) else knee.level == level
+    assert knee.message.startswith(f"{mode.name}: {cause.name}")
+    values = {pair.key: pair.value for pair in knee.values}
+    if mode in (Mode.DAMP, Mode.FAULT):
+        assert "xrl kill knee_left" in values["way out"]
+    silent = rows["xrl: knee_right"]
+    assert silent.message.startswith("silent")
+
+
+@pytest.mark.parametrize("mode", PlannerMode)
+def test_a_planner_that_does_not_lead_says_why(convert: Conversions, mode: PlannerMode) -> None:
+    status = planner_status(mode=int(mode), why="a leg is light", trip=int(Trip.UNLOADED))
+    payload = convert.diagnostics(NS, {}, status, None, {"sent": 3})
+    rows = {row.name: row for row in read(conversions.DIAGNOSTICS, payload).status}
+    assert "a leg is light: " in rows["xrl: planner"].message
+    assert rows["xrl: harness"].message == "silent"
+    assert [pair.value for pair in rows["xrl: ros2_gateway"].values] == ["3"]
+
+
+def test_in_a_namespace_every_frame_but_the_world_has_its_name(robot: RobotConfig) -> None:
+    ros2 = msgspec.structs.replace(robot.ros2, namespace="lab/legs")
+    named = Conversions(msgspec.structs.replace(robot, ros2=ros2), RosTypes("jazzy"))
+    rows = read(conversions.TRANSFORMS, named.transforms(NS, all_states(), planner_status()))
+    names = {name for row in rows.transforms for name in (row.header.frame_id, row.child_frame_id)}
+    assert {name for name in names if not name.startswith("lab/legs/")} == {"world"}
+    assert (
+        read(conversions.WRENCH, named.wrench(NS, wrench())).header.frame_id == "lab/legs/harness"
+    )
+
+
+def test_text_and_clock(convert: Conversions) -> None:
+    assert read(conversions.TEXT, convert.text("<robot ä/>")).data == "<robot ä/>"
+    clock = read(conversions.CLOCK, convert.clock(NS)).clock
+    assert (clock.sec, clock.nanosec) == (1_700_000_000, 123_456_789)
+
+
+@given(payload=st.binary(max_size=64))
+def test_bytes_that_are_no_message_are_none(payload: bytes) -> None:
+    found = RosTypes("jazzy").decode("std_msgs/msg/Float64", payload)
+    assert found is None or isinstance(found.data, float)
+
+
+@pytest.mark.parametrize("drive", [DriveStatus.LOST, DriveStatus.UNZEROED])
+def test_angles_of_a_drive_that_lost_its_zero_are_not_shown(drive: DriveStatus) -> None:
+    assert not conversions.knows_position(joint_state(drive=int(drive)))
+    assert conversions.knows_position(joint_state())

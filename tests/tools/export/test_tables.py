@@ -1,0 +1,154 @@
+"""`xrl export --csv` and `--parquet`: every number of the log, and nothing made up."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import msgspec
+import pytest
+from pyarrow import parquet as pq
+
+from shared.bus import topics
+from shared.bus.messages import JointState
+from shared.bus.topics import TOPICS, Topic
+from shared.clock import NS_PER_S
+from tests.tools.exit_codes import exit_code
+from tools import cli
+from tools.export import parquet
+from tools.export.tables import FOR_REEXECUTION, HELD_S, columns_of
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import read_run
+from tools.runs.run_parts import zero_ns
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_message_of_every_key_is_in_the_file_of_its_key(
+    run_file: Path, tmp_path: Path
+) -> None:
+    assert cli.main(["export", str(run_file), "--csv", str(tmp_path / "t")]) == 0
+    log = read_run(run_file)
+    prefix = f"xrl/{log.robot}/"
+    wanted = {
+        key.removeprefix(prefix).replace("/", "."): log.count(key)
+        for key, topic in topics.all_keys(log.robot).items()
+        if log.count(key) and topic not in FOR_REEXECUTION
+    }
+    found = {path.stem: len(rows_of(path)) for path in (tmp_path / "t").iterdir()}
+    assert found == wanted
+    assert len(found) > 20
+
+
+def test_a_row_is_the_message_with_time_zero_at_the_scenarios_start(
+    run_file: Path, tmp_path: Path
+) -> None:
+    words = ["--topic", "joint/knee_left/state", "--topic", "planner/status"]
+    assert cli.main(["export", str(run_file), "--csv", str(tmp_path / "t"), *words]) == 0
+    assert {path.name for path in (tmp_path / "t").iterdir()} == {
+        "joint.knee_left.state.csv", "planner.status.csv",
+    }  # fmt: skip
+    zero = zero_ns(RunIndex(run_file))
+    states: list[JointState] = read_run(run_file).messages(topics.JOINT_STATE, "knee_left")
+    rows = rows_of(tmp_path / "t" / "joint.knee_left.state.csv")
+    for state, row in zip(states, rows, strict=True):
+        if state.t_ns:
+            assert float(row["time_s"]) == (state.t_ns - zero) / NS_PER_S
+        assert (float(row["q[0]"]), float(row["q[1]"])) == state.q
+        assert (int(row["mode"]), row["ready"]) == (state.mode, str(state.ready))
+    assert list(rows[0])[:3] == ["time_s", "t_ns", "seq"]
+
+
+def test_parquet_has_the_same_numbers_with_their_types(run_file: Path, tmp_path: Path) -> None:
+    both = ["--csv", str(tmp_path / "c"), "--parquet", str(tmp_path / "p")]
+    assert cli.main(["export", str(run_file), *both]) == 0
+    names = {path.stem for path in (tmp_path / "c").iterdir()}
+    assert {path.stem for path in (tmp_path / "p").iterdir()} == names
+    for name in ("planner.status", "run.event", "joint.hip_right.command"):
+        table = pq.read_table(tmp_path / "p" / f"{name}.parquet").to_pylist()
+        as_text = [{key: str(value) for key, value in row.items()} for row in table]
+        assert as_text == rows_of(tmp_path / "c" / f"{name}.csv")
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_on_a_grid_each_cell_is_the_newest_message_and_empty_once_its_sender_is_silent(
+    run_file: Path, tmp_path: Path, suffix: str
+) -> None:
+    """The planner dies at 0.5 s."""
+    words = ["--rate", "50", "--from", "0", "--to", "1.4", "--topic", "planner/status"]
+    words += ["--topic", "sim/truth", "--topic", "run/event"]
+    out = tmp_path / "t"
+    assert cli.main(["export", str(run_file), f"--{suffix}", str(out), *words]) == 0
+    if suffix == "csv":
+        rows = rows_of(out / "run.csv")
+    else:
+        table = pq.read_table(out / "run.parquet").to_pylist()
+        rows = [{k: "" if v is None else str(v) for k, v in row.items()} for row in table]
+    times = [float(row["time_s"]) for row in rows]
+    assert times == [pytest.approx(number / 50) for number in range(70)]
+    for at, row in zip(times, rows, strict=True):
+        if abs(at - 0.5 - HELD_S) > 0.05:
+            assert (row["planner/status.mode"] != "") is (at < 0.5 + HELD_S)
+        seen = float(row["sim/truth.scenario_s"])
+        assert at < 0.02 or at - 0.021 < seen <= at + 1e-6
+    assert not any(name.startswith("run/event") for name in rows[0]), "events have no rate"
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_the_columns_of_a_type_are_all_of_its_fields_each_element_one(topic: Topic) -> None:
+    columns = columns_of(topic.type)
+    fields = [field.name for field in msgspec.structs.fields(topic.type)]
+    assert list(dict.fromkeys(name.partition("[")[0] for name in columns)) == sorted(
+        fields, key=lambda name: name not in ("t_ns", "seq")
+    )
+    assert all(column.kind in (int, float, bool, str) for column in columns.values())
+
+
+def test_without_pyarrow_parquet_says_what_to_install(
+    run_file: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(parquet, "pa", None)
+    assert cli.main(["export", str(run_file), "--parquet", str(tmp_path / "t")]) == 2
+    assert "pip install" in capsys.readouterr().err
+    assert not (tmp_path / "t").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--csv", "OUT", "--topic", "joint/foot/state"], "no topic is so named"),
+        (["--csv", "OUT", "--rate", "10", "--topic", "run/event"], "none of these topics has"),
+        (["--csv", "OUT", "--rate", "0"], "a rate in Hz is right"),
+        (["--csv", "OUT", "--rate", "nan"], "a rate in Hz is right"),
+        (["--gif", "OUT", "--rate", "5"], "--rate is that of tables or of a bag"),
+        (["--gif", "OUT", "--topic", "sim/truth"], "--topic chooses what is in tables"),
+        (["--csv", "OUT", "--from", "900", "--to", "901"], "has nothing from 900"),
+        (["--csv", "OUT", "--topic", "imu/attitude"], "has no message of these topics"),
+    ],
+)
+def test_what_cannot_be_is_one_line_and_leaves_no_folder(
+    run_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    out = tmp_path / "t"
+    given = [str(out) if word == "OUT" else word for word in words]
+    assert exit_code(["export", str(run_file), *given]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_is_replaced_only_with_force(run_file: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "t" / "mine"
+    mine.parent.mkdir()
+    mine.touch()
+    words = ["export", str(run_file), "--csv", str(mine.parent), "--topic", "run/event"]
+    assert cli.main(words) == 2
+    assert mine.exists()
+    assert cli.main([*words, "--force"]) == 0
+    assert [path.name for path in mine.parent.iterdir()] == ["run.event.csv"]
+    assert run_file.exists()

@@ -1,0 +1,117 @@
+"""A run as a bag of ROS 2: what the gateway would have published, in an MCAP with CDR messages."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from services.ros2_gateway.conversions import Conversions
+from services.ros2_gateway.gateway import INPUTS, Gateway
+from services.ros2_gateway.rmw import RosTopic
+from services.ros2_gateway.ros_types import RosTypes
+from shared.bus.messages import Message
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.robot.joints import MODULES
+from tools.export.stamps import stamped
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import RunLog, RunPart, parts_of
+
+_EVER: Final = QosTime(9223372036, 854775807)
+
+
+def write_bag(
+    index: RunIndex,
+    part: RunPart,
+    robot: RobotConfig,
+    folder: Path,
+    rate_hz: float,
+    done: Callable[[float], None],
+) -> int:
+    """Write a bag; return how many messages it has. Its times are the log's, ns since 1970.
+
+    Args:
+        index: of the run.
+        part: what of it to write.
+        robot: of the run.
+        folder: of the bag; must not exist.
+        rate_hz: of joint states, transforms and wrench.
+        done: is told how much of the run is written, s.
+    """
+    rates = {"joint_states_hz": rate_hz, "tf_hz": rate_hz, "wrench_hz": rate_hz}
+    ros2 = msgspec.structs.replace(robot.ros2, **rates)
+    config = msgspec.structs.replace(robot, ros2=ros2)
+    types = RosTypes(ros2.distribution)
+    gateway = Gateway(config, Conversions(config, types), simulated=False)
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    count = 0
+    with writer:
+        connections = {topic: _connection(writer, topic, types) for topic in gateway.sent_topics}
+        description = gateway.description()
+        for log in parts_of(index, part):
+            for at_ns, topic, module, message in _in_order(log):
+                unix_ns = at_ns + log.offset_ns
+                if not count:
+                    writer.write(connections[description.topic], unix_ns, description.payload)
+                    count += 1
+                gateway.receive(topic, module, message, at_ns)
+                for outgoing in gateway.due(at_ns, unix_ns):
+                    writer.write(connections[outgoing.topic], unix_ns, outgoing.payload)
+                    count += 1
+            done((log.end_ns - log.began_ns()) / NS_PER_S)
+    return count
+
+
+def _in_order(log: RunLog) -> Iterator[tuple[int, Topic, str, Message]]:
+    """Yield time, key and message of what the gateway receives, in the order of time."""
+    keys = [(t, m) for t in INPUTS for m in (MODULES if t.per_module else ("",))]
+    streams = [
+        sorted(
+            ((at_ns, topic, module, message) for at_ns, message in stamped(log, topic, module)),
+            key=_time,
+        )
+        for topic, module in keys
+    ]
+    return heapq.merge(*streams, key=_time)
+
+
+def _time(row: tuple[int, Any, Any, Any]) -> int:
+    return row[0]
+
+
+def _connection(writer: Writer, topic: RosTopic, types: RosTypes) -> Connection:
+    qos = topic.qos
+    profile = Qos(
+        QosHistory.KEEP_LAST,
+        qos.depth,
+        QosReliability.RELIABLE if qos.reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if qos.transient_local else QosDurability.VOLATILE,
+        _EVER,
+        _EVER,
+        QosLiveliness.AUTOMATIC,
+        _EVER,
+        avoid_ros_namespace_conventions=False,
+    )
+    return writer.add_connection(
+        topic.name,
+        topic.type,
+        msgdef=types.definition(topic.type),
+        rihs01=types.hash(topic.type),
+        offered_qos_profiles=[profile],
+    )

@@ -1,0 +1,263 @@
+"""A run as tables, CSV or Parquet: each key with all of its messages, or all on one time grid.
+
+A column is a field, or an element of one: `tau_ff[1]`, as viewers of the log name it. In a table of
+one key, `time_s` is the sender's stamp on the report's axis (`tools.export.stamps`).
+"""
+
+from __future__ import annotations
+
+import bisect
+import csv
+import fnmatch
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol, get_args, get_origin
+
+import msgspec
+
+from shared.bus import topics
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_S
+from shared.exceptions import RunError
+from tools.export.stamps import stamped
+from tools.runs.run_index import RunIndex
+from tools.runs.run_log import RunLog, RunPart, parts_of
+from tools.runs.run_parts import zero_ns
+
+TIME: Final = "time_s"
+GRID_NAME: Final = "run"
+"""File of the table on a grid, without its suffix."""
+HELD_S: Final = 0.5
+"""Newest messages that are older leave a grid's cells empty: their sender is silent."""
+
+_HEAD: Final = ("t_ns", "seq")
+"""Fields that come first."""
+FOR_REEXECUTION: Final = (topics.JOINT_TRACE, topics.PLANNER_CHECKPOINT, topics.SIM_STATE)
+
+Columns = Mapping[str, Sequence[Any]]
+"""Values by name, all of one length; None: an empty cell."""
+
+
+class TableKey(NamedTuple):
+    """A key of the log that has a table."""
+
+    topic: Topic
+    module: str
+
+    @property
+    def name(self) -> str:
+        """Name below the robot's, such as `joint/knee_left/state`."""
+        return self.topic.name.replace("*", self.module)
+
+
+class Column(NamedTuple):
+    """How a column is read from a message."""
+
+    read: Callable[[Any], Any]
+    kind: type
+    """int, float, bool or str."""
+
+
+Kinds = Mapping[str, type]
+"""Type of each column, by its name."""
+
+
+class TableFile(Protocol):
+    """A table that is being written."""
+
+    def add(self, columns: Columns) -> None:
+        """Append rows."""
+
+    def close(self) -> None:
+        """Finish it."""
+
+
+class CsvFile:
+    """A CSV file."""
+
+    suffix = ".csv"
+
+    def __init__(self, path: Path, kinds: Kinds) -> None:
+        """Begin it with its heading; the suffix is added to the path."""
+        path = path.with_name(path.name + self.suffix)
+        self._file = path.open("w", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file)
+        self._writer.writerow(kinds)
+
+    def add(self, columns: Columns) -> None:
+        """Append rows."""
+        self._writer.writerows(zip(*columns.values(), strict=True))
+
+    def close(self) -> None:
+        """Finish it."""
+        self._file.close()
+
+
+def keys_matching(index: RunIndex, patterns: Sequence[str]) -> list[TableKey]:
+    """Return the keys of a run whose names match a pattern, in the order of the table of topics.
+
+    Args:
+        index: of the run.
+        patterns: such as `joint/*/state`; none: all but those that only re-execution reads.
+
+    Raises:
+        RunError: a pattern matches no topic.
+    """
+    known = [
+        TableKey(topic, key.split("/")[3] if topic.per_module else "")
+        for key, topic in topics.all_keys(index.robot).items()
+    ]
+    for pattern in patterns:
+        if not any(fnmatch.fnmatch(key.name, pattern) for key in known):
+            names = ", ".join(topic.name for topic in topics.TOPICS)
+            raise RunError(f"--topic {pattern}: no topic is so named; there are {names}")
+    if not patterns:
+        return [key for key in known if key.topic not in FOR_REEXECUTION]
+    return [key for key in known if any(fnmatch.fnmatch(key.name, p) for p in patterns)]
+
+
+def columns_of(kind: type[msgspec.Struct]) -> dict[str, Column]:
+    """Return the columns of a message type, by name."""
+    found: dict[str, Column] = {}
+    fields = msgspec.structs.fields(kind)
+    for field in sorted(fields, key=lambda field: field.name not in _HEAD):
+        _add_column(found, field.name, field.type, _getter(field.name))
+    return found
+
+
+def write_tables(
+    index: RunIndex,
+    part: RunPart,
+    keys: Sequence[TableKey],
+    folder: Path,
+    make: Callable[[Path, Kinds], TableFile],
+    done: Callable[[float], None],
+) -> dict[str, int]:
+    """Write a file for each key that has messages; return the rows of each file.
+
+    Args:
+        index: of the run.
+        part: what of it to write.
+        keys: from `keys_matching`.
+        folder: to write into.
+        make: begins a file at a path without suffix, with the types of its columns.
+        done: is told how much of the run is written, s.
+    """
+    zero = zero_ns(index)
+    open_files: dict[str, TableFile] = {}
+    rows: dict[str, int] = {}
+    readers = {key.topic: columns_of(key.topic.type) for key in keys}
+    try:
+        for log in parts_of(index, part):
+            for key in keys:
+                held = list(stamped(log, *key))
+                if not held:
+                    continue
+                getters = readers[key.topic]
+                name = key.name.replace("/", ".")
+                if name not in open_files:
+                    kinds = {column: row.kind for column, row in getters.items()}
+                    open_files[name] = make(folder / name, {TIME: float, **kinds})
+                times = [(at_ns - zero) / NS_PER_S for at_ns, _ in held]
+                cells = {
+                    column: [row.read(message) for _, message in held]
+                    for column, row in getters.items()
+                }
+                open_files[name].add({TIME: times, **cells})
+                rows[name] = rows.get(name, 0) + len(held)
+            done((log.end_ns - log.began_ns()) / NS_PER_S)
+    finally:
+        for file in open_files.values():
+            file.close()
+    return rows
+
+
+def write_grid(
+    index: RunIndex,
+    part: RunPart,
+    keys: Sequence[TableKey],
+    rate_hz: float,
+    path: Path,
+    make: Callable[[Path, Kinds], TableFile],
+    done: Callable[[float], None],
+) -> int:
+    """Write one table on a grid of time: at each time the newest message of each key.
+
+    Topics of events, which have no rate, are left out. Returns the number of rows.
+
+    Args:
+        index: of the run.
+        part: what of it to write.
+        keys: from `keys_matching`.
+        rate_hz: of the grid.
+        path: without suffix.
+        make: as for `write_tables`.
+        done: as for `write_tables`.
+
+    Raises:
+        RunError: no key has a rate.
+    """
+    steady = [key for key in keys if key.topic.rate_hz]
+    if not steady:
+        raise RunError("--rate: none of these topics has a rate; leave it out for their events")
+    readers = {key.topic: columns_of(key.topic.type) for key in steady}
+    kinds = {
+        f"{key.name}.{name}": row.kind for key in steady for name, row in readers[key.topic].items()
+    }
+    zero, step_ns, count = zero_ns(index), NS_PER_S / rate_hz, 0
+    file = make(path, {TIME: float, **kinds})
+    try:
+        for log in parts_of(index, part):
+            first = math.ceil((log.begin_ns - zero) / step_ns)
+            last = math.ceil((log.end_ns - zero) / step_ns)
+            grid = [zero + round(number * step_ns) for number in range(first, last)]
+            cells: dict[str, Sequence[Any]] = {TIME: [(at - zero) / NS_PER_S for at in grid]}
+            for key in steady:
+                newest = _newest_at(log, key, grid)
+                for name, row in readers[key.topic].items():
+                    cells[f"{key.name}.{name}"] = [
+                        None if message is None else row.read(message) for message in newest
+                    ]
+            if grid:
+                file.add(cells)
+            count += len(grid)
+            done((log.end_ns - log.began_ns()) / NS_PER_S)
+    finally:
+        file.close()
+    return count
+
+
+def _newest_at(log: RunLog, key: TableKey, grid: Iterable[int]) -> list[Any | None]:
+    rows = sorted(stamped(log, *key, margins=True), key=_time)
+    times = [at_ns for at_ns, _ in rows]
+    found: list[Any | None] = []
+    for at_ns in grid:
+        number = bisect.bisect_right(times, at_ns) - 1
+        fresh = number >= 0 and at_ns - times[number] <= HELD_S * NS_PER_S
+        found.append(rows[number][1] if fresh else None)
+    return found
+
+
+def _time(row: tuple[int, Any]) -> int:
+    return row[0]
+
+
+def _add_column(found: dict[str, Column], name: str, kind: Any, read: Callable[[Any], Any]) -> None:
+    """Add a field's column, or those of its elements; what is no plain value becomes JSON."""
+    elements = get_args(kind)
+    if kind in (int, float, bool, str):
+        found[name] = Column(read, kind)
+    elif get_origin(kind) is tuple and elements[-1] is not Ellipsis:
+        for number, element in enumerate(elements):
+            _add_column(found, f"{name}[{number}]", element, _element(read, number))
+    else:
+        found[name] = Column(lambda message: msgspec.json.encode(read(message)).decode(), str)
+
+
+def _getter(name: str) -> Callable[[Any], Any]:
+    return lambda message: getattr(message, name)
+
+
+def _element(read: Callable[[Any], Any], number: int) -> Callable[[Any], Any]:
+    return lambda message: read(message)[number]
