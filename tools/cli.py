@@ -39,7 +39,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
-def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
+def whole_parser() -> argparse.ArgumentParser:
+    """Return the parser with every verb complete; takes a second or two."""
+    return _parser([], whole=True)
+
+
+def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.ArgumentParser:
     """Return the parser, complete for the verb in use and with one line for each other."""
     parser = argparse.ArgumentParser(
         prog="xrl",
@@ -49,7 +54,7 @@ def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(metavar="VERB", required=True)
     wanted = next((word for word in arguments if not word.startswith("-")), "")
     for verb in VERBS:
-        if verb.name == wanted:
+        if whole or verb.name == wanted:
             module = importlib.import_module(f"tools.verbs.{verb.name}")
             module.add_parser(subparsers)
             subparsers.choices[verb.name].set_defaults(run=module.run)

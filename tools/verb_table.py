@@ -30,6 +30,9 @@ VERBS: Final = (
     Verb("crashtest", "kill one service after the other, live, and judge each run"),
     Verb("up", "start the fleet"),
     Verb("status", "show every service and every module"),
+    Verb("top", "show processes and topics on one screen: CPU, rates, ages, bytes"),
+    Verb("echo", "print the messages of a topic as they come"),
+    Verb("hz", "measure the rate, spacing, age and size of topics"),
     Verb("faults", "list the faults: what the robot does then, and the way out"),
     Verb("kill", "send a signal to one service"),
     Verb("inject", "delay, drop or cut a live fleet's messages for a while"),
@@ -58,6 +61,7 @@ VERBS: Final = (
     Verb("bench", "measure what each part of the fleet costs here, warm and cold"),
     Verb("stiffness", "print how stiff the body must be to balance"),
     Verb("down", "stop the fleet and leave nothing behind"),
+    Verb("completion", "print what completes this command line in a shell"),
 )
 """A verb's module is imported only when the verb is used."""
 

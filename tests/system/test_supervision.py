@@ -335,3 +335,32 @@ def test_kill_and_down_work_from_the_command_line(
     assert wait_for(lambda: service(fleet, "planner").state == "suspended")
     assert cli.main(["down", *where]) == 0
     assert_nothing_left(run_dir, pids)
+
+
+@pytest.mark.usefixtures("signal_handlers")
+def test_top_hz_and_echo_show_what_the_services_send(
+    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet = start({"ankle_right": JOINT, "planner": SLEEPER})
+    place = ["--run-dir", str(run_dir)]
+    assert cli.main(["hz", "joint/ankle_right/state", "--for", "1", *place]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if "ankle_right" in line)
+    assert row.split()[1].endswith("/250"), "the rate, and the nominal one"
+    assert 20 < float(row.split()[1].removesuffix("/250")) < 150
+    assert cli.main(["hz", "planner/status", "--for", "0.2", *place]) == 1, "nothing came"
+    capsys.readouterr()
+
+    words = ["echo", "joint/*/state", "--count", "2", "--field", "mode", "--field", "seq"]
+    assert cli.main([*words, "--json", *place]) == 0
+    first, second = map(json.loads, capsys.readouterr().out.splitlines())
+    assert first["topic"] == "joint/ankle_right/state"
+    assert second["seq"] == first["seq"] + 1, "none is lost"
+    assert set(first) == {"topic", "mode", "seq"}
+    assert cli.main([*words, *place]) == 0
+    assert "mode: HOLD (1)" in capsys.readouterr().out
+
+    assert cli.main(["top", "--once", *place]) == 0
+    shown = capsys.readouterr().out
+    assert str(fleet.pids()["ankle_right"]) in shown
+    assert "joint/ankle_right/state" in shown
+    assert "planner/status" not in shown, "on which nothing has come"

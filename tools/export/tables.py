@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import bisect
 import csv
-import fnmatch
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -17,13 +16,13 @@ from typing import Any, Final, NamedTuple, Protocol, get_args, get_origin
 import msgspec
 
 from shared.bus import topics
-from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from tools.export.stamps import stamped
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, RunPart, parts_of
 from tools.runs.run_parts import zero_ns
+from tools.topic_keys import TopicKey
 
 TIME: Final = "time_s"
 GRID_NAME: Final = "run"
@@ -37,18 +36,6 @@ FOR_REEXECUTION: Final = (topics.JOINT_TRACE, topics.PLANNER_CHECKPOINT, topics.
 
 Columns = Mapping[str, Sequence[Any]]
 """Values by name, all of one length; None: an empty cell."""
-
-
-class TableKey(NamedTuple):
-    """A key of the log that has a table."""
-
-    topic: Topic
-    module: str
-
-    @property
-    def name(self) -> str:
-        """Name below the robot's, such as `joint/knee_left/state`."""
-        return self.topic.name.replace("*", self.module)
 
 
 class Column(NamedTuple):
@@ -94,29 +81,6 @@ class CsvFile:
         self._file.close()
 
 
-def keys_matching(index: RunIndex, patterns: Sequence[str]) -> list[TableKey]:
-    """Return the keys of a run whose names match a pattern, in the order of the table of topics.
-
-    Args:
-        index: of the run.
-        patterns: such as `joint/*/state`; none: all but those that only re-execution reads.
-
-    Raises:
-        RunError: a pattern matches no topic.
-    """
-    known = [
-        TableKey(topic, key.split("/")[3] if topic.per_module else "")
-        for key, topic in topics.all_keys(index.robot).items()
-    ]
-    for pattern in patterns:
-        if not any(fnmatch.fnmatch(key.name, pattern) for key in known):
-            names = ", ".join(topic.name for topic in topics.TOPICS)
-            raise RunError(f"--topic {pattern}: no topic is so named; there are {names}")
-    if not patterns:
-        return [key for key in known if key.topic not in FOR_REEXECUTION]
-    return [key for key in known if any(fnmatch.fnmatch(key.name, p) for p in patterns)]
-
-
 def columns_of(kind: type[msgspec.Struct]) -> dict[str, Column]:
     """Return the columns of a message type, by name."""
     found: dict[str, Column] = {}
@@ -129,7 +93,7 @@ def columns_of(kind: type[msgspec.Struct]) -> dict[str, Column]:
 def write_tables(
     index: RunIndex,
     part: RunPart,
-    keys: Sequence[TableKey],
+    keys: Sequence[TopicKey],
     folder: Path,
     make: Callable[[Path, Kinds], TableFile],
     done: Callable[[float], None],
@@ -139,7 +103,7 @@ def write_tables(
     Args:
         index: of the run.
         part: what of it to write.
-        keys: from `keys_matching`.
+        keys: from `tools.topic_keys`.
         folder: to write into.
         make: begins a file at a path without suffix, with the types of its columns.
         done: is told how much of the run is written, s.
@@ -176,7 +140,7 @@ def write_tables(
 def write_grid(
     index: RunIndex,
     part: RunPart,
-    keys: Sequence[TableKey],
+    keys: Sequence[TopicKey],
     rate_hz: float,
     path: Path,
     make: Callable[[Path, Kinds], TableFile],
@@ -189,7 +153,7 @@ def write_grid(
     Args:
         index: of the run.
         part: what of it to write.
-        keys: from `keys_matching`.
+        keys: from `tools.topic_keys`.
         rate_hz: of the grid.
         path: without suffix.
         make: as for `write_tables`.
@@ -228,7 +192,7 @@ def write_grid(
     return count
 
 
-def _newest_at(log: RunLog, key: TableKey, grid: Iterable[int]) -> list[Any | None]:
+def _newest_at(log: RunLog, key: TopicKey, grid: Iterable[int]) -> list[Any | None]:
     rows = sorted(stamped(log, *key, margins=True), key=_time)
     times = [at_ns for at_ns, _ in rows]
     found: list[Any | None] = []

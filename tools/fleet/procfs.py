@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 _POLL_S = 0.05
 
@@ -47,6 +48,27 @@ def fleets() -> set[str]:
         except OSError:
             continue
         found |= {os.fsdecode(v.removeprefix(mark)) for v in variables if v.startswith(mark)}
+    return found
+
+
+class ProcessUse(NamedTuple):
+    """What a process has used so far."""
+
+    cpu_s: float
+    memory_mib: float
+
+
+def use_of(pids: Iterable[int]) -> dict[int, ProcessUse]:
+    """Return what processes have used; one that has ended is left out."""
+    found = {}
+    for pid in pids:
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        ticks, pages = int(fields[11]) + int(fields[12]), int(fields[21])
+        memory_mib = pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
+        found[pid] = ProcessUse(ticks / os.sysconf("SC_CLK_TCK"), memory_mib)
     return found
 
 

@@ -13,7 +13,7 @@ from tools.fleet.fleet_status import OPEN, SILENT_PROXY, FleetStatus, LeadStatus
 from tools.output import printable
 
 _LABELS: Final = ("state", "last exit")
-_GOOD: Final = ("running", "starting")
+GOOD_STATES: Final = ("running", "starting")
 
 
 def describe_lead(lead: LeadStatus | None) -> str:
@@ -100,7 +100,7 @@ def tables(status: FleetStatus) -> Group:
     for name, row in status.services.items():
         services.add_row(
             name,
-            row.state if row.state in _GOOD else f"[bold red]{row.state}[/]",
+            row.state if row.state in GOOD_STATES else f"[bold red]{row.state}[/]",
             "-" if row.pid is None else str(row.pid),
             f"{row.uptime_s:.0f}",
             "-" if row.age_s is None else f"{1e3 * row.age_s:.0f}",

@@ -23,13 +23,20 @@ from tools.export.folders import whole_folder
 from tools.export.parquet import ParquetFile
 from tools.export.parquet import require as require_parquet
 from tools.export.ros2_bag import write_bag
-from tools.export.tables import GRID_NAME, CsvFile, keys_matching, write_grid, write_tables
+from tools.export.tables import (
+    FOR_REEXECUTION,
+    GRID_NAME,
+    CsvFile,
+    write_grid,
+    write_tables,
+)
 from tools.number_arguments import rate
 from tools.output import progress_along, write_atomically
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, RunPart, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
+from tools.topic_keys import keys_named
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 SCENE_SUFFIX: Final = ".scene" + SUFFIX
@@ -173,7 +180,7 @@ def _write_tables(
     console: Console,
 ) -> None:
     """Write a folder of tables, with progress."""
-    keys = keys_matching(index, args.topic)
+    keys = keys_named(args.topic, FOR_REEXECUTION)
     with (
         whole_folder(out, force=args.force) as folder,
         progress_along("writing", index.length_s) as done,

@@ -1,0 +1,119 @@
+"""What passes on the bus: rate, spacing, age and size of the messages of each key."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
+
+import msgspec
+
+from shared.bus.session import Session
+from shared.bus.topics import several_may_write
+from shared.clock import NS_PER_MS
+from shared.mcap_log.sequence_stats import KeyCount
+from tools.topic_keys import TopicKey
+
+POLL_S: Final = 0.001
+"""Bounds how late a message is seen, and so the spacing's error."""
+LINKS_S: Final = 0.3
+"""Time in which links to the services form."""
+
+
+class _Numbering(msgspec.Struct, gc=False):
+    """What is read of a message."""
+
+    t_ns: int
+    seq: int
+
+
+class KeyTraffic:
+    """The messages of one key in a window of time.
+
+    Attributes:
+        count: messages in the window.
+        size: of these, bytes.
+        lost: messages in the window that the numbers of the senders jump over.
+    """
+
+    def __init__(self, key: TopicKey) -> None:
+        """Begin with nothing received."""
+        self.key = key
+        self._counted = KeyCount(several=several_may_write(f"xrl/robot/{key.name}"))
+        self._last_ns: int | None = None
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a new window."""
+        self.count, self.size, self._lost_before = 0, 0, self._counted.missing
+        self._gaps: list[int] = []
+        self._ages: list[int] = []
+
+    def feed(self, payload: bytes, now_ns: int) -> None:
+        """Take a message; what is none is counted with its size only."""
+        self.count += 1
+        self.size += len(payload)
+        if self._last_ns is not None:
+            self._gaps.append(now_ns - self._last_ns)
+        self._last_ns = now_ns
+        try:
+            head = _NUMBERINGS.decode(payload)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            return
+        self._counted.feed(head.seq)
+        self._ages.append(now_ns - head.t_ns)
+
+    @property
+    def lost(self) -> int:
+        """Messages in the window that did not come."""
+        return self._counted.missing - self._lost_before
+
+    @property
+    def gaps_ms(self) -> tuple[float, float] | None:
+        """Median and longest time between two messages, ms; None: fewer than two."""
+        return _spread_ms(self._gaps)
+
+    @property
+    def ages_ms(self) -> tuple[float, float] | None:
+        """Median and largest age at reception, ms, if both clocks are one."""
+        return _spread_ms(self._ages)
+
+
+_NUMBERINGS: Final = msgspec.json.Decoder(_Numbering)
+
+
+def _spread_ms(values: Sequence[int]) -> tuple[float, float] | None:
+    if not values:
+        return None
+    return sorted(values)[len(values) // 2] / NS_PER_MS, max(values) / NS_PER_MS
+
+
+class Traffic:
+    """Receives keys of a bus, undecoded."""
+
+    def __init__(self, session: Session, keys: Iterable[TopicKey]) -> None:
+        """Subscribe."""
+        self.keys = {key.topic.key(session.robot, key.module): KeyTraffic(key) for key in keys}
+        self._stream = session.stream(list(self.keys))
+
+    def listen(self, seconds: float, left: Callable[[], bool] = lambda: False) -> float:
+        """Receive one window; return how long it was, s.
+
+        Args:
+            seconds: of the machine's clock.
+            left: ends it before.
+        """
+        for traffic in self.keys.values():
+            traffic.begin()
+        began = time.monotonic()
+        while time.monotonic() - began < seconds and not left():
+            while (sample := self._stream.take()) is not None:
+                key, payload, now_ns = sample
+                self.keys[key].feed(payload, now_ns)
+            time.sleep(POLL_S)
+        return time.monotonic() - began
+
+
+def rate_hz(traffic: KeyTraffic, window_s: float) -> float:
+    """Return messages per second of a window."""
+    return traffic.count / window_s if window_s > 0.0 else 0.0

@@ -1,0 +1,54 @@
+"""Keys of the bus by the names that a person types, such as `joint/*/state`."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+from shared.bus import topics
+from shared.bus.topics import Topic
+from shared.exceptions import RunError
+from shared.robot.joints import MODULES
+
+
+class TopicKey(NamedTuple):
+    """A key of a robot's bus."""
+
+    topic: Topic
+    module: str
+    """"" for a topic with one key."""
+
+    @property
+    def name(self) -> str:
+        """Name below the robot's, such as `joint/knee_left/state`."""
+        return self.topic.name.replace("*", self.module)
+
+
+def every_key() -> list[TopicKey]:
+    """Return every key, in the order of the table of topics."""
+    return [
+        TopicKey(topic, module)
+        for topic in topics.TOPICS
+        for module in (MODULES if topic.per_module else ("",))
+    ]
+
+
+def keys_named(patterns: Sequence[str], left_out: Collection[Topic] = ()) -> list[TopicKey]:
+    """Return the keys whose names match a pattern, in the order of the table of topics.
+
+    Args:
+        patterns: such as `joint/*/state`; none: all keys.
+        left_out: topics that are left out where there is no pattern.
+
+    Raises:
+        RunError: a pattern matches no key.
+    """
+    known = every_key()
+    for pattern in patterns:
+        if not any(fnmatch.fnmatch(key.name, pattern) for key in known):
+            names = ", ".join(topic.name for topic in topics.TOPICS)
+            raise RunError(f"{pattern}: no topic is so named; there are {names}")
+    if not patterns:
+        return [key for key in known if key.topic not in left_out]
+    return [key for key in known if any(fnmatch.fnmatch(key.name, p) for p in patterns)]

@@ -1,0 +1,127 @@
+"""`xrl echo`: the messages of a topic as they come."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from shared.bus.messages import Message
+from shared.bus.session import Session, open_session
+from shared.config.files import load
+from shared.exceptions import RunError
+from shared.mcap_log.schema import ENUMERATIONS
+from shared.process import StopFlag
+from tools.fleet.supervise import SupervisedFleet
+from tools.number_arguments import count, finite, rate
+from tools.topic_keys import TopicKey, keys_named
+from tools.verb_table import Subparsers, add_run_dir, add_verb
+
+POLL_S: Final = 0.002
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "echo",
+        """
+        xrl echo planner/status --count 1
+        xrl echo 'joint/*/state' --field q --hz 5
+        xrl echo joint/knee_left/event              # each change of mode
+        xrl echo harness/wrench --json | jq .force
+        """,
+    )
+    add_run_dir(parser)
+    parser.add_argument("topic", nargs="+", metavar="TOPIC", help="such as 'joint/*/state'")
+    parser.add_argument(
+        "--field", action="append", default=[], metavar="NAME", help="only these; may be repeated"
+    )
+    parser.add_argument(
+        "--hz", type=rate, metavar="HZ", help="at most so many of each topic a second"
+    )
+    parser.add_argument("--count", type=count, metavar="N", help="end after N messages")
+    parser.add_argument("--for", dest="for_s", type=finite, metavar="S", help="end after S seconds")
+    parser.add_argument(
+        "--json", action="store_true", help="a line of JSON for each message, as on the bus"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print until the end that was asked for; 1 if nothing came."""
+    keys = keys_named(args.topic)
+    for name in args.field:
+        without = [key.name for key in keys if name not in key.topic.type.__struct_fields__]
+        if len(without) == len(keys):
+            fields = ", ".join(keys[0].topic.type.__struct_fields__)
+            raise RunError(f"--field {name}: {keys[0].name} has no such field; it has {fields}")
+    fleet = SupervisedFleet.attach(args.run_dir)
+    robot = load(Path(fleet.manifest.config))
+    with open_session(robot, "echo", fleet.run.path) as session:
+        return 0 if _print(session, keys, args) else 1
+
+
+def _print(session: Session, keys: list[TopicKey], args: argparse.Namespace) -> int:
+    """Print the messages; return how many."""
+    by_key = {key.topic.key(session.robot, key.module): key for key in keys}
+    stream = session.stream(list(by_key))
+    stop, printed = StopFlag(), 0
+    deadline = None if args.for_s is None else time.monotonic() + args.for_s
+    due: dict[str, float] = {}
+    while not stop and (deadline is None or time.monotonic() < deadline):
+        sample = stream.take()
+        if sample is None:
+            time.sleep(POLL_S)
+            continue
+        name, payload, _ = sample
+        now = time.monotonic()
+        if args.hz is not None and now < due.get(name, 0.0):
+            continue
+        due[name] = now + (0.0 if args.hz is None else 1.0 / args.hz)
+        text = as_text(by_key[name], payload, args.field, as_json=args.json)
+        if text:
+            print(text)
+            sys.stdout.flush()
+            printed += 1
+        if args.count is not None and printed >= args.count:
+            break
+    return printed
+
+
+def as_text(key: TopicKey, payload: bytes, fields: list[str], *, as_json: bool) -> str:
+    """Return a message as text; "" if it has none of the fields, or is no message of its type."""
+    try:
+        message = msgspec.json.decode(payload, type=key.topic.type)
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return f"{key.name}: {len(payload)} bytes that are no {key.topic.type.__name__}"
+    values = {
+        name: getattr(message, name)
+        for name in message.__struct_fields__
+        if not fields or name in fields
+    }
+    if not values:
+        return ""
+    if as_json:
+        return msgspec.json.encode({"topic": key.name, **values}).decode()
+    rows = "".join(f"\n  {name}: {shown(message, name, value)}" for name, value in values.items())
+    return f"{key.name}{rows}"
+
+
+def shown(message: Message, name: str, value: Any) -> str:
+    """Return a value as a person reads it: enumerations by name, numbers short."""
+    kind: type[IntEnum] | None = ENUMERATIONS.get((type(message), name))
+    if kind is not None:
+        try:
+            return f"{kind(value).name} ({value})"
+        except ValueError:
+            return f"{value}, which is no {kind.__name__}"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(shown(message, "", part) for part in value) + "]"
+    return str(value)
