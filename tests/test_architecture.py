@@ -50,6 +50,8 @@ IMPORTS = {file: imports_in(source) for file, source in SOURCES.items()}
 VENDORS = {
     "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
     "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
+    "gymnasium": ["tools/learning/environment.py"],
+    "shtab": ["tools/verbs/completion.py"],
     "pyarrow": ["tools/export/parquet.py"],
     "mujoco": [
         "services/simulator/world.py",
@@ -112,6 +114,9 @@ LAWS = [
     "services/planner/sampled_loop.py",
     "services/planner/stability_margins.py",
     "services/planner/certificate.py",
+    "services/planner/controller.py",
+    "services/planner/controller_guard.py",
+    "tools/learning/policy.py",
     "services/planner/engagement_fsm.py",
     "services/planner/gains.py",
     "services/planner/hocca.py",
@@ -129,6 +134,7 @@ LAWS = [
     "services/ros2_gateway/gateway.py",
     "services/ros2_gateway/inbound.py",
     "services/ros2_gateway/rmw.py",
+    "shared/robot/capture_point.py",
     "shared/robot/frames.py",
     "shared/robot/remedies.py",
     "shared/robot/robot_urdf.py",

@@ -47,6 +47,19 @@ def test_the_robot_in_virtual_time_holds_while_the_planner_is_dead_and_is_led_ag
     assert lines[-2].endswith("TTTTTT")
 
 
+def test_the_lqr_leads_in_the_planners_place_and_the_robot_stands_when_it_is_killed(
+    tmp_path: Path,
+) -> None:
+    words = ["sim", "--controller", str(EXAMPLES / "lqr_controller.py"), "--scenario", "squat"]
+    words += ["--duration", "3", "--kill", "planner@1.5", "--out", str(tmp_path / "run")]
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.cli", *words],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "STOOD" in done.stdout
+
+
 def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
     shipped, gentle = (line.split() for line in run("own_operator.py").splitlines())
     force, height = 2, 8

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 
+from services.planner.controller_file import controller_maker
 from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner
 from shared import log, scheduling
@@ -36,10 +37,18 @@ def main() -> int:
         "Run the whole-body law.", "python -m services.planner --run-dir /tmp/xrl"
     )
     add_injected(parser)
+    parser.add_argument(
+        "--controller",
+        metavar="FILE.py[:NAME]",
+        help="a controller of your own in the place of the law (docs/own-controller.md)",
+    )
     arguments = parser.parse_args()
     logger = log.setup("planner")
     robot = config_file.load(arguments.config)
     gain_schedule.require(robot, arguments.config)
+    controller = None
+    if arguments.controller is not None:
+        controller = controller_maker(arguments.controller, robot)()
     stop = StopFlag()
     granted = scheduling.apply("planner")
     with open_session(robot, "planner", arguments.run_dir, injected=arguments.injected) as session:
@@ -53,8 +62,9 @@ def main() -> int:
             checkpoint=session.publisher(topics.PLANNER_CHECKPOINT, PlannerCheckpoint),
         )
         session_id = secrets.randbelow(1 << 53) + 1  # JSON readers keep 53 bits
-        loop = PlannerLoop(robot, Planner(robot, session_id), ports)
-        logger.info("up, %s, session %d", granted, session_id)
+        loop = PlannerLoop(robot, Planner(robot, session_id, controller), ports)
+        own = f", controller {arguments.controller}" if controller is not None else ""
+        logger.info("up, %s, session %d%s", granted, session_id, own)
         freeze_garbage()
         loop.run(stop)
     logger.info("stopped")

@@ -234,6 +234,30 @@ class Hocca:
             result.residual,
         )
 
+    @property
+    def J(self) -> Array:  # noqa: N802 - the paper's letter
+        """dp/dq (6, 12) at the measured joints; overwritten by the next tick."""
+        return self._measured.J
+
+    @property
+    def T(self) -> Array:  # noqa: N802 - the paper's letter
+        """Joint rates per unit of p along the closed chain (12, 6), at the reference pose."""
+        return self._reference.T
+
+    def rest_from_here(self, D: Array, torque: Array) -> Array:
+        """Return how far p (6,) goes until local gains alone balance a torque, m and rad.
+
+        Args:
+            D: local stiffness (12,), N m/rad, certified at this tick.
+            torque: beyond what balances the body here (12,), N m.
+        """
+        K_fail = self._split.certificate.failsafe_stiffness(D)
+        return np.asarray(np.linalg.solve(K_fail, self._reference.T.T @ torque), float)
+
+    def certify(self, D: Array) -> LocalGains:
+        """Return somebody's own local stiffness (12,), N m/rad, with its margins at this tick."""
+        return self._split.certify(D)
+
     def leg_loads(self, tau: Array) -> tuple[float, float]:
         """Return the upward force of right and left leg on the torso at the last tick, N.
 

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.assist import Overload, force_up
+from services.planner.controller import Controller, Observation
+from services.planner.controller_guard import ControllerGuard
 from services.planner.engagement_fsm import Engagement
 from services.planner.hocca import Hocca, LawOutput
 from services.planner.intents import OperatorRequest
@@ -56,15 +58,21 @@ _ALL_NEW = (1 << N_MODULES) - 1
 class Planner:
     """Whole-body law behind its engagement rule."""
 
-    def __init__(self, config: RobotConfig, session: int) -> None:
+    def __init__(
+        self, config: RobotConfig, session: int, controller: Controller | None = None
+    ) -> None:
         """Start waiting for six fresh states.
 
         Args:
             config: the robot.
             session: drawn at random at each start; sent in every command.
+            controller: in the place of the shipped law; its snapshot is not taken.
         """
         self.session = session
         self._law = Hocca(config)
+        self._guard: ControllerGuard | None = None
+        if controller is not None:
+            self._guard = ControllerGuard(controller, self._law, config.geometry)
         self._plausible = Plausible(config)
         self._engagement = Engagement()
         self._stale_ns = round(config.planner.state_stale_ms * NS_PER_MS)
@@ -183,6 +191,8 @@ class Planner:
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
         )
+        if self._guard is not None:
+            self._output = self._controlled(self._guard, self._output, now_ns, dt)
         self._source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
@@ -286,6 +296,16 @@ class Planner:
             commands.append(command)
         return commands
 
+    def _controlled(
+        self, guard: ControllerGuard, law: LawOutput, now_ns: int, dt: float
+    ) -> LawOutput:
+        """Return the output of somebody's own controller in the place of the law's."""
+        seen = Observation(
+            0.0, dt, self._q.copy(), self._v.copy(), self._tau.copy(), law.p, law.pdot,
+            self._law.J.copy(), self._law.T.copy(), self._usable_wrench(now_ns), self._request, law,
+        )  # fmt: skip
+        return guard.act(seen, leads=not self._engagement.hold)
+
     def _usable_wrench(self, now_ns: int) -> Wrench | None:
         """Return the newest wrench, or None if it is invalid or too old."""
         wrench = self._wrench
@@ -385,7 +405,8 @@ class Planner:
             why=self._rival.describe()
             or self._law.stance_refusal()
             or self._law.load_refusal()
-            or self._trips.why,
+            or self._trips.why
+            or (self._guard.why if self._guard is not None else ""),
             trip=int(self._trips.tripped),
         )
 

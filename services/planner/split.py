@@ -22,7 +22,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.robot import gain_schedule
 from shared.robot.gain_table import GainSchedule
-from shared.robot.joints import MODULES
+from shared.robot.joints import MODULES, N_JOINTS
 
 Array = NDArray[np.float64]
 
@@ -143,6 +143,18 @@ class GainSplit:
             if self._meets_margins(margins):
                 return LocalGains(D, D_B, margins, SplitSource.DIAGONAL)
         D, margins, source = self._stiffen(D, diagonal, margins)
+        return LocalGains(D, D_B, margins, source)
+
+    def certify(self, D: Array) -> LocalGains:
+        """Return somebody's own D with its margins at the pose of the last `split`.
+
+        Its source is UNCERTIFIED if it misses them, or is negative or beyond the limits.
+        """
+        D_B = self._schedule.D_B if self._schedule is not None else np.zeros(N_JOINTS)
+        margins = self.certificate.margins(D)
+        stands = self._schedule is not None and self._meets_margins(margins)
+        allowed = bool((D >= 0.0).all() and (self._k_max >= D).all())
+        source = SplitSource.CONTROLLER if stands and allowed else SplitSource.UNCERTIFIED
         return LocalGains(D, D_B, margins, source)
 
     def _diagonal_gains(self, body: JointGains) -> tuple[Array, Array]:

@@ -184,6 +184,8 @@ class SplitSource(IntEnum):
     """Stiffer gains, because the schedule's did not meet the certificate."""
     UNCERTIFIED = 3
     """None met the certificate: all hold."""
+    CONTROLLER = 4
+    """Those of a controller of your own, certified."""
 
 
 class Tare(IntEnum):

@@ -37,7 +37,8 @@ def test_a_short_slice_and_exact_timers_need_no_privilege() -> None:
 
 
 def test_every_process_of_the_fleet_has_a_row() -> None:
-    assert {row.kind for row in load_table(PROCESSES).process} == set(TABLE)
+    """The gateway to ROS 2 is off the control path: it is nicer than all others."""
+    assert {row.kind for row in load_table(PROCESSES).process} - {"ros2_gateway"} == set(TABLE)
 
 
 def test_what_a_step_needs_first_has_the_higher_priority() -> None:

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
+import pty
+import select
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import PlannerMode, PlannerStatus
+from shared.bus.messages import JointState, Mode, PlannerMode, PlannerStatus, SimTruth
 from shared.bus.session import open_session
+from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from shared.run_directory import RUN_DIR_VARIABLE
+from tests.system.waiting import wait_for
 from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(180)]
@@ -35,25 +43,93 @@ def wait_until_led(robot: RobotConfig, run_dir: Path) -> None:
             time.sleep(0.01)
 
 
-def test_the_planner_gives_the_assist_that_a_script_asks_for(
-    run_dir: Path, robot: RobotConfig
-) -> None:
-    fleet = SupervisedFleet.start(
-        DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES, "harness", "planner"]
+@pytest.fixture(scope="module")
+def place() -> Iterator[Path]:
+    """Return the run directory of a fleet that leads."""
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as path:
+        services = ["simulator", *MODULES, "harness", "planner"]
+        fleet = SupervisedFleet.start(DEFAULT_CONFIG, Path(path) / "r", services=services)
+        try:
+            wait_until_led(load(DEFAULT_CONFIG), fleet.run.path)
+            yield fleet.run.path
+        finally:
+            fleet.stop()
+
+
+def test_the_planner_gives_the_assist_that_a_script_asks_for(place: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, SCRIPT],
+        env=os.environ | {RUN_DIR_VARIABLE: str(place)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
-    try:
-        wait_until_led(robot, run_dir)
-        done = subprocess.run(
-            [sys.executable, SCRIPT],
-            env=os.environ | {RUN_DIR_VARIABLE: str(run_dir)},
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-    finally:
-        fleet.stop()
     assert done.returncode == 0, done.stderr
     words = done.stdout.split()
     assert words[:3] == ["the", "planner", "gives"]
     assert float(words[3]) > 20.0, done.stdout
+
+
+class Typist:
+    """Types into `xrl lead --keys` on a terminal of its own."""
+
+    def __init__(self, place: Path) -> None:
+        self.shown = b""
+        self._pid, self._descriptor = pty.fork()
+        if self._pid == 0:
+            words = [sys.executable, "-m", "tools.cli", "lead", "--keys", "--run-dir", str(place)]
+            os.execv(sys.executable, words)  # noqa: S606 - a command of ours, no shell
+
+    def types(self, key: bytes) -> None:
+        os.write(self._descriptor, key)
+
+    def shows(self, text: bytes) -> bool:
+        if select.select([self._descriptor], [], [], 0.0)[0]:
+            with contextlib.suppress(OSError):  # it has ended
+                self.shown += os.read(self._descriptor, 1 << 16)
+        return text in self.shown
+
+    def ends(self) -> int:
+        status = []
+        assert wait_for(lambda: bool(self.shows(b"\0") or status.extend(self._reaped()) or status))
+        os.close(self._descriptor)
+        return status[0]
+
+    def _reaped(self) -> list[int]:
+        pid, status = os.waitpid(self._pid, os.WNOHANG)
+        return [os.waitstatus_to_exitcode(status)] if pid else []
+
+
+def test_a_person_leads_the_robot_down_by_keys_lets_go_and_stops_it(
+    place: Path, robot: RobotConfig
+) -> None:
+    with open_session(robot, "test", place) as session:
+        truths = session.latest(topics.SIM_TRUTH, SimTruth)
+        states = [session.latest(topics.JOINT_STATE, JointState, name) for name in MODULES]
+        heights: list[float] = []
+
+        def height() -> float:
+            truth = truths.take()
+            heights.extend([] if truth is None else [truth.torso[2]])
+            return heights[-1] if heights else math.inf
+
+        assert wait_for(lambda: height() < 2.0)
+        before = height()
+        person = Typist(place)
+        assert wait_for(lambda: person.shows(b"arrows"))
+        for _ in range(8):
+            person.types(b"\x1b[B")
+        assert wait_for(lambda: height() < before - 0.08), person.shown[-300:]
+        person.types(b"q")
+        assert person.ends() == 0
+        person = Typist(place)
+        assert wait_for(lambda: person.shows(b"arrows"))
+        person.types(b" ")
+        assert person.ends() == 0
+        stopped: set[int] = set()
+        for number, latest in enumerate(states):
+            state = latest.take()
+            if state is not None and state.mode == Mode.DAMP:
+                stopped.add(number)
+        assert len(stopped) == len(MODULES)

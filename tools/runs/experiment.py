@@ -112,6 +112,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         "replaces the scenario's; may be repeated",
     )
     add_plant(parser)
+    add_controller(parser)
     add_imu(parser)
     parser.add_argument("--split", choices=choices("split"), help="gain split of the law")
     parser.add_argument(
@@ -135,6 +136,16 @@ def add_imu(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="with an IMU on the torso, and its service: the robot stands on slopes "
         "(imu.fitted of the robot file)",
+    )
+
+
+def add_controller(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that puts a controller of somebody's own in the place of the law."""
+    parser.add_argument(
+        "--controller",
+        metavar="FILE.py[:NAME]",
+        help="a controller of your own in the place of the law, behind the same certificate, age "
+        "rule and limits (docs/own-controller.md, examples/lqr_controller.py)",
     )
 
 

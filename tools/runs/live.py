@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from services.planner.controller_file import ATTACHED, absolute, split_spec
 from services.simulator.plant import PlantConfig
 from shared.bus.session import Session, open_session
 from shared.config.robot_config import RobotConfig
@@ -32,6 +33,7 @@ def run_live(
     true_plant: PlantConfig,
     no_restart: Collection[str],
     pace: float | None = None,
+    controller: str | None = None,
     tell: Callable[[str], None] = lambda _text: None,
 ) -> T:
     """Start a fleet, call `lead`, stop the fleet; return what `lead` returns.
@@ -49,6 +51,7 @@ def run_live(
         no_restart: services that the supervisor leaves down when they end.
         pace: clock rate of the fleet. None: the default, lowered step by step while the cores are
             full; the pace found becomes the default of this process.
+        controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
         tell: takes a line of text each time the pace is lowered.
 
     Raises:
@@ -60,6 +63,7 @@ def run_live(
         return _run_once(
             out, robot, scenario, lead,
             verb=verb, seed=seed, true_plant=true_plant, no_restart=no_restart, pace=pace,
+            controller=controller,
         )  # fmt: skip
 
     def again(text: str) -> None:
@@ -81,6 +85,7 @@ def _run_once(
     true_plant: PlantConfig,
     no_restart: Collection[str],
     pace: float,
+    controller: str | None,
 ) -> T:
     """Run at one pace."""
     robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
@@ -88,15 +93,17 @@ def _run_once(
     )
     model_path = out / "model.xml"
     model_path.write_text(mjcf(robot), encoding="utf-8")
+    attached = {"model.xml": model_path, PLANT_FILE: plant_path}
+    if controller is not None:
+        attached[ATTACHED] = split_spec(controller)[0]
     run_dir = Path(tempfile.mkdtemp(prefix=f"xrl-{verb}-", dir="/tmp"))
     try:
         fleet = SupervisedFleet.start(
             robot_path.absolute(),
             run_dir,
             overrides={
-                "recorder": _recorder_arguments(
-                    out, scenario, scenario_path, {"model.xml": model_path, PLANT_FILE: plant_path}
-                ),
+                "recorder": _recorder_arguments(out, scenario, scenario_path, attached),
+                **({"planner": ["--controller", absolute(controller)]} if controller else {}),
                 "simulator": [
                     *("--scenario", str(scenario_path.absolute())),
                     *("--plant", str(plant_path.absolute())),

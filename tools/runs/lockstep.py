@@ -15,6 +15,7 @@ import msgspec
 from services.joint.controller import JointController
 from services.joint.drive_manager import DriveManager
 from services.joint.snapshots import DriveManagerState
+from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
@@ -104,6 +105,7 @@ class Lockstep:
         clocks: Mapping[str, HostClock] | None = None,
         plant: PlantConfig | None = None,
         hand: Sequence[HandRow] = (),
+        controller: Callable[[], Controller] | None = None,
     ) -> None:
         """Put the robot on the hoist, drives idle.
 
@@ -117,6 +119,7 @@ class Lockstep:
             clocks: by service, of a host whose clock is not virtual time; not the simulator's.
             plant: how the true robot differs from `config`; None: the realistic default.
             hand: how somebody leads the hand in place of the scenario.
+            controller: makes a controller of somebody's own for each planner.
 
         Raises:
             RunError: the scenario kills a service that has no process here.
@@ -130,6 +133,7 @@ class Lockstep:
         self.now_ns = NS_PER_S
         self._record = record
         self._traces = self.traced and record is not forget
+        self._controller = controller
         self.network = VirtualNetwork(
             network or BASE,
             scenario.inject,
@@ -145,7 +149,7 @@ class Lockstep:
             config, self.plant.imu, self.network.attitudes(), record, seed, clock_of["imu"]
         )
         self._planner = VirtualPlanner(
-            lambda session: self.planner_type(config, session),
+            self._new_planner,
             self.network,
             record,
             rate_hz=config.planner.rate_hz,
@@ -255,6 +259,11 @@ class Lockstep:
         self._start_when_tracking(now)
         self.world.step(self._torque)
         self.now_ns += self._step_ns
+
+    def _new_planner(self, session: int) -> Planner:
+        if self._controller is None:
+            return self.planner_type(self.config, session)
+        return Planner(self.config, session, self._controller())
 
     def _request(self) -> OperatorRequest:
         wanted = self.world.lead()

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from services.planner.controller_file import ATTACHED, controller_maker, split_spec
 from services.simulator.plant import PlantConfig
 from shared.bus import topics
 from shared.bus.codec import encode
@@ -81,6 +82,7 @@ def record_run(
     run: Callable[[Record, Watch], Outcome],
     watch: Watch,
     true_plant: PlantConfig,
+    attached: Sequence[tuple[str, Path]] = (),
 ) -> Outcome:
     """Record one run into `run.mcap` with its inputs beside it.
 
@@ -92,6 +94,7 @@ def record_run(
         run: runs it, given the function that records a message and the one that sees the world.
         watch: sees the world at its rate.
         true_plant: that `run` simulates.
+        attached: names and files that go into the log as well.
 
     Returns:
         What `run` returned.
@@ -117,7 +120,8 @@ def record_run(
             "packages": provenance.packages(),
         },
         attachments={file.name: file.read_bytes() for file in inputs}
-        | {"model.xml": mjcf(robot).encode()},
+        | {"model.xml": mjcf(robot).encode()}
+        | {name: file.read_bytes() for name, file in attached},
         chunk_kib=robot.recorder.chunk_kib,
     ) as writer:
 
@@ -141,6 +145,7 @@ def simulate(
     control: str = SHIPPED,
     true_plant: PlantConfig | None = None,
     hand: Sequence[HandRow] = (),
+    controller: str | None = None,
 ) -> float:
     """Record a run of the fleet in virtual time, to its end or a second past a fall.
 
@@ -154,19 +159,24 @@ def simulate(
         control: a name of `CONTROLS`.
         true_plant: the simulated robot; None: the robot file's.
         hand: how somebody leads the hand in place of the scenario.
+        controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
 
     Returns:
         The simulated time, s.
 
     Raises:
         RunError: the log cannot be written.
+        ConfigError: the controller cannot be used.
     """
     true_plant = true_plant or PlantConfig()
+    make = controller_maker(controller, robot) if controller is not None else None
+    attached = [(ATTACHED, split_spec(controller)[0])] if controller is not None else []
 
     def run(record: Record, drain: Watch) -> float:
         fleet = CONTROLS[control](
-            robot, scenario, network, seed=seed, record=record, plant=true_plant, hand=hand
-        )
+            robot, scenario, network, seed=seed, record=record, plant=true_plant, hand=hand,
+            controller=make,
+        )  # fmt: skip
         end_s = math.inf
         for truth in fleet.run():
             drain(truth)
@@ -182,7 +192,9 @@ def simulate(
         f"loss {network.loss:g}, seed {seed}"
     )
     metadata = {"lockstep": lockstep, "control": control}
-    return record_run(scenario, robot, out, metadata, run, watch, true_plant)
+    if controller is not None:
+        metadata["controller"] = controller
+    return record_run(scenario, robot, out, metadata, run, watch, true_plant, attached)
 
 
 def judge_in_lockstep(scenario: Scenario, out: Path, **figures: Any) -> Summary:

@@ -12,6 +12,7 @@ from types import FrameType
 
 from rich.console import Console
 
+from services.planner.controller_file import controller_maker
 from services.simulator.plant import plant_from
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
@@ -46,6 +47,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl demo --view                        # lead, push and stop it by hand, in a browser
         xrl demo --scenario crawl --kill planner@8
         xrl demo --jacobian average
+        xrl demo --controller examples/lqr_controller.py
         xrl demo --plant drivetrain.stiffness=3000
         xrl demo --duration 8 --push 4:0.3:40,0,0
         xrl demo --pace 0.5
@@ -116,6 +118,8 @@ def lead_run(
             view = stack.enter_context(LiveView(console, scenario.inject, planner))
             return ScenarioRunner(fleet, session, scenario, view.show).run(ended.is_set)
 
+    if args.controller is not None:
+        controller_maker(args.controller, robot)  # refused before anything is started
     return run_live(
         out,
         robot,
@@ -125,6 +129,7 @@ def lead_run(
         seed=args.seed,
         true_plant=plant_from(args.plant),
         pace=args.pace,
+        controller=args.controller,
         tell=lambda text: console.print(f"[yellow]{text}[/]", highlight=False, soft_wrap=True),
         no_restart=robot.services if args.no_restart else {kill.service for kill in scenario.kill},
     )

@@ -24,13 +24,14 @@ from shared.exceptions import ConfigError, FleetError, RunError
 from shared.process import DEFAULT_CONFIG
 from tools.analysis.playback import arguments, guard, reading, selection
 from tools.analysis.playback.display import Display, introduce, summary, where
-from tools.analysis.playback.keyboard import Keyboard, Press
 from tools.analysis.playback.player import Player
+from tools.analysis.playback.press import PRESSES, Press
 from tools.analysis.playback.reading import Recording
 from tools.analysis.playback.schedule import Entry, Playhead, Schedule, Window, window
 from tools.analysis.playback.stream import EntryStream
 from tools.cli import INTERRUPTED
 from tools.fleet.supervise import SupervisedFleet
+from tools.keyboard import Keyboard
 from tools.verb_table import Subparsers, add_verb
 
 _POLL_S: Final = 0.01
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         listening = expand(args.listen, args.run_dir) if listen else ""
         words = where(list(targets.values()), recording.robot, part, listening)
         console.print(words, markup=False, soft_wrap=True)
-        keyboard = stack.enter_context(Keyboard())
+        keyboard = stack.enter_context(Keyboard(PRESSES))
         if args.start_paused and not keyboard.present:
             raise RunError("--start-paused: nobody could press space here; a terminal is needed")
         return _play(args, schedule, targets, session, keyboard, _alarm(watch, targets, args))
@@ -191,7 +192,7 @@ def _play(
     schedule: Schedule,
     targets: dict[str, str],
     session: Session,
-    keyboard: Keyboard,
+    keyboard: Keyboard[Press],
     alarm: Callable[[], None],
 ) -> int:
     """Play, and say at the end how it went."""
@@ -236,7 +237,9 @@ def _play(
     return 1 if player.stats.failed else 0
 
 
-def _await_subscriber(ports: Sequence[RawPublisher], wait_s: float, keyboard: Keyboard) -> None:
+def _await_subscriber(
+    ports: Sequence[RawPublisher], wait_s: float, keyboard: Keyboard[Press]
+) -> None:
     deadline = time.monotonic() + wait_s
     while time.monotonic() < deadline and not any(port.matched for port in ports):
         if Press.QUIT in keyboard.wait(_POLL_S):

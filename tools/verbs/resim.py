@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from services.planner.controller_file import controller_maker
 from shared.bus.messages import Message
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
@@ -22,6 +23,7 @@ from tools.analysis.reexecution.execution import Execution
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.analysis.reexecution.params import with_params
 from tools.number_arguments import finite
+from tools.runs import experiment
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, parts_of, read_part
@@ -42,6 +44,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl resim out/a/run.mcap                              # planner and six services
         xrl resim out/a/run.mcap --service knee_left --until-first-difference
         xrl resim out/a/run.mcap --service planner --param law.K_p.x=2000
+        xrl resim out/a/run.mcap --service planner --controller mine.py   # what would it have sent?
         xrl resim out/a/run.mcap --tolerance 1e-9             # of another machine class
         xrl resim out/a                                       # a split run, all of its files
         xrl resim out/a --from 1200 --to 1260                 # a minute of a long one
@@ -64,6 +67,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "joint_service.blend_ms=100: the same inputs, and what would have come out; a new file "
         "is written beside the old",
     )
+    experiment.add_controller(parser)
     add_part(parser)
     parser.add_argument(
         "--until-first-difference", action="store_true", help="stop there; sooner done"
@@ -105,8 +109,11 @@ def run(args: argparse.Namespace) -> int:
         for log in logs:
             if robot is None:
                 robot = with_params(robot_of(log), args.param, str(args.log))
+                make = controller_maker(args.controller, robot) if args.controller else None
+                exact = not (args.param or args.controller)
                 executions = [
-                    Execution(robot, name, args.tolerance, exact=not args.param) for name in names
+                    Execution(robot, name, args.tolerance, exact=exact, controller=make)
+                    for name in names
                 ]
             for number, execution in enumerate(executions):
                 if args.until_first_difference and execution.differs:
@@ -129,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
     _other_machine(log, console)
     console.print(summary(outcomes))
     for outcome in outcomes:
-        tell(outcome, log, console, changed=bool(args.param))
+        tell(outcome, log, console, changed=bool(args.param or args.controller))
     if not any(outcome.ticks for outcome in outcomes):
         raise RunError(
             f"{args.log}: nothing could be executed: it holds no memory of these services; a "

@@ -35,6 +35,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl sim --delay 50 --control centralised
         xrl sim --plant drivetrain.stiffness=3000 --plant drivetrain.play=0.01
         xrl sim --plant ideal
+        xrl sim --controller examples/lqr_controller.py
         xrl sim --scenario stand --hand out/view/run.mcap     # as a person led it there
         xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
         xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
@@ -85,6 +86,8 @@ def run(args: argparse.Namespace) -> int:
     robot, scenario = experiment.make_robot(args), experiment.make_scenario(args)
     true_plant = plant_from(args.plant)
     hand = _path_of(args.hand) if args.hand is not None else ()
+    if args.controller is not None and args.control != SHIPPED:
+        raise RunError("--controller and --control: one of them says who computes the torques")
     network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
     out = experiment.make_out(args.out, "sim")
     experiment.introduce(scenario, console)
@@ -100,8 +103,9 @@ def run(args: argparse.Namespace) -> int:
             progress.update(task, completed=max(0.0, truth.scenario_s))
 
         simulated_s = recorded_lockstep.simulate(
-            robot, scenario, network, args.seed, out, watch, args.control, true_plant, hand
-        )
+            robot, scenario, network, args.seed, out, watch, args.control, true_plant, hand,
+            args.controller,
+        )  # fmt: skip
     factor = simulated_s / (time.monotonic() - begin)
     summary = recorded_lockstep.judge_in_lockstep(scenario, out, speed=factor)
     verdict_table.show(summary, console)

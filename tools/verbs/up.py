@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from services.planner.controller_file import ATTACHED, absolute, controller_maker, split_spec
 from services.ros2_gateway.inbound import acceptable
 from services.ros2_gateway.rmw import domain
 from services.simulator.plant import plant_from
@@ -22,7 +23,7 @@ from tools.fleet.pace import add_pace
 from tools.fleet.process_table import check_known, is_simulated, load_table
 from tools.fleet.supervise import SupervisedFleet
 from tools.number_arguments import finite
-from tools.runs.experiment import add_plant, make_out, scenario_file
+from tools.runs.experiment import add_controller, add_plant, make_out, scenario_file
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 from tools.view.live import LiveSource
 from tools.view.serving import add_port, serve
@@ -64,6 +65,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "deploy/scenarios (its kills are left to you)",
     )
     add_plant(parser)
+    add_controller(parser)
     add_pace(parser)
     parser.add_argument(
         "--no-sim",
@@ -137,6 +139,8 @@ def run(args: argparse.Namespace) -> int:
     gain_schedule.require(robot, args.config)
     services = _services(args)
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
+    if args.controller is not None:
+        controller_maker(args.controller, robot)  # refused before anything is started
     overrides = _overrides(args, out)
     if args.ros2:
         overrides["ros2_gateway"] = _ros2_words(args, robot)
@@ -177,6 +181,12 @@ def run(args: argparse.Namespace) -> int:
 def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:
     """Return the arguments that the flags add to the services' own."""
     overrides = {"recorder": ["--out", str(out.absolute())]}
+    if args.controller is not None:
+        overrides["planner"] = ["--controller", absolute(args.controller)]
+        overrides["recorder"] += [
+            "--attach",
+            f"{ATTACHED}={split_spec(args.controller)[0].absolute()}",
+        ]
     if args.snapshot is not None:
         overrides["recorder"] += ["--snapshot", f"{args.snapshot:g}"]
     if args.readonly:
@@ -225,6 +235,7 @@ def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
         ("--plant", bool(args.plant), "simulator"),
         ("--snapshot", args.snapshot is not None, "recorder"),
         ("--injectable", args.injectable, "planner"),
+        ("--controller", args.controller is not None, "planner"),
     ):
         if is_given and service in absent:
             why = "--no-sim" if only is None or service in only else "--only"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -24,7 +23,8 @@ from shared.bus.messages import (
 )
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.robot_config import RobotConfig
+from shared.robot.capture_point import capture_point
 from shared.robot.joints import MODULE_INDEX, MODULES
 from tools.fleet.fleet_status import module_status
 from tools.view.sole_estimate import SoleEstimate
@@ -236,12 +236,10 @@ def _shown(status: PlannerStatus) -> PlannerShown:
 
 
 def _capture_point(status: PlannerStatus) -> tuple[float, ...]:
-    """Return where the foot of a pendulum of the COM's height would have to be for it to rest."""
-    x, y, z = status.p[:3]
-    if z <= 0.0:
+    """Return the capture point as it is drawn; nothing before the first tick."""
+    if status.p[2] <= 0.0:
         return ()
-    per_rate = math.sqrt(z / GRAVITY)
-    return _short((x + per_rate * status.pdot[0], y + per_rate * status.pdot[1]))
+    return _short(capture_point(status.p, status.pdot))
 
 
 def _shown_soles(loads: Sequence[SoleLoad]) -> tuple[SoleLoad, ...]:

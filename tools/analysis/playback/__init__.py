@@ -1,1 +1,1 @@
-"""Parts of `xrl play`: reading, selection of keys, schedule, player, keyboard."""
+"""Parts of `xrl play`: reading, selection of keys, schedule, player, keys."""

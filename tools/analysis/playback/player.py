@@ -8,7 +8,7 @@ from typing import Final, Protocol
 import msgspec
 
 from shared.clock import NS_PER_MS, NS_PER_S
-from tools.analysis.playback.keyboard import Press
+from tools.analysis.playback.press import Press
 from tools.analysis.playback.schedule import Playhead, Schedule
 
 BURST: Final = 256

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
+from services.planner.controller import Controller
 from shared.bus import topics
 from shared.bus.messages import JointEvent, JointState, Message, PlannerStatus
 from shared.config.robot_config import RobotConfig
@@ -17,11 +18,19 @@ class Execution:
     """One service, executed again from a run or from its parts one after the other."""
 
     def __init__(
-        self, robot: RobotConfig, name: str, tolerance: float = 0.0, *, exact: bool = True
+        self,
+        robot: RobotConfig,
+        name: str,
+        tolerance: float = 0.0,
+        *,
+        exact: bool = True,
+        controller: Callable[[], Controller] | None = None,
     ) -> None:
-        """Take the robot to execute with, the service, and how to compare."""
+        """Take the robot to execute with, the service, how to compare, and a controller."""
         self.outcome = ReexecutionResult(name, tolerance, exact=exact)
-        self._planner = PlannerExecution(robot, self.outcome) if name == "planner" else None
+        self._planner = (
+            PlannerExecution(robot, self.outcome, controller) if name == "planner" else None
+        )
         self._joint = None if name == "planner" else JointExecution(robot, name, self.outcome)
 
     @property

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import msgspec
 
+from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner
 from services.planner.snapshots import TickState
@@ -26,9 +27,14 @@ _encode: Final = msgspec.json.Encoder().encode
 class PlannerExecution:
     """The planner, re-executed from its statuses: each lists the inputs of its tick."""
 
-    def __init__(self, robot: RobotConfig, outcome: ReexecutionResult) -> None:
-        """Take the robot to execute with and what to fill in."""
-        self._robot, self._outcome = robot, outcome
+    def __init__(
+        self,
+        robot: RobotConfig,
+        outcome: ReexecutionResult,
+        controller: Callable[[], Controller] | None = None,
+    ) -> None:
+        """Take the robot to execute with, what to fill in, and somebody's own controller."""
+        self._robot, self._outcome, self._controller = robot, outcome, controller
         self._planner: Planner | None = None
         self._last: PlannerStatus | None = None
         self._state_seq: list[int] = []
@@ -81,7 +87,8 @@ class PlannerExecution:
         if snapshot is None:
             return
         known = memory_of(snapshot.snapshot, TickState)
-        self._planner = Planner(self._robot, status.session)
+        controller = self._controller() if self._controller is not None else None
+        self._planner = Planner(self._robot, status.session, controller)
         self._planner.restore(known)
         self._state_seq = [-1 if state is None else state.seq for state in known.states]
         self._wrench_seq = known.wrench_seq

@@ -39,7 +39,7 @@ PLANNER_COLOURS: Final[dict[int, str]] = {
 }  # fmt: skip
 SPLIT_COLOURS: Final[dict[int, str]] = {
     SplitSource.DIAGONAL: "idle", SplitSource.SCHEDULE: "good", SplitSource.STIFFENED: "warn",
-    SplitSource.UNCERTIFIED: "bad",
+    SplitSource.UNCERTIFIED: "bad", SplitSource.CONTROLLER: "good",
 }  # fmt: skip
 
 

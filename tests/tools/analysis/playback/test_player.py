@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from shared.clock import NS_PER_MS, NS_PER_S
 from tests.tools.analysis.playback.schedules import schedule_of
-from tools.analysis.playback.keyboard import Press
 from tools.analysis.playback.player import BURST, STEP_NS, ClockMessage, Player
+from tools.analysis.playback.press import Press
 from tools.analysis.playback.schedule import Entry, Playhead, window
 
 BEGAN = 4_000_000_000_000

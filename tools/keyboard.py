@@ -1,4 +1,4 @@
-"""The keys of a terminal during playback; no keys without a terminal."""
+"""Keys of a terminal, one by one; no keys without a terminal."""
 
 from __future__ import annotations
 
@@ -8,38 +8,20 @@ import sys
 import termios
 import time
 import tty
-from enum import Enum
+from collections.abc import Mapping
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Generic, Self, TypeVar
 
-
-class Press(Enum):
-    """A key that means something."""
-
-    PAUSE = "space"
-    STEP = "right"
-    FASTER = "up"
-    SLOWER = "down"
-    QUIT = "q"
-
-
-_PRESSES: Final = {
-    b" ": Press.PAUSE,
-    b"q": Press.QUIT,
-    b"\x1b[C": Press.STEP,
-    b"\x1bOC": Press.STEP,
-    b"\x1b[A": Press.FASTER,
-    b"\x1bOA": Press.FASTER,
-    b"\x1b[B": Press.SLOWER,
-    b"\x1bOB": Press.SLOWER,
-}
+K = TypeVar("K")
 _READ_MAX: Final = 256
 
 
-class Keyboard:
+class Keyboard(Generic[K]):
     """Waits, and returns early when a key is pressed; gives the terminal back at the end."""
 
-    def __init__(self) -> None:
+    def __init__(self, codes: Mapping[bytes, K]) -> None:
+        """Take what the bytes of each key mean."""
+        self._codes = codes
         self._descriptor = -1
         self._before: list[Any] = []
         self._rest = b""
@@ -73,7 +55,7 @@ class Keyboard:
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
             self._descriptor = -1
 
-    def wait(self, timeout_s: float) -> list[Press]:
+    def wait(self, timeout_s: float) -> list[K]:
         """Return the pressed keys, after a timeout at the latest."""
         if not self.present:
             time.sleep(timeout_s)
@@ -87,21 +69,21 @@ class Keyboard:
             text = b""
         if not text:  # the terminal is gone
             self._descriptor = -1
-        presses, self._rest = understood(self._rest + text)
+        presses, self._rest = understood(self._rest + text, self._codes)
         return presses
 
 
-def understood(text: bytes) -> tuple[list[Press], bytes]:
+def understood(text: bytes, codes: Mapping[bytes, K]) -> tuple[list[K], bytes]:
     """Split a terminal's bytes into keys and the start of an incomplete one."""
     presses = []
     while text:
-        for code, press in _PRESSES.items():
+        for code, press in codes.items():
             if text.startswith(code):
                 presses.append(press)
                 text = text[len(code) :]
                 break
         else:
-            if any(code.startswith(text) for code in _PRESSES):
+            if any(code.startswith(text) for code in codes):
                 return presses, text
             text = text[1:]
     return presses, b""

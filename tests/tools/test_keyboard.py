@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tools.analysis.playback.keyboard import Keyboard, Press, understood
+from tools.analysis.playback.press import PRESSES, Press
+from tools.keyboard import Keyboard, understood
 
 TYPED = {b" ": Press.PAUSE, b"\x1b[C": Press.STEP, b"\x1bOA": Press.FASTER, b"q": Press.QUIT}
 
@@ -21,7 +22,7 @@ def test_keys_are_understood_however_their_bytes_come(typed: list[bytes], size: 
     text = b"".join(typed)
     found, rest = [], b""
     for start in range(0, len(text), size):
-        presses, rest = understood(rest + text[start : start + size])
+        presses, rest = understood(rest + text[start : start + size], PRESSES)
         found += presses
     assert found == [TYPED[code] for code in typed]
     assert rest == b""
@@ -29,12 +30,12 @@ def test_keys_are_understood_however_their_bytes_come(typed: list[bytes], size: 
 
 @given(st.binary())
 def test_whatever_comes_leaves_no_more_than_the_start_of_a_key(text: bytes) -> None:
-    _, rest = understood(text)
+    _, rest = understood(text, PRESSES)
     assert rest in {code[:n] for code in TYPED for n in range(3)} | {b"\x1b[", b"\x1bO"}
 
 
 def test_other_keys_mean_nothing() -> None:
-    assert understood(b"xyz\r\n\x1b[5~") == ([], b"")
+    assert understood(b"xyz\r\n\x1b[5~", PRESSES) == ([], b"")
 
 
 def test_on_a_pipe_it_only_waits(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,7 +43,7 @@ def test_on_a_pipe_it_only_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     os.write(write, b" q")
     with os.fdopen(read) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
-        with Keyboard() as keyboard:
+        with Keyboard(PRESSES) as keyboard:
             assert not keyboard.present
             assert keyboard.wait(0.001) == []
     os.close(write)
@@ -55,7 +56,7 @@ def test_a_terminal_is_given_back_as_it_was() -> None:
         try:
             sys.stdin = os.fdopen(0)
             before = termios.tcgetattr(0)
-            with Keyboard() as keyboard:
+            with Keyboard(PRESSES) as keyboard:
                 os.write(1, b"ready")
                 pressed = keyboard.wait(20.0)
                 changed = termios.tcgetattr(0) != before

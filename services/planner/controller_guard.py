@@ -1,0 +1,143 @@
+"""Stands between a controller of somebody's own and the commands: certificate and form. Pure.
+
+Gains that do not stand alone at this pose are never sent: the tick is UNCERTIFIED, and all hold.
+So it is while the capture point, or the place where HOLD on this action would come to rest, is near
+the edge of the soles: a controller that leads the robot over smoothly breaks no bound of a joint,
+and made it fall.
+A controller that raises, or returns what is no action, is not asked again: all hold until the
+planner is started anew. Steps, references and torques beyond bounds are the joint services' to
+refuse (`services.joint.envelope`).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from services.planner.controller import Action, Controller, Observation
+from services.planner.hocca import Hocca, LawOutput
+from services.planner.split import LocalGains
+from shared.bus.messages import SplitSource
+from shared.config.sections import GeometryConfig
+from shared.robot.capture_point import capture_point
+from shared.robot.joints import N_JOINTS
+
+SUPPORT: Final = 0.5
+"""Fraction of the soles within which the capture point and the rest in HOLD must be."""
+CALM: Final = 0.6
+"""Fraction of that room within which the capture point must be before it is asked again."""
+REST_S: Final = 1.0
+"""Time for which all hold after an objection, and are calm."""
+WORDS: Final = 200
+"""Longest reason that goes into a status."""
+
+
+class ControllerGuard:
+    """Asks a controller, and lets through what holds.
+
+    Attributes:
+        why: why the controller's action was not used at the last tick; "": it was.
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        law: Hocca,
+        geometry: GeometryConfig,
+    ) -> None:
+        """Take the controller, the law that knows the pose of the tick, and the soles."""
+        half = geometry.l_foot / 2, (geometry.w_base + geometry.w_foot) / 2
+        self._room = SUPPORT * half[0], SUPPORT * half[1]
+        self._controller, self._law = controller, law
+        self._failed = False
+        self._rest_s = 0.0
+        self._time_s = 0.0
+        self._begun = False
+        self.why = ""
+
+    def act(self, seen: Observation, *, leads: bool) -> LawOutput:
+        """Return the tick's output.
+
+        Args:
+            seen: at this tick; its `time_s` is set here.
+            leads: the planner leads; else the controller is reset, and the shipped law's output is
+                returned, which starts at the measured pose.
+        """
+        law = seen.law
+        self._time_s = self._time_s + seen.dt if leads else 0.0
+        seen = seen._replace(time_s=self._time_s)
+        if self._failed:
+            return _uncertified(law)
+        try:
+            if not (leads and self._begun):
+                self._controller.reset(seen)
+                self._begun = True
+            if not leads:
+                return self._rested(seen)
+            action = self._controller.step(seen)
+            fault = fault_of(action)
+        except Exception as error:  # noqa: BLE001 - whatever somebody's code brings about
+            fault = f"raised {type(error).__name__}: {error}"
+        if fault:
+            self.why, self._failed = f"the controller {fault}"[:WORDS], True
+            return _uncertified(law)
+        local = self._law.certify(action.D)
+        self.why = self._objection(seen, action, local)
+        if self.why:
+            self._rest_s = REST_S
+            return _uncertified(law)
+        return law._replace(
+            q_ref=action.q_ref,
+            v_ref=action.v_ref,
+            tau_ff=action.tau_ff,
+            dtau_ff=action.dtau_ff,
+            tau_coupled=action.tau_coupled,
+            local=local,
+        )
+
+    def _rested(self, seen: Observation) -> LawOutput:
+        """Return the shipped law's output; after an objection all hold until it is calm."""
+        if self.why:
+            x, y = capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope)
+            calm = abs(x) <= CALM * self._room[0] and abs(y) <= CALM * self._room[1]
+            self._rest_s = max(0.0, self._rest_s - seen.dt) if calm else REST_S
+            if self._rest_s > 0.0:
+                return _uncertified(seen.law)
+            self.why = ""
+        return seen.law
+
+    def _objection(self, seen: Observation, action: Action, local: LocalGains) -> str:
+        """Return why an action must not be sent at this pose; "" if it may."""
+        if local.source is SplitSource.UNCERTIFIED:
+            service, onboard = local.margins
+            return f"the controller's gains do not stand alone: {service:.2f}, {onboard:.2f}"
+        held = action.D * (action.q_ref - seen.q) + action.tau_ff - seen.law.tau_ff
+        moves = self._law.rest_from_here(action.D, held)[:2].tolist()
+        places = {
+            "the capture point": capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope),
+            "the rest in HOLD": (seen.p[0] + moves[0], seen.p[1] + moves[1]),
+        }
+        for name, (x, y) in places.items():
+            if not (abs(x) <= self._room[0] and abs(y) <= self._room[1]):
+                return f"{name} is at {1e3 * x:.0f}, {1e3 * y:.0f} mm, near the edge of the soles"
+        return ""
+
+
+def fault_of(action: object) -> str:
+    """Return what is wrong with what a controller returned; "" if it is an action."""
+    if not isinstance(action, Action):
+        return f"returned a {type(action).__name__}; an Action is right"
+    for name, values in zip(Action._fields, action, strict=True):
+        if not isinstance(values, np.ndarray) or values.shape != (N_JOINTS,):
+            return (
+                f"returned {name} of shape {np.shape(values)}; an array of ({N_JOINTS},) is right"
+            )
+        if values.dtype.kind != "f" or not np.isfinite(values).all():
+            return f"returned {name} with a number that is not finite"
+    return ""
+
+
+def _uncertified(law: LawOutput) -> LawOutput:
+    """Return the shipped law's output, marked so that all six hold."""
+    return law._replace(local=law.local._replace(source=SplitSource.UNCERTIFIED))

@@ -1,0 +1,150 @@
+"""A controller of somebody's own in the planner's place: it may be wrong, and the robot stands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.planner.controller import Action, Observation
+from services.planner.controller_file import controller_maker
+from services.planner.hocca import LawOutput
+from services.simulator.plant import PlantConfig
+from shared.bus import topics
+from shared.bus.messages import Message, Mode, PlannerMode, PlannerStatus
+from shared.bus.topics import Topic
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Kill, Push
+from tests.lockstep.runs import still
+from tools.runs.lockstep import Lockstep
+from tools.runs.standing_start import begin_standing
+from tools.studies.sweeps import plants
+
+LQR = Path(__file__).parents[2] / "examples" / "lqr_controller.py"
+
+
+class Own:
+    """Changes the shipped law's action once a second has passed."""
+
+    def __init__(self, change: Callable[[Observation, Action], Action]) -> None:
+        self._change = change
+
+    def reset(self, seen: Observation) -> None:
+        """Nothing."""
+
+    def step(self, seen: Observation) -> Action:
+        action = Action.of(seen.law)
+        return self._change(seen, action) if seen.time_s > 1.0 else action
+
+
+def wrong(_seen: Observation, _action: Action) -> Action:
+    raise RuntimeError("lost")
+
+
+CHANGES: dict[str, Callable[[Observation, Action], Action]] = {
+    "raises": wrong,
+    "no gains": lambda _, action: action._replace(D=np.zeros(12)),
+    "half the gains": lambda _, action: action._replace(D=0.5 * action.D),
+    "no weight": lambda _, action: action._replace(tau_ff=np.zeros(12)),
+    "weight upside down": lambda _, action: action._replace(tau_ff=-action.tau_ff),
+    "references a radian off": lambda _, action: action._replace(q_ref=action.q_ref + 1.0),
+    "full torque": lambda _, action: action._replace(tau_coupled=np.full(12, 150.0)),
+    "torque to and fro": lambda seen, action: action._replace(
+        tau_coupled=np.full(12, 60.0 * math.sin(60.0 * seen.time_s))
+    ),
+    "runaway references": lambda seen, action: action._replace(
+        q_ref=action.q_ref + 0.3 * (seen.time_s - 1.0), v_ref=action.v_ref + 0.3
+    ),
+    "leans forward slowly": lambda seen, action: action._replace(
+        q_ref=action.q_ref + 0.05 * (seen.time_s - 1.0) * seen.T[:, 0]
+    ),
+    "leans sideways slowly": lambda seen, action: action._replace(
+        q_ref=action.q_ref + 0.05 * (seen.time_s - 1.0) * seen.T[:, 1]
+    ),
+    "leans as fast as it may": lambda seen, action: action._replace(
+        q_ref=action.q_ref + 0.3 * min(0.4, seen.time_s - 1.0) * seen.T[:, 0],
+        v_ref=action.v_ref + 0.3 * seen.T[:, 0],
+    ),
+    "turns": lambda seen, action: action._replace(
+        q_ref=action.q_ref + 0.3 * (seen.time_s - 1.0) * seen.T[:, 5]
+    ),
+    "NaN": lambda _, action: action._replace(tau_ff=np.full(12, math.nan)),
+}
+
+
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("name", CHANGES)
+def test_whatever_it_does_the_robot_stands(robot: RobotConfig, name: str) -> None:
+    fleet = Lockstep(robot, still(8.0), controller=lambda: Own(CHANGES[name]))
+    begin_standing(fleet)
+    for truth in fleet.run():
+        assert not truth.fallen, f"{truth.scenario_s:.2f} s"
+    assert abs(truth.over[0]) < 0.08
+
+
+def test_one_that_changes_nothing_is_the_shipped_law_to_the_last_bit(robot: RobotConfig) -> None:
+    def torques(controller: Callable[[], Own] | None) -> list[tuple[float, ...]]:
+        fleet = Lockstep(robot, still(1.5), controller=controller)
+        begin_standing(fleet)
+        return [truth.com for truth in fleet.run()]
+
+    assert torques(lambda: Own(lambda _, action: action)) == torques(None)
+
+
+def test_one_that_raises_is_told_and_not_asked_again(robot: RobotConfig) -> None:
+    said: list[PlannerStatus] = []
+
+    def record(topic: Topic, _module: str, message: Message) -> None:
+        if topic is topics.PLANNER_STATUS and isinstance(message, PlannerStatus):
+            said.append(message)
+
+    fleet = Lockstep(robot, still(4.0), controller=lambda: Own(wrong), record=record)
+    begin_standing(fleet)
+    for _ in fleet.run():
+        pass
+    assert said[-1].mode == PlannerMode.UNCERTIFIED
+    assert said[-1].why == "the controller raised RuntimeError: lost"
+    assert all(one.failsafe.mode is Mode.HOLD for one in fleet.controllers)
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("number", range(3))
+def test_the_lqr_of_the_examples_stands_through_pushes_and_the_kill_on_drawn_plants(
+    robot: RobotConfig, number: int
+) -> None:
+    plant = plants.draw(f"lqr {number}") if number else PlantConfig()
+    pushes = tuple(Push(at=at, duration=0.3, force=(30.0, 0.0, 0.0)) for at in (0.5, 2.5))
+    scenario = still(4.0, push=pushes, kill=(Kill(service="planner", at=1.5),))
+    fleet = Lockstep(robot, scenario, plant=plant, controller=controller_maker(str(LQR), robot))
+    assert begin_standing(fleet)
+    led = 0
+    for truth in fleet.run():
+        assert not truth.fallen
+        led += truth.scenario_s < 1.5 and all(
+            one.failsafe.mode is Mode.TRACK for one in fleet.controllers
+        )
+    assert led > 140 or number, "on the realistic plant it leads until it is killed"
+
+
+def test_its_output_is_what_is_sent(robot: RobotConfig) -> None:
+    """Not the shipped law's beside it."""
+    outputs: list[LawOutput] = []
+
+    def push_forward(seen: Observation, action: Action) -> Action:
+        outputs.append(seen.law)
+        return action._replace(tau_coupled=action.tau_coupled + 0.25)
+
+    sent: list[tuple[float, float]] = []
+
+    def record(topic: Topic, module: str, message: Message) -> None:
+        if topic is topics.JOINT_COMMAND and module == "knee_left":
+            sent.append(message.tau_coupled)  # type: ignore[attr-defined]  # a command
+
+    fleet = Lockstep(robot, still(2.0), controller=lambda: Own(push_forward), record=record)
+    begin_standing(fleet)
+    for _ in fleet.run():
+        pass
+    assert sent[-1][0] == outputs[-1].tau_coupled[8] + 0.25

@@ -1,0 +1,211 @@
+"""What a controller of somebody's own may do, and what holds all six instead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.planner.controller import Action, Observation
+from services.planner.controller_guard import SUPPORT, ControllerGuard
+from services.planner.hocca import Hocca
+from services.planner.intents import OperatorRequest
+from services.planner.split import LocalGains
+from shared.bus.messages import SplitSource
+from shared.config.files import load
+from shared.config.robot_config import RobotConfig
+from shared.process import DEFAULT_CONFIG
+from shared.robot.capture_point import capture_point
+from shared.robot.robot_model import stand_pose
+
+GEOMETRY = load(DEFAULT_CONFIG).geometry
+
+
+@pytest.fixture(scope="module")
+def hocca(robot: RobotConfig) -> Hocca:
+    return Hocca(robot)
+
+
+@pytest.fixture(scope="module")
+def seen(robot: RobotConfig, hocca: Hocca) -> Observation:
+    q, v = np.array(stand_pose(robot, 1.1)), np.zeros(12)
+    law = hocca.tick(q, v, 0.0, 0.004)
+    return Observation(
+        0.0, 0.004, q, v, v, law.p, law.pdot, hocca.J.copy(), hocca.T.copy(), None,
+        OperatorRequest(), law,
+    )  # fmt: skip
+
+
+class Scripted:
+    """Does what a function says, and counts how often it is asked."""
+
+    def __init__(self, act: Callable[[Observation], Any]) -> None:
+        self._act = act
+        self.steps = self.resets = 0
+        self.times: list[float] = []
+
+    def reset(self, _seen: Observation) -> None:
+        self.resets += 1
+
+    def step(self, seen: Observation) -> Any:
+        self.steps += 1
+        self.times.append(seen.time_s)
+        return self._act(seen)
+
+
+def changed(**parts: Any) -> Callable[[Observation], Action]:
+    return lambda seen: Action.of(seen.law)._replace(**parts)
+
+
+def test_what_is_the_shipped_laws_stays_it_to_the_last_bit(hocca: Hocca, seen: Observation) -> None:
+    found = ControllerGuard(Scripted(changed()), hocca, GEOMETRY).act(seen, leads=True)
+    for mine, shipped in zip(Action.of(found), Action.of(seen.law), strict=True):
+        assert np.array_equal(mine, shipped)
+    assert found.local.margins == seen.law.local.margins
+    assert found.local.source is SplitSource.CONTROLLER
+    assert np.array_equal(found.local.D_B, seen.law.local.D_B)
+
+
+def test_while_it_does_not_lead_it_is_reset_and_the_shipped_law_counts(
+    hocca: Hocca, seen: Observation
+) -> None:
+    mine = Scripted(changed(tau_coupled=np.ones(12)))
+    guard = ControllerGuard(mine, hocca, GEOMETRY)
+    assert guard.act(seen, leads=False) is seen.law
+    assert (mine.resets, mine.steps) == (1, 0)
+    for _ in range(3):
+        assert np.array_equal(guard.act(seen, leads=True).tau_coupled, np.ones(12))
+    assert (mine.resets, mine.steps) == (1, 3)
+    assert mine.times == pytest.approx([0.004, 0.008, 0.012])
+
+
+def test_one_that_leads_at_once_is_reset_first(hocca: Hocca, seen: Observation) -> None:
+    """Re-execution begins in the middle of a run."""
+    mine = Scripted(changed())
+    ControllerGuard(mine, hocca, GEOMETRY).act(seen, leads=True)
+    assert (mine.resets, mine.steps) == (1, 1)
+
+
+def raises(_seen: Observation) -> Action:
+    raise ZeroDivisionError("the mass is 0")
+
+
+NAN = np.full(12, math.nan)
+BAD = {
+    "None": lambda _: None,
+    "a tuple": lambda seen: tuple(Action.of(seen.law)),
+    "raises": raises,
+    "divides": lambda _: 1 / 0,
+    "too short": changed(q_ref=np.zeros(11)),
+    "a matrix": changed(D=np.ones((12, 1))),
+    "a list": changed(tau_ff=[0.0] * 12),
+    "whole numbers": changed(tau_ff=np.zeros(12, int)),
+    "complex": changed(v_ref=np.zeros(12, complex)),
+    **{f"{part} is NaN": changed(**{part: NAN}) for part in Action._fields},
+    "infinite": changed(tau_coupled=np.full(12, math.inf)),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_action_holds_all_and_is_not_asked_again(
+    hocca: Hocca, seen: Observation, name: str
+) -> None:
+    mine = Scripted(BAD[name])
+    guard = ControllerGuard(mine, hocca, GEOMETRY)
+    for _ in range(3):
+        found = guard.act(seen, leads=True)
+        assert found.local.source is SplitSource.UNCERTIFIED
+        for part, shipped in zip(Action.of(found), Action.of(seen.law), strict=True):
+            assert np.array_equal(part, shipped), "nothing of it is sent"
+        assert guard.why.startswith("the controller r")
+    assert mine.steps == 1
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3, 0.6, -1.0, 1e3])
+def test_gains_that_do_not_stand_alone_or_are_beyond_the_limit_are_never_sent(
+    hocca: Hocca, seen: Observation, scale: float
+) -> None:
+    soft = Scripted(lambda seen: Action.of(seen.law)._replace(D=scale * seen.law.local.D))
+    guard = ControllerGuard(soft, hocca, GEOMETRY)
+    found = guard.act(seen, leads=True)
+    assert found.local.source is SplitSource.UNCERTIFIED
+    assert np.array_equal(found.local.D, seen.law.local.D)
+    assert "do not stand alone" in guard.why
+    held = [guard.act(seen, leads=False).local.source for _ in range(300)]
+    assert held.index(SplitSource.SCHEDULE) == pytest.approx(250, abs=2), "for a second"
+    assert guard.why == ""
+    guard.act(seen, leads=True)
+    assert soft.steps == 2, "it is asked again: the next pose may be another"
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.1])
+def test_stiffer_gains_that_stand_are_sent(hocca: Hocca, seen: Observation, scale: float) -> None:
+    stiff = Scripted(lambda seen: Action.of(seen.law)._replace(D=scale * seen.law.local.D))
+    found = ControllerGuard(stiff, hocca, GEOMETRY).act(seen, leads=True)
+    assert found.local.source is SplitSource.CONTROLLER
+    assert np.array_equal(found.local.D, scale * seen.law.local.D)
+    assert found.local.margins.service >= seen.law.local.margins.service
+
+
+def test_without_a_certified_schedule_no_own_gains_are_sent(
+    robot: RobotConfig, seen: Observation
+) -> None:
+    papers = msgspec.structs.replace(
+        robot, law=msgspec.structs.replace(robot.law, split="diagonal"), gain_schedule=None
+    )
+    hocca = Hocca(papers)
+    hocca.tick(seen.q, seen.v, 0.0, 0.004)
+    local: LocalGains = hocca.certify(seen.law.local.D)
+    assert local.source is SplitSource.UNCERTIFIED
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("part", ["p", "pdot"])
+def test_near_the_edge_of_the_soles_it_is_not_followed(
+    hocca: Hocca, seen: Observation, axis: int, sign: float, part: str
+) -> None:
+    """By the place of the COM and by its rate, up to the edge itself and beyond it."""
+    half = (GEOMETRY.l_foot / 2, (GEOMETRY.w_base + GEOMETRY.w_foot) / 2)[axis]
+    gain = 1.0 if part == "p" else math.sqrt(seen.p[2] / 9.81)
+    for fraction, followed in ((0.99, True), (1.01, False), (5.0, False), (math.nan, False)):
+        p, pdot = seen.p.copy(), np.zeros(6)
+        p[:2] = 0.0
+        (p if part == "p" else pdot)[axis] = sign * fraction * SUPPORT * half / gain
+        guard = ControllerGuard(Scripted(changed()), hocca, GEOMETRY)
+        found = guard.act(seen._replace(p=p, pdot=pdot), leads=True)
+        assert (found.local.source is SplitSource.CONTROLLER) is followed, fraction
+        assert ("near the edge" in guard.why) is not followed
+
+
+def test_on_a_slope_the_capture_point_is_against_gravity() -> None:
+    p = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    assert capture_point(p, (0.0,) * 6, (0.05, -0.02)) == (0.05, -0.02)
+
+
+def test_after_the_edge_all_hold_until_it_is_calm(hocca: Hocca, seen: Observation) -> None:
+    guard = ControllerGuard(Scripted(changed()), hocca, GEOMETRY)
+    p = seen.p.copy()
+    p[0] = GEOMETRY.l_foot / 2
+    away = seen._replace(p=p)
+    guard.act(away, leads=True)
+    for _ in range(1000):
+        assert guard.act(away, leads=False).local.source is SplitSource.UNCERTIFIED
+    back = [guard.act(seen, leads=False).local.source for _ in range(300)]
+    assert back.index(SplitSource.SCHEDULE) == pytest.approx(250, abs=2)
+
+
+def test_references_that_would_come_to_rest_off_the_soles_are_not_sent(
+    hocca: Hocca, seen: Observation
+) -> None:
+    """Each joint is within its bounds; held, the whole would lean by 8 cm."""
+    lean = Scripted(
+        lambda seen: Action.of(seen.law)._replace(q_ref=seen.law.q_ref + 0.08 * seen.T[:, 0])
+    )
+    guard = ControllerGuard(lean, hocca, GEOMETRY)
+    assert guard.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
+    assert guard.why.startswith("the rest in HOLD is at ")

@@ -1,0 +1,75 @@
+"""What a person with sticks or keys leads: height, pitch and assist, within limits. Pure."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from services.simulator.led_hand import HEIGHTS, PITCHES
+
+HEIGHT_RATE: Final = 0.15
+"""m/s at full deflection."""
+PITCH_RATE: Final = 0.4
+"""rad/s at full deflection."""
+ASSIST_RATE: Final = 40.0
+"""N/s at full deflection."""
+DEAD_ZONE: Final = 0.12
+"""Deflection that counts as none: sticks do not return to their middle."""
+
+
+class Deflection(NamedTuple):
+    """What a person does now, each from -1 to 1."""
+
+    height: float = 0.0
+    pitch: float = 0.0
+    assist: float = 0.0
+
+
+class Led(NamedTuple):
+    """Where it leads."""
+
+    height: float
+    """m"""
+    pitch: float
+    """rad"""
+    assist_n: float
+
+
+class Pilot:
+    """Integrates deflections, while they are meant.
+
+    Attributes:
+        led: where it leads now.
+    """
+
+    def __init__(self, height: float, pitch: float, assist_max_n: float) -> None:
+        """Begin where the robot is, without assist."""
+        self._assist_max_n = assist_max_n
+        self.led = Led(_within(height, *HEIGHTS), _within(pitch, *PITCHES), 0.0)
+
+    def advance(self, wanted: Deflection, dt: float) -> Led:
+        """Go on by dt, s.
+
+        Args:
+            wanted: deflections; the dead man's button is held.
+            dt: since the last call, s.
+        """
+        height, pitch, assist_n = self.led
+        self.led = Led(
+            _within(height + HEIGHT_RATE * _beyond(wanted.height) * dt, *HEIGHTS),
+            _within(pitch + PITCH_RATE * _beyond(wanted.pitch) * dt, *PITCHES),
+            _within(assist_n + ASSIST_RATE * _beyond(wanted.assist) * dt, 0.0, self._assist_max_n),
+        )
+        return self.led
+
+
+def _beyond(deflection: float) -> float:
+    """Return a deflection without its dead zone; what is no number is none."""
+    size = min(1.0, abs(deflection)) if deflection == deflection else 0.0
+    if size <= DEAD_ZONE:
+        return 0.0
+    scaled = (size - DEAD_ZONE) / (1.0 - DEAD_ZONE)
+    return scaled if deflection > 0.0 else -scaled
+
+
+def _within(value: float, low: float, high: float) -> float:
+    return min(high, max(low, value))

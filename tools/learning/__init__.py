@@ -1,0 +1,1 @@
+"""Learning a controller: a policy's numbers, and a Gymnasium environment in virtual time."""

@@ -1,0 +1,202 @@
+"""`xrl lead`: lead height, pitch and assist by a gamepad or by keys."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import os
+import time
+from enum import Enum
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from shared.bus import topics
+from shared.bus.messages import HandLead, OperatorIntent, PlannerStatus, SimTruth
+from shared.bus.operator_key import require_operator
+from shared.bus.session import Session, open_session
+from shared.clock import now_ns
+from shared.config.files import load
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import FleetError
+from shared.process import StopFlag
+from tools.fleet.emergency_stop import BusStop, request_here
+from tools.fleet.gamepad import BUTTONS, Gamepad, open_pad
+from tools.fleet.pilot import Deflection, Led, Pilot
+from tools.fleet.supervise import SupervisedFleet
+from tools.keyboard import Keyboard
+from tools.verb_table import Subparsers, add_run_dir, add_verb
+
+PERIOD_S: Final = 0.05
+"""Repeats each request: an intent fades out, and a push ends, once nobody repeats it."""
+LINKS_S: Final = 3.0
+KEY_HELD_S: Final = 0.1
+"""A press of a key is a full deflection for so long."""
+
+
+class Key(Enum):
+    """A key that means something."""
+
+    UP = (1.0, 0.0, 0.0)
+    DOWN = (-1.0, 0.0, 0.0)
+    FORWARD = (0.0, 1.0, 0.0)
+    BACK = (0.0, -1.0, 0.0)
+    MORE = (0.0, 0.0, 1.0)
+    LESS = (0.0, 0.0, -1.0)
+    STOP = "x"
+    QUIT = "q"
+
+
+KEYS: Final = {
+    b"\x1b[A": Key.UP, b"\x1bOA": Key.UP, b"\x1b[B": Key.DOWN, b"\x1bOB": Key.DOWN,
+    b"\x1b[C": Key.FORWARD, b"\x1bOC": Key.FORWARD, b"\x1b[D": Key.BACK, b"\x1bOD": Key.BACK,
+    b"+": Key.MORE, b"=": Key.MORE, b"-": Key.LESS, b"x": Key.STOP, b" ": Key.STOP, b"q": Key.QUIT,
+}  # fmt: skip
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "lead",
+        """
+        xrl lead                 # the first gamepad: hold the right shoulder and move the sticks
+        xrl lead --keys          # arrows: height and pitch; + and -: assist; space: stop
+        xrl lead --pad /dev/input/event7 --hold leftshoulder --stop x
+        """,
+    )
+    add_run_dir(parser)
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--keys", action="store_true", help="keys of this terminal, no gamepad")
+    which.add_argument("--pad", metavar="DEVICE", help="event device (default: the first gamepad)")
+    parser.add_argument(
+        "--hold", choices=BUTTONS, default="rightshoulder", help="dead man's button (rightshoulder)"
+    )
+    parser.add_argument("--stop", choices=BUTTONS, default="b", help="emergency stop (b)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Lead until q, Ctrl-C, the stop, or the loss of the pad.
+
+    Raises:
+        FleetError: there is no pad, no terminal or no key that may act, or the robot is silent.
+    """
+    fleet = SupervisedFleet.attach(args.run_dir)
+    robot = load(Path(fleet.manifest.config))
+    require_operator(robot, "lead")
+    if args.hold == args.stop:
+        raise FleetError(f"--hold and --stop are both {args.hold}: two buttons are right")
+    pad = None if args.keys else Gamepad(open_pad(args.pad), hold=args.hold, stop=args.stop)
+    console = Console()
+    with open_session(robot, "lead", fleet.run.path) as session:
+        leader = Leader(robot, session, simulated="simulator" in fleet.manifest.services)
+        ended = _by_pad(pad, leader, console) if pad is not None else _by_keys(leader, console)
+        if ended is not Key.STOP:
+            console.print(f"let go: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
+            return 0 if pad is None or not pad.gone else 1
+        request_here(fleet.run.path)
+        going = BusStop(robot, session, fleet.run.path).stop()
+    if going:
+        raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
+    console.print("stopped: DAMP. It sinks slowly; `xrl status` names the way out")
+    return 0
+
+
+class Leader:
+    """Sends where a person leads."""
+
+    def __init__(self, robot: RobotConfig, session: Session, *, simulated: bool) -> None:
+        """Begin where the robot is.
+
+        Raises:
+            FleetError: it is silent.
+        """
+        self._hand = session.publisher(topics.OPERATOR_HAND, HandLead) if simulated else None
+        self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
+        self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
+        self._last: PlannerStatus | None = None
+        truths = session.latest(topics.SIM_TRUTH, SimTruth)
+        deadline = time.monotonic() + LINKS_S
+        truth: SimTruth | None = None
+        while (truth is None and simulated) or self._newest() is None:
+            truth = truths.take() or truth
+            if time.monotonic() > deadline:
+                raise FleetError("the robot is silent; see `xrl status`")
+            time.sleep(0.01)
+        height, pitch = (truth.torso[2], truth.angles[1]) if truth is not None else (1.0, 0.0)
+        self.pilot = Pilot(height, pitch, robot.assist.force_max)
+        self._source = f"xrl lead by {getpass.getuser()} ({os.getpid()})"
+        self._sent = 0
+
+    def lead(self, wanted: Deflection, dt: float) -> None:
+        """Go on by dt, s, and tell the robot."""
+        led = self.pilot.advance(wanted, dt)
+        now, self._sent = now_ns(), self._sent + 1
+        if self._hand is not None:
+            self._hand.put(
+                HandLead(
+                    t_ns=now, seq=self._sent, leads=True, height=led.height, pitch=led.pitch,
+                    push=(0.0, 0.0, 0.0), source=self._source,
+                )
+            )  # fmt: skip
+        if led.assist_n > 0.0:
+            self._intents.put(
+                OperatorIntent(t_ns=now, seq=self._sent, assist_n=led.assist_n, source=self._source)
+            )
+
+    def describe(self, held: str) -> Text:
+        """Return what is led and what the robot does, as one line."""
+        led: Led = self.pilot.led
+        status = self._newest()
+        hand = f"height {led.height:.3f} m, pitch {led.pitch:+.2f} rad, " if self._hand else ""
+        given = f", given {status.assist_n:.0f} N" if status is not None else ""
+        return Text(f"{held}: {hand}assist {led.assist_n:.0f} N{given}")
+
+    def _newest(self) -> PlannerStatus | None:
+        self._last = self._statuses.take() or self._last
+        return self._last
+
+
+def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
+    """Lead by a pad until it is over; STOP if it was the stop."""
+    console.print(f"{pad.name}: hold the dead man's button and move the sticks; Ctrl-C ends it")
+    stop = StopFlag()
+    last = time.monotonic()
+    with Live(console=console, refresh_per_second=4, transient=True) as shown:
+        while not stop and not pad.gone:
+            pad.wait(PERIOD_S)
+            if pad.stopped:
+                return Key.STOP
+            now = time.monotonic()
+            if pad.held:
+                leader.lead(pad.deflection, min(now - last, 2 * PERIOD_S))
+            last = now
+            shown.update(leader.describe("held" if pad.held else "not held, nothing is sent"))
+    if pad.gone:
+        console.print("the pad is gone", style="bold yellow")
+    return None
+
+
+def _by_keys(leader: Leader, console: Console) -> Key | None:
+    """Lead by keys until it is over; STOP if it was the stop."""
+    stop = StopFlag()
+    with Keyboard(KEYS) as keyboard:
+        if not keyboard.present:
+            raise FleetError("no terminal to read keys from; a gamepad leads without --keys")
+        console.print("arrows: height and pitch; + and -: assist; space or x: STOP; q ends it")
+        with Live(console=console, refresh_per_second=4, transient=True) as shown:
+            while not stop and keyboard.present:
+                presses = keyboard.wait(PERIOD_S)
+                if Key.STOP in presses:
+                    return Key.STOP
+                if Key.QUIT in presses:
+                    return None
+                for press in presses:
+                    leader.lead(Deflection(*press.value), KEY_HELD_S)
+                if not presses:
+                    leader.lead(Deflection(), PERIOD_S)
+                shown.update(leader.describe("led"))
+    return None
