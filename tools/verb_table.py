@@ -44,6 +44,7 @@ VERBS: Final = (
     Verb("gains", "compute the certified gain schedule of a robot"),
     Verb("tare", "set the harness's zero from its unloaded reading"),
     Verb("doctor", "check drives, buses and computer against the robot file"),
+    Verb("can", "bring the CAN buses up, listen to them, measure how long drives answer"),
     Verb("configure", "write the drives' settings, after a backup of the old ones"),
     Verb("zero", "write each joint's position to its drive"),
     Verb("jog", "move one joint of one module a little and judge the response"),

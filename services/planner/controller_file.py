@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.machinery
 import importlib.util
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 
 DEFAULT_NAME: Final = "Controller"
+_SPEC: Final = re.compile(r"(.+\.py)(?::(\w+))?")
 T = TypeVar("T")
 ATTACHED: Final = "controller.py"
 """Name of the file in a run's log."""
@@ -21,8 +23,8 @@ ATTACHED: Final = "controller.py"
 
 def split_spec(spec: str) -> tuple[Path, str]:
     """Return file and name of `FILE.py` or `FILE.py:NAME`."""
-    file, _, name = spec.partition(".py")
-    return Path(f"{file}.py" if "." in spec else spec), name.removeprefix(":") or DEFAULT_NAME
+    match = _SPEC.fullmatch(spec)
+    return (Path(match[1]), match[2] or DEFAULT_NAME) if match else (Path(spec), DEFAULT_NAME)
 
 
 def absolute(spec: str) -> str:
@@ -44,13 +46,14 @@ def controller_maker(spec: str, robot: RobotConfig) -> Callable[[], Controller]:
             is no controller.
     """
     path, name = split_spec(spec)
-    if not path.is_file():
+    if not path.is_file() or _SPEC.fullmatch(spec) is None:
         raise ConfigError(str(path), "--controller", "no such file", "FILE.py or FILE.py:NAME")
     module_spec = importlib.util.spec_from_file_location(f"xrl_controller_{path.stem}", path)
     if module_spec is None or module_spec.loader is None:
         raise ConfigError(str(path), "--controller", "is no Python file", "FILE.py or FILE.py:NAME")
     module = importlib.util.module_from_spec(module_spec)
     sys.modules[module_spec.name] = module
+    sys.path.append(str(path.absolute().parent))  # for files beside it
     make = _checked(path, "it", lambda: _executed(module_spec, module, name))
     if make is None:
         right = f"a class or function {name}(robot)"
@@ -60,7 +63,9 @@ def controller_maker(spec: str, robot: RobotConfig) -> Callable[[], Controller]:
     if missing:
         right = "reset(seen) and step(seen), as services/planner/controller.py has them"
         raise ConfigError(str(path), name, f"has no {' and no '.join(missing)}", right)
-    return lambda: make(robot)
+    first = [made]
+    # one that was made to look at it is the first planner's: it may have opened a device
+    return lambda: first.pop() if first else _checked(path, f"{name}(robot)", lambda: make(robot))
 
 
 def _executed(

@@ -11,12 +11,14 @@ refuse (`services.joint.envelope`).
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
+import msgspec
 import numpy as np
 
 from services.planner.controller import Action, Controller, Observation
 from services.planner.hocca import Hocca, LawOutput
+from services.planner.snapshots import GuardState
 from services.planner.split import LocalGains
 from shared.bus.messages import SplitSource
 from shared.config.sections import GeometryConfig
@@ -28,17 +30,17 @@ SUPPORT: Final = 0.5
 CALM: Final = 0.6
 """Fraction of that room within which the capture point must be before it is asked again."""
 REST_S: Final = 1.0
-"""Time for which all hold after an objection, and are calm."""
+"""Time for which all hold, calm, after an objection; it doubles with each, to `WAIT_MAX_S`."""
+WAIT_MAX_S: Final = 60.0
+FORGET_S: Final = 25.0
+"""Led for so long without an objection, the time begins at `REST_S` again."""
+_AT_REST: Final = (0.0,) * 6
 WORDS: Final = 200
 """Longest reason that goes into a status."""
 
 
 class ControllerGuard:
-    """Asks a controller, and lets through what holds.
-
-    Attributes:
-        why: why the controller's action was not used at the last tick; "": it was.
-    """
+    """Asks a controller, and lets through what holds."""
 
     def __init__(
         self,
@@ -50,11 +52,13 @@ class ControllerGuard:
         half = geometry.l_foot / 2, (geometry.w_base + geometry.w_foot) / 2
         self._room = SUPPORT * half[0], SUPPORT * half[1]
         self._controller, self._law = controller, law
-        self._failed = False
-        self._rest_s = 0.0
-        self._time_s = 0.0
+        self._state = GuardState()
         self._begun = False
-        self.why = ""
+
+    @property
+    def why(self) -> str:
+        """Why the controller's action was not used at the last tick; "": it was."""
+        return self._state.why
 
     def act(self, seen: Observation, *, leads: bool) -> LawOutput:
         """Return the tick's output.
@@ -64,29 +68,32 @@ class ControllerGuard:
             leads: the planner leads; else the controller is reset, and the shipped law's output is
                 returned, which starts at the measured pose.
         """
-        law = seen.law
-        self._time_s = self._time_s + seen.dt if leads else 0.0
-        seen = seen._replace(time_s=self._time_s)
-        if self._failed:
+        law, state = seen.law, self._state
+        state.time_s = state.time_s + seen.dt if leads else 0.0
+        if state.failed:
             return _uncertified(law)
+        shown = _frozen(seen._replace(time_s=state.time_s))
         try:
             if not (leads and self._begun):
-                self._controller.reset(seen)
+                self._controller.reset(shown)
                 self._begun = True
             if not leads:
                 return self._rested(seen)
-            action = self._controller.step(seen)
+            action = self._controller.step(shown)
             fault = fault_of(action)
         except Exception as error:  # noqa: BLE001 - whatever somebody's code brings about
             fault = f"raised {type(error).__name__}: {error}"
         if fault:
-            self.why, self._failed = f"the controller {fault}"[:WORDS], True
+            state.why, state.failed = f"the controller {fault}"[:WORDS], True
             return _uncertified(law)
         local = self._law.certify(action.D)
-        self.why = self._objection(seen, action, local)
-        if self.why:
-            self._rest_s = REST_S
+        state.why = self._objection(seen, action, local)
+        if state.why:
+            state.wait_s = min(WAIT_MAX_S, max(REST_S, 2.0 * state.wait_s))
+            state.rest_s = state.wait_s
             return _uncertified(law)
+        if state.time_s > FORGET_S:
+            state.wait_s = 0.0
         return law._replace(
             q_ref=action.q_ref,
             v_ref=action.v_ref,
@@ -98,14 +105,23 @@ class ControllerGuard:
 
     def _rested(self, seen: Observation) -> LawOutput:
         """Return the shipped law's output; after an objection all hold until it is calm."""
-        if self.why:
+        state = self._state
+        if state.why:
             x, y = capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope)
             calm = abs(x) <= CALM * self._room[0] and abs(y) <= CALM * self._room[1]
-            self._rest_s = max(0.0, self._rest_s - seen.dt) if calm else REST_S
-            if self._rest_s > 0.0:
+            state.rest_s = max(0.0, state.rest_s - seen.dt) if calm else state.wait_s
+            if state.rest_s > 0.0:
                 return _uncertified(seen.law)
-            self.why = ""
+            state.why = ""
         return seen.law
+
+    def snapshot(self) -> GuardState:
+        """Return the guard's own state; a controller's is its own affair."""
+        return msgspec.structs.replace(self._state)
+
+    def restore(self, state: GuardState) -> None:
+        """Continue from a state; the controller is reset first."""
+        self._state = msgspec.structs.replace(state)
 
     def _objection(self, seen: Observation, action: Action, local: LocalGains) -> str:
         """Return why an action must not be sent at this pose; "" if it may."""
@@ -114,9 +130,11 @@ class ControllerGuard:
             return f"the controller's gains do not stand alone: {service:.2f}, {onboard:.2f}"
         held = action.D * (action.q_ref - seen.q) + action.tau_ff - seen.law.tau_ff
         moves = self._law.rest_from_here(action.D, held)[:2].tolist()
+        x, y, z = seen.p[:3].tolist()
+        there = (x + moves[0], y + moves[1], z)
         places = {
             "the capture point": capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope),
-            "the rest in HOLD": (seen.p[0] + moves[0], seen.p[1] + moves[1]),
+            "the rest in HOLD": capture_point(there, _AT_REST, seen.law.slope),
         }
         for name, (x, y) in places.items():
             if not (abs(x) <= self._room[0] and abs(y) <= self._room[1]):
@@ -133,11 +151,33 @@ def fault_of(action: object) -> str:
             return (
                 f"returned {name} of shape {np.shape(values)}; an array of ({N_JOINTS},) is right"
             )
-        if values.dtype.kind != "f" or not np.isfinite(values).all():
-            return f"returned {name} with a number that is not finite"
+        if values.dtype not in (np.float32, np.float64) or not np.isfinite(values).all():
+            return f"returned {name} with a number that is not finite, or not a float"
     return ""
 
 
 def _uncertified(law: LawOutput) -> LawOutput:
     """Return the shipped law's output, marked so that all six hold."""
     return law._replace(local=law.local._replace(source=SplitSource.UNCERTIFIED))
+
+
+def _frozen(seen: Observation) -> Observation:
+    """Return what a controller may look at; who writes into it raises.
+
+    They are copies: guard, trips and status read the arrays themselves after the controller.
+    """
+    law = seen.law
+    local = law.local._replace(D=_read_only(law.local.D), D_B=_read_only(law.local.D_B))
+    return seen._replace(law=law._replace(**_arrays_of(law), local=local), **_arrays_of(seen))
+
+
+def _arrays_of(values: LawOutput | Observation) -> dict[str, Any]:
+    """Return copies of the arrays, by name."""
+    named = values._asdict()
+    return {name: _read_only(v) for name, v in named.items() if isinstance(v, np.ndarray)}
+
+
+def _read_only(values: np.ndarray) -> np.ndarray:
+    copied = values.copy()
+    copied.setflags(write=False)
+    return copied

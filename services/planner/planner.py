@@ -66,7 +66,7 @@ class Planner:
         Args:
             config: the robot.
             session: drawn at random at each start; sent in every command.
-            controller: in the place of the shipped law; its snapshot is not taken.
+            controller: in the place of the shipped law; its own state is in no snapshot.
         """
         self.session = session
         self._law = Hocca(config)
@@ -233,6 +233,7 @@ class Planner:
             self._unattended.snapshot(),
             self._phases.snapshot(),
             msgspec.structs.replace(self._rival),
+            self._guard.snapshot() if self._guard is not None else None,
         )
 
     def restore(self, snapshot: TickState) -> None:
@@ -254,6 +255,8 @@ class Planner:
         self._overload.restore(m.overload)
         self._law.restore(m.law)
         self._trips.restore(m.trips)
+        if self._guard is not None and m.guard is not None:
+            self._guard.restore(m.guard)
 
     def _watch_rival(self, states: Sequence[JointState]) -> None:
         """Find out if another planner leads, and if modules have retired this one's session."""

@@ -125,6 +125,21 @@ class LawState(msgspec.Struct, frozen=True):
     load: LoadState = LoadState()
 
 
+class GuardState(msgspec.Struct):
+    """State of `ControllerGuard`."""
+
+    failed: bool = False
+    """It is not asked again."""
+    why: str = ""
+    """Why its last action was not used."""
+    rest_s: float = 0.0
+    """Time for which all still hold."""
+    wait_s: float = 0.0
+    """The newest such time."""
+    time_s: float = 0.0
+    """Since it was last reset."""
+
+
 class TickState(msgspec.Struct, frozen=True):
     """State of `Planner`, before a tick."""
 
@@ -148,3 +163,5 @@ class TickState(msgspec.Struct, frozen=True):
     unattended: UnattendedState = UnattendedState()
     phases: PhasesState = PhasesState()
     rival: RivalWatch = msgspec.field(default_factory=RivalWatch)
+    guard: GuardState | None = None
+    """None without a controller of somebody's own."""

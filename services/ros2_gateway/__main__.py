@@ -11,7 +11,7 @@ from typing import Final
 
 from services.ros2_gateway.conversions import Conversions
 from services.ros2_gateway.gateway import INPUTS, Gateway
-from services.ros2_gateway.inbound import ACCEPTABLE, Inbound, acceptable
+from services.ros2_gateway.inbound import Inbound, acceptable, inbound_topics
 from services.ros2_gateway.loop import PERIOD_NS, GatewayLoop, Input
 from services.ros2_gateway.rmw import domain
 from services.ros2_gateway.ros_session import RosLink, RosSession
@@ -56,17 +56,25 @@ def main() -> int:
 
     def joined() -> RosSession:
         ros = RosSession(ros2.router, arguments.domain, types, namespace=ros2.namespace)
-        ros.show_node()
-        ros.publish(gateway.sent_topics)
-        ros.subscribe([ACCEPTABLE[name] for name in arguments.accept])
-        ros.put(*gateway.description())
+        try:
+            declare(ros)
+        except BaseException:
+            ros.close()
+            raise
         logger.info("the router answers")
         return ros
+
+    def declare(ros: RosSession) -> None:
+        ros.show_node()
+        ros.publish(gateway.sent_topics)
+        known = inbound_topics(ros2.namespace)
+        ros.subscribe([getattr(known, name) for name in arguments.accept])
+        ros.put(*gateway.description())
 
     with bus.open_session(config, "ros2_gateway", arguments.run_dir) as session:
         wanted = [(t, m) for t in INPUTS for m in (MODULES if t.per_module else ("",))]
         inputs: list[Input] = [(t, m, session.latest(t, t.type, m)) for t, m in wanted]
-        link = RosLink(joined)
+        link = RosLink(joined, lambda error: logger.warning("%s; it is dialled again", error))
         loop = GatewayLoop(gateway, inputs, link)
         if arguments.accept:
             intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
@@ -83,7 +91,8 @@ def main() -> int:
         deadline_ns = now_ns()
         while not stop:
             now = now_ns()
-            loop.cycle(now, now + offset_ns)
+            # a simulated robot tells its own time, maybe in slow motion; a real one that of day
+            loop.cycle(now, now + offset_ns if arguments.simulated else time.time_ns())
             deadline_ns = max(deadline_ns + PERIOD_NS, now)
             sleep_until(deadline_ns)
         link.close()

@@ -48,6 +48,8 @@ MODE_LEVEL: Final = {
     Mode.DAMP: ERROR,
     Mode.FAULT: ERROR,
 }
+NOT_STOPPED: Final = "emergency stop"
+"""Key of the gateway's figures: the stop that ROS 2 asked for was given up."""
 _UNKNOWN_POSITION: Final = (DriveStatus.LOST, DriveStatus.UNZEROED)
 
 
@@ -149,7 +151,9 @@ class Conversions:
         """
         rows = [self._module_row(name, states.get(name)) for name in MODULES]
         rows += [self._planner_row(status), self._harness_row(wrench)]
-        rows.append(self._row("ros2_gateway", OK, "running", gateway))
+        fault = gateway.get(NOT_STOPPED)
+        level, said = (ERROR, str(fault)) if fault else (OK, "running")
+        rows.append(self._row("ros2_gateway", level, said, gateway))
         return self._encode(DIAGNOSTICS, header=self._header(ns, ""), status=rows)
 
     def text(self, text: str) -> bytes:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
 
 from services.ros2_gateway.rmw import RosTopic
 from shared.bus.messages import Mode, OperatorIntent, PlannerStatus
@@ -15,16 +15,30 @@ from shared.exceptions import FleetError
 
 SOURCE: Final = "ros2_gateway"
 """Name of the sender, on the robot's bus."""
-INTENT: Final = RosTopic("/xrl/intent", "std_msgs/msg/Float64")
-"""Assist, N; to be repeated, as `assist.stale_ms` of the robot file says."""
-ESTOP: Final = RosTopic("/xrl/estop", "std_msgs/msg/Bool")
-"""True stops every module; nothing here ends a stop."""
-ACCEPTABLE: Final = {"intent": INTENT, "estop": ESTOP}
-"""By the words of `--accept`."""
-STOPPED: Final = (Mode.DAMP, Mode.DISARMED, Mode.FAULT)
+ACCEPTABLE: Final = ("estop", "intent")
+"""Words of `--accept`, the stop first."""
+STOPPED: Final = (Mode.DAMP, Mode.FAULT)
 REPEAT_NS: Final = 50 * NS_PER_MS
 GIVE_UP_NS: Final = 5 * NS_PER_S
 """A stop is repeated until every module has stopped, and for so long at most."""
+
+
+class InboundTopics(NamedTuple):
+    """Topics of a robot that ROS 2 may publish."""
+
+    estop: RosTopic
+    """`std_msgs/msg/Bool`: true stops every module; nothing here ends a stop."""
+    intent: RosTopic
+    """`std_msgs/msg/Float64`: assist, N; to be repeated, as `assist.stale_ms` says."""
+
+
+def inbound_topics(namespace: str) -> InboundTopics:
+    """Return them, in a namespace such as `legs`, or in none."""
+    below = f"/{namespace}" if namespace else ""
+    return InboundTopics(
+        RosTopic(f"{below}/xrl/estop", "std_msgs/msg/Bool"),
+        RosTopic(f"{below}/xrl/intent", "std_msgs/msg/Float64"),
+    )
 
 
 def acceptable(words: str) -> tuple[str, ...]:
@@ -33,12 +47,10 @@ def acceptable(words: str) -> tuple[str, ...]:
     Raises:
         FleetError: it is not a list of `ACCEPTABLE`.
     """
-    names = tuple(word for word in words.split(",") if word)
-    wrong = [name for name in names if name not in ACCEPTABLE]
-    if wrong or not names:
-        right = " or ".join([*ACCEPTABLE, ",".join(ACCEPTABLE)])
-        raise FleetError(f"--accept {words}: {right} is right")
-    return names
+    names = [word for word in words.split(",") if word]
+    if not names or not set(names) <= set(ACCEPTABLE):
+        raise FleetError(f"--accept {words}: intent or estop or intent,estop is right")
+    return tuple(name for name in ACCEPTABLE if name in names)
 
 
 class Inbound:
@@ -46,23 +58,27 @@ class Inbound:
 
     Attributes:
         refused: messages that were none, or asked for what cannot be given.
+        not_stopped: the last stop was given up before every module had stopped.
     """
 
     def __init__(self, config: RobotConfig) -> None:
         """Begin without a request."""
+        self._topics = inbound_topics(config.ros2.namespace)
         self._most_n = config.assist.force_max
         self._assist_n: float | None = None
         self._stop_since_ns: int | None = None
         self._next_stop_ns = 0
         self.refused = 0
+        self.not_stopped = False
 
     def receive(self, topic: RosTopic, message: Any | None, now_ns: int) -> None:
-        """Take a message of `/xrl/intent` or `/xrl/estop`; None: it could not be read."""
+        """Take a message of one of `inbound_topics`; None: it could not be read."""
         if message is None:
             self.refused += 1
-        elif topic == ESTOP:
+        elif topic == self._topics.estop:
             if message.data and self._stop_since_ns is None:
                 self._stop_since_ns = self._next_stop_ns = now_ns
+                self.not_stopped = False
         elif math.isfinite(message.data) and 0.0 <= message.data <= self._most_n:
             self._assist_n = float(message.data)
         else:
@@ -86,21 +102,22 @@ class Inbound:
             return None
         return OperatorIntent(t_ns=now_ns, seq=number, assist_n=assist_n, source=SOURCE)
 
-    def stop_due(self, now_ns: int, modes: Collection[int], of: int) -> bool:
+    def stop_due(self, now_ns: int, modes: Sequence[tuple[int, int]], of: int) -> bool:
         """Return True if the stop is to be put on the bus now.
+
+        What was heard before the request does not count: a module may be silent since.
 
         Args:
             now_ns: the fleet's clock.
-            modes: of the modules that are not silent.
+            modes: when each module's newest state arrived, ns, and its mode.
             of: number of all modules.
         """
         since_ns = self._stop_since_ns
         if since_ns is None:
             return False
-        stopped = len(modes) == of and all(mode in STOPPED for mode in modes)
-        repeated = now_ns > since_ns
-        if (stopped and repeated) or now_ns - since_ns > GIVE_UP_NS:
-            self._stop_since_ns = None
+        stopped = sum(at_ns > since_ns and mode in STOPPED for at_ns, mode in modes)
+        if stopped == of or now_ns - since_ns > GIVE_UP_NS:
+            self._stop_since_ns, self.not_stopped = None, stopped < of
             return False
         if now_ns < self._next_stop_ns:
             return False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
+from services.ros2_gateway.conversions import NOT_STOPPED
 from services.ros2_gateway.gateway import Gateway
 from services.ros2_gateway.inbound import Inbound
 from services.ros2_gateway.rmw import RosTopic
@@ -30,7 +31,8 @@ class GatewayLoop:
         self._inbound: Inbound | None = None
         self._intents: Publisher[OperatorIntent] | None = None
         self._stops: Publisher[Estop] | None = None
-        self._states: dict[str, JointState] = {}
+        self._modes: dict[str, tuple[int, int]] = {}
+        """By module: when its newest state arrived, ns, and its mode."""
         self._status: PlannerStatus | None = None
         self.cycles = 0
         self.sent = 0
@@ -57,7 +59,7 @@ class GatewayLoop:
                 continue
             self._gateway.receive(topic, module, message, now_ns)
             if isinstance(message, JointState):
-                self._states[module] = message
+                self._modes[module] = now_ns, message.mode
             elif isinstance(message, PlannerStatus):
                 self._status = message
         ros = self._link.session
@@ -76,6 +78,8 @@ class GatewayLoop:
         found: dict[str, object] = {"sent": self.sent, "not sent": ros.failed if ros else 0}
         if self._inbound is not None:
             found |= {"passed on": self.passed, "refused": self._inbound.refused}
+            if self._inbound.not_stopped:
+                found[NOT_STOPPED] = "a module did not stop: cut the power"
         return found
 
     def _pass_on(
@@ -89,7 +93,6 @@ class GatewayLoop:
         if intent is not None:
             self._intents.put(intent)
             self.passed += 1
-        modes = [state.mode for state in self._states.values()]
-        if inbound.stop_due(now_ns, modes, N_MODULES):
+        if inbound.stop_due(now_ns, list(self._modes.values()), N_MODULES):
             self._stops.put(Estop(t_ns=now_ns, seq=self.passed, source="ros2_gateway"))
             self.passed += 1

@@ -136,7 +136,10 @@ class RosSession:
         """Return what has come since the last call; None for what could not be read."""
         found = []
         for topic, subscriber in self._subscribers:
-            while (sample := subscriber.try_recv()) is not None:
+            for _ in range(_QUEUE):  # no more: a flood of one does not starve the next
+                sample = subscriber.try_recv()
+                if sample is None:
+                    break
                 found.append((topic, self._types.decode(topic.type, sample.payload.to_bytes())))
         return found
 
@@ -161,9 +164,16 @@ class RosSession:
 class RosLink:
     """Opens a session in a thread of its own, again and again until the router is there."""
 
-    def __init__(self, opened: Callable[[], RosSession]) -> None:
-        """Begin; `opened` opens and declares, and raises BusError where there is no router."""
-        self._open = opened
+    def __init__(
+        self, opened: Callable[[], RosSession], failed: Callable[[Exception], None]
+    ) -> None:
+        """Begin.
+
+        Args:
+            opened: opens and declares; raises where there is no router.
+            failed: is told the first time that it does.
+        """
+        self._open, self._failed = opened, failed
         self._left = threading.Event()
         self.session: RosSession | None = None
         """The session, once it is open; it then lasts, whether its router does or not."""
@@ -178,11 +188,15 @@ class RosLink:
             self.session.close()
 
     def _dial(self) -> None:
+        told = False
         while not self._left.is_set():
             try:
                 self.session = self._open()
                 return
-            except BusError:
+            except (BusError, zenoh.ZError) as error:
+                if not told:
+                    self._failed(error)
+                told = True
                 self._left.wait(_AGAIN_S)
 
 

@@ -6,13 +6,14 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from services.planner.controller import Action, Observation
 from services.planner.controller_file import controller_maker
 from services.planner.hocca import LawOutput
-from services.simulator.plant import PlantConfig
+from services.simulator.plant import PlantConfig, changed
 from shared.bus import topics
 from shared.bus.messages import Message, Mode, PlannerMode, PlannerStatus
 from shared.bus.topics import Topic
@@ -148,3 +149,19 @@ def test_its_output_is_what_is_sent(robot: RobotConfig) -> None:
     for _ in fleet.run():
         pass
     assert sent[-1][0] == outputs[-1].tau_coupled[8] + 0.25
+
+
+def test_on_a_slope_it_is_followed_as_on_the_level(robot: RobotConfig) -> None:
+    """Where the COM is uphill of the ankles it is over them."""
+    imu = msgspec.structs.replace(robot.imu, fitted=True)
+    plant = changed(PlantConfig(), {"floor.slope": [0.06, 0.0]})
+    fleet = Lockstep(
+        msgspec.structs.replace(robot, imu=imu), still(2.0), plant=plant,
+        controller=controller_maker(str(LQR), robot),
+    )  # fmt: skip
+    assert begin_standing(fleet)
+    rows = list(fleet.run())
+    assert not rows[-1].fallen
+    led = [one.failsafe.mode is Mode.TRACK for one in fleet.controllers]
+    assert all(led)
+    assert abs(rows[-1].com[0]) > 0.03, "it stands uphill of its ankles"

@@ -67,4 +67,25 @@ def test_a_file_that_is_not_there_is_one_clear_line(spec: str, robot: RobotConfi
 def test_a_spec_is_file_and_name() -> None:
     assert split_spec("a/b.py") == (Path("a/b.py"), "Controller")
     assert split_spec("a/b.py:LQR") == (Path("a/b.py"), "LQR")
+    assert split_spec("/home/me/.pyenv/c/mine.py:B") == (Path("/home/me/.pyenv/c/mine.py"), "B")
     assert absolute("b.py:LQR") == f"{Path.cwd() / 'b.py'}:LQR"
+
+
+def test_the_one_that_was_looked_at_is_the_first_planners(
+    tmp_path: Path, robot: RobotConfig
+) -> None:
+    """It may have opened a device, which a second one could not."""
+    path = tmp_path / "mine.py"
+    path.write_text(GOOD.replace("def __init__", "all = []\n    def __init__"), encoding="utf-8")
+    make = controller_maker(str(path), robot)
+    first = make()
+    assert type(first).made == 1  # type: ignore[attr-defined]  # of the file
+    make()
+    assert type(first).made == 2  # type: ignore[attr-defined]
+
+
+def test_a_file_beside_it_can_be_imported(tmp_path: Path, robot: RobotConfig) -> None:
+    (tmp_path / "beside_my_controller.py").write_text("GAIN = 3", encoding="utf-8")
+    path = tmp_path / "mine.py"
+    path.write_text(f"import beside_my_controller\n{GOOD}", encoding="utf-8")
+    controller_maker(str(path), robot)

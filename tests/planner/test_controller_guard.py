@@ -104,6 +104,7 @@ BAD = {
     "a matrix": changed(D=np.ones((12, 1))),
     "a list": changed(tau_ff=[0.0] * 12),
     "whole numbers": changed(tau_ff=np.zeros(12, int)),
+    "long doubles": changed(tau_ff=np.zeros(12, np.longdouble)),
     "complex": changed(v_ref=np.zeros(12, complex)),
     **{f"{part} is NaN": changed(**{part: NAN}) for part in Action._fields},
     "infinite": changed(tau_coupled=np.full(12, math.inf)),
@@ -184,7 +185,47 @@ def test_near_the_edge_of_the_soles_it_is_not_followed(
 
 def test_on_a_slope_the_capture_point_is_against_gravity() -> None:
     p = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-    assert capture_point(p, (0.0,) * 6, (0.05, -0.02)) == (0.05, -0.02)
+    assert capture_point(p, (0.0,) * 6, (0.05, -0.02)) == (-0.05, 0.02), "downhill of the ankles"
+
+
+def test_what_it_sees_cannot_be_written_and_nothing_of_the_guards_changes(
+    hocca: Hocca, seen: Observation
+) -> None:
+    for part in ("p", "pdot", "q", "J", "T"):
+
+        def write(shown: Observation, part: str = part) -> Action:
+            getattr(shown, part)[...] = 0.0
+            return Action.of(shown.law)
+
+        guard = ControllerGuard(Scripted(write), hocca, GEOMETRY)
+        before = getattr(seen, part).copy()
+        assert guard.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
+        assert "read-only" in guard.why
+        assert np.array_equal(getattr(seen, part), before)
+
+
+def test_each_objection_makes_all_hold_twice_as_long(hocca: Hocca, seen: Observation) -> None:
+    soft = Scripted(lambda seen: Action.of(seen.law)._replace(D=0.3 * seen.law.local.D))
+    guard = ControllerGuard(soft, hocca, GEOMETRY)
+    waits = []
+    for _ in range(8):
+        guard.act(seen, leads=True)
+        count = 1
+        while guard.act(seen, leads=False).local.source is SplitSource.UNCERTIFIED:
+            count += 1
+        waits.append(count * seen.dt)
+    assert waits == pytest.approx([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0], abs=0.02)
+
+
+def test_its_state_goes_on_from_a_snapshot(hocca: Hocca, seen: Observation) -> None:
+    failed = ControllerGuard(Scripted(raises), hocca, GEOMETRY)
+    failed.act(seen, leads=True)
+    mine = Scripted(changed())
+    again = ControllerGuard(mine, hocca, GEOMETRY)
+    again.restore(failed.snapshot())
+    assert again.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
+    assert again.why == failed.why
+    assert mine.steps == 0
 
 
 def test_after_the_edge_all_hold_until_it_is_calm(hocca: Hocca, seen: Observation) -> None:

@@ -118,9 +118,12 @@ def test_a_person_leads_the_robot_down_by_keys_lets_go_and_stops_it(
         before = height()
         person = Typist(place)
         assert wait_for(lambda: person.shows(b"arrows"))
-        for _ in range(8):
-            person.types(b"\x1b[B")
-        assert wait_for(lambda: height() < before - 0.08), person.shown[-300:]
+
+        def goes_down() -> bool:
+            person.types(b"\x1b[B")  # as a key that is held
+            return height() < before - 0.08
+
+        assert wait_for(goes_down), person.shown[-300:]
         person.types(b"q")
         assert person.ends() == 0
         person = Typist(place)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from statistics import fmean, median
-from typing import Final
+from typing import Final, NamedTuple
 
 import can
 import msgspec
@@ -24,9 +24,12 @@ from shared.can.imu_can import IDS as IMU_IDS
 from shared.can.imu_can import ImuAssembler, ImuSample
 from shared.can.loadcell_can import FRAME_IDS, SampleAssembler
 from shared.config.sections import CanConfig
+from shared.exceptions import DriveError
 
 LISTEN_S: Final = 0.5
 LISTEN_MAX_S: Final = 3.0
+ANSWER_S: Final = 0.1
+"""An answer that takes longer is counted as lost."""
 HEARTBEATS: Final = 3.0
 """Periods of the heartbeat that are listened for, at least."""
 
@@ -103,6 +106,58 @@ def listen(
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:
         traffic.trouble = str(error) or type(error).__name__
     return traffic
+
+
+class RoundTrips(NamedTuple):
+    """How long an axis takes to answer."""
+
+    times_ms: tuple[float, ...]
+    """Of each answer."""
+    lost: int
+    """Requests without an answer in `ANSWER_S`."""
+
+
+def round_trips(config: CanConfig, nodes: Sequence[int], count: int) -> dict[int, RoundTrips]:
+    """Ask axes for their supply's voltage, one after the other; return how long each takes.
+
+    Not where services are up: any frame feeds a drive's watchdog.
+
+    Args:
+        config: of the bus, `{run}` in its channel expanded.
+        nodes: of the axes.
+        count: requests to each.
+
+    Raises:
+        DriveError: the bus cannot be used.
+    """
+    times: dict[int, list[float]] = {node: [] for node in nodes}
+    try:
+        with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
+            for _ in range(count):
+                for node in nodes:
+                    took_s = _asked(bus, node)
+                    if took_s is not None:
+                        times[node].append(1e3 * took_s)
+    except (can.CanError, OSError, ValueError, NotImplementedError) as error:
+        raise DriveError(f"{config.channel}: {error or type(error).__name__}") from None
+    return {node: RoundTrips(tuple(found), count - len(found)) for node, found in times.items()}
+
+
+def _asked(bus: can.BusABC, node: int) -> float | None:
+    """Ask an axis once; return the time until its answer, s, or None."""
+    wanted = cansimple.arbitration_id(node, Command.GET_VBUS)
+    question = can.Message(
+        arbitration_id=wanted, is_remote_frame=True, dlc=_FRAME_BYTES, is_extended_id=False
+    )
+    began = time.monotonic()
+    bus.send(question, timeout=_WAIT_S)
+    while (left := began + ANSWER_S - time.monotonic()) > 0.0:
+        message = bus.recv(left)
+        if message is None:
+            return None
+        if message.arbitration_id == wanted and not message.is_remote_frame:
+            return time.monotonic() - began
+    return None
 
 
 def long_enough(heartbeat_period_ms: int) -> float:

@@ -15,8 +15,10 @@ try:
 except ImportError:
     evdev = None
 
-EV_KEY, EV_ABS = 1, 3
+EV_SYN, EV_KEY, EV_ABS = 0, 1, 3
 """Types of events, of linux/input-event-codes.h."""
+SYN_DROPPED: Final = 3
+"""Events were lost, because nobody read them in time."""
 BUTTONS: Final[Mapping[str, int]] = {
     "a": 0x130, "b": 0x131, "x": 0x133, "y": 0x134, "leftshoulder": 0x136, "rightshoulder": 0x137,
     "back": 0x13A, "start": 0x13B,
@@ -40,7 +42,10 @@ class PadDevice(Protocol):
         """Return the events that have come; raises OSError once the pad is gone."""
 
     def absinfo(self, axis: int) -> Any:
-        """Return an axis's `min` and `max`."""
+        """Return an axis's `value`, `min` and `max`."""
+
+    def active_keys(self) -> list[int]:
+        """Return the buttons that are down."""
 
 
 class Gamepad:
@@ -56,8 +61,8 @@ class Gamepad:
         self._device, self.name, self.gone = device, device.name, False
         self._hold, self._stop = BUTTONS[hold], BUTTONS[stop]
         self._down: set[int] = set()
-        self._values = dict.fromkeys(AXES.values(), 0.0)
         self._spans = {axis: device.absinfo(axis) for axis in AXES.values()}
+        self._values = {axis: self._scaled(axis, span.value) for axis, span in self._spans.items()}
         self.stopped = False
 
     @property
@@ -90,9 +95,22 @@ class Gamepad:
             (self._down.add if event.value else self._down.discard)(event.code)
             self.stopped |= event.code == self._stop and bool(event.value)
         elif event.type == EV_ABS and event.code in self._values:
-            span = self._spans[event.code]
-            middle, half = 0.5 * (span.max + span.min), 0.5 * (span.max - span.min)
-            self._values[event.code] = (event.value - middle) / half if half else 0.0
+            self._values[event.code] = self._scaled(event.code, event.value)
+        elif event.type == EV_SYN and event.code == SYN_DROPPED:
+            self._look_again()
+
+    def _look_again(self) -> None:
+        """Read what is down after a loss; the dead man's button counts once it is pressed anew."""
+        self._down.clear()
+        self.stopped |= self._stop in self._device.active_keys()
+        for axis in self._values:
+            self._values[axis] = self._scaled(axis, self._device.absinfo(axis).value)
+
+    def _scaled(self, axis: int, value: int) -> float:
+        """Return a position of an axis from -1 to 1."""
+        span = self._spans[axis]
+        middle, half = 0.5 * (span.max + span.min), 0.5 * (span.max - span.min)
+        return (value - middle) / half if half else 0.0
 
 
 def open_pad(path: str | None) -> PadDevice:

@@ -46,6 +46,10 @@ class Pilot:
         self._assist_max_n = assist_max_n
         self.led = Led(_within(height, *HEIGHTS), _within(pitch, *PITCHES), 0.0)
 
+    def keep_assist(self, given_n: float) -> None:
+        """Ask for no more assist than is given now, N."""
+        self.led = self.led._replace(assist_n=max(0.0, min(self.led.assist_n, given_n)))
+
     def advance(self, wanted: Deflection, dt: float) -> Led:
         """Go on by dt, s.
 

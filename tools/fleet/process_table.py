@@ -202,11 +202,13 @@ def select(
         services: names; each is then started at once, whatever its row says. None for all.
 
     Raises:
-        FleetError: a name is not in the table, or the IMU's on a robot without one.
+        FleetError: a name is not in the table, or of what this fleet is not to have.
     """
     check_known(services or (), [row.name for row in table.process])
     if "imu" in (services or ()) and not imu:
         raise FleetError("imu: this robot has none; `fitted` of [imu] in the robot file says so")
+    if "ros2_gateway" in (services or ()) and not ros2:
+        raise FleetError("ros2_gateway: it is started with --ros2; add that")
     wanted = {
         "": True, "simulation": simulation, "injected": injected, "imu": imu, "ros2": ros2,
     }  # fmt: skip

@@ -63,7 +63,9 @@ def check(robot: RobotConfig, domain: int, wait_s: float) -> list[CheckRow]:
             for topic in known
             if _has_rate(topic, known, robot)
         ]
-        rows += _received(ros, [topic for topic in shown if topic != known.description], known)
+        steady = [topic for topic in shown if topic != known.description]
+        slowest_hz = ros2.diagnostics_hz or 1.0
+        rows += _received(ros, steady, known, slowest_hz)
         rows.append(CheckRow(True, "other nodes", _nodes([s for s in seen if s.node != name])))
         return rows
 
@@ -108,13 +110,16 @@ def _topic_row(topic: RosTopic, seen: list[SeenEndpoint], node: str, types: RosT
     )
 
 
-def _received(ros: RosSession, topics: list[RosTopic], known: RosTopics) -> list[CheckRow]:
-    """Receive for a while; return a row for each topic."""
+def _received(
+    ros: RosSession, topics: list[RosTopic], known: RosTopics, slowest_hz: float
+) -> list[CheckRow]:
+    """Receive long enough for the slowest; return a row for each topic."""
+    listen_s = max(LISTEN_S, 1.5 / slowest_hz)
     ros.subscribe(topics)
     counts = dict.fromkeys(topics, 0)
     joints: list[str] = []
     began = time.monotonic()
-    while time.monotonic() - began < LISTEN_S:
+    while time.monotonic() - began < listen_s:
         for topic, message in ros.take():
             counts[topic] += message is not None
             if topic == known.joint_states and message is not None:
@@ -122,7 +127,7 @@ def _received(ros: RosSession, topics: list[RosTopic], known: RosTopics) -> list
         time.sleep(LOOK_S / 4)
     rows = []
     for topic, count in counts.items():
-        found = f"{count} messages in {LISTEN_S:g} s"
+        found = f"{count} messages in {listen_s:.1f} s"
         if topic == known.joint_states:
             found += f", {len(joints)} of {len(JOINTS)} joints"
         good = count > 0 and (topic != known.joint_states or len(joints) == len(JOINTS))

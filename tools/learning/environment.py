@@ -102,9 +102,12 @@ class BalanceEnv(gymnasium.Env[Array, Array]):
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Act at this tick and go on to the next one that is asked about."""
         episode = self._episode
-        if episode is None:
-            raise gymnasium.error.ResetNeeded("reset() comes before step()")
-        episode.act(np.array(action, float))
+        if episode is None or episode.over:
+            raise gymnasium.error.ResetNeeded("reset() comes before step(), and after an end")
+        given = np.array(action, float)
+        if given.shape != (ACTIONS,) or not np.isfinite(given).all():
+            raise gymnasium.error.InvalidAction(f"an action is {ACTIONS} finite numbers")
+        episode.act(given)
         asked = episode.await_turn()
         truth = episode.truth
         fallen = truth is not None and truth.fallen
@@ -137,6 +140,8 @@ class _Episode:
     ) -> None:
         self.seen: Array = np.zeros(OBSERVED)
         self.truth: SimTruth | None = None
+        self.over = False
+        """Nobody asks for an action any more."""
         self._actions: SimpleQueue[Array | None] = SimpleQueue()
         self._turns: SimpleQueue[BaseException | bool] = SimpleQueue()
         self._fleet = Lockstep(robot, scenario, seed=seed, plant=plant, controller=lambda: self)
@@ -162,6 +167,7 @@ class _Episode:
     def await_turn(self) -> bool:
         """Wait until an action is asked for; False: the run is over."""
         turn = self._turns.get()
+        self.over = turn is not True
         if isinstance(turn, BaseException):
             raise turn
         return turn

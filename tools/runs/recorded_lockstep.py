@@ -27,7 +27,7 @@ from tools.runs import experiment
 from tools.runs.centralised.fleet import CONTROLS, SHIPPED
 from tools.runs.hand_path import HandRow
 from tools.runs.judgement import judge_run
-from tools.runs.lockstep import Record, Watch
+from tools.runs.lockstep import Lockstep, Record, Watch
 from tools.runs.verdict import Summary
 
 Outcome = TypeVar("Outcome")
@@ -173,10 +173,13 @@ def simulate(
     attached = [(ATTACHED, split_spec(controller)[0])] if controller is not None else []
 
     def run(record: Record, drain: Watch) -> float:
-        fleet = CONTROLS[control](
-            robot, scenario, network, seed=seed, record=record, plant=true_plant, hand=hand,
-            controller=make,
-        )  # fmt: skip
+        inputs: dict[str, Any] = {
+            "seed": seed, "record": record, "plant": true_plant, "hand": hand,
+        }  # fmt: skip
+        if make is not None:
+            fleet = Lockstep(robot, scenario, network, controller=make, **inputs)
+        else:
+            fleet = CONTROLS[control](robot, scenario, network, **inputs)
         end_s = math.inf
         for truth in fleet.run():
             drain(truth)

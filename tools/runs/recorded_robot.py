@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from services.planner.controller_file import ATTACHED
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
@@ -43,3 +44,21 @@ def text_of(log: RunLog | RunIndex, name: str) -> str:
         raise RunError(f"{log.path}: holds no {name}; a run of this project has one") from None
     except UnicodeDecodeError:
         raise RunError(f"{log.path}: {name} in it is no UTF-8 text") from None
+
+
+def has_own_controller(log: RunLog | RunIndex) -> bool:
+    """Return True if a controller of somebody's own led in the law's place."""
+    return ATTACHED in log.attachments
+
+
+def refuse_own_controller(log: RunLog | RunIndex) -> None:
+    """Refuse a log whose planner was led by a controller of somebody's own.
+
+    Raises:
+        RunError: the shipped law would be computed in its place.
+    """
+    if has_own_controller(log):
+        raise RunError(
+            f"{log.path}: a controller of somebody's own led ({ATTACHED} in it), and this computes "
+            "the shipped law; `xrl resim --controller FILE` runs it again"
+        )

@@ -30,7 +30,7 @@ from shared.robot.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
 from tools.number_arguments import finite
 from tools.runs import snapshot_text
-from tools.runs.recorded_robot import robot_of
+from tools.runs.recorded_robot import refuse_own_controller, robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, RunPart
 from tools.runs.run_parts import zero_ns
@@ -110,6 +110,7 @@ def run(args: argparse.Namespace) -> int:
     index = RunIndex(args.log)
     zero = zero_ns(index)
     log = read_around(index, zero, args.at)
+    refuse_own_controller(log)
     robot = robot_of(log)
     tick = tick_at(log, args.at, zero)
     _introduce(log, tick, args.at, zero, console)

@@ -182,7 +182,7 @@ def _write_tables(
     """Write a folder of tables, with progress."""
     keys = keys_named(args.topic, FOR_REEXECUTION)
     with (
-        whole_folder(out, force=args.force) as folder,
+        whole_folder(out, index.path, force=args.force) as folder,
         progress_along("writing", index.length_s) as done,
     ):
         folder.mkdir()
@@ -200,7 +200,7 @@ def _write_tables(
 def _write_bag(index: RunIndex, part: RunPart, args: argparse.Namespace, console: Console) -> None:
     """Write a bag of ROS 2, with progress."""
     with (
-        whole_folder(args.ros2bag, force=args.force) as folder,
+        whole_folder(args.ros2bag, index.path, force=args.force) as folder,
         progress_along("writing", index.length_s) as done,
     ):
         rate_hz = args.rate or BAG_RATE_HZ

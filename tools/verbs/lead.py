@@ -6,6 +6,7 @@ import argparse
 import getpass
 import os
 import time
+from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Final
@@ -21,6 +22,7 @@ from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 from shared.process import StopFlag
 from tools.fleet.emergency_stop import BusStop, request_here
@@ -34,11 +36,11 @@ PERIOD_S: Final = 0.05
 """Repeats each request: an intent fades out, and a push ends, once nobody repeats it."""
 LINKS_S: Final = 3.0
 KEY_HELD_S: Final = 0.1
-"""A press of a key is a full deflection for so long."""
+"""A press of a key is a full deflection for the time since the last look, and no longer than so."""
 
 
 class Key(Enum):
-    """A key that means something."""
+    """A key that means something: its deflection."""
 
     UP = (1.0, 0.0, 0.0)
     DOWN = (-1.0, 0.0, 0.0)
@@ -46,8 +48,8 @@ class Key(Enum):
     BACK = (0.0, -1.0, 0.0)
     MORE = (0.0, 0.0, 1.0)
     LESS = (0.0, 0.0, -1.0)
-    STOP = "x"
-    QUIT = "q"
+    STOP = (0.0, 0.0, 0.0, "x")
+    QUIT = (0.0, 0.0, 0.0, "q")
 
 
 KEYS: Final = {
@@ -131,8 +133,20 @@ class Leader:
         self._source = f"xrl lead by {getpass.getuser()} ({os.getpid()})"
         self._sent = 0
 
+    def take_hold(self) -> None:
+        """Begin to lead again: with the assist that is given now, not with that of before."""
+        status = self._newest()
+        self.pilot.keep_assist(0.0 if status is None else status.assist_n)
+
+    @property
+    def other(self) -> str:
+        """Who else asks for assist now; "" for nobody."""
+        status = self._newest()
+        by = "" if status is None else status.requested_by
+        return "" if by in ("", SCENARIO, self._source) else by
+
     def lead(self, wanted: Deflection, dt: float) -> None:
-        """Go on by dt, s, and tell the robot."""
+        """Go on by dt, s, and tell the robot; assist only while nobody else asks for it."""
         led = self.pilot.advance(wanted, dt)
         now, self._sent = now_ns(), self._sent + 1
         if self._hand is not None:
@@ -142,7 +156,7 @@ class Leader:
                     push=(0.0, 0.0, 0.0), source=self._source,
                 )
             )  # fmt: skip
-        if led.assist_n > 0.0:
+        if led.assist_n > 0.0 and not self.other:
             self._intents.put(
                 OperatorIntent(t_ns=now, seq=self._sent, assist_n=led.assist_n, source=self._source)
             )
@@ -153,6 +167,7 @@ class Leader:
         status = self._newest()
         hand = f"height {led.height:.3f} m, pitch {led.pitch:+.2f} rad, " if self._hand else ""
         given = f", given {status.assist_n:.0f} N" if status is not None else ""
+        given += f"; {self.other} asks for assist" if self.other else ""
         return Text(f"{held}: {hand}assist {led.assist_n:.0f} N{given}")
 
     def _newest(self) -> PlannerStatus | None:
@@ -164,14 +179,17 @@ def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
     """Lead by a pad until it is over; STOP if it was the stop."""
     console.print(f"{pad.name}: hold the dead man's button and move the sticks; Ctrl-C ends it")
     stop = StopFlag()
-    last = time.monotonic()
+    last, held = time.monotonic(), False
     with Live(console=console, refresh_per_second=4, transient=True) as shown:
         while not stop and not pad.gone:
             pad.wait(PERIOD_S)
             if pad.stopped:
                 return Key.STOP
             now = time.monotonic()
-            if pad.held:
+            if pad.held and not held:
+                leader.take_hold()
+            held = pad.held
+            if held:
                 leader.lead(pad.deflection, min(now - last, 2 * PERIOD_S))
             last = now
             shown.update(leader.describe("held" if pad.held else "not held, nothing is sent"))
@@ -187,6 +205,7 @@ def _by_keys(leader: Leader, console: Console) -> Key | None:
         if not keyboard.present:
             raise FleetError("no terminal to read keys from; a gamepad leads without --keys")
         console.print("arrows: height and pitch; + and -: assist; space or x: STOP; q ends it")
+        last = time.monotonic()
         with Live(console=console, refresh_per_second=4, transient=True) as shown:
             while not stop and keyboard.present:
                 presses = keyboard.wait(PERIOD_S)
@@ -194,9 +213,15 @@ def _by_keys(leader: Leader, console: Console) -> Key | None:
                     return Key.STOP
                 if Key.QUIT in presses:
                     return None
-                for press in presses:
-                    leader.lead(Deflection(*press.value), KEY_HELD_S)
-                if not presses:
-                    leader.lead(Deflection(), PERIOD_S)
+                now = time.monotonic()
+                leader.lead(deflection_of(presses), min(now - last, KEY_HELD_S))
+                last = now
                 shown.update(leader.describe("led"))
     return None
+
+
+def deflection_of(presses: Sequence[Key]) -> Deflection:
+    """Return what several keys ask for together; however often one is repeated, at most full."""
+    parts = [sum(float(press.value[axis]) for press in presses) for axis in range(3)]
+    height, pitch, assist = (max(-1.0, min(1.0, part)) for part in parts)
+    return Deflection(height, pitch, assist)

@@ -24,7 +24,7 @@ from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.analysis.reexecution.params import with_params
 from tools.number_arguments import finite
 from tools.runs import experiment
-from tools.runs.recorded_robot import robot_of
+from tools.runs.recorded_robot import has_own_controller, robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
@@ -134,6 +134,11 @@ def run(args: argparse.Namespace) -> int:
                 break
     outcomes = [execution.outcome for execution in executions]
     _other_machine(log, console)
+    if has_own_controller(index) and args.controller is None and "planner" in names:
+        console.print(
+            "a controller of somebody's own led: the planner is equal only with --controller FILE",
+            style="yellow",
+        )
     console.print(summary(outcomes))
     for outcome in outcomes:
         tell(outcome, log, console, changed=bool(args.param or args.controller))

@@ -20,7 +20,7 @@ from shared.robot.joints import MODULES
 from tools.number_arguments import count, finite
 from tools.runs.experiment import PLANT_FILE
 from tools.runs.hand_path import hand_path
-from tools.runs.recorded_robot import robot_of, text_of
+from tools.runs.recorded_robot import refuse_own_controller, robot_of, text_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog
 from tools.runs.run_parts import add_part, read_asked
@@ -79,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
         raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
     console = Console()
     log = read_asked(args, RunIndex(args.log))
+    refuse_own_controller(log)
     robot, scenario = robot_of(log), scenario_of(log)
     moments = moments_of(log, robot, args.every)
     kill = tuple(dict.fromkeys(args.kill))

@@ -142,13 +142,32 @@ def test_what_cannot_be_is_one_line_and_leaves_no_folder(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_is_replaced_only_with_force(run_file: Path, tmp_path: Path) -> None:
-    mine = tmp_path / "t" / "mine"
-    mine.parent.mkdir()
-    mine.touch()
-    words = ["export", str(run_file), "--csv", str(mine.parent), "--topic", "run/event"]
-    assert cli.main(words) == 2
-    assert mine.exists()
-    assert cli.main([*words, "--force"]) == 0
-    assert [path.name for path in mine.parent.iterdir()] == ["run.event.csv"]
+def test_an_earlier_export_is_replaced_only_with_force(run_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "t"
+    words = ["export", str(run_file), "--csv", str(out), "--topic"]
+    assert cli.main([*words, "run/event"]) == 0
+    assert cli.main([*words, "planner/status"]) == 2
+    assert cli.main([*words, "planner/status", "--force"]) == 0
+    assert [path.name for path in out.iterdir()] == ["planner.status.csv"]
+
+
+@pytest.mark.parametrize("mine", ["notes.txt", "run.mcap", "deeper/x.csv"])
+def test_what_is_not_of_an_export_is_never_taken_away(
+    run_file: Path, tmp_path: Path, mine: str
+) -> None:
+    kept = tmp_path / "t" / mine
+    kept.parent.mkdir(parents=True)
+    kept.write_text("mine", encoding="utf-8")
+    for flag in ("--csv", "--ros2bag"):
+        words = ["export", str(run_file), flag, str(tmp_path / "t"), "--force"]
+        assert cli.main(words) == 2
+        assert kept.read_text(encoding="utf-8") == "mine"
+
+
+def test_the_folder_of_the_record_is_refused_whatever_it_is_called(
+    run_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(run_file.parent)
+    for out in (".", str(run_file.parent), str(run_file.parent.parent), ".."):
+        assert cli.main(["export", str(run_file), "--csv", out, "--force"]) == 2
     assert run_file.exists()

@@ -15,7 +15,16 @@ from hypothesis import strategies as st
 from services.simulator.led_hand import HEIGHTS, PITCHES
 from shared.exceptions import FleetError
 from tools.fleet import gamepad
-from tools.fleet.gamepad import AXES, BUTTONS, EV_ABS, EV_KEY, Gamepad, open_pad
+from tools.fleet.gamepad import (
+    AXES,
+    BUTTONS,
+    EV_ABS,
+    EV_KEY,
+    EV_SYN,
+    SYN_DROPPED,
+    Gamepad,
+    open_pad,
+)
 from tools.fleet.pilot import (
     ASSIST_RATE,
     DEAD_ZONE,
@@ -68,13 +77,19 @@ class FakePad:
         self._read, self._write = os.pipe()
         self._events: list[SimpleNamespace] = []
         self.gone = False
+        self.at: dict[int, int] = {}
+        self.down: list[int] = []
 
     def fileno(self) -> int:
         return self._read
 
     def absinfo(self, axis: int) -> SimpleNamespace:
         trigger = axis in (AXES["lefttrigger"], AXES["righttrigger"])
-        return SimpleNamespace(min=0 if trigger else -32768, max=255 if trigger else 32767)
+        low, high = (0, 255) if trigger else (-32768, 32767)
+        return SimpleNamespace(value=self.at.get(axis, 0), min=low, max=high)
+
+    def active_keys(self) -> list[int]:
+        return self.down
 
     def read(self) -> Iterator[SimpleNamespace]:
         os.read(self._read, 100)
@@ -112,6 +127,32 @@ def test_sticks_and_buttons_are_read_and_forward_is_forward() -> None:
 def test_before_a_trigger_is_touched_it_asks_for_nothing() -> None:
     """A pad tells an axis only once it moves."""
     assert Gamepad(FakePad()).deflection.assist == 0.0
+
+
+@pytest.mark.parametrize("trigger", ["lefttrigger", "righttrigger"])
+def test_a_trigger_that_was_tapped_asks_for_nothing_more(trigger: str) -> None:
+    """At rest it is at the end of its way, not in the middle."""
+    device = FakePad()
+    pad = Gamepad(device)
+    for value in (200, 0):
+        device.send(EV_ABS, AXES[trigger], value)
+    pad.wait(0.1)
+    assert pad.deflection.assist == pytest.approx(0.0, abs=1e-9)
+
+
+def test_after_a_loss_of_events_the_dead_mans_button_is_to_be_pressed_again() -> None:
+    device = FakePad()
+    pad = Gamepad(device)
+    device.send(EV_KEY, BUTTONS["rightshoulder"], 1)
+    device.send(EV_ABS, AXES["lefty"], -32768)
+    pad.wait(0.1)
+    device.at[AXES["lefty"]] = 0
+    device.down = [BUTTONS["b"]]
+    device.send(EV_SYN, SYN_DROPPED, 0)
+    pad.wait(0.1)
+    assert not pad.held
+    assert pad.stopped, "its press may be among what was lost"
+    assert pad.deflection.height == pytest.approx(0.0, abs=1e-4)
 
 
 def test_the_stop_is_kept_however_short_it_is_pressed() -> None:
@@ -155,4 +196,5 @@ def test_the_codes_are_the_kernels() -> None:
     assert {name: getattr(ecodes, code) for name, code in names.items()} == dict(BUTTONS)
     axes = {"lefty": "ABS_Y", "righty": "ABS_RY", "lefttrigger": "ABS_Z", "righttrigger": "ABS_RZ"}
     assert {name: getattr(ecodes, code) for name, code in axes.items()} == dict(AXES)
-    assert (EV_KEY, EV_ABS) == (ecodes.EV_KEY, ecodes.EV_ABS)
+    assert (EV_SYN, EV_KEY, EV_ABS) == (ecodes.EV_SYN, ecodes.EV_KEY, ecodes.EV_ABS)
+    assert SYN_DROPPED == ecodes.SYN_DROPPED

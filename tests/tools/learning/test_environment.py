@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
+from gymnasium.error import InvalidAction, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from services.planner.certificate import Certificate
@@ -90,6 +90,25 @@ def test_who_steps_before_the_reset_or_closes_twice_is_told(env: BalanceEnv) -> 
     env.close()
     with pytest.raises(ResetNeeded):
         env.step(np.zeros(ACTIONS))
+
+
+def test_after_the_end_it_asks_for_a_reset_and_does_not_wait(env: BalanceEnv) -> None:
+    env.reset(seed=1)
+    while not env.step(np.zeros(ACTIONS))[3]:
+        pass
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros(ACTIONS))
+    env.reset(seed=2)
+
+
+@pytest.mark.parametrize("action", [np.zeros(35), np.full(ACTIONS, np.nan), np.zeros((1, ACTIONS))])
+def test_an_action_that_is_none_raises_and_the_episode_goes_on(
+    env: BalanceEnv, action: np.ndarray
+) -> None:
+    env.reset(seed=1)
+    with pytest.raises(InvalidAction):
+        env.step(action)
+    env.step(np.zeros(ACTIONS))
 
 
 def margin(robot: RobotConfig, certificate: Certificate, q: np.ndarray, D: np.ndarray) -> float:

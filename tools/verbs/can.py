@@ -1,0 +1,241 @@
+"""`xrl can`: bring the CAN buses up, listen to them, measure how long drives take to answer."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import subprocess
+from collections.abc import Mapping
+from typing import Final
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from shared.can.cansimple import AxisState
+from shared.config.files import load
+from shared.config.robot_config import RobotConfig, expand
+from shared.config.sections import CanConfig
+from shared.exceptions import DriveError, FleetError
+from tools.bringup import check_robot
+from tools.bringup.can_monitor import (
+    BusTraffic,
+    NodeTraffic,
+    RoundTrips,
+    listen,
+    long_enough,
+    mean_ms,
+    round_trips,
+)
+from tools.bringup.check_can import bus_nodes
+from tools.bringup.check_socketcan import setup_commands
+from tools.bringup.reach import drives_within_reach
+from tools.number_arguments import count, finite
+from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+
+COMMAND_S: Final = 10.0
+REQUESTS: Final = 200
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "can",
+        """
+        xrl can setup --config lab.toml             # prints the commands
+        sudo xrl can setup --config lab.toml --apply
+        xrl can test --config lab.toml --for 5      # listens, sends nothing
+        xrl can latency --config lab.toml           # asks each axis 200 times; the fleet is down
+        """,
+    )
+    actions = parser.add_subparsers(metavar="ACTION", required=True, dest="action")
+    setup = actions.add_parser("setup", help="bring the kernel's CAN interfaces up")
+    add_config(setup)
+    setup.add_argument(
+        "--apply", action="store_true", help="run the commands, as root; else they are printed"
+    )
+    test = actions.add_parser("test", help="listen: which drives and sensors send how often")
+    latency = actions.add_parser("latency", help="how long each axis takes to answer")
+    for looks in (test, latency):
+        add_config(looks)
+        add_run_dir(looks)
+        looks.add_argument("--bus", metavar="NAME", help="only this one of the robot file")
+    test.add_argument("--for", dest="for_s", type=finite, metavar="S", help="listen so long")
+    latency.add_argument(
+        "--count", type=count, default=REQUESTS, metavar="N", help=f"requests an axis ({REQUESTS})"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do it; 1 if a drive or sensor is missing, or a command failed."""
+    robot = load(args.config)
+    if args.action == "setup":
+        return _set_up(robot, apply=args.apply)
+    buses = _buses(robot, args.bus)
+    with drives_within_reach(robot, args.config, args.run_dir, ()):
+        if args.action == "latency":
+            return _measure(robot, args, buses)
+        return _listen(robot, args, buses)
+
+
+def _buses(robot: RobotConfig, only: str | None) -> dict[str, tuple[int, ...]]:
+    """Return the nodes of each bus that is asked for.
+
+    Raises:
+        FleetError: there is none of that name.
+    """
+    known = {name: tuple(nodes) for name, nodes in bus_nodes(robot).items()}
+    if only is None:
+        return known
+    if only not in known:
+        raise FleetError(f"--bus {only}: the robot has {', '.join(known)}")
+    return {only: known[only]}
+
+
+def _set_up(robot: RobotConfig, *, apply: bool) -> int:
+    names = sorted(
+        {
+            robot.can[name].channel
+            for name in robot.buses
+            if robot.can[name].interface == "socketcan"
+        }
+    )
+    if not names:
+        print("nothing to bring up: no bus of this robot file is a socketcan interface")
+        return 0
+    for name in names:
+        for words in setup_commands(name):
+            print(shlex.join(words))
+            if apply and not _ran(words):
+                return 1
+    if not apply:
+        print(
+            "# printed only; --apply runs them, as root. deploy/udev/92-can.rules does it at boot"
+        )
+    return 0
+
+
+def _ran(words: list[str]) -> bool:
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=COMMAND_S, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise FleetError(f"{shlex.join(words)}: {error}; package iproute2 has `ip`") from None
+    if done.returncode != 0:
+        Console(stderr=True).print(
+            f"[red]{escape(done.stderr.strip())}[/]; as root? is it plugged in?"
+        )
+    return done.returncode == 0
+
+
+def _listen(
+    robot: RobotConfig, args: argparse.Namespace, buses: Mapping[str, tuple[int, ...]]
+) -> int:
+    console, complete = Console(), True
+    for name, nodes in buses.items():
+        seconds = args.for_s or long_enough(robot.drive.heartbeat_period_ms if nodes else 0)
+        bus = _expanded(robot, name, args)
+        traffic = listen(
+            bus, nodes, poll_nodes=False,
+            cells=name == robot.harness.bus,
+            imu=robot.imu.fitted and name == robot.imu.bus, seconds=seconds,
+        )  # fmt: skip
+        console.print(_heading(name, bus, traffic), highlight=False, soft_wrap=True)
+        if traffic.trouble:
+            complete = False
+            continue
+        if nodes:
+            console.print(_node_table(robot, traffic))
+        complete &= all(traffic.nodes[node].heartbeats_s for node in nodes)
+        if name == robot.harness.bus:
+            console.print(f"  load cells: {_rate(traffic.samples_s, traffic.seconds)}")
+            complete &= bool(traffic.samples_s)
+        if robot.imu.fitted and name == robot.imu.bus:
+            console.print(f"  IMU: {_rate(traffic.attitudes_s, traffic.seconds)}")
+            complete &= bool(traffic.attitudes_s)
+    return 0 if complete else 1
+
+
+def _heading(name: str, bus: CanConfig, traffic: BusTraffic) -> str:
+    which = f"[bold]{name}[/] ({bus.interface} {escape(bus.channel)})"
+    if traffic.trouble:
+        return f"{which}: [red]{escape(traffic.trouble)}[/]"
+    errors = f", [red]{traffic.error_frames} error frames[/]" if traffic.error_frames else ""
+    hz = traffic.frames / traffic.seconds
+    return f"{which}: {hz:.0f} frames/s{errors}"
+
+
+def _node_table(robot: RobotConfig, traffic: BusTraffic) -> Table:
+    owners = {
+        node: f"{module.name}.axis{axis}"
+        for module in robot.module
+        for axis, node in enumerate(module.node_ids)
+    }
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("node", "axis", "state", "heartbeat ms", "estimates ms", "turns"):
+        table.add_column(heading, no_wrap=True)
+    for node, axis in sorted(traffic.nodes.items()):
+        state = "[red]silent[/]"
+        if axis.heartbeat is not None:
+            known = axis.heartbeat.axis_state in set(AxisState)
+            state = AxisState(axis.heartbeat.axis_state).name if known else "?"
+        turns = "-" if axis.pos_turns is None else f"{axis.pos_turns:.3f}"
+        owner = owners.get(node, "[red]nobody's[/]")
+        table.add_row(str(node), owner, state, *_periods(axis), turns)
+    return table
+
+
+def _periods(axis: NodeTraffic) -> tuple[str, str]:
+    heartbeat, estimates = (
+        f"{mean_ms(times):.1f}" if len(times) > 1 else "-"
+        for times in (axis.heartbeats_s, axis.estimates_s)
+    )
+    return heartbeat, estimates
+
+
+def _rate(times_s: list[float], seconds: float) -> str:
+    return f"{len(times_s) / seconds:.0f} Hz" if times_s else "[red]silent[/]"
+
+
+def _measure(
+    robot: RobotConfig, args: argparse.Namespace, buses: Mapping[str, tuple[int, ...]]
+) -> int:
+    """Ask each axis, and print how long it takes.
+
+    Raises:
+        FleetError: joint services are up.
+    """
+    up = check_robot.joint_services(check_robot.services_up(robot, args.run_dir))
+    if up:
+        raise FleetError(
+            f"{', '.join(up)}: up, and a request would feed a drive's watchdog; `xrl down` first"
+        )
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("bus", "node", "median ms", "p99 ms", "largest ms", "lost"):
+        table.add_column(heading, justify="left" if heading == "bus" else "right", no_wrap=True)
+    complete = True
+    for name, nodes in buses.items():
+        try:
+            found = round_trips(_expanded(robot, name, args), nodes, args.count) if nodes else {}
+        except DriveError as error:
+            raise FleetError(f"bus {name}: {error}; `xrl can setup`, `xrl doctor`") from None
+        for node, trips in found.items():
+            table.add_row(name, str(node), *_percentiles(trips), str(trips.lost or ""))
+            complete &= bool(trips.times_ms)
+    Console().print(table)
+    return 0 if complete else 1
+
+
+def _percentiles(trips: RoundTrips) -> tuple[str, str, str]:
+    ordered = sorted(trips.times_ms)
+    if not ordered:
+        return "-", "-", "-"
+    chosen = (ordered[len(ordered) // 2], ordered[(99 * len(ordered)) // 100], ordered[-1])
+    middle, late, latest = (f"{value:.2f}" for value in chosen)
+    return middle, late, latest
+
+
+def _expanded(robot: RobotConfig, name: str, args: argparse.Namespace) -> CanConfig:
+    bus = robot.can[name]
+    return CanConfig(interface=bus.interface, channel=expand(bus.channel, args.run_dir))
