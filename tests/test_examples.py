@@ -60,6 +60,16 @@ def test_the_lqr_leads_in_the_planners_place_and_the_robot_stands_when_it_is_kil
     assert "STOOD" in done.stdout
 
 
+def test_a_controller_that_is_not_there_leaves_nothing_behind(tmp_path: Path) -> None:
+    words = ["sim", "--controller", "nowhere.py", "--out", str(tmp_path / "run")]
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.cli", *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "nowhere.py: --controller: no such file" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
     shipped, gentle = (line.split() for line in run("own_operator.py").splitlines())
     force, height = 2, 8

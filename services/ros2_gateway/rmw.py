@@ -13,6 +13,7 @@ In tokens each / of a name is written %.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import struct
 from typing import Final, Literal, NamedTuple, TypeAlias
@@ -67,12 +68,11 @@ def domain(text: str) -> int:
     """Return a domain from a command line.
 
     Raises:
-        ValueError: it is none: 0 to 232.
+        argparse.ArgumentTypeError: it is none: 0 to 232.
     """
-    number = int(text)
-    if not 0 <= number <= DOMAIN_MAX:
-        raise ValueError(text)
-    return number
+    if not (text.strip().isdecimal() and int(text) <= DOMAIN_MAX):
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: a domain is from 0 to {DOMAIN_MAX}")
+    return int(text)
 
 
 def dds_type(name: str) -> str:

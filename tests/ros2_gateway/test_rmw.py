@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -86,5 +88,9 @@ def test_type_hashes_are_those_of_another_implementation(distribution: str, name
 
 @pytest.mark.parametrize("text", ["-1", "233", "x", "1.5", ""])
 def test_a_domain_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"."):
+    with pytest.raises(argparse.ArgumentTypeError, match="from 0 to 232"):
         rmw.domain(text)
+
+
+def test_a_domain_is_a_number_from_0_to_232() -> None:
+    assert [rmw.domain(text) for text in ("0", "7", "232")] == [0, 7, 232]

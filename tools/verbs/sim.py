@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from services.planner.controller_file import controller_maker
 from services.simulator.plant import plant_from
 from shared.bus import topics
 from shared.bus.messages import SimTruth
@@ -88,6 +89,8 @@ def run(args: argparse.Namespace) -> int:
     hand = _path_of(args.hand) if args.hand is not None else ()
     if args.controller is not None and args.control != SHIPPED:
         raise RunError("--controller and --control: one of them says who computes the torques")
+    if args.controller is not None:
+        controller_maker(args.controller, robot)  # refused before anything is written
     network = Impairment(delay_ms=args.delay, jitter_ms=args.jitter, loss=args.loss)
     out = experiment.make_out(args.out, "sim")
     experiment.introduce(scenario, console)
