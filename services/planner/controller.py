@@ -68,7 +68,7 @@ class Observation(NamedTuple):
     T: Array
     """Joint rates per unit of p with closed legs (12, 6), at the law's reference pose."""
     wrench: Wrench | None
-    """Of the person on the torso, at the harness, torso axes; None: not known now."""
+    """Wrench of the person on the torso, at the harness, torso axes; None if unknown."""
     request: OperatorRequest
     """Assist and shift that the operator requests."""
     law: LawOutput
@@ -76,7 +76,7 @@ class Observation(NamedTuple):
 
 
 class Controller(Protocol):
-    """A controller; made anew with each planner."""
+    """A controller; each planner makes its own."""
 
     def reset(self, seen: Observation) -> None:
         """Begin at a pose; called at every tick in which the planner does not lead."""

@@ -5,7 +5,7 @@ So it is while the capture point, or the place where HOLD on this action would c
 the edge of the soles: a controller that leads the robot over smoothly breaks no bound of a joint,
 and made it fall.
 A controller that raises, or returns what is no action, is not asked again: all hold until the
-planner is started anew. Steps, references and torques beyond bounds are the joint services' to
+planner is restarted. Steps, references and torques beyond bounds are the joint services' to
 refuse (`services.joint.envelope`).
 """
 

@@ -88,8 +88,8 @@ class Gateway:
         self._sends = [
             (topic, round(NS_PER_S / rate_hz), make) for topic, rate_hz, make in sends if rate_hz
         ]
-        self.figures: Mapping[str, object] = {}
-        """What `/diagnostics` tells of the gateway itself."""
+        self.figures: Callable[[], Mapping[str, object]] = dict
+        """Asked with each `/diagnostics`: what it tells of the gateway itself."""
 
     @property
     def sent_topics(self) -> list[RosTopic]:
@@ -159,5 +159,5 @@ class Gateway:
             self._states(now_ns),
             self._status(now_ns),
             self._at(topics.WRENCH, "", now_ns),
-            self.figures,
+            self.figures(),
         )

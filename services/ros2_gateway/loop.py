@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from services.ros2_gateway.conversions import NOT_STOPPED
 from services.ros2_gateway.gateway import Gateway
-from services.ros2_gateway.inbound import Inbound
+from services.ros2_gateway.inbound import SOURCE, Inbound
 from services.ros2_gateway.rmw import RosTopic
 from services.ros2_gateway.ros_session import RosLink
 from shared.bus.messages import Estop, JointState, OperatorIntent, PlannerStatus
@@ -28,6 +28,7 @@ class GatewayLoop:
     def __init__(self, gateway: Gateway, inputs: Sequence[Input], link: RosLink) -> None:
         """Take the robot's subscribers and the link with ROS 2."""
         self._gateway, self._inputs, self._link = gateway, inputs, link
+        gateway.figures = self.figures
         self._inbound: Inbound | None = None
         self._intents: Publisher[OperatorIntent] | None = None
         self._stops: Publisher[Estop] | None = None
@@ -65,7 +66,6 @@ class GatewayLoop:
         ros = self._link.session
         if self._inbound is not None and ros is not None:
             self._pass_on(self._inbound, ros.take(), now_ns)
-        self._gateway.figures = self.figures()
         for outgoing in self._gateway.due(now_ns, unix_ns):
             if ros is not None:
                 ros.put(*outgoing)
@@ -94,5 +94,5 @@ class GatewayLoop:
             self._intents.put(intent)
             self.passed += 1
         if inbound.stop_due(now_ns, list(self._modes.values()), N_MODULES):
-            self._stops.put(Estop(t_ns=now_ns, seq=self.passed, source="ros2_gateway"))
+            self._stops.put(Estop(t_ns=now_ns, seq=self.passed, source=SOURCE))
             self.passed += 1

@@ -112,7 +112,7 @@ class RoundTrips(NamedTuple):
     """How long an axis takes to answer."""
 
     times_ms: tuple[float, ...]
-    """Of each answer."""
+    """Round trip of each answer, ms."""
     lost: int
     """Requests without an answer in `ANSWER_S`."""
 

@@ -208,7 +208,7 @@ def _time(row: tuple[int, Any]) -> int:
 
 
 def _add_column(found: dict[str, Column], name: str, kind: Any, read: Callable[[Any], Any]) -> None:
-    """Add a field's column, or those of its elements; what is no plain value becomes JSON."""
+    """Add a field's column, or those of its elements; any other value becomes JSON."""
     elements = get_args(kind)
     if kind in (int, float, bool, str):
         found[name] = Column(read, kind)

@@ -100,7 +100,7 @@ class Gamepad:
             self._look_again()
 
     def _look_again(self) -> None:
-        """Read what is down after a loss; the dead man's button counts once it is pressed anew."""
+        """Read what is down after a loss; the dead man's button counts once it is pressed again."""
         self._down.clear()
         self.stopped |= self._stop in self._device.active_keys()
         for axis in self._values:
