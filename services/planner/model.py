@@ -112,3 +112,31 @@ class BodyInertia:
         # the torso moves so that the right foot stays; T keeps the left foot in place too
         rates[:6] = -np.linalg.solve(J_foot[:, :6], J_foot[:, 6:] @ rates[6:])
         return np.asarray(rates.T @ M @ rates, float)
+
+
+class HangingLegs:
+    """Joint-space statics and inertia of a torso that hangs still, upright, feet in the air."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Load the model."""
+        self._model = load_pinocchio(config)
+        self._model.armature = np.zeros(self._model.nv)
+        self._data = self._model.createData()
+
+    def inertia(self, q: Array) -> Array:
+        """Return the inertia about each joint (12,), kg m^2, the others held; without its rotor.
+
+        Args:
+            q: joint angles (12,), rad.
+        """
+        M = pin.crba(self._model, self._data, q_tree(q, self._model))
+        return np.asarray(np.diag(M)[6 + _TREE_OF_LEG.ravel()], float)
+
+    def torque(self, q: Array) -> Array:
+        """Return the torques that hold the legs up (12,), N m.
+
+        Args:
+            q: joint angles (12,), rad.
+        """
+        tau = pin.computeGeneralizedGravity(self._model, self._data, q_tree(q, self._model))
+        return np.asarray(tau[6 + _TREE_OF_LEG.ravel()], float)

@@ -110,7 +110,9 @@ class LoadedStand:
         """Torso twist per joint rate of each leg (6, 6), linear before angular."""
         D_left = kinematics.D_left
         weight = config.torso_mass * GRAVITY
-        self._W = [weight * shares[:, 2] for shares in (np.eye(6) - D_left, D_left)]
+        arm_x, arm_y = _torso_com(config, kinematics.p[3:])[:2]
+        torso = np.array([0.0, 0.0, weight, weight * arm_y, -weight * arm_x, 0.0])
+        self._W = [shares @ torso for shares in (np.eye(6) - D_left, D_left)]
         """Torso wrench on each leg (6,), N and N m at the torso's origin."""
         F_O = np.zeros(6)
         F_O[2] = config.total_mass * GRAVITY
@@ -275,6 +277,20 @@ def equivalent_slope(config: RobotConfig, force_n: float) -> float:
 
 def _horizontal(direction: tuple[float, float]) -> Array:
     return np.array([*direction, 0.0, 0.0, 0.0, 0.0])
+
+
+def _torso_com(config: RobotConfig, angles: Array) -> Array:
+    """Return the torso's centre of mass from its origin (3,), m, world.
+
+    Args:
+        config: the robot.
+        angles: roll, pitch and yaw of the torso (3,), rad; R = Rz(yaw) Rx(roll) Ry(pitch).
+    """
+    (s_x, s_y, s_z), (c_x, c_y, c_z) = np.sin(angles), np.cos(angles)
+    R_z = np.array([[c_z, -s_z, 0.0], [s_z, c_z, 0.0], [0.0, 0.0, 1.0]])
+    R_x = np.array([[1.0, 0.0, 0.0], [0.0, c_x, -s_x], [0.0, s_x, c_x]])
+    R_y = np.array([[c_y, 0.0, s_y], [0.0, 1.0, 0.0], [-s_y, 0.0, c_y]])
+    return np.asarray(R_z @ R_x @ R_y @ np.array(config.torso_com), float)
 
 
 def _limits(config: RobotConfig) -> list[_Limit]:

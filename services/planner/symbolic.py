@@ -225,6 +225,8 @@ class _Pose(NamedTuple):
     r_harness: ca.SX
     E_inverse: ca.SX
     rotation: ca.SX
+    arm_com: ca.SX | None
+    """From the torso's origin to its centre of mass, world; None: it is the origin."""
 
 
 def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
@@ -242,6 +244,11 @@ def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
     knee_fraction = config.mass.module / config.total_mass
     r_com = torso_fraction * r_torso + knee_fraction * (right.r_knee + left.r_knee)
     J_com = torso_fraction * J_torso[:3, :] + knee_fraction * ca.horzcat(right.J_knee, left.J_knee)
+    arm_com = None
+    if any(config.torso_com):
+        arm_com = rotation @ ca.DM(config.torso_com)
+        r_com += torso_fraction * arm_com
+        J_com -= torso_fraction * ca.skew(arm_com) @ J_torso[3:, :]
     angles = _angles(rotation)
     E_inverse = _angle_rates_from_omega(angles[0], angles[2])
     arm = rotation @ ca.DM(config.geometry.harness_point)
@@ -255,6 +262,7 @@ def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
         r_harness=r_torso + arm,
         E_inverse=E_inverse,
         rotation=rotation,
+        arm_com=arm_com,
     )
 
 
@@ -274,9 +282,11 @@ def _hessian(
     knee_force = config.mass.module / config.total_mass * F[:3]
     force = torso_fraction * F[:3] + F_harness
     moment = pose.E_inverse.T @ F[3:] + ca.cross(pose.r_harness - pose.r_torso, F_harness)
+    if pose.arm_com is not None:
+        moment += torso_fraction * ca.cross(pose.arm_com, F[:3])
     wrench = ca.vertcat(force, moment)
     left_share = D_left @ wrench
-    by_rotation = _by_rotation(config, pose.rotation, F[3:], F_harness)
+    by_rotation = _by_rotation(config, pose.rotation, F, F_harness)
     blocks = []
     for leg, leg_wrench in zip(legs, (wrench - left_share, left_share), strict=True):
         block = ca.SX.zeros(N_LEG, N_LEG)
@@ -293,12 +303,19 @@ def _hessian(
     return ca.diagcat(*blocks)
 
 
-def _by_rotation(config: RobotConfig, rotation: ca.SX, moment: ca.SX, F_harness: ca.SX) -> ca.SX:
-    """Return the Hessian (3, 3) of moment . angles + F_harness . arm by a small rotation."""
+def _by_rotation(config: RobotConfig, rotation: ca.SX, F: ca.SX, F_harness: ca.SX) -> ca.SX:
+    """Return the Hessian (3, 3) of the work of F and F_harness by a small rotation.
+
+    It is that of moment . angles + F_harness . arm, plus the torso's part of the force times its
+    centre of mass.
+    """
     turn = ca.SX.sym("turn", 3)
     turned = _rotation(turn) @ rotation
     arm = turned @ ca.DM(config.geometry.harness_point)
-    work = ca.dot(moment, _angles(turned)) + ca.dot(F_harness, arm)
+    work = ca.dot(F[3:], _angles(turned)) + ca.dot(F_harness, arm)
+    if any(config.torso_com):
+        fraction = config.torso_mass / config.total_mass
+        work += fraction * ca.dot(F[:3], turned @ ca.DM(config.torso_com))
     return ca.substitute(ca.hessian(work, turn)[0], turn, ca.SX.zeros(3))
 
 

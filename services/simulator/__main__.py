@@ -68,6 +68,13 @@ def main() -> int:
         help="how the true robot differs from the robot file: realistic (default), ideal, a TOML "
         "file, or one value; may be given several times",
     )
+    parser.add_argument(
+        "--lifted",
+        type=float,
+        default=0.0,
+        metavar="M",
+        help="hang the robot this much higher, its feet clear of the floor (0: soles on it)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
     arguments = parser.parse_args()
     logger = log.setup("simulator")
@@ -108,7 +115,7 @@ def main() -> int:
         imu = None
         if robot.imu.fitted:
             imu = ImuFront(robot.imu, true_plant.imu, hubs[robot.imu.bus], arguments.seed)
-        world = World(body_of(robot, true_plant), scenario)
+        world = World(body_of(robot, true_plant), scenario, arguments.lifted)
         logger.info("up, %s, scenario %s", granted, scenario.name)
         freeze_garbage()
         loop = SimulatorLoop(robot, world, bank, front, usb, (harness, imu), ports)

@@ -30,8 +30,14 @@ Array = NDArray[np.float64]
 class World:
     """The simulated robot and what acts on it."""
 
-    def __init__(self, body: Body, scenario: Scenario) -> None:
-        """Put the robot on its feet at the stand height, held by the hoist."""
+    def __init__(self, body: Body, scenario: Scenario, lifted: float = 0.0) -> None:
+        """Put the robot at its stand height, held by the hoist.
+
+        Args:
+            body: the true robot.
+            scenario: what happens.
+            lifted: the hoist holds it this much higher, m; 0: the soles rest on the floor.
+        """
         self._scenario = scenario
         self.model = body.model
         self.data = mujoco.MjData(self.model)
@@ -54,6 +60,7 @@ class World:
         self._damping = self.model.dof_damping
         self._dt: float = self.model.opt.timestep
         self._harness_point = body.harness_point
+        self._torso_com: list[float] = self.model.body_ipos[self._torso].tolist()
         self._hoist = Hoist(body.weight, body.hoist_s)
         self.time = 0.0
         self._start_time = math.inf
@@ -78,6 +85,7 @@ class World:
         # the hoist hangs from above: on a slope it holds the torso aside of the floor's normal
         self._placement.stand_up(body.stand_q, self._lean)
         self._actuation.settle(self.data.qpos[self._q_index])
+        self.data.qpos[2] += lifted
         self._hoist.position = self.data.qpos[:3].copy()
 
     def stand_at(self, q: Array) -> None:
@@ -215,6 +223,11 @@ class World:
         x, y, z = self._harness_point
         arm_x = r[0] * x + r[1] * y + r[2] * z
         arm_y = r[3] * x + r[4] * y + r[5] * z
+        # MuJoCo applies outside forces at the body's centre of mass, which a plant may move
+        x, y, z = self._torso_com
+        com_x = r[0] * x + r[1] * y + r[2] * z
+        com_y = r[3] * x + r[4] * y + r[5] * z
+        x, y, z = self._harness_point
         self.hand = HandForce(0.0, 0.0)
         if self._hand_on and self._hoist.share == 0.0:
             height = float(self._qpos[2]) + r[6] * x + r[7] * y + r[8] * z
@@ -240,13 +253,15 @@ class World:
             self.push[0],
             self.push[1],
             self.push[2] + f,
-            r[1] * m + arm_y * f,
-            r[4] * m - arm_x * f,
+            r[1] * m + (arm_y - com_y) * f,
+            r[4] * m - (arm_x - com_x) * f,
             r[7] * m,
         )
         if self._hoist.share > 0.0:
             rotation = self.data.xmat[self._torso].reshape(3, 3)
-            wrench += self._hoist.advance(self._qpos[:3], rotation, self._torso_rates, self._dt)
+            hoist = self._hoist.advance(self._qpos[:3], rotation, self._torso_rates, self._dt)
+            hoist[3:] -= np.cross(rotation @ self._torso_com, hoist[:3])
+            wrench += hoist
 
     def truth(self, t_ns: int, real_time_factor: float, late_s: float) -> SimTruth:
         """Return the world as it is, for the log and the verdict."""

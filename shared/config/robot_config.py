@@ -149,6 +149,13 @@ class RobotConfig(Section, frozen=True):
         return 2 * self.mass.module + 2 * self.mass.battery + self.mass.payload
 
     @property
+    def torso_com(self) -> tuple[float, float, float]:
+        """Centre of mass of torso and payload, m, torso axes: of all else it is 0."""
+        fraction = self.mass.payload / self.torso_mass
+        x, y, z = self.mass.payload_com
+        return fraction * x, fraction * y, fraction * z
+
+    @property
     def total_mass(self) -> float:
         """m_total of the paper in kg."""
         return self.torso_mass + 4 * self.mass.module

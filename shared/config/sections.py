@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from shared.config.toml_file import Range, Section
 
 Mass = Annotated[float, Range(0.0, 200.0, "kg")]
+PayloadPlace = Annotated[float, Range(-0.3, 0.3, "m")]
 Length = Annotated[float, Range(0.005, 2.0, "m")]
 Share = Annotated[float, Range(0.0, 1.0, "1")]
 Rate = Annotated[float, Range(1.0, 8000.0, "Hz")]
@@ -23,6 +24,8 @@ class MassConfig(Section, frozen=True):
     battery: Mass
     payload: Mass
     payload_max: Mass
+    payload_com: tuple[PayloadPlace, PayloadPlace, PayloadPlace] = (0.0, 0.0, 0.0)
+    """Centre of the payload, m, torso axes, from the torso's origin; `xrl identify` measures it."""
 
 
 class GeometryConfig(Section, frozen=True):

@@ -72,6 +72,8 @@ def inputs_of(config: RobotConfig) -> dict[str, Any]:
     flat = {
         f"{section}.{key}": value for section, part in table.items() for key, value in part.items()
     }
+    if not any(config.mass.payload_com):
+        del flat["mass.payload_com"]  # younger than schedules that are still right
     plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(flat))
     return plain
 

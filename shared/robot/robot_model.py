@@ -42,6 +42,7 @@ def mjcf(config: RobotConfig) -> str:
     geometry = config.geometry
     legs = "".join(_leg(config, side) for side in SIDES)
     harness = _numbers(*geometry.harness_point)
+    torso_inertia = box_inertia(config.torso_mass, geometry.torso_size)
     return f"""<mujoco model="{config.name}">
   <compiler angle="radian" autolimits="true"/>
   <option gravity="0 0 -{GRAVITY}" timestep="{config.simulation.timestep}"
@@ -55,7 +56,7 @@ def mjcf(config: RobotConfig) -> str:
           contype="1" conaffinity="1"/>
     <body name="torso" pos="0 0 {config.simulation.stand_height}">
       <freejoint name="torso"/>
-      {_inertial(config.torso_mass, box_inertia(config.torso_mass, geometry.torso_size))}
+      {_inertial(config.torso_mass, torso_inertia, _numbers(*config.torso_com))}
       <geom name="torso" type="box" size="{_numbers(*(s / 2 for s in geometry.torso_size))}"/>
       <site name="harness" pos="{harness}"/>{legs}
     </body>

@@ -36,7 +36,8 @@ def urdf(config: RobotConfig) -> str:
     geometry = config.geometry
     torso = ET.SubElement(root, "link", name="torso")
     size = geometry.torso_size
-    _add_inertial(torso, config.torso_mass, box_inertia(config.torso_mass, size))
+    inertia = box_inertia(config.torso_mass, size)
+    _add_inertial(torso, config.torso_mass, inertia, config.torso_com)
     _add_visual(torso, "box", size=_numbers(size))
     _add_fixed(root, "torso", "harness", geometry.harness_point)
     for side in SIDES:

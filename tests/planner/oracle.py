@@ -73,6 +73,12 @@ def masses(config: RobotConfig) -> tuple[float, float]:
     return m_torso, m_torso + 4 * mass.module
 
 
+def mass_centre(config: RobotConfig, one: Leg) -> Array:
+    """Return the torso's centre of mass, m: modules and batteries at its origin, payload beside."""
+    place = np.array(config.mass.payload_com)
+    return one.torso + one.R @ (config.mass.payload * place) / masses(config)[0]
+
+
 def com(config: RobotConfig, q: Array, torso: Array) -> Array:
     """Return r_COM (paper's equation) for a torso centre given, m."""
     m_torso, m_total = masses(config)
@@ -95,7 +101,7 @@ def euler(R: Array) -> Array:
 def pose(config: RobotConfig, q: Array, side: int = RIGHT) -> Array:
     """Return p (6,) with the torso as one leg carries it: exact where the legs agree."""
     one = leg(config, side, q)
-    return np.concatenate([com(config, q, one.torso), euler(one.R)])
+    return np.concatenate([com(config, q, mass_centre(config, one)), euler(one.R)])
 
 
 def rotation_vector(R: Array) -> Array:
@@ -205,7 +211,7 @@ def feasible(config: RobotConfig, q: Array) -> Array:
 
 def potential_energy(config: RobotConfig, q: Array) -> float:
     """Return m g z_COM in J, the torso in the middle of what the legs say."""
-    torso = 0.5 * (leg(config, RIGHT, q).torso + leg(config, LEFT, q).torso)
+    torso = 0.5 * sum(mass_centre(config, leg(config, side, q)) for side in (RIGHT, LEFT))
     return masses(config)[1] * GRAVITY * float(com(config, q, torso)[2])
 
 

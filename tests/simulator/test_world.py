@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import msgspec
+import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from services.simulator.body import body_of
-from services.simulator.plant import IDEAL
+from services.simulator.plant import IDEAL, changed
 from services.simulator.world import World
 from shared.bus.messages import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
@@ -272,3 +273,31 @@ def test_two_worlds_stepped_alike_are_the_same_to_the_bit(robot: RobotConfig) ->
     np.testing.assert_array_equal(one.data.qvel, other.data.qvel)
     assert seen(one) == seen(other)
     assert one.hoist == 0.0
+
+
+def test_the_hand_acts_at_the_harness_point_wherever_the_payload_is(robot: RobotConfig) -> None:
+    """MuJoCo takes outside forces at the centre of mass, which is elsewhere then."""
+    plant = changed(IDEAL, {"body.com_offset": [0.05, -0.04, 0.03]})
+    scenario = msgspec.structs.replace(
+        STAND, hand=True, keyframe=(Keyframe(at=0.0, height=1.25, assist=50.0),)
+    )
+    world = World(body_of(robot, plant), scenario)
+    world.let_off_hoist()
+    world.start()
+    world.step(IDLE)
+    model, data = world.model, world.data
+    mujoco.mj_forward(model, data)
+    torso = model.body("torso").id
+    at = data.site("harness").xpos
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, jacobian, None, at, torso)
+    rotation = data.xmat[torso].reshape(3, 3)
+    force = rotation @ np.array(world.harness_force)
+    assert np.linalg.norm(force) > 10.0
+    by_hand = jacobian[:, :6].T @ force
+    wrench = data.xfrc_applied[torso]
+    com, turning = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    mujoco.mj_jacBodyCom(model, data, com, turning, torso)
+    applied = com[:, :6].T @ wrench[:3] + turning[:, :6].T @ wrench[3:]
+    applied[3:] -= rotation.T @ (rotation @ np.array(world.harness_moment))
+    np.testing.assert_allclose(applied, by_hand, atol=0.1)  # the step has turned it a little

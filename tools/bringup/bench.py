@@ -72,13 +72,25 @@ def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFlee
 
 @contextlib.contextmanager
 def drives_to_ourselves(
-    robot: RobotConfig, config_path: Path, run_dir: Path, progress: Callable[[str], None]
+    robot: RobotConfig,
+    config_path: Path,
+    run_dir: Path,
+    progress: Callable[[str], None],
+    *,
+    lifted: float = 0.0,
 ) -> Iterator[bool]:
     """Have the drives within reach, and no new fleet on them, for a while.
 
     A fleet that is up is left as it is. If none is and the robot is an emulated one, its
     simulator runs for the while; if the drives are real the run directory is held, so that
     none is started meanwhile.
+
+    Args:
+        robot: what stands in the robot file.
+        config_path: the robot file.
+        run_dir: of the fleet.
+        progress: is told what was started.
+        lifted: the simulator that is started hangs the robot this much higher, m.
 
     Yields:
         True if the simulator was started.
@@ -88,7 +100,9 @@ def drives_to_ourselves(
     """
     with contextlib.ExitStack() as stack:
         stack.enter_context(reach.no_fleet_meanwhile(robot, run_dir))
-        started = stack.enter_context(reach.drives_within_reach(robot, config_path, run_dir))
+        started = stack.enter_context(
+            reach.drives_within_reach(robot, config_path, run_dir, lifted=lifted)
+        )
         if started:
             progress(
                 "no fleet is up and the drives are emulated: their simulator runs for the while"

@@ -14,7 +14,7 @@ from shared.bus.messages import Pair
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
-from tools.bringup.jogging import STRAYED_MAX, Jog, JogPlan, Sample, duration_s, outside
+from tools.bringup.jogging import STRAYED_MAX, Jog, MotionPlan, Sample, outside
 
 ANSWER_S: Final = 3.0
 """Longest wait for a drive's first words."""
@@ -97,7 +97,7 @@ def jog_drive(
     drive: Drive,
     robot: RobotConfig,
     module: str,
-    plan: JogPlan,
+    plan: MotionPlan,
     *,
     q_seen: Pair,
     interrupts: Interrupts,
@@ -118,7 +118,7 @@ def jog_drive(
     """
     samples: list[Sample] = []
     try:
-        reading = _arm(drive, interrupts, clock)
+        reading = arm(drive, interrupts, clock)
         if isinstance(reading, str):
             trouble = reading
         else:
@@ -127,14 +127,14 @@ def jog_drive(
             if not trouble:
                 jog = Jog(robot, module, plan, q, clock())
                 samples = jog.samples
-                give_up_ns = clock() + _ns(duration_s(plan) + 5.0)
+                give_up_ns = clock() + _ns(plan.duration_s + 5.0)
                 _move(drive, jog, interrupts, progress, clock, give_up_ns)
                 trouble = jog.trouble
     except BaseException as error:
-        if not _idle(drive, clock):
+        if not idle(drive, clock):
             error.add_note(NOT_IDLE)
         raise
-    return JogResult(samples, trouble, _idle(drive, clock))
+    return JogResult(samples, trouble, idle(drive, clock))
 
 
 def _strayed(q: Pair, q_seen: Pair) -> str:
@@ -171,8 +171,8 @@ def _move(
             progress(jog.samples[-1])
 
 
-def _arm(drive: Drive, interrupts: Interrupts, clock: Clock) -> DriveReading | str:
-    """Return the first armed reading, or why there is none."""
+def arm(drive: Drive, interrupts: Interrupts, clock: Clock) -> DriveReading | str:
+    """Arm a drive; return its first armed reading, or why there is none."""
     reading: DriveReading | None = None
     for _ in range(ARM_TRIES):
         drive.arm(onboard=True)
@@ -190,7 +190,7 @@ def _arm(drive: Drive, interrupts: Interrupts, clock: Clock) -> DriveReading | s
     return f"it does not arm: {reading.status.name}, error 0x{reading.error:x} (`xrl doctor`)"
 
 
-def _idle(drive: Drive, clock: Clock) -> bool:
+def idle(drive: Drive, clock: Clock) -> bool:
     """Idle both axes and wait until the drive says so; return False if it does not."""
     for attempt in range(1, IDLE_TRIES + 1):
         drive.idle()

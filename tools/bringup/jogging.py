@@ -8,7 +8,7 @@ torque, whatever happens to this process. Pure; `jog_drive` has the clock and th
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import msgspec
 
@@ -20,6 +20,7 @@ from services.joint.torque_limiter import TorqueLimits, limit_torque, limits_of
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.config.sections import StandGains
 from shared.exceptions import DriveError
 from shared.robot.joints import AXES, kind_of
 
@@ -46,18 +47,84 @@ SIBLING_MAX: Final = 0.02
 """rad that the other axis may move."""
 
 
+class MotionPlan(Protocol):
+    """A motion of one axis about where the joint is found."""
+
+    @property
+    def axis(self) -> int:
+        """0: phi, 1: theta."""
+
+    @property
+    def torque_limit(self) -> float:
+        """N m at the joint: |tau_phi| + |tau_theta|."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long the whole takes."""
+
+    @property
+    def reach(self) -> tuple[Pair, Pair]:
+        """Lowest and highest offset that phi, and that theta, is led to, rad."""
+
+    @property
+    def rate_max(self) -> float:
+        """Fastest rate that it asks for, rad/s."""
+
+    def gains(self, stand: StandGains) -> tuple[Pair, Pair]:
+        """Return k_p, N m/rad, and k_d, N m s/rad, of (phi, theta).
+
+        Args:
+            stand: of the module.
+        """
+
+    def offset(self, t_s: float) -> tuple[Pair, Pair]:
+        """Return the offsets of (phi, theta), rad, and their rates, rad/s.
+
+        Args:
+            t_s: since the drive was armed, s.
+        """
+
+
 class JogPlan(NamedTuple):
-    """The motion."""
+    """There and back: by/2 (1 - cos) along the axis, between two rests."""
 
     axis: int
-    """0: phi, 1: theta."""
     by: float
     """rad, there and back."""
     period_s: float
     """Period of one motion there and back, s."""
     cycles: int
     torque_limit: float
-    """N m at the joint: |tau_phi| + |tau_theta|."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long the whole takes."""
+        return SETTLE_S + self.cycles * self.period_s + SETTLE_S
+
+    @property
+    def reach(self) -> tuple[Pair, Pair]:
+        """Lowest and highest offset that phi, and that theta, is led to, rad."""
+        moved = (min(0.0, self.by), max(0.0, self.by))
+        return (moved, pd_law.ZERO) if self.axis == 0 else (pd_law.ZERO, moved)
+
+    @property
+    def rate_max(self) -> float:
+        """Fastest rate that it asks for, rad/s."""
+        return math.pi * abs(self.by) / self.period_s
+
+    def gains(self, stand: StandGains) -> tuple[Pair, Pair]:
+        """Return the stand gains."""
+        return stand.k_p, stand.k_d
+
+    def offset(self, t_s: float) -> tuple[Pair, Pair]:
+        """Return the offsets of (phi, theta), rad, and their rates, rad/s, at a time, s."""
+        moving_s = t_s - SETTLE_S
+        if not 0.0 <= moving_s <= self.cycles * self.period_s:
+            return pd_law.ZERO, pd_law.ZERO
+        omega = 2.0 * math.pi / self.period_s
+        way = 0.5 * self.by * (1.0 - math.cos(omega * moving_s))
+        rate = 0.5 * self.by * omega * math.sin(omega * moving_s)
+        return ((way, 0.0), (rate, 0.0)) if self.axis == 0 else ((0.0, way), (0.0, rate))
 
 
 class Sample(NamedTuple):
@@ -69,6 +136,8 @@ class Sample(NamedTuple):
     q: Pair
     tau: Pair
     """Requested torque at this sample, N m at the joint."""
+    tau_before: Pair = pd_law.ZERO
+    """Torque at this sample by the target before it, which the drive had up to now."""
 
 
 class JogCheck(NamedTuple):
@@ -81,7 +150,7 @@ class JogCheck(NamedTuple):
     good: bool
 
 
-def gentle(robot: RobotConfig, plan: JogPlan) -> RobotConfig:
+def gentle(robot: RobotConfig, plan: MotionPlan) -> RobotConfig:
     """Return the robot with its drives limited to the plan's torque and speed.
 
     A motor's torque is at most T / 2N, so that |tau_phi| + |tau_theta| <= T in the drive.
@@ -97,7 +166,7 @@ def gentle(robot: RobotConfig, plan: JogPlan) -> RobotConfig:
             f"--torque-limit {plan.torque_limit:g}: {per_ampere:.1f} .. {most:.1f} N m are right "
             "(one ampere, and what the robot file allows)"
         )
-    asked = math.pi * abs(plan.by) / plan.period_s * joint.gear_ratio / (2.0 * math.pi)
+    asked = plan.rate_max * joint.gear_ratio / (2.0 * math.pi)
     speed = min(drive.vel_limit, max(VEL_LIMIT, VEL_FACTOR * asked))
     limited = msgspec.structs.replace(
         drive, current_lim=plan.torque_limit / per_ampere, vel_limit=speed
@@ -105,20 +174,22 @@ def gentle(robot: RobotConfig, plan: JogPlan) -> RobotConfig:
     return msgspec.structs.replace(robot, drive=limited)
 
 
-def outside(robot: RobotConfig, module: str, plan: JogPlan, q: Pair) -> str:
+def outside(robot: RobotConfig, module: str, plan: MotionPlan, q: Pair) -> str:
     """Return why the joint may not go where the plan leads it from q, rad; "" if it may."""
     limits = limits_of(robot, module)
     for axis, (low, high) in enumerate((limits.phi, limits.theta)):
-        to = q[axis] + (plan.by if axis == plan.axis else 0.0)
+        reach = [q[axis] + offset for offset in plan.reach[axis]]
         if not low <= q[axis] <= high:
             return (
                 f"{AXES[axis]} is at {q[axis]:.3f} rad, outside of {low:g} .. {high:g} rad; bring "
                 "it inside by hand, or correct its zero (`xrl zero`)"
             )
-        if not low <= to <= high:
+        beyond = [to for to in reach if not low <= to <= high]
+        if beyond:
             return (
-                f"{AXES[axis]} is at {q[axis]:.3f} rad and would go to {to:.3f}, outside of "
-                f"{low:g} .. {high:g} rad; jog the other way (--by {-plan.by:g})"
+                f"{AXES[axis]} is at {q[axis]:.3f} rad and would go to {beyond[0]:.3f}, outside of "
+                f"{low:g} .. {high:g} rad; move it the other way (a jog: --by with the other "
+                "sign), or bring the joint elsewhere by hand"
             )
     return ""
 
@@ -151,7 +222,7 @@ class Jog:
     """
 
     def __init__(
-        self, robot: RobotConfig, module: str, plan: JogPlan, q: Pair, now_ns: int
+        self, robot: RobotConfig, module: str, plan: MotionPlan, q: Pair, now_ns: int
     ) -> None:
         """Begin at q, rad, with a drive that has just been armed.
 
@@ -162,8 +233,7 @@ class Jog:
             q: where the joint was found.
             now_ns: monotonic time.
         """
-        stand = robot.stand_gains(module)
-        self._k_p, self._k_d = stand.k_p, stand.k_d
+        self._k_p, self._k_d = plan.gains(robot.stand_gains(module))
         limits = limits_of(robot, module)
         self._limits: TorqueLimits = msgspec.structs.replace(
             limits, tau_module_max=min(plan.torque_limit, limits.tau_module_max)
@@ -174,6 +244,7 @@ class Jog:
         self._start_ns = self._received_ns = now_ns
         self._at_limit_s: float | None = None
         self._tau: Pair = pd_law.ZERO
+        self._setpoint: pd_law.Setpoint | None = None
         self.trouble = ""
         self.done = False
         self.samples: list[Sample] = []
@@ -196,16 +267,27 @@ class Jog:
             return None
         q = joint_from_motor(reading.pos_turns, self._gear_ratio)
         v = joint_from_motor(reading.vel_turns, self._gear_ratio)
-        q_ref, v_ref = reference(self._plan, self._q_start, t_s)
+        q_ref, v_ref = self._reference(t_s)
+        before = self._setpoint or pd_law.Setpoint(
+            q, pd_law.ZERO, pd_law.ZERO, pd_law.ZERO, self._k_p, self._k_d
+        )
+        tau_before = pd_law.torque(before, q, v)
         setpoint = pd_law.Setpoint(q_ref, v_ref, pd_law.ZERO, pd_law.ZERO, self._k_p, self._k_d)
         self._tau = limit_torque(pd_law.torque(setpoint, q, v), q, self._tau, self._limits)
-        self.samples.append(Sample(t_s, q_ref, q, self._tau))
+        self._setpoint = setpoint
+        self.samples.append(Sample(t_s, q_ref, q, self._tau, tau_before))
         self.trouble = self._watch(t_s, q_ref, q)
-        self.done = t_s > duration_s(self._plan)
+        self.done = t_s > self._plan.duration_s
         if self.trouble:
             return None
         pos, vel = reading.pos_turns, reading.vel_turns
         return self._onboard.target(now_ns, setpoint, self._tau, pos, vel)
+
+    def _reference(self, t_s: float) -> tuple[Pair, Pair]:
+        """Return q_ref, rad, and v_ref, rad/s."""
+        (by_phi, by_theta), v_ref = self._plan.offset(t_s)
+        phi, theta = self._q_start
+        return (phi + by_phi, theta + by_theta), v_ref
 
     def _watch(self, t_s: float, q_ref: Pair, q: Pair) -> str:
         """Return what speaks against going on; "" if nothing does."""
@@ -228,30 +310,11 @@ class Jog:
         return ""
 
 
-def duration_s(plan: JogPlan) -> float:
-    """Return how long the whole takes."""
-    return SETTLE_S + plan.cycles * plan.period_s + SETTLE_S
-
-
-def reference(plan: JogPlan, q_start: Pair, t_s: float) -> tuple[Pair, Pair]:
-    """Return q_ref, rad, and v_ref, rad/s: q + by/2 (1 - cos) along the axis, between two rests."""
-    moving_s = t_s - SETTLE_S
-    if not 0.0 <= moving_s <= plan.cycles * plan.period_s:
-        return q_start, pd_law.ZERO
-    omega = 2.0 * math.pi / plan.period_s
-    way = 0.5 * plan.by * (1.0 - math.cos(omega * moving_s))
-    rate = 0.5 * plan.by * omega * math.sin(omega * moving_s)
-    phi, theta = q_start
-    if plan.axis == 0:
-        return (phi + way, theta), (rate, 0.0)
-    return (phi, theta + way), (0.0, rate)
-
-
 def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
     """Return the verdict on a jog that came to its end."""
     axis, other = plan.axis, 1 - plan.axis
     rest = [s for s in samples if s.t_s < SETTLE_S][-20:]
-    moving = [s for s in samples if SETTLE_S <= s.t_s <= duration_s(plan) - SETTLE_S]
+    moving = [s for s in samples if SETTLE_S <= s.t_s <= plan.duration_s - SETTLE_S]
     if not rest or not moving:
         return [
             JogCheck("samples", f"{len(rest)} at rest, {len(moving)} moving", "some of both", False)

@@ -98,7 +98,12 @@ def is_up(run_dir: Path) -> bool:
 
 @contextlib.contextmanager
 def drives_within_reach(
-    robot: RobotConfig, config_path: Path, run_dir: Path, plants: Sequence[str] = ()
+    robot: RobotConfig,
+    config_path: Path,
+    run_dir: Path,
+    plants: Sequence[str] = (),
+    *,
+    lifted: float = 0.0,
 ) -> Iterator[bool]:
     """Have the drives there for a while; yields True if the simulator was started for it.
 
@@ -109,6 +114,7 @@ def drives_within_reach(
         config_path: the robot file.
         run_dir: of the fleet.
         plants: settings that the emulated drives have kept, as `--drive-setting` takes them.
+        lifted: a simulator that is started hangs the robot this much higher, m.
 
     Raises:
         FleetError: the simulator cannot be started, or it ended meanwhile, or the robot file has
@@ -121,6 +127,8 @@ def drives_within_reach(
     simulator: SupervisedFleet | None = None
     if not is_up(run_dir):
         words = [word for planted in plants for word in ("--drive-setting", planted)]
+        # a light foot in the air on a damped drivetrain wants a finer step than a standing robot
+        words += ["--lifted", f"{lifted:g}", "--plant", "steps=4"] if lifted else []
         simulator = SupervisedFleet.start(
             config_path,
             run_dir,

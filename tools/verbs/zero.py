@@ -34,6 +34,8 @@ from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 DEGREES_FROM: Final = 7.0
 """No joint has an angle of so many rad: more than a turn."""
+CORRECTION_MAX: Final = 0.1
+"""rad; more is no error of a protractor."""
 _NEGATIVE = re.compile(r"-\.?\d")
 
 HEARD_S: Final = 2.0
@@ -49,6 +51,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
         xrl zero ankle_right --at -0.02,0.14
         xrl zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
+        xrl zero knee_left --by 0,-0.009        # corrects a zero, as `xrl identify body` tells
         """,
     )
     which = parser.add_mutually_exclusive_group(required=True)
@@ -62,6 +65,11 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     # "-0.02,0.14" is a value and no option, as a single negative number is to argparse
     parser._negative_number_matcher = _NEGATIVE  # noqa: SLF001 - no public way
+    where.add_argument(
+        "--by",
+        metavar="PHI,THETA",
+        help="the joint is this much farther, rad, than its present zero says",
+    )
     where.add_argument(
         "--standing",
         type=finite,
@@ -81,12 +89,16 @@ def run(args: argparse.Namespace) -> int:
     path = bench.robot_file(args)
     robot = config_file.load_without_schedule(path)
     wanted = angles_of(args, robot, console)
-    holders = {module: bench.service_on(robot, module, args.run_dir) for module in wanted}
+    by = None if args.by is None else _pair("--by", args.by)
+    modules = tuple(wanted) or (args.module,)
+    holders = {module: bench.service_on(robot, module, args.run_dir) for module in modules}
     with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
         refuse_services(robot, holders)
         with contextlib.ExitStack() as stack:
-            drives = {module: _open(robot, module, args.run_dir, stack) for module in wanted}
+            drives = {module: _open(robot, module, args.run_dir, stack) for module in modules}
             before = _look_all(robot, drives)
+            if by is not None:
+                wanted = corrected(before, by, robot)
             console.print(plan_table(wanted, before))
             _warn(wanted, holders, console)
             if not bench.confirm("Are the joints at these angles now?", yes=args.yes):
@@ -101,17 +113,19 @@ def run(args: argparse.Namespace) -> int:
 
 
 def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) -> dict[str, Pair]:
-    """Return the position (phi, theta), rad, of each selected module.
+    """Return the position (phi, theta), rad, of each selected module; none yet for `--by`.
 
     Raises:
         DriveError: the value is not two angles, or one is outside the limits.
         RunError: there is no such stand.
     """
     modules = MODULES if args.all else (args.module,)
+    if args.all and args.standing is None:
+        raise DriveError("--at and --by are for one module; for all give --standing HEIGHT")
+    if args.by is not None:
+        return {}
     if args.at is not None:
-        if args.all:
-            raise DriveError("--at is for one module; for all give --standing HEIGHT")
-        wanted = {args.module: _pair(args.at)}
+        wanted = {args.module: _pair("--at", args.at)}
     else:
         from tools.bringup.standing import standing  # noqa: PLC0415 - takes a second
 
@@ -125,6 +139,31 @@ def angles_of(args: argparse.Namespace, robot: RobotConfig, console: Console) ->
     for module, q in wanted.items():
         if fault := outside(robot, module, q):
             raise DriveError(f"{module}: {fault}{_if_degrees(q)}")
+    return wanted
+
+
+def corrected(before: Mapping[str, DriveLook], by: Pair, robot: RobotConfig) -> dict[str, Pair]:
+    """Return where modules are if they are farther than their present zeros say.
+
+    Args:
+        before: the drives as they are.
+        by: how much farther, (phi, theta), rad.
+        robot: its limits.
+
+    Raises:
+        DriveError: a drive has no zero that could be corrected, or it would be beyond its limits.
+    """
+    if not all(abs(part) <= CORRECTION_MAX for part in by):  # so that a NaN is refused
+        raise DriveError(
+            f"--by: at most {CORRECTION_MAX:g} rad either way is a correction; measure, and --at"
+        )
+    wanted = {}
+    for module, seen in before.items():
+        if not seen.zeroed:
+            raise DriveError(f"{module}: it has no zero to correct; give --at PHI,THETA")
+        wanted[module] = (seen.q[0] + by[0], seen.q[1] + by[1])
+        if fault := outside(robot, module, wanted[module]):
+            raise DriveError(f"{module}: {fault}")
     return wanted
 
 
@@ -259,11 +298,11 @@ def _way_out(module: str, mode: Mode) -> str:
     )
 
 
-def _pair(text: str) -> Pair:
+def _pair(option: str, text: str) -> Pair:
     try:
         phi, theta = (float(part) for part in text.split(","))
     except ValueError:
-        raise DriveError(f"--at {text!r}: write phi and theta in rad, such as 0,-0.5") from None
+        raise DriveError(f"{option} {text!r}: write phi and theta in rad, such as 0,-0.5") from None
     return phi, theta
 
 

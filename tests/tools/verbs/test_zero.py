@@ -205,7 +205,7 @@ def test_angles_outside_of_the_limits_are_refused(
 
 def asked(**changes: object) -> argparse.Namespace:
     fields = {"module": MODULE, "all": False, "at": None, "standing": None}
-    return argparse.Namespace(**{**fields, **changes})
+    return argparse.Namespace(**{"by": None, **fields, **changes})
 
 
 @pytest.mark.parametrize(
@@ -281,3 +281,24 @@ def test_without_a_terminal_yes_must_be_given(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(FleetError, match="--yes"):
         bench.confirm("sure?", yes=False)
     assert bench.confirm("sure?", yes=True)
+
+
+def test_a_correction_goes_on_from_the_zero_that_is_there(robot: RobotConfig) -> None:
+    wanted = verb.corrected({"knee_left": STILL}, (0.01, -0.02), robot)
+    assert wanted == {"knee_left": pytest.approx((0.01, -1.02))}
+
+
+@pytest.mark.parametrize(
+    ("seen", "by", "words"),
+    [
+        (STILL._replace(zeroed=False), (0.0, 0.01), "no zero to correct.*--at"),
+        (STILL, (0.0, 0.11), "at most 0.1"),
+        (STILL, (math.nan, 0.0), "at most 0.1"),
+        (STILL._replace(q=(0.0, -0.21)), (0.0, 0.05), "outside"),
+    ],
+)
+def test_what_is_no_correction_is_refused(
+    robot: RobotConfig, seen: DriveLook, by: Pair, words: str
+) -> None:
+    with pytest.raises(XrlError, match=words):
+        verb.corrected({"knee_left": seen}, by, robot)

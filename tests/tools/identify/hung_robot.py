@@ -1,0 +1,87 @@
+"""The simulated robot on its hoist, feet in the air, in virtual time: each drive as a `Drive`."""
+
+from __future__ import annotations
+
+from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveCommand
+from services.joint.drivers.base import DriveReading, MotorTarget
+from services.simulator.axis_bank import AxisBank
+from services.simulator.body import body_of
+from services.simulator.plant import PlantConfig
+from services.simulator.world import World
+from shared.bus.messages import Pair
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Scenario
+from shared.robot.joints import MODULES
+from tools.runs.virtual_drive import VirtualDrive
+
+STEP_NS = NS_PER_S // 1000
+STAND = Scenario("stand", "nothing", 10.0, (Keyframe(0.0, 1.188),))
+
+
+class HungRobot:
+    """World and axes; whoever reads a drive moves time on."""
+
+    def __init__(self, robot: RobotConfig, plant: PlantConfig) -> None:
+        self.now_ns = NS_PER_S
+        self.world = World(body_of(robot, plant), STAND, lifted=0.2)
+        self.bank = AxisBank(
+            robot.drive,
+            encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,
+            motor_signs=robot.motor_signs(),
+        )
+        self.drives = {
+            name: HungDrive(self, VirtualDrive(
+                self.bank, index, robot.drive, robot.module_named(name).motor_signs, self.now_ns
+            ))
+            for index, name in enumerate(MODULES)
+        }  # fmt: skip
+        for _ in range(1500):
+            self.step()
+
+    def step(self) -> None:
+        """Move on by a millisecond."""
+        self.torque = self.bank.step(self.world.time, *self.world.motor_turns())
+        self.world.step(self.torque)
+        self.now_ns += STEP_NS
+
+    def clock(self) -> int:
+        return self.now_ns
+
+
+class HungDrive:
+    """One drive of it (`services.joint.drivers.base.Drive`)."""
+
+    def __init__(self, robot: HungRobot, drive: VirtualDrive) -> None:
+        self._robot, self._drive = robot, drive
+        self.never_arms = False
+
+    def read(self, timeout_s: float) -> DriveReading | None:
+        assert timeout_s > 0.0
+        for _ in range(2):
+            self._robot.step()
+        return self._drive.read(self._robot.now_ns)
+
+    def write(self, target: MotorTarget) -> None:
+        self._do(DriveCommand.TARGET, target)
+
+    def arm(self, *, onboard: bool) -> None:
+        assert onboard
+        if not self.never_arms:
+            self._do(DriveCommand.ARM)
+
+    def idle(self) -> None:
+        self._do(DriveCommand.IDLE)
+
+    def write_torque(self, torque: Pair) -> None:
+        raise AssertionError(torque)
+
+    def set_position(self, turns: Pair) -> None:
+        raise AssertionError(turns)
+
+    def close(self) -> None:
+        pass
+
+    def _do(self, command: DriveCommand, target: MotorTarget | None = None) -> None:
+        action = DriveAction(None, command, (0.0, 0.0), target, ArmingInhibit.NONE)
+        self._drive.carry_out(action, onboard=True)

@@ -1,0 +1,152 @@
+"""Small sines of one joint: on a bench joint, and on a leg of the simulated robot."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from services.joint.drivers.base import DriveStatus
+from services.simulator.plant import PlantConfig, changed
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import DriveError
+from tests.tools.identify.hung_robot import HungRobot
+from tests.tools.verbs.bench_drive import START, BenchDrive
+from tools.bringup import jog_drive
+from tools.bringup.jogging import gentle
+from tools.identify import joint_drive
+from tools.identify.estimates import JointResult, Verdict, changes, measured, of_joints
+from tools.identify.sines import SinePlan, fit_sines, plan_for
+
+MODULE = "ankle_left"
+
+
+def test_the_plan_is_smooth_stays_in_its_reach_and_ends_where_it_began() -> None:
+    plan = plan_for(1, 15.0, 9.4, 88.0, bias=(0.0, -0.3))
+    t = np.linspace(0.0, plan.duration_s, 60001)
+    q, v = np.array([[pair[1] for pair in plan.offset(float(one))] for one in t]).T
+    assert (q[0], q[-1]) == pytest.approx((0.0, 0.0), abs=1e-12)
+    low, high = plan.reach[1]
+    assert low - 1e-9 <= q.min()
+    assert max(q.max(), 0.0) <= max(high, 0.0) + 1e-9
+    assert np.abs(v).max() <= 1.2 * plan.rate_max + 0.3
+    np.testing.assert_allclose(np.gradient(q, t), v, atol=2e-3)
+
+
+def test_heavy_joints_are_moved_slowly_and_within_the_torque() -> None:
+    light, heavy = plan_for(0, 15.0, 0.17, 0.0), plan_for(0, 15.0, 15.0, 134.0)
+    assert max(tone.frequency_hz for tone in heavy.tones) < 1.0
+    assert light.tones[0].amplitude > heavy.tones[0].amplitude
+    for tone in heavy.tones:
+        assert 134.0 * tone.amplitude < 15.0
+
+
+@pytest.mark.parametrize(("friction", "axis"), [(1.0, 0), (0.4, 1)])
+def test_a_bench_joint_has_the_inertia_and_friction_that_it_has(
+    robot: RobotConfig, friction: float, axis: int
+) -> None:
+    plan = plan_for(axis, 15.0, 0.5, 0.0)
+    limited = gentle(robot, plan)
+    drive = BenchDrive(limited)
+    drive.friction = friction
+    result = jog_drive.jog_drive(
+        drive, limited, "knee_left", plan, q_seen=START, interrupts=jog_drive.Interrupts(),
+        progress=lambda _: None, clock=drive.clock,
+    )  # fmt: skip
+    assert (result.trouble, result.is_idle) == ("", True)
+    fit = fit_sines(result.samples, plan)
+    assert fit is not None
+    for truth, (value, sd) in ((0.5, fit.inertia), (0.5, fit.viscous), (friction, fit.dry)):
+        assert abs(value - truth) < 1.96 * sd
+    assert fit_sines(result.samples[:3000], plan) is None
+
+
+def moved(
+    hung: HungRobot, robot: RobotConfig, module: str, axis: int
+) -> tuple[JointResult, SinePlan]:
+    leg = {name: hung.drives[name] for name in joint_drive.leg_of(module)}
+    interrupts = jog_drive.Interrupts()
+    q = joint_drive.wait_until_still(leg, robot, interrupts, hung.clock)
+    where = joint_drive.hanging(robot, q, module, axis)
+    plan = joint_drive.plan_at(robot, module, axis, 15.0, where)
+    result = joint_drive.move(
+        leg, joint_drive.limited(robot, plan), module, plan, q_seen=q, interrupts=interrupts,
+        progress=lambda _: None, clock=hung.clock,
+    )  # fmt: skip
+    assert (result.trouble, result.is_idle) == ("", True)
+    fit = fit_sines(result.samples, plan)
+    assert fit is not None
+    return JointResult(f"{module}_{'phi' if axis == 0 else 'theta'}", fit, where.inertia), plan
+
+
+def test_an_ankles_rotor_and_friction_are_found_within_their_intervals(robot: RobotConfig) -> None:
+    plant = changed(
+        PlantConfig(),
+        {
+            "steps": 4,
+            "drivetrain.rotor_inertia": 0.11,
+            "drivetrain.motor_friction": 0.5,
+            "drivetrain.motor_damping": 1.0,
+        },
+    )
+    result, _ = moved(HungRobot(robot, plant), robot, MODULE, 1)
+    rows = {row.what.split(" ankle")[0]: row for row in of_joints([result], robot)}
+    assert rows["dry friction"].describes(0.6)
+    assert rows["viscous friction"].describes(1.2)
+    assert rows["reflected inertia"].describes(0.11)
+    assert rows["reflected inertia"].verdict is Verdict.CHANGE
+    values = changes(list(rows.values()), robot)
+    assert values.keys() == {"joint.armature"}
+    assert measured(list(rows.values())) == {"joint.armature"}
+
+
+def test_a_knee_that_hangs_on_its_stop_is_led_off_it_and_its_friction_found(
+    robot: RobotConfig,
+) -> None:
+    result, plan = moved(HungRobot(robot, PlantConfig(steps=2)), robot, "knee_left", 1)
+    assert plan.bias[1] < -0.2
+    rows = {row.what.split(" knee")[0]: row for row in of_joints([result], robot)}
+    assert rows["dry friction"].describes(0.3)
+    assert rows["inertia"].verdict is Verdict.AGREES
+    # two percent of a leg are more than the rotor
+    assert rows["reflected inertia"].verdict is Verdict.UNKNOWN
+
+
+def test_a_leg_that_swings_is_waited_for_and_not_for_ever(robot: RobotConfig) -> None:
+    hung = HungRobot(robot, PlantConfig())
+    hung.world.data.qvel[6:] = 0.5
+    leg = {name: hung.drives[name] for name in joint_drive.leg_of(MODULE)}
+    interrupts = jog_drive.Interrupts()
+    interrupts.number = 2
+    with pytest.raises(DriveError, match="swings"):
+        joint_drive.wait_until_still(leg, robot, interrupts, hung.clock)
+
+
+def test_held_modules_are_idle_again_when_one_does_not_arm(robot: RobotConfig) -> None:
+    hung = HungRobot(robot, PlantConfig())
+    leg = {name: hung.drives[name] for name in joint_drive.leg_of(MODULE)}
+    q = joint_drive.wait_until_still(leg, robot, jog_drive.Interrupts(), hung.clock)
+    where = joint_drive.hanging(robot, q, MODULE, 0)
+    plan = joint_drive.plan_at(robot, MODULE, 0, 15.0, where)
+    hung.drives["hip_left"].never_arms = True
+    with pytest.raises(DriveError, match="hip_left"):
+        joint_drive.move(
+            leg, joint_drive.limited(robot, plan), MODULE, plan, q_seen=q,
+            interrupts=jog_drive.Interrupts(), progress=lambda _: None, clock=hung.clock,
+        )  # fmt: skip
+    for drive in leg.values():
+        reading = drive.read(0.02)
+        assert reading is not None
+        assert reading.status is DriveStatus.IDLE
+
+
+def test_a_torque_beyond_the_robots_is_refused(robot: RobotConfig) -> None:
+    plan = plan_for(0, 500.0, 0.17, 0.0)
+    with pytest.raises(DriveError, match="torque"):
+        joint_drive.limited(robot, plan)
+
+
+def test_limits_at_the_stops_are_wider_than_the_soft_ones(robot: RobotConfig) -> None:
+    wide = joint_drive.within_stops(robot)
+    assert wide.limits.knee.theta[1] > robot.limits.knee.theta[1]
+    assert msgspec.structs.replace(wide, limits=robot.limits) == robot

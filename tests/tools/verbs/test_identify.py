@@ -1,0 +1,121 @@
+"""`xrl identify`: on a record with planted errors, and what it refuses."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from shared.config import files as config_file
+from tests.conftest import ROBOT_FILE
+from tests.tools.exit_codes import exit_code
+
+ZEROS = "encoder.zero_errors=[0,0.004,0,-0.01,0,0.012,0,-0.004,0,0.009,0,-0.008]"
+PLANTED = (
+    "drive.torque_scale=1.05", "body.payload_scale=0.88", "body.com_offset=[0.012,-0.01,0.02]",
+    ZEROS,
+)  # fmt: skip
+PAYLOAD = 0.88 * 20.4
+TORSO = PAYLOAD + 39.66 - 20.4
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a record of the motions, in lockstep, on the realistic plant with planted errors."""
+    out = tmp_path_factory.mktemp("identify") / "run"
+    plants = [word for key in PLANTED for word in ("--plant", key)]
+    code = exit_code(["sim", "--scenario", "identify", *plants, "--out", out])
+    assert code == 0, "it stood"
+    return out / "run.mcap"
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    path = tmp_path / "lab.toml"
+    path.write_text(ROBOT_FILE.read_text(encoding="utf-8"), encoding="utf-8")
+    return path
+
+
+def test_what_was_planted_is_found_within_its_interval_and_written(
+    record: Path, lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = config_file.load_without_schedule(lab)
+    words = ["identify", "body", record, "--config", lab, "--apply", "--out", tmp_path / "fit"]
+    assert exit_code(words) == 0
+    told = capsys.readouterr().out
+    rows = {
+        match[1].strip(): (float(match[2]), float(match[3]))
+        for match in re.finditer(r"^ +(\S.*?)  +[\d.-]* +(-?[\d.]+) +± ([\d.]+)", told, re.M)
+    }
+    at = [TORSO / PAYLOAD * by for by in (0.012, -0.01, 0.02)]
+    truth = {
+        "payload": PAYLOAD,
+        "payload's centre x": at[0],
+        "payload's centre y": at[1],
+        "payload's centre z": at[2],
+        "harness point x": 0.08,
+        "harness point y": 0.0,
+        "harness point z": 0.0,
+        "torque constant": 1.05 * before.drive.torque_constant,
+        "zero knee_right_theta": -0.01,
+        "zero hip_right_theta": 0.012,
+        "zero knee_left_theta": 0.009,
+        "zero hip_left_theta": -0.008,
+        "zero ankle_right_theta": 0.004,
+        "zero ankle_left_theta": -0.004,
+    }
+    for name, value in truth.items():
+        found, half_width = rows[name]
+        assert abs(found - value) <= half_width, (name, found, half_width, value)
+    after = config_file.load_without_schedule(lab)
+    assert after.mass.payload == pytest.approx(PAYLOAD, abs=1.0)
+    assert after.mass.payload_com[0] == pytest.approx(at[0], abs=0.01)
+    assert after.drive.torque_constant == pytest.approx(1.05 * 0.0827, rel=0.03)
+    assert "drive.torque_constant" not in after.assumed
+    assert len(list(tmp_path.glob("lab.toml.*.bak"))) == 1
+    assert (tmp_path / "fit" / "identify.png").stat().st_size > 10_000
+    assert "xrl gains --config" in told
+    assert re.search(r"xrl zero knee_right --by -?0\.0\d+,0\.0(0[89]|1[012])", told)
+
+
+def test_a_dry_run_shows_the_motions_and_needs_no_robot(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert exit_code(["identify", "body", "--dry-run"]) == 0
+    told = capsys.readouterr().out
+    assert "law.shift_max" in told
+    assert "1.188" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["body", "--level", "0"], "--level"),
+        (["body", "--added", "1", "--added", "2"], "2 for 1"),
+        (["body", "--added", "-1"], "from 0 to 100"),
+        (["body", "/nowhere/run.mcap"], "/nowhere"),
+        (["joint"], "name modules, or --all"),
+        (["joint", "--all", "knee_left"], "name modules, or --all"),
+        (["joint", "shin_left"], "shin_left: one of ankle_right"),
+    ],
+)
+def test_bad_words_are_refused_in_a_line(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str], run_dir: Path
+) -> None:
+    assert exit_code(["identify", *words, "--run-dir", run_dir]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_record_without_slow_motion_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "short"
+    assert exit_code(["sim", "--scenario", "stand", "--duration", "3", "--out", out]) == 0
+    assert exit_code(["identify", "body", out]) == 2
+    assert "quasi-static moments" in capsys.readouterr().err
+
+
+def test_no_fleet_is_said_so(capsys: pytest.CaptureFixture[str], run_dir: Path) -> None:
+    assert exit_code(["identify", "body", "--run-dir", run_dir]) == 2
+    assert "no fleet" in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""What `xrl identify` measures: the body from a standing record, joints from small sines."""

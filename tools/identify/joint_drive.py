@@ -1,0 +1,203 @@
+"""Moves one joint of a hanging leg by sines, the leg's other modules held where they hang."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+
+from services.joint.differential import joint_from_motor
+from services.joint.drive_setpoint import DriveSetpointLaw
+from services.joint.drivers.base import Drive, DriveReading
+from services.joint.pd_law import ZERO, Setpoint
+from services.joint.torque_limiter import limits_of
+from services.planner.model import HangingLegs
+from shared.bus.messages import Pair
+from shared.clock import NS_PER_S
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import DriveError
+from shared.robot.joints import MODULE_INDEX, MODULES, N_JOINTS
+from shared.robot.robot_model import HARD_STOP_MARGIN
+from tools.bringup import jog_drive
+from tools.bringup.jogging import Sample, gentle
+from tools.identify.sines import SinePlan, plan_for
+
+STILL: Final = 0.004
+"""rad that a leg which hangs still moves in `STILL_FOR_S`; an idle drive may report no rate."""
+STILL_FOR_S: Final = 1.5
+"""More than half a swing of the leg."""
+STILL_WAIT_S: Final = 60.0
+INSIDE: Final = 0.12
+"""rad inside its limits that a joint is led to: room for the sines."""
+
+
+class Hanging(NamedTuple):
+    """A leg as it hangs."""
+
+    q: dict[str, Pair]
+    """Of its three modules, (phi, theta), rad."""
+    inertia: float
+    """Of what hangs on the joint by the robot file, without its rotor, kg m^2."""
+    gravity: float
+    """Its stiffness, N m/rad."""
+
+
+def leg_of(module: str) -> tuple[str, ...]:
+    """Return the modules of a module's leg."""
+    side = module.rpartition("_")[2]
+    return tuple(name for name in MODULES if name.endswith(f"_{side}"))
+
+
+def hanging(robot: RobotConfig, q: Mapping[str, Pair], module: str, axis: int) -> Hanging:
+    """Return what the robot file says of a joint of a leg that hangs at q, rad."""
+    legs, at = HangingLegs(robot), np.zeros(N_JOINTS)
+    for name, (phi, theta) in q.items():
+        index = 2 * MODULE_INDEX[name]
+        at[index], at[index + 1] = phi, theta
+    joint, by = 2 * MODULE_INDEX[module] + axis, np.zeros(N_JOINTS)
+    by[joint] = 1e-4
+    slope = (legs.torque(at + by)[joint] - legs.torque(at - by)[joint]) / 2e-4
+    return Hanging(dict(q), float(legs.inertia(at)[joint]), abs(float(slope)))
+
+
+def plan_at(robot: RobotConfig, module: str, axis: int, torque: float, where: Hanging) -> SinePlan:
+    """Return the sines of a joint, led inside its limits first.
+
+    Args:
+        robot: the robot.
+        module: its module.
+        axis: 0: phi, 1: theta.
+        torque: of the sines, N m.
+        where: it hangs.
+    """
+    bias = []
+    limits = limits_of(robot, module)
+    for value, (low, high) in zip(where.q[module], (limits.phi, limits.theta), strict=True):
+        bias.append(min(max(value, low + INSIDE), high - INSIDE) - value)
+    inertia = where.inertia + robot.joint.armature
+    return plan_for(axis, torque, inertia, where.gravity, (bias[0], bias[1]))
+
+
+def wait_until_still(
+    drives: Mapping[str, Drive],
+    robot: RobotConfig,
+    interrupts: jog_drive.Interrupts,
+    clock: jog_drive.Clock,
+) -> dict[str, Pair]:
+    """Wait until a leg hangs still; return where, (phi, theta), rad.
+
+    Args:
+        drives: of the leg, idle.
+        robot: gear ratio.
+        interrupts: end the wait.
+        clock: monotonic, ns.
+
+    Raises:
+        DriveError: it does not in a minute, somebody interrupts, or a drive does not answer.
+    """
+    begin = still_since = clock()
+    rest: dict[str, Pair] = {}
+    while True:
+        q = {}
+        for name, drive in drives.items():
+            reading = _first(drive, name, clock)
+            phi, theta = q[name] = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)
+            at = rest.get(name, (math.inf, math.inf))
+            if max(abs(phi - at[0]), abs(theta - at[1])) > STILL:
+                rest, still_since = {}, clock()
+        rest = rest or q
+        if clock() - still_since > STILL_FOR_S * NS_PER_S:
+            return q
+        if interrupts.number or clock() - begin > STILL_WAIT_S * NS_PER_S:
+            raise DriveError("the leg swings: hold it still, and again")
+
+
+def _first(drive: Drive, name: str, clock: jog_drive.Clock) -> DriveReading:
+    try:
+        return jog_drive.first_reading(drive, clock)
+    except DriveError as error:
+        raise DriveError(f"{name}: {error}") from None
+
+
+def within_stops(robot: RobotConfig) -> RobotConfig:
+    """Return the robot with limits at the mechanism's stops: a leg that hangs may rest on one."""
+    limits = {}
+    for kind in ("ankle", "knee", "hip"):
+        limit = getattr(robot.limits, kind)
+        (a, b), (c, d) = limit.phi, limit.theta
+        m = HARD_STOP_MARGIN + 0.02  # and a little: the count of an encoder
+        limits[kind] = msgspec.structs.replace(limit, phi=(a - m, b + m), theta=(c - m, d + m))
+    return msgspec.structs.replace(robot, limits=msgspec.structs.replace(robot.limits, **limits))
+
+
+def move(
+    drives: Mapping[str, Drive],
+    robot: RobotConfig,
+    module: str,
+    plan: SinePlan,
+    *,
+    q_seen: Mapping[str, Pair],
+    interrupts: jog_drive.Interrupts,
+    progress: Callable[[Sample], None],
+    clock: jog_drive.Clock,
+) -> jog_drive.JogResult:
+    """Hold the leg, move the joint, and idle all, whatever happens.
+
+    Args:
+        drives: of the leg, idle, opened with the limits of `limited`.
+        robot: as `limited` made it.
+        module: that is moved.
+        plan: the sines.
+        q_seen: joint angles when the person agreed, rad.
+        interrupts: read in every cycle.
+        progress: receives a sample now and then.
+        clock: monotonic, ns.
+
+    Raises:
+        DriveError: one of the leg's other drives does not arm.
+    """
+    with contextlib.ExitStack() as stack:
+        for name, drive in drives.items():
+            if name != module:
+                stack.enter_context(_held(drive, robot, name, interrupts, clock))
+        return jog_drive.jog_drive(
+            drives[module], robot, module, plan, q_seen=q_seen[module], interrupts=interrupts,
+            progress=progress, clock=clock,
+        )  # fmt: skip
+
+
+def limited(robot: RobotConfig, plan: SinePlan) -> RobotConfig:
+    """Return the robot with torque, speed and joint limits for a plan.
+
+    Raises:
+        DriveError: the torque is beyond the robot's.
+    """
+    return gentle(within_stops(robot), plan)
+
+
+@contextlib.contextmanager
+def _held(
+    drive: Drive,
+    robot: RobotConfig,
+    module: str,
+    interrupts: jog_drive.Interrupts,
+    clock: jog_drive.Clock,
+) -> Iterator[None]:
+    """Have a drive hold its module where it is, by its own loop."""
+    try:
+        reading = jog_drive.arm(drive, interrupts, clock)
+        if isinstance(reading, str):
+            raise DriveError(f"{module}: {reading}")
+        q = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)
+        stand = robot.stand_gains(module)
+        setpoint = Setpoint(q, ZERO, ZERO, ZERO, stand.k_p, stand.k_d)
+        law = DriveSetpointLaw(robot.joint.gear_ratio, robot.drive.vel_limit)
+        drive.write(law.target(clock(), setpoint, ZERO, reading.pos_turns, reading.vel_turns))
+        yield
+    finally:
+        if not jog_drive.idle(drive, clock):
+            raise DriveError(f"{module}: {jog_drive.NOT_IDLE}")

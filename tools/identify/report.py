@@ -1,0 +1,100 @@
+"""Tells what was identified: a table, the robot file's new lines, what to do about zeros."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from shared.exceptions import RunError
+from tools.identify.estimates import ParameterEstimate, Value, Verdict
+from tools.identify.robot_file_edit import apply
+
+_STYLES = {
+    Verdict.CHANGE: "bold yellow", Verdict.AGREES: "green", Verdict.MEASURED: "",
+    Verdict.UNKNOWN: "dim",
+}  # fmt: skip
+
+
+def estimates_table(estimates: Sequence[ParameterEstimate]) -> Table:
+    """Return the estimates as a table for the terminal."""
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column("", no_wrap=True)
+    for heading in ("robot file", "measured", "95 %"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("unit")
+    table.add_column("")
+    for row in estimates:
+        digits = row.digits
+        table.add_row(
+            row.what, "" if row.file is None else f"{row.file:.{digits}f}",
+            f"{row.value:.{digits}f}",
+            f"± {row.half_width:.{digits}f}", row.unit,
+            Text(row.verdict.value, _STYLES[row.verdict]),
+        )  # fmt: skip
+    return table
+
+
+def lines_of(values: Mapping[str, Value]) -> str:
+    """Return the robot file's new lines, by section."""
+    text, section_before = "", ""
+    for key in sorted(values):
+        section, name = key.split(".")
+        if section != section_before:
+            text += f"[{section}]\n"
+        section_before = section
+        value = values[key]
+        text += f"{name} = {list(value) if isinstance(value, tuple) else value}\n"
+    return text
+
+
+def propose(values: Mapping[str, Value], known: Collection[str], console: Console) -> None:
+    """Print the lines to write, and what is not assumed any more."""
+    if values:
+        console.print("to write into the robot file (`--apply` does, after a backup):")
+        console.print(lines_of(values), markup=False, highlight=False, end="")
+    else:
+        console.print("the robot file is right, within what was measured")
+    if known:
+        console.print(f"measured now, no longer assumed: {', '.join(sorted(known))}", style="dim")
+
+
+def write(
+    path: Path, values: Mapping[str, Value], known: Collection[str], console: Console
+) -> None:
+    """Write the new values, and say what has to follow.
+
+    Raises:
+        RunError: a file cannot be read or written.
+        ConfigError: the new values make no robot file that can be used.
+    """
+    if not values and not known:
+        console.print(f"{path}: nothing to write")
+        return
+    backup = apply(path, values, known, time.strftime("%Y%m%d-%H%M%S"))
+    console.print(f"{path}: written; as it was: {backup}")
+    if any(key in SCHEDULED or key.startswith(("mass.", "geometry.")) for key in values):
+        console.print(f"now `xrl gains --config {path}`: its schedule is another robot's")
+
+
+SCHEDULED = ("joint.armature",)
+"""Keys beside masses and lengths that the gain schedule depends on."""
+
+
+def make_folder(out: Path | None) -> Path:
+    """Make the folder for pictures; without a name, one of this time.
+
+    Raises:
+        RunError: it cannot be made.
+    """
+    out = out if out is not None else Path("out") / time.strftime("identify-%Y%m%d-%H%M%S")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+    return out

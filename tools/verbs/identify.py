@@ -1,0 +1,242 @@
+"""`xrl identify`: measure what the robot file assumes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from rich import box
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from shared.bus import topics
+from shared.bus.messages import PlannerStatus
+from shared.bus.operator_key import require_operator
+from shared.bus.session import open_session
+from shared.config import files as config_file
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Lead, Scenario
+from shared.exceptions import RunError
+from shared.process import StopFlag
+from shared.robot.joints import AXES, MODULES
+from tools.fleet.supervise import SupervisedFleet
+from tools.identify import joint_bench, report
+from tools.identify.body_fit import Record, fit
+from tools.identify.estimates import changes, measured, of_body, zero_corrections
+from tools.identify.motion import Motion
+from tools.identify.quasi_static import Moments, TimedRows, moments_of
+from tools.number_arguments import finite
+from tools.runs import experiment
+from tools.runs.recorded_robot import robot_of
+from tools.runs.run_log import RunLog, read_run
+from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+
+LEVEL_SD: Final = 0.003
+"""rad: a floor that a spirit level calls level."""
+TORQUE: Final = 15.0
+LEVEL_MAX: Final = 0.1
+WEIGHED_SD: Final = 0.1
+"""kg: a payload that was on a scale."""
+MOTIONS: Final = "identify"
+"""The scenario whose path is led."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "identify",
+        """
+        xrl identify body --dry-run                      # the motions, and nothing else
+        xrl identify body                                # lead the robot that is up, and fit
+        xrl identify body out/a/run.mcap                 # from a record of slow motions
+        xrl identify body run.mcap loaded.mcap --added 0 --added 10   # 10 kg more on the torso
+        xrl identify body run.mcap --weighed --config lab.toml --apply
+        xrl identify joint ankle_left --dry-run          # hanging, the fleet down
+        xrl identify joint ankle_left ankle_right --apply
+        xrl identify joint --all --axis theta
+        """,
+    )
+    actions = parser.add_subparsers(metavar="WHAT", required=True, dest="what")
+    body = actions.add_parser(
+        "body",
+        help="standing: payload and its centre, harness point, torque constant, encoder zeros",
+    )
+    body.add_argument(
+        "record", nargs="*", type=Path, metavar="RUN",
+        help="records of this robot, standing and led slowly; without one the robot that is up is "
+        "led through deploy/scenarios/identify.toml",
+    )  # fmt: skip
+    body.add_argument(
+        "--added", action="append", type=finite, metavar="KG",
+        help="mass on the torso beyond the robot file's, known by a scale; once for each record",
+    )  # fmt: skip
+    body.add_argument(
+        "--weighed", action="store_true",
+        help=f"the robot file's payload was on a scale, within {WEIGHED_SD:g} kg",
+    )  # fmt: skip
+    body.add_argument(
+        "--level", type=finite, default=LEVEL_SD, metavar="RAD",
+        help="how level the floor is, as a standard deviation (default: %(default)s)",
+    )  # fmt: skip
+    joint = actions.add_parser(
+        "joint",
+        help="hanging, its services down: dry and viscous friction, reflected inertia",
+    )
+    joint.add_argument("module", nargs="*", metavar="MODULE", help="which; or --all")
+    joint.add_argument("--all", action="store_true", help="all six, one joint after the other")
+    joint.add_argument("--axis", choices=AXES, help="only this one (default: both)")
+    joint.add_argument(
+        "--torque", type=finite, default=TORQUE, metavar="NM",
+        help="of the sines; what holds a leg that is bent for it comes on top (default: "
+        "%(default)s)",
+    )  # fmt: skip
+    joint.add_argument("--yes", action="store_true", help="do not ask")
+    for one in (body, joint):
+        one.add_argument("--dry-run", action="store_true", help="show the motions, move nothing")
+        one.add_argument(
+            "--apply", action="store_true",
+            help="write what changes into the robot file, after a backup of it",
+        )  # fmt: skip
+        one.add_argument(
+            "--out", type=Path, metavar="DIR", help="where the picture goes (out/identify-<time>)"
+        )
+        add_config(one)
+        add_run_dir(one)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, fit, tell, and write if it is asked for."""
+    console = Console()
+    if args.what == "joint":
+        return joint_bench.run(args, console)
+    if not 0.0 < args.level <= LEVEL_MAX:
+        raise RunError(f"--level {args.level:g}: more than 0 and at most {LEVEL_MAX:g} is right")
+    scenario = scenarios.load(experiment.scenario_file(MOTIONS))
+    if args.dry_run:
+        _show_motions(scenario, config_file.load_without_schedule(args.config), console)
+        return 0
+    added = _added(args.added, max(1, len(args.record)))
+    if args.record:
+        logs = [read_run(path) for path in args.record]
+        robot, path = robot_of(logs[0]), args.config
+        moments = [_moments_in(log) for log in logs]
+    else:
+        fleet = SupervisedFleet.attach(args.run_dir)
+        path = Path(fleet.manifest.config)
+        robot = config_file.load(path)
+        moments = [_led(robot, fleet, scenario, console)]
+    records = [Record(part, kg) for part, kg in zip(moments, added, strict=True)]
+    _fit_and_tell(args, robot, path, records, console)
+    return 0
+
+
+def _fit_and_tell(
+    args: argparse.Namespace,
+    robot: RobotConfig,
+    path: Path,
+    records: Sequence[Record],
+    console: Console,
+) -> None:
+    payload_sd = WEIGHED_SD if args.weighed else None
+    result = fit(robot, records, level_sd=args.level, payload_sd=payload_sd)
+    estimates = of_body(result, robot)
+    folder = report.make_folder(args.out)
+    from tools.identify.picture import draw_body  # noqa: PLC0415 - takes a second
+
+    picture = folder / "identify.png"
+    draw_body(estimates, result, picture)
+    console.print(report.estimates_table(estimates))
+    values, known = changes(estimates, robot), measured(estimates)
+    report.propose(values, known, console)
+    corrections = zero_corrections(estimates)
+    if corrections:
+        console.print("zeros, with the robot hung and its services DISARMED or down:")
+        for module, (phi, theta) in corrections.items():
+            console.print(f"  xrl zero {module} --by {phi:.4f},{theta:.4f}", highlight=False)
+    if args.apply:
+        report.write(path, values, known, console)
+    console.print(f"{picture}", style="dim")
+
+
+def _added(given: list[float] | None, records: int) -> list[float]:
+    """Return the added mass of each record, kg.
+
+    Raises:
+        RunError: the number of values is another, or one is no mass.
+    """
+    added = given if given is not None else [0.0] * records
+    if len(added) != records:
+        raise RunError(f"--added: {len(added)} for {records} records; once for each is right")
+    if any(not 0.0 <= kg <= 100.0 for kg in added):
+        raise RunError("--added: from 0 to 100 kg is right")
+    return added
+
+
+def _moments_in(log: RunLog) -> Moments:
+    states = [
+        TimedRows(log.received_ns(topics.JOINT_STATE, name), log.messages(topics.JOINT_STATE, name))
+        for name in MODULES
+    ]
+    wrenches = TimedRows(log.received_ns(topics.WRENCH), log.messages(topics.WRENCH))
+    return moments_of(states, wrenches)
+
+
+def _led(
+    robot: RobotConfig, fleet: SupervisedFleet, scenario: Scenario, console: Console
+) -> Moments:
+    """Lead the robot that is up; return its moments.
+
+    Raises:
+        FleetError: it is silent or does not lead.
+        RunError: it ended before its time.
+    """
+    require_operator(robot, "identify")
+    simulated = "simulator" in fleet.manifest.services
+    stop = StopFlag()
+    with open_session(robot, "identify", fleet.run.path) as session:
+        motion = Motion(robot, session, simulated=simulated)
+        if not simulated:
+            console.print("lead the torso by hand to the height and pitch that are shown")
+        with Live(console=console, refresh_per_second=4, transient=True) as shown:
+            heard = motion.go(
+                scenario,
+                lambda t_s, wanted, status: shown.update(_line(t_s, scenario, wanted, status)),
+                lambda: bool(stop),
+            )
+    if heard.ended:
+        raise RunError(f"{heard.ended}: nothing was fitted; requests fade out by themselves")
+    return moments_of(heard.states, heard.wrenches)
+
+
+def _line(t_s: float, scenario: Scenario, wanted: Lead, status: PlannerStatus) -> Text:
+    """Return where the robot is led, and where it is, as one line."""
+    x, y, roll, yaw = wanted.shift
+    return Text(
+        f"{t_s:5.1f} of {scenario.duration:g} s  height {wanted.height:.2f} m, pitch "
+        f"{wanted.pitch:+.2f} (is {status.p[4]:+.2f}) rad, assist {wanted.assist:.0f} (is "
+        f"{status.assist_n:.0f}) N, shift {1e3 * x:+.0f} {1e3 * y:+.0f} mm {roll:+.2f} {yaw:+.2f}"
+    )
+
+
+def _show_motions(scenario: Scenario, robot: RobotConfig, console: Console) -> None:
+    """Print where the robot would be led, and the limits that stay in force."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("s", "height, m", "pitch, rad", "assist, N", "x, y, mm", "roll, yaw, rad"):
+        table.add_column(heading, justify="right")
+    for row in scenario.keyframe:
+        x, y, roll, yaw = row.shift
+        table.add_row(
+            f"{row.at:g}", f"{row.height:.3f}", f"{row.pitch:g}", f"{row.assist:g}",
+            f"{1e3 * x:g}, {1e3 * y:g}", f"{roll:g}, {yaw:g}",
+        )  # fmt: skip
+    console.print(table)
+    console.print(
+        f"at most law.shift_max {list(robot.law.shift_max)} and {robot.assist.force_max:g} N; all "
+        "limits and trips stay in force; it ends when the planner stops leading"
+    )
