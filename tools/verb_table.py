@@ -49,6 +49,7 @@ VERBS: Final = (
     Verb("zero", "write each joint's position to its drive"),
     Verb("jog", "move one joint of one module a little and judge the response"),
     Verb("identify", "measure what the robot file assumes: masses, zeros, friction, scale"),
+    Verb("tune", "offset a reference by step and sines: rise, damping, margin; propose gains"),
     Verb("hosts", "run the services on several hosts: bring, check, start, look, stop"),
     Verb("keys", "make, pack, check, renew and revoke the keys of the fleet's processes"),
     Verb("info", "show what is in a log: topics, rates, gaps, losses"),

@@ -31,6 +31,7 @@ from services.planner.kinematics import Measured
 from services.planner.law_terms import LawAtReference
 from services.planner.levelling import Levelling
 from services.planner.load import Load
+from services.planner.probe import NO_ROW, ReferenceProbe
 from services.planner.reference import Reference
 from services.planner.shift import ShiftReference
 from services.planner.snapshots import LawState
@@ -94,6 +95,7 @@ class Hocca:
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
+        self._probe = ReferenceProbe(config.law.probe_max)
         self._stance = Stance(config.law.stance_max)
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
@@ -145,6 +147,7 @@ class Hocca:
         dt: float,
         *,
         shift_requested: Vector4 = STRAIGHT,
+        probe: tuple[int, float] = (NO_ROW, 0.0),
         align: bool = False,
         wrench: Wrench | None = None,
         up_torso: Vector3 | None = None,
@@ -158,6 +161,8 @@ class Hocca:
                 except in the first tick, which takes over the assist that HOLD carries.
             dt: time since the last tick, s.
             shift_requested: requested x, y (m), roll and yaw (rad) of the shift; limited here.
+            probe: row of p whose reference is offset, and by how much, m or rad
+                (`services.planner.probe`).
             align: start from the measured pose, so that engaging makes no step. p_C starts at the
                 measured pose and returns to zero (COM over the ankles, no roll, no yaw; height and
                 pitch stay) during `law.recentre_s` of ticks without `align`. A planner that was
@@ -181,8 +186,10 @@ class Hocca:
         if align or not self._aligned:
             self._align(q)
             self._shift.rest()
+            self._probe.reset()
         else:
             self._has_led = True
+            self._probe.advance(*probe, measured.p, dt)
             self._shift.advance(shift_requested, dt)
         pdot = measured.pdot
         p_C, pdot_C = self._closed_loop_reference(dt)
@@ -192,6 +199,11 @@ class Hocca:
         pdot_C[:2] += lean * pdot[2]
         p_ref = self._S_perp * p_C + self._S * measured.p
         pdot_ref = self._S_perp * pdot_C + self._S * pdot
+        row = self._probe.row
+        if row != NO_ROW:
+            if self._S[row]:
+                p_ref[row], pdot_ref[row] = self._probe.held, 0.0
+            p_ref[row] += self._probe.offset
         force, moment_pitch = None, 0.0
         if wrench is not None:
             force = force_up(wrench.force, measured.p[3], measured.p[4])
@@ -317,6 +329,7 @@ class Hocca:
             self._shift.snapshot(),
             self._stance.snapshot(),
             self._load.snapshot(),
+            self._probe.snapshot(),
         )
 
     def restore(self, state: LawState) -> None:
@@ -332,6 +345,7 @@ class Hocca:
         self._shift.restore(state.shift)
         self._stance.restore(state.stance)
         self._load.restore(state.load)
+        self._probe.restore(state.probe)
         self._apply_stance()
 
     def _apply_stance(self) -> None:

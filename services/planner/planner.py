@@ -187,6 +187,7 @@ class Planner:
             self._request.assist_n,
             dt,
             shift_requested=self._request.shift,
+            probe=(self._request.probe_row, self._request.probe),
             align=engagement.hold,
             wrench=self._usable_wrench(now_ns),
             up_torso=self._usable_up(now_ns),
@@ -404,6 +405,8 @@ class Planner:
             shift_requested=self._request.shift,
             load=self._law.load,
             requested_by=self._request.source,
+            probe_row=self._request.probe_row,
+            probe=self._request.probe,
             stance=stance,
             why=self._rival.describe()
             or self._law.stance_refusal()

@@ -7,6 +7,7 @@ import msgspec
 from services.planner.engagement_fsm import Engagement
 from services.planner.intents import OperatorRequest
 from services.planner.limp_leg_watch import LimpLegWatch
+from services.planner.probe import ProbeState
 from services.planner.rival_watch import RivalWatch
 from shared.bus.messages import (
     AS_CONFIGURED,
@@ -123,6 +124,7 @@ class LawState(msgspec.Struct, frozen=True):
     stance: tuple[Vector6, bool] = (AS_CONFIGURED, False)
     """State of `Stance`: the adopted stance, m and rad, and True if it is refused."""
     load: LoadState = LoadState()
+    probe: ProbeState = ProbeState()
 
 
 class GuardState(msgspec.Struct):

@@ -428,6 +428,10 @@ class PlannerStatus(Message, frozen=True):
     (`services.planner.load`)."""
     requested_by: str = ""
     """Source of the intent in use; empty: none, or it is stale."""
+    probe_row: int = -1
+    """Row of p that is asked to be offset; -1: none."""
+    probe: float = 0.0
+    """The offset that is asked for, m or rad."""
 
 
 class OperatorIntent(Message, frozen=True):
@@ -439,6 +443,10 @@ class OperatorIntent(Message, frozen=True):
     """Requested offset from a straight stand: COM x and y, m; torso's roll and yaw, rad."""
     source: str = ""
     """Name of the sender."""
+    probe_row: int = -1
+    """Row of p whose reference is offset to measure the answer; -1: none (`xrl tune`)."""
+    probe: float = 0.0
+    """Its offset, m or rad."""
 
 
 class HandLead(Message, frozen=True):

@@ -111,6 +111,11 @@ StanceAngle = Annotated[float, Range(0.0, 0.8, "rad")]
 Stance6 = tuple[StanceLength, StanceLength, StanceLength, StanceAngle, StanceAngle, StanceAngle]
 
 
+ProbeLength = Annotated[float, Range(0.0, 0.03, "m")]
+ProbeAngle = Annotated[float, Range(0.0, 0.1, "rad")]
+Probe6 = tuple[ProbeLength, ProbeLength, ProbeLength, ProbeAngle, ProbeAngle, ProbeAngle]
+
+
 class LawConfig(Section, frozen=True):
     """Gains and choices of the law (docs/law.md)."""
 
@@ -127,6 +132,7 @@ class LawConfig(Section, frozen=True):
     recentre_s: Seconds
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
     shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
+    probe_max: Probe6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     stance_max: Stance6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     load_correction: tuple[
         Annotated[float, Range(0.0, 50.0, "kg")], Annotated[float, Range(0.0, 100.0, "N m")]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from rich.console import Console
 from rich.live import Live
@@ -22,11 +22,12 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, FleetError, XrlError
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive, limits
-from tools.bringup.jogging import Sample, outside
+from tools.bringup.jogging import MotionPlan, Sample, outside
 from tools.identify import joint_drive, report
 from tools.identify.estimates import JointResult, changes, measured, of_joints
 from tools.identify.sines import SinePlan, fit_sines
 
+P = TypeVar("P", bound=MotionPlan)
 LIFTED: Final = 0.2
 """m; the emulated robot is hung this much higher, feet clear of the floor."""
 
@@ -39,7 +40,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     results: list[JointResult] = []
     trouble = ""
     interrupts = jog_drive.Interrupts()
-    _refuse_services(robot, modules, args.run_dir)
+    refuse_services(robot, modules, args.run_dir)
     with bench.drives_to_ourselves(robot, path, args.run_dir, console.print, lifted=LIFTED):
         for module in modules:
             for axis in axes:
@@ -75,7 +76,7 @@ def _asked(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
     return (MODULES if args.all else args.module), axes
 
 
-def _refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -> None:
+def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -> None:
     """Refuse legs that have a joint service up: a drive has one master.
 
     Raises:
@@ -98,28 +99,74 @@ def _joint(
     interrupts: jog_drive.Interrupts,
     console: Console,
 ) -> JointResult | str | None:
-    """Measure one joint; return its result, why it was stopped, or None for a dry run.
+    """Measure one joint; return its result, why it was stopped, or None for a dry run."""
+    joint = f"{module}_{AXES[axis]}"
+
+    def plan_of(where: joint_drive.Hanging) -> SinePlan:
+        plan = joint_drive.plan_at(robot, module, axis, args.torque, where)
+        console.print(_described(joint, plan))
+        return plan
+
+    moved = move_joint(args, robot, (module, axis), plan_of, interrupts, console)
+    if not isinstance(moved, Moved):
+        return moved
+    fit = fit_sines(moved.samples, moved.plan)
+    if fit is None:
+        return f"{joint}: too few samples came for a fit; look at its bus (`xrl can test`)"
+    return JointResult(joint, fit, moved.where.inertia)
+
+
+class Moved(NamedTuple, Generic[P]):
+    """A joint that was moved to the end of its plan."""
+
+    samples: list[Sample]
+    plan: P
+    where: joint_drive.Hanging
+    """The leg hung before."""
+
+
+def move_joint(
+    args: argparse.Namespace,
+    robot: RobotConfig,
+    joint: tuple[str, int],
+    plan_of: Callable[[joint_drive.Hanging], P],
+    interrupts: jog_drive.Interrupts,
+    console: Console,
+) -> Moved[P] | str | None:
+    """Look at a leg, ask, and move a joint; return why it was stopped, or None for a dry run.
+
+    Args:
+        args: of the verb: `dry_run`, `yes`, `run_dir`.
+        robot: its file.
+        joint: module and axis.
+        plan_of: returns the motion of a leg that hangs so, and tells of it.
+        interrupts: kept while drives may be armed.
+        console: to speak on.
 
     Raises:
         DriveError: a drive of the leg does not answer, or the joint may not go there.
         FleetError: nobody is there to ask, or a service has a drive.
     """
-    joint = f"{module}_{AXES[axis]}"
+    module, axis = joint
+    name = f"{module}_{AXES[axis]}"
     leg = joint_drive.leg_of(module)
-    with _open(robot, leg, args.run_dir) as drives, interrupts.kept():
+    with (
+        _open(robot, leg, args.run_dir) as drives,
+        interrupts.kept(),
+        console.status("waiting until the leg hangs still"),
+    ):
         q = joint_drive.wait_until_still(drives, robot, interrupts, now_ns)
     where = joint_drive.hanging(robot, q, module, axis)
-    plan = joint_drive.plan_at(robot, module, axis, args.torque, where)
+    plan = plan_of(where)
     limited = joint_drive.limited(robot, plan)
     if why := outside(joint_drive.within_stops(robot), module, plan, q[module]):
         raise DriveError(f"{module}: {why}")
-    console.print(_described(joint, plan))
     if args.dry_run:
         return None
     question = "Does the leg hang free, the power switch at hand?"
     if not bench.confirm(question, yes=args.yes):
         return "nothing was moved"
-    _refuse_services(robot, [module], args.run_dir)
+    refuse_services(robot, [module], args.run_dir)
     try:
         with (
             _open(limited, leg, args.run_dir) as drives,
@@ -133,7 +180,7 @@ def _joint(
                 plan,
                 q_seen=q,
                 interrupts=interrupts,
-                progress=lambda sample: shown.update(_line(sample, plan, joint)),
+                progress=lambda sample: shown.update(_line(sample, plan, name)),
                 clock=now_ns,
             )
     finally:
@@ -141,11 +188,8 @@ def _joint(
     if not result.is_idle:
         return f"{module}: {jog_drive.NOT_IDLE}"
     if result.trouble:
-        return f"{joint}: {result.trouble}"
-    fit = fit_sines(result.samples, plan)
-    if fit is None:
-        return f"{joint}: too few samples came for a fit; look at its bus (`xrl can test`)"
-    return JointResult(joint, fit, where.inertia)
+        return f"{name}: {result.trouble}"
+    return Moved(result.samples, plan, where)
 
 
 @contextlib.contextmanager
@@ -181,7 +225,7 @@ def _described(joint: str, plan: SinePlan) -> str:
     )
 
 
-def _line(sample: Sample, plan: SinePlan, joint: str) -> Text:
+def _line(sample: Sample, plan: MotionPlan, joint: str) -> Text:
     return Text(
         f"{joint}  {sample.t_s:5.1f} of {plan.duration_s:.0f} s  "
         f"{sample.q[plan.axis]:+.4f} rad, {sample.tau[plan.axis]:+6.2f} N m"

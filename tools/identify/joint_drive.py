@@ -1,4 +1,4 @@
-"""Moves one joint of a hanging leg by sines, the leg's other modules held where they hang."""
+"""Moves one joint of a hanging leg, the leg's other modules held where they hang."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from shared.exceptions import DriveError
 from shared.robot.joints import MODULE_INDEX, MODULES, N_JOINTS
 from shared.robot.robot_model import HARD_STOP_MARGIN
 from tools.bringup import jog_drive
-from tools.bringup.jogging import Sample, gentle
+from tools.bringup.jogging import MotionPlan, Sample, gentle
 from tools.identify.sines import SinePlan, plan_for
 
 STILL: Final = 0.004
@@ -74,12 +74,18 @@ def plan_at(robot: RobotConfig, module: str, axis: int, torque: float, where: Ha
         torque: of the sines, N m.
         where: it hangs.
     """
-    bias = []
-    limits = limits_of(robot, module)
-    for value, (low, high) in zip(where.q[module], (limits.phi, limits.theta), strict=True):
-        bias.append(min(max(value, low + INSIDE), high - INSIDE) - value)
     inertia = where.inertia + robot.joint.armature
-    return plan_for(axis, torque, inertia, where.gravity, (bias[0], bias[1]))
+    return plan_for(axis, torque, inertia, where.gravity, bias_of(robot, module, where))
+
+
+def bias_of(robot: RobotConfig, module: str, where: Hanging) -> Pair:
+    """Return how far a module must be led to be well inside its limits, (phi, theta), rad."""
+    limits = limits_of(robot, module)
+    phi, theta = (
+        min(max(value, low + INSIDE), high - INSIDE) - value
+        for value, (low, high) in zip(where.q[module], (limits.phi, limits.theta), strict=True)
+    )
+    return phi, theta
 
 
 def wait_until_still(
@@ -138,7 +144,7 @@ def move(
     drives: Mapping[str, Drive],
     robot: RobotConfig,
     module: str,
-    plan: SinePlan,
+    plan: MotionPlan,
     *,
     q_seen: Mapping[str, Pair],
     interrupts: jog_drive.Interrupts,
@@ -151,7 +157,7 @@ def move(
         drives: of the leg, idle, opened with the limits of `limited`.
         robot: as `limited` made it.
         module: that is moved.
-        plan: the sines.
+        plan: its motion.
         q_seen: joint angles when the person agreed, rad.
         interrupts: read in every cycle.
         progress: receives a sample now and then.
@@ -170,7 +176,7 @@ def move(
         )  # fmt: skip
 
 
-def limited(robot: RobotConfig, plan: SinePlan) -> RobotConfig:
+def limited(robot: RobotConfig, plan: MotionPlan) -> RobotConfig:
     """Return the robot with torque, speed and joint limits for a plan.
 
     Raises:

@@ -34,6 +34,8 @@ ASK_S: Final = 0.02
 """Between two requests: an intent fades out once nobody repeats it."""
 LISTEN_S: Final = 0.002
 LINKS_S: Final = 3.0
+LEADS_S: Final = 15.0
+"""Longest wait for a planner that does not lead yet: a fleet that was just started."""
 
 Progress = Callable[[float, Lead, PlannerStatus], None]
 
@@ -76,7 +78,11 @@ class Motion:
                 raise FleetError("the robot is silent; see `xrl status`")
             time.sleep(LISTEN_S)
         self._newest = status
-        if why := self._trouble():
+        deadline = time.monotonic() + LEADS_S
+        while (why := self._trouble()) and time.monotonic() < deadline:
+            time.sleep(LISTEN_S)
+            self._newest = self._status.take() or self._newest
+        if why:
             raise FleetError(f"{why}; see `xrl status`")
 
     def go(

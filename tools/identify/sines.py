@@ -124,7 +124,7 @@ class SinePlan(NamedTuple):
     @property
     def _rest_s(self) -> float:
         """Time before the first tone and after the last, s."""
-        return SETTLE_S + (BIAS_S + SETTLE_S if any(self.bias) else 0.0)
+        return rest_s(self.bias)
 
     @property
     def rate_max(self) -> float:
@@ -142,16 +142,7 @@ class SinePlan(NamedTuple):
         for begin_s, tone in self.begins():
             if begin_s <= t_s < begin_s + tone.duration_s:
                 moved, rate = tone.offset(t_s - begin_s)
-        # there after the first rest, back before the last
-        side = 1.0 if t_s < 0.5 * self.duration_s else -1.0
-        phase = min(1.0, max(0.0, (min(t_s, self.duration_s - t_s) - SETTLE_S) / BIAS_S))
-        way = 0.5 - 0.5 * math.cos(math.pi * phase)
-        slope = side * 0.5 * math.pi / BIAS_S * math.sin(math.pi * phase)
-        (phi, theta), own = self.bias, (1.0 - self.axis, float(self.axis))
-        return (
-            (way * phi + own[0] * moved, way * theta + own[1] * moved),
-            (slope * phi + own[0] * rate, slope * theta + own[1] * rate),
-        )
+        return led_there_and_back(self.bias, t_s, self.duration_s, self.axis, moved, rate)
 
     def begins(self) -> list[tuple[float, Tone]]:
         """Return when each tone begins, s since the drive armed."""
@@ -160,6 +151,37 @@ class SinePlan(NamedTuple):
             found.append((at, tone))
             at += tone.duration_s
         return found
+
+
+def rest_s(bias: Pair) -> float:
+    """Return the time before the first motion and after the last, s, with the way to a bias."""
+    return SETTLE_S + (BIAS_S + SETTLE_S if any(bias) else 0.0)
+
+
+def led_there_and_back(
+    bias: Pair, t_s: float, duration_s: float, axis: int, moved: float, rate: float
+) -> tuple[Pair, Pair]:
+    """Return offsets of (phi, theta), rad, and their rates: of a motion about a bias.
+
+    There after the first rest, back before the last.
+
+    Args:
+        bias: (phi, theta), rad.
+        t_s: time since the drive was armed, s.
+        duration_s: of the whole.
+        axis: that is moved; 0: phi.
+        moved: its offset from the bias, rad.
+        rate: rad/s.
+    """
+    side = 1.0 if t_s < 0.5 * duration_s else -1.0
+    phase = min(1.0, max(0.0, (min(t_s, duration_s - t_s) - SETTLE_S) / BIAS_S))
+    way = 0.5 - 0.5 * math.cos(math.pi * phase)
+    slope = side * 0.5 * math.pi / BIAS_S * math.sin(math.pi * phase)
+    (phi, theta), own = bias, (1.0 - axis, float(axis))
+    return (
+        (way * phi + own[0] * moved, way * theta + own[1] * moved),
+        (slope * phi + own[0] * rate, slope * theta + own[1] * rate),
+    )
 
 
 class JointFit(NamedTuple):

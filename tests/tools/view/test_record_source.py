@@ -16,7 +16,7 @@ from tools.runs.run_log import RunLog, read_run
 from tools.view.record import RecordSource
 from tools.view.source import Order
 
-LOG = Path(__file__).parents[1] / "analysis" / "reexecution" / "golden" / "stand-v6b.mcap"
+LOG = Path(__file__).parents[1] / "analysis" / "reexecution" / "golden" / "stand-v6c.mcap"
 
 
 @pytest.fixture(scope="module")

@@ -122,7 +122,11 @@ class PlannerExecution:
             planner.receive_attitude(attitude, status.t_ns)
             self._attitude_seq = status.attitude_seq
         request = OperatorRequest(
-            status.assist_requested_n, status.shift_requested, status.requested_by
+            status.assist_requested_n,
+            status.shift_requested,
+            status.requested_by,
+            status.probe_row,
+            status.probe,
         )
         planner.receive_request(request)
         return True

@@ -1,0 +1,69 @@
+"""`xrl tune`: in virtual time, and what it refuses."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from shared.config import files as config_file
+from tests.conftest import ROBOT_FILE
+from tests.tools.exit_codes import exit_code
+from tools.tune import excitation
+
+
+def test_a_direction_is_measured_beside_the_model_and_gains_are_proposed_that_do_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(excitation, "FREQUENCIES_HZ", (0.3, 0.5, 0.75, 1.1))
+    words = ["tune", "x", "--sim", "--bandwidth", "7", "--damping", "0.6", "--out", tmp_path]
+    assert exit_code(words) == 0
+    told = capsys.readouterr().out
+    rows = {
+        match[1].strip(): [float(one) for one in match[2].split()]
+        for match in re.finditer(r"^ +(\w[\w ,]*?)  +((?:[\d.]+ +)+)", told, re.M)
+    }
+    measured, predicted, proposed = rows["natural frequency"]
+    assert 3.0 < measured < 8.0
+    assert 3.0 < predicted < 9.0
+    assert abs(proposed - 7.0) < abs(measured - 7.0), "nearer to what was wanted"
+    before, _, after = rows["overshoot"]
+    assert after < before
+    assert re.search(r"K_p = \[\d+\.\d, 2810\.0, 0\.0, 800\.0, 0\.0, 400\.0\]", told)
+    assert (tmp_path / "tune.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["up"], "up: one of x, y, z"),
+        (["x", "--bandwidth", "7"], "both, or none"),
+        (["x", "--bandwidth", "0", "--damping", "0.5"], "0.1 to 500"),
+        (["x", "--bandwidth", "7", "--damping", "9"], "0.05 to 3"),
+        (["x", "--size", "0.5", "--sim"], "law.probe_max"),
+        (["x", "--size", "0", "--sim"], "law.probe_max"),
+        (["x"], "no fleet"),
+    ],
+)
+def test_bad_words_are_refused_in_a_line(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str], run_dir: Path
+) -> None:
+    assert exit_code(["tune", *words, "--run-dir", run_dir]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_robot_file_may_forbid_probes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = ROBOT_FILE.read_text(encoding="utf-8")
+    probes = list(config_file.load_without_schedule(ROBOT_FILE).law.probe_max)
+    path = tmp_path / "lab.toml"
+    path.write_text(text.replace(f"probe_max = {probes}", "probe_max = [0, 0, 0, 0, 0, 0]"))
+    schedule = ROBOT_FILE.with_suffix(".gains.json").read_bytes()
+    path.with_suffix(".gains.json").write_bytes(schedule)
+    assert exit_code(["tune", "x", "--dry-run", "--config", path]) == 2
+    assert "forbids it" in capsys.readouterr().err
+
+
+def test_a_dry_run_tells_the_motion_and_moves_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(["tune", "roll", "--dry-run"]) == 0
+    assert "0.016 rad" in capsys.readouterr().out

@@ -1,0 +1,210 @@
+"""Offsets one row of the pose's reference, live or in lockstep, and takes down the answer."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import time
+from collections.abc import Callable
+from typing import ClassVar, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner.intents import OperatorRequest
+from services.planner.kinematics import Kinematics
+from services.planner.model import BodyInertia
+from services.planner.probe import NO_ROW
+from services.simulator.plant import PlantConfig
+from shared.bus import topics
+from shared.bus.messages import (
+    STRAIGHT,
+    Message,
+    OperatorIntent,
+    PlannerMode,
+    PlannerStatus,
+)
+from shared.bus.session import Session
+from shared.bus.topics import Topic
+from shared.clock import NS_PER_S, now_ns
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO, Keyframe, Scenario
+from shared.exceptions import FleetError, RunError
+from shared.robot.robot_model import stand_pose
+from tools.runs.lockstep import Lockstep
+from tools.tune.excitation import Excitation
+
+Array = NDArray[np.float64]
+
+DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Rows of p."""
+ASK_S: Final = 0.01
+LISTEN_S: Final = 0.001
+LINKS_S: Final = 3.0
+LEADS_S: Final = 15.0
+
+
+class ProbeCourse(NamedTuple):
+    """What reference and robot did."""
+
+    t_s: Array
+    """Since the excitation began (n,), s."""
+    r: Array
+    """Offset of the reference (n,), m or rad."""
+    y: Array
+    """Of the robot from where it stood (n,), m or rad."""
+    ended: str
+    """Why it ended before its time; "" if it did not."""
+
+
+def course_of(statuses: list[PlannerStatus], row: int, ended: str = "") -> ProbeCourse:
+    """Return the course of a row of p in the statuses of an excitation."""
+    begin = statuses[0].t_ns if statuses else 0
+    t_s = np.array([(status.t_ns - begin) / NS_PER_S for status in statuses])
+    r = np.array([status.p_ref[row] for status in statuses])
+    y = np.array([status.p[row] for status in statuses])
+    if len(statuses):
+        r, y = r - r[0], y - y[0]
+    return ProbeCourse(t_s, r, y, ended)
+
+
+class ProbedLockstep(Lockstep):
+    """A stand whose reference is probed."""
+
+    traced: ClassVar[bool] = False
+    row: int = NO_ROW
+    excitation: Excitation | None = None
+
+    def _request(self) -> OperatorRequest:
+        wanted, t_s = super()._request(), self.world.scenario_s
+        if self.excitation is None or t_s < 0.0:
+            return wanted
+        return wanted._replace(probe_row=self.row, probe=self.excitation.at(t_s))
+
+
+def in_lockstep(
+    robot: RobotConfig,
+    row: int,
+    excitation: Excitation,
+    plant: PlantConfig,
+    progress: Callable[[float], None],
+) -> ProbeCourse:
+    """Return what a robot in virtual time does.
+
+    Args:
+        robot: ready to run.
+        row: of p.
+        excitation: of its reference.
+        plant: the true robot.
+        progress: is given the time, s.
+
+    Raises:
+        RunError: it fell, or is not led on this plant.
+    """
+    scenario = Scenario(
+        name="tune", about="one reference is offset", duration=excitation.duration_s,
+        keyframe=(Keyframe(at=0.0, height=robot.simulation.stand_height),),
+    )  # fmt: skip
+    statuses: list[PlannerStatus] = []
+
+    def record(topic: Topic, _module: str, message: Message) -> None:
+        if topic is topics.PLANNER_STATUS and fleet.world.scenario_s >= 0.0:
+            assert isinstance(message, PlannerStatus)  # noqa: S101 - by its topic
+            statuses.append(message)
+
+    fleet = ProbedLockstep(robot, scenario, record=record, plant=plant)
+    fleet.row, fleet.excitation = row, excitation
+    for truth in fleet.run():
+        progress(max(0.0, truth.scenario_s))
+        if truth.fallen:
+            raise RunError("the robot fell in lockstep; nothing can be told of its answer")
+    left = [status for status in statuses if status.mode != PlannerMode.LEADING]
+    if not statuses or left:
+        why = left[0].why if left else "it was never led"
+        raise RunError(f"in lockstep the planner stopped leading: {why}")
+    return course_of(statuses, row)
+
+
+class LiveProbe:
+    """A robot that is up."""
+
+    def __init__(self, session: Session) -> None:
+        """Meet the robot.
+
+        Raises:
+            FleetError: it is silent, does not lead, or somebody else asks it for something.
+        """
+        self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
+        self._status = session.latest(topics.PLANNER_STATUS, PlannerStatus)
+        self._source = f"xrl tune by {getpass.getuser()} ({os.getpid()})"
+        self._sent = 0
+        deadline = time.monotonic() + LINKS_S
+        while (status := self._status.take()) is None:
+            if time.monotonic() > deadline:
+                raise FleetError("the robot is silent; see `xrl status`")
+            time.sleep(LISTEN_S)
+        deadline = time.monotonic() + LEADS_S
+        while (why := self._trouble(status)) and time.monotonic() < deadline:
+            time.sleep(LISTEN_S)
+            status = self._status.take() or status
+        if why:
+            raise FleetError(f"{why}; see `xrl status`")
+
+    def go(
+        self,
+        row: int,
+        excitation: Excitation,
+        progress: Callable[[float], None],
+        stopped: Callable[[], bool],
+    ) -> ProbeCourse:
+        """Probe a row; whatever ends it, nothing is asked for any more and the probe ends.
+
+        Args:
+            row: of p.
+            excitation: of its reference.
+            progress: is given the time, s.
+            stopped: True to end it.
+        """
+        statuses: list[PlannerStatus] = []
+        begin, ask_s, ended = now_ns(), 0.0, ""
+        while not ended and (t_s := (now_ns() - begin) / NS_PER_S) < excitation.duration_s:
+            if t_s >= ask_s:
+                self._ask(row, excitation.at(t_s))
+                progress(t_s)
+                ask_s = t_s + ASK_S
+            status = self._status.take()
+            if status is not None and status.probe_row == row:
+                statuses.append(status)
+                ended = self._trouble(status)
+            if stopped():
+                ended = "stopped"
+            time.sleep(LISTEN_S)
+        self._ask(NO_ROW, 0.0)
+        return course_of(statuses, row, ended)
+
+    def _trouble(self, status: PlannerStatus) -> str:
+        if status.mode != PlannerMode.LEADING:
+            why = f" ({status.why})" if status.why else ""
+            return f"the planner does not lead: {PlannerMode(status.mode).name}{why}"
+        if status.requested_by not in ("", SCENARIO, self._source):
+            return f"{status.requested_by} asks the robot for something else"
+        return ""
+
+    def _ask(self, row: int, offset: float) -> None:
+        self._sent += 1
+        self._intents.put(
+            OperatorIntent(
+                t_ns=now_ns(), seq=self._sent, assist_n=0.0, shift=STRAIGHT, source=self._source,
+                probe_row=row, probe=offset,
+            )
+        )  # fmt: skip
+
+
+def inertia_along(robot: RobotConfig, row: int) -> float:
+    """Return the inertia of the body along a row of p at the stand, kg or kg m^2; no rotors."""
+    q = np.array(stand_pose(robot, robot.simulation.stand_height))
+    kinematics = Kinematics(robot)
+    kinematics.update(q)
+    both = np.vstack([kinematics.J, kinematics.C])
+    T = np.asarray(np.linalg.solve(both, np.eye(12, 6)), float)
+    return float(BodyInertia(robot).at(q, T)[row, row])

@@ -1,0 +1,296 @@
+"""`xrl tune`: how a direction of the body, or a module, answers; gains for a wanted answer."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from rich.console import Console
+from rich.markup import escape
+
+from services.simulator.plant import IDEAL, plant_from
+from shared.bus.operator_key import require_operator
+from shared.bus.session import open_session
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
+from shared.process import StopFlag
+from shared.robot import gain_schedule
+from shared.robot.joints import AXES, MODULES
+from tools.bringup import bench, jog_drive
+from tools.fleet.supervise import SupervisedFleet
+from tools.identify import joint_bench, joint_drive
+from tools.number_arguments import finite
+from tools.output import progress_along
+from tools.runs import experiment
+from tools.tune import module_probe
+from tools.tune.excitation import Excitation, excitation
+from tools.tune.pose_probe import DIRECTIONS, LiveProbe, ProbeCourse, in_lockstep, inertia_along
+from tools.tune.response import ResponseFit, answer_of, propose
+from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
+
+SIZE_SHARE: Final = 0.8
+"""Of `law.probe_max`."""
+UNITS: Final = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "tune",
+        """
+        xrl tune x                                    # the robot that is up: step and sines
+        xrl tune y --sim                              # in virtual time, on the realistic plant
+        xrl tune y --sim --plant drivetrain.stiffness=3000
+        xrl tune x --bandwidth 7 --damping 0.6        # proposes K_p and B_p
+        xrl tune ankle_left --axis theta              # hanging, the fleet down
+        xrl tune x --dry-run
+        """,
+    )
+    parser.add_argument(
+        "what", metavar="WHAT", help=f"one of {', '.join(DIRECTIONS)}; or a module, hanging"
+    )
+    parser.add_argument("--size", type=finite, metavar="S", help="of step and sines, m or rad")
+    parser.add_argument("--axis", choices=AXES, default="theta", help="of a module (theta)")
+    parser.add_argument(
+        "--torque", type=finite, metavar="NM", help="of a module's step and sines (15; 60 for legs)"
+    )
+    parser.add_argument(
+        "--bandwidth", type=finite, metavar="RAD/S", help="wanted natural frequency"
+    )
+    parser.add_argument("--damping", type=finite, metavar="RATIO", help="wanted damping ratio")
+    parser.add_argument("--sim", action="store_true", help="a robot in virtual time, no fleet")
+    parser.add_argument("--dry-run", action="store_true", help="show the motions, move nothing")
+    parser.add_argument("--yes", action="store_true", help="do not ask")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="for the picture (out/tune-<time>)")
+    experiment.add_plant(parser)
+    add_config(parser)
+    add_run_dir(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, compare with what the model predicts, and propose; 1 if it was stopped."""
+    console = Console()
+    if args.what not in (*DIRECTIONS, *MODULES):
+        raise RunError(f"{args.what[:40]}: one of {', '.join((*DIRECTIONS, *MODULES))} is right")
+    _check_wanted(args)
+    if args.what in MODULES:
+        return _tune_module(args, console)
+    return _tune_direction(args, console)
+
+
+def _check_wanted(args: argparse.Namespace) -> None:
+    """Refuse half a wish, or one that no loop can have.
+
+    Raises:
+        RunError: saying what would be right.
+    """
+    wanted = (args.bandwidth, args.damping)
+    if (wanted[0] is None) != (wanted[1] is None):
+        raise RunError("--bandwidth and --damping: both, or none")
+    if wanted[0] is not None and not 0.1 <= wanted[0] <= 500.0:
+        raise RunError(f"--bandwidth {wanted[0]:g}: 0.1 to 500 rad/s is right")
+    if wanted[1] is not None and not 0.05 <= wanted[1] <= 3.0:
+        raise RunError(f"--damping {wanted[1]:g}: 0.05 to 3 is right")
+
+
+def _tune_direction(args: argparse.Namespace, console: Console) -> int:
+    row = DIRECTIONS.index(args.what)
+    fleet = None if args.sim or args.dry_run else SupervisedFleet.attach(args.run_dir)
+    path = args.config if fleet is None else Path(fleet.manifest.config)
+    robot = experiment.load_robot(path)
+    plan = excitation(_size(args, robot, row))
+    sines = ", ".join(f"{sine.frequency_hz:g}" for sine in plan.sines)
+    unit = "m" if row < 3 else "rad"
+    console.print(
+        f"{args.what}: a step of {plan.size:g} {unit} there and back, then sines of it at {sines} "
+        f"Hz: {plan.duration_s:.0f} s. The planner limits it (law.probe_max), and all trips stay"
+    )
+    if args.dry_run:
+        return 0
+    if fleet is None:
+        with progress_along("simulated", plan.duration_s) as progress:
+            course = in_lockstep(robot, row, plan, plant_from(args.plant), progress)
+    else:
+        course = _live(robot, fleet, row, plan, console)
+    if course.ended:
+        console.print(f"[bold red]STOPPED[/]: {escape(course.ended)}")
+        return 1
+    with progress_along("what the model predicts", plan.duration_s) as progress:
+        ideal = in_lockstep(robot, row, plan, IDEAL, progress)
+    courses = {"measured": course, "predicted": ideal}
+    answers = _answers(courses, plan)
+    closed = not robot.law.S[row]
+    if args.bandwidth is not None and closed:
+        proposed = _proposed(args, robot, row, answers["measured"], console)
+        if proposed is not None:
+            with progress_along("with the proposed gains", plan.duration_s) as progress:
+                # on the plant that was measured, where it is known
+                plant = plant_from(args.plant) if args.sim else IDEAL
+                courses["proposed"] = in_lockstep(proposed, row, plan, plant, progress)
+            answers = _answers(courses, plan)
+    _tell(args, courses, answers, console, closed=closed)
+    if not closed:
+        console.print(
+            "the person leads this direction: it was held on local gains while it was probed, with "
+            "the hand as it is; `xrl gains` chooses them (certificate.K_required)"
+        )
+    return 0
+
+
+def _live(
+    robot: RobotConfig, fleet: SupervisedFleet, row: int, plan: Excitation, console: Console
+) -> ProbeCourse:
+    require_operator(robot, "tune")
+    stop = StopFlag()
+    with (
+        open_session(robot, "tune", fleet.run.path) as session,
+        progress_along("probing", plan.duration_s) as progress,
+    ):
+        console.print("leave the robot alone but for the hand that holds its height")
+        return LiveProbe(session).go(row, plan, progress, lambda: bool(stop))
+
+
+def _size(args: argparse.Namespace, robot: RobotConfig, row: int) -> float:
+    """Return the size of step and sines, m or rad.
+
+    Raises:
+        RunError: it is none, or beyond what the robot file accepts.
+    """
+    most = robot.law.probe_max[row]
+    if most == 0.0:
+        raise RunError(f"{args.what}: law.probe_max of the robot file forbids it; set it there")
+    size: float = SIZE_SHARE * most if args.size is None else args.size
+    if not 0.0 < size <= most:
+        raise RunError(f"--size {size:g}: more than 0 and at most {most:g} (law.probe_max)")
+    return size
+
+
+def _answers(courses: dict[str, ProbeCourse], plan: Excitation) -> dict[str, ResponseFit]:
+    """Return the answers.
+
+    Raises:
+        RunError: there is hardly any.
+    """
+    answers = {}
+    for name, course in courses.items():
+        answer = answer_of(course.t_s, course.r, course.y, plan)
+        if answer is None:
+            raise RunError(f"{name}: hardly any answer to the offset; try a larger --size")
+        answers[name] = answer
+    return answers
+
+
+def _proposed(
+    args: argparse.Namespace, robot: RobotConfig, row: int, answer: ResponseFit, console: Console
+) -> RobotConfig | None:
+    """Tell gains for the wanted answer; return the robot with them, None if there are none."""
+    if not answer.is_second_order:
+        console.print("no second-order answer was measured: no gains follow from it")
+        return None
+    law = robot.law
+    new = propose(
+        answer.model, K_p=law.K_p[row], B_p=law.B_p[row], inertia=inertia_along(robot, row),
+        bandwidth=args.bandwidth, damping_ratio=args.damping,
+    )  # fmt: skip
+    K_p, B_p = list(law.K_p), list(law.B_p)
+    K_p[row], B_p[row] = float(f"{new.K_p:.3g}"), float(f"{new.B_p:.3g}")
+    console.print(
+        f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}, in {UNITS[row]}:"
+    )
+    console.print(f"K_p = {K_p}\nB_p = {B_p}", highlight=False)
+    console.print(
+        "to try them: set the law's rows in a copy of the robot file, then `xrl gains`, which says "
+        "if a loop with them is stable, then `xrl tune` again"
+    )
+    changed = msgspec.structs.replace(law, K_p=tuple(K_p), B_p=tuple(B_p))
+    return with_local_gains_kept(msgspec.structs.replace(robot, law=changed))
+
+
+def with_local_gains_kept(robot: RobotConfig) -> RobotConfig:
+    """Return a changed robot on the local gains of before: for a look in lockstep, nowhere else."""
+    schedule = robot.gain_schedule
+    if schedule is None:
+        return robot
+    inputs = gain_schedule.inputs_of(robot)
+    kept = msgspec.structs.replace(schedule, inputs=inputs, digest=gain_schedule.digest_of(inputs))
+    return msgspec.structs.replace(robot, gain_schedule=kept)
+
+
+def _tune_module(args: argparse.Namespace, console: Console) -> int:
+    module, axis = args.what, AXES.index(args.axis)
+    path = bench.robot_file(args)
+    robot = config_file.load_without_schedule(path)
+    joint_bench.refuse_services(robot, [module], args.run_dir)
+    interrupts = jog_drive.Interrupts()
+
+    def plan_of(where: joint_drive.Hanging) -> module_probe.ModulePlan:
+        plan = module_probe.module_plan(robot, module, axis, args.torque, where)
+        console.print(
+            f"{module} {AXES[axis]}: a step of {1e3 * plan.excitation.size:.1f} mrad there and "
+            f"back, then sines of it, {plan.duration_s:.0f} s, at most {plan.torque_limit:.0f} N "
+            f"m, on the stand gains ({plan.k_p:g} N m/rad, {plan.k_d:g} N m s/rad)"
+        )
+        return plan
+
+    with bench.drives_to_ourselves(
+        robot, path, args.run_dir, console.print, lifted=joint_bench.LIFTED
+    ):
+        moved = joint_bench.move_joint(args, robot, (module, axis), plan_of, interrupts, console)
+    if interrupts.number:
+        sys.exit(128 + interrupts.number)
+    if moved is None:
+        return 0
+    if isinstance(moved, str):
+        console.print(f"[bold red]STOPPED[/]: {escape(moved)}")
+        return 1
+    plan = moved.plan
+    course = module_probe.course_of_samples(moved.samples, plan)
+    answers = _answers({"measured": course}, plan.excitation)
+    model = module_probe.predicted(robot, plan.k_p, plan.k_d, moved.where)
+    _tell(args, {"measured": course}, answers, console, closed=False)
+    console.print(
+        f"predicted, rotor and leg rigid: natural frequency {model.natural_frequency:.1f} rad/s, "
+        f"damping ratio {model.damping_ratio:.2f}"
+    )
+    answer = answers["measured"]
+    if not answer.is_second_order:
+        console.print(
+            "the encoder is at the motor: behind play and a soft drivetrain this leg is no "
+            "second-order system; compare step and picture with another leg's"
+        )
+    elif args.bandwidth is not None:
+        inertia = plan.k_p / answer.model.b_0
+        k_p = max(0.0, inertia * args.bandwidth**2 - moved.where.gravity)
+        k_d = 2.0 * args.damping * args.bandwidth * inertia
+        console.print(
+            f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}: k_p = "
+            f"{k_p:.0f} N m/rad, k_d = {k_d:.1f} N m s/rad (stand.*, then `xrl gains`)"
+        )
+    return 0
+
+
+def _tell(
+    args: argparse.Namespace,
+    courses: dict[str, ProbeCourse],
+    answers: dict[str, ResponseFit],
+    console: Console,
+    *,
+    closed: bool,
+) -> None:
+    from tools.tune.report import answer_table, draw  # noqa: PLC0415 - takes a second
+
+    out = args.out if args.out is not None else Path("out") / time.strftime("tune-%Y%m%d-%H%M%S")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+    console.print(answer_table(answers, closed=closed))
+    title = args.what if args.what in DIRECTIONS else f"{args.what} {args.axis}"
+    draw(title, courses, answers, out / "tune.png")
+    console.print(f"{out}/tune.png", style="dim")
