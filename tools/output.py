@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -26,6 +27,20 @@ def progress_along(what: str, length_s: float) -> Iterator[Callable[[float], Non
     with Progress(console=console, transient=True, disable=not console.is_terminal) as shown:
         bar = shown.add_task(what, total=length_s)
         yield lambda done_s: shown.update(bar, completed=done_s)
+
+
+def make_folder(out: Path | None, verb: str) -> Path:
+    """Make the folder of a verb's pictures; without a name, `out/VERB-<time>`.
+
+    Raises:
+        RunError: it cannot be made.
+    """
+    out = out if out is not None else Path("out") / time.strftime(f"{verb}-%Y%m%d-%H%M%S")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+    return out
 
 
 def write_atomically(out: Path, content: bytes, *, private: bool = False) -> None:

@@ -26,6 +26,7 @@ from tools.bringup.jogging import MotionPlan, Sample, outside
 from tools.identify import joint_drive, report
 from tools.identify.estimates import JointResult, changes, measured, of_joints
 from tools.identify.sines import SinePlan, fit_sines
+from tools.output import make_folder
 
 P = TypeVar("P", bound=MotionPlan)
 LIFTED: Final = 0.2
@@ -240,7 +241,7 @@ def _tell(
     console: Console,
 ) -> None:
     estimates = of_joints(results, robot)
-    folder = report.make_folder(args.out)
+    folder = make_folder(args.out, "identify")
     from tools.identify.picture import draw_joints  # noqa: PLC0415 - takes a second
 
     picture = folder / "joints.png"

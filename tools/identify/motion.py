@@ -7,35 +7,23 @@ where to lead. Whatever ends it, nothing is asked for any more, and the requests
 
 from __future__ import annotations
 
-import getpass
-import os
 import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from shared.bus import topics
-from shared.bus.messages import (
-    HandLead,
-    JointState,
-    OperatorIntent,
-    PlannerMode,
-    PlannerStatus,
-    Wrench,
-)
+from shared.bus.messages import HandLead, JointState, PlannerStatus, Wrench
 from shared.bus.session import Session
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import SCENARIO, Lead, Scenario, lead
-from shared.exceptions import FleetError
+from shared.config.scenarios import Lead, Scenario, lead
 from shared.robot.joints import MODULES
+from tools.fleet.led_planner import LedPlanner
 from tools.identify.quasi_static import TimedRows
 
 ASK_S: Final = 0.02
 """Between two requests: an intent fades out once nobody repeats it."""
 LISTEN_S: Final = 0.002
-LINKS_S: Final = 3.0
-LEADS_S: Final = 15.0
-"""Longest wait for a planner that does not lead yet: a fleet that was just started."""
 
 Progress = Callable[[float, Lead, PlannerStatus], None]
 
@@ -66,24 +54,10 @@ class Motion:
         """
         self._robot = robot
         self._hand = session.publisher(topics.OPERATOR_HAND, HandLead) if simulated else None
-        self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
-        self._status = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._states = [session.latest(topics.JOINT_STATE, JointState, name) for name in MODULES]
         self._wrench = session.latest(topics.WRENCH, Wrench)
-        self._source = f"xrl identify by {getpass.getuser()} ({os.getpid()})"
+        self._planner = LedPlanner(session, "identify")
         self._sent = 0
-        deadline = time.monotonic() + LINKS_S
-        while (status := self._status.take()) is None:
-            if time.monotonic() > deadline:
-                raise FleetError("the robot is silent; see `xrl status`")
-            time.sleep(LISTEN_S)
-        self._newest = status
-        deadline = time.monotonic() + LEADS_S
-        while (why := self._trouble()) and time.monotonic() < deadline:
-            time.sleep(LISTEN_S)
-            self._newest = self._status.take() or self._newest
-        if why:
-            raise FleetError(f"{why}; see `xrl status`")
 
     def go(
         self, scenario: Scenario, progress: Progress, stopped: Callable[[], bool]
@@ -103,7 +77,7 @@ class Motion:
             if t_s >= ask_s:
                 wanted = self._limited(lead(scenario, t_s))
                 self._ask(wanted)
-                progress(t_s, wanted, self._newest)
+                progress(t_s, wanted, self._planner.status)
                 ask_s = t_s + ASK_S
             for (t_ns, rows), source in zip(states, self._states, strict=True):
                 if (state := source.take()) is not None:
@@ -112,19 +86,10 @@ class Motion:
             if (wrench := self._wrench.take()) is not None:
                 wrenches[0].append(now_ns())
                 wrenches[1].append(wrench)
-            self._newest = self._status.take() or self._newest
-            ended = "stopped" if stopped() else self._trouble()
+            self._planner.look()
+            ended = "stopped" if stopped() else self._planner.trouble()
             time.sleep(LISTEN_S)
         return MotionRecord(tuple(TimedRows(*one) for one in states), TimedRows(*wrenches), ended)
-
-    def _trouble(self) -> str:
-        status = self._newest
-        if status.mode != PlannerMode.LEADING:
-            why = f" ({status.why})" if status.why else ""
-            return f"the planner does not lead: {PlannerMode(status.mode).name}{why}"
-        if status.requested_by not in ("", SCENARIO, self._source):
-            return f"{status.requested_by} asks the robot for something else"
-        return ""
 
     def _limited(self, wanted: Lead) -> Lead:
         x, y, roll, yaw = (
@@ -135,17 +100,13 @@ class Motion:
         return wanted._replace(shift=(x, y, roll, yaw), assist=assist)
 
     def _ask(self, wanted: Lead) -> None:
-        now, self._sent = now_ns(), self._sent + 1
-        if self._hand is not None:
-            self._hand.put(
-                HandLead(
-                    t_ns=now, seq=self._sent, leads=True, height=wanted.height, pitch=wanted.pitch,
-                    push=(0.0, 0.0, 0.0), source=self._source,
-                )
-            )  # fmt: skip
-        self._intents.put(
-            OperatorIntent(
-                t_ns=now, seq=self._sent, assist_n=wanted.assist, shift=wanted.shift,
-                source=self._source,
+        self._planner.ask(assist_n=wanted.assist, shift=wanted.shift)
+        if self._hand is None:
+            return
+        self._sent += 1
+        self._hand.put(
+            HandLead(
+                t_ns=now_ns(), seq=self._sent, leads=True, height=wanted.height,
+                pitch=wanted.pitch, push=(0.0, 0.0, 0.0), source=self._planner.source,
             )
         )  # fmt: skip

@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from shared.exceptions import RunError
 from tools.identify.estimates import ParameterEstimate, Value, Verdict
 from tools.identify.robot_file_edit import apply
 
@@ -84,17 +83,3 @@ def write(
 
 SCHEDULED = ("joint.armature",)
 """Keys beside masses and lengths that the gain schedule depends on."""
-
-
-def make_folder(out: Path | None) -> Path:
-    """Make the folder for pictures; without a name, one of this time.
-
-    Raises:
-        RunError: it cannot be made.
-    """
-    out = out if out is not None else Path("out") / time.strftime("identify-%Y%m%d-%H%M%S")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
-    return out

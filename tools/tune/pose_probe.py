@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
-import os
 import time
 from collections.abc import Callable
 from typing import ClassVar, Final, NamedTuple
@@ -17,20 +15,15 @@ from services.planner.model import BodyInertia
 from services.planner.probe import NO_ROW
 from services.simulator.plant import PlantConfig
 from shared.bus import topics
-from shared.bus.messages import (
-    STRAIGHT,
-    Message,
-    OperatorIntent,
-    PlannerMode,
-    PlannerStatus,
-)
+from shared.bus.messages import Message, PlannerMode, PlannerStatus
 from shared.bus.session import Session
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import SCENARIO, Keyframe, Scenario
-from shared.exceptions import FleetError, RunError
+from shared.config.scenarios import Keyframe, Scenario
+from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
+from tools.fleet.led_planner import LedPlanner
 from tools.runs.lockstep import Lockstep
 from tools.tune.excitation import Excitation
 
@@ -40,8 +33,6 @@ DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Rows of p."""
 ASK_S: Final = 0.01
 LISTEN_S: Final = 0.001
-LINKS_S: Final = 3.0
-LEADS_S: Final = 15.0
 
 
 class ProbeCourse(NamedTuple):
@@ -134,21 +125,7 @@ class LiveProbe:
         Raises:
             FleetError: it is silent, does not lead, or somebody else asks it for something.
         """
-        self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
-        self._status = session.latest(topics.PLANNER_STATUS, PlannerStatus)
-        self._source = f"xrl tune by {getpass.getuser()} ({os.getpid()})"
-        self._sent = 0
-        deadline = time.monotonic() + LINKS_S
-        while (status := self._status.take()) is None:
-            if time.monotonic() > deadline:
-                raise FleetError("the robot is silent; see `xrl status`")
-            time.sleep(LISTEN_S)
-        deadline = time.monotonic() + LEADS_S
-        while (why := self._trouble(status)) and time.monotonic() < deadline:
-            time.sleep(LISTEN_S)
-            status = self._status.take() or status
-        if why:
-            raise FleetError(f"{why}; see `xrl status`")
+        self._planner = LedPlanner(session, "tune")
 
     def go(
         self,
@@ -169,35 +146,15 @@ class LiveProbe:
         begin, ask_s, ended = now_ns(), 0.0, ""
         while not ended and (t_s := (now_ns() - begin) / NS_PER_S) < excitation.duration_s:
             if t_s >= ask_s:
-                self._ask(row, excitation.at(t_s))
+                self._planner.ask(probe_row=row, probe=excitation.at(t_s))
                 progress(t_s)
                 ask_s = t_s + ASK_S
-            status = self._status.take()
-            if status is not None and status.probe_row == row:
-                statuses.append(status)
-                ended = self._trouble(status)
-            if stopped():
-                ended = "stopped"
+            if self._planner.look() and self._planner.status.probe_row == row:
+                statuses.append(self._planner.status)
+            ended = "stopped" if stopped() else self._planner.trouble()
             time.sleep(LISTEN_S)
-        self._ask(NO_ROW, 0.0)
+        self._planner.ask()
         return course_of(statuses, row, ended)
-
-    def _trouble(self, status: PlannerStatus) -> str:
-        if status.mode != PlannerMode.LEADING:
-            why = f" ({status.why})" if status.why else ""
-            return f"the planner does not lead: {PlannerMode(status.mode).name}{why}"
-        if status.requested_by not in ("", SCENARIO, self._source):
-            return f"{status.requested_by} asks the robot for something else"
-        return ""
-
-    def _ask(self, row: int, offset: float) -> None:
-        self._sent += 1
-        self._intents.put(
-            OperatorIntent(
-                t_ns=now_ns(), seq=self._sent, assist_n=0.0, shift=STRAIGHT, source=self._source,
-                probe_row=row, probe=offset,
-            )
-        )  # fmt: skip
 
 
 def inertia_along(robot: RobotConfig, row: int) -> float:

@@ -31,6 +31,7 @@ from tools.identify.estimates import changes, measured, of_body, zero_correction
 from tools.identify.motion import Motion
 from tools.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.number_arguments import finite
+from tools.output import make_folder
 from tools.runs import experiment
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
@@ -146,7 +147,7 @@ def _fit_and_tell(
     payload_sd = WEIGHED_SD if args.weighed else None
     result = fit(robot, records, level_sd=args.level, payload_sd=payload_sd)
     estimates = of_body(result, robot)
-    folder = report.make_folder(args.out)
+    folder = make_folder(args.out, "identify")
     from tools.identify.picture import draw_body  # noqa: PLC0415 - takes a second
 
     picture = folder / "identify.png"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from pathlib import Path
 from typing import Final
 
@@ -25,7 +24,7 @@ from tools.bringup import bench, jog_drive
 from tools.fleet.supervise import SupervisedFleet
 from tools.identify import joint_bench, joint_drive
 from tools.number_arguments import finite
-from tools.output import progress_along
+from tools.output import make_folder, progress_along
 from tools.runs import experiment
 from tools.tune import module_probe
 from tools.tune.excitation import Excitation, excitation
@@ -285,11 +284,7 @@ def _tell(
 ) -> None:
     from tools.tune.report import answer_table, draw  # noqa: PLC0415 - takes a second
 
-    out = args.out if args.out is not None else Path("out") / time.strftime("tune-%Y%m%d-%H%M%S")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RunError(f"{out}: cannot be made: {error.strerror}; choose another --out") from None
+    out = make_folder(args.out, "tune")
     console.print(answer_table(answers, closed=closed))
     title = args.what if args.what in DIRECTIONS else f"{args.what} {args.axis}"
     draw(title, courses, answers, out / "tune.png")

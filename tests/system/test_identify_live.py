@@ -1,0 +1,66 @@
+"""`xrl identify` and `xrl tune` on a live fleet: asked for, led, measured, and left as it was."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared.bus.session import open_session
+from shared.clock import keep_pace
+from shared.config import files as config_file
+from shared.config.scenarios import Keyframe, Scenario
+from shared.process import DEFAULT_CONFIG
+from tools.identify.motion import Motion
+from tools.identify.quasi_static import moments_of
+from tools.tune.excitation import Excitation, SinePart
+from tools.tune.pose_probe import LiveProbe
+
+pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
+
+SHORT = Scenario(
+    "identify", "", 8.0,
+    (Keyframe(0.0, 1.188), Keyframe(4.0, 1.15, shift=(0.0, 0.02, 0.0, 0.0)), Keyframe(8.0, 1.188)),
+)  # fmt: skip
+STEP = Excitation(0.008, (SinePart(9.0, 1.0, 3),))
+
+
+def xrl(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "tools.cli", *words],
+        capture_output=True, text=True, timeout=90, check=False,
+    )  # fmt: skip
+
+
+def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    place = ("--run-dir", str(run_dir))
+    up = xrl("up", *place, "--out", str(tmp_path / "run"))
+    assert up.returncode == 0, up.stderr
+    try:
+        keep_pace(run_dir)
+        robot = config_file.load(DEFAULT_CONFIG)
+        with open_session(robot, "identify", run_dir) as session:
+            motion = Motion(robot, session, simulated=True)
+            heard = motion.go(SHORT, lambda *_: None, lambda: False)
+            assert heard.ended == ""
+            moments = moments_of(heard.states, heard.wrenches)
+            assert len(moments.t_s) > 20
+            assert moments.q[:, 5].max() - moments.q[:, 5].min() > 0.05, "the hips went down"
+            stopped = motion.go(SHORT, lambda *_: None, lambda: True)
+            assert stopped.ended == "stopped"
+        with open_session(robot, "tune", run_dir) as session:
+            course = LiveProbe(session).go(0, STEP, lambda _: None, lambda: False)
+            assert course.ended == ""
+            assert course.r.max() == pytest.approx(0.008, rel=0.05)
+            at_top = (course.t_s > 3.0) & (course.t_s < 5.0)
+            assert 0.004 < course.y[at_top].mean() < 0.012
+        status = xrl("status", *place)
+        assert "LEADING" in status.stdout
+    finally:
+        down = xrl("down", *place)
+        keep_pace(tmp_path)
+    assert down.returncode == 0, down.stderr

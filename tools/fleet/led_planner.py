@@ -1,0 +1,90 @@
+"""A planner that leads and is asked for something: met, watched, asked (`operator/intent`)."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import time
+from typing import Final
+
+from services.planner.probe import NO_ROW
+from shared.bus import topics
+from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
+from shared.bus.session import Session
+from shared.clock import now_ns
+from shared.config.scenarios import SCENARIO
+from shared.exceptions import FleetError
+
+LOOK_S: Final = 0.002
+LINKS_S: Final = 3.0
+"""Longest wait for the first status."""
+LEADS_S: Final = 15.0
+"""Longest wait for a planner that does not lead yet: a fleet that was just started."""
+
+
+class LedPlanner:
+    """The planner of a robot that is up.
+
+    Attributes:
+        status: the newest.
+    """
+
+    def __init__(self, session: Session, verb: str) -> None:
+        """Meet it.
+
+        Args:
+            session: of an operator.
+            verb: that asks; it stands in the planner's status.
+
+        Raises:
+            FleetError: it is silent, does not lead, or somebody else asks it for something.
+        """
+        self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
+        self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
+        self.source = f"xrl {verb} by {getpass.getuser()} ({os.getpid()})"
+        self._sent = 0
+        deadline = time.monotonic() + LINKS_S
+        while (status := self._statuses.take()) is None:
+            if time.monotonic() > deadline:
+                raise FleetError("the robot is silent; see `xrl status`")
+            time.sleep(LOOK_S)
+        self.status = status
+        deadline = time.monotonic() + LEADS_S
+        while (why := self.trouble()) and time.monotonic() < deadline:
+            time.sleep(LOOK_S)
+            self.look()
+        if why:
+            raise FleetError(f"{why}; see `xrl status`")
+
+    def look(self) -> bool:
+        """Take a newer status, if there is one; return True if there was."""
+        newer = self._statuses.take()
+        self.status = newer or self.status
+        return newer is not None
+
+    def trouble(self) -> str:
+        """Return why it cannot be asked for anything now; "" if it can."""
+        status = self.status
+        if status.mode != PlannerMode.LEADING:
+            why = f" ({status.why})" if status.why else ""
+            return f"the planner does not lead: {PlannerMode(status.mode).name}{why}"
+        if status.requested_by not in ("", SCENARIO, self.source):
+            return f"{status.requested_by} asks the robot for something else"
+        return ""
+
+    def ask(
+        self,
+        *,
+        assist_n: float = 0.0,
+        shift: Vector4 = STRAIGHT,
+        probe_row: int = NO_ROW,
+        probe: float = 0.0,
+    ) -> None:
+        """Ask once; what is not repeated fades out, and a probe ends."""
+        self._sent += 1
+        self._intents.put(
+            OperatorIntent(
+                t_ns=now_ns(), seq=self._sent, assist_n=assist_n, shift=shift, source=self.source,
+                probe_row=probe_row, probe=probe,
+            )
+        )  # fmt: skip
