@@ -157,6 +157,8 @@ def move_joint(
         console.status("waiting until the leg hangs still"),
     ):
         q = joint_drive.wait_until_still(drives, robot, interrupts, now_ns)
+    if q is None:
+        return "stopped before anything moved"
     where = joint_drive.hanging(robot, q, module, axis)
     plan = plan_of(where)
     limited = joint_drive.limited(robot, plan)

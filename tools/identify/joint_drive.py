@@ -93,8 +93,8 @@ def wait_until_still(
     robot: RobotConfig,
     interrupts: jog_drive.Interrupts,
     clock: jog_drive.Clock,
-) -> dict[str, Pair]:
-    """Wait until a leg hangs still; return where, (phi, theta), rad.
+) -> dict[str, Pair] | None:
+    """Wait until a leg hangs still; return where, (phi, theta), rad; None if interrupted.
 
     Args:
         drives: of the leg, idle.
@@ -103,7 +103,7 @@ def wait_until_still(
         clock: monotonic, ns.
 
     Raises:
-        DriveError: it does not in a minute, somebody interrupts, or a drive does not answer.
+        DriveError: it does not in a minute, or a drive does not answer.
     """
     begin = still_since = clock()
     rest: dict[str, Pair] = {}
@@ -118,7 +118,9 @@ def wait_until_still(
         rest = rest or q
         if clock() - still_since > STILL_FOR_S * NS_PER_S:
             return q
-        if interrupts.number or clock() - begin > STILL_WAIT_S * NS_PER_S:
+        if interrupts.number:
+            return None
+        if clock() - begin > STILL_WAIT_S * NS_PER_S:
             raise DriveError("the leg swings: hold it still, and again")
 
 

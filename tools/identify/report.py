@@ -11,6 +11,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
 from tools.identify.estimates import ParameterEstimate, Value, Verdict
 from tools.identify.robot_file_edit import apply
 
@@ -61,6 +64,31 @@ def propose(values: Mapping[str, Value], known: Collection[str], console: Consol
         console.print("the robot file is right, within what was measured")
     if known:
         console.print(f"measured now, no longer assumed: {', '.join(sorted(known))}", style="dim")
+
+
+def refuse_other_robot(path: Path, robot: RobotConfig, values: Mapping[str, Value]) -> None:
+    """Refuse to write what was measured against another file than the one to be written.
+
+    Args:
+        path: of the robot file.
+        robot: that the record was made with.
+        values: new ones by dotted key.
+
+    Raises:
+        RunError: the file has another value where a new one would go, or another robot's name.
+        ConfigError: the file cannot be read.
+    """
+    file = config_file.load_without_schedule(path)
+    if file.name != robot.name:
+        raise RunError(f"{path}: the robot {file.name}; the record is of {robot.name}")
+    for key in values:
+        section, name = key.split(".")
+        here, there = (getattr(getattr(one, section), name) for one in (file, robot))
+        if here != there:
+            raise RunError(
+                f"{path}: {key} is {here}, and was {there} when the record was made; give that "
+                "robot's file as --config, or record again"
+            )
 
 
 def write(

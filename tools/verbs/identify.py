@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -43,6 +44,8 @@ TORQUE: Final = 15.0
 LEVEL_MAX: Final = 0.1
 WEIGHED_SD: Final = 0.1
 """kg: a payload that was on a scale."""
+INTERRUPTED: Final = 130
+"""Exit code after Ctrl-C, as a shell has it."""
 MOTIONS: Final = "identify"
 """The scenario whose path is led."""
 
@@ -161,6 +164,7 @@ def _fit_and_tell(
         for module, (phi, theta) in corrections.items():
             console.print(f"  xrl zero {module} --by {phi:.4f},{theta:.4f}", highlight=False)
     if args.apply:
+        report.refuse_other_robot(path, robot, values)
         report.write(path, values, known, console)
     console.print(f"{picture}", style="dim")
 
@@ -210,6 +214,9 @@ def _led(
                 lambda t_s, wanted, status: shown.update(_line(t_s, scenario, wanted, status)),
                 lambda: bool(stop),
             )
+    if stop:
+        console.print("stopped: nothing was fitted; requests fade out by themselves")
+        sys.exit(INTERRUPTED)
     if heard.ended:
         raise RunError(f"{heard.ended}: nothing was fitted; requests fade out by themselves")
     return moments_of(heard.states, heard.wrenches)

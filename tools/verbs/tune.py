@@ -119,7 +119,7 @@ def _tune_direction(args: argparse.Namespace, console: Console) -> int:
         course = _live(robot, fleet, row, plan, console)
     if course.ended:
         console.print(f"[bold red]STOPPED[/]: {escape(course.ended)}")
-        return 1
+        return 130 if course.ended == "stopped" else 1  # Ctrl-C, as a shell has it
     with progress_along("what the model predicts", plan.duration_s) as progress:
         ideal = in_lockstep(robot, row, plan, IDEAL, progress)
     courses = {"measured": course, "predicted": ideal}

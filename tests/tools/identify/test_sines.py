@@ -67,6 +67,7 @@ def moved(
     leg = {name: hung.drives[name] for name in joint_drive.leg_of(module)}
     interrupts = jog_drive.Interrupts()
     q = joint_drive.wait_until_still(leg, robot, interrupts, hung.clock)
+    assert q is not None
     where = joint_drive.hanging(robot, q, module, axis)
     plan = joint_drive.plan_at(robot, module, axis, 15.0, where)
     result = joint_drive.move(
@@ -112,20 +113,25 @@ def test_a_knee_that_hangs_on_its_stop_is_led_off_it_and_its_friction_found(
     assert rows["reflected inertia"].verdict is Verdict.UNKNOWN
 
 
-def test_a_leg_that_swings_is_waited_for_and_not_for_ever(robot: RobotConfig) -> None:
+def test_a_leg_that_swings_is_waited_for_but_not_for_ever(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hung = HungRobot(robot, PlantConfig())
     hung.world.data.qvel[6:] = 0.5
     leg = {name: hung.drives[name] for name in joint_drive.leg_of(MODULE)}
     interrupts = jog_drive.Interrupts()
-    interrupts.number = 2
+    monkeypatch.setattr(joint_drive, "STILL_WAIT_S", 1.0)
     with pytest.raises(DriveError, match="swings"):
         joint_drive.wait_until_still(leg, robot, interrupts, hung.clock)
+    interrupts.number = 2
+    assert joint_drive.wait_until_still(leg, robot, interrupts, hung.clock) is None
 
 
 def test_held_modules_are_idle_again_when_one_does_not_arm(robot: RobotConfig) -> None:
     hung = HungRobot(robot, PlantConfig())
     leg = {name: hung.drives[name] for name in joint_drive.leg_of(MODULE)}
     q = joint_drive.wait_until_still(leg, robot, jog_drive.Interrupts(), hung.clock)
+    assert q is not None
     where = joint_drive.hanging(robot, q, MODULE, 0)
     plan = joint_drive.plan_at(robot, MODULE, 0, 15.0, where)
     hung.drives["hip_left"].never_arms = True

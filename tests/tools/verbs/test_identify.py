@@ -79,6 +79,17 @@ def test_what_was_planted_is_found_within_its_interval_and_written(
     assert re.search(r"xrl zero knee_right --by -?0\.0\d+,0\.0(0[89]|1[012])", told)
 
 
+def test_a_file_that_is_not_the_records_robot_is_not_written(
+    record: Path, lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = lab.read_text(encoding="utf-8").replace("payload = 20.4", "payload = 15.0", 1)
+    lab.write_text(text, encoding="utf-8")
+    words = ["identify", "body", record, "--config", lab, "--apply", "--out", tmp_path / "fit"]
+    assert exit_code(words) == 2
+    assert "mass.payload is 15.0, and was 20.4" in capsys.readouterr().err
+    assert lab.read_text(encoding="utf-8") == text
+
+
 def test_a_dry_run_shows_the_motions_and_needs_no_robot(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
