@@ -95,7 +95,7 @@ class Hocca:
         self._S_perp = 1.0 - self._S
         self._levelling = Levelling(config.imu.levelling_s)
         self._shift = ShiftReference(config.law.shift_max)
-        self._probe = ReferenceProbe(config.law.probe_max)
+        self._probe = ReferenceProbe(config.law.probe_max, config.law.S)
         self._stance = Stance(config.law.stance_max)
         self._weight = config.total_mass * GRAVITY
         self._F_O: Array = np.zeros(6)
@@ -189,7 +189,7 @@ class Hocca:
             self._probe.reset()
         else:
             self._has_led = True
-            self._probe.advance(*probe, measured.p, dt)
+            self._probe.advance(*probe, measured.p, measured.pdot, dt)
             self._shift.advance(shift_requested, dt)
         pdot = measured.pdot
         p_C, pdot_C = self._closed_loop_reference(dt)
@@ -199,11 +199,7 @@ class Hocca:
         pdot_C[:2] += lean * pdot[2]
         p_ref = self._S_perp * p_C + self._S * measured.p
         pdot_ref = self._S_perp * pdot_C + self._S * pdot
-        row = self._probe.row
-        if row != NO_ROW:
-            if self._S[row]:
-                p_ref[row], pdot_ref[row] = self._probe.held, 0.0
-            p_ref[row] += self._probe.offset
+        self._probe.apply(p_ref, pdot_ref, measured.p, pdot)
         force, moment_pitch = None, 0.0
         if wrench is not None:
             force = force_up(wrench.force, measured.p[3], measured.p[4])

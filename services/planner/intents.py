@@ -4,7 +4,7 @@ An intent that is not repeated goes stale: an operator who requested 100 N and l
 lifted forever. It fades out slowly, because somebody may still lean on the robot:
 
     request = intent                                       younger than `assist.stale_ms`
-    request = intent max(0, 1 - (age - stale) / fade)      older; a probe ends
+    request = intent max(0, 1 - (age - stale) / fade)      older; a probe ends then
 """
 
 from __future__ import annotations

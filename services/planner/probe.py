@@ -1,12 +1,16 @@
 """Small known offsets of one row of the pose's reference, to measure how the robot answers. Pure.
 
 `xrl tune` asks for them (`operator/intent`). The offset is added to the reference, within
-`law.probe_max`, no faster than `PROBE_S` for the whole range, and without a rate of its own:
-damping acts on the robot's motion alone. A row that the person leads is held where it is while it
-is probed, on local gains. A probe that is not repeated ends at once.
+`law.probe_max`, no faster than `PROBE_S` from the middle to the end of its range, and without a
+rate of its own: damping acts on the robot's motion alone. A probe ends when its intent is stale.
 
-    p_ref = p_C + offset                  a closed row
-    p_ref = p at the probe's begin + offset    a row that is led
+A row that the person leads is held where it is while it is probed, on local gains. The hold begins
+only at rest, and fades in and out during `HOLD_S`: at once it would be a step in torque (measured:
+11 N m at a knee with the torso at 0.3 m/s), which the joint services refuse.
+
+    p_ref    = p_C + offset                                a closed row
+    p_ref    = p + hold (held - p) + offset                a row that is led
+    pdot_ref = (1 - hold) pdot
 """
 
 from __future__ import annotations
@@ -23,6 +27,10 @@ NO_ROW: Final = -1
 PROBE_S: Final = 0.04
 """Shortest time from the middle to the end of the range, s: ten ticks, so that no tick's torque
 steps by more than the joint services accept."""
+HOLD_S: Final = 0.5
+"""Time in which the hold of a led row fades in, and out, s."""
+STILL: Final = 0.02
+"""m/s or rad/s; a led row that moves faster is not taken from the person."""
 
 
 class ProbeState(NamedTuple):
@@ -31,6 +39,7 @@ class ProbeState(NamedTuple):
     row: int = NO_ROW
     offset: float = 0.0
     held: float = 0.0
+    hold: float = 0.0
 
 
 class ReferenceProbe:
@@ -39,42 +48,68 @@ class ReferenceProbe:
     Attributes:
         row: of p that is probed; `NO_ROW`: none.
         offset: m or rad.
-        held: the row's place when the probe began, m or rad.
     """
 
-    def __init__(self, probe_max: Sequence[float]) -> None:
-        """Set the largest offset of each row of p either way, m and rad; 0: never."""
-        self._most = tuple(probe_max)
-        self.row, self.offset, self.held = NO_ROW, 0.0, 0.0
+    def __init__(self, probe_max: Sequence[float], led: Sequence[float]) -> None:
+        """Set the limits.
 
-    def advance(self, row: int, wanted: float, p: Array, dt: float) -> None:
-        """Follow what is asked for; another row begins when this one's offset is back at 0.
+        Args:
+            probe_max: largest offset of each row of p either way, m and rad; 0: never.
+            led: `law.S`; 1 for a row that the person leads.
+        """
+        self._most, self._led = tuple(probe_max), tuple(bool(one) for one in led)
+        self.row, self.offset = NO_ROW, 0.0
+        self._held = self._hold = 0.0
+
+    def advance(self, row: int, wanted: float, p: Array, pdot: Array, dt: float) -> None:
+        """Follow what is asked for; another row begins when this one is given back.
 
         Args:
             row: asked for; `NO_ROW`: none.
             wanted: its offset, m or rad; clipped to the limit.
             p: measured pose (6,).
+            pdot: its rate (6,).
             dt: time since the last tick, s.
         """
-        if self.row == NO_ROW and row != NO_ROW and self._most[row] > 0.0:
-            self.row, self.held = row, float(p[row])
+        if self.row == NO_ROW and row != NO_ROW and self._may_begin(row, float(pdot[row])):
+            self.row, self._held = row, float(p[row])
         if self.row == NO_ROW:
             return
+        is_asked, led = row == self.row, self._led[self.row]
         most = self._most[self.row]
-        target = min(most, max(-most, wanted)) if row == self.row else 0.0
+        # a led row is held before it is offset, and offset no more before it is given back
+        ready = is_asked and (not led or self._hold == 1.0)
+        target = min(most, max(-most, wanted)) if ready else 0.0
         step = dt * most / PROBE_S
         self.offset += min(step, max(-step, target - self.offset))
-        if row != self.row and self.offset == 0.0:
+        if led and is_asked:
+            self._hold = min(1.0, self._hold + dt / HOLD_S)
+        elif self.offset == 0.0:
+            self._hold = max(0.0, self._hold - dt / HOLD_S)
+        if not is_asked and self.offset == 0.0 and self._hold == 0.0:
             self.row = NO_ROW
+
+    def apply(self, p_ref: Array, pdot_ref: Array, p: Array, pdot: Array) -> None:
+        """Offset the row of a reference p_ref (6,) and hold it, if it is led; rates pdot_ref."""
+        row = self.row
+        if row == NO_ROW:
+            return
+        if self._led[row]:
+            p_ref[row] = p[row] + self._hold * (self._held - p[row])
+            pdot_ref[row] = (1.0 - self._hold) * pdot[row]
+        p_ref[row] += self.offset
 
     def reset(self) -> None:
         """End at once: the planner does not lead."""
-        self.row, self.offset = NO_ROW, 0.0
+        self.row, self.offset, self._hold = NO_ROW, 0.0, 0.0
 
     def snapshot(self) -> ProbeState:
         """Return the state."""
-        return ProbeState(self.row, self.offset, self.held)
+        return ProbeState(self.row, self.offset, self._held, self._hold)
 
     def restore(self, state: ProbeState) -> None:
         """Continue from a state."""
-        self.row, self.offset, self.held = state
+        self.row, self.offset, self._held, self._hold = state
+
+    def _may_begin(self, row: int, rate: float) -> bool:
+        return self._most[row] > 0.0 and (not self._led[row] or abs(rate) < STILL)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from services.planner.intents import Intents
 from services.planner.probe import NO_ROW, PROBE_S, ReferenceProbe
@@ -20,9 +21,12 @@ from shared.config.scenarios import Keyframe, Scenario
 from tools.tune.excitation import Excitation, SinePart
 from tools.tune.pose_probe import DIRECTIONS, ProbedLockstep, course_of
 
+Array = NDArray[np.float64]
 MOST = (0.01, 0.01, 0.01, 0.02, 0.05, 0.0)
 DT = 0.004
+LED = (0, 0, 1, 0, 1, 0)
 P = np.array([0.0, 0.0, 0.9, 0.0, 0.1, 0.0])
+REST = np.zeros(6)
 
 
 @given(
@@ -34,9 +38,9 @@ P = np.array([0.0, 0.0, 0.9, 0.0, 0.1, 0.0])
 def test_an_offset_is_never_larger_nor_faster_than_it_may_be(
     course: list[tuple[int, float, float]],
 ) -> None:
-    probe, last = ReferenceProbe(MOST), (NO_ROW, 0.0)
+    probe, last = ReferenceProbe(MOST, LED), (NO_ROW, 0.0)
     for row, wanted, dt in course:
-        probe.advance(row, wanted, P, dt)
+        probe.advance(row, wanted, P, REST, dt)
         if probe.row == NO_ROW:
             assert probe.offset == 0.0
         else:
@@ -48,12 +52,12 @@ def test_an_offset_is_never_larger_nor_faster_than_it_may_be(
 
 
 def test_another_row_begins_only_when_the_first_is_back() -> None:
-    probe = ReferenceProbe(MOST)
+    probe = ReferenceProbe(MOST, LED)
     for _ in range(20):
-        probe.advance(0, 0.01, P, DT)
+        probe.advance(0, 0.01, P, REST, DT)
     rows = []
     for _ in range(30):
-        probe.advance(3, 0.02, P, DT)
+        probe.advance(3, 0.02, P, REST, DT)
         rows.append((probe.row, probe.offset))
     assert rows[0][0] == 0
     assert rows[-1] == (3, pytest.approx(0.02))
@@ -62,21 +66,58 @@ def test_another_row_begins_only_when_the_first_is_back() -> None:
 
 
 def test_a_row_that_the_robot_file_forbids_is_never_probed() -> None:
-    probe = ReferenceProbe(MOST)
-    probe.advance(5, 0.01, P, DT)
+    probe = ReferenceProbe(MOST, LED)
+    probe.advance(5, 0.01, P, REST, DT)
     assert probe.row == NO_ROW
 
 
 def test_a_probe_goes_on_from_its_state() -> None:
-    probe, other = ReferenceProbe(MOST), ReferenceProbe(MOST)
-    for _ in range(5):
-        probe.advance(2, 0.01, P, DT)
+    probe, other = ReferenceProbe(MOST, LED), ReferenceProbe(MOST, LED)
+    for _ in range(160):
+        probe.advance(2, 0.01, P, REST, DT)
     other.restore(probe.snapshot())
     for _ in range(9):
-        probe.advance(2, -0.01, P, DT)
-        other.advance(2, -0.01, P, DT)
+        probe.advance(2, -0.01, P, REST, DT)
+        other.advance(2, -0.01, P, REST, DT)
         assert other.snapshot() == probe.snapshot()
-    assert probe.held == 0.9
+    assert probe.snapshot().held == 0.9
+
+
+def referred(probe: ReferenceProbe, p: Array, pdot: Array) -> tuple[Array, Array]:
+    """Return what becomes of the reference of a robot at p."""
+    p_ref, pdot_ref = p.copy(), pdot.copy()
+    probe.apply(p_ref, pdot_ref, p, pdot)
+    return p_ref, pdot_ref
+
+
+def test_a_led_row_is_taken_only_at_rest() -> None:
+    probe, moving = ReferenceProbe(MOST, LED), np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
+    for _ in range(50):
+        probe.advance(2, 0.01, P, moving, DT)
+    assert probe.row == NO_ROW
+    probe.advance(2, 0.01, P, REST, DT)
+    assert probe.row == 2
+
+
+def test_a_led_row_is_held_and_given_back_without_a_step() -> None:
+    """However the person moves it meanwhile: the reference moves by little from tick to tick."""
+    probe = ReferenceProbe(MOST, LED)
+    p, last, largest, offset_step = P.copy(), P[2], 0.0, DT * MOST[2] / PROBE_S
+    pdot = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    seen = []
+    for tick in range(600):
+        if tick > 0:
+            p[2] += 0.1 * DT
+        probe.advance(2 if tick < 300 else NO_ROW, 0.01, p, pdot if tick else REST, DT)
+        p_ref, pdot_ref = referred(probe, p, pdot)
+        largest = max(largest, abs(p_ref[2] - last) - 0.1 * DT)
+        last = p_ref[2]
+        seen.append((probe.row, p_ref[2] - p[2], pdot_ref[2]))
+    # the deviation of 0.12 m that is held goes back over half a second
+    assert largest <= offset_step + 0.15 * DT / 0.5 + 1e-9
+    assert seen[250][0] == 2
+    assert seen[250][2] == pytest.approx(0.0, abs=1e-12), "held"
+    assert seen[-1] == (NO_ROW, 0.0, pytest.approx(0.1)), "the person's again"
 
 
 def intent(row: int, offset: float) -> OperatorIntent:
@@ -135,3 +176,26 @@ def test_the_largest_probe_of_each_direction_is_led_without_a_refused_command_or
     assert course.r.min() == pytest.approx(-size, rel=0.05)
     at_top = (course.t_s > 4.0) & (course.t_s < 5.0)
     assert 0.03 * size < course.y[at_top].mean() < 1.3 * size
+
+
+def test_a_hand_that_moves_a_probed_height_meets_no_refused_command(robot: RobotConfig) -> None:
+    """It is led down by 0.12 m from before the probe ends until after it: HOLD would be a step."""
+    keys = (Keyframe(0.0, 1.188), Keyframe(2.0, 1.188), Keyframe(5.0, 1.15), Keyframe(8.0, 1.07))
+    plan = Excitation(robot.law.probe_max[2], (SinePart(3.0, 2.0, 4),))
+    scenario = Scenario("probe", "", 9.0, keys)
+    refused: dict[str, int] = {}
+    trips: set[int] = set()
+
+    def record(topic: Topic, module: str, message: Message) -> None:
+        if isinstance(message, JointState) and topic is topics.JOINT_STATE:
+            refused[module] = message.refused
+        elif isinstance(message, PlannerStatus):
+            trips.add(message.trip)
+            if fleet.world.scenario_s > 5.5:
+                fleet.excitation = None
+
+    fleet = ProbedLockstep(robot, scenario, record=record, plant=PlantConfig())
+    fleet.row, fleet.excitation = 2, plan
+    assert not any(truth.fallen for truth in fleet.run())
+    assert set(refused.values()) == {0}
+    assert trips == {0}

@@ -24,6 +24,7 @@ SHORT = Scenario(
     "identify", "", 8.0,
     (Keyframe(0.0, 1.188), Keyframe(4.0, 1.15, shift=(0.0, 0.02, 0.0, 0.0)), Keyframe(8.0, 1.188)),
 )  # fmt: skip
+HELD = Excitation(0.008, (SinePart(9.0, 2.0, 4),))
 STEP = Excitation(0.008, (SinePart(9.0, 1.0, 3),))
 
 
@@ -52,14 +53,31 @@ def test_a_live_robot_is_led_for_a_fit_and_probed_and_leads_on(
             assert moments.q[:, 5].max() - moments.q[:, 5].min() > 0.05, "the hips went down"
             stopped = motion.go(SHORT, lambda *_: None, lambda: True)
             assert stopped.ended == "stopped"
+            applied = xrl("identify", "body", *place, "--apply")
+            assert applied.returncode == 2
+            assert "runs with it" in applied.stderr, "and nothing was led"
         with open_session(robot, "tune", run_dir) as session:
             course = LiveProbe(session).go(0, STEP, lambda _: None, lambda: False)
             assert course.ended == ""
             assert course.r.max() == pytest.approx(0.008, rel=0.05)
             at_top = (course.t_s > 3.0) & (course.t_s < 5.0)
             assert 0.004 < course.y[at_top].mean() < 0.012
+            led = LiveProbe(session).go(2, HELD, lambda _: None, lambda: False)
+            assert led.ended == "", "a led row is held and given back"
+            assert led.r.max() == pytest.approx(0.008, rel=0.1)
         status = xrl("status", *place)
         assert "LEADING" in status.stdout
+        with open_session(robot, "tune", run_dir) as session:
+            probe = LiveProbe(session)
+            killed: list[int] = []
+
+            def kill(t_s: float) -> None:
+                if t_s > 1.5 and not killed:
+                    killed.append(xrl("kill", "planner", *place).returncode)
+
+            course = probe.go(0, STEP, kill, lambda: False)
+            assert killed == [0]
+            assert course.ended != "", "a planner that is gone leads nothing"
     finally:
         down = xrl("down", *place)
         keep_pace(tmp_path)

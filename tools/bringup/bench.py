@@ -70,6 +70,20 @@ def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFlee
     return None
 
 
+def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
+    """Refuse a module whose joint service is up: a drive has one master.
+
+    Raises:
+        FleetError: it is.
+    """
+    fleet = service_on(robot, module, run_dir)
+    if fleet is not None:
+        raise FleetError(
+            f"{module}: its joint service in {fleet.run.path} has the drive; hang the robot and "
+            f"`xrl down --run-dir {fleet.run.path}` first"
+        )
+
+
 @contextlib.contextmanager
 def drives_to_ourselves(
     robot: RobotConfig,

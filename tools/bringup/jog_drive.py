@@ -35,6 +35,12 @@ PROGRESS_S: Final = 0.25
 
 Clock = Callable[[], int]
 Progress = Callable[[Sample], None]
+Watch = Callable[[], str]
+
+
+def nothing() -> str:
+    """Watch nothing."""
+    return ""
 
 
 class JogResult(NamedTuple):
@@ -103,6 +109,7 @@ def jog_drive(
     interrupts: Interrupts,
     progress: Progress,
     clock: Clock = now_ns,
+    watch: Watch = nothing,
 ) -> JogResult:
     """Arm a drive, move its joint as planned, and idle it, whatever happens.
 
@@ -115,6 +122,7 @@ def jog_drive(
         interrupts: read in every cycle.
         progress: receives a sample now and then.
         clock: monotonic, ns.
+        watch: called in every cycle; returns why the motion must stop, "" if it need not.
     """
     samples: list[Sample] = []
     try:
@@ -128,7 +136,7 @@ def jog_drive(
                 jog = Jog(robot, module, plan, q, clock())
                 samples = jog.samples
                 give_up_ns = clock() + _ns(plan.duration_s + 5.0)
-                _move(drive, jog, interrupts, progress, clock, give_up_ns)
+                _move(drive, jog, interrupts, progress, clock, give_up_ns, watch)
                 trouble = jog.trouble
     except BaseException as error:
         if not idle(drive, clock):
@@ -152,6 +160,7 @@ def _move(
     progress: Progress,
     clock: Clock,
     give_up_ns: int,
+    watch: Watch,
 ) -> None:
     """Run the jog until it is done, in trouble, or interrupted."""
     report_at_s = 0.0
@@ -164,6 +173,7 @@ def _move(
         target = jog.step(now, reading)
         if target is not None:
             drive.write(target)
+        jog.trouble = jog.trouble or watch()
         if now > give_up_ns:
             jog.trouble = "it took too long: the drive's samples come too seldom"
         elif jog.samples and jog.samples[-1].t_s >= report_at_s:

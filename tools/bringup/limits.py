@@ -16,7 +16,7 @@ from shared.can.cansimple import Command
 from shared.can.drive_settings import AXES
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
-from shared.exceptions import DriveError
+from shared.exceptions import DriveError, XrlError
 from tools.bringup.boards import Value, equal
 from tools.bringup.reach import boards_on_usb
 
@@ -36,6 +36,18 @@ def give_back(robot: RobotConfig, module: str, run_dir: Path) -> None:
         _over_usb(robot, module, run_dir)
     else:
         _over_can(robot, module, run_dir)
+
+
+def not_given_back(robot: RobotConfig, module: str, run_dir: Path) -> str:
+    """Give the limits back; return what to tell of a drive that did not take them, "" if it did."""
+    try:
+        give_back(robot, module, run_dir)
+    except XrlError as error:
+        return (
+            f"the drive still has the limits of this motion ({error}): until it is armed by its "
+            "service or restarted, `xrl doctor` finds them wrong"
+        )
+    return ""
 
 
 def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:

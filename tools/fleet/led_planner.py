@@ -11,13 +11,15 @@ from services.planner.probe import NO_ROW
 from shared.bus import topics
 from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
 from shared.bus.session import Session
-from shared.clock import now_ns
+from shared.clock import NS_PER_S, now_ns
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 
 LOOK_S: Final = 0.002
 LINKS_S: Final = 3.0
 """Longest wait for the first status."""
+SILENT_S: Final = 0.3
+"""Without a status for so long, nobody knows what it does."""
 LEADS_S: Final = 15.0
 """Longest wait for a planner that does not lead yet: a fleet that was just started."""
 
@@ -48,7 +50,7 @@ class LedPlanner:
             if time.monotonic() > deadline:
                 raise FleetError("the robot is silent; see `xrl status`")
             time.sleep(LOOK_S)
-        self.status = status
+        self.status, self._heard_ns = status, now_ns()
         deadline = time.monotonic() + LEADS_S
         while (why := self.trouble()) and time.monotonic() < deadline:
             time.sleep(LOOK_S)
@@ -59,12 +61,15 @@ class LedPlanner:
     def look(self) -> bool:
         """Take a newer status, if there is one; return True if there was."""
         newer = self._statuses.take()
-        self.status = newer or self.status
+        if newer is not None:
+            self.status, self._heard_ns = newer, now_ns()
         return newer is not None
 
     def trouble(self) -> str:
         """Return why it cannot be asked for anything now; "" if it can."""
         status = self.status
+        if now_ns() - self._heard_ns > SILENT_S * NS_PER_S:
+            return "the planner is silent"
         if status.mode != PlannerMode.LEADING:
             why = f" ({status.why})" if status.why else ""
             return f"the planner does not lead: {PlannerMode(status.mode).name}{why}"

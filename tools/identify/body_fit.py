@@ -97,7 +97,7 @@ MOMENTS_MIN: Final = 50
 """Fewer are refused: ten seconds of quasi-static motion."""
 _ANKLES: Final = [JOINTS.index(f"ankle_{side}_{axis}") for side in SIDES for axis in AXES]
 _STEP: Final = 1e-3
-"""Of a prior's width, for the numerical derivative."""
+"""Step of the numerical derivative, in widths of the prior."""
 
 
 class Record(NamedTuple):
@@ -130,10 +130,18 @@ class BodyFit(NamedTuple):
         i = self.names.index(name)
         return float(self.x[i]), float(np.sqrt(self.covariance[i, i]))
 
+    def covariance_of(self, a: str, b: str) -> float:
+        """Return the covariance of two parameters."""
+        return float(self.covariance[self.names.index(a), self.names.index(b)])
+
     def known(self, name: str) -> float:
-        """Return what share of the prior's variance the record has taken away, 0 to 1."""
+        """Return what share of the usual prior's variance is gone, 0 to 1.
+
+        By the record, or before it: a weighed payload is known.
+        """
         i = self.names.index(name)
-        return 1.0 - float(self.covariance[i, i]) / self.priors[i].sd ** 2
+        usual = next((row.sd for row in PRIORS if row.name == name), self.priors[i].sd)
+        return 1.0 - float(self.covariance[i, i]) / usual**2
 
 
 def fit(

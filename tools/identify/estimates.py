@@ -17,6 +17,9 @@ HALF_WIDTH: Final = 1.96
 KNOWN_MIN: Final = 0.75
 """Share of the prior's variance that a record must take away: the interval is half as wide then."""
 
+LIGHT: Final = 1.0
+"""kg; nothing is known of the place of a load that is hardly there."""
+
 Value = float | tuple[float, float, float]
 
 
@@ -37,14 +40,14 @@ class ParameterEstimate(NamedTuple):
     """One number of the robot."""
 
     key: str
-    """Of the robot file; "" if it has none."""
+    """Key in the robot file; "" if it has none."""
     what: str
     unit: str
     file: float | None
     """The robot file's value, in `unit`; None: it has none."""
     value: float
     half_width: float
-    """Of the 95 % interval."""
+    """Half the width of the 95 % interval."""
     verdict: Verdict
 
     @property
@@ -87,7 +90,7 @@ class JointResult(NamedTuple):
     joint: str
     fit: JointFit
     leg_inertia: float
-    """Of what hangs on it by the robot file, without its rotor, kg m^2."""
+    """Inertia of what hangs on it by the robot file, without its rotor, kg m^2."""
 
     @property
     def rotor(self) -> tuple[float, float]:
@@ -141,6 +144,8 @@ def changes(estimates: list[ParameterEstimate], robot: RobotConfig) -> dict[str,
     for row in estimates:
         if not row.key or row.verdict is not Verdict.CHANGE:
             continue
+        if row.key == "mass.payload" and not _is_written(row, robot):
+            continue
         if row.key not in file:
             found[row.key] = round(row.value, row.digits)
             continue
@@ -153,6 +158,26 @@ def changes(estimates: list[ParameterEstimate], robot: RobotConfig) -> dict[str,
     if most < robot.joint.tau_module_max:
         found["joint.tau_module_max"] = math.floor(10.0 * most) / 10.0
     return found
+
+
+def remarks(estimates: Sequence[ParameterEstimate], robot: RobotConfig) -> list[str]:
+    """Return what a person has to know beside the lines to write."""
+    said = []
+    for row in estimates:
+        if row.verdict is not Verdict.CHANGE:
+            continue
+        if row.key == "mass.payload" and not _is_written(row, robot):
+            said.append(
+                f"mass.payload: {row.value:.1f} kg is not within 0 .. mass.payload_max "
+                f"({robot.mass.payload_max:g} kg): not written; put the load or the maximum right"
+            )
+        if row.key == "drive.torque_constant":
+            said.append(
+                "drive.torque_constant: the drives have a copy. After it is written: `xrl "
+                "configure --apply`, which restarts them, then zero them; until then the robot is "
+                "as it was, and to measure and write again would count the error twice"
+            )
+    return said
 
 
 def measured(estimates: list[ParameterEstimate]) -> set[str]:
@@ -177,23 +202,31 @@ def zero_corrections(estimates: list[ParameterEstimate]) -> dict[str, tuple[floa
 
 def _masses(fit: BodyFit, robot: RobotConfig) -> Iterator[ParameterEstimate]:
     more, sd = fit.of(MASS)
-    payload = robot.mass.payload + more
-    yield estimate(
+    mass = estimate(
         "mass.payload", "payload", "kg",
-        file=robot.mass.payload, value=payload, sd=sd, known=fit.known(MASS) >= KNOWN_MIN,
+        file=robot.mass.payload, value=robot.mass.payload + more, sd=sd,
+        known=fit.known(MASS) >= KNOWN_MIN,
     )  # fmt: skip
+    yield mass
+    # a moment is what is measured; its place goes with the payload that the file will have
+    is_new = _is_written(mass, robot)
+    payload = max(mass.value if is_new else robot.mass.payload, LIGHT)
     for axis, name in enumerate(COM):
         at_file = robot.mass.payload_com[axis]
         moment, moment_sd = fit.of(name)
-        # nothing is known of the place of a load that is hardly there
-        held = max(payload, 1.0)
-        place = (robot.mass.payload * at_file + moment) / held
-        spread = math.hypot(moment_sd, place * sd) / held
+        place = (robot.mass.payload * at_file + moment) / payload
+        variance = moment_sd**2
+        if is_new:
+            variance += place * (place * sd**2 - 2.0 * fit.covariance_of(name, MASS))
         yield estimate(
             "mass.payload_com", f"payload's centre {'xyz'[axis]}", "m",
-            file=at_file, value=place, sd=spread,
-            known=fit.known(name) >= KNOWN_MIN and payload > 1.0,
+            file=at_file, value=place, sd=math.sqrt(max(0.0, variance)) / payload,
+            known=fit.known(name) >= KNOWN_MIN and payload > LIGHT,
         )  # fmt: skip
+
+
+def _is_written(mass: ParameterEstimate, robot: RobotConfig) -> bool:
+    return mass.verdict is Verdict.CHANGE and 0.0 <= mass.value <= robot.mass.payload_max
 
 
 def _harness(fit: BodyFit, robot: RobotConfig) -> Iterator[ParameterEstimate]:

@@ -19,12 +19,13 @@ from services.joint.drivers.base import Drive
 from shared.clock import now_ns
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DriveError, FleetError, XrlError
+from shared.exceptions import DriveError
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive, limits
 from tools.bringup.jogging import MotionPlan, Sample, outside
+from tools.bringup.stops import within_stops
 from tools.identify import joint_drive, report
-from tools.identify.estimates import JointResult, changes, measured, of_joints
+from tools.identify.estimates import JointResult, of_joints
 from tools.identify.sines import SinePlan, fit_sines
 from tools.output import make_folder
 
@@ -33,63 +34,94 @@ LIFTED: Final = 0.2
 """m; the emulated robot is hung this much higher, feet clear of the floor."""
 
 
+class Moved(NamedTuple, Generic[P]):
+    """A joint that was moved to the end of its plan."""
+
+    samples: list[Sample]
+    plan: P
+    where: joint_drive.Hanging
+    """How the leg hung before."""
+
+
+class Stopped(NamedTuple):
+    """A motion that did not come to its end, or did not begin."""
+
+    why: str
+    not_idle: tuple[str, ...] = ()
+    """Modules whose drives do not say that they are idle."""
+    declined: bool = False
+    """The person said no."""
+
+
 def run(args: argparse.Namespace, console: Console) -> int:
-    """Measure the joints that are asked for; 1 if a motion was stopped."""
+    """Measure the joints that are asked for; 1 if a motion was stopped, 2 if none was wanted."""
     modules, axes = _asked(args)
     path = bench.robot_file(args)
     robot = config_file.load_without_schedule(path)
+    if args.apply:
+        report.refuse_running(path)
     results: list[JointResult] = []
-    trouble = ""
+    stopped: Stopped | None = None
     interrupts = jog_drive.Interrupts()
     refuse_services(robot, modules, args.run_dir)
     with bench.drives_to_ourselves(robot, path, args.run_dir, console.print, lifted=LIFTED):
-        for module in modules:
-            for axis in axes:
+        for module, axis in ((module, axis) for module in modules for axis in axes):
+            try:
                 found = _joint(args, robot, module, axis, interrupts, console)
-                if isinstance(found, str):
-                    trouble = found
-                    break
-                if found is not None:
-                    results.append(found)
-            if trouble:
+            except DriveError as error:
+                if not results:
+                    raise
+                found = Stopped(str(error))  # what is measured by now is told
+            if isinstance(found, Stopped):
+                stopped = found
                 break
-    if interrupts.number:
-        sys.exit(128 + interrupts.number)
-    if trouble:
-        console.print(f"[bold red]STOPPED[/]: {escape(trouble)}")
+            if found is not None:
+                results.append(found)
     if results:
         _tell(args, robot, path, results, console)
-    return 1 if trouble else 0
+    code = 0 if stopped is None else tell_stopped(stopped, console)
+    if interrupts.number:
+        sys.exit(128 + interrupts.number)
+    return code
+
+
+def tell_stopped(stopped: Stopped, console: Console) -> int:
+    """Print why a motion ended, a danger last; return the exit code."""
+    if stopped.declined:
+        console.print(stopped.why)
+        return 2
+    console.print(f"[bold red]STOPPED[/]: {escape(stopped.why)}")
+    for module in stopped.not_idle:
+        console.print(f"[bold red]{module}: {jog_drive.NOT_IDLE}[/]")
+    return 1
 
 
 def _asked(args: argparse.Namespace) -> tuple[Sequence[str], Sequence[int]]:
     """Return modules and axes.
 
     Raises:
-        DriveError: they name none, or no such module.
+        DriveError: they name none, or no such module; or the torque is none.
     """
     unknown = [name for name in args.module if name not in MODULES]
     if unknown:
         raise DriveError(f"{unknown[0][:40]}: one of {', '.join(MODULES)} is right")
     if bool(args.module) == args.all:
         raise DriveError("name modules, or --all")
+    if not args.torque > 0.0:
+        raise DriveError(f"--torque {args.torque:g}: more than 0 N m is right")
     axes = (0, 1) if args.axis is None else (AXES.index(args.axis),)
     return (MODULES if args.all else args.module), axes
 
 
 def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -> None:
-    """Refuse legs that have a joint service up: a drive has one master.
+    """Refuse if the leg of one of these modules has a joint service up.
 
     Raises:
         FleetError: naming the first.
     """
-    for module in dict.fromkeys(name for one in modules for name in joint_drive.leg_of(one)):
-        fleet = bench.service_on(robot, module, run_dir)
-        if fleet is not None:
-            raise FleetError(
-                f"{module}: its joint service in {fleet.run.path} has the drive; hang the robot "
-                f"and `xrl down --run-dir {fleet.run.path}` first"
-            )
+    legs = dict.fromkeys(name for one in modules for name in joint_drive.leg_of(one))
+    for name in legs:
+        bench.refuse_service(robot, name, run_dir)
 
 
 def _joint(
@@ -99,8 +131,8 @@ def _joint(
     axis: int,
     interrupts: jog_drive.Interrupts,
     console: Console,
-) -> JointResult | str | None:
-    """Measure one joint; return its result, why it was stopped, or None for a dry run."""
+) -> JointResult | Stopped | None:
+    """Measure one joint; return its result, how it was stopped, or None for a dry run."""
     joint = f"{module}_{AXES[axis]}"
 
     def plan_of(where: joint_drive.Hanging) -> SinePlan:
@@ -113,17 +145,8 @@ def _joint(
         return moved
     fit = fit_sines(moved.samples, moved.plan)
     if fit is None:
-        return f"{joint}: too few samples came for a fit; look at its bus (`xrl can test`)"
+        return Stopped(f"{joint}: too few samples for a fit; look at its bus (`xrl can test`)")
     return JointResult(joint, fit, moved.where.inertia)
-
-
-class Moved(NamedTuple, Generic[P]):
-    """A joint that was moved to the end of its plan."""
-
-    samples: list[Sample]
-    plan: P
-    where: joint_drive.Hanging
-    """The leg hung before."""
 
 
 def move_joint(
@@ -133,8 +156,8 @@ def move_joint(
     plan_of: Callable[[joint_drive.Hanging], P],
     interrupts: jog_drive.Interrupts,
     console: Console,
-) -> Moved[P] | str | None:
-    """Look at a leg, ask, and move a joint; return why it was stopped, or None for a dry run.
+) -> Moved[P] | Stopped | None:
+    """Look at a leg, ask, and move a joint; return how it ended, or None for a dry run.
 
     Args:
         args: of the verb: `dry_run`, `yes`, `run_dir`.
@@ -158,40 +181,38 @@ def move_joint(
     ):
         q = joint_drive.wait_until_still(drives, robot, interrupts, now_ns)
     if q is None:
-        return "stopped before anything moved"
+        return Stopped("nothing was moved yet")
     where = joint_drive.hanging(robot, q, module, axis)
     plan = plan_of(where)
     limited = joint_drive.limited(robot, plan)
-    if why := outside(joint_drive.within_stops(robot), module, plan, q[module]):
+    if why := outside(within_stops(robot), module, plan, q[module]):
         raise DriveError(f"{module}: {why}")
     if args.dry_run:
         return None
     question = "Does the leg hang free, the power switch at hand?"
     if not bench.confirm(question, yes=args.yes):
-        return "nothing was moved"
+        return Stopped("nothing was moved", declined=True)
     refuse_services(robot, [module], args.run_dir)
-    try:
-        with (
-            _open(limited, leg, args.run_dir) as drives,
-            interrupts.kept(),
-            Live(console=console, refresh_per_second=4, transient=True) as shown,
-        ):
-            result = joint_drive.move(
-                drives,
-                limited,
-                module,
-                plan,
-                q_seen=q,
-                interrupts=interrupts,
-                progress=lambda sample: shown.update(_line(sample, plan, name)),
-                clock=now_ns,
-            )
-    finally:
-        _give_limits_back(robot, leg, args.run_dir, console)
-    if not result.is_idle:
-        return f"{module}: {jog_drive.NOT_IDLE}"
-    if result.trouble:
-        return f"{name}: {result.trouble}"
+    with (
+        _open(limited, leg, args.run_dir) as drives,
+        interrupts.kept(),
+        Live(console=console, refresh_per_second=4, transient=True) as shown,
+    ):
+        result = joint_drive.move(
+            drives,
+            limited,
+            module,
+            plan,
+            q_seen=q,
+            interrupts=interrupts,
+            progress=lambda sample: shown.update(_line(sample, plan, name)),
+            clock=now_ns,
+        )
+    # only to drives that say that they are idle: full limits are nothing for an armed one
+    idle = [one for one in leg if one not in result.not_idle]
+    _give_limits_back(robot, idle, args.run_dir, console)
+    if result.trouble or result.not_idle:
+        return Stopped(f"{name}: {result.trouble or 'the motion ended'}", result.not_idle)
     return Moved(result.samples, plan, where)
 
 
@@ -209,13 +230,8 @@ def _give_limits_back(
     robot: RobotConfig, modules: Sequence[str], run_dir: Path, console: Console
 ) -> None:
     for module in modules:
-        try:
-            limits.give_back(robot, module, run_dir)
-        except XrlError as error:
-            console.print(
-                f"[yellow]{module}: the drive still has the limits of this motion "
-                f"({escape(str(error))}) until it is armed by its service or restarted[/]"
-            )
+        if why := limits.not_given_back(robot, module, run_dir):
+            console.print(f"[yellow]{module}: {escape(why)}[/]")
 
 
 def _described(joint: str, plan: SinePlan) -> str:
@@ -248,9 +264,5 @@ def _tell(
 
     picture = folder / "joints.png"
     draw_joints(estimates, results, picture)
-    console.print(report.estimates_table(estimates))
-    values, known = changes(estimates, robot), measured(estimates)
-    report.propose(values, known, console)
-    if args.apply:
-        report.write(path, values, known, console)
+    report.tell(estimates, robot, path if args.apply else None, console)
     console.print(f"{picture}", style="dim")

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 
 from services.joint.differential import joint_from_motor
-from services.joint.drive_setpoint import DriveSetpointLaw
 from services.joint.drivers.base import Drive, DriveReading
-from services.joint.pd_law import ZERO, Setpoint
 from services.joint.torque_limiter import limits_of
 from services.planner.model import HangingLegs
 from shared.bus.messages import Pair
@@ -21,9 +17,10 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from shared.robot.joints import MODULE_INDEX, MODULES, N_JOINTS
-from shared.robot.robot_model import HARD_STOP_MARGIN
 from tools.bringup import jog_drive
+from tools.bringup.held_module import HeldModule
 from tools.bringup.jogging import MotionPlan, Sample, gentle
+from tools.bringup.stops import within_stops
 from tools.identify.sines import SinePlan, plan_for
 
 STILL: Final = 0.004
@@ -39,11 +36,11 @@ class Hanging(NamedTuple):
     """A leg as it hangs."""
 
     q: dict[str, Pair]
-    """Of its three modules, (phi, theta), rad."""
+    """Angles of its three modules, (phi, theta), rad."""
     inertia: float
-    """Of what hangs on the joint by the robot file, without its rotor, kg m^2."""
+    """Inertia of what hangs on the joint by the robot file, without its rotor, kg m^2."""
     gravity: float
-    """Its stiffness, N m/rad."""
+    """Stiffness that gravity gives the joint, N m/rad."""
 
 
 def leg_of(module: str) -> tuple[str, ...]:
@@ -131,15 +128,14 @@ def _first(drive: Drive, name: str, clock: jog_drive.Clock) -> DriveReading:
         raise DriveError(f"{name}: {error}") from None
 
 
-def within_stops(robot: RobotConfig) -> RobotConfig:
-    """Return the robot with limits at the mechanism's stops: a leg that hangs may rest on one."""
-    limits = {}
-    for kind in ("ankle", "knee", "hip"):
-        limit = getattr(robot.limits, kind)
-        (a, b), (c, d) = limit.phi, limit.theta
-        m = HARD_STOP_MARGIN + 0.02  # and a little: the count of an encoder
-        limits[kind] = msgspec.structs.replace(limit, phi=(a - m, b + m), theta=(c - m, d + m))
-    return msgspec.structs.replace(robot, limits=msgspec.structs.replace(robot.limits, **limits))
+class LegResult(NamedTuple):
+    """How a motion of a leg ended."""
+
+    samples: list[Sample]
+    trouble: str
+    """Why it was stopped; "" if it came to its end."""
+    not_idle: tuple[str, ...]
+    """Modules whose drives do not say that they are idle."""
 
 
 def move(
@@ -152,11 +148,13 @@ def move(
     interrupts: jog_drive.Interrupts,
     progress: Callable[[Sample], None],
     clock: jog_drive.Clock,
-) -> jog_drive.JogResult:
+) -> LegResult:
     """Hold the leg, move the joint, and idle all, whatever happens.
 
+    A held module that moves, or whose drive faults, stops the motion.
+
     Args:
-        drives: of the leg, idle, opened with the limits of `limited`.
+        drives: the leg's, idle, opened with the limits of `limited`.
         robot: as `limited` made it.
         module: that is moved.
         plan: its motion.
@@ -164,18 +162,38 @@ def move(
         interrupts: read in every cycle.
         progress: receives a sample now and then.
         clock: monotonic, ns.
-
-    Raises:
-        DriveError: one of the leg's other drives does not arm.
     """
-    with contextlib.ExitStack() as stack:
-        for name, drive in drives.items():
-            if name != module:
-                stack.enter_context(_held(drive, robot, name, interrupts, clock))
-        return jog_drive.jog_drive(
-            drives[module], robot, module, plan, q_seen=q_seen[module], interrupts=interrupts,
-            progress=progress, clock=clock,
-        )  # fmt: skip
+    held = [
+        HeldModule(drive, robot, name, plan.torque_limit, clock)
+        for name, drive in drives.items()
+        if name != module
+    ]
+    samples: list[Sample] = []
+    not_idle: list[str] = []
+    trouble = ""
+    try:
+        for one in held:
+            trouble = trouble or one.hold(interrupts)
+        if not trouble:
+            result = jog_drive.jog_drive(
+                drives[module], robot, module, plan, q_seen=q_seen[module], interrupts=interrupts,
+                progress=progress, clock=clock, watch=lambda: _first_of(held),
+            )  # fmt: skip
+            samples, trouble = result.samples, result.trouble
+            not_idle += [] if result.is_idle else [module]
+    except BaseException as error:
+        left = [one.module for one in held if not one.release()]
+        if left:
+            error.add_note(f"{', '.join(left)}: {jog_drive.NOT_IDLE}")
+        raise
+    not_idle += [one.module for one in held if not one.release()]
+    return LegResult(samples, trouble, tuple(not_idle))
+
+
+def _first_of(held: Sequence[HeldModule]) -> str:
+    """Keep all; return the first trouble."""
+    troubles = [trouble for one in held if (trouble := one.keep())]
+    return troubles[0] if troubles else ""
 
 
 def limited(robot: RobotConfig, plan: MotionPlan) -> RobotConfig:
@@ -185,27 +203,3 @@ def limited(robot: RobotConfig, plan: MotionPlan) -> RobotConfig:
         DriveError: the torque is beyond the robot's.
     """
     return gentle(within_stops(robot), plan)
-
-
-@contextlib.contextmanager
-def _held(
-    drive: Drive,
-    robot: RobotConfig,
-    module: str,
-    interrupts: jog_drive.Interrupts,
-    clock: jog_drive.Clock,
-) -> Iterator[None]:
-    """Have a drive hold its module where it is, by its own loop."""
-    try:
-        reading = jog_drive.arm(drive, interrupts, clock)
-        if isinstance(reading, str):
-            raise DriveError(f"{module}: {reading}")
-        q = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)
-        stand = robot.stand_gains(module)
-        setpoint = Setpoint(q, ZERO, ZERO, ZERO, stand.k_p, stand.k_d)
-        law = DriveSetpointLaw(robot.joint.gear_ratio, robot.drive.vel_limit)
-        drive.write(law.target(clock(), setpoint, ZERO, reading.pos_turns, reading.vel_turns))
-        yield
-    finally:
-        if not jog_drive.idle(drive, clock):
-            raise DriveError(f"{module}: {jog_drive.NOT_IDLE}")

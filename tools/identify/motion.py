@@ -32,7 +32,7 @@ class MotionRecord(NamedTuple):
     """What was heard meanwhile, by arrival."""
 
     states: tuple[TimedRows[JointState], ...]
-    """Of the six modules."""
+    """One stream for each of the six modules."""
     wrenches: TimedRows[Wrench]
     ended: str
     """Why it ended before its time; "" if it did not."""

@@ -55,7 +55,7 @@ def moments_of(states: Sequence[TimedRows[JointState]], wrenches: TimedRows[Wren
     """Return the quasi-static moments of a record; none if a stream is empty.
 
     Args:
-        states: of the six modules.
+        states: one stream for each of the six modules.
         wrenches: of the harness.
     """
     streams: tuple[TimedRows[Any], ...] = (*states, wrenches)

@@ -14,7 +14,16 @@ from rich.text import Text
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from tools.identify.estimates import ParameterEstimate, Value, Verdict
+from tools.fleet import procfs
+from tools.fleet.run_dir import RunDir
+from tools.identify.estimates import (
+    ParameterEstimate,
+    Value,
+    Verdict,
+    changes,
+    measured,
+    remarks,
+)
 from tools.identify.robot_file_edit import apply
 
 _STYLES = {
@@ -26,11 +35,11 @@ _STYLES = {
 def estimates_table(estimates: Sequence[ParameterEstimate]) -> Table:
     """Return the estimates as a table for the terminal."""
     table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("", no_wrap=True)
+    table.add_column("")
     for heading in ("robot file", "measured", "95 %"):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("unit")
-    table.add_column("")
+    table.add_column("unit", no_wrap=True)
+    table.add_column("", no_wrap=True)
     for row in estimates:
         digits = row.digits
         table.add_row(
@@ -55,15 +64,50 @@ def lines_of(values: Mapping[str, Value]) -> str:
     return text
 
 
-def propose(values: Mapping[str, Value], known: Collection[str], console: Console) -> None:
-    """Print the lines to write, and what is not assumed any more."""
+def tell(
+    estimates: list[ParameterEstimate], robot: RobotConfig, path: Path | None, console: Console
+) -> None:
+    """Print the estimates, what to write and what to know; write it if there is a path.
+
+    Args:
+        estimates: of one measurement.
+        robot: that they were measured against.
+        path: of the robot file to write; None: none.
+        console: to speak on.
+
+    Raises:
+        RunError: the file is another robot's, or cannot be read or written.
+        ConfigError: the new values make no robot file that can be used.
+    """
+    values, known = changes(estimates, robot), measured(estimates)
+    console.print(estimates_table(estimates))
     if values:
         console.print("to write into the robot file (`--apply` does, after a backup):")
         console.print(lines_of(values), markup=False, highlight=False, end="")
     else:
-        console.print("the robot file is right, within what was measured")
+        console.print("nothing to write: the robot file is right, within what was measured")
     if known:
         console.print(f"measured now, no longer assumed: {', '.join(sorted(known))}", style="dim")
+    for remark in remarks(estimates, robot):
+        console.print(remark, style="yellow")
+    if path is not None:
+        refuse_other_robot(path, robot, values)
+        write(path, values, known, console)
+
+
+def refuse_running(path: Path) -> None:
+    """Refuse to write the robot file of a fleet that is up: a service that restarts would read it.
+
+    Raises:
+        RunError: naming the fleet, and what to do.
+    """
+    for place in sorted(procfs.fleets()):
+        manifest = RunDir(Path(place)).read_manifest()
+        if manifest is not None and Path(manifest.config).resolve() == path.resolve():
+            raise RunError(
+                f"{path}: the fleet in {place} runs with it; measure without --apply, `xrl down "
+                f"--run-dir {place}`, then --apply (`xrl identify body RECORD --apply`)"
+            )
 
 
 def refuse_other_robot(path: Path, robot: RobotConfig, values: Mapping[str, Value]) -> None:

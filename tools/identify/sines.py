@@ -53,7 +53,7 @@ TIME_SD: Final = 5e-4
 BIAS_TORQUE: Final = 1.3
 """Times what gravity takes at the bias, by the robot file."""
 YIELDS: Final = 0.05
-"""Of an inertia: leg and hoist, which hold the joint's other side, give way to what moves it."""
+"""Share of an inertia that is uncertain: leg and hoist, on the joint's other side, give way."""
 DRY_SD: Final = 0.04
 """N m; cogging and play show as dry friction of this size."""
 MASS_SD: Final = 0.03

@@ -43,7 +43,7 @@ an encoder at the motor."""
 
 
 class StepAnswer(NamedTuple):
-    """ResponseFit to a step."""
+    """Answer to a step."""
 
     rise_s: float
     """From 10 to 90 % of the final value; NaN: it did not get there."""
@@ -56,7 +56,7 @@ class StepAnswer(NamedTuple):
 
 
 class FrequencyPoint(NamedTuple):
-    """ResponseFit to one sine."""
+    """Answer to one sine."""
 
     frequency_hz: float
     H: complex
@@ -225,7 +225,7 @@ def propose(
     bandwidth: float,
     damping_ratio: float,
 ) -> Proposal:
-    """Return K_p and B_p that make the measured answer the wanted one.
+    """Return K_p and B_p that make the measured answer the wanted one; below 0 there are none.
 
     The model's a_0 and a_1 are all stiffness and damping over inertia, whoever gives them; what is
     missing or too much is added to the gains of the robot file.
@@ -239,6 +239,6 @@ def propose(
         damping_ratio: wanted.
     """
     return Proposal(
-        max(0.0, K_p + inertia * (bandwidth**2 - model.a_0)),
-        max(0.0, B_p + inertia * (2.0 * damping_ratio * bandwidth - model.a_1)),
+        K_p + inertia * (bandwidth**2 - model.a_0),
+        B_p + inertia * (2.0 * damping_ratio * bandwidth - model.a_1),
     )

@@ -23,12 +23,13 @@ from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Lead, Scenario
 from shared.exceptions import RunError
-from shared.process import StopFlag
 from shared.robot.joints import AXES, MODULES
+from tools.bringup.bench import confirm
+from tools.bringup.jog_drive import Interrupts
 from tools.fleet.supervise import SupervisedFleet
 from tools.identify import joint_bench, report
 from tools.identify.body_fit import Record, fit
-from tools.identify.estimates import changes, measured, of_body, zero_corrections
+from tools.identify.estimates import of_body, zero_corrections
 from tools.identify.motion import Motion
 from tools.identify.quasi_static import Moments, TimedRows, moments_of
 from tools.number_arguments import finite
@@ -44,8 +45,6 @@ TORQUE: Final = 15.0
 LEVEL_MAX: Final = 0.1
 WEIGHED_SD: Final = 0.1
 """kg: a payload that was on a scale."""
-INTERRUPTED: Final = 130
-"""Exit code after Ctrl-C, as a shell has it."""
 MOTIONS: Final = "identify"
 """The scenario whose path is led."""
 
@@ -100,8 +99,8 @@ def add_parser(subparsers: Subparsers) -> None:
         help="of the sines; what holds a leg that is bent for it comes on top (default: "
         "%(default)s)",
     )  # fmt: skip
-    joint.add_argument("--yes", action="store_true", help="do not ask")
     for one in (body, joint):
+        one.add_argument("--yes", action="store_true", help="do not ask")
         one.add_argument("--dry-run", action="store_true", help="show the motions, move nothing")
         one.add_argument(
             "--apply", action="store_true",
@@ -128,45 +127,55 @@ def run(args: argparse.Namespace) -> int:
     added = _added(args.added, max(1, len(args.record)))
     if args.record:
         logs = [read_run(path) for path in args.record]
-        robot, path = robot_of(logs[0]), args.config
+        robot, path = _same_robot(logs), args.config
+        if args.apply:
+            report.refuse_running(path)
         moments = [_moments_in(log) for log in logs]
     else:
         fleet = SupervisedFleet.attach(args.run_dir)
         path = Path(fleet.manifest.config)
+        if args.apply:
+            report.refuse_running(path)
         robot = config_file.load(path)
-        moments = [_led(robot, fleet, scenario, console)]
+        led = _led(robot, fleet, scenario, args, console)
+        if led is None:
+            console.print("nothing was moved")
+            return 2
+        moments = [led]
     records = [Record(part, kg) for part, kg in zip(moments, added, strict=True)]
-    _fit_and_tell(args, robot, path, records, console)
-    return 0
-
-
-def _fit_and_tell(
-    args: argparse.Namespace,
-    robot: RobotConfig,
-    path: Path,
-    records: Sequence[Record],
-    console: Console,
-) -> None:
     payload_sd = WEIGHED_SD if args.weighed else None
     result = fit(robot, records, level_sd=args.level, payload_sd=payload_sd)
     estimates = of_body(result, robot)
-    folder = make_folder(args.out, "identify")
     from tools.identify.picture import draw_body  # noqa: PLC0415 - takes a second
 
-    picture = folder / "identify.png"
+    picture = make_folder(args.out, "identify") / "identify.png"
     draw_body(estimates, result, picture)
-    console.print(report.estimates_table(estimates))
-    values, known = changes(estimates, robot), measured(estimates)
-    report.propose(values, known, console)
+    report.tell(estimates, robot, path if args.apply else None, console)
     corrections = zero_corrections(estimates)
     if corrections:
         console.print("zeros, with the robot hung and its services DISARMED or down:")
-        for module, (phi, theta) in corrections.items():
-            console.print(f"  xrl zero {module} --by {phi:.4f},{theta:.4f}", highlight=False)
-    if args.apply:
-        report.refuse_other_robot(path, robot, values)
-        report.write(path, values, known, console)
+    for module, (phi, theta) in corrections.items():
+        console.print(f"  xrl zero {module} --by {phi:.4f},{theta:.4f}", highlight=False)
     console.print(f"{picture}", style="dim")
+    return 0
+
+
+def _same_robot(logs: Sequence[RunLog]) -> RobotConfig:
+    """Return the robot of all records.
+
+    Raises:
+        RunError: they are of different ones.
+    """
+    robots = [robot_of(log) for log in logs]
+    first = robots[0]
+    for log, other in zip(logs, robots, strict=True):
+        for part in ("name", "mass", "geometry", "joint", "drive"):
+            if getattr(other, part) != getattr(first, part):
+                raise RunError(
+                    f"{log.path}: its robot differs in {part} from that of {logs[0].path}; records "
+                    "of one robot file are right"
+                )
+    return first
 
 
 def _added(given: list[float] | None, records: int) -> list[float]:
@@ -193,9 +202,13 @@ def _moments_in(log: RunLog) -> Moments:
 
 
 def _led(
-    robot: RobotConfig, fleet: SupervisedFleet, scenario: Scenario, console: Console
-) -> Moments:
-    """Lead the robot that is up; return its moments.
+    robot: RobotConfig,
+    fleet: SupervisedFleet,
+    scenario: Scenario,
+    args: argparse.Namespace,
+    console: Console,
+) -> Moments | None:
+    """Lead the robot that is up; return its moments, None if the person does not want it.
 
     Raises:
         FleetError: it is silent or does not lead.
@@ -203,20 +216,29 @@ def _led(
     """
     require_operator(robot, "identify")
     simulated = "simulator" in fleet.manifest.services
-    stop = StopFlag()
+    if not simulated:
+        console.print(
+            "it will lean and turn by itself. Lead the torso by hand to the height and pitch that "
+            "are shown, and rest on the harness with the assist that is shown; nobody else touches "
+            "it"
+        )
+        if not confirm("Does it stand, with room around it, and the stop at hand?", yes=args.yes):
+            return None
+    interrupts = Interrupts()
     with open_session(robot, "identify", fleet.run.path) as session:
         motion = Motion(robot, session, simulated=simulated)
-        if not simulated:
-            console.print("lead the torso by hand to the height and pitch that are shown")
-        with Live(console=console, refresh_per_second=4, transient=True) as shown:
+        with (
+            interrupts.kept(),
+            Live(console=console, refresh_per_second=4, transient=True) as shown,
+        ):
             heard = motion.go(
                 scenario,
                 lambda t_s, wanted, status: shown.update(_line(t_s, scenario, wanted, status)),
-                lambda: bool(stop),
+                lambda: bool(interrupts.number),
             )
-    if stop:
+    if interrupts.number:
         console.print("stopped: nothing was fitted; requests fade out by themselves")
-        sys.exit(INTERRUPTED)
+        sys.exit(128 + interrupts.number)
     if heard.ended:
         raise RunError(f"{heard.ended}: nothing was fitted; requests fade out by themselves")
     return moments_of(heard.states, heard.wrenches)

@@ -15,7 +15,7 @@ from services.joint.__main__ import open_drive
 from services.joint.differential import joint_from_motor
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DriveError, FleetError, XrlError
+from shared.exceptions import DriveError
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, limits
 from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_reading, jog_drive
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     module: str = args.module
     robot = config_file.load_without_schedule(path)
     limited = gentle(robot, plan)
-    refuse_service(robot, args)
+    bench.refuse_service(robot, args.module, args.run_dir)
     interrupts = Interrupts()
     with bench.drives_to_ourselves(robot, path, args.run_dir, console.print) as started:
         if started:
@@ -94,8 +94,9 @@ def run(args: argparse.Namespace) -> int:
         if outcome is None:
             console.print("nothing was moved")
             return 2
-        if outcome.is_idle:
-            _give_limits_back(robot, args, console)
+        why = limits.not_given_back(robot, args.module, args.run_dir) if outcome.is_idle else ""
+        if why:
+            console.print(f"[yellow]{escape(why)}[/]")
     code = report(outcome, module, plan, console)
     if interrupts.number:
         sys.exit(128 + interrupts.number)
@@ -135,7 +136,9 @@ def confirm_and_move(
         _introduce(robot, module, plan, console)
         if not bench.confirm("Is the joint free, and the power switch at hand?", yes=args.yes):
             return None
-        refuse_service(robot, args)  # a person may take minutes to answer
+        bench.refuse_service(
+            robot, args.module, args.run_dir
+        )  # a person may take minutes to answer
         with interrupts.kept():
             return jog_drive(
                 drive,
@@ -163,20 +166,6 @@ def plan_of(args: argparse.Namespace) -> JogPlan:
     if not 1 <= args.cycles <= CYCLES_MAX:
         raise DriveError(f"--cycles {args.cycles}: 1 .. {CYCLES_MAX} is right")
     return JogPlan(AXES.index(args.axis), args.by, args.period, args.cycles, args.torque_limit)
-
-
-def refuse_service(robot: RobotConfig, args: argparse.Namespace) -> None:
-    """Refuse a module whose joint service is up: a drive has one master.
-
-    Raises:
-        FleetError: it is.
-    """
-    fleet = bench.service_on(robot, args.module, args.run_dir)
-    if fleet is not None:
-        raise FleetError(
-            f"{args.module}: its joint service in {fleet.run.path} has the drive; hang the robot "
-            f"and `xrl down --run-dir {fleet.run.path}` first"
-        )
 
 
 def progress(sample: Sample, plan: JogPlan) -> str:
@@ -214,17 +203,6 @@ def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> 
         return code
     console.print(f"[bold red]{NOT_IDLE}[/]")
     return 1
-
-
-def _give_limits_back(robot: RobotConfig, args: argparse.Namespace, console: Console) -> None:
-    """Set the drive's limits as the robot file has them, or say that they are the jog's still."""
-    try:
-        limits.give_back(robot, args.module, args.run_dir)
-    except XrlError as error:
-        console.print(
-            f"[yellow]the drive still has the limits of this jog ({escape(str(error))}): until it "
-            "is armed by its service or restarted, `xrl doctor` finds them wrong[/]"
-        )
 
 
 def _introduce(robot: RobotConfig, module: str, plan: JogPlan, console: Console) -> None:

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from services.simulator.plant import IDEAL, plant_from
+from services.simulator.plant import IDEAL, PlantConfig, plant_from
 from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.process import StopFlag
 from shared.robot import gain_schedule
 from shared.robot.joints import AXES, MODULES
 from tools.bringup import bench, jog_drive
@@ -34,6 +34,8 @@ from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 SIZE_SHARE: Final = 0.8
 """Of `law.probe_max`."""
+STATUSES_MIN: Final = 1000
+"""Fewer are no course: four seconds of the planner's."""
 UNITS: Final = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
 
 
@@ -54,8 +56,10 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "what", metavar="WHAT", help=f"one of {', '.join(DIRECTIONS)}; or a module, hanging"
     )
-    parser.add_argument("--size", type=finite, metavar="S", help="of step and sines, m or rad")
-    parser.add_argument("--axis", choices=AXES, default="theta", help="of a module (theta)")
+    parser.add_argument(
+        "--size", type=finite, metavar="S", help="of a direction's step and sines, m or rad"
+    )
+    parser.add_argument("--axis", choices=AXES, help="of a module (theta)")
     parser.add_argument(
         "--torque", type=finite, metavar="NM", help="of a module's step and sines (15; 60 for legs)"
     )
@@ -78,6 +82,7 @@ def run(args: argparse.Namespace) -> int:
     if args.what not in (*DIRECTIONS, *MODULES):
         raise RunError(f"{args.what[:40]}: one of {', '.join((*DIRECTIONS, *MODULES))} is right")
     _check_wanted(args)
+    _refuse_mixed(args)
     if args.what in MODULES:
         return _tune_module(args, console)
     return _tune_direction(args, console)
@@ -98,6 +103,25 @@ def _check_wanted(args: argparse.Namespace) -> None:
         raise RunError(f"--damping {wanted[1]:g}: 0.05 to 3 is right")
 
 
+def _refuse_mixed(args: argparse.Namespace) -> None:
+    """Refuse options of the other kind: who asks for virtual time must not move a real module.
+
+    Raises:
+        RunError: naming them.
+    """
+    of_directions = {"--sim": args.sim, "--plant": args.plant, "--size": args.size is not None}
+    of_modules = {"--axis": args.axis is not None, "--torque": args.torque is not None}
+    is_module = args.what in MODULES
+    wrong = [name for name, given in (of_directions if is_module else of_modules).items() if given]
+    if wrong:
+        kind = "a direction" if is_module else "a module"
+        raise RunError(f"{', '.join(wrong)}: for {kind}, and {args.what} is none")
+    if args.plant and not args.sim:
+        raise RunError("--plant: for a robot in virtual time (--sim)")
+    if args.torque is not None and not args.torque > 0.0:
+        raise RunError(f"--torque {args.torque:g}: more than 0 N m is right")
+
+
 def _tune_direction(args: argparse.Namespace, console: Console) -> int:
     row = DIRECTIONS.index(args.what)
     fleet = None if args.sim or args.dry_run else SupervisedFleet.attach(args.run_dir)
@@ -116,23 +140,24 @@ def _tune_direction(args: argparse.Namespace, console: Console) -> int:
         with progress_along("simulated", plan.duration_s) as progress:
             course = in_lockstep(robot, row, plan, plant_from(args.plant), progress)
     else:
-        course = _live(robot, fleet, row, plan, console)
+        live = _live(args, robot, fleet, row, plan, console)
+        if live is None:
+            console.print("nothing was moved")
+            return 2
+        course = live
     if course.ended:
         console.print(f"[bold red]STOPPED[/]: {escape(course.ended)}")
-        return 130 if course.ended == "stopped" else 1  # Ctrl-C, as a shell has it
-    with progress_along("what the model predicts", plan.duration_s) as progress:
-        ideal = in_lockstep(robot, row, plan, IDEAL, progress)
-    courses = {"measured": course, "predicted": ideal}
-    answers = _answers(courses, plan)
+        return 1
+    answer = _answer(course, plan)
+    courses, answers = {"measured": course}, {"measured": answer}
+    _simulate("predicted", robot, row, plan, IDEAL, courses, answers, console)
     closed = not robot.law.S[row]
     if args.bandwidth is not None and closed:
-        proposed = _proposed(args, robot, row, answers["measured"], console)
+        proposed = _proposed(args, robot, row, answer, console)
         if proposed is not None:
-            with progress_along("with the proposed gains", plan.duration_s) as progress:
-                # on the plant that was measured, where it is known
-                plant = plant_from(args.plant) if args.sim else IDEAL
-                courses["proposed"] = in_lockstep(proposed, row, plan, plant, progress)
-            answers = _answers(courses, plan)
+            # on the plant that was measured, where it is known
+            plant = plant_from(args.plant) if args.sim else IDEAL
+            _simulate("proposed", proposed, row, plan, plant, courses, answers, console)
     _tell(args, courses, answers, console, closed=closed)
     if not closed:
         console.print(
@@ -142,17 +167,50 @@ def _tune_direction(args: argparse.Namespace, console: Console) -> int:
     return 0
 
 
+def _simulate(
+    name: str,
+    robot: RobotConfig,
+    row: int,
+    plan: Excitation,
+    plant: PlantConfig,
+    courses: dict[str, ProbeCourse],
+    answers: dict[str, ResponseFit],
+    console: Console,
+) -> None:
+    """Add the course and answer of a simulation; if it fails say so, the measured one stays."""
+    try:
+        with progress_along(f"simulated: {name}", plan.duration_s) as progress:
+            course = in_lockstep(robot, row, plan, plant, progress)
+        answers[name] = _answer(course, plan)
+        courses[name] = course
+    except RunError as error:
+        console.print(f"[yellow]{name}: {escape(str(error))}[/]")
+
+
 def _live(
-    robot: RobotConfig, fleet: SupervisedFleet, row: int, plan: Excitation, console: Console
-) -> ProbeCourse:
+    args: argparse.Namespace,
+    robot: RobotConfig,
+    fleet: SupervisedFleet,
+    row: int,
+    plan: Excitation,
+    console: Console,
+) -> ProbeCourse | None:
+    """Return what the robot that is up does; None if the person does not want it."""
     require_operator(robot, "tune")
-    stop = StopFlag()
-    with (
-        open_session(robot, "tune", fleet.run.path) as session,
-        progress_along("probing", plan.duration_s) as progress,
-    ):
-        console.print("leave the robot alone but for the hand that holds its height")
-        return LiveProbe(session).go(row, plan, progress, lambda: bool(stop))
+    console.print("leave the robot alone but for the hand that holds its height")
+    question = "Does it stand, with room around it, and the stop at hand?"
+    simulated = "simulator" in fleet.manifest.services
+    if not simulated and not bench.confirm(question, yes=args.yes):
+        return None
+    interrupts = jog_drive.Interrupts()
+    with open_session(robot, "tune", fleet.run.path) as session:
+        probe = LiveProbe(session)
+        with interrupts.kept(), progress_along("probing", plan.duration_s) as progress:
+            course = probe.go(row, plan, progress, lambda: bool(interrupts.number))
+    if interrupts.number:
+        console.print("stopped: the probe ends by itself")
+        sys.exit(128 + interrupts.number)
+    return course
 
 
 def _size(args: argparse.Namespace, robot: RobotConfig, row: int) -> float:
@@ -163,26 +221,31 @@ def _size(args: argparse.Namespace, robot: RobotConfig, row: int) -> float:
     """
     most = robot.law.probe_max[row]
     if most == 0.0:
-        raise RunError(f"{args.what}: law.probe_max of the robot file forbids it; set it there")
+        raise RunError(
+            f"{args.what}: law.probe_max of the robot file forbids it; set it there, and start the "
+            "planner again"
+        )
     size: float = SIZE_SHARE * most if args.size is None else args.size
     if not 0.0 < size <= most:
         raise RunError(f"--size {size:g}: more than 0 and at most {most:g} (law.probe_max)")
     return size
 
 
-def _answers(courses: dict[str, ProbeCourse], plan: Excitation) -> dict[str, ResponseFit]:
-    """Return the answers.
+def _answer(course: ProbeCourse, plan: Excitation) -> ResponseFit:
+    """Return how a reference was answered.
 
     Raises:
-        RunError: there is hardly any.
+        RunError: it was not offset, or hardly answered.
     """
-    answers = {}
-    for name, course in courses.items():
-        answer = answer_of(course.t_s, course.r, course.y, plan)
-        if answer is None:
-            raise RunError(f"{name}: hardly any answer to the offset; try a larger --size")
-        answers[name] = answer
-    return answers
+    if len(course.t_s) < STATUSES_MIN or float(np.ptp(course.r)) < plan.size:
+        raise RunError(
+            "the planner did not offset its reference as asked: the robot moved too much for a led "
+            "direction to be held, or the planner was started before law.probe_max was set"
+        )
+    answer = answer_of(course.t_s, course.r, course.y, plan)
+    if answer is None:
+        raise RunError("the offset was hardly answered; a larger one is seen better")
+    return answer
 
 
 def _proposed(
@@ -197,6 +260,12 @@ def _proposed(
         answer.model, K_p=law.K_p[row], B_p=law.B_p[row], inertia=inertia_along(robot, row),
         bandwidth=args.bandwidth, damping_ratio=args.damping,
     )  # fmt: skip
+    if new.K_p <= 0.0 or new.B_p <= 0.0:
+        console.print(
+            f"[yellow]no gains: with K_p = {new.K_p:.3g} and B_p = {new.B_p:.3g} it would be so; "
+            "local gains and joints give more stiffness or damping than was wanted[/]"
+        )
+        return None
     K_p, B_p = list(law.K_p), list(law.B_p)
     K_p[row], B_p[row] = float(f"{new.K_p:.3g}"), float(f"{new.B_p:.3g}")
     console.print(
@@ -222,7 +291,7 @@ def with_local_gains_kept(robot: RobotConfig) -> RobotConfig:
 
 
 def _tune_module(args: argparse.Namespace, console: Console) -> int:
-    module, axis = args.what, AXES.index(args.axis)
+    module, axis = args.what, AXES.index(args.axis or "theta")
     path = bench.robot_file(args)
     robot = config_file.load_without_schedule(path)
     joint_bench.refuse_services(robot, [module], args.run_dir)
@@ -241,31 +310,31 @@ def _tune_module(args: argparse.Namespace, console: Console) -> int:
         robot, path, args.run_dir, console.print, lifted=joint_bench.LIFTED
     ):
         moved = joint_bench.move_joint(args, robot, (module, axis), plan_of, interrupts, console)
-    if interrupts.number:
-        sys.exit(128 + interrupts.number)
     if moved is None:
         return 0
-    if isinstance(moved, str):
-        console.print(f"[bold red]STOPPED[/]: {escape(moved)}")
-        return 1
+    if isinstance(moved, joint_bench.Stopped):
+        code = joint_bench.tell_stopped(moved, console)
+        if interrupts.number:
+            sys.exit(128 + interrupts.number)
+        return code
     plan = moved.plan
     course = module_probe.course_of_samples(moved.samples, plan)
-    answers = _answers({"measured": course}, plan.excitation)
+    answer = _answer(course, plan.excitation)
     model = module_probe.predicted(robot, plan.k_p, plan.k_d, moved.where)
-    _tell(args, {"measured": course}, answers, console, closed=False)
+    _tell(args, {"measured": course}, {"measured": answer}, console, closed=False)
     console.print(
         f"predicted, rotor and leg rigid: natural frequency {model.natural_frequency:.1f} rad/s, "
         f"damping ratio {model.damping_ratio:.2f}"
     )
-    answer = answers["measured"]
     if not answer.is_second_order:
         console.print(
             "the encoder is at the motor: behind play and a soft drivetrain this leg is no "
             "second-order system; compare step and picture with another leg's"
         )
     elif args.bandwidth is not None:
+        # k_p below 0: gravity alone is stiffer than what is wanted
         inertia = plan.k_p / answer.model.b_0
-        k_p = max(0.0, inertia * args.bandwidth**2 - moved.where.gravity)
+        k_p = inertia * args.bandwidth**2 - moved.where.gravity
         k_d = 2.0 * args.damping * args.bandwidth * inertia
         console.print(
             f"for {args.bandwidth:g} rad/s and a damping ratio of {args.damping:g}: k_p = "
@@ -286,6 +355,6 @@ def _tell(
 
     out = make_folder(args.out, "tune")
     console.print(answer_table(answers, closed=closed))
-    title = args.what if args.what in DIRECTIONS else f"{args.what} {args.axis}"
+    title = args.what if args.what in DIRECTIONS else f"{args.what} {args.axis or 'theta'}"
     draw(title, courses, answers, out / "tune.png")
     console.print(f"{out}/tune.png", style="dim")

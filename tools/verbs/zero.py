@@ -27,6 +27,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError, FleetError
 from shared.robot.joints import MODULES
 from tools.bringup import bench
+from tools.bringup.stops import within_stops
 from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, zero
 from tools.fleet.supervise import SupervisedFleet
 from tools.number_arguments import finite
@@ -101,11 +102,14 @@ def run(args: argparse.Namespace) -> int:
                 wanted = corrected(before, by, robot)
             console.print(plan_table(wanted, before))
             _warn(wanted, holders, console)
-            if not bench.confirm("Are the joints at these angles now?", yes=args.yes):
+            question = "Are the joints at these angles now?" if by is None else "Correct the zero?"
+            if not bench.confirm(question, yes=args.yes):
                 console.print("nothing was changed")
                 return 1
             refuse_services(robot, holders)  # a person may take minutes to answer
-            _look_all(robot, drives)
+            now = _look_all(robot, drives)
+            if by is not None:  # from where it hangs now: it may have been touched meanwhile
+                wanted = corrected(now, by, robot)
             code = _set_all(robot, drives, wanted, console)
     if started:
         console.print(bench.GONE)
@@ -162,8 +166,8 @@ def corrected(before: Mapping[str, DriveLook], by: Pair, robot: RobotConfig) -> 
         if not seen.zeroed:
             raise DriveError(f"{module}: it has no zero to correct; give --at PHI,THETA")
         wanted[module] = (seen.q[0] + by[0], seen.q[1] + by[1])
-        if fault := outside(robot, module, wanted[module]):
-            raise DriveError(f"{module}: {fault}")
+        if fault := outside(within_stops(robot), module, wanted[module]):
+            raise DriveError(f"{module}: {fault}")  # a knee may hang on its stop
     return wanted
 
 

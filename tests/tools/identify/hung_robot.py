@@ -54,11 +54,10 @@ class HungDrive:
 
     def __init__(self, robot: HungRobot, drive: VirtualDrive) -> None:
         self._robot, self._drive = robot, drive
-        self.never_arms = False
+        self.never_arms = self.deaf = False
 
     def read(self, timeout_s: float) -> DriveReading | None:
-        assert timeout_s > 0.0
-        for _ in range(2):
+        for _ in range(2 if timeout_s > 0.0 else 0):
             self._robot.step()
         return self._drive.read(self._robot.now_ns)
 
@@ -71,7 +70,8 @@ class HungDrive:
             self._do(DriveCommand.ARM)
 
     def idle(self) -> None:
-        self._do(DriveCommand.IDLE)
+        if not self.deaf:
+            self._do(DriveCommand.IDLE)
 
     def write_torque(self, torque: Pair) -> None:
         raise AssertionError(torque)

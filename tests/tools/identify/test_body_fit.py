@@ -17,13 +17,21 @@ from tools.identify.body_fit import (
     COM,
     HARNESS,
     MASS,
+    PRIORS,
     SCALE,
     ZEROS,
     BodyFit,
     Record,
     fit,
 )
-from tools.identify.estimates import Verdict, changes, measured, of_body, zero_corrections
+from tools.identify.estimates import (
+    Verdict,
+    changes,
+    measured,
+    of_body,
+    remarks,
+    zero_corrections,
+)
 from tools.identify.quasi_static import Moments
 
 FRICTION = 0.3
@@ -184,3 +192,46 @@ def test_a_known_weight_and_a_weighed_payload_sharpen_the_torques_scale(
 def test_too_few_moments_are_refused_in_words(robot: RobotConfig, true_robot: RobotConfig) -> None:
     with pytest.raises(RunError, match=r"30 quasi-static moments.*50 or more"):
         fit(robot, [Record(moments(true_robot, 30))], level_sd=0.003)
+
+
+def fit_of(robot: RobotConfig, more_kg: float, moment: float, sd: float) -> BodyFit:
+    """Return a fit with a payload and a moment about y, each with a standard deviation."""
+    names = tuple(row.name for row in PRIORS)
+    x, variance = np.zeros(len(names)), np.full(len(names), 1e-12)
+    x[names.index(MASS)], variance[names.index(MASS)] = more_kg, sd**2
+    x[names.index(COM[0])], variance[names.index(COM[0])] = moment, 0.01**2
+    nothing = np.zeros((1, 6))
+    covariance = np.diag(variance)
+    return BodyFit(names, PRIORS, x, covariance, nothing, nothing, nothing, nothing)
+
+
+def test_a_moment_is_kept_with_the_payload_that_the_file_will_have(robot: RobotConfig) -> None:
+    for more_kg, sd in ((-4.0, 0.3), (-4.0, 9.0), (3.0, 0.3)):
+        rows = of_body(fit_of(robot, more_kg, 0.5, sd), robot)
+        values = changes(rows, robot)
+        payload = values.get("mass.payload", robot.mass.payload)
+        place = values["mass.payload_com"]
+        assert isinstance(payload, float)
+        assert isinstance(place, tuple)
+        assert payload * place[0] == pytest.approx(0.5, abs=0.03), (more_kg, sd)
+
+
+def test_a_payload_beyond_the_largest_is_not_written_but_the_rest_is(robot: RobotConfig) -> None:
+    rows = of_body(fit_of(robot, 3.0, 0.5, 0.3), robot)
+    assert robot.mass.payload + 3.0 > robot.mass.payload_max
+    assert changes(rows, robot).keys() == {"mass.payload_com"}
+    assert any("mass.payload_max" in remark for remark in remarks(rows, robot))
+
+
+def test_a_new_torque_constant_comes_with_what_the_drives_need(
+    robot: RobotConfig, fitted: BodyFit
+) -> None:
+    assert any("xrl configure" in remark for remark in remarks(of_body(fitted, robot), robot))
+
+
+def test_a_weighed_payload_is_known(robot: RobotConfig, true_robot: RobotConfig) -> None:
+    weighed = msgspec.structs.replace(
+        robot, mass=msgspec.structs.replace(robot.mass, payload=PAYLOAD_TRUE)
+    )
+    found = fit(weighed, [Record(moments(true_robot, 120))], level_sd=0.003, payload_sd=0.1)
+    assert of_body(found, weighed)[0].verdict is Verdict.AGREES

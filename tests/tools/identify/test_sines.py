@@ -8,12 +8,15 @@ import pytest
 
 from services.joint.drivers.base import DriveStatus
 from services.simulator.plant import PlantConfig, changed
+from shared.can.cansimple import AxisState
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
+from shared.robot.joints import MODULE_INDEX
 from tests.tools.identify.hung_robot import HungRobot
 from tests.tools.verbs.bench_drive import START, BenchDrive
 from tools.bringup import jog_drive
-from tools.bringup.jogging import gentle
+from tools.bringup.jogging import Sample, gentle
+from tools.bringup.stops import within_stops
 from tools.identify import joint_drive
 from tools.identify.estimates import JointResult, Verdict, changes, measured, of_joints
 from tools.identify.sines import SinePlan, fit_sines, plan_for
@@ -74,7 +77,7 @@ def moved(
         leg, joint_drive.limited(robot, plan), module, plan, q_seen=q, interrupts=interrupts,
         progress=lambda _: None, clock=hung.clock,
     )  # fmt: skip
-    assert (result.trouble, result.is_idle) == ("", True)
+    assert (result.trouble, result.not_idle) == ("", ())
     fit = fit_sines(result.samples, plan)
     assert fit is not None
     return JointResult(f"{module}_{'phi' if axis == 0 else 'theta'}", fit, where.inertia), plan
@@ -127,23 +130,84 @@ def test_a_leg_that_swings_is_waited_for_but_not_for_ever(
     assert joint_drive.wait_until_still(leg, robot, interrupts, hung.clock) is None
 
 
-def test_held_modules_are_idle_again_when_one_does_not_arm(robot: RobotConfig) -> None:
-    hung = HungRobot(robot, PlantConfig())
+def started(hung: HungRobot, robot: RobotConfig, **change: object) -> joint_drive.LegResult:
+    """Return how a motion of the left ankle ended, with the leg's other modules held."""
     leg = {name: hung.drives[name] for name in joint_drive.leg_of(MODULE)}
-    q = joint_drive.wait_until_still(leg, robot, jog_drive.Interrupts(), hung.clock)
+    interrupts = jog_drive.Interrupts()
+    q = joint_drive.wait_until_still(leg, robot, interrupts, hung.clock)
     assert q is not None
     where = joint_drive.hanging(robot, q, MODULE, 0)
     plan = joint_drive.plan_at(robot, MODULE, 0, 15.0, where)
+    words = {
+        "q_seen": q, "interrupts": interrupts, "progress": lambda _: None, "clock": hung.clock,
+    } | change  # fmt: skip
+    return joint_drive.move(leg, joint_drive.limited(robot, plan), MODULE, plan, **words)  # type: ignore[arg-type]
+
+
+def all_idle(hung: HungRobot) -> bool:
+    readings = [hung.drives[name].read(0.02) for name in joint_drive.leg_of(MODULE)]
+    return all(one is not None and one.status is not DriveStatus.ARMED for one in readings)
+
+
+def test_all_are_idle_again_when_a_held_module_does_not_arm(robot: RobotConfig) -> None:
+    hung = HungRobot(robot, PlantConfig())
     hung.drives["hip_left"].never_arms = True
-    with pytest.raises(DriveError, match="hip_left"):
-        joint_drive.move(
-            leg, joint_drive.limited(robot, plan), MODULE, plan, q_seen=q,
-            interrupts=jog_drive.Interrupts(), progress=lambda _: None, clock=hung.clock,
-        )  # fmt: skip
-    for drive in leg.values():
-        reading = drive.read(0.02)
-        assert reading is not None
-        assert reading.status is DriveStatus.IDLE
+    result = started(hung, robot)
+    assert "hip_left: it does not arm" in result.trouble
+    assert result.not_idle == ()
+    assert all_idle(hung)
+
+
+@pytest.mark.parametrize("name", ["knee_left", "hip_left"])
+def test_a_held_module_that_disarms_or_moves_stops_the_motion(
+    robot: RobotConfig, name: str
+) -> None:
+    hung, seen = HungRobot(robot, PlantConfig()), []
+
+    def progress(sample: Sample) -> None:
+        seen.append(sample)
+        if len(seen) == 3:
+            for axis in (0, 1):
+                hung.bank.request_state(2 * MODULE_INDEX[name] + axis, AxisState.IDLE)
+
+    result = started(hung, robot, progress=progress)
+    assert result.trouble.startswith(f"{name}: the drive is IDLE")
+    assert len(seen) < 8
+    assert all_idle(hung)
+
+
+def test_a_held_modules_target_goes_out_in_every_cycle(robot: RobotConfig) -> None:
+    """A frame may be lost: the drive would be armed and hold nothing."""
+    hung, seen = HungRobot(robot, PlantConfig()), []
+
+    def progress(sample: Sample) -> None:
+        seen.append(sample)
+        if len(seen) == 3:  # as if its gains had not arrived
+            hung.bank.pos_gain[:] = 0.0
+            hung.bank.vel_gain[:] = 0.0
+
+    result = started(hung, robot, progress=progress)
+    assert result.trouble == ""
+    knee = 2 * MODULE_INDEX["knee_left"]
+    assert hung.bank.pos_gain[knee] > 0.0
+
+
+def test_an_exception_idles_the_whole_leg(robot: RobotConfig) -> None:
+    hung = HungRobot(robot, PlantConfig())
+
+    def progress(_: Sample) -> None:
+        raise RuntimeError("a test")
+
+    with pytest.raises(RuntimeError):
+        started(hung, robot, progress=progress)
+    assert all_idle(hung)
+
+
+def test_drives_that_do_not_say_that_they_are_idle_are_named(robot: RobotConfig) -> None:
+    hung = HungRobot(robot, PlantConfig())
+    hung.drives["knee_left"].deaf = True
+    hung.drives["hip_left"].never_arms = True
+    assert started(hung, robot).not_idle == ("knee_left",)
 
 
 def test_a_torque_beyond_the_robots_is_refused(robot: RobotConfig) -> None:
@@ -153,6 +217,6 @@ def test_a_torque_beyond_the_robots_is_refused(robot: RobotConfig) -> None:
 
 
 def test_limits_at_the_stops_are_wider_than_the_soft_ones(robot: RobotConfig) -> None:
-    wide = joint_drive.within_stops(robot)
+    wide = within_stops(robot)
     assert wide.limits.knee.theta[1] > robot.limits.knee.theta[1]
     assert msgspec.structs.replace(wide, limits=robot.limits) == robot

@@ -104,7 +104,7 @@ def test_proposed_gains_make_the_wanted_answer() -> None:
     assert after.damping_ratio == pytest.approx(0.6)
     stiff = SecondOrder(K / M, B / M, (K + 9000.0) / M)
     soft = propose(stiff, K_p=K, B_p=B, inertia=M, bandwidth=0.1, damping_ratio=0.1)
-    assert soft.K_p == 0.0, "never a negative gain"
+    assert soft.K_p < 0.0, "there is none"
 
 
 def test_the_excitation_is_as_large_as_asked_and_returns() -> None:

@@ -109,6 +109,7 @@ def test_a_dry_run_shows_the_motions_and_needs_no_robot(
         (["joint"], "name modules, or --all"),
         (["joint", "--all", "knee_left"], "name modules, or --all"),
         (["joint", "shin_left"], "shin_left: one of ankle_right"),
+        (["joint", "knee_left", "--torque", "-1"], "--torque -1"),
     ],
 )
 def test_bad_words_are_refused_in_a_line(

@@ -5,12 +5,18 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from services.simulator.plant import IDEAL
 from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
 from tests.conftest import ROBOT_FILE
 from tests.tools.exit_codes import exit_code
 from tools.tune import excitation
+from tools.tune.pose_probe import ProbeCourse
+from tools.verbs import tune
 
 
 def test_a_direction_is_measured_beside_the_model_and_gains_are_proposed_that_do_it(
@@ -44,6 +50,12 @@ def test_a_direction_is_measured_beside_the_model_and_gains_are_proposed_that_do
         (["x", "--size", "0.5", "--sim"], "law.probe_max"),
         (["x", "--size", "0", "--sim"], "law.probe_max"),
         (["x"], "no fleet"),
+        (["knee_left", "--sim"], "--sim: for a direction"),
+        (["knee_left", "--size", "0.01", "--plant", "ideal"], "--plant, --size: for a direction"),
+        (["x", "--sim", "--torque", "10"], "--torque: for a module"),
+        (["x", "--sim", "--axis", "phi"], "--axis: for a module"),
+        (["x", "--plant", "ideal"], "(--sim)"),
+        (["knee_left", "--torque", "0"], "more than 0"),
     ],
 )
 def test_bad_words_are_refused_in_a_line(
@@ -67,3 +79,32 @@ def test_a_robot_file_may_forbid_probes(tmp_path: Path, capsys: pytest.CaptureFi
 def test_a_dry_run_tells_the_motion_and_moves_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code(["tune", "roll", "--dry-run"]) == 0
     assert "0.016 rad" in capsys.readouterr().out
+
+
+def test_a_simulation_that_fails_leaves_what_was_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(excitation, "FREQUENCIES_HZ", (0.5, 1.0, 1.5, 2.0))
+    real = tune.in_lockstep
+
+    def falls(robot: RobotConfig, row: int, plan: object, plant: object, *rest: object) -> object:
+        if plant is IDEAL:
+            raise RunError("the robot fell in lockstep")
+        return real(robot, row, plan, plant, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(tune, "in_lockstep", falls)
+    assert exit_code(["tune", "roll", "--sim", "--out", tmp_path]) == 0
+    told = capsys.readouterr().out
+    assert "predicted: the robot fell in lockstep" in told
+    assert "natural frequency" in told
+    assert (tmp_path / "tune.png").exists()
+
+
+def test_a_reference_that_was_not_offset_is_said_so() -> None:
+    """A planner that was started before law.probe_max was set echoes the request only."""
+    plan = excitation.excitation(0.01)
+    t = 0.004 * np.arange(10_000)
+    with pytest.raises(RunError, match="did not offset"):
+        tune._answer(ProbeCourse(t, 0.0 * t, 0.0 * t, ""), plan)
+    with pytest.raises(RunError, match="did not offset"):
+        tune._answer(ProbeCourse(t[:0], t[:0], t[:0], ""), plan)

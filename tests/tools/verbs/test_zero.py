@@ -294,7 +294,7 @@ def test_a_correction_goes_on_from_the_zero_that_is_there(robot: RobotConfig) ->
         (STILL._replace(zeroed=False), (0.0, 0.01), "no zero to correct.*--at"),
         (STILL, (0.0, 0.11), "at most 0.1"),
         (STILL, (math.nan, 0.0), "at most 0.1"),
-        (STILL._replace(q=(0.0, -0.21)), (0.0, 0.05), "outside"),
+        (STILL._replace(q=(0.0, -0.05)), (0.0, 0.05), "outside"),
     ],
 )
 def test_what_is_no_correction_is_refused(
@@ -302,3 +302,9 @@ def test_what_is_no_correction_is_refused(
 ) -> None:
     with pytest.raises(XrlError, match=words):
         verb.corrected({"knee_left": seen}, by, robot)
+
+
+def test_a_knee_that_hangs_on_its_stop_can_be_corrected(robot: RobotConfig) -> None:
+    at_stop = STILL._replace(q=(0.0, -0.05))
+    wanted = verb.corrected({"knee_left": at_stop}, (0.0, 0.009), robot)
+    assert wanted["knee_left"][1] == pytest.approx(-0.041)
