@@ -34,7 +34,7 @@ _STYLES = {
 
 def estimates_table(estimates: Sequence[ParameterEstimate]) -> Table:
     """Return the estimates as a table for the terminal."""
-    table = Table(box=box.SIMPLE_HEAD)
+    table = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)  # in 80 columns
     table.add_column("")
     for heading in ("robot file", "measured", "95 %"):
         table.add_column(heading, justify="right", no_wrap=True)

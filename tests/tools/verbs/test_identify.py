@@ -38,8 +38,13 @@ def lab(tmp_path: Path) -> Path:
 
 
 def test_what_was_planted_is_found_within_its_interval_and_written(
-    record: Path, lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    record: Path,
+    lab: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "80")  # no name is cut in two
     before = config_file.load_without_schedule(lab)
     words = ["identify", "body", record, "--config", lab, "--apply", "--out", tmp_path / "fit"]
     assert exit_code(words) == 0
