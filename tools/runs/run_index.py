@@ -6,6 +6,7 @@ once, and `tools/runs/run_log.py` reads the parts that are needed.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -13,6 +14,7 @@ from pathlib import Path
 from shared.exceptions import RunError
 from shared.mcap_log.reader import LogRecord, LostBytes
 from shared.mcap_log.writer import SCHEMA_VERSION
+from tools.runs.host_clocks import hosts_of
 from tools.runs.recorded_file import RecordedFile
 from tools.runs.run_files import MetadataByName, files_in
 
@@ -56,6 +58,16 @@ class RunIndex:
     def attachments(self) -> dict[str, bytes]:
         """Attached files by name."""
         return dict(chain.from_iterable(file.attachments.items() for file in self._files))
+
+    @property
+    def hosts(self) -> dict[str, str]:
+        """Host of each service, by the attached robot file; nothing if that says none."""
+        text = self.attachments.get("robot.toml", b"")
+        try:
+            endpoints = tomllib.loads(text.decode()).get("bus", {}).get("endpoints", {})
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, AttributeError):
+            return {}
+        return hosts_of(endpoints) if isinstance(endpoints, dict) else {}
 
     @property
     def complete(self) -> bool:

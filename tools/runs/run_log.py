@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -19,10 +20,11 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from shared.bus import topics
-from shared.bus.topics import Topic
+from shared.bus.topics import RECORDER, Topic
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.sequence_stats import KeyCount
+from tools.runs.host_clocks import HostClocks, look
 from tools.runs.run_index import RunIndex
 
 PART_S: Final = 30.0
@@ -33,6 +35,10 @@ WHOLE_MAX_S: Final = 600.0
 """Longest time that is read at once."""
 PICTURE_MAX_S: Final = 120.0
 """Longest time in one picture of a run."""
+LOOK_S: Final = 5.0
+"""Length of the part in which the hosts' clocks are compared."""
+DRIFT_S: Final = 60.0
+"""In a run that is longer they are compared a second time, at its end."""
 
 
 class RunPart(NamedTuple):
@@ -64,15 +70,27 @@ class RunLog:
 
     Messages are decoded on request, once for each key. Topics of events, which have no rate, are
     always of the whole run: a mode or a cut link that began before a part holds in it.
+
+    Where the services ran on several hosts, `t_ns` of a message is brought to the clock of the
+    recorder's (`tools/runs/host_clocks.py`), so that times can be compared; with `as_sent` it is
+    what the message says, as re-execution needs it. Other times in a message stay its sender's.
     """
 
-    def __init__(self, index: RunIndex, part: RunPart = WHOLE, margin_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        index: RunIndex,
+        part: RunPart = WHOLE,
+        margin_s: float = 0.0,
+        *,
+        as_sent: bool = False,
+    ) -> None:
         """Read the messages; `read_run` is the name to use.
 
         Args:
             index: of the run.
             part: what of it to read.
             margin_s: how much before and behind it is read as well.
+            as_sent: leave all times as they were sent.
 
         Raises:
             RunError: a file has gone, or is no log any more.
@@ -87,6 +105,7 @@ class RunLog:
         self.is_first = part.begin_s <= 0.0
         self.is_last = self.end_ns > self._ended_ns()
         self.is_whole = self.is_first and self.is_last
+        self._clocks = None if as_sent else clocks_of(index)
         self._series: dict[str, Series] = {}
         self._read(_ns(margin_s))
         self.complete, self.damage, self.cut = index.complete, index.damage, index.cut
@@ -125,13 +144,14 @@ class RunLog:
         if series.decoded is None:
             decode = msgspec.json.Decoder(topic.type).decode
             try:
-                series.decoded = [decode(payload) for payload in series.payloads]
+                decoded = [decode(payload) for payload in series.payloads]
             except (msgspec.DecodeError, UnicodeDecodeError) as error:
                 version = self.metadata["run"].get("schema_version", "unknown")
                 raise RunError(
                     f"{self.path}: {key}: a message is no {topic.type.__name__}: {error}; "
                     f"the file has schema version {version}: read it with the code that wrote it"
                 ) from None
+            series.decoded = self._aligned(decoded, topic, module, series.received_ns)
         return series.decoded
 
     def raw(self, key: str) -> list[tuple[int, bytes, int]]:
@@ -179,6 +199,18 @@ class RunLog:
     def forget(self) -> None:
         """Drop all messages; metadata and attachments stay."""
         self._series = {}
+
+    def _aligned(
+        self, messages: list[Any], topic: Topic, module: str, received_ns: list[int]
+    ) -> list[Any]:
+        """Return the messages with `t_ns` on the recorder's clock."""
+        if self._clocks is None:
+            return messages
+        offset_ns = self._clocks.offset_ns
+        return [
+            msgspec.structs.replace(message, t_ns=message.t_ns + offset_ns(topic, module, at_ns))
+            for message, at_ns in zip(messages, received_ns, strict=True)
+        ]
 
     def _key(self, topic: Topic, module: str) -> str:
         if topic.per_module != bool(module):
@@ -233,21 +265,47 @@ class RunLog:
                     series.seq.append(seq)
 
 
-def read_run(path: Path) -> RunLog:
+@lru_cache(maxsize=8)
+def clocks_of(index: RunIndex) -> HostClocks | None:
+    """Compare the clocks of a run's hosts; None if all its services ran on one.
+
+    Raises:
+        RunError: a message cannot be read.
+    """
+    hosts = index.hosts
+    if RECORDER not in hosts or len(set(hosts.values())) == 1:
+        return None
+    parts = [RunPart(0.0, LOOK_S)]
+    if index.length_s > DRIFT_S:
+        parts.append(RunPart(index.length_s - LOOK_S))
+    looks = []
+    for part in parts:
+        log = RunLog(index, part, as_sent=True)
+        looks.append(look(log, hosts, (log.begin_ns + log.end_ns) // 2))
+    return HostClocks(hosts, looks)
+
+
+def read_run(path: Path, *, as_sent: bool = False) -> RunLog:
     """Read a run, finished or killed.
 
     Args:
         path: a file; or a directory: all files of the run in it.
+        as_sent: leave all times as they were sent, see `RunLog`.
 
     Raises:
         RunError: a file is missing, empty, no MCAP file or no run; or the directory holds no
             run, or several; or the run is longer than is read at once.
     """
-    return read_part(RunIndex(path), WHOLE)
+    return read_part(RunIndex(path), WHOLE, as_sent=as_sent)
 
 
-def read_part(index: RunIndex, part: RunPart) -> RunLog:
+def read_part(index: RunIndex, part: RunPart, *, as_sent: bool = False) -> RunLog:
     """Read a part of a run at once.
+
+    Args:
+        index: of the run.
+        part: what of it to read.
+        as_sent: leave all times as they were sent, see `RunLog`.
 
     Raises:
         RunError: the part is empty, or longer than is read at once.
@@ -261,11 +319,16 @@ def read_part(index: RunIndex, part: RunPart) -> RunLog:
             f"{index.path}: {read_s:.0f} s are more than the {WHOLE_MAX_S:g} s that are read at "
             "once; give --from and --to"
         )
-    return RunLog(index, part)
+    return RunLog(index, part, as_sent=as_sent)
 
 
 def parts_of(
-    index: RunIndex, part: RunPart = WHOLE, *, part_s: float = PART_S, margin_s: float = MARGIN_S
+    index: RunIndex,
+    part: RunPart = WHOLE,
+    *,
+    part_s: float = PART_S,
+    margin_s: float = MARGIN_S,
+    as_sent: bool = False,
 ) -> Iterator[RunLog]:
     """Yield a run, or a part of it, in parts that follow each other: one in memory at a time.
 
@@ -276,13 +339,14 @@ def parts_of(
         part: what of it to read.
         part_s: length of each part.
         margin_s: how much before and behind each is read as well.
+        as_sent: leave all times as they were sent, see `RunLog`.
     """
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     count = max(1, math.ceil((end_s - begin_s) / part_s))
     step_s = (end_s - begin_s) / count
     edges = [*(begin_s + number * step_s for number in range(count)), part.end_s]
     for first_s, last_s in pairwise(edges):
-        log = RunLog(index, RunPart(first_s, last_s), margin_s)
+        log = RunLog(index, RunPart(first_s, last_s), margin_s, as_sent=as_sent)
         yield log
         log.forget()
 

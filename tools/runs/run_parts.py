@@ -51,13 +51,13 @@ def part_of(args: argparse.Namespace, index: RunIndex) -> RunPart:
     return RunPart(max(0.0, begin_s + offset_s), end_s + offset_s)
 
 
-def read_asked(args: argparse.Namespace, index: RunIndex) -> RunLog:
-    """Read the part that a command line asks for, at once.
+def read_asked(args: argparse.Namespace, index: RunIndex, *, as_sent: bool = False) -> RunLog:
+    """Read the part that a command line asks for, at once; `as_sent` as for `RunLog`.
 
     Raises:
         RunError: it is empty, outside of the run, or too long for that.
     """
-    return read_part(index, part_of(args, index))
+    return read_part(index, part_of(args, index), as_sent=as_sent)
 
 
 def zero_ns(index: RunIndex) -> int:

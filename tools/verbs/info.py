@@ -20,10 +20,11 @@ from shared.mcap_log.recover import clock_time, describe_lost
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
 from tools.output import printable
+from tools.runs.host_clocks import describe as describe_clocks
 from tools.runs.impairment_intervals import impairments
 from tools.runs.run_files import files_of_run
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import NOTHING, RunLog
+from tools.runs.run_log import NOTHING, RunLog, clocks_of
 from tools.runs.run_parts import zero_ns
 from tools.verb_table import Subparsers, add_verb
 
@@ -97,6 +98,7 @@ def as_json(survey: Survey, run_files: list[Path]) -> dict[str, Any]:
         "start_ns": survey.first_ns if survey.messages else None,
         "duration_s": _seconds(survey.first_ns, survey.last_ns) if survey.messages else None,
         "messages": survey.messages,
+        "clocks": _clocks_as_json(survey.files[0]),
         "topics": {
             name: {
                 "schema": topic.schema,
@@ -190,8 +192,9 @@ def _show_run(survey: Survey, console: Console) -> None:
         grid.add_row(
             "version", f"{printable(version) or 'unknown'}; this code writes {SCHEMA_VERSION}"
         )
-    for number, line in enumerate(_injected(survey)):
-        grid.add_row("" if number else "injected", printable(line))
+    for label, lines in (("injected", _injected(survey)), ("clocks", _clocks(file))):
+        for number, line in enumerate(lines):
+            grid.add_row("" if number else label, printable(line))
     console.print(grid)
 
 
@@ -219,6 +222,23 @@ def _injected(survey: Survey) -> list[str]:
     if more > 0:
         lines[INJECTED_MAX:] = [f"and {more} more"]
     return [line + since for line in lines[:1]] + lines[1:]
+
+
+def _clocks(file: FileFacts) -> list[str]:
+    """Return a line for each host of a run on several: what brings its times to the recorder's."""
+    try:
+        clocks = clocks_of(RunIndex(file.path)) if file.ours else None
+    except XrlError as error:
+        return [str(error)]
+    return [] if clocks is None else describe_clocks(clocks)
+
+
+def _clocks_as_json(file: FileFacts) -> dict[str, Any]:
+    try:
+        clocks = clocks_of(RunIndex(file.path)) if file.ours else None
+    except XrlError:
+        return {}
+    return {} if clocks is None else clocks.as_json()
 
 
 def _zero(index: RunIndex) -> tuple[int, str]:

@@ -95,7 +95,11 @@ def run(args: argparse.Namespace) -> int:
     index = RunIndex(args.log)
     part = part_of(args, index)
     # the new file is written from all of the old: that is read at once
-    logs = iter((read_part(index, part),)) if args.param else parts_of(index, part)
+    logs = (
+        iter((read_part(index, part, as_sent=True),))
+        if args.param
+        else parts_of(index, part, as_sent=True)
+    )
     robot: RobotConfig | None = None
     chosen = set(args.service or ("all",))
     names = SERVICES if "all" in chosen else tuple(name for name in SERVICES if name in chosen)

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     if not (args.every >= 0.1 - 1e-9 and args.for_s > 0.0):
         raise RunError("--every from 0.1 s on (so often is the state recorded), --for over 0 s")
     console = Console()
-    log = read_asked(args, RunIndex(args.log))
+    log = read_asked(args, RunIndex(args.log), as_sent=True)
     refuse_own_controller(log)
     robot, scenario = robot_of(log), scenario_of(log)
     moments = moments_of(log, robot, args.every)
