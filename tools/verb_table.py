@@ -54,6 +54,7 @@ VERBS: Final = (
     Verb("keys", "make, pack, check, renew and revoke the keys of the fleet's processes"),
     Verb("info", "show what is in a log: topics, rates, gaps, losses"),
     Verb("recover", "finish a log that was cut off"),
+    Verb("join", "join the records of several hosts into one run"),
     Verb("play", "put a log back onto the bus, beside the live robot"),
     Verb("explain", "break one planner tick down: gains, margins, torque by origin"),
     Verb("view", "show the robot in a browser: live, a record, or one to lead and push"),

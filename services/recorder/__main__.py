@@ -5,6 +5,9 @@ run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says. Unfinished fil
 recorders in DIR are recovered meanwhile. With --snapshot nothing is written until a fault. SIGTERM
 and SIGINT finish the file; after SIGKILL the next recorder, or `xrl recover`, recovers what was
 flushed.
+
+With --of it is one host's own recorder: it dials these services only, and records what they say
+though the network to the fleet's recorder is cut. `xrl join` joins the records.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from shared.bus import topics
 from shared.bus.session import open_session
 from shared.clock import keep_pace, now_ns, pace
 from shared.config.files import load
+from shared.config.robot_config import SERVICES
 from shared.config.sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
 from shared.mcap_log import provenance
@@ -69,11 +73,12 @@ def main() -> int:
     keep_pace(arguments.run_dir)
     attachments = _attachments(arguments)
     metadata = _metadata(config.name, arguments, config.recorder)
-    recorded = {key: t for key, t in topics.all_keys(config.name).items() if t.recorded}
+    recorded = _recorded(config.name, arguments.of)
     snapshot = _snapshot(arguments.snapshot, config.recorder, recorded)
     granted = scheduling.apply("recorder")
     # The bus before the file: an endpoint that is taken leaves no empty file behind.
-    with open_session(config, "recorder", arguments.run_dir) as session:
+    name = topics.HOST_RECORDER if arguments.of else topics.RECORDER
+    with open_session(config, name, arguments.run_dir, only=arguments.of) as session:
         stream = session.stream([f"xrl/{config.name}/**"], capacity=CAPACITY)
         auto_recovery = AutoRecovery(arguments.out, config.recorder.free_min_mib * MIB, logger)
         try:
@@ -100,6 +105,18 @@ def main() -> int:
     what = f"finished {writer.path}" if writer.begun else "nothing written"
     logger.info("%s: %s", what, summary(writer, snapshot))
     return 0
+
+
+def _recorded(robot: str, of: tuple[str, ...] | None) -> dict[str, topics.Topic]:
+    """Return the keys to record with their topics: all, or those that some services write."""
+    wanted = (
+        None if of is None else {key for name in of for key in topics.written_keys(robot, name)}
+    )
+    return {
+        key: topic
+        for key, topic in topics.all_keys(robot).items()
+        if topic.recorded and (wanted is None or key in wanted)
+    }
 
 
 def _record(recording: Recorder, stop: StopFlag, asked: SnapshotRequest) -> None:
@@ -162,6 +179,12 @@ def _arguments() -> argparse.Namespace:
         "Record the bus into one MCAP file.", "python -m services.recorder --out out/run"
     )
     parser.add_argument("--out", type=Path, required=True, help=f"directory for {FIRST}")
+    parser.add_argument(
+        "--of",
+        type=_services,
+        metavar="SERVICE,...",
+        help="record these services of this host only, beside the fleet's recorder on another",
+    )
     parser.add_argument("--scenario", type=Path, help="scenario file, attached as scenario.toml")
     parser.add_argument("--scenario-text", default="", help="what this run is, in words")
     parser.add_argument(
@@ -179,6 +202,15 @@ def _arguments() -> argparse.Namespace:
         "an emergency stop or SIGUSR1; then SECONDS before and after it",
     )
     return parser.parse_args()
+
+
+def _services(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
+    for name in names:
+        if name not in SERVICES:
+            right = f"one of {', '.join(SERVICES)}"
+            raise argparse.ArgumentTypeError(f"no service {name!r}; {right}")
+    return names
 
 
 def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
@@ -215,6 +247,7 @@ def _metadata(
         "pace": f"{pace():g}",
         "scenario": arguments.scenario_text,
         "scenario_file": arguments.scenario.name if arguments.scenario else "",
+        "of": ",".join(arguments.of or ()),
     }
     return {
         "run": run | provenance.code(CHECKOUT) | provenance.machine(),

@@ -320,6 +320,7 @@ def open_session(
     *,
     listen: Sequence[str] = (),
     connect: Sequence[str] = (),
+    only: Sequence[str] | None = None,
     injected: bool = False,
 ) -> Session:
     """Join the bus and return at once; links form as peers come up.
@@ -335,6 +336,7 @@ def open_session(
         run_dir: replaces `{run}` in endpoints; made if it is not there.
         listen: further endpoints to listen on: with them a tool serves other tools.
         connect: further endpoints to dial: those of such a tool.
+        only: services to dial; None: all that this process talks to.
         injected: dial through the network proxy on the links that it serves
             (`shared.bus.links.PAIRS`).
 
@@ -351,6 +353,7 @@ def open_session(
         if injected and Pair(name, peer) in PAIRS
         else config.bus.endpoints[peer]
         for peer in peers_of(name, config.services)
+        if only is None or peer in only
     ]
     listening = [_endpoint(text, run_dir) for text in (*own, *listen)]
     dialling = [_endpoint(text, run_dir) for text in (*peers, *connect)]

@@ -24,6 +24,8 @@ OPERATOR: Final = "operator"
 VIEWER: Final = "viewer"
 """Who only looks."""
 RECORDER: Final = "recorder"
+HOST_RECORDER: Final = "host_recorder"
+"""One host's own recorder: on the bus a tool, which listens nowhere."""
 READERS_OF_ALL: Final = (RECORDER, OPERATOR, VIEWER)
 
 

@@ -30,6 +30,7 @@ from tools import cli
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
 from tools.keys.authority import Authority
+from tools.runs.run_log import read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
@@ -164,3 +165,12 @@ def lead_through(place: Place, watch: Watch, capsys: Any) -> None:
     assert "an emergency stop by xrl estop by" in said
     assert watch.all_in(Mode.DAMP)
     assert place.xrl("down") == 0
+
+    out = place.base / "records"
+    assert place.xrl("records", "-o", str(out)) == 0
+    assert [len(list((out / host).glob("*/run.mcap"))) for host in NAMES] == [1, 1, 3]
+    joined = read_run(out / "joined")
+    for module in MODULES:
+        modes = [event.mode_after for event in joined.messages(topics.JOINT_EVENT, module)]
+        assert modes[-1] == Mode.DAMP, "to the end"
+        assert Mode.TRACK in modes

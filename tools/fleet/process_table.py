@@ -65,9 +65,10 @@ class Process(Section, frozen=True):
     settle_s: Annotated[int, Range(1, 60, "s")]
     """A start that ends sooner has failed, and the next one is delayed."""
     why: str
-    only: Literal["", "simulation", "injected", "imu", "ros2"] = ""
+    only: Literal["", "simulation", "injected", "imu", "ros2", "named"] = ""
     """`simulation`: not started where the drives are real; `injected`: only where the network is
-    to be impaired; `imu`: only on a robot that has one; `ros2`: only where ROS 2 is to see it."""
+    to be impaired; `imu`: only on a robot that has one; `ros2`: only where ROS 2 is to see it;
+    `named`: only where it is asked for by name."""
     topic: str = ""
     """Topic that it publishes steadily, as in `shared.bus.topics`; empty if there is none."""
 
@@ -211,6 +212,7 @@ def select(
         raise FleetError("ros2_gateway: it is started with --ros2; add that")
     wanted = {
         "": True, "simulation": simulation, "injected": injected, "imu": imu, "ros2": ros2,
+        "named": services is not None,
     }  # fmt: skip
     rows = [row for row in table.process if wanted[row.only]]
     if services is None:

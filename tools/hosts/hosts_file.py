@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Final
 
 from shared.bus.access import PRINCIPALS
-from shared.bus.topics import OPERATOR, VIEWER
+from shared.bus.topics import HOST_RECORDER, OPERATOR, RECORDER, VIEWER
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.config.toml_file import Range, Section, read_toml
 from shared.exceptions import ConfigError
@@ -30,6 +30,14 @@ class Host(Section, frozen=True):
     """Whose key its tools have."""
     processors: str = ""
     """As systemd takes them: `2-3`; empty: all."""
+    record: bool = True
+    """Where the recorder is another host's: keep a record of this one's services here."""
+
+    @property
+    def processes(self) -> tuple[str, ...]:
+        """What `xrl up --only` starts here."""
+        beside = self.record and RECORDER not in self.services
+        return (*self.services, HOST_RECORDER) if beside else self.services
 
 
 class Hosts(Section, frozen=True):
@@ -95,6 +103,9 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
         if host.processors and not re.fullmatch(r"\d+(-\d+)?([ ,]\d+(-\d+)?)*", host.processors):
             found = f"{host.processors!r}"
             raise ConfigError(file, f"{where}.processors", found, "as systemd takes them: 0-1,3")
+        if HOST_RECORDER in host.processes and not host.tools:
+            right = '["viewer"], whose key this host\'s own record needs; or record = false'
+            raise ConfigError(file, f"{where}.tools", "none", right)
         if not host.services:
             raise ConfigError(file, f"{where}.services", "none", "at least one")
         for service in host.services:

@@ -17,6 +17,8 @@ UNIT: Final = "xrl.service"
 RUN_DIR: Final = "/var/lib/xrl/run"
 """On the disk and not in memory: an emergency stop outlasts a power cut, once the kernel has
 written it, within half a minute."""
+RECORDS: Final = "/var/lib/xrl/out"
+"""Where the services, which start in /var/lib/xrl, keep their records: a folder for each start."""
 
 _SIMULATOR_HOST: Final = "127.0.0.1"
 
@@ -52,7 +54,7 @@ Wants=network-online.target
 Type=forking
 PIDFile={RUN_DIR}/supervisord.pid
 ExecStart={xrl} up --no-sim --disarmed --config {hosts.folder}/{ROBOT_FILE} \\
-  --run-dir {RUN_DIR} --only {",".join(host.services)}
+  --run-dir {RUN_DIR} --only {",".join(host.processes)}
 ExecStop={xrl} down --keep-stops --run-dir {RUN_DIR}
 Restart=always
 RestartSec=2

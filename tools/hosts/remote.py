@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import Final, NamedTuple, TypeVar
+from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 from shared.exceptions import FleetError
 from tools.hosts.hosts_file import Host, Hosts
@@ -95,6 +95,21 @@ class Remote:
             why = _last(said.error) or f"exit status {said.code}"
             raise FleetError(f"{self.host.name}: {shlex.join(words)[:120]}: {why}")
         return said.out
+
+    def fetch(self, *words: str, into: BinaryIO) -> None:
+        """Run a command as the services' user, and put what it prints into a file.
+
+        Raises:
+            FleetError: it failed, or the host is not reached; the file has what came until then.
+        """
+        command = [*self._begin, shlex.join([*self._as_user, *words])]
+        try:
+            done = subprocess.run(command, stdout=into, stderr=subprocess.PIPE, check=False)
+        except OSError as error:
+            raise FleetError(f"{self.host.name}: {command[0]}: {error.strerror}") from None
+        if done.returncode != 0:
+            why = _last(done.stderr.decode(errors="replace"))
+            raise FleetError(f"{self.host.name}: {words[0]}: {why}")
 
     def write(self, path: str, content: bytes, mode: int, *, as_user: bool) -> None:
         """Write a file whole or not at all; it belongs to who writes it.

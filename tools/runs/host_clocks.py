@@ -71,7 +71,21 @@ class HostClocks:
             module: its module, or "".
             received_ns: when the recorder got it, on its own clock.
         """
-        host = self.hosts.get(sender_of(topic, module), "")
+        return self.offset_of_ns(self.hosts.get(sender_of(topic, module), ""), received_ns)
+
+    def knows(self, host: str) -> bool:
+        """Return True if something is known of a host's clock."""
+        return any(
+            host in look.bounds and math.isfinite(look.bounds[host].best_ns) for look in self.looks
+        )
+
+    def offset_of_ns(self, host: str, at_ns: int) -> int:
+        """Return what brings a host's times to the recorder's clock; 0 if that is unknown.
+
+        Args:
+            host: its name.
+            at_ns: at this time of the recorder's clock.
+        """
         found = [
             (look.at_ns, look.bounds[host].best_ns)
             for look in self.looks
@@ -82,7 +96,7 @@ class HostClocks:
         (begin_ns, begin), (end_ns, end) = found[0], found[-1]
         if end_ns == begin_ns:
             return round(begin)
-        return round(begin + (end - begin) * (received_ns - begin_ns) / (end_ns - begin_ns))
+        return round(begin + (end - begin) * (at_ns - begin_ns) / (end_ns - begin_ns))
 
     def as_json(self) -> dict[str, Any]:
         """Return each host: services, and where the run begins its offset and the error of that."""

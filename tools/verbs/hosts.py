@@ -17,7 +17,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from shared.robot import gain_schedule
 from tools.fleet.status_table import tables
-from tools.hosts import hosts_file, installation, running
+from tools.hosts import hosts_file, installation, records, running
 from tools.hosts.hosts_file import Hosts
 from tools.hosts.installation import HostFile, HostRow
 from tools.hosts.remote import Remote, on_all
@@ -34,6 +34,7 @@ xrl hosts update                           # bring it there, over ssh
 xrl hosts check                            # versions, keys, clocks, units
 xrl hosts up
 xrl hosts status
+xrl hosts records -o out/lab               # bring the newest records here, joined into one run
 xrl hosts estop
 xrl hosts down
 """
@@ -87,6 +88,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "check": (_check, "look whether the hosts are as they should be; 0: they are"),
         "up": (_up, "start the services on all hosts, and arm the drives"),
         "status": (_status, "show the services of all hosts in one table"),
+        "records": (_records, "bring the newest records here, and join them into one run"),
         "estop": (_estop, "every module to DAMP, by each host's own shared memory"),
         "down": (_down, "stop the services on all hosts"),
     }
@@ -107,7 +109,7 @@ def add_parser(subparsers: Subparsers) -> None:
             metavar="DIR",
             help="folder of the authority (default: ~/.config/xrl/ROBOT/authority)",
         )
-        if name == "files":
+        if name in ("files", "records"):
             one.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="folder")
         if name == "update":
             one.add_argument(
@@ -201,6 +203,35 @@ def _status(given: _Given) -> int:
         if isinstance(one, FleetError):
             _tell(name, one)
     return 0 if len(good) == len(found) else 1
+
+
+def _records(given: _Given) -> int:
+    """Bring the fleet's newest record and what other hosts have recorded since it began."""
+    out: Path = given.args.out
+    if out.exists() and any(out.iterdir()):
+        raise RunError(f"{out}: is not empty; give another folder")
+    fleets = [remote for remote in given.remotes if records.is_fleets(remote)]
+    if not fleets:
+        raise RunError("the recorder's host is not among those named: its record comes first")
+    (body,) = fleets
+    base = records.fetch(body, records.newest(body), out / body.host.name)
+    _tell(body.host.name, str(base))
+    began_s = records.began_s(base)
+    fetched: list[Path] = []
+
+    def one(remote: Remote) -> str:
+        names = records.since(remote, began_s)
+        mine = [records.fetch(remote, name, out / remote.host.name) for name in names]
+        fetched.extend(mine)
+        return ", ".join(map(str, mine)) or "no record since then"
+
+    others = [r for r in given.remotes if not records.is_fleets(r) and r.host.record]
+    failed = _each(given._replace(remotes=others), one) if others else 0
+    gained, left_out = records.join_fetched(base, sorted(fetched), out / records.JOINED)
+    for why in left_out:
+        _tell("", FleetError(why))
+    print(f"{out / records.JOINED}: one run, {gained} messages more than the recorder had")
+    return 1 if failed or left_out else 0
 
 
 def _check(given: _Given) -> int:

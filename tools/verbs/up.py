@@ -13,8 +13,9 @@ from services.ros2_gateway.inbound import acceptable
 from services.ros2_gateway.rmw import domain
 from services.simulator.plant import plant_from
 from shared.bus.operator_key import require_operator
+from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
-from shared.config.robot_config import RobotConfig
+from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import FleetError
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
@@ -46,6 +47,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl up --injectable                            # then: xrl inject --link ... --delay 30
         xrl up --config lab.toml --no-sim
         xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # of one host
+        xrl up --config lab.toml --no-sim --only hip_left,host_recorder         # and its record
         xrl up --config lab.toml --no-sim --disarmed   # from a systemd unit
         xrl up --config lab.toml --no-sim --readonly   # move the joints by hand, and look
         """,
@@ -146,7 +148,8 @@ def run(args: argparse.Namespace) -> int:
         overrides["ros2_gateway"] = _ros2_words(args, robot)
     if services is not None:
         overrides = {name: words for name, words in overrides.items() if name in services}
-    if services is None or "recorder" in services:
+    recorders = {"recorder", HOST_RECORDER}
+    if services is None or recorders & set(services):
         make_out(out, "up")
     not_started = args.no_planner and (services is None or "planner" in services)
     fleet = SupervisedFleet.start(
@@ -162,7 +165,7 @@ def run(args: argparse.Namespace) -> int:
         disarmed=args.disarmed,
     )
     up = len(fleet.manifest.services) - not_started
-    record = f", record: {out}" if "recorder" in fleet.manifest.services else ""
+    record = f", record: {out}" if recorders & set(fleet.manifest.services) else ""
     print(
         f"{up} service{'s are' if up != 1 else ' is'} up in {fleet.run.path} "
         f"(logs: {fleet.run.logs}{record}); `xrl status` shows them, `xrl down` stops them"
@@ -189,6 +192,8 @@ def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:
         ]
     if args.snapshot is not None:
         overrides["recorder"] += ["--snapshot", f"{args.snapshot:g}"]
+    if HOST_RECORDER in (args.only or ()):
+        overrides[HOST_RECORDER] = [*overrides["recorder"], "--of", _of_host(args.only)]
     if args.readonly:
         overrides |= {module: ["--readonly"] for module in MODULES}
     if args.scenario is not None:
@@ -229,7 +234,14 @@ def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
         if not only:
             raise FleetError("--only names no service; --only planner,harness,recorder, say")
         check_known(only, [row.name for row in load_table().process])
+        if HOST_RECORDER in only and ("recorder" in only or not _of_host(only)):
+            raise FleetError(
+                f"{HOST_RECORDER} is for a host without the recorder, beside services of its own; "
+                "name those, and leave the recorder"
+            )
         absent |= {"simulator", "recorder", "planner", *MODULES} - set(only)
+        if HOST_RECORDER in only:
+            absent.discard("recorder")  # what is for one recorder is for the other
     for option, is_given, service in (
         ("--scenario", args.scenario is not None, "simulator"),
         ("--plant", bool(args.plant), "simulator"),
@@ -247,6 +259,11 @@ def _services(args: argparse.Namespace) -> tuple[str, ...] | None:
         return None
     beside = {"network_proxy": args.injectable, "ros2_gateway": args.ros2}
     return (*only, *(name for name, wanted in beside.items() if wanted))
+
+
+def _of_host(only: tuple[str, ...] | None) -> str:
+    """Return what a host's own recorder records: the services that run beside it."""
+    return ",".join(name for name in only or () if name in SERVICES)
 
 
 def _absolute(word: str) -> str:

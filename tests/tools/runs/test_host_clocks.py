@@ -4,45 +4,32 @@ from __future__ import annotations
 
 import json
 import math
-import random
 import re
-from collections import deque
 from pathlib import Path
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.bus import topics
-from shared.bus.codec import encode
-from shared.bus.messages import Message
-from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.files import to_toml
 from shared.config.robot_config import RobotConfig
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
-from shared.robot.joints import MODULES, side_of
+from shared.robot.joints import MODULES
 from tests.conftest import ROBOT_FILE
 from tests.tools.exit_codes import exit_code
+from tests.tools.runs.three_hosts import (
+    BODY,
+    CLOCKS,
+    LEFT,
+    RIGHT,
+    Sent,
+    sent_by_all,
+    write_record,
+)
 from tools.runs.clock_offsets import ClockOffsets
-from tools.runs.host_clock import HostClock
-from tools.runs.lockstep import Lockstep
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import clocks_of, read_run
-from tools.runs.standing_start import NOTHING_HAPPENS
-
-BODY, RIGHT, LEFT = "10.0.0.1", "10.0.0.2", "10.0.0.3"
-CLOCKS = {
-    BODY: HostClock(3 * 24 * 3600 * NS_PER_S),
-    RIGHT: HostClock(-NS_PER_S // 2, 40.0),
-    LEFT: HostClock(7_200 * NS_PER_S, -60.0),
-}
-"""Each against virtual time: started at another moment, and a little too fast or slow."""
-HOST_OF = {"planner": BODY, "harness": BODY, "imu": BODY, "recorder": BODY} | {
-    module: RIGHT if side_of(module) == "right" else LEFT for module in MODULES
-}
-
 
 # ---- bounds
 
@@ -94,49 +81,14 @@ def test_two_hosts_that_talk_to_a_third_only_are_compared_by_it() -> None:
 
 
 @pytest.fixture(scope="module")
-def record(robot: RobotConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the record of a robot on three hosts, in virtual time, in random network delays."""
-    folder = tmp_path_factory.mktemp("hosts")
-    ports = {name: f"tls/{host}:{7447 + n}" for n, (name, host) in enumerate(HOST_OF.items())}
-    bus = msgspec.structs.replace(
-        robot.bus,
-        endpoints={**robot.bus.endpoints, "simulator": "tls/127.0.0.1:7446", **ports},
-        security=msgspec.structs.replace(robot.bus.security, mode="mtls"),
-    )
-    queue: deque[tuple[str, bytes, int]] = deque()
-    dice = random.Random(5)
+def sent(robot: RobotConfig) -> list[Sent]:
+    return sent_by_all(robot, 2.0)
 
-    def put(topic: Topic, module: str, message: Message) -> None:
-        late_ns = dice.randrange(NS_PER_MS)
-        key = topic.key(robot.name, module)
-        queue.append((key, encode(message), CLOCKS[BODY].read(fleet.now_ns) + late_ns))
 
-    class Source:
-        def take(self) -> tuple[str, bytes, int] | None:
-            return queue.popleft() if queue else None
-
-    scenario = msgspec.structs.replace(NOTHING_HAPPENS, duration=2.0)
-    fleet = Lockstep(
-        robot, scenario, record=put, clocks={name: CLOCKS[HOST_OF[name]] for name in HOST_OF}
-    )
-    for _ in fleet.run():
-        pass
-    ready = sorted(queue, key=lambda row: row[2])
-    queue.clear()
-    queue.extend(ready)
-    with RunWriter(
-        folder,
-        topics.all_keys(robot.name),
-        offset_ns=0,
-        metadata={"run": {"schema_version": SCHEMA_VERSION, "robot": robot.name}},
-        attachments={
-            "robot.toml": to_toml(msgspec.structs.replace(robot, bus=bus)).encode(),
-            "robot.gains.json": ROBOT_FILE.with_name("robot.gains.json").read_bytes(),
-        },
-        chunk_kib=256,
-    ) as writer:
-        writer.take_from(Source(), len(queue))
-    return writer.path
+@pytest.fixture(scope="module")
+def record(robot: RobotConfig, sent: list[Sent], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the fleet's record."""
+    return write_record(tmp_path_factory.mktemp("fleet"), robot, sent, BODY)
 
 
 def test_the_offset_of_each_host_is_found_and_how_well_it_is_known(record: Path) -> None:
@@ -199,3 +151,79 @@ def test_on_one_host_nothing_is_compared(tmp_path: Path, robot: RobotConfig) -> 
     ):
         pass
     assert clocks_of(RunIndex(tmp_path)) is None
+
+
+# ---- joined with the records of single hosts
+
+LEG = ("ankle_left", "knee_left", "hip_left")
+
+
+def in_the_cut(one: Sent) -> bool:
+    """The left leg's network is cut for 0.8 s: nothing of it arrives at the fleet's recorder."""
+    return one[1] in LEG and 4 * NS_PER_S <= one[0] < 4.8 * NS_PER_S
+
+
+@pytest.fixture(scope="module")
+def with_a_gap(
+    robot: RobotConfig, sent: list[Sent], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("gap")
+    return write_record(folder, robot, sent, BODY, lost=in_the_cut)
+
+
+@pytest.fixture(scope="module")
+def of_the_leg(
+    robot: RobotConfig, sent: list[Sent], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    return write_record(tmp_path_factory.mktemp("leg"), robot, sent, LEFT, of=LEG)
+
+
+def test_joined_with_a_hosts_own_record_the_fleets_has_what_a_cut_network_kept_from_it(
+    record: Path,
+    with_a_gap: Path,
+    of_the_leg: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lost = [key for key in topics.all_keys("xrl") if "_left/" in key]
+    assert exit_code(["resim", with_a_gap, "--service", "knee_left"]) == 0
+    assert not re.search(r"knee_left +2810 +0 ", capsys.readouterr().out)
+    assert exit_code(["join", with_a_gap, of_the_leg, "--out", tmp_path / "joined"]) == 0
+    assert "xrl/xrl/joint/knee_left/state: 200" in capsys.readouterr().out
+    whole, joined = (
+        read_run(path, as_sent=True) for path in (record, tmp_path / "joined" / "run.mcap")
+    )
+    for key in whole.keys():  # noqa: SIM118 - no dict
+        assert [row[1] for row in joined.raw(key)] == [row[1] for row in whole.raw(key)], key
+    for key in lost:
+        times = zip(joined.raw(key), whole.raw(key), strict=True)
+        assert all(abs(mine[0] - its[0]) < 3 * NS_PER_MS for mine, its in times)
+    assert exit_code(["resim", tmp_path / "joined", "--service", "knee_left"]) == 0
+    assert re.search(r"knee_left +2810 +0 .*all equal", capsys.readouterr().out)
+    assert exit_code(["info", tmp_path / "joined" / "run.mcap"]) == 0
+
+
+def test_what_is_no_hosts_record_is_not_joined(
+    record: Path, of_the_leg: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for first, second, why in (
+        (record, record, "is no host's own record"),
+        (of_the_leg, of_the_leg, "the fleet's comes first"),
+        (record, tmp_path, "holds no .mcap file"),
+    ):
+        assert exit_code(["join", first, second, "--out", tmp_path / "out"]) == 2
+        assert why in capsys.readouterr().err
+    assert not (tmp_path / "out" / "run.mcap").exists()
+
+
+def test_a_record_of_another_time_is_not_joined(
+    robot: RobotConfig,
+    sent: list[Sent],
+    of_the_leg: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    late = [(at_ns + 100 * NS_PER_S, *rest) for at_ns, *rest in sent]
+    fleets = write_record(tmp_path, robot, late, BODY)  # type: ignore[arg-type]  # the same tuple
+    assert exit_code(["join", fleets, of_the_leg, "--out", tmp_path / "out"]) == 2
+    assert "of another time" in capsys.readouterr().err

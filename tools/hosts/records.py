@@ -1,0 +1,123 @@
+"""Fetches the records of a robot's hosts, and joins them into one run."""
+
+from __future__ import annotations
+
+import re
+import tarfile
+import tempfile
+from pathlib import Path
+from typing import Final
+
+from shared.bus.topics import RECORDER
+from shared.exceptions import FleetError, RunError
+from tools.hosts.layout import RECORDS
+from tools.hosts.remote import Remote
+from tools.runs.joined_records import HostRecord, host_record, join
+from tools.runs.run_index import RunIndex
+
+JOINED: Final = "joined"
+"""Folder of the joined run, beside one for each host."""
+
+
+def newest(remote: Remote) -> str:
+    """Return the name of a host's newest record.
+
+    Raises:
+        FleetError: it has none, or is not reached.
+    """
+    listed = remote.must("find", RECORDS, "-name", "*.mcap", "-printf", "%T@ %h\\n", as_user=True)
+    rows = [line.split(" ", 1) for line in listed.splitlines() if " " in line]
+    if not rows:
+        raise FleetError(f"{remote.host.name}: no record in {RECORDS}")
+    return _name_in(remote, max(rows, key=lambda row: float(row[0]))[1])
+
+
+def since(remote: Remote, wall_s: float) -> list[str]:
+    """Return the names of a host's records that were written to after a time.
+
+    Args:
+        remote: the host.
+        wall_s: s since 1970.
+
+    Raises:
+        FleetError: the host is not reached, or has no records.
+    """
+    words = ("find", RECORDS, "-name", "*.mcap", "-newermt", f"@{wall_s:.0f}", "-printf", "%h\\n")
+    listed = remote.must(*words, as_user=True)
+    return sorted({_name_in(remote, line) for line in listed.splitlines() if line})
+
+
+def fetch(remote: Remote, name: str, into: Path) -> Path:
+    """Bring one record here; what is still being written comes as far as it is.
+
+    Args:
+        remote: the host.
+        name: of the record's folder there.
+        into: folder for the records of this host.
+
+    Returns:
+        The record's folder here.
+
+    Raises:
+        FleetError: the host is not reached.
+        RunError: it cannot be written here.
+    """
+    try:
+        into.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=into) as packed:
+            # a file that grows meanwhile is no error: it is read as far as it is whole
+            words = ("tar", "--warning=no-file-changed", "-cf", "-", "-C", RECORDS, "--", name)
+            remote.fetch(*words, into=packed)
+            packed.seek(0)
+            with tarfile.open(fileobj=packed) as archive:
+                archive.extractall(into, filter="data")
+    except (OSError, tarfile.TarError) as error:
+        raise RunError(f"{into}: {remote.host.name}'s {name} is not written: {error}") from None
+    return into / name
+
+
+def is_fleets(remote: Remote) -> bool:
+    """Return True for the host whose record is of the whole fleet."""
+    return RECORDER in remote.host.services
+
+
+def join_fetched(fleets: Path, hosts: list[Path], out: Path) -> tuple[int, list[str]]:
+    """Join what was fetched.
+
+    Args:
+        fleets: folder of the fleet's record.
+        hosts: folders of single hosts' records.
+        out: folder for the joined run.
+
+    Returns:
+        How many messages the fleet's record gained, and why some records were left out.
+
+    Raises:
+        RunError: the fleet's record cannot be read, or the joined one cannot be written.
+    """
+    index = RunIndex(fleets)
+    records: list[HostRecord] = []
+    left_out: list[str] = []
+    for folder in hosts:
+        try:
+            records.append(host_record(index, RunIndex(folder)))
+        except RunError as error:
+            left_out.append(str(error))
+    out.mkdir(parents=True, exist_ok=True)
+    return sum(join(index, records, out).values()), left_out
+
+
+def began_s(fleets: Path) -> float:
+    """Return when a record began, s since 1970.
+
+    Raises:
+        RunError: it cannot be read.
+    """
+    return RunIndex(fleets).began_ns * 1e-9
+
+
+def _name_in(remote: Remote, folder: str) -> str:
+    name = folder.rsplit("/", 1)[-1]
+    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):
+        raise FleetError(f"{remote.host.name}: {name[:40]!r} is no name of a record")
+    return name

@@ -1,0 +1,62 @@
+"""`xrl join`: the fleet's record and those of single hosts become one run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from shared.mcap_log.files import FIRST
+from tools.output import printable
+from tools.runs.experiment import make_out
+from tools.runs.joined_records import host_record, join
+from tools.runs.run_index import RunIndex
+from tools.verb_table import RUN_HELP, Subparsers, add_verb
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the verb."""
+    parser = add_verb(
+        subparsers,
+        "join",
+        """
+        xrl join out/body out/left out/right --out out/joined
+        xrl resim out/joined
+        """,
+    )
+    parser.add_argument("fleets", type=Path, metavar="FLEET", help=f"the fleet's: {RUN_HELP}")
+    parser.add_argument(
+        "hosts",
+        type=Path,
+        nargs="+",
+        metavar="HOST",
+        help="records that hosts made of their own services (`record` in hosts.toml)",
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="DIR", help="folder of the joined run"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the joined run and say what it gained; a run cut short leaves no file."""
+    console = Console()
+    fleets = RunIndex(args.fleets)
+    records = [host_record(fleets, RunIndex(path)) for path in args.hosts]
+    out = make_out(args.out, "join")
+    try:
+        with Progress(console=console, transient=True) as progress:
+            task = progress.add_task("joining", total=1.0)
+            gained = join(fleets, records, out, lambda done: progress.update(task, completed=done))
+    except BaseException:
+        (out / FIRST).unlink(missing_ok=True)
+        raise
+    count = sum(gained.values())
+    console.print(
+        f"{printable(str(out / FIRST))}: {count} messages that the fleet's record had not",
+        soft_wrap=True,
+    )
+    for key, number in sorted(gained.items()):
+        console.print(f"  {printable(key)}: {number}", highlight=False)
+    return 0
