@@ -1,8 +1,9 @@
 """Leads a live fleet on three hosts through cuts of its network; what test_namespaces starts.
 
 One host has planner, harness, recorder, simulator and the tool that leads, which is this
-process; each leg's host has its three joint services. Emulated drives are reached through
-UNIX sockets, which no cut reaches, as a leg's real drives are on wires of their own.
+process; each leg's host has its three joint services, and the left one a record of them. Emulated
+drives are reached through UNIX sockets, which no cut reaches, as a leg's real drives are on wires
+of their own.
 
     unshare --net python -m tests.system.multihost OUT RUN_DIR PARENT_PID
 
@@ -26,6 +27,7 @@ import tomli_w
 
 from services.simulator.plant import PlantConfig
 from shared.bus.session import open_session
+from shared.bus.topics import HOST_RECORDER
 from shared.clock import now_ns
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
@@ -48,6 +50,8 @@ LEGS: Final = {
 }
 """The hosts beside `BODY`, and what runs there."""
 
+RECORDED: Final = "left"
+"""The host that has a record of its own, in a folder of that name beside the fleet's."""
 REPORT: Final = "report.json"
 STEADY_S: Final = 1.0
 """All six modules track for so long before a cut, and after the last."""
@@ -140,6 +144,8 @@ class Cutter:
 
 def host_of(service: str) -> str:
     """Return where a service runs."""
+    if service == HOST_RECORDER:
+        return RECORDED
     return next((leg for leg, modules in LEGS.items() if service in modules), BODY)
 
 
@@ -192,8 +198,10 @@ def lead(out: Path, run_dir: Path, network: Network, report: Report, pace: float
         run_dir,
         overrides={
             "recorder": ["--out", str(out), "--scenario", str(scenario_path)],
+            HOST_RECORDER: ["--out", str(out / RECORDED), "--of", ",".join(LEGS[RECORDED])],
             "simulator": ["--scenario", str(scenario_path)],
         },
+        services=(*(name for name in robot.services if name != "imu"), HOST_RECORDER),
         leashed=True,
         pace=pace,
         table_path=write_table(out / "processes.toml", network),
@@ -216,7 +224,7 @@ def main() -> None:
     die_with_parent(parent_pid, signal.SIGTERM)
 
     def again(text: str) -> None:
-        for record in out.glob("run*.mcap"):
+        for record in out.rglob("run*.mcap"):
             record.unlink()  # of a robot that stood and waited
         sys.stdout.write(f"{text}\n")
 

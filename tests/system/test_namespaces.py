@@ -34,10 +34,12 @@ from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
 from tests.shared.mcap_log.runs import ROBOT, sample, write
-from tests.system.multihost import BODY, LEGS, REPORT, Cut, Report
+from tests.system.multihost import BODY, LEGS, RECORDED, REPORT, Cut, Report
 from tests.system.namespaces import isolation, processes_in
 from tests.system.stalls import stalled_before_it_began
 from tools.fleet import procfs
+from tools.runs.joined_records import host_record, join
+from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, read_run
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(240)]
@@ -67,6 +69,8 @@ class Led(NamedTuple):
 
     report: Report
     log: RunLog
+    joined: RunLog
+    """With the record that the left leg's host made of its own services."""
     run_dir: Path
     interfaces_before: list[str]
 
@@ -131,8 +135,16 @@ def lead_to_the_end(folder: Callable[[], Path], lead: Callable[[Path, Path], End
         fell = [row.scenario_s for row in truth if row.fallen]
         assert not fell, f"the robot fell at {fell[0]:.2f} s of {report.cuts}; record in {out}"
         if report.finished_ns:
-            return Led(report, log, run_dir, before)
+            return Led(report, log, _joined(out), run_dir, before)
     pytest.fail(f"not all six track again after the cuts: {report.cuts}; logs in {out}")
+
+
+def _joined(out: Path) -> RunLog:
+    fleets = RunIndex(out)
+    if (out / RECORDED).exists():  # not of a run that a test only tells of
+        join(fleets, [host_record(fleets, RunIndex(out / RECORDED))], out / "joined")
+        return read_run(out / "joined")
+    return read_run(out)
 
 
 def lead_in_a_process(out: Path, run_dir: Path) -> Ended:
@@ -274,6 +286,16 @@ def test_nothing_passes_a_cut_until_it_is_mended(led: Led) -> None:
             assert all(received > cut.up_ns for received in meanwhile)
             late += len(meanwhile)
     assert late, "no link outlived its cut and brought what was said meanwhile"
+
+
+def test_the_cut_off_legs_own_record_has_every_state_that_reached_nobody(led: Led) -> None:
+    for module in LEGS[RECORDED]:
+        states = [
+            [s.seq for s in log.messages(topics.JOINT_STATE, module)]
+            for log in (led.log, led.joined)
+        ]
+        assert len(states[0]) < len(states[1]), "the cut kept some from the fleet's recorder"
+        assert states[1] == list(range(states[1][0], states[1][0] + len(states[1])))
 
 
 def test_a_run_on_three_hosts_leaves_no_process_and_no_network(led: Led) -> None:

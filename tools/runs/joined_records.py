@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import msgspec
+
 from shared.bus import topics
 from shared.exceptions import RunError
 from shared.mcap_log.writer import COUNTS, RunWriter
@@ -25,6 +27,8 @@ _NS: Final = 1e-9
 _MARGIN_NS: Final = 1_000_000_000
 """A message lies so close to where the other record has it."""
 
+Timed = tuple[int, bytes]
+"""When the fleet's recorder had a message or would have, and its payload."""
 Row = tuple[str, bytes, int]
 """Key, payload, and when the fleet's recorder had it or would have."""
 
@@ -118,20 +122,61 @@ def join(
     )
     with writer:
         for log in parts_of(fleets, part_s=PART_S, as_sent=True):
-            rows, near = [], dict[str, set[bytes]]()
-            for key in log.keys():  # noqa: SIM118 - no dict
-                raw = log.raw(key)
-                near[key] = {payload for _, payload, _ in raw}
-                rows += [(key, payload, t_ns) for t_ns, payload, _ in raw if log.holds(t_ns)]
-            for record in records:
-                for row in _rows_within(record, log):
-                    if row[1] not in near.get(row[0], ()):
-                        gained[row[0]] = gained.get(row[0], 0) + 1
-                        rows.append(row)
+            rows: list[Row] = []
+            gained_by_key = _gained(log, records)
+            for key in {*log.keys(), *gained_by_key}:
+                own = [(t_ns, payload) for t_ns, payload, _ in log.raw(key) if log.holds(t_ns)]
+                new = gained_by_key.get(key, [])
+                if new:
+                    gained[key] = gained.get(key, 0) + len(new)
+                rows += [(key, payload, t_ns) for t_ns, payload in in_order(own, new)]
             rows.sort(key=lambda row: row[2])
             writer.take_from(_Rows(rows), len(rows))
             progress((log.end_ns - log.began_ns()) * _NS / max(fleets.length_s, 1e-9))
     return gained
+
+
+def in_order(own: Sequence[Timed], gained: Sequence[Timed]) -> list[Timed]:
+    """Return the messages of one key in the order in which they were sent.
+
+    A message that the fleet's recorder had keeps its time there, however late it came; one that it
+    gains is put between its neighbours.
+
+    Args:
+        own: of the fleet's record, in its order.
+        gained: of a host's record.
+    """
+    if not gained:
+        return list(own)
+    heads = msgspec.json.Decoder(_Head).decode
+    rows = [(heads(payload), t_ns, payload, False) for t_ns, payload in own]
+    rows += [(heads(payload), t_ns, payload, True) for t_ns, payload in gained]
+    rows.sort(key=lambda row: (row[0].t_ns, row[0].seq))
+    times = [t_ns for _, t_ns, _, _ in rows]
+    for numbers, bound in ((range(1, len(rows)), max), (range(len(rows) - 2, -1, -1), min)):
+        for n in numbers:
+            if rows[n][3]:
+                times[n] = bound(times[n], times[n - 1 if bound is max else n + 1])
+    return [(t_ns, row[2]) for t_ns, row in zip(times, rows, strict=True)]
+
+
+def _gained(log: RunLog, records: Sequence[HostRecord]) -> dict[str, list[Timed]]:
+    """Return by key what hosts' records have in a part, and the fleet's has not."""
+    found: dict[str, list[Timed]] = {}
+    known: dict[str, set[bytes]] = {}
+    for record in records:
+        for key, payload, at_ns in _rows_within(record, log):
+            if key not in known:
+                known[key] = {one for _, one, _ in log.raw(key)}
+            if payload not in known[key]:
+                known[key].add(payload)
+                found.setdefault(key, []).append((at_ns, payload))
+    return found
+
+
+class _Head(msgspec.Struct, gc=False):
+    t_ns: int
+    seq: int
 
 
 class _Rows:

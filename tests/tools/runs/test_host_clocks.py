@@ -28,6 +28,7 @@ from tests.tools.runs.three_hosts import (
     write_record,
 )
 from tools.runs.clock_offsets import ClockOffsets
+from tools.runs.joined_records import in_order
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import clocks_of, read_run
 
@@ -201,6 +202,32 @@ def test_joined_with_a_hosts_own_record_the_fleets_has_what_a_cut_network_kept_f
     assert exit_code(["resim", tmp_path / "joined", "--service", "knee_left"]) == 0
     assert re.search(r"knee_left +2810 +0 .*all equal", capsys.readouterr().out)
     assert exit_code(["info", tmp_path / "joined" / "run.mcap"]) == 0
+
+
+@given(
+    st.lists(st.tuples(st.booleans(), st.integers(0, 300), st.integers(0, 300)), max_size=30),
+)
+def test_joined_messages_of_a_key_are_in_the_order_in_which_they_were_sent(
+    rows: list[tuple[bool, int, int]],
+) -> None:
+    """However late the fleet's recorder had those that it had; those keep their times."""
+    own: list[tuple[int, bytes]] = []
+    gained: list[tuple[int, bytes]] = []
+    newest = 0
+    for n, (is_gained, late, off) in enumerate(rows):
+        payload = b'{"t_ns":%d,"seq":%d}' % (100 * n, n)
+        if is_gained:
+            gained.append((100 * n + off, payload))
+        else:
+            newest = max(newest, 100 * n + late)
+            own.append((newest, payload))
+    found = in_order(own, gained)
+    assert sorted(found, key=lambda row: row[0]) == found or not own
+    if own:
+        assert [payload for _, payload in found] == [
+            b'{"t_ns":%d,"seq":%d}' % (100 * n, n) for n in range(len(rows))
+        ]
+    assert [row for row in found if row in own] == own
 
 
 def test_what_is_no_hosts_record_is_not_joined(
