@@ -64,7 +64,7 @@ class MessageSource(Protocol):
         """Return (key, payload, monotonic ns of this call), or None if there is none now."""
 
 
-class _Head(msgspec.Struct, gc=False):
+class MessageHead(msgspec.Struct, gc=False):
     """The two fields of a message that the recorder needs; the rest is skipped over."""
 
     t_ns: Annotated[int, _UNSIGNED]
@@ -125,7 +125,7 @@ class RunWriter:
         self._channels: dict[str, tuple[int, KeyCount]] = {}
         self._before: dict[str, KeyCount] = {}
         """Counts at the start of the file."""
-        self._decode = msgspec.json.Decoder(_Head).decode
+        self._decode = msgspec.json.Decoder(MessageHead).decode
         self._file: BinaryIO | None = None
         self._syncer = FsyncThread()
         if begin:

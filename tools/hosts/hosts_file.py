@@ -33,6 +33,13 @@ class Host(Section, frozen=True):
     record: bool = True
     """Where the recorder is another host's: keep a record of this one's services here."""
 
+    private: tuple[str, ...] = ()
+    """CAN interfaces that only the services reach, in a network namespace of their own."""
+    nic: str = ""
+    """With `private`: interface of the robot's network, on which the services have `address`."""
+    prefix: Annotated[int, Range(1, 128, "1")] = 24
+    """With `private`: length of the network's part of `address`."""
+
     @property
     def processes(self) -> tuple[str, ...]:
         """What `xrl up --only` starts here."""
@@ -103,6 +110,7 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
         if host.processors and not re.fullmatch(r"\d+(-\d+)?([ ,]\d+(-\d+)?)*", host.processors):
             found = f"{host.processors!r}"
             raise ConfigError(file, f"{where}.processors", found, "as systemd takes them: 0-1,3")
+        _check_private(file, where, host)
         if HOST_RECORDER in host.processes and not host.tools:
             right = '["viewer"], whose key this host\'s own record needs; or record = false'
             raise ConfigError(file, f"{where}.tools", "none", right)
@@ -137,6 +145,20 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
             raise ConfigError(file, key, f"{value!r}", "an absolute path without spaces")
     if not re.fullmatch(r"[a-z_][a-z0-9_-]*", hosts.user):
         raise ConfigError(file, "user", f"{hosts.user!r}", "a user's name")
+
+
+def _check_private(file: str, where: str, host: Host) -> None:
+    for key, names in (("private", host.private), ("nic", (host.nic,) if host.nic else ())):
+        for name in names:
+            if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}", name):
+                right = "a network interface's name"
+                raise ConfigError(file, f"{where}.{key}", f"{name!r}", right)
+    if host.private and not host.nic:
+        right = "the interface of the robot's network, on which the services get `address`"
+        raise ConfigError(file, f"{where}.nic", "missing beside `private`", right)
+    if host.nic and not host.private:
+        right = "the CAN interfaces that only the services are to reach"
+        raise ConfigError(file, f"{where}.private", "missing beside `nic`", right)
 
 
 def _check_address(file: str, where: str, text: str) -> None:

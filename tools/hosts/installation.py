@@ -12,6 +12,7 @@ from shared.bus.credentials import NAMES
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
+from tools.hosts import private_network
 from tools.hosts.hosts_file import Host, Hosts, principals_on
 from tools.hosts.layout import (
     KEYS,
@@ -74,6 +75,9 @@ def files_of(
         HostFile(f"{folder}/{SCHEDULE}", schedule, 0o644, False),
         HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode(), 0o644, False),
     ]
+    if host.private:
+        text = private_network.unit(host).encode()
+        files.append(HostFile(f"{_UNIT_FOLDER}/{private_network.UNIT}", text, 0o644, False))
     if authority is not None:
         keys = bundle(authority, principals_on(host))
         files += [HostFile(f"{folder}/{KEYS}/{n}", text, 0o600, True) for n, text in keys.items()]
@@ -136,9 +140,10 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     if probe.schedule != wanted[SCHEDULE]:
         wrong.append("another gain schedule; `xrl hosts update`")
     wrong += _about_keys(probe, {Path(f.path).name: f.content for f in files if f.of_service})
-    own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{UNIT}").out
-    if digest(own_unit.encode()) != wanted[UNIT]:
-        wrong.append("another unit; `xrl hosts update`")
+    for name in (UNIT, private_network.UNIT):
+        own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{name}").out if name in wanted else ""
+        if name in wanted and digest(own_unit.encode()) != wanted[name]:
+            wrong.append(f"another {name}; `xrl hosts update`")
     if not probe.revision:
         wrong.append(f"of no known version: {hosts.checkout} is no git checkout that can be read")
     warnings = list(probe.warnings)

@@ -8,6 +8,7 @@ import msgspec
 
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import BusSecurityConfig
+from tools.hosts import private_network
 from tools.hosts.hosts_file import Host, Hosts, ports
 
 ROBOT_FILE: Final = "robot.toml"
@@ -43,13 +44,18 @@ def unit(hosts: Hosts, host: Host) -> str:
     """
     xrl = f"{hosts.checkout}/.venv/bin/xrl"
     processors = f"CPUAffinity={host.processors}\n" if host.processors else ""
+    after = before = ""
+    if host.private:
+        # Wants, not Requires: whoever stops that unit is not to idle the drives.
+        before = f"After={private_network.UNIT}\nWants={private_network.UNIT}\n"
+        after = f"NetworkNamespacePath={private_network.PATH}\n"
     return f"""\
 # Made by `xrl hosts`; what it is for stands in docs/hosts.md.
 [Unit]
 Description=Extra Robotic Legs: {", ".join(host.services)}
 After=network-online.target
 Wants=network-online.target
-
+{before}
 [Service]
 Type=forking
 PIDFile={RUN_DIR}/supervisord.pid
@@ -72,7 +78,7 @@ UMask=0027
 LimitRTPRIO=40
 LimitMEMLOCK=infinity
 LimitCORE=0
-{processors}NoNewPrivileges=yes
+{processors}{after}NoNewPrivileges=yes
 CapabilityBoundingSet=
 ProtectSystem=strict
 ProtectHome=yes

@@ -12,6 +12,7 @@ from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 from shared.exceptions import FleetError
 from tools.hosts.hosts_file import Host, Hosts
+from tools.hosts.private_network import NAMESPACE
 
 R = TypeVar("R")
 
@@ -43,6 +44,7 @@ class Remote:
         self.host = host
         self._begin = [*hosts.ssh, host.ssh]
         # from a folder that every user may enter: find and others go back to where they began
+        self._in_network = ["ip", "netns", "exec", NAMESPACE] if host.private else []
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
     def run(
@@ -50,6 +52,7 @@ class Remote:
         *words: str,
         content: bytes = b"",
         as_user: bool = False,
+        on_bus: bool = False,
         timeout_s: float = TIMEOUT_S,
     ) -> Said:
         """Run a command and wait for it.
@@ -58,12 +61,14 @@ class Remote:
             words: the command; no shell takes them apart.
             content: for its standard input.
             as_user: as the user who runs the services, not as the one who logs in.
+            on_bus: it talks to the services: in their network, where that is their own.
             timeout_s: time in which it has to end.
 
         Raises:
             FleetError: the host is not reached, or the command does not end.
         """
-        command = [*self._begin, shlex.join([*(self._as_user if as_user else []), *words])]
+        before = [*(self._in_network if on_bus else []), *(self._as_user if as_user else [])]
+        command = [*self._begin, shlex.join([*before, *words])]
         name = self.host.name
         try:
             done = subprocess.run(
@@ -83,6 +88,7 @@ class Remote:
         *words: str,
         content: bytes = b"",
         as_user: bool = False,
+        on_bus: bool = False,
         timeout_s: float = TIMEOUT_S,
     ) -> str:
         """Run a command that has to succeed, and return what it printed.
@@ -90,7 +96,9 @@ class Remote:
         Raises:
             FleetError: it failed, or as `run`.
         """
-        said = self.run(*words, content=content, as_user=as_user, timeout_s=timeout_s)
+        said = self.run(
+            *words, content=content, as_user=as_user, on_bus=on_bus, timeout_s=timeout_s
+        )
         if said.code != 0:
             why = _last(said.error) or f"exit status {said.code}"
             raise FleetError(f"{self.host.name}: {shlex.join(words)[:120]}: {why}")

@@ -114,7 +114,8 @@ def status(hosts: Hosts, remote: Remote) -> FleetStatus:
     Raises:
         FleetError: no fleet is up there.
     """
-    said = remote.must(_xrl(hosts), "status", "--json", "--run-dir", RUN_DIR, as_user=True)
+    words = (_xrl(hosts), "status", "--json", "--run-dir", RUN_DIR)
+    said = remote.must(*words, as_user=True, on_bus=True)
     try:
         return msgspec.json.decode(said.encode(), type=FleetStatus)
     except msgspec.DecodeError as error:

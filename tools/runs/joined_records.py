@@ -15,7 +15,7 @@ import msgspec
 
 from shared.bus import topics
 from shared.exceptions import RunError
-from shared.mcap_log.writer import COUNTS, RunWriter
+from shared.mcap_log.writer import COUNTS, MessageHead, RunWriter
 from tools.runs.host_clocks import HostClocks
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import PART_S, RunLog, RunPart, clocks_of, parts_of
@@ -148,7 +148,7 @@ def in_order(own: Sequence[Timed], gained: Sequence[Timed]) -> list[Timed]:
     """
     if not gained:
         return list(own)
-    heads = msgspec.json.Decoder(_Head).decode
+    heads = msgspec.json.Decoder(MessageHead).decode
     rows = [(heads(payload), t_ns, payload, False) for t_ns, payload in own]
     rows += [(heads(payload), t_ns, payload, True) for t_ns, payload in gained]
     rows.sort(key=lambda row: (row[0].t_ns, row[0].seq))
@@ -172,11 +172,6 @@ def _gained(log: RunLog, records: Sequence[HostRecord]) -> dict[str, list[Timed]
                 known[key].add(payload)
                 found.setdefault(key, []).append((at_ns, payload))
     return found
-
-
-class _Head(msgspec.Struct, gc=False):
-    t_ns: int
-    seq: int
 
 
 class _Rows:

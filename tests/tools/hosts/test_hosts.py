@@ -90,6 +90,10 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a folder with a quote": ({"folder": "/etc/x'"}, "an absolute path"),
     "a name that is allowed": ({"allow": ["laptop"]}, "an IP address"),
     "a user": ({"user": "a b"}, "a user's name"),
+    "no key for its own record": ({"tools1": []}, "record = false"),
+    "a private interface without a network": ({"private1": ["can0"]}, "the robot's network"),
+    "a network without a private interface": ({"nic1": "eth0"}, "missing beside `nic`"),
+    "an interface's name": ({"private1": ["can 0"], "nic1": "eth0"}, "an interface's name|name"),
     "an unknown key": ({"colour": "red"}, "colour"),
 }
 
@@ -203,7 +207,7 @@ def test_a_host_that_differs_is_told_by_name(
     assert xrl("check", base) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "another robot file" in said
-    assert "another unit" in said
+    assert "another xrl.service" in said
 
 
 def test_a_host_that_is_not_reached_is_told_and_the_others_go_on(
