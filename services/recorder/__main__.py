@@ -24,6 +24,7 @@ from typing import Final
 from services.recorder.auto_recover import AutoRecovery
 from services.recorder.disk_guard import MIB
 from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
+from services.recorder.roster import Roster
 from services.recorder.snapshot import SnapshotRing
 from shared import log, scheduling
 from shared.bus import topics
@@ -96,7 +97,8 @@ def main() -> int:
                 )
                 logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
                 auto_recovery.start()
-                _record(recording, stop, asked)
+                roster = None if arguments.of else Roster(session)
+                _record(recording, stop, asked, roster)
         except RunError as error:
             logger.error("%s", error)
             return 1
@@ -119,7 +121,9 @@ def _recorded(robot: str, of: tuple[str, ...] | None) -> dict[str, topics.Topic]
     }
 
 
-def _record(recording: Recorder, stop: StopFlag, asked: SnapshotRequest) -> None:
+def _record(
+    recording: Recorder, stop: StopFlag, asked: SnapshotRequest, roster: Roster | None
+) -> None:
     """Record until `stop`, then the queued rest.
 
     Raises:
@@ -128,7 +132,10 @@ def _record(recording: Recorder, stop: StopFlag, asked: SnapshotRequest) -> None
     while not stop:
         if asked.take():
             recording.trigger("requested by SIGUSR1", now_ns())
-        recording.cycle(now_ns())
+        now = now_ns()
+        if roster is not None:
+            roster.put_if_due(now)
+        recording.cycle(now)
         time.sleep(DRAIN_PERIOD_S)
     recording.close()
     time.sleep(LAST_WORDS_S)

@@ -26,10 +26,22 @@ def alive_prefix(robot: str) -> str:
     return f"xrl/{robot}/alive"
 
 
-def token_key(robot: str, name: str) -> str:
-    """Return the key of a process's liveliness token; a tool's is apart from the services'."""
-    kind = "" if name in SERVICES else "tool/"
-    return f"{alive_prefix(robot)}/{kind}{name}"
+def tools_prefix(robot: str) -> str:
+    """Return what the keys of the tools' liveliness tokens begin with."""
+    return f"{alive_prefix(robot)}/tool"
+
+
+def token_key(robot: str, name: str, place: str = "") -> str:
+    """Return the key of a process's liveliness token.
+
+    Args:
+        robot: its name.
+        name: of the process.
+        place: of a tool, where it runs: several have one name.
+    """
+    if name in SERVICES:
+        return f"{alive_prefix(robot)}/{name}"
+    return f"{tools_prefix(robot)}/{name}{place and f'.{place}'}"
 
 
 def access_control(robot: str, own: str, generations: Mapping[str, int]) -> dict[str, Any]:
@@ -40,11 +52,12 @@ def access_control(robot: str, own: str, generations: Mapping[str, int]) -> dict
         own: the process, one of `PRINCIPALS`.
         generations: the current generation of each certified name.
     """
+    shown = (f"{alive_prefix(robot)}/*", f"{tools_prefix(robot)}/*")
     rules = [
         _rule("subscribe", "egress", _RECEIVED, topics.read_keys(robot, own)),
         _rule("show-me", "egress", _TOKENS, _token_keys(robot, own)),
-        _rule("look-round", "egress", _QUERIES, (f"{alive_prefix(robot)}/*",)),
-        _rule("be-looked-at", "ingress", _QUERIES, (f"{alive_prefix(robot)}/*",)),
+        _rule("look-round", "egress", _QUERIES, shown),
+        _rule("be-looked-at", "ingress", _QUERIES, shown),
     ]
     everybody = [rule["id"] for rule in rules if rule is not None]
     subjects, policies = [], []
@@ -77,7 +90,7 @@ def common_name(name: str, generation: int) -> str:
 def _token_keys(robot: str, name: str) -> tuple[str, ...]:
     if name in SERVICES:
         return (token_key(robot, name),)
-    return (f"{alive_prefix(robot)}/tool/*",)
+    return (f"{tools_prefix(robot)}/*",)
 
 
 def _rule(

@@ -369,6 +369,13 @@ class TareRequest(Message, frozen=True):
     """Name of the sender."""
 
 
+class ToolRoster(Message, frozen=True):
+    """The tools that are linked with the recorder."""
+
+    tools: tuple[str, ...]
+    """Each as NAME.HOST.PID, as it names itself."""
+
+
 class PlannerStatus(Message, frozen=True):
     """Inputs and decisions of one planner tick."""
 

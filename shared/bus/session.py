@@ -15,6 +15,7 @@ import contextlib
 import json
 import os
 import re
+import socket
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ from typing import Final, Generic, Self, TypeAlias, TypeVar
 import zenoh
 
 from shared.bus import security, socket_linger
-from shared.bus.access import alive_prefix, token_key
+from shared.bus.access import alive_prefix, token_key, tools_prefix
 from shared.bus.codec import Decoder, encode
 from shared.bus.links import PAIRS, Pair, endpoint_through
 from shared.bus.messages import Message
@@ -75,6 +76,8 @@ _PRIORITIES: Final = {
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
 _ALIVE_TIMEOUT_S: Final = 0.2
+_TOOLS_MAX: Final = 256
+"""Comings and goings of tools that wait to be taken."""
 
 
 def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
@@ -185,6 +188,24 @@ class Stream:
         return None
 
 
+class LinkedTools:
+    """The tools that are linked with this process, by the names that they give themselves."""
+
+    def __init__(self, subscriber: _Subscriber) -> None:
+        self._subscriber = subscriber
+        self._names: set[str] = set()
+
+    def names(self) -> tuple[str, ...]:
+        """Return each as NAME.HOST.PID; never blocks."""
+        while (sample := self._subscriber.try_recv()) is not None:
+            name = str(sample.key_expr).rpartition("/")[2]
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._names.add(name)
+            else:
+                self._names.discard(name)
+        return tuple(sorted(self._names))
+
+
 class Session:
     """One process on the bus. Use it in a `with` statement; see `open_session`."""
 
@@ -195,7 +216,8 @@ class Session:
         self.name = name
         self._session = session
         self._alive_prefix = f"{alive_prefix(robot)}/"
-        self._token = session.liveliness().declare_token(token_key(robot, name))
+        place = f"{re.sub('[^A-Za-z0-9-]', '-', socket.gethostname())}.{os.getpid()}"
+        self._token = session.liveliness().declare_token(token_key(robot, name, place))
         if over_tcp:  # held, or it would end
             self._links = session.info.declare_link_events_listener(_meet_link, history=True)
 
@@ -300,6 +322,15 @@ class Session:
             for reply in replies
             if reply.ok is not None
         }
+
+    def linked_tools(self) -> LinkedTools:
+        """Declare a watch on the tools that are linked with this process."""
+        watched = f"{tools_prefix(self.robot)}/*"
+        return LinkedTools(
+            self._session.liveliness().declare_subscriber(
+                watched, zenoh.handlers.RingChannel(_TOOLS_MAX), history=True
+            )
+        )
 
     def _key(self, topic: Topic, message_type: type[Message], module: str) -> str:
         if message_type is not topic.type:

@@ -218,6 +218,16 @@ LINK_EVENT: Final = Topic(
     why="impairments of the network on purpose: a log without them is no evidence",
 )
 
+TOOLS: Final = Topic(
+    name="recorder/tools",
+    type=messages.ToolRoster,
+    rate_hz=2.0,
+    priority=Priority.BACKGROUND,
+    recorded=True,
+    writers=(RECORDER,),
+    why="who looks on or leads by a tool, and when",
+)
+
 TOPICS: Final = (
     JOINT_STATE,
     JOINT_COMMAND,
@@ -236,6 +246,7 @@ TOPICS: Final = (
     SIM_CONTROL,
     RUN_EVENT,
     LINK_EVENT,
+    TOOLS,
 )
 
 

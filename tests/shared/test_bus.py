@@ -474,3 +474,22 @@ with open_session(robot, "planner", run_dir) as session:
 """)
     out, _ = process.communicate(timeout=30)
     assert 2 <= int(out) <= 4
+
+
+def test_tools_that_link_are_named_with_their_place_and_are_gone_when_they_end_or_are_killed(
+    run_dir: Path, start: Start
+) -> None:
+    waits = "with open_session(robot, sys.argv[2], run_dir):\n    time.sleep(60)"
+    with open_session(ROBOT, "recorder", run_dir) as session:
+        tools = session.linked_tools()
+        viewer, leader = start(waits, "view"), start(waits, "lead")
+        expected = {("view", str(viewer.pid)), ("lead", str(leader.pid))}
+
+        def found() -> set[tuple[str, str]]:
+            return {(n.split(".")[0], n.rsplit(".")[-1]) for n in tools.names()}
+
+        assert wait_until(lambda: found() == expected)
+        viewer.kill()
+        assert wait_until(lambda: found() == {("lead", str(leader.pid))})
+        leader.terminate()
+        assert wait_until(lambda: tools.names() == ())

@@ -28,6 +28,7 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.SIM_CONTROL: ((TOOL,), ("simulator", "recorder")),
     topics.RUN_EVENT: ((TOOL,), ("recorder",)),
     topics.LINK_EVENT: ((TOOL,), ("recorder",)),
+    topics.TOOLS: (("recorder",), (TOOL,)),
 }
 """Who puts each topic on the bus, and who takes it."""
 

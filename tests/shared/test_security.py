@@ -41,7 +41,7 @@ PUTS = {
     "planner": ["joint/*/command", "planner/status", "planner/checkpoint"],
     "harness": ["harness/wrench"],
     "imu": ["imu/attitude"],
-    "recorder": [],
+    "recorder": ["recorder/tools"],
     "simulator": ["sim/truth", "sim/state", "operator/intent"],
     "operator": [
         "estop",
@@ -200,9 +200,11 @@ def test_services_show_themselves_by_their_own_name_only(bus: Bus) -> None:
             peer.liveliness().declare_token(token_key(ROBOT.name, name))
             for name in ("planner", "a-tool")
         ]
+        tools = recorder.linked_tools()
         assert waits_for(lambda: linked(peer))
         time.sleep(0.5)
         assert recorder.alive() == {"recorder"}
+        assert tools.names() == ("a-tool",)
         assert len(tokens) == 2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -20,9 +21,10 @@ from shared.bus.messages import (
     PlannerMode,
     PlannerStatus,
     Refusal,
+    ToolRoster,
 )
 from shared.bus.session import Latest, Session
-from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOPICS
+from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS
 from shared.clock import NS_PER_S, now_ns, pace
 from shared.exceptions import FleetError
 from shared.robot.joints import MODULES
@@ -35,6 +37,8 @@ TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
 mode the joint service does not, and the mode says why."""
 
 PLANNER: Final = "planner"
+ROSTER: Final = "tools"
+"""Whom the recorder hears of; no service has this name."""
 SILENT_PROXY: Final = "not known, for the network proxy does not answer"
 
 OPEN: Final = "bus.security.mode is open: anyone who reaches its ports commands this robot"
@@ -122,15 +126,22 @@ class FleetStatus(msgspec.Struct, frozen=True):
     """How fast the fleet's clock goes; below 1 it is in slow motion."""
     security: str = "local"
     """`bus.security.mode` of the robot file."""
+    tools: tuple[str, ...] = ()
+    """Tools that are linked beside this one, each as NAME.HOST.PID, as it names itself."""
 
 
 class RateMonitor:
-    """Listens to one service: newest message, first and last of the present window."""
+    """Listens to one service: newest message, first and last of the present window.
+
+    How old that is goes by its arrival: its stamp is of its sender's clock, which may be another
+    host's.
+    """
 
     def __init__(self, latest: Latest[Message]) -> None:
         self._latest = latest
         self._first: Message | None = None
         self.newest: Message | None = None
+        self._heard_ns = 0
 
     def listen(self) -> None:
         """Receive new messages."""
@@ -140,15 +151,15 @@ class RateMonitor:
         restarted = self.newest is not None and message.seq < self.newest.seq
         if self._first is None or restarted:
             self._first = message
-        self.newest = message
+        self.newest, self._heard_ns = message, now_ns()
 
     def new_window(self) -> None:
         """Count the rate from here on."""
         self._first = self.newest
 
     def age_s(self) -> float | None:
-        """Return the time since the newest message was made."""
-        return None if self.newest is None else (now_ns() - self.newest.t_ns) / NS_PER_S
+        """Return the time since the newest message came."""
+        return None if self.newest is None else (now_ns() - self._heard_ns) / NS_PER_S
 
     def is_fresh(self) -> bool:
         """Return True if the newest message still says how things are."""
@@ -178,7 +189,9 @@ def ears_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMonito
         session: on the bus.
         topics: of the services of this fleet; modules and planner may run on other hosts.
     """
-    elsewhere = dict.fromkeys(MODULES, JOINT_STATE.name) | {PLANNER: PLANNER_STATUS.name}
+    elsewhere = dict.fromkeys(MODULES, JOINT_STATE.name) | {
+        PLANNER: PLANNER_STATUS.name, ROSTER: TOOLS.name,
+    }  # fmt: skip
     by_name = {topic.name: topic for topic in TOPICS}
     monitors = {}
     for service, name in (elsewhere | dict(topics)).items():
@@ -230,9 +243,10 @@ def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: 
         if module in monitors
     }
     lead = lead_status(monitors[PLANNER].newest if PLANNER in fresh else None)
+    tools = tools_of(monitors[ROSTER].newest if ROSTER in fresh else None)
     config, network = fleet.manifest.config, impairments(fleet)
     return FleetStatus(
-        str(fleet.run.path), config, services, modules, lead, network, pace(), security
+        str(fleet.run.path), config, services, modules, lead, network, pace(), security, tools
     )
 
 
@@ -278,6 +292,14 @@ def lead_status(message: Message | None) -> LeadStatus | None:
         return None
     mode = PlannerMode(message.mode).name
     return LeadStatus(mode, message.wait_s, message.margin, reason_of(message), message.session)
+
+
+def tools_of(message: Message | None) -> tuple[str, ...]:
+    """Return the tools that are linked, but for this process, from the recorder's newest roster."""
+    own = f".{os.getpid()}"
+    if not isinstance(message, ToolRoster):
+        return ()
+    return tuple(name for name in message.tools if not name.endswith(own))
 
 
 def _listen(

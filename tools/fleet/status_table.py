@@ -6,6 +6,7 @@ from typing import Final
 
 from rich import box
 from rich.console import Group
+from rich.markup import escape
 from rich.table import Table
 
 from shared.bus.messages import DriveStatus, Refusal
@@ -78,6 +79,16 @@ def describe_sessions(status: FleetStatus) -> str:
     )
 
 
+def describe_tools(status: FleetStatus) -> str:
+    """Return the tools that are linked, for example "view on lab3, lead on pad"."""
+    words = []
+    for name in status.tools:
+        tool, _, place = name.partition(".")
+        host = place.rpartition(".")[0]
+        words.append(printable(f"{tool} on {host}" if host else tool))
+    return ", ".join(words)
+
+
 def tables(status: FleetStatus) -> Group:
     """Return the status as two tables for the terminal, and what there is to say beside."""
     services = Table(
@@ -135,6 +146,7 @@ def tables(status: FleetStatus) -> Group:
     lines += [slow] if status.pace != 1.0 else []
     lines += [line] if status.network else []
     lines += [f" [bold yellow]{text}[/]" for text in describe_refusals(status)]
+    lines += [f" linked: {escape(describe_tools(status))}"] if status.tools else []
     sessions = describe_sessions(status)
     lines += [f" [bold yellow]{sessions}[/]"] if sessions else []
     return Group(services, modules, *lines)

@@ -27,6 +27,10 @@ class _Numbering(msgspec.Struct, gc=False):
     seq: int
 
 
+AGE_MAX_MS: Final = 60_000.0
+"""An age beyond it, or below zero, is none: the sender's host has another clock."""
+
+
 class KeyTraffic:
     """The messages of one key in a window of time.
 
@@ -75,8 +79,9 @@ class KeyTraffic:
 
     @property
     def ages_ms(self) -> tuple[float, float] | None:
-        """Median and largest age at reception, ms, if both clocks are one."""
-        return _spread_ms(self._ages)
+        """Median and largest age at reception, ms; None where the sender has another clock."""
+        found = _spread_ms(self._ages)
+        return found if found is not None and -1.0 < found[0] < AGE_MAX_MS else None
 
 
 _NUMBERINGS: Final = msgspec.json.Decoder(_Numbering)

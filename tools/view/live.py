@@ -90,6 +90,8 @@ class LiveSource(Source):
         for topic, module, latest in self._latest:
             message = latest.take()
             if message is not None:
+                # by its arrival: its own time is its host's, which may be another
+                message = msgspec.structs.replace(message, t_ns=now_ns())
                 self._newest.take(topic, module, message)
         found = self._newest.frame(now_ns())
         if found is None:

@@ -37,7 +37,7 @@ def plan(run_dir: Path, **changes: object) -> process_table.FleetPlan:
 
 
 def test_the_table_has_one_row_for_each_service_of_the_bus() -> None:
-    beside = ("injected", "ros2")
+    beside = ("injected", "ros2", "named")
     names = [row.name for row in process_table.load_table().process if row.only not in beside]
     assert sorted(names) == sorted(SERVICES)
 
@@ -54,6 +54,14 @@ def test_the_injector_stands_between_those_that_dial_only_where_it_is_asked_for(
     assert len(new) == len(PAIRS) + 1, "a socket for each pair, and its own"
     names = [row.name for row in injected.processes]
     assert names.index("network_proxy") < names.index("planner")
+
+
+def test_a_hosts_own_recorder_is_there_only_where_it_is_named(run_dir: Path) -> None:
+    assert "host_recorder" not in plan(run_dir).commands
+    assert "host_recorder" not in plan(run_dir, services=("knee_left",)).commands
+    own = plan(run_dir, services=("knee_left", "host_recorder"))
+    assert "host_recorder" in own.commands
+    assert [item.service for item in own.listeners] == ["knee_left"], "it listens nowhere"
 
 
 def test_the_gateway_to_ros_2_is_there_only_where_it_is_asked_for(run_dir: Path) -> None:

@@ -42,6 +42,15 @@ def test_median_and_longest_of_spacing_and_age(periods: list[float], age_ms: flo
     assert traffic.lost == 0
 
 
+@pytest.mark.parametrize("apart_ms", [-3.6e6, 3.6e6])
+def test_a_sender_with_another_clock_has_no_age(apart_ms: float) -> None:
+    traffic = KeyTraffic(STATE)
+    for seq in range(3):
+        traffic.feed(message(seq, 1e7 + apart_ms + seq), round((1e7 + seq) * NS_PER_MS))
+    assert traffic.ages_ms is None
+    assert traffic.gaps_ms == (1.0, 1.0)
+
+
 def test_losses_are_those_of_the_window_and_rubbish_is_counted_by_its_size() -> None:
     traffic = KeyTraffic(STATE)
     traffic.feed(message(1, 0.0), 0)

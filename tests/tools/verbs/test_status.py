@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from itertools import product
 from types import SimpleNamespace
 from typing import cast
@@ -9,8 +10,18 @@ from typing import cast
 import msgspec
 import pytest
 
-from shared.bus.messages import Cause, DriveStatus, JointState, Message, Mode, Outside, Refusal
+from shared.bus.messages import (
+    Cause,
+    DriveStatus,
+    JointState,
+    Message,
+    Mode,
+    Outside,
+    Refusal,
+    ToolRoster,
+)
 from shared.bus.session import Latest
+from shared.clock import NS_PER_S, now_ns
 from shared.robot.joints import MODULES
 from shared.robot.trip_table import JOINT_TRIPS
 from tools.fleet.fleet_status import (
@@ -20,8 +31,14 @@ from tools.fleet.fleet_status import (
     RateMonitor,
     lead_status,
     module_status,
+    tools_of,
 )
-from tools.fleet.status_table import describe_lead, describe_refusals, describe_sessions
+from tools.fleet.status_table import (
+    describe_lead,
+    describe_refusals,
+    describe_sessions,
+    describe_tools,
+)
 
 
 def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:
@@ -117,6 +134,36 @@ def test_modules_that_follow_another_planner_are_named() -> None:
     words = describe_sessions(fleet_with(7, *rows))
     assert words == "knee_right: last followed session 99, and the planner heard is 7"
     assert describe_sessions(fleet_with(7, module_status(own), module_status(None))) == ""
+
+
+def test_the_other_tools_that_are_linked_are_told_with_their_hosts() -> None:
+    roster = ToolRoster(
+        t_ns=1, seq=1, tools=("lead.pad.17", f"status.lab3.{os.getpid()}", "view.lab-3.9")
+    )
+    status = msgspec.structs.replace(fleet_with(7), tools=tools_of(roster))
+    assert describe_tools(status) == "lead on pad, view on lab-3"
+    assert tools_of(None) == ()
+
+
+@pytest.mark.parametrize("apart_s", [-7200, 7200])
+def test_a_module_on_a_host_with_another_clock_is_as_old_as_its_last_message_came(
+    apart_s: int,
+) -> None:
+    there_ns = now_ns() + apart_s * NS_PER_S
+    said = msgspec.structs.replace(
+        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED), t_ns=there_ns
+    )
+    messages = iter([said])
+    latest = SimpleNamespace(take=lambda: next(messages, None))
+    monitor = RateMonitor(cast("Latest[Message]", latest))
+    assert not monitor.is_fresh()
+    monitor.listen()
+    assert monitor.is_fresh()
+    age_s = monitor.age_s()
+    assert age_s is not None
+    assert 0.0 <= age_s < 1.0
+    monitor._heard_ns -= 2 * NS_PER_S  # two seconds later
+    assert not monitor.is_fresh(), "it has been silent since"
 
 
 @pytest.mark.parametrize(("first", "last", "hz"), [(10, 35, 250.0), (10, 10, 0.0), (90, 5, 0.0)])
