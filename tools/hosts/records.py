@@ -18,6 +18,9 @@ from tools.runs.run_index import RunIndex
 JOINED: Final = "joined"
 """Folder of the joined run, beside one for each host."""
 
+_PACK: Final = 'tar --warning=no-file-changed -cf - -C "$1" -- "$2"; [ $? -le 1 ]'
+"""Ends well also if a file has grown meanwhile: it is then read as far as it is whole."""
+
 
 def newest(remote: Remote) -> str:
     """Return the name of a host's newest record.
@@ -65,9 +68,7 @@ def fetch(remote: Remote, name: str, into: Path) -> Path:
     try:
         into.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=into) as packed:
-            # a file that grows meanwhile is no error: it is read as far as it is whole
-            words = ("tar", "--warning=no-file-changed", "-cf", "-", "-C", RECORDS, "--", name)
-            remote.fetch(*words, into=packed)
+            remote.fetch("sh", "-c", _PACK, "-", RECORDS, name, into=packed)
             packed.seek(0)
             with tarfile.open(fileobj=packed) as archive:
                 archive.extractall(into, filter="data")
