@@ -20,11 +20,10 @@ FULL: Final = 0.75
 
 LED: Final = {
     "test_agreement", "test_crashtest", "test_demo", "test_estop_live", "test_floods", "test_hosts",
-    "test_hosts_verb", "test_identify_live", "test_injector", "test_namespaces",
-    "test_old_commands", "test_play", "test_ros2", "test_supervision", "test_usb_fleet",
-    "test_view_live", "test_zero_and_jog",
+    "test_hosts_verb", "test_identify_live", "test_namespaces",
+    "test_old_commands", "test_ros2", "test_usb_fleet", "test_view_live", "test_zero_and_jog",
 }  # fmt: skip
-"""Files whose tests start the ten processes and wait until the planner leads."""
+"""Files whose tests start services that hold or lead the simulated robot: one after the other."""
 
 
 def carried_pace() -> str:

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
-from services.simulator.plant import IDEAL
+from services.simulator.plant import IDEAL, PlantConfig
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tests.conftest import ROBOT_FILE
 from tests.tools.exit_codes import exit_code
 from tools.tune import excitation
+from tools.tune.excitation import Excitation
 from tools.tune.pose_probe import ProbeCourse
 from tools.verbs import tune
 
@@ -22,7 +24,7 @@ from tools.verbs import tune
 def test_a_direction_is_measured_beside_the_model_and_gains_are_proposed_that_do_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(excitation, "FREQUENCIES_HZ", (0.3, 0.5, 0.75, 1.1))
+    monkeypatch.setattr(excitation, "FREQUENCIES_HZ", (0.4, 0.6, 0.9, 1.2))
     words = ["tune", "x", "--sim", "--bandwidth", "7", "--damping", "0.6", "--out", tmp_path]
     assert exit_code(words) == 0
     told = capsys.readouterr().out
@@ -84,13 +86,15 @@ def test_a_dry_run_tells_the_motion_and_moves_nothing(capsys: pytest.CaptureFixt
 def test_a_simulation_that_fails_leaves_what_was_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(excitation, "FREQUENCIES_HZ", (0.5, 1.0, 1.5, 2.0))
-    real = tune.in_lockstep
-
-    def falls(robot: RobotConfig, row: int, plan: object, plant: object, *rest: object) -> object:
+    def falls(
+        _robot: RobotConfig, _row: int, plan: Excitation, plant: PlantConfig, *_rest: object
+    ) -> ProbeCourse:
         if plant is IDEAL:
             raise RunError("the robot fell in lockstep")
-        return real(robot, row, plan, plant, *rest)  # type: ignore[arg-type]
+        t = np.arange(0.0, plan.duration_s, 0.004)
+        r = np.array([plan.at(one) for one in t])
+        _, y, _ = signal.lsim(([36.0], [1.0, 6.0, 36.0]), r, t)
+        return ProbeCourse(t, r, np.asarray(y), "")
 
     monkeypatch.setattr(tune, "in_lockstep", falls)
     assert exit_code(["tune", "roll", "--sim", "--out", tmp_path]) == 0
