@@ -14,9 +14,10 @@ from typing import Final, NamedTuple
 import msgspec
 
 from shared.bus import topics
+from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.writer import COUNTS, MessageHead, RunWriter
-from tools.runs.host_clocks import HostClocks
+from tools.runs.host_clocks import ClockLife
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import PART_S, RunLog, RunPart, clocks_of, parts_of
 
@@ -24,8 +25,10 @@ _OF_A_FILE: Final = ("clock", "split", COUNTS, "recovered")
 """Metadata that says something of a file, not of the run."""
 _CHUNK_KIB: Final = 256
 _NS: Final = 1e-9
-_MARGIN_NS: Final = 1_000_000_000
-"""A message lies so close to where the other record has it."""
+_MARGIN_NS: Final = NS_PER_S
+"""The joined run begins so much before the fleet's record at most, and ends so much after it."""
+LATE_S: Final = 10.0
+"""A message came to the fleet's recorder at most so late: what was held up by a cut network."""
 
 Timed = tuple[int, bytes]
 """When the fleet's recorder had a message or would have, and its payload."""
@@ -39,15 +42,25 @@ class HostRecord(NamedTuple):
     run: RunIndex
     host: str
     """As the fleet's robot file names it."""
-    clocks: HostClocks | None
-    """Of the fleet's record; None: it ran on one host."""
+    clock: ClockLife | None
+    """Of the host, against the fleet's recorder; None: it is one clock."""
 
     def to_fleets_ns(self, own_ns: int) -> int:
         """Return a time of this record on the clock of the fleet's."""
-        if self.clocks is None:
+        if self.clock is None:
             return own_ns
-        about_ns = own_ns + self.clocks.offset_of_ns(self.host, own_ns)
-        return own_ns + self.clocks.offset_of_ns(self.host, about_ns)
+        about_ns = own_ns + round(self.clock.points[0].bounds.best_ns)
+        return own_ns + round(self.clock.offset_ns(about_ns))
+
+    def to_own_ns(self, fleets_ns: int) -> int:
+        """Return a time of the fleet's record on the clock of this one."""
+        return fleets_ns - (0 if self.clock is None else round(self.clock.offset_ns(fleets_ns)))
+
+    def overlap_ns(self, fleets: RunIndex) -> int:
+        """Return how long both were recorded; below zero: how far they are apart."""
+        first_ns, last_ns = map(self.to_fleets_ns, _span_ns(self.run))
+        began_ns, ended_ns = _span_ns(fleets)
+        return min(last_ns, ended_ns) - max(first_ns, began_ns)
 
 
 def host_record(fleets: RunIndex, index: RunIndex) -> HostRecord:
@@ -66,27 +79,32 @@ def host_record(fleets: RunIndex, index: RunIndex) -> HostRecord:
         )
     if index.robot != fleets.robot:
         raise RunError(f"{index.path}: of the robot {index.robot}; {fleets.path}: {fleets.robot}")
-    clocks = clocks_of(fleets)
+    for one in (fleets, index):
+        if not one.length_s:
+            raise RunError(f"{one.path}: has no messages; nothing can be joined")
     hosts = {fleets.hosts.get(name, "") for name in services}
     if len(hosts) != 1:
-        raise RunError(
-            f"{index.path}: {', '.join(services)} run on {len(hosts)} hosts; one is right"
-        )
+        names = ", ".join(services)
+        raise RunError(f"{index.path}: {names} run on {len(hosts)} hosts; one is right")
     (host,) = hosts
-    if clocks is not None and not clocks.knows(host):
+    clocks = clocks_of(fleets)
+    lives = (None,) if clocks is None else clocks.lives.get(host, ())
+    if not lives:
         raise RunError(
-            f"{fleets.path}: has nothing of {host} where it begins or ends, so that host's clock "
-            "is not known; join a longer record"
+            f"{fleets.path}: has nothing of {host}, so that host's clock is not known there"
         )
-    found = HostRecord(index, host, clocks)
-    first_ns, last_ns = (
-        found.to_fleets_ns(wall_ns - index.offset_ns) + fleets.offset_ns
-        for wall_ns in (index.began_ns, index.ended_ns)
+    found = max(
+        (HostRecord(index, host, life) for life in lives), key=lambda one: one.overlap_ns(fleets)
     )
-    if last_ns < fleets.began_ns or first_ns > fleets.ended_ns:
-        apart_s = max(fleets.began_ns - last_ns, first_ns - fleets.ended_ns) * _NS
+    if found.overlap_ns(fleets) < 0:
+        apart_s = -found.overlap_ns(fleets) * _NS
         raise RunError(f"{index.path}: of another time than {fleets.path}, {apart_s:.0f} s apart")
     return found
+
+
+def _span_ns(index: RunIndex) -> tuple[int, int]:
+    """Return begin and end on the clock of the record's own host."""
+    return index.began_ns - index.offset_ns, index.ended_ns - index.offset_ns
 
 
 def join(
@@ -111,7 +129,10 @@ def join(
     """
     gained: dict[str, int] = {}
     metadata = {name: row for name, row in fleets.metadata.items() if name not in _OF_A_FILE}
-    metadata["joined"] = {record.host: str(record.run.path) for record in records}
+    paths: dict[str, list[str]] = {}
+    for record in records:
+        paths.setdefault(record.host, []).append(str(record.run.path))
+    metadata["joined"] = {host: ", ".join(those) for host, those in paths.items()}
     writer = RunWriter(
         out,
         topics.all_keys(fleets.robot),
@@ -121,51 +142,66 @@ def join(
         chunk_kib=_CHUNK_KIB,
     )
     with writer:
-        for log in parts_of(fleets, part_s=PART_S, as_sent=True):
+        for log in parts_of(fleets, part_s=PART_S, margin_s=2.0 * LATE_S, as_sent=True):
+            window = _window_ns(fleets, log)
+            new = _gained(log, records, window)
             rows: list[Row] = []
-            gained_by_key = _gained(log, records)
-            for key in {*log.keys(), *gained_by_key}:
-                own = [(t_ns, payload) for t_ns, payload, _ in log.raw(key) if log.holds(t_ns)]
-                new = gained_by_key.get(key, [])
-                if new:
-                    gained[key] = gained.get(key, 0) + len(new)
-                rows += [(key, payload, t_ns) for t_ns, payload in in_order(own, new)]
+            for key in {*log.keys(), *new}:
+                own = [(t_ns, payload) for t_ns, payload, _ in log.raw(key)]
+                for t_ns, payload, is_new in in_order(own, new.get(key, ())):
+                    if window[0] <= t_ns < window[1]:
+                        rows.append((key, payload, t_ns))
+                        if is_new:
+                            gained[key] = gained.get(key, 0) + 1
             rows.sort(key=lambda row: row[2])
             writer.take_from(_Rows(rows), len(rows))
             progress((log.end_ns - log.began_ns()) * _NS / max(fleets.length_s, 1e-9))
     return gained
 
 
-def in_order(own: Sequence[Timed], gained: Sequence[Timed]) -> list[Timed]:
-    """Return the messages of one key in the order in which they were sent.
+def in_order(own: Sequence[Timed], new: Sequence[Timed]) -> list[tuple[int, bytes, bool]]:
+    """Return the messages of one key in the order in which they were sent, True: it is new.
 
     A message that the fleet's recorder had keeps its time there, however late it came; one that it
     gains is put between its neighbours.
 
     Args:
         own: of the fleet's record, in its order.
-        gained: of a host's record.
+        new: of a host's record.
     """
-    if not gained:
-        return list(own)
+    if not new:
+        return [(t_ns, payload, False) for t_ns, payload in own]
     heads = msgspec.json.Decoder(MessageHead).decode
     rows = [(heads(payload), t_ns, payload, False) for t_ns, payload in own]
-    rows += [(heads(payload), t_ns, payload, True) for t_ns, payload in gained]
+    rows += [(heads(payload), t_ns, payload, True) for t_ns, payload in new]
     rows.sort(key=lambda row: (row[0].t_ns, row[0].seq))
     times = [t_ns for _, t_ns, _, _ in rows]
-    for numbers, bound in ((range(1, len(rows)), max), (range(len(rows) - 2, -1, -1), min)):
-        for n in numbers:
-            if rows[n][3]:
-                times[n] = bound(times[n], times[n - 1 if bound is max else n + 1])
-    return [(t_ns, row[2]) for t_ns, row in zip(times, rows, strict=True)]
+    for n in range(1, len(rows)):
+        if rows[n][3]:
+            times[n] = max(times[n], times[n - 1])
+    for n in range(len(rows) - 2, -1, -1):
+        if rows[n][3]:
+            times[n] = min(times[n], times[n + 1])
+    return [(t_ns, row[2], row[3]) for t_ns, row in zip(times, rows, strict=True)]
 
 
-def _gained(log: RunLog, records: Sequence[HostRecord]) -> dict[str, list[Timed]]:
-    """Return by key what hosts' records have in a part, and the fleet's has not."""
+def _window_ns(fleets: RunIndex, log: RunLog) -> tuple[int, int]:
+    """Return from when to when, fleet's clock, the joined run has the messages of a part."""
+    began_ns, ended_ns = _span_ns(fleets)
+    return (
+        began_ns - _MARGIN_NS if log.is_first else log.begin_ns,
+        ended_ns + _MARGIN_NS if log.is_last else log.end_ns,
+    )
+
+
+def _gained(
+    log: RunLog, records: Sequence[HostRecord], window: tuple[int, int]
+) -> dict[str, list[Timed]]:
+    """Return by key what hosts' records have around a part, and the fleet's has not."""
     found: dict[str, list[Timed]] = {}
     known: dict[str, set[bytes]] = {}
     for record in records:
-        for key, payload, at_ns in _rows_within(record, log):
+        for key, payload, at_ns in _rows_around(record, window):
             if key not in known:
                 known[key] = {one for _, one, _ in log.raw(key)}
             if payload not in known[key]:
@@ -184,20 +220,13 @@ class _Rows:
         return next(self._rows, None)
 
 
-def _rows_within(record: HostRecord, log: RunLog) -> Iterator[Row]:
-    """Yield the messages of a host's record in a part of the fleet's, on the fleet's clock."""
-    index = record.run
-    own_ns = index.began_ns - index.offset_ns
-    ahead_ns = record.to_fleets_ns(own_ns) - own_ns
-    began_ns = own_ns + ahead_ns
-    begin_s = 0.0 if log.is_first else (log.begin_ns - _MARGIN_NS - began_ns) * _NS
-    end_s = index.length_s if log.is_last else (log.end_ns + _MARGIN_NS - began_ns) * _NS
-    if end_s < 0.0 or begin_s > index.length_s:
+def _rows_around(record: HostRecord, window: tuple[int, int]) -> Iterator[Row]:
+    """Yield the messages of a host's record in a window and a margin about it, fleet's clock."""
+    own_ns = _span_ns(record.run)[0]
+    begin_s, end_s = ((record.to_own_ns(t_ns) - own_ns) * _NS for t_ns in window)
+    if end_s + LATE_S < 0.0 or begin_s - LATE_S > record.run.length_s:
         return
-    part = RunPart(max(0.0, begin_s), end_s + 1.0)
-    own = RunLog(index, part, as_sent=True)
+    own = RunLog(record.run, RunPart(max(0.0, begin_s - LATE_S), end_s + LATE_S), as_sent=True)
     for key in own.keys():  # noqa: SIM118 - no dict
         for t_ns, payload, _ in own.raw(key):
-            at_ns = record.to_fleets_ns(t_ns)
-            if log.holds(at_ns):
-                yield key, payload, at_ns
+            yield key, payload, record.to_fleets_ns(t_ns)

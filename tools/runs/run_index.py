@@ -65,7 +65,7 @@ class RunIndex:
         text = self.attachments.get("robot.toml", b"")
         try:
             endpoints = tomllib.loads(text.decode()).get("bus", {}).get("endpoints", {})
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, AttributeError):
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, AttributeError, RecursionError):
             return {}
         return hosts_of(endpoints) if isinstance(endpoints, dict) else {}
 

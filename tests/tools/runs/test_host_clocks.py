@@ -12,11 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.bus import topics
+from shared.bus.codec import encode
+from shared.bus.messages import Estop, JointEvent, JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.robot.joints import MODULES
 from tests.conftest import ROBOT_FILE
+from tests.shared.mcap_log.runs import sample
 from tests.tools.exit_codes import exit_code
 from tests.tools.runs.three_hosts import (
     BODY,
@@ -27,10 +30,11 @@ from tests.tools.runs.three_hosts import (
     sent_by_all,
     write_record,
 )
-from tools.runs.clock_offsets import ClockOffsets
+from tools.runs.clock_offsets import ClockOffsets, OffsetBounds
+from tools.runs.host_clock import HostClock
 from tools.runs.joined_records import in_order
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import clocks_of, read_run
+from tools.runs.run_log import clocks_of, parts_of, read_run
 
 # ---- bounds
 
@@ -95,10 +99,10 @@ def record(robot: RobotConfig, sent: list[Sent], tmp_path_factory: pytest.TempPa
 def test_the_offset_of_each_host_is_found_and_how_well_it_is_known(record: Path) -> None:
     clocks = clocks_of(RunIndex(record))
     assert clocks is not None
-    (found,) = clocks.looks
     for host in (RIGHT, LEFT):
         truth = CLOCKS[BODY].read(5 * NS_PER_S) - CLOCKS[host].read(5 * NS_PER_S)
-        bounds = found.bounds[host]
+        ((point,),) = (life.points for life in clocks.lives[host])
+        bounds = point.bounds
         assert bounds.known
         assert bounds.error_ns < 3 * NS_PER_MS
         assert abs(bounds.best_ns - truth) < bounds.error_ns + 0.5 * NS_PER_MS
@@ -138,7 +142,7 @@ def test_info_tells_the_clocks(
     assert exit_code(["info", record, "--json"]) == 0
     left = json.loads(capsys.readouterr().out)["clocks"][LEFT]
     assert left["services"] == ["ankle_left", "knee_left", "hip_left"]
-    assert left["offset_s"] == pytest.approx(252_000.0, abs=0.01)
+    assert left["clocks"][0]["offset_s"] == pytest.approx(252_000.0, abs=0.01)
 
 
 def test_on_one_host_nothing_is_compared(tmp_path: Path, robot: RobotConfig) -> None:
@@ -224,10 +228,10 @@ def test_joined_messages_of_a_key_are_in_the_order_in_which_they_were_sent(
     found = in_order(own, gained)
     assert sorted(found, key=lambda row: row[0]) == found or not own
     if own:
-        assert [payload for _, payload in found] == [
+        assert [payload for _, payload, _ in found] == [
             b'{"t_ns":%d,"seq":%d}' % (100 * n, n) for n in range(len(rows))
         ]
-    assert [row for row in found if row in own] == own
+    assert [(t_ns, payload) for t_ns, payload, is_new in found if not is_new] == own
 
 
 def test_what_is_no_hosts_record_is_not_joined(
@@ -254,3 +258,142 @@ def test_a_record_of_another_time_is_not_joined(
     fleets = write_record(tmp_path, robot, late, BODY)  # type: ignore[arg-type]  # the same tuple
     assert exit_code(["join", fleets, of_the_leg, "--out", tmp_path / "out"]) == 2
     assert "of another time" in capsys.readouterr().err
+
+
+# ---- clocks that begin anew, drift, or are heard late
+
+
+def states(
+    module: str, clock: HostClock, begin_s: float, end_s: float, *, hz: float = 10.0, first: int = 0
+) -> list[Sent]:
+    """Return states of a module alone, stamped by a clock."""
+    key = topics.JOINT_STATE.key("xrl", module)
+    found: list[Sent] = []
+    for n in range(round((end_s - begin_s) * hz)):
+        at_ns = round((begin_s + n / hz) * NS_PER_S)
+        state = sample(JointState, t_ns=clock.read(at_ns), seq=first + n)
+        found.append((at_ns, module, key, encode(state)))
+    return found
+
+
+def test_a_host_that_starts_again_has_two_clocks_and_all_its_times_are_right(
+    robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    again = HostClock(-100 * NS_PER_S)
+    sent = states("knee_left", CLOCKS[LEFT], 1.0, 80.0) + states("knee_left", again, 110.0, 200.0)
+    path = write_record(tmp_path / "fleet", robot, [*sent, *kept_up(200.0)], BODY)
+    log = read_run(path)
+    received = log.received_ns(topics.JOINT_STATE, "knee_left")
+    rows = log.messages(topics.JOINT_STATE, "knee_left")
+    late = [at_ns - row.t_ns for at_ns, row in zip(received, rows, strict=True)]
+    assert len(late) == 790 + 900
+    assert max(map(abs, late)) < 3 * NS_PER_MS
+    assert exit_code(["info", path]) == 0
+    assert "then it started again" in " ".join(capsys.readouterr().out.split())
+    for number, those in enumerate((sent[:790], sent[790:])):
+        clock = (CLOCKS[LEFT], again)[number]
+        own = write_record(tmp_path / f"own{number}", robot, those, LEFT, of=LEG, clock=clock)
+        assert exit_code(["join", path, own, "--out", tmp_path / f"joined{number}"]) == 0
+        assert ": 0 messages" in capsys.readouterr().out
+
+
+def kept_up(seconds: float) -> list[Sent]:
+    """Return what the body says all the time: there is something in every part of the record."""
+    return states("knee_right", CLOCKS[RIGHT], 0.0, seconds, hz=2.0)
+
+
+def test_a_host_that_is_heard_late_is_known_from_then_on(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
+    sent = states("knee_left", CLOCKS[LEFT], 31.0, 60.0)
+    log = read_run(write_record(tmp_path, robot, [*sent, *kept_up(60.0)], BODY))
+    received = log.received_ns(topics.JOINT_STATE, "knee_left")
+    rows = log.messages(topics.JOINT_STATE, "knee_left")
+    late = [at_ns - row.t_ns for at_ns, row in zip(received, rows, strict=True)]
+    assert max(map(abs, late)) < 3 * NS_PER_MS
+
+
+def test_events_of_the_whole_run_do_not_bound_the_clock_at_its_begin(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
+    fast = HostClock(CLOCKS[LEFT].offset_ns, 50.0)
+    sent = states("knee_left", fast, 0.0, 1800.0, hz=2.0)
+    key = topics.JOINT_EVENT.key("xrl", "knee_left")
+    for n, at_ns in enumerate((NS_PER_S, 1799 * NS_PER_S)):
+        event = sample(JointEvent, t_ns=fast.read(at_ns), seq=n)
+        sent.append((at_ns, "knee_left", key, encode(event)))
+    clocks = clocks_of(RunIndex(write_record(tmp_path, robot, sent, BODY)))
+    assert clocks is not None
+    (life,) = clocks.lives[LEFT]
+    for at_ns in (10 * NS_PER_S, 1790 * NS_PER_S):
+        there_ns = CLOCKS[BODY].read(at_ns)
+        truth = there_ns - fast.read(at_ns)
+        assert abs(life.offset_ns(there_ns) - truth) < NS_PER_MS
+
+
+def test_a_sender_whose_clock_is_not_known_has_the_times_at_which_it_was_heard(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
+    stop = sample(Estop, t_ns=5, seq=1, source="a laptop")
+    sent = [(NS_PER_S, "", topics.ESTOP.key("xrl"), encode(stop)), *kept_up(3.0)]
+    log = read_run(write_record(tmp_path, robot, sent, BODY))
+    assert [row.t_ns for row in log.messages(topics.ESTOP)] == log.received_ns(topics.ESTOP)
+
+
+def test_clocks_that_contradict_themselves_are_not_known_and_spoil_no_other() -> None:
+    clocks = ClockOffsets(("body", "left", "right"))
+    for sender, sent_ns, receiver, received_ns in (
+        ("left", 0, "body", 10_000_000), ("body", 0, "left", 100_000_000),
+        ("left", 900_000_000, "body", 400_000_000),  # its clock began anew
+        ("right", 0, "body", 51_000_000), ("body", 0, "right", -49_500_000),
+    ):  # fmt: skip
+        clocks.heard(sender, sent_ns, receiver, received_ns)
+    found = clocks.against("body")
+    assert not math.isfinite(found["left"].best_ns)
+    assert (found["right"].low_ns, found["right"].high_ns) == (49_500_000, 51_000_000)
+
+
+def test_bounds_that_are_wide_are_not_those_of_one_clock_because_they_hold_zero() -> None:
+    wide = OffsetBounds(-1e6, 900e6)
+    assert wide.best_ns == pytest.approx(449.5e6)
+    assert wide.error_ns == pytest.approx(450.5e6)
+    one = OffsetBounds(-3e6, 1e6)
+    assert (one.best_ns, one.error_ns) == (0.0, 3e6)
+
+
+def test_over_hours_of_drift_no_message_is_lost_or_doubled(
+    robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of a while in the middle were held up by a cut, and came eight seconds late."""
+    drifts = HostClock(7 * NS_PER_S, 400.0)
+    sent = states("knee_left", drifts, 0.0, 4_000.0, hz=1.0)
+    missed = [one for n, one in enumerate(sent) if n % 7]
+    begin_ns, end_ns = 1_000 * NS_PER_S, 2_000 * NS_PER_S
+    late = [
+        (min(at_ns + 8 * NS_PER_S, end_ns) if begin_ns < at_ns < end_ns else at_ns, *rest)
+        for at_ns, *rest in missed
+    ]
+    fleets = write_record(tmp_path / "fleet", robot, late, BODY)  # type: ignore[arg-type]  # same
+    own = write_record(tmp_path / "own", robot, sent, LEFT, of=LEG, clock=drifts)
+    assert exit_code(["join", fleets, own, "--out", tmp_path / "joined"]) == 0
+    assert f": {len(sent) - len(missed)} messages" in capsys.readouterr().out
+    key = topics.JOINT_STATE.key("xrl", "knee_left")
+    seqs = [
+        seq
+        for log in parts_of(RunIndex(tmp_path / "joined"), part_s=500.0, margin_s=0.0)
+        for t_ns, _, seq in log.raw(key)
+        if log.holds(t_ns)
+    ]
+    assert seqs == list(range(len(sent)))
+
+
+def test_a_hosts_record_of_hours_before_adds_a_second_at_most(
+    robot: RobotConfig, tmp_path: Path
+) -> None:
+    sent = states("knee_left", CLOCKS[LEFT], 0.0, 1020.0)
+    fleets = write_record(
+        tmp_path / "fleet", robot, [one for one in sent if one[0] > 1000 * NS_PER_S], BODY
+    )
+    own = write_record(tmp_path / "own", robot, sent, LEFT, of=LEG)
+    assert exit_code(["join", fleets, own, "--out", tmp_path / "joined"]) == 0
+    assert 20.0 < RunIndex(tmp_path / "joined").length_s < 21.2

@@ -63,6 +63,7 @@ def write_record(
     *,
     of: Sequence[str] = (),
     lost: Callable[[Sent], bool] = lambda _one: False,
+    clock: HostClock | None = None,
 ) -> Path:
     """Write what a host's recorder gets, by its own clock.
 
@@ -73,13 +74,18 @@ def write_record(
         host: of the recorder.
         of: it is the host's own, of these services.
         lost: what does not arrive.
+        clock: of that host; None: as in `CLOCKS`.
     """
+    clock = clock or CLOCKS[host]
     dice = random.Random(5)
-    rows = [
-        (key, payload, CLOCKS[host].read(at_ns) + dice.randrange(NS_PER_MS))
-        for at_ns, sender, key, payload in sent
-        if (not of or sender in of) and not lost((at_ns, sender, key, payload))
-    ]
+    newest: dict[str, int] = {}
+    rows: list[tuple[str, bytes, int]] = []
+    for one in sent:
+        at_ns, sender, key, payload = one
+        if (not of or sender in of) and not lost(one):
+            # a link keeps the order of what passes it
+            newest[key] = max(newest.get(key, 0), clock.read(at_ns) + dice.randrange(NS_PER_MS))
+            rows.append((key, payload, newest[key]))
     rows.sort(key=lambda row: row[2])
     waiting = iter(rows)
 
@@ -91,7 +97,7 @@ def write_record(
     with RunWriter(
         folder,
         topics.all_keys(robot.name),
-        offset_ns=1_700_000_000 * NS_PER_S - CLOCKS[host].offset_ns,
+        offset_ns=1_700_000_000 * NS_PER_S - clock.offset_ns,
         metadata={"run": about},
         attachments={
             "robot.toml": to_toml(on_three_hosts(robot)).encode(),
