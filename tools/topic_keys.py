@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from shared.bus import topics
 from shared.bus.topics import Topic
+from shared.config.robot_config import SERVICES
 from shared.exceptions import RunError
 from shared.robot.joints import MODULES
 
@@ -52,3 +53,10 @@ def keys_named(patterns: Sequence[str], left_out: Collection[Topic] = ()) -> lis
     if not patterns:
         return [key for key in known if key.topic not in left_out]
     return [key for key in known if any(fnmatch.fnmatch(key.name, p) for p in patterns)]
+
+
+def sender_of(topic: Topic, module: str = "") -> str:
+    """Return the service that puts a topic; "" if tools do, on any host."""
+    if topic.writers == ("*",):
+        return module
+    return topic.writers[0] if len(topic.writers) == 1 and topic.writers[0] in SERVICES else ""

@@ -76,8 +76,11 @@ _PRIORITIES: Final = {
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
 _ALIVE_TIMEOUT_S: Final = 0.2
-_TOOLS_MAX: Final = 256
-"""Comings and goings of tools that wait to be taken."""
+_TOOLS_MAX: Final = 128
+"""Tools that are named: as many as there may be links."""
+_TOOLS_WAITING: Final = 4096
+"""Comings and goings of tools that wait to be taken; of more the oldest are lost."""
+_TOOLS_AT_ONCE: Final = 64
 
 
 def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
@@ -188,6 +191,11 @@ class Stream:
         return None
 
 
+def place_of_tool() -> str:
+    """Return HOST.PID of this process, as its token has it."""
+    return f"{re.sub('[^A-Za-z0-9-]', '-', socket.gethostname())}.{os.getpid()}"
+
+
 class LinkedTools:
     """The tools that are linked with this process, by the names that they give themselves."""
 
@@ -196,13 +204,16 @@ class LinkedTools:
         self._names: set[str] = set()
 
     def names(self) -> tuple[str, ...]:
-        """Return each as NAME.HOST.PID; never blocks."""
-        while (sample := self._subscriber.try_recv()) is not None:
+        """Return each as NAME.HOST.PID; never blocks, however many come and go."""
+        for _ in range(_TOOLS_AT_ONCE):
+            sample = self._subscriber.try_recv()
+            if sample is None:
+                break
             name = str(sample.key_expr).rpartition("/")[2]
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._names.add(name)
-            else:
+            if sample.kind != zenoh.SampleKind.PUT:
                 self._names.discard(name)
+            elif len(self._names) < _TOOLS_MAX:
+                self._names.add(name)
         return tuple(sorted(self._names))
 
 
@@ -216,8 +227,7 @@ class Session:
         self.name = name
         self._session = session
         self._alive_prefix = f"{alive_prefix(robot)}/"
-        place = f"{re.sub('[^A-Za-z0-9-]', '-', socket.gethostname())}.{os.getpid()}"
-        self._token = session.liveliness().declare_token(token_key(robot, name, place))
+        self._token = session.liveliness().declare_token(token_key(robot, name, place_of_tool()))
         if over_tcp:  # held, or it would end
             self._links = session.info.declare_link_events_listener(_meet_link, history=True)
 
@@ -328,7 +338,7 @@ class Session:
         watched = f"{tools_prefix(self.robot)}/*"
         return LinkedTools(
             self._session.liveliness().declare_subscriber(
-                watched, zenoh.handlers.RingChannel(_TOOLS_MAX), history=True
+                watched, zenoh.handlers.RingChannel(_TOOLS_WAITING), history=True
             )
         )
 

@@ -148,7 +148,9 @@ def lead_through(place: Place, watch: Watch, capsys: Any) -> None:
     assert place.xrl("update") == 1
     assert "`xrl hosts down` first" in " ".join(capsys.readouterr().out.split())
 
-    assert place.xrl("records", "-o", str(place.base / "so far")) == 0, "while they are written"
+    assert place.xrl("records", "-o", str(place.base / "so far")) == 2
+    assert "--while-up" in capsys.readouterr().err
+    assert place.xrl("records", "--while-up", "-o", str(place.base / "so far")) == 0
     assert read_run(place.base / "so far" / "joined").count(topics.PLANNER_STATUS.key("xrl"))
 
     before = procfs.fleet_pids(place.run_dir("right"))

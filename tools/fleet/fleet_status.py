@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -23,7 +22,7 @@ from shared.bus.messages import (
     Refusal,
     ToolRoster,
 )
-from shared.bus.session import Latest, Session
+from shared.bus.session import Latest, Session, place_of_tool
 from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS
 from shared.clock import NS_PER_S, now_ns, pace
 from shared.exceptions import FleetError
@@ -296,7 +295,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
 
 def tools_of(message: Message | None) -> tuple[str, ...]:
     """Return the tools that are linked, but for this process, from the recorder's newest roster."""
-    own = f".{os.getpid()}"
+    own = f".{place_of_tool()}"
     if not isinstance(message, ToolRoster):
         return ()
     return tuple(name for name in message.tools if not name.endswith(own))

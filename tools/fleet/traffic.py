@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Final
 
 import msgspec
@@ -12,7 +12,7 @@ from shared.bus.session import Session
 from shared.bus.topics import several_may_write
 from shared.clock import NS_PER_MS
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.topic_keys import TopicKey
+from tools.topic_keys import TopicKey, sender_of
 
 POLL_S: Final = 0.001
 """Bounds how late a message is seen, and so the spacing's error."""
@@ -27,10 +27,6 @@ class _Numbering(msgspec.Struct, gc=False):
     seq: int
 
 
-AGE_MAX_MS: Final = 60_000.0
-"""An age beyond it, or below zero, is none: the sender's host has another clock."""
-
-
 class KeyTraffic:
     """The messages of one key in a window of time.
 
@@ -40,9 +36,15 @@ class KeyTraffic:
         lost: messages in the window that the numbers of the senders jump over.
     """
 
-    def __init__(self, key: TopicKey) -> None:
-        """Begin with nothing received."""
+    def __init__(self, key: TopicKey, *, here: bool = True) -> None:
+        """Begin with nothing received.
+
+        Args:
+            key: of the messages.
+            here: their sender is on this host, and has its clock.
+        """
         self.key = key
+        self._here = here
         self._counted = KeyCount(several=several_may_write(f"xrl/robot/{key.name}"))
         self._last_ns: int | None = None
         self.begin()
@@ -65,7 +67,8 @@ class KeyTraffic:
         except (msgspec.DecodeError, UnicodeDecodeError):
             return
         self._counted.feed(head.seq)
-        self._ages.append(now_ns - head.t_ns)
+        if self._here:
+            self._ages.append(now_ns - head.t_ns)
 
     @property
     def lost(self) -> int:
@@ -79,9 +82,8 @@ class KeyTraffic:
 
     @property
     def ages_ms(self) -> tuple[float, float] | None:
-        """Median and largest age at reception, ms; None where the sender has another clock."""
-        found = _spread_ms(self._ages)
-        return found if found is not None and -1.0 < found[0] < AGE_MAX_MS else None
+        """Median and largest age at reception, ms; None where the sender is not on this host."""
+        return _spread_ms(self._ages)
 
 
 _NUMBERINGS: Final = msgspec.json.Decoder(_Numbering)
@@ -96,9 +98,22 @@ def _spread_ms(values: Sequence[int]) -> tuple[float, float] | None:
 class Traffic:
     """Receives keys of a bus, undecoded."""
 
-    def __init__(self, session: Session, keys: Iterable[TopicKey]) -> None:
-        """Subscribe."""
-        self.keys = {key.topic.key(session.robot, key.module): KeyTraffic(key) for key in keys}
+    def __init__(
+        self, session: Session, keys: Iterable[TopicKey], elsewhere: Collection[str] = ()
+    ) -> None:
+        """Subscribe.
+
+        Args:
+            session: on the bus.
+            keys: to receive.
+            elsewhere: services on other hosts; where there are any, so may the tools be.
+        """
+        self.keys = {
+            key.topic.key(session.robot, key.module): KeyTraffic(
+                key, here=not elsewhere or sender_of(key.topic, key.module) not in {"", *elsewhere}
+            )
+            for key in keys
+        }
         self._stream = session.stream(list(self.keys))
 
     def listen(self, seconds: float, left: Callable[[], bool] = lambda: False) -> float:

@@ -15,6 +15,9 @@ from shared.exceptions import ConfigError
 from shared.robot.joints import MODULES, SIDES, side_of
 
 _TOOLS: Final = (OPERATOR, VIEWER)
+_IPV4_BITS: Final = 32
+JOINED: Final = "joined"
+"""Folder of the joined run, beside one for each host (`xrl hosts records`)."""
 
 
 class Host(Section, frozen=True):
@@ -31,19 +34,20 @@ class Host(Section, frozen=True):
     processors: str = ""
     """As systemd takes them: `2-3`; empty: all."""
     record: bool = True
-    """Where the recorder is another host's: keep a record of this one's services here."""
+    """Where the recorder is another host's: keep a record of this one's services here. It is a
+    reader like any tool: without the key of one there is none."""
 
     private: tuple[str, ...] = ()
     """CAN interfaces that only the services reach, in a network namespace of their own."""
     nic: str = ""
     """With `private`: interface of the robot's network, on which the services have `address`."""
-    prefix: Annotated[int, Range(1, 128, "1")] = 24
-    """With `private`: length of the network's part of `address`."""
+    prefix: Annotated[int, Range(1, 127, "1")] = 24
+    """With `private`: length of the network's part of `address`; 64 as a rule for IPv6."""
 
     @property
     def processes(self) -> tuple[str, ...]:
         """What `xrl up --only` starts here."""
-        beside = self.record and RECORDER not in self.services
+        beside = self.record and bool(self.tools) and RECORDER not in self.services
         return (*self.services, HOST_RECORDER) if beside else self.services
 
 
@@ -60,7 +64,9 @@ class Hosts(Section, frozen=True):
     checkout: str = "/opt/xrl"
     folder: str = "/etc/xrl"
     """Where robot file, gain schedule and keys lie on each host."""
-    ssh: tuple[str, ...] = ("ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=5")
+    ssh: tuple[str, ...] = (
+        "ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=5", "-o", "ServerAliveInterval=5",
+    )  # fmt: skip
 
     def host_of(self, service: str) -> Host:
         """Return where a service runs."""
@@ -99,6 +105,8 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", host.name):
             right = "letters, digits, _ and - only"
             raise ConfigError(file, f"{where}.name", f"{host.name!r}", right)
+        if host.name == JOINED:
+            raise ConfigError(file, f"{where}.name", repr(JOINED), "that is the joined record's")
         _check_address(file, f"{where}.address", host.address)
         if host.ssh.startswith("-") or not host.ssh.strip():
             raise ConfigError(file, f"{where}.ssh", f"{host.ssh!r}", "as ssh takes it: user@host")
@@ -111,9 +119,6 @@ def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
             found = f"{host.processors!r}"
             raise ConfigError(file, f"{where}.processors", found, "as systemd takes them: 0-1,3")
         _check_private(file, where, host)
-        if HOST_RECORDER in host.processes and not host.tools:
-            right = '["viewer"], whose key this host\'s own record needs; or record = false'
-            raise ConfigError(file, f"{where}.tools", "none", right)
         if not host.services:
             raise ConfigError(file, f"{where}.services", "none", "at least one")
         for service in host.services:
@@ -156,6 +161,17 @@ def _check_private(file: str, where: str, host: Host) -> None:
     if host.private and not host.nic:
         right = "the interface of the robot's network, on which the services get `address`"
         raise ConfigError(file, f"{where}.nic", "missing beside `private`", right)
+    if len({*host.private, host.nic}) <= len(host.private):
+        right = "each interface once, and `nic` not among them"
+        raise ConfigError(file, f"{where}.private", ", ".join(host.private), right)
+    most = ipaddress.ip_address(host.address).max_prefixlen
+    least = 1 if most == _IPV4_BITS else _IPV4_BITS
+    if host.private and not least <= host.prefix < most:
+        right = f"{least} to {most - 1}: the length of the network's part of `address`"
+        raise ConfigError(file, f"{where}.prefix", str(host.prefix), right)
+    if host.private and host.ssh.rpartition("@")[2] == host.address:
+        right = "the host's own address: `address` is then the services'"
+        raise ConfigError(file, f"{where}.ssh", f"{host.ssh!r}", right)
     if host.nic and not host.private:
         right = "the CAN interfaces that only the services are to reach"
         raise ConfigError(file, f"{where}.private", "missing beside `nic`", right)

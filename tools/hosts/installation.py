@@ -96,12 +96,15 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: boo
     Raises:
         FleetError: the host is not reached, its services are running, or a file cannot be written.
     """
+    if not while_up:
+        why = "a service that crashes would come back with the new files beside the old"
+        refuse_up(remote, why)
     state = _state(remote)
-    if not while_up and state not in _AT_REST:
-        raise FleetError(
-            f"{remote.host.name}: its unit is {state}: a service that crashes would come "
-            "back with the new files beside the old; `xrl hosts down` first, or --while-up"
-        )
+    network_unit = f"{_UNIT_FOLDER}/{private_network.UNIT}"
+    if state in _AT_REST and remote.run("test", "-e", network_unit).code == 0:
+        # the next start makes the services' network as it is to be then
+        remote.must("systemctl", "stop", "--quiet", private_network.UNIT)
+        remote.must("rm", "-f", network_unit)
     folder = hosts.folder
     keys = f"{folder}/{KEYS}"
     remote.must("install", "-d", "-m", "755", folder)
@@ -117,6 +120,18 @@ def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: boo
     remote.must("systemctl", "daemon-reload")
     remote.must("systemctl", "enable", "--quiet", UNIT)
     return f"{len(files)} files"
+
+
+def refuse_up(remote: Remote, why: str) -> None:
+    """Refuse to go on while a host's services are up.
+
+    Raises:
+        FleetError: they are.
+    """
+    state = _state(remote)
+    if state not in _AT_REST:
+        text = f"{remote.host.name}: its unit is {state}: {why}"
+        raise FleetError(f"{text}; `xrl hosts down` first, or --while-up")
 
 
 def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
@@ -144,6 +159,12 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
         own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{name}").out if name in wanted else ""
         if name in wanted and digest(own_unit.encode()) != wanted[name]:
             wrong.append(f"another {name}; `xrl hosts update`")
+    state = _state(remote)
+    if remote.host.private and state not in _AT_REST:
+        inside = remote.run("cat", "/proc/net/dev", on_bus=True).out
+        outside = [n for n in (*remote.host.private, private_network.LINK) if f"{n}:" not in inside]
+        if outside:
+            wrong.append(f"not in the services' network: {', '.join(outside)} (docs/hosts.md)")
     if not probe.revision:
         wrong.append(f"of no known version: {hosts.checkout} is no git checkout that can be read")
     warnings = list(probe.warnings)
@@ -152,7 +173,7 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     if abs(clock.offset_s) > CLOCK_MAX_S + clock.round_trip_s:
         warnings.append(f"its clock is {clock.offset_s:+.1f} s off: certificates go by it")
     return HostRow(
-        remote.host.name, probe.revision, clock, _state(remote), (probe.lock, probe.python),
+        remote.host.name, probe.revision, clock, state, (probe.lock, probe.python),
         tuple(wrong), tuple(warnings),
     )  # fmt: skip
 

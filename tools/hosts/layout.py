@@ -14,7 +14,7 @@ from tools.hosts.hosts_file import Host, Hosts, ports
 ROBOT_FILE: Final = "robot.toml"
 SCHEDULE: Final = "robot.gains.json"
 KEYS: Final = "keys"
-UNIT: Final = "xrl.service"
+UNIT: Final = private_network.SERVICES_UNIT
 RUN_DIR: Final = "/var/lib/xrl/run"
 """On the disk and not in memory: an emergency stop outlasts a power cut, once the kernel has
 written it, within half a minute."""
@@ -44,18 +44,18 @@ def unit(hosts: Hosts, host: Host) -> str:
     """
     xrl = f"{hosts.checkout}/.venv/bin/xrl"
     processors = f"CPUAffinity={host.processors}\n" if host.processors else ""
-    after = before = ""
+    of_unit = of_service = ""
     if host.private:
         # Wants, not Requires: whoever stops that unit is not to idle the drives.
-        before = f"After={private_network.UNIT}\nWants={private_network.UNIT}\n"
-        after = f"NetworkNamespacePath={private_network.PATH}\n"
+        of_unit = f"After={private_network.UNIT}\nWants={private_network.UNIT}\n"
+        of_service = f"NetworkNamespacePath={private_network.PATH}\n"
     return f"""\
 # Made by `xrl hosts`; what it is for stands in docs/hosts.md.
 [Unit]
 Description=Extra Robotic Legs: {", ".join(host.services)}
 After=network-online.target
 Wants=network-online.target
-{before}
+{of_unit}
 [Service]
 Type=forking
 PIDFile={RUN_DIR}/supervisord.pid
@@ -78,7 +78,7 @@ UMask=0027
 LimitRTPRIO=40
 LimitMEMLOCK=infinity
 LimitCORE=0
-{processors}{after}NoNewPrivileges=yes
+{processors}{of_service}NoNewPrivileges=yes
 CapabilityBoundingSet=
 ProtectSystem=strict
 ProtectHome=yes

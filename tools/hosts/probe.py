@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import platform
+import shutil
 import subprocess
 import sys
 import time
@@ -25,6 +26,8 @@ from tools.fleet.run_dir import SUPERVISOR_PID
 from tools.keys.bundle import held_files
 from tools.keys.inspection import look
 
+FREE_MIB: Final = 4096
+"""Less is warned of: an hour of records is 2.4 GiB."""
 LOCKS: Final = ("requirements.lock", "requirements.runtime.lock")
 
 
@@ -68,6 +71,8 @@ def probe(config: Path, run_dir: Path) -> Probe:
         wrong.append(str(error))
     if not _environment_is_current():
         warnings.append(f"{CHECKOUT}: the environment is not that of this version: deploy/install")
+    if _free_mib(run_dir) < FREE_MIB:
+        warnings.append(f"{_free_mib(run_dir)} MiB free for records: take old ones away")
     return Probe(
         revision=_revision(),
         lock=_hash_of(CHECKOUT / "requirements.runtime.lock"),
@@ -78,6 +83,13 @@ def probe(config: Path, run_dir: Path) -> Probe:
         wrong=tuple(wrong),
         warnings=tuple(warnings),
     )
+
+
+def _free_mib(folder: Path) -> int:
+    """Return the free space where a folder is or will be."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return shutil.disk_usage(folder).free >> 20
 
 
 def digest(content: bytes) -> str:

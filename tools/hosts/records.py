@@ -13,11 +13,11 @@ from shared.exceptions import FleetError, RunError
 from tools.hosts.layout import RECORDS
 from tools.hosts.remote import Remote
 from tools.runs.joined_records import HostRecord, host_record, join
+from tools.runs.run_files import runs_in
 from tools.runs.run_index import RunIndex
 
-JOINED: Final = "joined"
-"""Folder of the joined run, beside one for each host."""
-
+_DATED: Final = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,12})?) (/.*)")
+"""A time, s since 1970, and a folder."""
 _PACK: Final = 'tar --warning=no-file-changed -cf - -C "$1" -- "$2"; [ $? -le 1 ]'
 """Ends well also if a file has grown meanwhile: it is then read as far as it is whole."""
 
@@ -29,10 +29,10 @@ def newest(remote: Remote) -> str:
         FleetError: it has none, or is not reached.
     """
     listed = remote.must("find", RECORDS, "-name", "*.mcap", "-printf", "%T@ %h\\n", as_user=True)
-    rows = [line.split(" ", 1) for line in listed.splitlines() if " " in line]
+    rows = [found for line in listed.splitlines() if (found := _DATED.fullmatch(line))]
     if not rows:
         raise FleetError(f"{remote.host.name}: no record in {RECORDS}")
-    return _name_in(remote, max(rows, key=lambda row: float(row[0]))[1])
+    return _name_in(remote, max(rows, key=lambda row: float(row[1]))[2])
 
 
 def since(remote: Remote, wall_s: float) -> list[str]:
@@ -82,11 +82,20 @@ def is_fleets(remote: Remote) -> bool:
     return RECORDER in remote.host.services
 
 
-def join_fetched(fleets: Path, hosts: list[Path], out: Path) -> tuple[int, list[str]]:
+def fleets_run(folder: Path) -> RunIndex:
+    """Return the fleet's newest run in a folder: a recorder that was killed begins another.
+
+    Raises:
+        RunError: it holds none that can be read.
+    """
+    return RunIndex(folder, runs_in(folder)[-1])
+
+
+def join_fetched(fleets: RunIndex, hosts: list[Path], out: Path) -> tuple[int, list[str]]:
     """Join what was fetched.
 
     Args:
-        fleets: folder of the fleet's record.
+        fleets: the fleet's record.
         hosts: folders of single hosts' records.
         out: folder for the joined run.
 
@@ -94,27 +103,23 @@ def join_fetched(fleets: Path, hosts: list[Path], out: Path) -> tuple[int, list[
         How many messages the fleet's record gained, and why some records were left out.
 
     Raises:
-        RunError: the fleet's record cannot be read, or the joined one cannot be written.
+        RunError: the joined run cannot be written.
     """
-    index = RunIndex(fleets)
     records: list[HostRecord] = []
     left_out: list[str] = []
     for folder in hosts:
         try:
-            records.append(host_record(index, RunIndex(folder)))
+            runs = runs_in(folder)
         except RunError as error:
             left_out.append(str(error))
+            continue
+        for files in runs:
+            try:
+                records.append(host_record(fleets, RunIndex(files[0], files)))
+            except RunError as error:
+                left_out.append(str(error))
     out.mkdir(parents=True, exist_ok=True)
-    return sum(join(index, records, out).values()), left_out
-
-
-def began_s(fleets: Path) -> float:
-    """Return when a record began, s since 1970.
-
-    Raises:
-        RunError: it cannot be read.
-    """
-    return RunIndex(fleets).began_ns * 1e-9
+    return sum(join(fleets, records, out).values()), left_out
 
 
 def _name_in(remote: Remote, folder: str) -> str:

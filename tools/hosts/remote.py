@@ -12,7 +12,7 @@ from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 from shared.exceptions import FleetError
 from tools.hosts.hosts_file import Host, Hosts
-from tools.hosts.private_network import NAMESPACE
+from tools.hosts.private_network import IP, NAMESPACE
 
 R = TypeVar("R")
 
@@ -43,8 +43,8 @@ class Remote:
     def __init__(self, hosts: Hosts, host: Host) -> None:
         self.host = host
         self._begin = [*hosts.ssh, host.ssh]
+        self._in_network = [IP, "netns", "exec", NAMESPACE] if host.private else []
         # from a folder that every user may enter: find and others go back to where they began
-        self._in_network = ["ip", "netns", "exec", NAMESPACE] if host.private else []
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
     def run(

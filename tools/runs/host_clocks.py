@@ -22,6 +22,7 @@ from shared.clock import NS_PER_MS, NS_PER_S, NS_PER_US
 from shared.config.robot_config import SERVICES
 from shared.robot.joints import MODULES
 from tools.runs.clock_offsets import TIME_MAX_NS, ClockOffsets, OffsetBounds
+from tools.topic_keys import sender_of
 
 PLANNER: Final = "planner"
 THIS_HOST: Final = "this host"
@@ -164,13 +165,6 @@ def hosts_of(endpoints: Mapping[str, Any]) -> dict[str, str]:
         service: _host_of(endpoint) for service, endpoint in endpoints.items()
         if service in SERVICES and isinstance(endpoint, str)
     }  # fmt: skip
-
-
-def sender_of(topic: Topic, module: str = "") -> str:
-    """Return the service that puts a topic; "" if tools do, on any host."""
-    if topic.writers == ("*",):
-        return module
-    return topic.writers[0] if len(topic.writers) == 1 and topic.writers[0] in SERVICES else ""
 
 
 def spans_of_lives(samples: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:

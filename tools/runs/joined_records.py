@@ -125,7 +125,7 @@ def join(
         How many messages each key gained.
 
     Raises:
-        RunError: a file cannot be read or written.
+        RunError: a file cannot be read or written; what was written so far is gone then.
     """
     gained: dict[str, int] = {}
     metadata = {name: row for name, row in fleets.metadata.items() if name not in _OF_A_FILE}
@@ -141,6 +141,21 @@ def join(
         attachments=fleets.attachments,
         chunk_kib=_CHUNK_KIB,
     )
+    try:
+        _join(writer, fleets, records, gained, progress)
+    except BaseException:
+        writer.path.unlink(missing_ok=True)
+        raise
+    return gained
+
+
+def _join(
+    writer: RunWriter,
+    fleets: RunIndex,
+    records: Sequence[HostRecord],
+    gained: dict[str, int],
+    progress: Callable[[float], None],
+) -> None:
     with writer:
         for log in parts_of(fleets, part_s=PART_S, margin_s=2.0 * LATE_S, as_sent=True):
             window = _window_ns(fleets, log)
@@ -156,7 +171,6 @@ def join(
             rows.sort(key=lambda row: row[2])
             writer.take_from(_Rows(rows), len(rows))
             progress((log.end_ns - log.began_ns()) * _NS / max(fleets.length_s, 1e-9))
-    return gained
 
 
 def in_order(own: Sequence[Timed], new: Sequence[Timed]) -> list[tuple[int, bytes, bool]]:

@@ -66,6 +66,19 @@ def files_in(directory: Path) -> list[Path]:
     Raises:
         RunError: it holds no run, or several.
     """
+    runs = runs_in(directory)
+    if len(runs) > 1:
+        first = ", ".join(run[0].name for run in runs)
+        raise RunError(f"{directory}: holds {len(runs)} runs ({first}); give the files of one")
+    return runs[0]
+
+
+def runs_in(directory: Path) -> list[list[Path]]:
+    """Return the files of each run in a directory, in order: a recorder that restarts begins one.
+
+    Raises:
+        RunError: it holds none that can be read.
+    """
     names = sorted(directory.glob(f"*{SUFFIX}"), key=lambda file: (len(file.name), file.name))
     plain = [path for path in names if "." not in path.stem]  # not recovered or executed again
     runs: list[list[Path]] = []
@@ -79,10 +92,7 @@ def files_in(directory: Path) -> list[Path]:
             unreadable = error
     if not runs:
         raise unreadable or RunError(f"{directory}: holds no {SUFFIX} file; give a run's directory")
-    if len(runs) > 1:
-        first = ", ".join(run[0].name for run in runs)
-        raise RunError(f"{directory}: holds {len(runs)} runs ({first}); give the files of one")
-    return runs[0]
+    return runs
 
 
 def _names(directory: Path) -> Iterable[Path]:

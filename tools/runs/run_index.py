@@ -7,7 +7,7 @@ once, and `tools/runs/run_log.py` reads the parts that are needed.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -22,15 +22,19 @@ from tools.runs.run_files import MetadataByName, files_in
 class RunIndex:
     """A run's files: what is said about it, and the places of its messages."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, files: Sequence[Path] = ()) -> None:
         """Skim a file, or the files of the run in a directory.
+
+        Args:
+            path: of it.
+            files: of the run, where a directory holds several runs.
 
         Raises:
             RunError: a file is missing, empty, no MCAP file or no run; or the directory holds
                 no run, or several.
         """
         self.path = path
-        self.files = files_in(path) if path.is_dir() else [path]
+        self.files = list(files) or (files_in(path) if path.is_dir() else [path])
         """The files of the run, in order: several if it was split."""
         self._files = [RecordedFile(file) for file in self.files]
         first = self._files[0]

@@ -30,10 +30,10 @@ from tools.runs.host_clocks import (
     ClockPoint,
     HostClocks,
     bounds_in,
-    sender_of,
     spans_of_lives,
 )
 from tools.runs.run_index import RunIndex
+from tools.topic_keys import sender_of
 
 PART_S: Final = 30.0
 """Length of a part: its messages, decoded, fit into some 0.4 GB."""

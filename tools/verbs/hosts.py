@@ -40,6 +40,12 @@ xrl hosts down
 """
 
 
+_WHILE_UP: Final = {
+    "update": "although services are running: one that crashes starts with the new files",
+    "records": "although services are running: what leads shares the network with the records",
+}
+
+
 class _Given(NamedTuple):
     """What every order works with."""
 
@@ -111,12 +117,8 @@ def add_parser(subparsers: Subparsers) -> None:
         )
         if name in ("files", "records"):
             one.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="folder")
-        if name == "update":
-            one.add_argument(
-                "--while-up",
-                action="store_true",
-                help="although services are running: one that crashes starts with the new files",
-            )
+        if name in _WHILE_UP:
+            one.add_argument("--while-up", action="store_true", help=_WHILE_UP[name])
         if name == "up":
             one.add_argument(
                 "--disarmed", action="store_true", help="leave drives that do not hold idle"
@@ -214,23 +216,26 @@ def _records(given: _Given) -> int:
     if not fleets:
         raise RunError("the recorder's host is not among those named: its record comes first")
     (body,) = fleets
+    if not given.args.while_up:
+        installation.refuse_up(body, "what leads over the same network would wait")
     base = records.fetch(body, records.newest(body), out / body.host.name)
     _tell(body.host.name, str(base))
-    began_s = records.began_s(base)
+    fleets_run = records.fleets_run(base)
     fetched: list[Path] = []
 
     def one(remote: Remote) -> str:
-        names = records.since(remote, began_s)
+        names = records.since(remote, fleets_run.began_ns * 1e-9)
         mine = [records.fetch(remote, name, out / remote.host.name) for name in names]
         fetched.extend(mine)
         return ", ".join(map(str, mine)) or "no record since then"
 
     others = [r for r in given.remotes if not records.is_fleets(r) and r.host.record]
     failed = _each(given._replace(remotes=others), one) if others else 0
-    gained, left_out = records.join_fetched(base, sorted(fetched), out / records.JOINED)
+    joined = out / hosts_file.JOINED
+    gained, left_out = records.join_fetched(fleets_run, sorted(fetched), joined)
     for why in left_out:
         _tell("", FleetError(why))
-    print(f"{out / records.JOINED}: one run, {gained} messages more than the recorder had")
+    print(f"{joined}: one run, {gained} messages more than the recorder had")
     return 1 if failed or left_out else 0
 
 

@@ -14,6 +14,7 @@ from shared.clock import pace
 from shared.config.files import load
 from shared.exceptions import FleetError
 from shared.process import StopFlag
+from tools.fleet.process_table import services_elsewhere
 from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.traffic import LINKS_S, Traffic
 from tools.fleet.traffic_table import traffic_table
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     robot = load(Path(fleet.manifest.config))
     console, stop = Console(), StopFlag()
     with open_session(robot, "hz", fleet.run.path) as session:
-        traffic = Traffic(session, keys)
+        traffic = Traffic(session, keys, services_elsewhere(robot, fleet.run.path))
         traffic.listen(LINKS_S)  # links form: what was waiting has no spacing
         if args.for_s is not None:
             window_s = traffic.listen(args.for_s, lambda: bool(stop))

@@ -45,13 +45,9 @@ def run(args: argparse.Namespace) -> int:
     fleets = RunIndex(args.fleets)
     records = [host_record(fleets, RunIndex(path)) for path in args.hosts]
     out = make_out(args.out, "join")
-    try:
-        with Progress(console=console, transient=True) as progress:
-            task = progress.add_task("joining", total=1.0)
-            gained = join(fleets, records, out, lambda done: progress.update(task, completed=done))
-    except BaseException:
-        (out / FIRST).unlink(missing_ok=True)
-        raise
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("joining", total=1.0)
+        gained = join(fleets, records, out, lambda done: progress.update(task, completed=done))
     count = sum(gained.values())
     console.print(
         f"{printable(str(out / FIRST))}: {count} messages that the fleet's record had not",

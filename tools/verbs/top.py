@@ -13,6 +13,7 @@ from shared.bus.session import open_session
 from shared.clock import pace
 from shared.config.files import load
 from shared.process import StopFlag
+from tools.fleet.process_table import services_elsewhere
 from tools.fleet.procfs import use_of
 from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.traffic import LINKS_S, Traffic
@@ -43,7 +44,8 @@ def run(args: argparse.Namespace) -> int:
     robot = load(Path(fleet.manifest.config))
     console, stop = Console(), StopFlag()
     with open_session(robot, "top", fleet.run.path) as session:
-        traffic = Traffic(session, keys_named(()))
+        elsewhere = services_elsewhere(robot, fleet.run.path)
+        traffic = Traffic(session, keys_named(()), elsewhere)
         traffic.listen(LINKS_S)
         if args.once:
             console.print(_screen(fleet, traffic, stop))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from shared.bus.operator_key import require_operator
 from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.exceptions import FleetError
+from shared.exceptions import FleetError, RunError
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import OPEN
@@ -150,7 +151,7 @@ def run(args: argparse.Namespace) -> int:
         overrides = {name: words for name, words in overrides.items() if name in services}
     recorders = {"recorder", HOST_RECORDER}
     if services is None or recorders & set(services):
-        make_out(out, "up")
+        _make_record_folder(out, must=not args.disarmed)
     not_started = args.no_planner and (services is None or "planner" in services)
     fleet = SupervisedFleet.start(
         args.config,
@@ -179,6 +180,20 @@ def run(args: argparse.Namespace) -> int:
         finally:
             live.disconnect()
     return 0
+
+
+def _make_record_folder(out: Path, *, must: bool) -> None:
+    """Make the folder of the record; where nobody looks on, a robot starts without it.
+
+    Raises:
+        RunError: it cannot be made, and it must.
+    """
+    try:
+        make_out(out, "up")
+    except RunError as error:
+        if must:
+            raise
+        print(f"xrl: not recorded: {error}", file=sys.stderr)
 
 
 def _overrides(args: argparse.Namespace, out: Path) -> dict[str, list[str]]:

@@ -90,9 +90,15 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a folder with a quote": ({"folder": "/etc/x'"}, "an absolute path"),
     "a name that is allowed": ({"allow": ["laptop"]}, "an IP address"),
     "a user": ({"user": "a b"}, "a user's name"),
-    "no key for its own record": ({"tools1": []}, "record = false"),
+    "the joined record's name": ({"name1": "joined"}, "the joined record's"),
     "a private interface without a network": ({"private1": ["can0"]}, "the robot's network"),
     "a network without a private interface": ({"nic1": "eth0"}, "missing beside `nic`"),
+    "the network among the private": ({"private1": ["eth0"], "nic1": "eth0"}, "not among them"),
+    "an address twice in use": (
+        {"private1": ["can0"], "nic1": "eth0", "ssh1": "root@127.0.0.3"},
+        "the host's own",
+    ),
+    "a network of one": ({"private1": ["can0"], "nic1": "eth0", "prefix1": 32}, "1 to 31"),
     "an interface's name": ({"private1": ["can 0"], "nic1": "eth0"}, "an interface's name|name"),
     "an unknown key": ({"colour": "red"}, "colour"),
 }
@@ -127,6 +133,14 @@ def test_a_host_gets_the_keys_of_what_it_runs_and_of_nothing_else(
     assert held["body"] == {"planner", "harness", "recorder", "operator"}
     assert held["left"] == {*LEGS["left"], "viewer"}
     assert set.union(*held.values()) == set(principals_of(robot)) - {"simulator"}
+
+
+def test_a_host_without_a_tools_key_keeps_no_record_and_its_file_stays_right(
+    file: Path, robot: RobotConfig
+) -> None:
+    hosts = hosts_file.load(changed(file, tools1=[]), robot)
+    assert hosts.host[1].processes == hosts.host[1].services
+    assert "host_recorder" in hosts.host[2].processes
 
 
 def test_systemd_takes_the_unit_and_it_arms_nothing(hosts: Hosts, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -15,6 +16,7 @@ from shared.bus import topics
 from shared.bus.codec import encode
 from shared.bus.messages import Estop, JointEvent, JointState
 from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.files import to_toml
 from shared.config.robot_config import RobotConfig
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.robot.joints import MODULES
@@ -27,9 +29,11 @@ from tests.tools.runs.three_hosts import (
     LEFT,
     RIGHT,
     Sent,
+    on_three_hosts,
     sent_by_all,
     write_record,
 )
+from tools.hosts.records import fleets_run, join_fetched
 from tools.runs.clock_offsets import ClockOffsets, OffsetBounds
 from tools.runs.host_clock import HostClock
 from tools.runs.joined_records import in_order
@@ -397,3 +401,44 @@ def test_a_hosts_record_of_hours_before_adds_a_second_at_most(
     own = write_record(tmp_path / "own", robot, sent, LEFT, of=LEG)
     assert exit_code(["join", fleets, own, "--out", tmp_path / "joined"]) == 0
     assert 20.0 < RunIndex(tmp_path / "joined").length_s < 21.2
+
+
+@pytest.mark.parametrize(
+    ("robot_file", "t_ns"),
+    [("[" * 3000, 1), ("[bus]\nendpoints = 3", 1), ("", 2**62)],
+    ids=["deeply nested", "no endpoints", "a time that no clock shows"],
+)
+def test_a_record_with_nonsense_in_it_is_told_of_in_words(
+    robot_file: str, t_ns: int, robot: RobotConfig, tmp_path: Path
+) -> None:
+    text = robot_file or to_toml(on_three_hosts(robot))
+    with RunWriter(
+        tmp_path,
+        topics.all_keys(robot.name),
+        offset_ns=0,
+        metadata={"run": {"schema_version": SCHEMA_VERSION, "robot": robot.name}},
+        attachments={"robot.toml": text.encode()},
+        chunk_kib=256,
+    ) as writer:
+        key = topics.JOINT_STATE.key(robot.name, "knee_left")
+        rows = iter([(key, encode(sample(JointState, t_ns=t_ns, seq=1)), 7)])
+        writer.take_from(SimpleNamespace(take=lambda: next(rows, None)), 1)
+    assert exit_code(["info", writer.path]) == 0
+    assert read_run(writer.path).count(key) == 1
+
+
+def test_after_a_recorders_crash_the_fleets_newest_run_is_joined(
+    robot: RobotConfig, sent: list[Sent], of_the_leg: Path, tmp_path: Path
+) -> None:
+    for folder, host, of in ((tmp_path / "body", BODY, ()), (tmp_path / "left", LEFT, LEG)):
+        half = 3 * NS_PER_S
+        for part in ([s for s in sent if s[0] < half], [s for s in sent if s[0] >= half]):
+            write_record(folder, robot, part, host, of=of)
+        assert {file.name for file in folder.iterdir()} == {"run.mcap", "run-1.mcap"}
+    run = fleets_run(tmp_path / "body")
+    assert [file.name for file in run.files] == ["run-1.mcap"]
+    _, left_out = join_fetched(run, [tmp_path / "left"], tmp_path / "joined")
+    assert len(left_out) <= 1, "the leg's first run may end before the fleet's second begins"
+    joined, second = read_run(tmp_path / "joined"), read_run(run.files[0])
+    key = topics.JOINT_STATE.key(robot.name, "hip_left")
+    assert joined.count(key) >= second.count(key) > 0

@@ -20,9 +20,9 @@ from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.robot.joints import MODULES, side_of
 from tests.conftest import ROBOT_FILE
 from tools.runs.host_clock import HostClock
-from tools.runs.host_clocks import sender_of
 from tools.runs.lockstep import Lockstep
 from tools.runs.standing_start import NOTHING_HAPPENS
+from tools.topic_keys import sender_of
 
 BODY, RIGHT, LEFT = "10.0.0.1", "10.0.0.2", "10.0.0.3"
 CLOCKS: Final = {

@@ -20,7 +20,7 @@ from shared.bus.messages import (
     Refusal,
     ToolRoster,
 )
-from shared.bus.session import Latest
+from shared.bus.session import Latest, place_of_tool
 from shared.clock import NS_PER_S, now_ns
 from shared.robot.joints import MODULES
 from shared.robot.trip_table import JOINT_TRIPS
@@ -137,11 +137,10 @@ def test_modules_that_follow_another_planner_are_named() -> None:
 
 
 def test_the_other_tools_that_are_linked_are_told_with_their_hosts() -> None:
-    roster = ToolRoster(
-        t_ns=1, seq=1, tools=("lead.pad.17", f"status.lab3.{os.getpid()}", "view.lab-3.9")
-    )
+    others = ("lead.pad.17", f"lead.evil.{os.getpid()}", "view.lab-3.9")
+    roster = ToolRoster(t_ns=1, seq=1, tools=(*others, f"status.{place_of_tool()}"))
     status = msgspec.structs.replace(fleet_with(7), tools=tools_of(roster))
-    assert describe_tools(status) == "lead on pad, view on lab-3"
+    assert describe_tools(status) == "lead on pad, lead on evil, view on lab-3"
     assert tools_of(None) == ()
 
 
