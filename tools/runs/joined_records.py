@@ -8,6 +8,7 @@ one already has is left out: the same bytes on the same key at about the same ti
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -183,20 +184,39 @@ def in_order(own: Sequence[Timed], new: Sequence[Timed]) -> list[tuple[int, byte
         own: of the fleet's record, in its order.
         new: of a host's record.
     """
+    rows = [(t_ns, payload, False) for t_ns, payload in own]
     if not new:
-        return [(t_ns, payload, False) for t_ns, payload in own]
-    heads = msgspec.json.Decoder(MessageHead).decode
-    rows = [(heads(payload), t_ns, payload, False) for t_ns, payload in own]
-    rows += [(heads(payload), t_ns, payload, True) for t_ns, payload in new]
-    rows.sort(key=lambda row: (row[0].t_ns, row[0].seq))
-    times = [t_ns for _, t_ns, _, _ in rows]
-    for n in range(1, len(rows)):
-        if rows[n][3]:
-            times[n] = max(times[n], times[n - 1])
-    for n in range(len(rows) - 2, -1, -1):
-        if rows[n][3]:
-            times[n] = min(times[n], times[n + 1])
-    return [(t_ns, row[2], row[3]) for t_ns, row in zip(times, rows, strict=True)]
+        return rows
+    rows += [(t_ns, payload, True) for t_ns, payload in new]
+    sent = _sent_ns([payload for _, payload, _ in rows], len(own))
+    if sent is None:
+        return sorted(rows, key=lambda row: row[0])
+    order = sorted(range(len(rows)), key=lambda n: sent[n])
+    times = [rows[n][0] for n in order]
+    for place in range(1, len(order)):
+        if rows[order[place]][2]:
+            times[place] = max(times[place], times[place - 1])
+    for place in range(len(order) - 2, -1, -1):
+        if rows[order[place]][2]:
+            times[place] = min(times[place], times[place + 1])
+    return [(t_ns, *rows[n][1:]) for t_ns, n in zip(times, order, strict=True)]
+
+
+def _sent_ns(payloads: Sequence[bytes], count: int) -> list[tuple[int, int]] | None:
+    """Return each message's own time and number; None if they tell no order.
+
+    Args:
+        payloads: of one key.
+        count: how many of them, the first, were recorded in their order: in that their times go
+            back only if the sender's host started again, or has had no sample of its drive yet.
+    """
+    decode = msgspec.json.Decoder(MessageHead).decode
+    try:
+        found = [(head.t_ns, head.seq) for head in map(decode, payloads)]
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        return None
+    goes_back = any(after[0] < before[0] for before, after in pairwise(found[:count]))
+    return None if goes_back else found
 
 
 def _window_ns(fleets: RunIndex, log: RunLog) -> tuple[int, int]:

@@ -238,6 +238,14 @@ def test_joined_messages_of_a_key_are_in_the_order_in_which_they_were_sent(
     assert [(t_ns, payload) for t_ns, payload, is_new in found if not is_new] == own
 
 
+def test_where_times_go_back_joined_messages_are_in_the_order_of_their_arrival() -> None:
+    """The sender's host started again: its times say nothing of the order."""
+    own = [(10, b'{"t_ns":900,"seq":1}'), (30, b'{"t_ns":5,"seq":1}')]
+    new = [(20, b'{"t_ns":910,"seq":2}'), (40, b'{"t_ns":9,"seq":2}')]
+    assert [t_ns for t_ns, _, _ in in_order(own, new)] == [10, 20, 30, 40]
+    assert [t_ns for t_ns, _, _ in in_order(own, [(20, b"no message")])] == [10, 20, 30]
+
+
 def test_what_is_no_hosts_record_is_not_joined(
     record: Path, of_the_leg: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
