@@ -13,7 +13,6 @@ from rich.table import Table
 
 from services.planner.controller_file import controller_maker
 from shared.bus.messages import Message
-from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.mcap_log.provenance import machine
 from shared.robot.joints import MODULES
@@ -22,12 +21,14 @@ from tools.analysis.reexecution.compare import size
 from tools.analysis.reexecution.execution import Execution
 from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.analysis.reexecution.params import with_params
-from tools.number_arguments import finite
+from tools.analysis.reexecution.ranges import RangeTask, execute_range, merged, ranges_of
+from tools.number_arguments import count, finite
 from tools.runs import experiment
 from tools.runs.recorded_robot import has_own_controller, robot_of
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunLog, parts_of, read_part
+from tools.runs.run_log import RunPart, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
+from tools.studies.sweeps.pool import cores, results
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 SERVICES: Final = ("planner", *MODULES)
@@ -80,6 +81,13 @@ def add_parser(subparsers: Subparsers) -> None:
         help="largest accepted difference of numbers (default 0: equal to the last bit)",
     )
     parser.add_argument(
+        "--workers",
+        type=count,
+        default=cores(),
+        metavar="N",
+        help="processes for a run of over a minute (default: one for each core)",
+    )
+    parser.add_argument(
         "--out",
         type=Path,
         metavar="FILE",
@@ -94,50 +102,21 @@ def run(args: argparse.Namespace) -> int:
     console = Console()
     index = RunIndex(args.log)
     part = part_of(args, index)
-    # the new file is written from all of the old: that is read at once
-    logs = (
-        iter((read_part(index, part, as_sent=True),))
-        if args.param
-        else parts_of(index, part, as_sent=True)
-    )
-    robot: RobotConfig | None = None
     chosen = set(args.service or ("all",))
     names = SERVICES if "all" in chosen else tuple(name for name in SERVICES if name in chosen)
     path = args.out or index.files[0].with_suffix(".resim.mcap")
     if args.param and path.exists():
         raise RunError(f"{path}: is there already; remove it, or name another with --out")
     recomputed = dict[str, list[Message]]()
-    executions: list[Execution] = []
+    # a new file, a controller's memory and a first difference need one part after the other
+    one_by_one = args.param or args.controller or args.until_first_difference
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("executing again", total=None)
-        for log in logs:
-            if robot is None:
-                robot = with_params(robot_of(log), args.param, str(args.log))
-                make = controller_maker(args.controller, robot) if args.controller else None
-                exact = not (args.param or args.controller)
-                executions = [
-                    Execution(robot, name, args.tolerance, exact=exact, controller=make)
-                    for name in names
-                ]
-            for number, execution in enumerate(executions):
-                if args.until_first_difference and execution.differs:
-                    continue
-                done_s = number / len(executions) * (log.end_ns - log.begin_ns) / 1e9
-                progress.update(
-                    task,
-                    description=f"executing {execution.outcome.service}",
-                    completed=(log.begin_ns - log.began_ns()) / 1e9 + done_s,
-                    total=min(part.end_s, index.length_s),
-                )
-                for key, message in execution.run(log):
-                    if args.param:
-                        recomputed.setdefault(key, []).append(message)
-                    if args.until_first_difference and execution.differs:
-                        break
-            if args.until_first_difference and all(one.differs for one in executions):
-                break
-    outcomes = [execution.outcome for execution in executions]
-    _other_machine(log, console)
+        ranges = [] if one_by_one else ranges_of(index, part, names, args.tolerance)
+        if len(ranges) > 1 and args.workers > 1:
+            outcomes = _side_by_side(ranges, args.workers, progress)
+        else:
+            outcomes = _one_by_one(args, index, part, names, recomputed, progress)
+    _other_machine(index, console)
     if has_own_controller(index) and args.controller is None and "planner" in names:
         console.print(
             "a controller of somebody's own led: the planner is equal only with --controller FILE",
@@ -145,17 +124,87 @@ def run(args: argparse.Namespace) -> int:
         )
     console.print(summary(outcomes))
     for outcome in outcomes:
-        tell(outcome, log, console, changed=bool(args.param or args.controller))
+        tell(outcome, index, console, changed=bool(args.param or args.controller))
     if not any(outcome.ticks for outcome in outcomes):
         raise RunError(
             f"{args.log}: nothing could be executed: it holds no memory of these services; a "
             "run that was recorded by this version for more than a second does"
         )
     if args.param:
-        count = rewritten.write(log, path, recomputed, {"params": ", ".join(args.param)})
-        console.print(f"{count} messages, the recomputed ones among them, in {path}")
+        log = read_part(index, part, as_sent=True)
+        number = rewritten.write(log, path, recomputed, {"params": ", ".join(args.param)})
+        console.print(f"{number} messages, the recomputed ones among them, in {path}")
         return 0
     return 0 if all(outcome.equal for outcome in outcomes if outcome.ticks) else 1
+
+
+def _side_by_side(
+    ranges: list[RangeTask], workers: int, progress: Progress
+) -> list[ReexecutionResult]:
+    """Execute ranges of the run in worker processes."""
+    task = progress.add_task("executing again", total=len(ranges))
+    done: dict[RangeTask, list[ReexecutionResult]] = {}
+    for one, results_of_range in results(
+        execute_range, ranges, workers, lambda one: f"from {one.part.begin_s:.0f} s"
+    ):
+        done[one] = results_of_range
+        progress.update(task, advance=1, description=f"executed from {one.part.begin_s:.0f} s")
+    return merged([done[one] for one in ranges])
+
+
+def _one_by_one(
+    args: argparse.Namespace,
+    index: RunIndex,
+    part: RunPart,
+    names: tuple[str, ...],
+    recomputed: dict[str, list[Message]],
+    progress: Progress,
+) -> list[ReexecutionResult]:
+    """Execute a run's services part by part, here.
+
+    Args:
+        args: of the command line.
+        index: of the run.
+        part: what of it to execute.
+        names: of the services.
+        recomputed: is given what came out, by key, if a parameter is changed.
+        progress: is given the time.
+    """
+    # the new file is written from all of the old: that is read at once
+    logs = (
+        iter((read_part(index, part, as_sent=True),))
+        if args.param
+        else parts_of(index, part, as_sent=True)
+    )
+    executions: list[Execution] = []
+    task = progress.add_task("executing again", total=None)
+    for log in logs:
+        if not executions:
+            robot = with_params(robot_of(log), args.param, str(args.log))
+            make = controller_maker(args.controller, robot) if args.controller else None
+            exact = not (args.param or args.controller)
+            executions = [
+                Execution(robot, name, args.tolerance, exact=exact, controller=make)
+                for name in names
+            ]
+        for number, execution in enumerate(executions):
+            if args.until_first_difference and execution.differs:
+                continue
+            done_s = number / len(executions) * (log.end_ns - log.begin_ns) / 1e9
+            progress.update(
+                task,
+                description=f"executing {execution.outcome.service}",
+                completed=(log.begin_ns - log.began_ns()) / 1e9 + done_s,
+                total=min(part.end_s, index.length_s),
+            )
+            for key, message in execution.run(log):
+                if args.param:
+                    recomputed.setdefault(key, []).append(message)
+                if args.until_first_difference and execution.differs:
+                    break
+        if args.until_first_difference and all(one.differs for one in executions):
+            break
+    return [execution.outcome for execution in executions]
 
 
 def summary(outcomes: list[ReexecutionResult]) -> Table:
@@ -181,7 +230,7 @@ def summary(outcomes: list[ReexecutionResult]) -> Table:
     return table
 
 
-def tell(outcome: ReexecutionResult, log: RunLog, console: Console, *, changed: bool) -> None:
+def tell(outcome: ReexecutionResult, index: RunIndex, console: Console, *, changed: bool) -> None:
     """Print the first difference of a service, and with a changed parameter the largest."""
     first = outcome.comparison.first
     if outcome.lost_inputs:
@@ -191,7 +240,8 @@ def tell(outcome: ReexecutionResult, log: RunLog, console: Console, *, changed: 
         )
     if first is None:
         return
-    at_s = (first.t_ns - log.began_ns()) / 1e9
+    began_ns = index.began_ns - index.offset_ns
+    at_s = (first.t_ns - began_ns) / 1e9
     console.print(f"[bold]{outcome.service}[/], first at {at_s:.3f} s: {first.describe()}")
     if not changed:
         return
@@ -200,7 +250,7 @@ def tell(outcome: ReexecutionResult, log: RunLog, console: Console, *, changed: 
         table.add_column(heading, justify="left" if heading in ("topic", "field") else "right")
     rows = sorted(outcome.comparison.largest.values(), key=size, reverse=True)
     for row in rows[:SHOWN]:
-        seconds = (row.t_ns - log.began_ns()) / 1e9
+        seconds = (row.t_ns - began_ns) / 1e9
         recorded, recomputed = (_short(value) for value in (row.recorded, row.recomputed))
         table.add_row(row.key, row.field, f"{seconds:.3f}", recorded, recomputed)
     console.print(table)
@@ -210,9 +260,9 @@ def _short(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)[:24]
 
 
-def _other_machine(log: RunLog, console: Console) -> None:
+def _other_machine(index: RunIndex, console: Console) -> None:
     """Say so if the run is of another processor: BLAS then takes other kernels."""
-    recorded, here = log.metadata["run"].get("cpu_model", ""), machine()["cpu_model"]
+    recorded, here = index.metadata["run"].get("cpu_model", ""), machine()["cpu_model"]
     if recorded and recorded != here:
         console.print(
             f"recorded on {recorded}, executed on {here}: last bits may differ; see --tolerance",

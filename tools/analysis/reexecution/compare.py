@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import msgspec
@@ -14,6 +14,7 @@ from shared.bus.messages import Message
 _F64: Final = struct.Struct("<d")
 _I64: Final = struct.Struct("<q")
 _SIGN: Final = 1 << 63
+_encode: Final = msgspec.json.Encoder().encode
 SHOWN: Final = 60
 """Characters of a value."""
 
@@ -59,7 +60,6 @@ class Comparison:
     def __init__(self, tolerance: float = 0.0) -> None:
         """Take how much numbers may differ; 0: not in one bit."""
         self._tolerance = tolerance
-        self._encode = msgspec.json.Encoder().encode
         self.compared = 0
         self.differing = 0
         self.first: Difference | None = None
@@ -75,7 +75,7 @@ class Comparison:
             recomputed: as it came out now.
         """
         self.compared += 1
-        if self._encode(recorded) == self._encode(recomputed):
+        if _encode(recorded) == _encode(recomputed):
             return True
         pairs = _apart(recorded, recomputed)
         rows = [
@@ -87,11 +87,21 @@ class Comparison:
             return True
         self.differing += 1
         self.first = self.first or rows[0]
-        for row in rows:
-            before = self.largest.get((key, row.field))
-            if before is None or size(row) > size(before):
-                self.largest[key, row.field] = row
+        self._keep_largest(rows)
         return False
+
+    def add(self, later: Comparison) -> None:
+        """Add what was compared in a later part of the run."""
+        self.compared += later.compared
+        self.differing += later.differing
+        self.first = self.first or later.first
+        self._keep_largest(later.largest.values())
+
+    def _keep_largest(self, rows: Iterable[Difference]) -> None:
+        for row in rows:
+            before = self.largest.get((row.key, row.field))
+            if before is None or size(row) > size(before):
+                self.largest[row.key, row.field] = row
 
 
 def size(row: Difference) -> float:

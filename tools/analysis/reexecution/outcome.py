@@ -21,11 +21,24 @@ class ReexecutionResult:
     def __init__(self, service: str, tolerance: float, *, exact: bool) -> None:
         self.service = service
         self.exact = exact
+        self._tolerance = tolerance
+        self.forget()
+
+    def forget(self) -> None:
+        """Count from here on."""
         self.ticks = 0
         self.skipped = 0
         self.starts = 0
         self.lost_inputs = 0
-        self.comparison = Comparison(tolerance)
+        self.comparison = Comparison(self._tolerance)
+
+    def add(self, later: ReexecutionResult) -> None:
+        """Add what came of the same service in a later part of the run."""
+        self.ticks += later.ticks
+        self.skipped += later.skipped
+        self.starts += later.starts
+        self.lost_inputs += later.lost_inputs
+        self.comparison.add(later.comparison)
 
     @property
     def equal(self) -> bool:

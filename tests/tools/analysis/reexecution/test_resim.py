@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,13 @@ from shared.network.impairment import Impairment
 from shared.robot.joints import MODULES
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
+from tests.shared.mcap_log.runs import state
 from tests.tools.analysis.reexecution.executions import executed
 from tools import cli
+from tools.analysis.reexecution.outcome import ReexecutionResult
+from tools.analysis.reexecution.ranges import execute_range, merged, ranges_of
 from tools.runs.recorded_lockstep import simulate
-from tools.runs.run_log import RunLog, RunPart, parts_of, read_run
+from tools.runs.run_log import WHOLE, RunLog, RunPart, parts_of, read_run
 from tools.verbs import resim
 
 
@@ -69,6 +73,38 @@ def test_a_run_read_in_parts_is_executed_like_the_whole(log: RunLog, name: str) 
     assert (outcome.ticks, outcome.skipped, outcome.starts) == (
         whole.ticks, whole.skipped, whole.starts,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("range_s", [1.3, 3.0])
+def test_ranges_side_by_side_execute_every_tick_once_as_one_after_the_other(
+    log: RunLog, range_s: float
+) -> None:
+    """Each begins at a memory before it: what begins at a dead planner finds the next one's."""
+    names = ("planner", "knee_left", "hip_right")
+    tasks = ranges_of(log.index, WHOLE, names, 0.0, range_s=range_s)
+    assert len(tasks) > 2
+    found = merged([pickle.loads(pickle.dumps(execute_range(task))) for task in tasks])  # noqa: S301
+    for outcome, name in zip(found, names, strict=True):
+        whole = executed(log, name)
+        assert outcome.comparison.first is None
+        assert outcome.ticks == whole.ticks
+        assert outcome.skipped == whole.skipped
+        assert outcome.lost_inputs == 0
+        assert outcome.comparison.compared == whole.comparison.compared
+
+
+def test_the_first_difference_is_that_of_the_first_range_that_has_one() -> None:
+    parts = [ReexecutionResult("planner", 0.0, exact=True) for _ in range(3)]
+    for part, q in zip(parts[1:], (0.2, 0.7), strict=True):
+        recorded = msgspec.structs.replace(state(1), q=(0.1, 0.0))
+        part.comparison.take("x", 7, recorded, msgspec.structs.replace(recorded, q=(q, 0.0)))
+        part.ticks = 5
+    (whole,) = merged([[part] for part in parts])
+    assert whole.comparison.first is not None
+    assert whole.comparison.first.recomputed == 0.2
+    (largest,) = whole.comparison.largest.values()
+    assert largest.recomputed == 0.7
+    assert (whole.ticks, whole.comparison.differing) == (10, 2)
 
 
 def test_a_part_of_a_run_is_executed_from_its_first_memory_on(log: RunLog) -> None:
