@@ -13,9 +13,9 @@ from shared.robot.joints import MODULES
 from tools import cli
 from tools.runs.run_log import read_run
 
-NOT_HERE = (topics.ATTITUDE, topics.OPERATOR_INTENT)
-"""Periodic topics that a run in virtual time does not have: no IMU is fitted, and the scenario
-requests without a message."""
+NOT_HERE = (topics.ATTITUDE, topics.OPERATOR_INTENT, topics.TOOLS)
+"""Periodic topics that a run in virtual time does not have: no IMU is fitted, the scenario requests
+without a message, and no tool links."""
 
 
 def sim(out: Path, *flags: str) -> int:
