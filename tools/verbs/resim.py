@@ -111,7 +111,11 @@ def run(args: argparse.Namespace) -> int:
     # a new file, a controller's memory and a first difference need one part after the other
     one_by_one = args.param or args.controller or args.until_first_difference
     with Progress(console=console, transient=True) as progress:
-        ranges = [] if one_by_one else ranges_of(index, part, names, args.tolerance)
+        ranges = (
+            []
+            if one_by_one
+            else ranges_of(index, part, names, args.tolerance, workers=args.workers)
+        )
         if len(ranges) > 1 and args.workers > 1:
             outcomes = _side_by_side(ranges, args.workers, progress)
         else:

@@ -41,6 +41,7 @@ def ranges_of(
     tolerance: float,
     *,
     range_s: float = RANGE_S,
+    workers: int = 1,
 ) -> list[RangeTask]:
     """Return a part of a run in ranges, in their order.
 
@@ -49,10 +50,12 @@ def ranges_of(
         part: what of it to execute.
         services: their names.
         tolerance: largest accepted difference of numbers.
-        range_s: about the length of each.
+        range_s: the longest that one may be.
+        workers: that share them: each is to have as many.
     """
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
-    count = max(1, math.ceil((end_s - begin_s) / range_s))
+    count = math.ceil((end_s - begin_s) / range_s)
+    count = workers * math.ceil(count / workers) if count > 1 else 1
     edges = [begin_s + number * (end_s - begin_s) / count for number in range(count)]
     parts = zip(edges, [*edges[1:], part.end_s], strict=True)
     return [RangeTask(index.path, RunPart(*edge), services, tolerance) for edge in parts]
