@@ -11,7 +11,7 @@ So what may be long is read by `parts_of`, one after the other.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -20,20 +20,13 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from shared.bus import topics
-from shared.bus.topics import RECORDER, Topic
+from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
 from shared.mcap_log.sequence_stats import KeyCount
-from tools.runs.clock_offsets import UNKNOWN, OffsetBounds
-from tools.runs.host_clocks import (
-    ClockLife,
-    ClockPoint,
-    HostClocks,
-    bounds_in,
-    spans_of_lives,
-)
+from tools.runs.host_clocks import HostClocks
+from tools.runs.run_clocks import find_clocks
 from tools.runs.run_index import RunIndex
-from tools.topic_keys import sender_of
 
 PART_S: Final = 30.0
 """Length of a part: its messages, decoded, fit into some 0.4 GB."""
@@ -43,14 +36,6 @@ WHOLE_MAX_S: Final = 600.0
 """Longest time that is read at once."""
 PICTURE_MAX_S: Final = 120.0
 """Longest time in one picture of a run."""
-LOOK_S: Final = 5.0
-"""Length of the part in which the hosts' clocks are compared."""
-DRIFT_S: Final = 60.0
-"""Where a host is heard for longer they are compared a second time, at its end."""
-LOOKS_MAX: Final = 16
-SAMPLE_S: Final = 10.0
-"""So often it is looked whether a host's clock began anew."""
-SAMPLES_MAX: Final = 400
 
 
 class RunPart(NamedTuple):
@@ -286,60 +271,7 @@ def clocks_of(index: RunIndex) -> HostClocks | None:
     Raises:
         RunError: a message cannot be read.
     """
-    hosts = index.hosts
-    if RECORDER not in hosts or len(set(hosts.values())) == 1:
-        return None
-    lives: dict[str, list[ClockLife]] = {host: [] for host in hosts.values()}
-    seen: dict[int, dict[str, OffsetBounds]] = {}
-    for host, samples in _samples_of_hosts(index, hosts).items():
-        for first_ns, last_ns in spans_of_lives(samples):
-            points = []
-            for at_ns in _looks_in(first_ns, last_ns):
-                if at_ns not in seen and len(seen) < LOOKS_MAX:
-                    part = RunPart(*((t - index.began_ns) / NS_PER_S for t in _around(at_ns)))
-                    seen[at_ns] = bounds_in(RunLog(index, part, as_sent=True), hosts)
-                bounds = seen.get(at_ns, {}).get(host, UNKNOWN)
-                if math.isfinite(bounds.best_ns):
-                    points.append(ClockPoint(at_ns - index.offset_ns, bounds))
-            if points:
-                lives[host].append(ClockLife(tuple(points)))
-    return HostClocks(hosts, {host: tuple(found) for host, found in lives.items()})
-
-
-def _samples_of_hosts(
-    index: RunIndex, hosts: Mapping[str, str]
-) -> dict[str, list[tuple[int, int]]]:
-    """Return for each host, now and then, the smallest of reception less sender's time, ns."""
-    known = topics.all_keys(index.robot).items()
-    of_key = {
-        key: hosts.get(sender_of(topic, key.split("/")[3] if topic.per_module else ""), "")
-        for key, topic in known
-    }
-    step_ns = max(_ns(SAMPLE_S), (index.ended_ns - index.began_ns) // SAMPLES_MAX + 1)
-    found: dict[str, list[tuple[int, int]]] = {host: [] for host in hosts.values()}
-    for at_ns in [*range(index.began_ns, index.ended_ns, step_ns), index.ended_ns]:
-        smallest: dict[str, int] = {}
-        for record, keys in index.records(at_ns, at_ns + 1):
-            for row in record.rows:
-                host = of_key.get(keys.get(row.channel_id, ""), "")
-                if host and abs(row.log_ns - at_ns) < NS_PER_S:
-                    late_ns = row.log_ns - row.publish_ns
-                    smallest[host] = min(smallest.get(host, late_ns), late_ns)
-        for host, late_ns in smallest.items():
-            found[host].append((at_ns, late_ns))
-    return found
-
-
-def _looks_in(first_ns: int, last_ns: int) -> tuple[int, ...]:
-    """Return where to look closely in the life of a clock, log time: at its begin and its end."""
-    half_ns = _ns(LOOK_S) // 2
-    if last_ns - first_ns < _ns(DRIFT_S):
-        return (first_ns + min(half_ns, (last_ns - first_ns) // 2),)
-    return first_ns + half_ns, last_ns - half_ns
-
-
-def _around(at_ns: int) -> tuple[int, int]:
-    return at_ns - _ns(LOOK_S) // 2, at_ns + _ns(LOOK_S) // 2
+    return find_clocks(index, lambda *part: RunLog(index, RunPart(*part), as_sent=True))
 
 
 def read_run(path: Path, *, as_sent: bool = False) -> RunLog:
