@@ -43,6 +43,11 @@ def test_the_genuine_package_reads_arms_streams_and_meets_a_disarm(usb: UsbRobot
     for set_point in np.linspace(0.0, 1.5, 100).tolist():
         for axis in axes:
             axis.controller.input_pos = set_point
+
+        def follows(wanted: float = set_point) -> bool:
+            return all(abs(axis.encoder.pos_estimate - wanted) < 0.1 for axis in axes)
+
+        assert eventually(follows), "a machine that stalls makes no step of many set points"
     assert eventually(
         lambda: (
             axes[0].encoder.pos_estimate == pytest.approx(1.5, abs=1e-3)

@@ -29,6 +29,8 @@ FIRST_SERIAL = 0x365A335A3430
 READ_TIMEOUT_S = 0.005
 INERTIA = 1e-3
 """kg m^2 of a motor that carries nothing."""
+STEP_MAX_S = 0.005
+"""A machine that stalled makes no longer step: a drive's loop would not survive it."""
 
 
 def serial_number(module: int) -> str:
@@ -81,9 +83,10 @@ class UsbRobot:
                 if not stalled:
                     self.hub.poll()
                 now = time.monotonic()
+                passed_s = min(now - before, STEP_MAX_S)
                 torque = self.bank.step(now, self.pos, self.vel)
-                self.vel += torque / (2 * np.pi * INERTIA) * (now - before)
-                self.pos += self.vel * (now - before)
+                self.vel += torque / (2 * np.pi * INERTIA) * passed_s
+                self.pos += self.vel * passed_s
                 before = now
 
 
