@@ -19,7 +19,7 @@ LOOK_S: Final = 0.002
 LINKS_S: Final = 3.0
 """Longest wait for the first status."""
 SILENT_S: Final = 0.3
-"""Without a status for so long, nobody knows what it does."""
+"""Longest time without a status; beyond it nobody knows what the planner does."""
 LEADS_S: Final = 15.0
 """Longest wait for a planner that does not lead yet: a fleet that was just started."""
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import platform
-import shutil
 import subprocess
 import sys
 import time
@@ -17,6 +16,8 @@ from typing import Final
 
 import msgspec
 
+from services.recorder.disk_guard import MIB
+from services.recorder.loop import free_bytes_at
 from shared.bus.credentials import NAMES, keys_folder
 from shared.config import files as config_file
 from shared.exceptions import XrlError
@@ -71,8 +72,9 @@ def probe(config: Path, run_dir: Path) -> Probe:
         wrong.append(str(error))
     if not _environment_is_current():
         warnings.append(f"{CHECKOUT}: the environment is not that of this version: deploy/install")
-    if _free_mib(run_dir) < FREE_MIB:
-        warnings.append(f"{_free_mib(run_dir)} MiB free for records: take old ones away")
+    free_mib = free_bytes_at(run_dir) // MIB
+    if free_mib < FREE_MIB:
+        warnings.append(f"{free_mib} MiB free for records: take old ones away")
     return Probe(
         revision=_revision(),
         lock=_hash_of(CHECKOUT / "requirements.runtime.lock"),
@@ -83,13 +85,6 @@ def probe(config: Path, run_dir: Path) -> Probe:
         wrong=tuple(wrong),
         warnings=tuple(warnings),
     )
-
-
-def _free_mib(folder: Path) -> int:
-    """Return the free space where a folder is or will be."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return shutil.disk_usage(folder).free >> 20
 
 
 def digest(content: bytes) -> str:

@@ -22,7 +22,7 @@ from shared.clock import NS_PER_MS
 ONE_CLOCK_NS: Final = 20 * NS_PER_MS
 """Bounds that are so narrow and hold 0 are those of one clock."""
 DRIFT_NS: Final = NS_PER_MS
-"""Bounds may contradict each other by so much, for clocks drift; by more they are none."""
+"""Bounds may contradict each other by this much, because clocks drift; beyond it none holds."""
 TIME_MAX_NS: Final = 1 << 62
 """More than any monotonic clock shows."""
 
@@ -107,7 +107,7 @@ class ClockOffsets:
     def _without_contradictions(self, zero: int) -> list[list[float]]:
         """Return the bounds of all pairs, without hosts that contradict themselves.
 
-        A clock that began anew meanwhile would bound the others wrongly.
+        A host that restarted meanwhile would bound the others wrongly.
         """
         most = [row.copy() for row in self._most]
         count = len(most)

@@ -28,9 +28,9 @@ PLANNER: Final = "planner"
 THIS_HOST: Final = "this host"
 """Name of the host of services whose endpoint is a socket in the file system."""
 LATE_MAX_NS: Final = 60 * NS_PER_S
-"""No message takes so long: one that seems to is of a clock that is not known."""
+"""A message that seems to take longer is of a clock that is not known."""
 JUMP_NS: Final = NS_PER_S
-"""A clock that is off by so much, from one sample to the next, began anew."""
+"""A clock whose offset changes by more than this from one sample to the next has restarted."""
 
 
 class Messages(Protocol):

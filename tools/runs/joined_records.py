@@ -27,9 +27,9 @@ _OF_A_FILE: Final = ("clock", "split", COUNTS, "recovered")
 _CHUNK_KIB: Final = 256
 _NS: Final = 1e-9
 _MARGIN_NS: Final = NS_PER_S
-"""The joined run begins so much before the fleet's record at most, and ends so much after it."""
+"""How far the joined run may begin before the fleet's record, and end after it."""
 LATE_S: Final = 10.0
-"""A message came to the fleet's recorder at most so late: what was held up by a cut network."""
+"""Longest delay of a message to the fleet's recorder: a cut network holds some up."""
 
 Timed = tuple[int, bytes]
 """When the fleet's recorder had a message or would have, and its payload."""

@@ -1,6 +1,6 @@
 """Finds the clocks of a run's hosts: where to look in it, and what is seen there.
 
-A record of an hour is not read for that: a chunk now and then tells when a host's clock began anew,
+A record of an hour is not read for that: a chunk now and then tells when a host restarted,
 and a few seconds where each clock is first and last heard tell how it stands.
 """
 
@@ -31,7 +31,7 @@ DRIFT_NS: Final = 60 * NS_PER_S
 """Where a host is heard for longer they are compared a second time, at its end."""
 LOOKS_MAX: Final = 16
 SAMPLE_NS: Final = 10 * NS_PER_S
-"""So often it is looked whether a host's clock began anew."""
+"""Time between two looks for a restart of a host."""
 SAMPLES_MAX: Final = 400
 
 

@@ -20,6 +20,7 @@ from shared.mcap_log.recover import clock_time, describe_lost
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
 from tools.output import printable
+from tools.runs.host_clocks import HostClocks
 from tools.runs.host_clocks import describe as describe_clocks
 from tools.runs.impairment_intervals import impairments
 from tools.runs.run_files import files_of_run
@@ -227,7 +228,7 @@ def _injected(survey: Survey) -> list[str]:
 def _clocks(file: FileFacts) -> list[str]:
     """Return a line for each host of a run on several: what brings its times to the recorder's."""
     try:
-        clocks = clocks_of(RunIndex(file.path)) if file.ours else None
+        clocks = _clocks_of(file)
     except XrlError as error:
         return [str(error)]
     return [] if clocks is None else describe_clocks(clocks)
@@ -235,10 +236,14 @@ def _clocks(file: FileFacts) -> list[str]:
 
 def _clocks_as_json(file: FileFacts) -> dict[str, Any]:
     try:
-        clocks = clocks_of(RunIndex(file.path)) if file.ours else None
-    except XrlError:
-        return {}
+        clocks = _clocks_of(file)
+    except XrlError as error:
+        return {"error": str(error)}
     return {} if clocks is None else clocks.as_json()
+
+
+def _clocks_of(file: FileFacts) -> HostClocks | None:
+    return clocks_of(RunIndex(file.path)) if file.ours else None
 
 
 def _zero(index: RunIndex) -> tuple[int, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -26,7 +27,7 @@ from tools.number_arguments import count, finite
 from tools.runs import experiment
 from tools.runs.recorded_robot import has_own_controller, robot_of
 from tools.runs.run_index import RunIndex
-from tools.runs.run_log import RunPart, parts_of, read_part
+from tools.runs.run_log import RunLog, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
 from tools.studies.sweeps.pool import cores, results
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
@@ -110,6 +111,7 @@ def run(args: argparse.Namespace) -> int:
     recomputed = dict[str, list[Message]]()
     # a new file, a controller's memory and a first difference need one part after the other
     one_by_one = args.param or args.controller or args.until_first_difference
+    whole: RunLog | None = None
     with Progress(console=console, transient=True) as progress:
         ranges = (
             []
@@ -119,7 +121,12 @@ def run(args: argparse.Namespace) -> int:
         if len(ranges) > 1 and args.workers > 1:
             outcomes = _side_by_side(ranges, args.workers, progress)
         else:
-            outcomes = _one_by_one(args, index, part, names, recomputed, progress)
+            # the new file is written from all of the old: that is read at once
+            whole = read_part(index, part, as_sent=True) if args.param else None
+            logs = parts_of(index, part, as_sent=True) if whole is None else iter((whole,))
+            outcomes = _one_by_one(
+                args, logs, min(part.end_s, index.length_s), names, recomputed, progress
+            )
     _other_machine(index, console)
     if has_own_controller(index) and args.controller is None and "planner" in names:
         console.print(
@@ -134,9 +141,8 @@ def run(args: argparse.Namespace) -> int:
             f"{args.log}: nothing could be executed: it holds no memory of these services; a "
             "run that was recorded by this version for more than a second does"
         )
-    if args.param:
-        log = read_part(index, part, as_sent=True)
-        number = rewritten.write(log, path, recomputed, {"params": ", ".join(args.param)})
+    if whole is not None:
+        number = rewritten.write(whole, path, recomputed, {"params": ", ".join(args.param)})
         console.print(f"{number} messages, the recomputed ones among them, in {path}")
         return 0
     return 0 if all(outcome.equal for outcome in outcomes if outcome.ticks) else 1
@@ -158,8 +164,8 @@ def _side_by_side(
 
 def _one_by_one(
     args: argparse.Namespace,
-    index: RunIndex,
-    part: RunPart,
+    logs: Iterator[RunLog],
+    end_s: float,
     names: tuple[str, ...],
     recomputed: dict[str, list[Message]],
     progress: Progress,
@@ -168,18 +174,12 @@ def _one_by_one(
 
     Args:
         args: of the command line.
-        index: of the run.
-        part: what of it to execute.
+        logs: the run, or its parts one after the other.
+        end_s: where they end, s since the run's first message.
         names: of the services.
         recomputed: is given what came out, by key, if a parameter is changed.
         progress: is given the time.
     """
-    # the new file is written from all of the old: that is read at once
-    logs = (
-        iter((read_part(index, part, as_sent=True),))
-        if args.param
-        else parts_of(index, part, as_sent=True)
-    )
     executions: list[Execution] = []
     task = progress.add_task("executing again", total=None)
     for log in logs:
@@ -199,7 +199,7 @@ def _one_by_one(
                 task,
                 description=f"executing {execution.outcome.service}",
                 completed=(log.begin_ns - log.began_ns()) / 1e9 + done_s,
-                total=min(part.end_s, index.length_s),
+                total=end_s,
             )
             for key, message in execution.run(log):
                 if args.param:

@@ -11,7 +11,7 @@ import msgspec
 
 from shared.bus import topics
 from shared.bus.codec import encode
-from shared.bus.messages import Message
+from shared.bus.messages import JointState, Message
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.files import to_toml
@@ -19,6 +19,7 @@ from shared.config.robot_config import RobotConfig
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.robot.joints import MODULES, side_of
 from tests.conftest import ROBOT_FILE
+from tests.shared.mcap_log.runs import sample
 from tools.runs.host_clock import HostClock
 from tools.runs.lockstep import Lockstep
 from tools.runs.standing_start import NOTHING_HAPPENS
@@ -34,6 +35,8 @@ CLOCKS: Final = {
 HOST_OF: Final = {"planner": BODY, "harness": BODY, "imu": BODY, "recorder": BODY} | {
     module: RIGHT if side_of(module) == "right" else LEFT for module in MODULES
 }
+
+LEG: Final = ("ankle_left", "knee_left", "hip_left")
 
 Sent = tuple[int, str, str, bytes]
 """Virtual time, sender, key, payload."""
@@ -118,3 +121,21 @@ def on_three_hosts(robot: RobotConfig) -> RobotConfig:
         security=msgspec.structs.replace(robot.bus.security, mode="mtls"),
     )
     return msgspec.structs.replace(robot, bus=bus)
+
+
+def states(
+    module: str, clock: HostClock, begin_s: float, end_s: float, *, hz: float = 10.0, first: int = 0
+) -> list[Sent]:
+    """Return states of a module alone, stamped by a clock."""
+    key = topics.JOINT_STATE.key("xrl", module)
+    found: list[Sent] = []
+    for n in range(round((end_s - begin_s) * hz)):
+        at_ns = round((begin_s + n / hz) * NS_PER_S)
+        state = sample(JointState, t_ns=clock.read(at_ns), seq=first + n)
+        found.append((at_ns, module, key, encode(state)))
+    return found
+
+
+def kept_up(seconds: float) -> list[Sent]:
+    """Return what the body says all the time: there is something in every part of the record."""
+    return states("knee_right", CLOCKS[RIGHT], 0.0, seconds, hz=2.0)
