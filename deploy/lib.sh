@@ -73,7 +73,7 @@ make_environment() {  # LOCK
 
 # The graphs' C is right while this stays the same; a library also carries its graph's hash.
 graphs_fingerprint() {
-  { command -v cc; cat "$stamp" "$root"/services/planner/{symbolic,model}.py \
+  { command -v cc; cat "$stamp" "$root"/services/planner/{symbolic,model,certificate}.py \
     "$root"/services/simulator/{body,drivetrain,plant}.py "$root"/shared/robot/compiled_graph.py \
     "$root"/tools/graph_libraries.py "$root"/deploy/robot.toml; } 2>/dev/null | sha256sum || true
 }

@@ -64,6 +64,7 @@ VENDORS = {
     "cryptography": ["tools/keys/certificates.py"],
     "cvxpy": ["services/planner/split_program.py"],
     "casadi": [
+        "services/planner/certificate.py",
         "services/planner/symbolic.py",
         "services/simulator/axis_control.py",
         "services/simulator/drivetrain.py",

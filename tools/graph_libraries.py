@@ -20,7 +20,7 @@ from typing import Final
 import casadi as ca
 import numpy as np
 
-from services.planner import symbolic
+from services.planner import certificate, symbolic
 from services.planner.model import leg_geometry
 from services.simulator import axis_control
 from services.simulator.body import body_of
@@ -44,7 +44,8 @@ def graphs_of(robot: RobotConfig) -> list[ca.Function]:
     """Return every graph that a planner and a simulated world of a robot call in their cycles."""
     body = body_of(robot, PlantConfig())
     drivetrain = step_graph(body.drivetrain, body.motor_from_joint, body.model.opt.timestep)
-    return [*symbolic.build(robot, leg_geometry(robot)), drivetrain, axis_control.law_graph()]
+    law = symbolic.build(robot, leg_geometry(robot))
+    return [*law, certificate.stiffness_graph(), drivetrain, axis_control.law_graph()]
 
 
 def build(function: ca.Function, folder: Path = FOLDER) -> Path:

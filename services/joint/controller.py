@@ -6,7 +6,9 @@ re-execution from a log.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final
+
+import msgspec
 
 from services.joint import pd_law
 from services.joint.differential import joint_torque
@@ -24,8 +26,12 @@ from shared.bus.messages import Cause, JointCommand, JointEvent, JointState, Mod
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 
+# Each cycle compares these; see services.joint.failsafe.
+_DISARMED, _TRACK, _FAULT = Mode.DISARMED, Mode.TRACK, Mode.FAULT
+_NONE: Final = Event.NONE
 
-class CycleResult(NamedTuple):
+
+class CycleResult(msgspec.Struct, gc=False, frozen=True):
     """Outcome of one cycle."""
 
     tau: Pair
@@ -88,7 +94,8 @@ class JointController:
             self._enter(now_ns, before)
         tau_before = s.tau
         setpoint = self._law.evaluate(now_ns, s.failsafe, s.estimate.q, near)
-        if s.failsafe.mode in (Mode.DISARMED, Mode.FAULT):
+        mode = s.failsafe.mode
+        if mode is _DISARMED or mode is _FAULT:
             s.tau = pd_law.ZERO
         else:
             wanted = self._wanted(now_ns, setpoint)
@@ -231,8 +238,8 @@ class JointController:
         """Update the joint's estimate; return what happened to the drive."""
         s = self._state
         if reading is None:
-            return Event.NONE
-        controlled = s.failsafe.mode is not Mode.DISARMED and not flushing
+            return _NONE
+        controlled = s.failsafe.mode is not _DISARMED and not flushing
         event = s.estimate.take(reading, armed=controlled)
         if reading.torque is not None:
             s.initial_torque = joint_torque(reading.torque, self._gear_ratio)
@@ -241,7 +248,7 @@ class JointController:
     def _offer(self, now_ns: int, command: JointCommand) -> None:
         """Let the age rule and the envelope decide about a command."""
         s = self._state
-        tracked = s.failsafe.command if s.failsafe.mode is Mode.TRACK else None
+        tracked = s.failsafe.command if s.failsafe.mode is _TRACK else None
         outside = self._envelope.judge(
             command,
             tracked,
@@ -255,10 +262,10 @@ class JointController:
     def _tripped(self, now_ns: int) -> Event:
         """Return the trip of this cycle; only a module in TRACK trips."""
         s = self._state
-        if s.failsafe.mode is Mode.TRACK:
+        if s.failsafe.mode is _TRACK:
             return s.trips.judge(now_ns, s.tau, s.estimate.v, self._trip_limits)
         s.trips.rest(s.tau)
-        return Event.NONE
+        return _NONE
 
     def _enter(self, now_ns: int, before: Mode) -> None:
         """Start a mode from the present setpoint, or from the torque of an armed drive."""

@@ -33,6 +33,6 @@ class DriveFallback:
 
     def law(self, setpoint: Setpoint, mode: Mode) -> Setpoint:
         """Return the fallback for a setpoint. In DAMP a drive without commands goes on sinking."""
-        if mode is Mode.DAMP or self._share == 0.0:
+        if self._share == 0.0 or mode is Mode.DAMP:
             return setpoint
         return pd_law.raise_gains(setpoint, self._hold_k_p, self._hold_k_d, self._share)

@@ -8,7 +8,7 @@ a real drive, lockstep to an emulated one. Pure.
 from __future__ import annotations
 
 from enum import Enum
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 
@@ -62,7 +62,7 @@ class ArmingInhibit(Enum):
     """The drive holds by its own loop; it is taken over once a planner is there."""
 
 
-class DriveAction(NamedTuple):
+class DriveAction(msgspec.Struct, gc=False, frozen=True):
     """Outcome of a cycle."""
 
     event: JointEvent | None
@@ -77,6 +77,12 @@ class DriveAction(NamedTuple):
 _NO_TORQUE: Pair = (0.0, 0.0)
 _MAY_HOLD: Final = (DriveStatus.LOST, DriveStatus.HOLDING, DriveStatus.ARMED)
 _UNCONTROLLED: Final = (Mode.DISARMED, Mode.FAULT)
+
+# Each cycle compares these; see services.joint.failsafe.
+_DISARMED, _HOLD, _DAMP, _FAULT = Mode.DISARMED, Mode.HOLD, Mode.DAMP, Mode.FAULT
+_ARMED: Final = DriveStatus.ARMED
+_NO_COMMAND, _TORQUE, _TARGET = DriveCommand.NOTHING, DriveCommand.TORQUE, DriveCommand.TARGET
+_NO_INHIBIT: Final = ArmingInhibit.NONE
 
 
 class DriveManager:
@@ -116,7 +122,8 @@ class DriveManager:
     @property
     def needs_neighbours(self) -> bool:
         """True while the neighbours' states are used: in HOLD and DAMP."""
-        return self.controller.failsafe.mode in (Mode.HOLD, Mode.DAMP)
+        mode = self.controller.failsafe.mode
+        return mode is _HOLD or mode is _DAMP
 
     @property
     def leaves_holding(self) -> bool:
@@ -135,7 +142,7 @@ class DriveManager:
     ) -> DriveAction:
         """Run one cycle; arguments as for `JointController.step`; `estop` latches."""
         self._estop = self._estop or estop
-        if self._tries == 0 and reading is not None and reading.status is DriveStatus.ARMED:
+        if self._tries == 0 and reading is not None and reading.status is _ARMED:
             reading = self._found_armed(now_ns, reading)
         if self._last_cycle_ns and now_ns - self._last_cycle_ns > GAP_NS:
             self._listen_until_ns = now_ns + LISTEN_NS
@@ -154,31 +161,27 @@ class DriveManager:
             else:
                 result = self._resumed(now_ns, result, tau_before)
                 if now_ns < self._listen_until_ns or reading is None:
-                    return DriveAction(
-                        result.event, DriveCommand.NOTHING, _NO_TORQUE, None, ArmingInhibit.NONE
-                    )
+                    return DriveAction(result.event, _NO_COMMAND, _NO_TORQUE, None, _NO_INHIBIT)
                 self._listen_until_ns = 0
-        if mode is Mode.DISARMED and now_ns >= self._arm_at_ns:
+        if mode is _DISARMED and now_ns >= self._arm_at_ns:
             inhibit = self._inhibit(now_ns, reading)
             if inhibit is not None:
-                command_out = (
-                    DriveCommand.ARM if inhibit is ArmingInhibit.NONE else DriveCommand.NOTHING
-                )
+                command_out = DriveCommand.ARM if inhibit is _NO_INHIBIT else _NO_COMMAND
                 return DriveAction(result.event, command_out, _NO_TORQUE, None, inhibit)
-        command_out, torque, target = DriveCommand.NOTHING, _NO_TORQUE, None
-        if mode is Mode.FAULT:
+        command_out, torque, target = _NO_COMMAND, _NO_TORQUE, None
+        if mode is _FAULT:
             command_out = self._in_fault(now_ns)
         elif not self.onboard:
-            command_out, torque = DriveCommand.TORQUE, motor_torque(result.tau, self._gear_ratio)
-        elif mode is not Mode.DISARMED:
+            command_out, torque = _TORQUE, motor_torque(result.tau, self._gear_ratio)
+        elif mode is not _DISARMED:
             samples = controller.samples
-            command_out = DriveCommand.TARGET
+            command_out = _TARGET
             fallback_setpoint = self._fallback.law(controller.setpoint, mode)
             target = self._law.target(
                 now_ns, fallback_setpoint, result.tau, samples.pos, samples.vel
             )
             self._target = target
-        return DriveAction(result.event, command_out, torque, target, ArmingInhibit.NONE)
+        return DriveAction(result.event, command_out, torque, target, _NO_INHIBIT)
 
     def snapshot(self) -> DriveManagerState:
         """Return the state; `restore` continues from it."""
@@ -264,7 +267,7 @@ class DriveManager:
 
         An emergency stop needs the drive's torque to start from.
         """
-        if not self.onboard or self.controller.failsafe.mode is not Mode.DISARMED:
+        if not self.onboard or self.controller.failsafe.mode is not _DISARMED:
             return False
         return reading is None or reading.status in _MAY_HOLD
 

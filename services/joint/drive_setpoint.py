@@ -20,6 +20,7 @@ from services.joint.differential import joint_torque, motor_from_joint, motor_to
 from services.joint.drivers.base import MotorTarget
 from services.joint.pd_law import Setpoint
 from shared.bus.messages import Pair
+from shared.clamp import clamp
 from shared.clock import NS_PER_MS
 
 GAIN_CHANGE: Final = 0.02
@@ -85,15 +86,15 @@ class DriveSetpointLaw:
         vel_ref = motor_from_joint(s.v_ref, self._gear_ratio)
         wanted = motor_torque(tau, self._gear_ratio)
         limit = self._vel_limit
-        a = min(limit, max(-limit, vel_ref[0] + pos_gain * (pos_ref[0] - pos[0])))
-        b = min(limit, max(-limit, vel_ref[1] + pos_gain * (pos_ref[1] - pos[1])))
+        a = clamp(vel_ref[0] + pos_gain * (pos_ref[0] - pos[0]), -limit, limit)
+        b = clamp(vel_ref[1] + pos_gain * (pos_ref[1] - pos[1]), -limit, limit)
         torque = (wanted[0] - vel_gain * (a - vel[0]), wanted[1] - vel_gain * (b - vel[1]))
         most = self._input_max
         if (abs(torque[0]) > most or abs(torque[1]) > most) and pos_gain > 0.0:
             # what the firmware would clamp goes in by way of the position
-            a += (torque[0] - min(most, max(-most, torque[0]))) / vel_gain
-            b += (torque[1] - min(most, max(-most, torque[1]))) / vel_gain
-            a, b = min(limit, max(-limit, a)), min(limit, max(-limit, b))
+            a += (torque[0] - clamp(torque[0], -most, most)) / vel_gain
+            b += (torque[1] - clamp(torque[1], -most, most)) / vel_gain
+            a, b = clamp(a, -limit, limit), clamp(b, -limit, limit)
             pos_ref = (
                 pos[0] + (a - vel_ref[0]) / pos_gain,
                 pos[1] + (b - vel_ref[1]) / pos_gain,
@@ -113,8 +114,8 @@ class DriveSetpointLaw:
         a = t.vel_turns[0] + t.pos_gain[0] * (t.pos_turns[0] - pos[0])
         b = t.vel_turns[1] + t.pos_gain[1] * (t.pos_turns[1] - pos[1])
         motors = (
-            t.torque[0] + t.vel_gain[0] * (min(limit, max(-limit, a)) - vel[0]),
-            t.torque[1] + t.vel_gain[1] * (min(limit, max(-limit, b)) - vel[1]),
+            t.torque[0] + t.vel_gain[0] * (clamp(a, -limit, limit) - vel[0]),
+            t.torque[1] + t.vel_gain[1] * (clamp(b, -limit, limit) - vel[1]),
         )
         return joint_torque(motors, self._gear_ratio)
 

@@ -12,14 +12,18 @@ A command with `hold` is obeyed anyway, but a module that refused its numbers is
 
 from __future__ import annotations
 
+from typing import Final
+
 from services.joint import pd_law
 from shared.bus.messages import JointCommand, Outside, Pair
+from shared.clamp import clamp
 from shared.config.robot_config import RobotConfig
 from shared.robot.gain_table import Bounds, ModuleBounds
 from shared.robot.joints import kind_of
 
 ROUNDING = 0.02
 """Share of a gain that is allowed beyond: the schedule interpolates between rounded nodes."""
+_INSIDE: Final = Outside.NOTHING  # of nearly every command; see services.joint.failsafe
 GAP_TICKS = 4
 """The step that is allowed grows with the time between commands no longer than so: a wrong torque
 that is refused again and again would be within it in the end."""
@@ -32,11 +36,14 @@ class Envelope:
         """Take the bounds; without a schedule that has them every command is inside."""
         schedule = config.gain_schedule
         table = schedule.bounds if config.law.split == "certified" and schedule else None
-        self._bounds = table[kind_of(module)] if table else None
+        self._bounds = bounds = table[kind_of(module)] if table else None
         own, least = config.envelope, config.certificate
+        if bounds is not None:
+            self._k_p, self._k_d = _widened(bounds.k_p), _widened(bounds.k_d)
+            self._v_ref = [min(own.v_ref, most) for most in bounds.v_ref]
         self._room = own.tau_ff_margin
         self._distance, self._spring = own.q_ref_distance, own.spring_torque
-        self._coupled, self._dtau_ff, self._v_ref = own.tau_coupled, own.dtau_ff, own.v_ref
+        self._coupled, self._dtau_ff = own.tau_coupled, own.dtau_ff
         self._step, self._rate = own.torque_step, own.torque_rate
         self._gap_s = GAP_TICKS / config.planner.rate_hz
         self._margin = (1.0 - ROUNDING) * least.margin_min
@@ -67,12 +74,12 @@ class Envelope:
         """
         bounds, c = self._bounds, command
         if bounds is None:
-            return Outside.NOTHING
+            return _INSIDE
         if not (c.margin >= self._margin and c.margin_onboard >= self._margin_onboard):
             return Outside.MARGIN
-        if not _within(c.k_p, bounds.k_p):
+        if not _within(c.k_p, self._k_p):
             return Outside.K_P
-        if not _within(c.k_d, bounds.k_d):
+        if not _within(c.k_d, self._k_d):
             return Outside.K_D
         lowest, highest = self._tau_ff_at(bounds, q[1])
         for axis in (0, 1):
@@ -82,19 +89,19 @@ class Envelope:
                 return Outside.DTAU_FF
             if not abs(c.tau_coupled[axis]) <= self._coupled:
                 return Outside.TAU_COUPLED
-            if not abs(c.v_ref[axis]) <= min(self._v_ref, bounds.v_ref[axis]):
+            if not abs(c.v_ref[axis]) <= self._v_ref[axis]:
                 return Outside.V_REF
             distance = abs(c.q_ref[axis] + age_s * c.v_ref[axis] - q[axis])
             spring = c.k_p[axis] * distance if settled else 0.0
             if not (distance <= self._distance and spring <= self._spring):
                 return Outside.Q_REF
         if last is None or last.hold or last.session != c.session:
-            return Outside.NOTHING
-        most = self._step + self._rate * min(self._gap_s, max(0.0, 1e-9 * (c.t_ns - last.t_ns)))
+            return _INSIDE
+        most = self._step + self._rate * clamp(1e-9 * (c.t_ns - last.t_ns), 0.0, self._gap_s)
         (phi, theta), (last_phi, last_theta) = pd_law.torque(c, q, v), pd_law.torque(last, q, v)
         if not (abs(phi - last_phi) <= most and abs(theta - last_theta) <= most):
             return Outside.TORQUE_STEP
-        return Outside.NOTHING
+        return _INSIDE
 
     @staticmethod
     def _tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:
@@ -104,15 +111,15 @@ class Envelope:
         return rows[min(len(rows) - 1, max(0, part))]
 
 
-def _within(gains: Pair, bounds: Bounds) -> bool:
-    (phi, theta), (phi_high, theta_high) = gains, bounds[1]
+def _widened(gains: Bounds) -> Bounds:
+    """Return bounds of gains with the rounding that is allowed."""
+    (phi_low, theta_low), (phi_high, theta_high) = gains
     return (
-        _at_least(gains, bounds)
-        and phi <= (1.0 + ROUNDING) * phi_high
-        and theta <= (1.0 + ROUNDING) * theta_high
+        ((1.0 - ROUNDING) * phi_low, (1.0 - ROUNDING) * theta_low),
+        ((1.0 + ROUNDING) * phi_high, (1.0 + ROUNDING) * theta_high),
     )
 
 
-def _at_least(gains: Pair, bounds: Bounds) -> bool:
-    (phi, theta), (phi_low, theta_low) = gains, bounds[0]
-    return phi >= (1.0 - ROUNDING) * phi_low and theta >= (1.0 - ROUNDING) * theta_low
+def _within(gains: Pair, bounds: Bounds) -> bool:
+    (phi, theta), ((phi_low, theta_low), (phi_high, theta_high)) = gains, bounds
+    return phi_low <= phi <= phi_high and theta_low <= theta <= theta_high

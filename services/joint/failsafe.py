@@ -116,6 +116,12 @@ TICKS_PER_S_MAX: Final = 2000
 REFUSED_SHOWN_NS: Final = NS_PER_S
 """How long the cause of the newest refusal is reported."""
 
+# Each cycle compares these. Python 3.11 finds a member by its class in 53 ns, by a name in 6.
+_DISARMED, _HOLD, _TRACK = Mode.DISARMED, Mode.HOLD, Mode.TRACK
+_ESTOP, _DRIVE_ARMED, _STALE = Event.ESTOP, Event.DRIVE_ARMED, Event.COMMAND_STALE
+_HOLD_REQUESTED, _READY, _NONE = Event.HOLD_REQUESTED, Event.READY, Event.NONE
+_INSIDE, _USABLE = Outside.NOTHING, Refusal.NONE
+
 
 class Failsafe(msgspec.Struct):
     """The state of one joint service's failsafe."""
@@ -159,11 +165,11 @@ class Failsafe(msgspec.Struct):
             outside: judgement of `services.joint.envelope`.
         """
         refusal = self._judge(command, now_ns, timing)
-        if refusal in (Refusal.NONE, Refusal.OUT_OF_LIMITS):
+        if refusal is _USABLE or refusal is Refusal.OUT_OF_LIMITS:
             self.outside, self.judged_ns = outside, now_ns
-        if refusal is Refusal.NONE and outside and not command.hold:
+        if refusal is _USABLE and outside is not _INSIDE and not command.hold:
             refusal = Refusal.OUT_OF_ENVELOPE
-        if refusal is not Refusal.NONE:
+        if refusal is not _USABLE:
             self.refused += 1
             self.refusal, self.refused_session = refusal, command.session
             self.refused_ns = now_ns
@@ -183,7 +189,7 @@ class Failsafe(msgspec.Struct):
     @property
     def stiffen_requested(self) -> bool:
         """True in HOLD if the newest accepted command says that another module may be limp."""
-        return self.mode is Mode.HOLD and self.command is not None and self.command.stiffen
+        return self.mode is _HOLD and self.command is not None and self.command.stiffen
 
     def age_ns(self, now_ns: int) -> int:
         """Return the age of the newest accepted command on this module's clock; -1 if none."""
@@ -192,12 +198,12 @@ class Failsafe(msgspec.Struct):
     def current_outside(self, now_ns: int, timing: Timing) -> Outside:
         """Return the part of the newest command outside the envelope, while that is recent."""
         old = now_ns - self.judged_ns > timing.max_command_age_ns
-        return Outside.NOTHING if old else self.outside
+        return _INSIDE if old else self.outside
 
     def newest_refusal(self, now_ns: int) -> tuple[Refusal, int]:
         """Return the cause of the newest refusal and its session, while that is recent."""
         if not self.refused or now_ns - self.refused_ns > REFUSED_SHOWN_NS:
-            return Refusal.NONE, 0
+            return _USABLE, 0
         return self.refusal, self.refused_session
 
     def is_fresh(self, now_ns: int, timing: Timing) -> bool:
@@ -214,8 +220,8 @@ class Failsafe(msgspec.Struct):
     def ready(self, now_ns: int, timing: Timing) -> bool:
         """Return True if this module can track and accepted commands for long enough."""
         return (
-            self.mode in (Mode.HOLD, Mode.TRACK)
-            and self.outside is Outside.NOTHING
+            (self.mode is _TRACK or self.mode is _HOLD)
+            and self.outside is _INSIDE
             and self.fresh_since_ns >= 0
             and now_ns - self.fresh_since_ns >= self.engage_after_ns(timing)
         )
@@ -226,7 +232,7 @@ class Failsafe(msgspec.Struct):
         timing: Timing,
         drive: Event,
         estop: bool,
-        trip: Event = Event.NONE,
+        trip: Event = _NONE,
     ) -> Cause | None:
         """Advance by one cycle; return the cause if the mode changed.
 
@@ -237,23 +243,25 @@ class Failsafe(msgspec.Struct):
             estop: the emergency stop is engaged.
             trip: one of `TRIPS`, or NONE.
         """
-        fresh = self.is_fresh(now_ns, timing)
+        mode, fresh = self.mode, self.is_fresh(now_ns, timing)
+        tracks = mode is _TRACK
         # a new session replaced a current one that went stale in this cycle
-        broken = self.mode is Mode.TRACK and self.fresh_since_ns < 0
-        if not fresh or self.mode is Mode.DISARMED:
+        broken = tracks and self.fresh_since_ns < 0
+        if not fresh or mode is _DISARMED:
             self.fresh_since_ns = -1  # commands from before arming do not count
         elif self.fresh_since_ns < 0:
             self.fresh_since_ns = now_ns
-        gone = estop or drive not in (Event.NONE, Event.DRIVE_ARMED)
         event = self._event(now_ns, timing, drive, estop, fresh and not broken)
-        if trip is not Event.NONE and self.mode is Mode.TRACK and not gone:
-            event = trip
-            self.fresh_since_ns = now_ns  # after a trip it waits as after a drop-out
-        row = TRANSITIONS[self.mode].get(event)
+        if trip is not _NONE and tracks:
+            gone = estop or not (drive is _NONE or drive is _DRIVE_ARMED)
+            if not gone:
+                event = trip
+                self.fresh_since_ns = now_ns  # after a trip it waits as after a drop-out
+        row = TRANSITIONS[mode].get(event)
         self.dropouts.advance(
             now_ns,
-            engaged=self.mode is Mode.TRACK,
-            dropped=event is Event.COMMAND_STALE or event in TRIPS,
+            engaged=tracks,
+            dropped=event is _STALE or event in TRIPS,
             count_max=timing.dropouts_max,
             forget_ns=timing.dropout_forget_ns,
         )
@@ -264,18 +272,17 @@ class Failsafe(msgspec.Struct):
 
     def _event(self, now_ns: int, timing: Timing, drive: Event, estop: bool, fresh: bool) -> Event:
         if estop and self.mode not in (Mode.DAMP, Mode.FAULT):
-            return Event.ESTOP
-        armed_mode = self.mode is not Mode.DISARMED
-        if drive is Event.DRIVE_ARMED:
-            if not armed_mode:
+            return _ESTOP
+        if drive is _DRIVE_ARMED:
+            if self.mode is _DISARMED:
                 return drive
-        elif drive is not Event.NONE:
+        elif drive is not _NONE:
             return drive
         if not fresh:
-            return Event.COMMAND_STALE
+            return _STALE
         if self.command is not None and self.command.hold:
-            return Event.HOLD_REQUESTED
-        return Event.READY if self.ready(now_ns, timing) else Event.NONE
+            return _HOLD_REQUESTED
+        return _READY if self.ready(now_ns, timing) else _NONE
 
     def _judge(self, command: JointCommand, now_ns: int, timing: Timing) -> Refusal:
         age = now_ns - command.echo_t_ns
@@ -294,7 +301,7 @@ class Failsafe(msgspec.Struct):
             counted = TICKS_PER_S_MAX * (now_ns - self.command.echo_t_ns) / NS_PER_S
             if ahead > SEQ_AHEAD_MAX + counted:
                 return Refusal.TOO_FAR_AHEAD
-        return Refusal.NONE if within_limits(command, timing) else Refusal.OUT_OF_LIMITS
+        return _USABLE if within_limits(command, timing) else Refusal.OUT_OF_LIMITS
 
 
 def within_limits(command: JointCommand, timing: Timing) -> bool:

@@ -17,6 +17,8 @@ from shared.bus.messages import JointCommand, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 
+_HOLD, _TRACK, _DAMP = Mode.HOLD, Mode.TRACK, Mode.DAMP  # see services.joint.failsafe
+
 
 class SetpointState(msgspec.Struct, frozen=True, kw_only=True):
     """State of `SetpointLaw`."""
@@ -97,13 +99,13 @@ class SetpointLaw:
             near: what is known of the other modules on this host.
         """
         mode = failsafe.mode
-        limp = near.stiffen and mode in (Mode.HOLD, Mode.DAMP)
+        limp = near.stiffen and (mode is _HOLD or mode is _DAMP)
         if not self._stiffened_ns and (limp or failsafe.stiffen_requested):
             self._stiffened_ns = now_ns
         since_ns = now_ns - self._changed_ns
-        if mode is Mode.TRACK:
+        if mode is _TRACK:
             self.current = self._tracked(now_ns, failsafe.command, since_ns)
-        elif mode is Mode.DAMP:
+        elif mode is _DAMP:
             near = near._replace(stiffen=self._stiffened_ns > 0)
             self.current = self.sinking.law(self._frozen, since_ns, q, near)
         else:

@@ -21,6 +21,7 @@ from services.joint import pd_law
 from services.joint.neighbours import NeighbourView
 from services.joint.pd_law import Setpoint
 from shared.bus.messages import Pair
+from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import kind_of
@@ -160,5 +161,5 @@ class Sinking:
         if self.upright is None:
             self.upright = self.below + theta
         wanted = self.upright - self.below
-        wanted = min(theta + LEVEL_MAX, max(theta - LEVEL_MAX, wanted))
+        wanted = clamp(wanted, theta - LEVEL_MAX, theta + LEVEL_MAX)
         return pd_law.hold_theta(sunk, wanted, -rate, risen * self._k_p[1])

@@ -11,6 +11,7 @@ import math
 import msgspec
 
 from shared.bus.messages import Pair
+from shared.clamp import clamp
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import kind_of
 
@@ -55,16 +56,16 @@ def limit_torque(tau: Pair, q: Pair, tau_last: Pair, limits: TorqueLimits) -> Pa
     theta = tau[1] + _soft_stop(q[1], limits.theta, limits.soft_stop_k_p)
     if not (math.isfinite(phi) and math.isfinite(theta)):
         return tau_last
-    step = limits.tau_step_max
-    phi = min(tau_last[0] + step, max(tau_last[0] - step, phi))
-    theta = min(tau_last[1] + step, max(tau_last[1] - step, theta))
+    step, (last_phi, last_theta) = limits.tau_step_max, tau_last
+    phi = clamp(phi, last_phi - step, last_phi + step)
+    theta = clamp(theta, last_theta - step, last_theta + step)
     return limit_differential((phi, theta), limits.tau_module_max)
 
 
 def limit_differential(tau: Pair, tau_module_max: float) -> Pair:
     """Clip each motor's torque: |tau_phi + tau_theta| and |tau_theta - tau_phi| <= max."""
-    total = min(tau_module_max, max(-tau_module_max, tau[1] + tau[0]))
-    difference = min(tau_module_max, max(-tau_module_max, tau[1] - tau[0]))
+    total = clamp(tau[1] + tau[0], -tau_module_max, tau_module_max)
+    difference = clamp(tau[1] - tau[0], -tau_module_max, tau_module_max)
     return ((total - difference) * 0.5, (total + difference) * 0.5)
 
 

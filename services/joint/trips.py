@@ -30,6 +30,7 @@ SHAKE_ABOVE_HZ: Final = 8.0
 SHAKE_S: Final = 0.1
 AT_LIMIT: Final = 0.995
 """Share of the torque diamond: a motor there gives all it has."""
+_NONE: Final = Event.NONE  # of each cycle; see services.joint.failsafe
 
 
 class TripLimits(msgspec.Struct, frozen=True):
@@ -97,13 +98,14 @@ class JointTrips(msgspec.Struct):
         mean_phi += limits.mean_share * ((phi - slow_phi) ** 2 - mean_phi)
         mean_theta += limits.mean_share * ((theta - slow_theta) ** 2 - mean_theta)
         self.mean = (mean_phi, mean_theta)
-        if max(mean_phi, mean_theta) > limits.shaking:
+        if mean_phi > limits.shaking or mean_theta > limits.shaking:
             return Event.SHAKING
-        at_limit, fast = abs(phi) + abs(theta) >= limits.torque, max(map(abs, v)) > limits.speed
+        at_limit = abs(phi) + abs(theta) >= limits.torque
+        fast = abs(v[0]) > limits.speed or abs(v[1]) > limits.speed
         self.at_limit_ns = (self.at_limit_ns or now_ns) if at_limit else 0
         self.fast_ns = (self.fast_ns or now_ns) if fast else 0
         if self.at_limit_ns and now_ns - self.at_limit_ns >= limits.torque_ns:
             return Event.TORQUE_LIMIT
         if self.fast_ns and now_ns - self.fast_ns >= limits.speed_ns:
             return Event.TOO_FAST
-        return Event.NONE
+        return _NONE

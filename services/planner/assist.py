@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from services.planner.snapshots import AssistState, EasingState, OverloadState
 from shared.bus.messages import Vector3, Wrench
+from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import HarnessConfig
 
@@ -135,13 +136,13 @@ class AssistLaw:
             dt: time since the last tick, s.
             still: False while the robot holds or the operator leads.
         """
-        wanted = min(self._force_max, max(0.0, wanted))
+        wanted = clamp(wanted, 0.0, self._force_max)
         if self._ramp is None:
             # a planner that takes over from HOLD finds the assist in HOLD's feedforward
             self._ramp = wanted
         before = self._ramp + self.integral
         change_max = self._rate_max * dt
-        self._ramp += min(change_max, max(-change_max, wanted - self._ramp))
+        self._ramp += clamp(wanted - self._ramp, -change_max, change_max)
         steady = still and wanted == self._wanted == self._ramp
         self._wanted = wanted
         self._still_s = self._still_s + dt if steady else 0.0
@@ -149,10 +150,10 @@ class AssistLaw:
             self.integral -= self.integral * min(1.0, dt / self._integral_s)
         elif measured is not None and self._still_s > SETTLE_S:
             error = wanted - measured
-            error -= min(ERROR_MIN, max(-ERROR_MIN, error))
+            error -= clamp(error, -ERROR_MIN, ERROR_MIN)
             self.integral += error * dt / self._integral_s
         low = max(-self._integral_max, -self._ramp)
-        self.integral = min(self._integral_max, max(low, self.integral))
+        self.integral = clamp(self.integral, low, self._integral_max)
         return (self._ramp + self.integral - before) / dt if dt > 0.0 else 0.0
 
 
@@ -199,8 +200,8 @@ class LeadEasing:
             self._left = min(1.0, self._left + dt / LEAD_FADE_S)
             force_max, moment_max = LEAD_MAX
             self._lead = (
-                min(force_max, max(-force_max, up + assist)),
-                min(moment_max, max(-moment_max, moment_pitch)),
+                clamp(up + assist, -force_max, force_max),
+                clamp(moment_pitch, -moment_max, moment_max),
             )
         gain = self._alpha * self._left
         return gain * self._lead[0], gain * self._lead[1]

@@ -18,11 +18,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.small_matrices import eigenvalue_min
 from shared.config.robot_config import RobotConfig
+from shared.robot.compiled_graph import CompiledGraph
 from shared.robot.joints import N_JOINTS
 
 Array = NDArray[np.float64]
@@ -62,17 +64,35 @@ def motor_mean(D: Array) -> Array:
     return mean
 
 
+def stiffness_graph() -> ca.Function:
+    """Return the graph (T, H, D, scale) -> K_fail of both tiers, scaled; K_fail of tier 2.
+
+    The first result (6, 12) holds both side by side; the second (6, 6) is in N/m and N m/rad.
+    """
+    T, H = ca.MX.sym("T", N_JOINTS, 6), ca.MX.sym("H", N_JOINTS, N_JOINTS)
+    D, scale = ca.MX.sym("D", N_JOINTS), ca.MX.sym("scale", 6)
+    pair = ca.DM(0.5 * np.kron(np.eye(N_JOINTS // 2), np.ones((2, 2))))
+    scaled = T * ca.repmat(scale.T, N_JOINTS, 1)
+    geometric = scaled.T @ H @ scaled
+    geometric = 0.5 * (geometric + geometric.T)
+    service, onboard = (
+        scaled.T @ (ca.repmat(stiffness, 1, 6) * scaled) + geometric
+        for stiffness in (D, ca.sparsify(pair) @ D)
+    )
+    both = ca.horzcat(service, onboard)
+    return ca.Function("stiffness", [T, H, D, scale], [both, service / (scale @ scale.T)])
+
+
 class Certificate:
     """Certificate at one configuration; `at` sets the configuration."""
 
     def __init__(self, config: RobotConfig) -> None:
         """Set the required stiffness."""
         self.K_required: Array = np.array(config.certificate.K_required)
-        self._scale = 1.0 / np.sqrt(self.K_required)
-        self._scale_squared = np.outer(self._scale, self._scale)
-        self._T_scaled: Array = np.zeros((N_JOINTS, 6))
-        self._K_geo: Array = np.zeros((6, 6))
-        self._pair: Array = np.zeros((2, N_JOINTS, 1))
+        self._graph = CompiledGraph(stiffness_graph())
+        self._T, self._hessian_O, self._D, self._scale = self._graph.arguments
+        self._scale[:] = 1.0 / np.sqrt(self.K_required)
+        self._K_scaled, self._K_fail = self._graph.results
 
     def at(self, T: Array, hessian_O: Array) -> None:
         """Set the configuration.
@@ -81,27 +101,25 @@ class Certificate:
             T: joint rates per unit of p along the closed chain (12, 6).
             hessian_O: `Kinematics.hessian_times` of F_O and F_assist (12, 12), N m/rad.
         """
-        np.multiply(T, self._scale, out=self._T_scaled)
-        K_geo = self._T_scaled.T @ hessian_O @ self._T_scaled
-        self._K_geo = 0.5 * (K_geo + K_geo.T)
+        self._T[:], self._hessian_O[:] = T, hessian_O
 
     def margins(self, D: Array) -> Margins:
         """Return the margins of local stiffnesses D (12,), N m/rad.
 
         Zero at angles at which the closed chain has no finite rates: nothing is certified there.
         """
-        pair = self._pair
-        pair[0, :, 0] = D
-        pair[1, :, 0] = motor_mean(D)
-        K = self._T_scaled.T @ (pair * self._T_scaled) + self._K_geo
+        self._D[:] = D
+        self._graph()
+        K = self._K_scaled
         if not np.isfinite(K).all():
             return Margins(0.0, 0.0)
-        return Margins(eigenvalue_min(K[0]), eigenvalue_min(K[1]))
+        return Margins(eigenvalue_min(K[:, :6]), eigenvalue_min(K[:, 6:]))
 
     def weakest(self, D: Array) -> Weakest:
         """Return the weakest direction under local stiffnesses D (12,), N m/rad."""
-        K = self._T_scaled.T @ (D[:, np.newaxis] * self._T_scaled) + self._K_geo
-        values, vectors = np.linalg.eigh(K)
+        self._D[:] = D
+        self._graph()
+        values, vectors = np.linalg.eigh(self._K_scaled[:, :6])
         u = vectors[:, 0]
         index = int(np.abs(u).argmax())
         required = float(self.K_required[index])
@@ -116,5 +134,6 @@ class Certificate:
 
     def failsafe_stiffness(self, D: Array) -> Array:
         """Return K_fail (6, 6) of local stiffnesses D (12,): N/m, N/rad and N m/rad."""
-        K = self._T_scaled.T @ (D[:, np.newaxis] * self._T_scaled) + self._K_geo
-        return np.asarray(K / self._scale_squared, float)
+        self._D[:] = D
+        self._graph()
+        return self._K_fail.copy()

@@ -21,6 +21,7 @@ from services.planner.hocca import Hocca, LawOutput
 from services.planner.snapshots import GuardState
 from services.planner.split import LocalGains
 from shared.bus.messages import SplitSource
+from shared.clamp import clamp
 from shared.config.sections import GeometryConfig
 from shared.robot.capture_point import capture_point
 from shared.robot.joints import N_JOINTS
@@ -89,7 +90,7 @@ class ControllerGuard:
         local = self._law.certify(action.D)
         state.why = self._objection(seen, action, local)
         if state.why:
-            state.wait_s = min(WAIT_MAX_S, max(REST_S, 2.0 * state.wait_s))
+            state.wait_s = clamp(2.0 * state.wait_s, REST_S, WAIT_MAX_S)
             state.rest_s = state.wait_s
             return _uncertified(law)
         if state.time_s > FORGET_S:

@@ -32,6 +32,9 @@ FORGET_NS: Final = 25 * NS_PER_S
 would fit into a minute."""
 
 _NOT_TRACKABLE: Final = (Mode.FAULT, Mode.DAMP)
+# Each tick compares these. Python 3.11 finds a member by its class in 53 ns, by a name in 6.
+_TRACK: Final = Mode.TRACK
+_LEADING, _ALIGNING, _WAITING = PlannerMode.LEADING, PlannerMode.ALIGNING, PlannerMode.WAITING
 """Modes from which no module returns to TRACK, so that waiting is useless."""
 _DROPPED: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED)
 """Modes after LEADING that count as a drop-out."""
@@ -67,7 +70,7 @@ class Engagement(msgspec.Struct):
         next_mode = self._next(now_ns, fresh, ready, modes, inhibit)
         self.dropouts.advance(
             now_ns,
-            engaged=self.mode is PlannerMode.LEADING,
+            engaged=self.mode is _LEADING,
             dropped=next_mode in _DROPPED,
             count_max=len(WAITS_NS) - 1,
             forget_ns=FORGET_NS,
@@ -94,20 +97,20 @@ class Engagement(msgspec.Struct):
         inhibit: PlannerMode | None,
     ) -> PlannerMode:
         if not all(fresh):
-            return PlannerMode.WAITING
+            return _WAITING
         if inhibit is not None:
             return inhibit
-        if self.mode is PlannerMode.LEADING:
+        if self.mode is _LEADING:
             grace_over = now_ns - self.since_ns > GRACE_NS
             dropped = any(
-                mode in _NOT_TRACKABLE or (grace_over and mode != Mode.TRACK) for mode in modes
+                mode in _NOT_TRACKABLE or (grace_over and mode != _TRACK) for mode in modes
             )
-            return PlannerMode.ALIGNING if dropped else PlannerMode.LEADING
-        if self.mode is PlannerMode.ALIGNING and not self.wait_ns(now_ns) and all(ready):
-            return PlannerMode.LEADING
-        return PlannerMode.ALIGNING
+            return _ALIGNING if dropped else _LEADING
+        if self.mode is _ALIGNING and not self.wait_ns(now_ns) and all(ready):
+            return _LEADING
+        return _ALIGNING
 
     @property
     def hold(self) -> bool:
         """True if every command is to carry `hold`."""
-        return self.mode is not PlannerMode.LEADING
+        return self.mode is not _LEADING

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.bus.messages import Pair, Vector3
+from shared.clamp import clamp
 
 Array = NDArray[np.float64]
 
@@ -116,4 +117,4 @@ def slope_of(up_torso: Vector3, roll: float, pitch: float, yaw: float) -> Pair:
     x, y = math.cos(yaw) * x - math.sin(yaw) * y, math.cos(yaw) * y + math.sin(yaw) * x
     if z <= 0.0:
         return math.pi, math.pi
-    return math.asin(min(1.0, max(-1.0, x))), math.asin(min(1.0, max(-1.0, y)))
+    return math.asin(clamp(x, -1.0, 1.0)), math.asin(clamp(y, -1.0, 1.0))

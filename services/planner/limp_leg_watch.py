@@ -19,6 +19,9 @@ from shared.robot.limp_leg_support import SUPPORT_FOR, Support
 DISARMED_NS: Final = 200 * NS_PER_MS
 """ns; a module DISARMED for this long is not about to take its drive over."""
 
+# Each tick compares these, of six modules; see services.planner.engagement_fsm.
+_DISARMED, _FAULT, _HOLDING = Mode.DISARMED, Mode.FAULT, DriveStatus.HOLDING
+
 
 class LimpLegWatch(msgspec.Struct):
     """Times since which each module is DISARMED while its drive does not hold."""
@@ -43,10 +46,10 @@ class LimpLegWatch(msgspec.Struct):
         support = Support.NONE
         for state, since_ns, wanted in zip(states, self.since_ns, SUPPORT_FOR, strict=True):
             persists = since_ns > 0 and now_ns - since_ns >= DISARMED_NS
-            if persists or state.mode == Mode.FAULT:
+            if persists or state.mode == _FAULT:
                 support = max(support, wanted)
         return support
 
 
 def _is_down(state: JointState) -> bool:
-    return state.mode == Mode.DISARMED and state.drive != DriveStatus.HOLDING
+    return state.mode == _DISARMED and state.drive != _HOLDING

@@ -53,6 +53,9 @@ TICK_GAP_MAX_S = 0.02
 """A longer gap between ticks (a stopped process) is not integrated over."""
 
 _ALL_NEW = (1 << N_MODULES) - 1
+# Each tick compares these; see services.planner.engagement_fsm.
+_CARRIES = (int(Mode.HOLD), int(Mode.TRACK))
+_WAITING, _UNCERTIFIED = PlannerMode.WAITING, SplitSource.UNCERTIFIED
 
 
 class Planner:
@@ -197,8 +200,8 @@ class Planner:
         self._source = self._output.local.source
         loads = self._law.leg_loads(self._tau)
         lifted, leads = self._lifted(now_ns), not engagement.hold
-        all_carry = all(state.mode in (Mode.HOLD, Mode.TRACK) for state in states)
-        is_fresh = engagement.mode is not PlannerMode.WAITING
+        all_carry = all(state.mode in _CARRIES for state in states)
+        is_fresh = engagement.mode is not _WAITING
         known = is_fresh and all_carry and not any(map(math.isnan, loads))
         if known:
             self._law.weigh(self._tau, self._v, self._usable_wrench(now_ns), dt, led=leads)
@@ -351,7 +354,7 @@ class Planner:
             return PlannerMode.MISPLACED
         if self._law.load_refused:
             return PlannerMode.MISLOADED
-        if self._source is SplitSource.UNCERTIFIED:
+        if self._source is _UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
         if self._trips.tripped:
             return PlannerMode.TRIPPED
@@ -373,7 +376,7 @@ class Planner:
             now_ns - arrived if state is not None else -1
             for state, arrived in zip(states, self._arrived_ns, strict=True)
         ]
-        leads = self._engagement.mode is PlannerMode.LEADING
+        leads = not self._engagement.hold
         p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         if output is not None:
             vectors = output.p, output.pdot, output.p_ref, output.closure, output.stance

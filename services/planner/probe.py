@@ -21,6 +21,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.clamp import clamp
+
 Array = NDArray[np.float64]
 
 NO_ROW: Final = -1
@@ -79,9 +81,9 @@ class ReferenceProbe:
         most = self._most[self.row]
         # a led row is held before it is offset, and offset no more before it is given back
         ready = is_asked and (not led or self._hold == 1.0)
-        target = min(most, max(-most, wanted)) if ready else 0.0
+        target = clamp(wanted, -most, most) if ready else 0.0
         step = dt * most / PROBE_S
-        self.offset += min(step, max(-step, target - self.offset))
+        self.offset += clamp(target - self.offset, -step, step)
         if led and is_asked:
             self._hold = min(1.0, self._hold + dt / HOLD_S)
         elif self.offset == 0.0:

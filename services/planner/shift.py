@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from services.planner.snapshots import ShiftState
 from shared.bus.messages import Vector4
+from shared.clamp import clamp
 
 Array = NDArray[np.float64]
 
@@ -50,9 +51,9 @@ class ShiftReference:
         """
         at, rate = self._at, self._rate
         for i, limit in enumerate(self._shift_max):
-            target, rate_max = min(limit, max(-limit, wanted[i])), limit / SHIFT_S
+            target, rate_max = clamp(wanted[i], -limit, limit), limit / SHIFT_S
             rate_next = rate[i] + dt * OMEGA * (OMEGA * (target - at[i]) - 2.0 * rate[i])
-            rate[i] = min(rate_max, max(-rate_max, rate_next))
+            rate[i] = clamp(rate_next, -rate_max, rate_max)
             at[i] += dt * rate[i]
 
     def rest(self) -> None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from services.planner.certificate import Certificate, Margins
 from services.planner.gains import JointGains
 from shared.bus.messages import SplitSource
+from shared.clamp import clamp
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.robot import gain_schedule
@@ -80,7 +81,7 @@ def _interval(nodes: tuple[float, ...], value: float) -> tuple[int, float]:
     """Return the interval's index and the fraction of the way through it, 0 .. 1."""
     i = min(max(bisect_right(nodes, value) - 1, 0), len(nodes) - 2)
     fraction = (value - nodes[i]) / (nodes[i + 1] - nodes[i])
-    return i, min(1.0, max(0.0, fraction))
+    return i, clamp(fraction, 0.0, 1.0)
 
 
 class GainSplit:

@@ -79,9 +79,12 @@ class Actuation:
         return acting if self.flexible is None else self.flexible.step(acting, q, v)
 
     def encoders(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the encoders' motor angles (12,), turns, and the true rates, turn/s."""
-        if self.flexible is not None:
-            q, v = self.flexible.theta, self.flexible.rate
+        """Return the encoders' motor angles (12,), turns, and the true rates, turn/s.
+
+        Args:
+            q: angles of the rotors (12,), rad at the joints.
+            v: their rates (12,), rad/s.
+        """
         turns = self._turns @ q
         turns += self._offset
         turns += self._noise[self._reads % len(self._noise)]

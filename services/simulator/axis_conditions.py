@@ -13,6 +13,7 @@ from services.simulator.axis_control import AxisControl
 from services.simulator.axis_encoders import AxisEncoders
 from services.simulator.axis_faults import FAULTS, AxisErrors
 from services.simulator.axis_settings import N_DRIVES, Settings
+from shared.clamp import clamp
 from shared.robot.joints import N_JOINTS
 
 BOOT_S: Final = 1.5
@@ -94,7 +95,7 @@ class Conditions:
         enabled = self._settings.axis(below + "enabled")[axis] > 0.0
         low = float(self._settings.axis(below + "temp_limit_lower")[axis])
         high = float(self._settings.axis(below + "temp_limit_upper")[axis])
-        share = min(1.0, max(0.0, (high - celsius) / (high - low))) if enabled else 1.0
+        share = clamp((high - celsius) / (high - low), 0.0, 1.0) if enabled else 1.0
         self._control.derating[axis] = share
         over = enabled and celsius >= high + OVER_TEMP_MARGIN
         (self._hot.add if over else self._hot.discard)(axis)

@@ -55,6 +55,7 @@ class HarnessFront:
         forces = self._G_inverse @ np.concatenate((force_torso, moment_torso))
         forces += self.bias
         forces += self._noise * self._random.standard_normal(stewart.N_LEGS)
-        np.clip(forces, -self._leg_force_max, self._leg_force_max, out=forces)
+        np.maximum(forces, -self._leg_force_max, out=forces)
+        np.minimum(forces, self._leg_force_max, out=forces)
         self._hub.poll()  # a load cell takes no requests, but clients that listen must be admitted
         self._hub.broadcast(loadcell_can.pack(forces.tolist()))

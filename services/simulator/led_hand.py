@@ -8,6 +8,7 @@ from typing import Final
 
 from services.simulator.follower import Follower
 from shared.bus.messages import HandLead, Vector3
+from shared.clamp import clamp
 from shared.config.scenarios import Lead
 
 HEIGHT_MAX_RATE: Final = 0.25
@@ -52,8 +53,8 @@ class LedHand:
             self._height.at, self._pitch.at = now.height, now.pitch
             self._height.rate, self._pitch.rate = now.height_rate, now.pitch_rate
         if asked.leads:
-            self._wanted = (_within(asked.height, *HEIGHTS), _within(asked.pitch, *PITCHES))
-        x, y, z = (_within(part, -PUSH_MAX, PUSH_MAX) for part in asked.push)
+            self._wanted = (clamp(asked.height, *HEIGHTS), clamp(asked.pitch, *PITCHES))
+        x, y, z = (clamp(part, -PUSH_MAX, PUSH_MAX) for part in asked.push)
         self._force = (x, y, z)
         self._push_left_s = PUSH_EXPIRES_S if any(self._force) else 0.0
 
@@ -94,7 +95,3 @@ class LedHand:
         made._force = (state[7], state[8], state[9])
         made._push_left_s = state[10]
         return made
-
-
-def _within(value: float, low: float, high: float) -> float:
-    return min(max(value, low), high)

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 from services.simulator.plant import Person
 from shared.bus.messages import Vector3
+from shared.clamp import clamp
 from shared.config.scenarios import Lead
 from shared.config.sections import OperatorConfig
 
@@ -113,6 +114,6 @@ class Operator:
             wanted.pitch_rate - pitch_rate
         )
         return HandForce(
-            min(hand.force_max, max(-hand.force_max, force)),
-            min(hand.moment_max, max(-hand.moment_max, moment)),
+            clamp(force, -hand.force_max, hand.force_max),
+            clamp(moment, -hand.moment_max, hand.moment_max),
         )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.bus.messages import Vector3
+from shared.clamp import clamp
 
 Array = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -
         ankles: where the feet were placed (2, 3), m.
     """
     rotation = data.xmat[torso].reshape(3, 3)
-    roll = math.asin(min(1.0, max(-1.0, rotation[2, 1])))
+    roll = math.asin(clamp(rotation[2, 1], -1.0, 1.0))
     pitch = math.atan2(-rotation[2, 0], rotation[2, 2])
     yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
     positions = np.array([data.xpos[foot] for foot in feet])

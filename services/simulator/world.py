@@ -168,9 +168,10 @@ class World:
 
         Order: axis0, axis1 of each module in `MODULES` order.
         """
-        return self._actuation.encoders(
-            self._qpos.take(self._q_index), self._qvel.take(self._v_index)
-        )
+        actuation = self._actuation
+        if actuation.flexible is not None:
+            return actuation.encoders(actuation.flexible.theta, actuation.flexible.rate)
+        return actuation.encoders(self._qpos.take(self._q_index), self._qvel.take(self._v_index))
 
     def torso_against_gravity(self) -> list[float]:
         """Return the quaternion (w, x, y, z) that turns torso axes into axes whose z is up."""

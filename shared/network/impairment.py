@@ -130,9 +130,10 @@ class Impairer:
         if what.rate and self._line_free_ns - now_ns > QUEUE_MAX * size * NS_PER_S / what.rate:
             self.lost += 1
             return ()
-        copies = 2 if what.duplicate and self._random.random() < what.duplicate else 1
+        twice = what.duplicate and self._random.random() < what.duplicate
         self.passed += 1
-        return tuple(self._release_ns(now_ns, size) for _ in range(copies))
+        release_ns = self._release_ns(now_ns, size)
+        return (release_ns, self._release_ns(now_ns, size)) if twice else (release_ns,)
 
     def delays(self, now_ns: int) -> int:
         """Return when a link's own traffic comes out, ns: in order, never lost.

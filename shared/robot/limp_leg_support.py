@@ -35,7 +35,9 @@ class Support(IntEnum):
 
     def includes(self, module: str) -> bool:
         """Return True if this module stiffens."""
-        return self is Support.ALL or (self is Support.KNEES and kind_of(module) == "knee")
+        if not self:  # as in nearly every tick
+            return False
+        return self is Support.ALL or kind_of(module) == "knee"
 
 
 _BY_KIND: Final = {"ankle": Support.KNEES, "knee": Support.ALL, "hip": Support.NONE}

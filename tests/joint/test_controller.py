@@ -8,6 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from services.joint.controller import CycleResult
 from services.joint.drivers.base import DriveReading, DriveStatus
 from shared.bus.messages import Cause, JointCommand, Mode, Pair, Refusal
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -42,7 +43,7 @@ def test_no_torque_and_no_change_before_the_drive_is_armed(
 ) -> None:
     bench.status = status
     for result in bench.run(50, fresh=True):
-        assert result == ((0.0, 0.0), None)
+        assert result == CycleResult((0.0, 0.0), None)
     assert bench.mode is Mode.DISARMED
 
 

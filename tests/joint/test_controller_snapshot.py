@@ -120,7 +120,6 @@ def test_motors_at_their_limit_take_the_module_out_of_track(
 ) -> None:
     beyond = (0.0, -2.0 * robot.joint.tau_module_max)
     bench.to_track(tau_ff=beyond)  # it blends in: at once it would be shaking
-    causes = [
-        event.cause for _, event in bench.run(500, fresh=True, tau_ff=beyond) if event is not None
-    ]
+    results = bench.run(500, fresh=True, tau_ff=beyond)
+    causes = [result.event.cause for result in results if result.event is not None]
     assert causes[0] == Cause.TORQUE_LIMIT

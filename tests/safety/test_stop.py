@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.joint.controller import CycleResult
 from services.joint.drivers.base import DriveStatus
 from shared.bus.messages import Cause, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -38,8 +39,8 @@ def test_torque_is_zero_after_drive_fault_whatever_comes(
     assert result.event.mode_after == Mode.FAULT
     bench.status, bench.q, bench.v = DriveStatus.ARMED, (0.5, -0.1), (1.0, 1.0)
     for _ in range(100):
-        assert bench.cycle(bench.fresh(), estop=True) == ((0.0, 0.0), None)
-        assert bench.cycle(bench.fresh()) == ((0.0, 0.0), None)
+        assert bench.cycle(bench.fresh(), estop=True) == CycleResult((0.0, 0.0), None)
+        assert bench.cycle(bench.fresh()) == CycleResult((0.0, 0.0), None)
 
 
 @pytest.mark.parametrize("before", [Mode.DISARMED, Mode.HOLD, Mode.TRACK])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from services.simulator.led_hand import HEIGHTS, PITCHES
+from shared.clamp import clamp
 
 HEIGHT_RATE: Final = 0.15
 """m/s at full deflection."""
@@ -44,7 +45,7 @@ class Pilot:
     def __init__(self, height: float, pitch: float, assist_max_n: float) -> None:
         """Begin where the robot is, without assist."""
         self._assist_max_n = assist_max_n
-        self.led = Led(_within(height, *HEIGHTS), _within(pitch, *PITCHES), 0.0)
+        self.led = Led(clamp(height, *HEIGHTS), clamp(pitch, *PITCHES), 0.0)
 
     def keep_assist(self, given_n: float) -> None:
         """Ask for no more assist than is given now, N."""
@@ -59,9 +60,9 @@ class Pilot:
         """
         height, pitch, assist_n = self.led
         self.led = Led(
-            _within(height + HEIGHT_RATE * _beyond(wanted.height) * dt, *HEIGHTS),
-            _within(pitch + PITCH_RATE * _beyond(wanted.pitch) * dt, *PITCHES),
-            _within(assist_n + ASSIST_RATE * _beyond(wanted.assist) * dt, 0.0, self._assist_max_n),
+            clamp(height + HEIGHT_RATE * _beyond(wanted.height) * dt, *HEIGHTS),
+            clamp(pitch + PITCH_RATE * _beyond(wanted.pitch) * dt, *PITCHES),
+            clamp(assist_n + ASSIST_RATE * _beyond(wanted.assist) * dt, 0.0, self._assist_max_n),
         )
         return self.led
 
@@ -73,7 +74,3 @@ def _beyond(deflection: float) -> float:
         return 0.0
     scaled = (size - DEAD_ZONE) / (1.0 - DEAD_ZONE)
     return scaled if deflection > 0.0 else -scaled
-
-
-def _within(value: float, low: float, high: float) -> float:
-    return min(high, max(low, value))

@@ -30,7 +30,8 @@ class HostClock:
 
     def read(self, now_ns: int) -> int:
         """Return the host's time at a virtual time, ns."""
-        return now_ns + self.offset_ns + round(now_ns * self.drift_ppm * 1e-6)
+        drift_ns = round(now_ns * self.drift_ppm * 1e-6) if self.drift_ppm else 0
+        return now_ns + self.offset_ns + drift_ns
 
     def step(self, by_ns: int) -> None:
         """Step the clock, which a monotonic clock never does."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from services.joint.drive_manager import DriveAction, DriveCommand
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.drivers.odrive_can import LOST_MS
@@ -11,6 +13,11 @@ from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.clock import NS_PER_S
 from shared.config.sections import DriveConfig
+
+# Each cycle compares these; see services.joint.failsafe.
+_NOTHING, _TORQUE = DriveCommand.NOTHING, DriveCommand.TORQUE
+_LOST, _IDLE, _ARMED = DriveStatus.LOST, DriveStatus.IDLE, DriveStatus.ARMED
+_CLOSED_LOOP: Final = AxisState.CLOSED_LOOP_CONTROL
 
 
 class VirtualDrive:
@@ -46,10 +53,10 @@ class VirtualDrive:
             self._sampled_ns = now_ns
         elif now_ns - self._sampled_ns <= self._lost_after_ns:
             return None
-        armed = bank.state[a] == bank.state[b] == AxisState.CLOSED_LOOP_CONTROL
-        status = DriveStatus.LOST
+        armed = bank.state[a] == bank.state[b] == _CLOSED_LOOP
+        status = _LOST
         if is_responding:
-            status = DriveStatus.ARMED if armed else DriveStatus.IDLE
+            status = _ARMED if armed else _IDLE
         errors = 0 if armed else bank.heartbeat(a).errors | bank.heartbeat(b).errors
         pos, vel = bank.pos_estimate, bank.vel_estimate
         reading = DriveReading(
@@ -65,12 +72,12 @@ class VirtualDrive:
     def carry_out(self, step: DriveAction, *, onboard: bool) -> None:
         """Carry out a cycle's action, if the drive receives it; each frame feeds its watchdog."""
         bank, (a, b) = self._bank, self._axes
-        if step.command is DriveCommand.NOTHING or not bank.is_responding(a):
+        if step.command is _NOTHING or not bank.is_responding(a):
             return
         self._written = True
         if step.target is not None:
             self._aim(self._frame.target(step.target))
-        elif step.command is DriveCommand.TORQUE:
+        elif step.command is _TORQUE:
             bank.input_torque[self._module] = self._frame.torque(step.torque)
         elif step.command is DriveCommand.ARM:
             self._arm(onboard=onboard)

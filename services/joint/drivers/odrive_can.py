@@ -52,6 +52,7 @@ LOST_MS: Final = 100
 CLOSE_MS: Final = 20
 """Time for which a command that the bus had no room for may hold up `close`."""
 
+_LOST, _ARMED = DriveStatus.LOST, DriveStatus.ARMED  # of each cycle; see services.joint.failsafe
 _unpack_two_floats = struct.Struct("<ff").unpack_from
 
 
@@ -165,10 +166,10 @@ class OdriveCan:
                 self._has_sample = True
                 status = self._report.status
                 unheard_ns = now - min(self._heard_ns)
-                if status is not DriveStatus.LOST and unheard_ns > REBOOT_MS * NS_PER_MS:
+                if status is not _LOST and unheard_ns > REBOOT_MS * NS_PER_MS:
                     self._forget()
-                    status = DriveStatus.LOST
-                if status is not DriveStatus.ARMED and now < self._feed_until_ns:
+                    status = _LOST
+                if status is not _ARMED and now < self._feed_until_ns:
                     self._link.send(self._food)
                 return self._reading(status)
             if now >= deadline or not self._link.is_open:

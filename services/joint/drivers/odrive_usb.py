@@ -31,6 +31,7 @@ from services.joint.drivers.odrive_v3 import OdriveV3
 from shared import log
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState
+from shared.clamp import clamp
 from shared.clock import NS_PER_MS, machine_s, now_ns
 from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
@@ -162,7 +163,7 @@ class OdriveUsb:
             return
         limit = self._torque_max
         if max(map(abs, target.torque)) > limit:
-            first, second = (min(max(value, -limit), limit) for value in target.torque)
+            first, second = (clamp(value, -limit, limit) for value in target.torque)
             target = msgspec.structs.replace(target, torque=(first, second))
         self._target = target
         awaited = self._awaited
