@@ -27,9 +27,9 @@ class MotorFrame(NamedTuple):
 
     def from_drive(self, reading: DriveReading) -> DriveReading:
         """Return a reading in turns from the joint's zero; UNZEROED if the position is invalid."""
-        mark, torque = self.mark_turns, reading.torque
-        a, b = self._signed(reading.pos_turns)
-        a, b = a - mark, b - mark
+        mark, (sign_a, sign_b) = self
+        (a, b), (vel_a, vel_b), torque = reading.pos_turns, reading.vel_turns, reading.torque
+        a, b = a * sign_a - mark, b * sign_b - mark
         status, half = reading.status, 0.5 * mark
         zeroed = mark == 0.0 or (-half < a < half and -half < b < half)
         if not zeroed and status is not DriveStatus.LOST:
@@ -37,7 +37,7 @@ class MotorFrame(NamedTuple):
         return DriveReading(
             reading.t_ns,
             (a, b),
-            self._signed(reading.vel_turns),
+            (vel_a * sign_a, vel_b * sign_b),
             status,
             reading.error,
             None if torque is None else self._signed(torque),
@@ -45,10 +45,13 @@ class MotorFrame(NamedTuple):
 
     def target(self, target: MotorTarget) -> MotorTarget:
         """Return a target as the drive counts it."""
+        mark, (sign_a, sign_b) = self
+        (a, b), (vel_a, vel_b) = target.pos_turns, target.vel_turns
+        torque_a, torque_b = target.torque
         return MotorTarget(
-            self.position(target.pos_turns),
-            self._signed(target.vel_turns),
-            self._signed(target.torque),
+            ((a + mark) * sign_a, (b + mark) * sign_b),
+            (vel_a * sign_a, vel_b * sign_b),
+            (torque_a * sign_a, torque_b * sign_b),
             target.pos_gain,
             target.vel_gain,
         )
