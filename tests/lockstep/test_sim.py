@@ -9,8 +9,10 @@ import pytest
 
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
+from shared.clock import NS_PER_S
 from shared.robot.joints import MODULES
 from tools import cli
+from tools.runs import lockstep
 from tools.runs.run_log import read_run
 
 NOT_HERE = (topics.ATTITUDE, topics.OPERATOR_INTENT, topics.TOOLS)
@@ -93,8 +95,9 @@ def test_bad_input_is_one_clear_line(
 
 
 def test_a_stance_that_is_not_led_is_reported_in_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(lockstep, "READY_NS", 6 * NS_PER_S)
     far = ("--plant", "feet.offset_right=[0.2,0,0]")
     assert sim(tmp_path, "--duration", "1", *far) == 2
     output = capsys.readouterr().err

@@ -69,7 +69,7 @@ def test_beyond_the_limit_it_is_not_led_and_stands_in_hold(
     plant = with_foot(PlantConfig(), right)
     fleet = Lockstep(robot, variant("stand", duration=2.0), Impairment(delay_ms=1.0), plant=plant)
     row = None
-    for row, _ in zip(fleet.run(), range(1200), strict=False):
+    for row, _ in zip(fleet.run(), range(600), strict=False):
         assert not row.fallen
         assert row.scenario_s < 0.0, "the person is not asked to lead it"
     assert row is not None

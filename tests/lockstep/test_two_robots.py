@@ -8,6 +8,7 @@ from shared.config.scenarios import Scenario
 from shared.network.impairment import Impairment
 from tests.lockstep.runs import kill, restart, still
 from tools.runs.lockstep import Lockstep
+from tools.runs.standing_start import begin_standing
 
 CALM = still(1.5, height=1.1)
 HARD = still(1.5, height=1.0, kill=kill(0.4), restart=restart(0.9))
@@ -15,7 +16,9 @@ HARD = still(1.5, height=1.0, kill=kill(0.4), restart=restart(0.9))
 
 def fleet(robot: RobotConfig, scenario: Scenario, seed: int) -> Lockstep:
     network = Impairment(delay_ms=2.0, jitter_ms=1.0, loss=0.01)
-    return Lockstep(robot, scenario, network, seed=seed)
+    made = Lockstep(robot, scenario, network, seed=seed)
+    assert begin_standing(made)
+    return made
 
 
 def test_two_robots_side_by_side_run_as_each_alone_to_the_last_bit(robot: RobotConfig) -> None:

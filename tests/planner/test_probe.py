@@ -18,6 +18,7 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Scenario
+from tools.runs.standing_start import begin_standing
 from tools.tune.excitation import Excitation, SinePart
 from tools.tune.pose_probe import DIRECTIONS, ProbedLockstep, course_of
 
@@ -167,6 +168,7 @@ def test_the_largest_probe_of_each_direction_is_led_without_a_refused_command_or
 
     fleet = ProbedLockstep(robot, scenario, record=record, plant=PlantConfig())
     fleet.row, fleet.excitation = row, plan
+    assert begin_standing(fleet)
     assert not any(truth.fallen for truth in fleet.run())
     assert {status.trip for status in statuses} == {0}
     assert not any(status.hold for status in statuses)
@@ -196,6 +198,7 @@ def test_a_hand_that_moves_a_probed_height_meets_no_refused_command(robot: Robot
 
     fleet = ProbedLockstep(robot, scenario, record=record, plant=PlantConfig())
     fleet.row, fleet.excitation = 2, plan
+    assert begin_standing(fleet)
     assert not any(truth.fallen for truth in fleet.run())
     assert set(refused.values()) == {0}
     assert trips == {0}

@@ -31,6 +31,7 @@ from shared.robot.joints import MODULES
 from tools.bench.timing import Repeated
 from tools.runs.lockstep import Lockstep, forget
 from tools.runs.recorded_lockstep import DRAIN_EVERY, Outbox
+from tools.runs.standing_start import begin_standing
 
 SECONDS: Final = 3.0
 """Recorded of the squat: on the way down and up."""
@@ -79,7 +80,7 @@ def record(robot: RobotConfig, scenario: Scenario) -> Recorded:
     joint = fleet.joints[MODULES.index(MODULE)]
     kept = _KeptManager(robot, MODULE)
     joint.manager = kept
-    started = False
+    started = begin_standing(fleet)
     for truth in fleet.run():
         if not started and truth.scenario_s >= 0.0:
             started = True
@@ -256,6 +257,7 @@ class LockstepRun:
         self._outbox = Outbox(self._robot.name)
         record = self._outbox.put if self._recorded else forget
         self._fleet = Lockstep(self._robot, self._scenario, record=record)
+        begin_standing(self._fleet)
         self._run = self._fleet.run()
         for truth in self._run:
             if truth.scenario_s >= 0.0:

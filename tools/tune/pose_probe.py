@@ -25,6 +25,7 @@ from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
 from tools.fleet.led_planner import LedPlanner
 from tools.runs.lockstep import Lockstep
+from tools.runs.standing_start import begin_standing
 from tools.tune.excitation import Excitation
 
 Array = NDArray[np.float64]
@@ -105,6 +106,7 @@ def in_lockstep(
 
     fleet = ProbedLockstep(robot, scenario, record=record, plant=plant)
     fleet.row, fleet.excitation = row, excitation
+    begin_standing(fleet)
     for truth in fleet.run():
         progress(max(0.0, truth.scenario_s))
         if truth.fallen:
