@@ -180,8 +180,8 @@ def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
 
 # ---- the network alone: the network proxy between two sessions, against the object that decides
 
-LATE, NEAR = "knee_left", "knee_right"
-"""The proxy impairs the first of two links; a stall of the machine meets both."""
+NEAR = "hip_right"
+"""Nothing is done to this module's link; a stall of the machine meets it too."""
 COUNT = 800
 PERIOD_S = 0.004
 PATIENCE_S = 20.0
@@ -202,8 +202,12 @@ JITTERS = {
 }
 
 
+LATE = dict(zip(JITTERS, (name for name in MODULES if name != NEAR), strict=False))
+"""The module whose link the proxy makes late in this way; all of them at the same time."""
+
+
 class Wire:
-    """Two joint services' sessions, a planner's that dials them through the network proxy."""
+    """Joint services' sessions, a planner's that dials them through the network proxy."""
 
     def __init__(self, run_dir: Path, planner: Session, modules: dict[str, Session]) -> None:
         self.client = ProxyClient(run_dir)
@@ -254,7 +258,7 @@ def wire() -> Iterator[Wire]:
         stack.callback(proxy.kill)
         modules = {
             module: stack.enter_context(open_session(ROBOT, module, run_dir))
-            for module in (LATE, NEAR)
+            for module in (*LATE.values(), NEAR)
         }
         planner = stack.enter_context(open_session(ROBOT, "planner", run_dir, injected=True))
         made = Wire(run_dir, planner, modules)
@@ -262,6 +266,11 @@ def wire() -> Iterator[Wire]:
         while not ((run_dir / SOCKET).exists() and all(made.came_ms.values())):
             assert time.monotonic() < deadline, "the links did not come up"
             made.send(1)
+        for name, what in JITTERS.items():
+            link = f"{LATE[name]}->planner"
+            made.client.begin(Inject(link=link, at=0.0, **msgspec.to_builtins(what)))
+        made.send(COUNT)
+        made.client.clear("all")
         yield made
 
 
@@ -281,10 +290,7 @@ def modelled(what: Impairment, seed: int, sent_ns: list[int]) -> list[float]:
 def test_on_the_wire_messages_are_as_late_as_in_the_modelled_network(name: str, wire: Wire) -> None:
     """Quantiles of many messages, relative to a link beside it to which nothing is done."""
     what = JITTERS[name]
-    wire.client.begin(Inject(link=f"{LATE}->planner", at=0.0, **msgspec.to_builtins(what)))
-    wire.send(COUNT)
-    wire.client.clear("all")
-    late, near = np.array(wire.came_ms[LATE]), np.array(wire.came_ms[NEAR])
+    late, near = np.array(wire.came_ms[LATE[name]]), np.array(wire.came_ms[NEAR])
     assert len(near) > 0.9 * COUNT, "nothing is done to this link"
     wanted = [modelled(what, seed, wire.sent_ns) for seed in range(MODELLED)]
     pooled = np.concatenate(wanted)

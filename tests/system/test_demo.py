@@ -118,23 +118,3 @@ def test_an_interrupted_demo_leaves_nothing_behind(tmp_path: Path) -> None:
     process.stdout.close()
     assert set(fleet_processes()) <= before
     assert set(Path("/tmp").glob("xrl-demo-*")) <= folders
-
-
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (("--scenario", "flight"), "no scenario 'flight'"),
-        (("--kill", "plannner@3"), "services:"),
-        (("--kill", "planner@3:BLINK"), "signals:"),
-        (("--kill", "planner@30"), "not inside the run"),
-        (("--restart", "planner@3"), "kill it first"),
-        (("--push", "1:2:3"), "START:DURATION:FX,FY,FZ"),
-        (("--duration", "0"), "more than 0"),
-        (("--config", "no_such.toml"), "not found"),
-    ],
-)
-def test_bad_input_is_one_clear_line(tmp_path: Path, flags: tuple[str, ...], words: str) -> None:
-    result = demo(tmp_path / "out", *flags)
-    assert result.returncode == 2
-    assert words in result.stderr
-    assert "Traceback" not in result.stderr
