@@ -21,6 +21,7 @@ from tools.analysis.reexecution.outcome import ReexecutionResult
 from tools.runs.run_log import RunLog
 
 _encode: Final = msgspec.json.Encoder().encode
+_STATUS: Final = {int(status): status for status in DriveStatus}
 
 
 class JointExecution:
@@ -95,10 +96,9 @@ class JointExecution:
         step = module.step(c.now_ns, _reading(c), command, c.estop, near)
         controller = module.controller
         outcome.ticks += 1
-        computed = msgspec.structs.replace(
-            cycle, drive_command=step.command.value, tau=controller.tau
-        )
-        if computed != cycle:
+        drive_command, tau = step.command.value, controller.tau
+        if drive_command != cycle.drive_command or tau != cycle.tau:
+            computed = msgspec.structs.replace(cycle, drive_command=drive_command, tau=tau)
             self._compare("trace", controller.cycle, _single(cycle), _single(computed))
         if controller.is_state_due:
             state = controller.state(c.now_ns)
@@ -129,7 +129,7 @@ def _reading(c: CycleTrace) -> DriveReading | None:
         c.sampled_ns,
         c.pos,
         c.vel,
-        DriveStatus(c.status),
+        _STATUS[c.status],
         c.error,
         c.carried if c.carries else None,
     )
