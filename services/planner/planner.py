@@ -271,7 +271,8 @@ class Planner:
         self, now_ns: int, states: Sequence[JointState], output: LawOutput
     ) -> list[JointCommand]:
         """Return the tick's six commands; each echoes the stamp of its module's state."""
-        local, hold = output.local, self._hold()
+        local, hold, support = output.local, self._hold(), self._support
+        margins = local.margins
         arrays = (
             output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled,
             local.D, local.D_B,
@@ -295,9 +296,9 @@ class Planner:
                 tau_coupled=tau_coupled,
                 k_p=k_p,
                 k_d=k_d,
-                margin=local.margins.service,
-                margin_onboard=local.margins.onboard,
-                stiffen=self._support.includes(module),
+                margin=margins.service,
+                margin_onboard=margins.onboard,
+                stiffen=support.includes(module),
                 state_phase=phase,
             )
             commands.append(command)

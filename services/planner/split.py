@@ -69,12 +69,9 @@ class ScheduledGains:
         """Return D (12,), N m/rad, at a COM height (m) and a torso pitch (rad)."""
         i, a = _interval(self._z, z)
         j, b = _interval(self._pitch, pitch)
-        low, high = self._table[i], self._table[i + 1]
-        return np.asarray(
-            (1.0 - a) * ((1.0 - b) * low[j] + b * low[j + 1])
-            + a * ((1.0 - b) * high[j] + b * high[j + 1]),
-            float,
-        )
+        shares = np.array(((1.0 - a) * (1.0 - b), (1.0 - a) * b, a * (1.0 - b), a * b))
+        D: Array = shares @ self._table[i : i + 2, j : j + 2].reshape(4, N_JOINTS)
+        return D
 
 
 def _interval(nodes: tuple[float, ...], value: float) -> tuple[int, float]:
