@@ -356,3 +356,14 @@ def test_no_two_classes_have_the_same_name() -> None:
                 if isinstance(node, ast.ClassDef):
                     found.setdefault(node.name, set()).add(str(path.relative_to(ROOT)))
     assert {name: files for name, files in found.items() if len(files) > 1} == {}
+
+
+def test_what_leads_a_live_fleet_is_where_the_script_looks_for_it() -> None:
+    """`deploy/test` runs the live tests of one folder."""
+    marked = [
+        path.relative_to(ROOT)
+        for path in sorted(ROOT.glob("tests/**/*.py"))
+        if "pytest.mark.live" in path.read_text(encoding="utf-8") and path != Path(__file__)
+    ]
+    assert marked
+    assert {path.parent.as_posix() for path in marked} == {"tests/system"}
