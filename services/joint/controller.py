@@ -26,7 +26,7 @@ from shared.bus.messages import Cause, JointCommand, JointEvent, JointState, Mod
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 
-# Each cycle compares these; see services.joint.failsafe.
+# Compared in each cycle: docs/contributing.md, The control path.
 _DISARMED, _TRACK, _FAULT = Mode.DISARMED, Mode.TRACK, Mode.FAULT
 _NONE: Final = Event.NONE
 

@@ -78,7 +78,7 @@ _NO_TORQUE: Pair = (0.0, 0.0)
 _MAY_HOLD: Final = (DriveStatus.LOST, DriveStatus.HOLDING, DriveStatus.ARMED)
 _UNCONTROLLED: Final = (Mode.DISARMED, Mode.FAULT)
 
-# Each cycle compares these; see services.joint.failsafe.
+# Compared in each cycle: docs/contributing.md, The control path.
 _DISARMED, _HOLD, _DAMP, _FAULT = Mode.DISARMED, Mode.HOLD, Mode.DAMP, Mode.FAULT
 _ARMED: Final = DriveStatus.ARMED
 _NO_COMMAND, _TORQUE, _TARGET = DriveCommand.NOTHING, DriveCommand.TORQUE, DriveCommand.TARGET

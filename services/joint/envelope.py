@@ -23,10 +23,10 @@ from shared.robot.joints import kind_of
 
 ROUNDING = 0.02
 """Share of a gain that is allowed beyond: the schedule interpolates between rounded nodes."""
-_INSIDE: Final = Outside.NOTHING  # of nearly every command; see services.joint.failsafe
 GAP_TICKS = 4
 """The step that is allowed grows with the time between commands no longer than so: a wrong torque
 that is refused again and again would be within it in the end."""
+_INSIDE: Final = Outside.NOTHING  # returned in each cycle: docs/contributing.md
 
 
 class Envelope:

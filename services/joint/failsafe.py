@@ -116,7 +116,7 @@ TICKS_PER_S_MAX: Final = 2000
 REFUSED_SHOWN_NS: Final = NS_PER_S
 """How long the cause of the newest refusal is reported."""
 
-# Each cycle compares these. Python 3.11 finds a member by its class in 53 ns, by a name in 6.
+# Compared in each cycle: docs/contributing.md, The control path.
 _DISARMED, _HOLD, _TRACK = Mode.DISARMED, Mode.HOLD, Mode.TRACK
 _ESTOP, _DRIVE_ARMED, _STALE = Event.ESTOP, Event.DRIVE_ARMED, Event.COMMAND_STALE
 _HOLD_REQUESTED, _READY, _NONE = Event.HOLD_REQUESTED, Event.READY, Event.NONE

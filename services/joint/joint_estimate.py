@@ -26,7 +26,7 @@ in free fall gains 8."""
 REJECTED_MAX: Final = 3
 """Number of rejected samples in a row after which the position is lost."""
 
-# Each cycle compares these. Python 3.11 finds a member by its class in 53 ns, by a name in 6.
+# Compared in each cycle: docs/contributing.md, The control path.
 _NONE, _DRIVE_ARMED = Event.NONE, Event.DRIVE_ARMED
 _DRIVE_LOST, _POSITION_LOST = Event.DRIVE_LOST, Event.POSITION_LOST
 _EVENT: Final = {

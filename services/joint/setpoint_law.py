@@ -17,7 +17,8 @@ from shared.bus.messages import JointCommand, Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 
-_HOLD, _TRACK, _DAMP = Mode.HOLD, Mode.TRACK, Mode.DAMP  # see services.joint.failsafe
+# Compared in each cycle: docs/contributing.md, The control path.
+_HOLD, _TRACK, _DAMP = Mode.HOLD, Mode.TRACK, Mode.DAMP
 
 
 class SetpointState(msgspec.Struct, frozen=True, kw_only=True):

@@ -30,7 +30,7 @@ SHAKE_ABOVE_HZ: Final = 8.0
 SHAKE_S: Final = 0.1
 AT_LIMIT: Final = 0.995
 """Share of the torque diamond: a motor there gives all it has."""
-_NONE: Final = Event.NONE  # of each cycle; see services.joint.failsafe
+_NONE: Final = Event.NONE  # returned in each cycle: docs/contributing.md
 
 
 class TripLimits(msgspec.Struct, frozen=True):

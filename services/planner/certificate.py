@@ -65,9 +65,10 @@ def motor_mean(D: Array) -> Array:
 
 
 def stiffness_graph() -> ca.Function:
-    """Return the graph (T, H, D, scale) -> K_fail of both tiers, scaled; K_fail of tier 2.
+    """Return the graph (T, H, D, scale) -> K_fail scaled (6, 12), K_fail (6, 6).
 
-    The first result (6, 12) holds both side by side; the second (6, 6) is in N/m and N m/rad.
+    Columns 0 to 5 of the first are tier 2, where D holds, and 6 to 11 tier 3, where its mean by
+    module holds. The second is that of tier 2 in N/m, N/rad and N m/rad.
     """
     T, H = ca.MX.sym("T", N_JOINTS, 6), ca.MX.sym("H", N_JOINTS, N_JOINTS)
     D, scale = ca.MX.sym("D", N_JOINTS), ca.MX.sym("scale", 6)

@@ -19,7 +19,7 @@ from shared.robot.limp_leg_support import SUPPORT_FOR, Support
 DISARMED_NS: Final = 200 * NS_PER_MS
 """ns; a module DISARMED for this long is not about to take its drive over."""
 
-# Each tick compares these, of six modules; see services.planner.engagement_fsm.
+# Compared in each tick, for six modules: docs/contributing.md, The control path.
 _DISARMED, _FAULT, _HOLDING = Mode.DISARMED, Mode.FAULT, DriveStatus.HOLDING
 
 

@@ -53,7 +53,7 @@ TICK_GAP_MAX_S = 0.02
 """A longer gap between ticks (a stopped process) is not integrated over."""
 
 _ALL_NEW = (1 << N_MODULES) - 1
-# Each tick compares these; see services.planner.engagement_fsm.
+# Compared in each tick: docs/contributing.md, The control path.
 _CARRIES = (int(Mode.HOLD), int(Mode.TRACK))
 _WAITING, _UNCERTIFIED = PlannerMode.WAITING, SplitSource.UNCERTIFIED
 

@@ -35,7 +35,7 @@ class Support(IntEnum):
 
     def includes(self, module: str) -> bool:
         """Return True if this module stiffens."""
-        if not self:  # as in nearly every tick
+        if not self:  # the usual case
             return False
         return self is Support.ALL or kind_of(module) == "knee"
 

@@ -229,3 +229,16 @@ def test_the_worst_pose_of_the_design_falls_forward_and_a_stiff_one_stands(
         D[[1, 7]] = ankle
         verdicts.append(certificate.margins(D).service)
     assert verdicts[0] < 0.0 < verdicts[1]
+
+
+def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(
+    robot: RobotConfig,
+) -> None:
+    certificate, rng = Certificate(robot), np.random.default_rng(3)
+    certificate.at(rng.normal(size=(12, 6)), np.zeros((12, 12)))
+    soft, stiff = rng.uniform(100.0, 200.0, 12), rng.uniform(1000.0, 2000.0, 12)
+    found = certificate.failsafe_stiffness(soft)
+    kept = found.copy()
+    certificate.margins(stiff)
+    np.testing.assert_array_equal(found, kept)
+    np.testing.assert_array_equal(certificate.failsafe_stiffness(soft), kept)

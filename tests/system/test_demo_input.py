@@ -10,6 +10,8 @@ import pytest
 
 pytestmark = pytest.mark.system
 
+ROOT = Path(__file__).resolve().parents[2]
+
 
 @pytest.mark.parametrize(
     ("flags", "words"),
@@ -26,7 +28,9 @@ pytestmark = pytest.mark.system
 )
 def test_bad_input_is_one_clear_line(tmp_path: Path, flags: tuple[str, ...], words: str) -> None:
     command = [sys.executable, "-m", "tools.cli", "demo", "--out", str(tmp_path / "out"), *flags]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    result = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False
+    )
     assert result.returncode == 2
     assert words in result.stderr
     assert "Traceback" not in result.stderr

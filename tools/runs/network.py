@@ -50,7 +50,7 @@ class VirtualLink(Generic[M]):
     def put(self, now_ns: int, message: M) -> None:
         """Send."""
         self._sent += 1
-        if self.direction.active is None and now_ns >= self._stream_ns:  # as nearly always
+        if self.direction.active is None and now_ns >= self._stream_ns:  # the usual case
             self._enter(now_ns, self._sent, message)
             return
         for release_ns in self.direction.passes(now_ns, self._size(message)):

@@ -14,7 +14,7 @@ from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.clock import NS_PER_S
 from shared.config.sections import DriveConfig
 
-# Each cycle compares these; see services.joint.failsafe.
+# Compared in each cycle: docs/contributing.md, The control path.
 _NOTHING, _TORQUE = DriveCommand.NOTHING, DriveCommand.TORQUE
 _LOST, _IDLE, _ARMED = DriveStatus.LOST, DriveStatus.IDLE, DriveStatus.ARMED
 _CLOSED_LOOP: Final = AxisState.CLOSED_LOOP_CONTROL

@@ -52,7 +52,8 @@ LOST_MS: Final = 100
 CLOSE_MS: Final = 20
 """Time for which a command that the bus had no room for may hold up `close`."""
 
-_LOST, _ARMED = DriveStatus.LOST, DriveStatus.ARMED  # of each cycle; see services.joint.failsafe
+# Compared in each cycle: docs/contributing.md, The control path.
+_LOST, _ARMED = DriveStatus.LOST, DriveStatus.ARMED
 _unpack_two_floats = struct.Struct("<ff").unpack_from
 
 

@@ -15,6 +15,7 @@ from shared.bus import topics
 from shared.bus.messages import DriveStatus, JointCommand, JointState, Message
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
 from tools.analysis.reexecution.compare import Comparison
 from tools.analysis.reexecution.memory import memory_of
 from tools.analysis.reexecution.outcome import ReexecutionResult
@@ -122,14 +123,24 @@ def _single(cycle: CycleTrace) -> JointTrace:
 
 
 def _reading(c: CycleTrace) -> DriveReading | None:
-    """Return the drive's sample of a cycle."""
+    """Return the drive's sample of a cycle.
+
+    Raises:
+        RunError: it has a status that there is not.
+    """
     if c.sampled_ns < 0:
         return None
+    status = _STATUS.get(c.status)
+    if status is None:
+        raise RunError(
+            f"trace of the cycle at {c.now_ns} ns: drive status {c.status}; there are 0 to "
+            f"{max(_STATUS)}: the record is damaged, or of a later version"
+        )
     return DriveReading(
         c.sampled_ns,
         c.pos,
         c.vel,
-        _STATUS[c.status],
+        status,
         c.error,
         c.carried if c.carries else None,
     )
