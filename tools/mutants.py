@@ -51,6 +51,8 @@ class Group(Section, frozen=True):
     name: str
     modules: tuple[str, ...]
     tests: tuple[str, ...]
+    without: tuple[str, ...] = ()
+    """Folders in these whose tests are about other modules."""
 
 
 class Mutation(Section, frozen=True, order=True):
@@ -166,6 +168,7 @@ def _prepare(group: Group, folder: Path) -> None:
         "also_copy": ["tools", "deploy", "docs", "README.md"],
         "pytest_add_cli_args": [
             "-m", "not system", "-p", "no:cacheprovider", "--hypothesis-profile", "mutants",
+            *(f"--ignore={folder}" for folder in group.without),
         ],
         "pytest_add_cli_args_test_selection": list(group.tests),
         "timeout_multiplier": 8.0,
