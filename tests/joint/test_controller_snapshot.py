@@ -59,6 +59,8 @@ def test_a_snapshot_shares_nothing_with_the_controller_that_it_was_taken_from(be
     snapshot = bench.controller.snapshot()
     before = msgspec.msgpack.encode(snapshot)
     bench.run(3, fresh=True)
+    bench.run(60)
+    assert bench.controller.failsafe.dropouts.count == 1
     assert msgspec.msgpack.encode(snapshot) == before
 
 

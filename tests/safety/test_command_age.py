@@ -254,6 +254,11 @@ def test_a_number_far_ahead_is_refused_and_the_right_ones_after_it_are_not(timin
     assert failsafe.offer(command(seq=11), T0, timing) is Refusal.NONE
 
 
+def test_the_step_of_a_number_may_be_500_and_not_one_more(timing: Timing) -> None:
+    assert taken(timing, seq=10).offer(command(seq=510), T0, timing) is Refusal.NONE
+    assert taken(timing, seq=10).offer(command(seq=511), T0, timing) is Refusal.TOO_FAR_AHEAD
+
+
 @pytest.mark.parametrize("away_s", [0.0, 1.0, 60.0, 3600.0])
 def test_a_planner_that_was_not_heard_for_a_while_is_heard_again(
     timing: Timing, away_s: float
