@@ -109,8 +109,7 @@ class Certificate:
 
         Zero at angles at which the closed chain has no finite rates: nothing is certified there.
         """
-        self._D[:] = D
-        self._graph()
+        self._evaluate(D)
         K = self._K_scaled
         if not np.isfinite(K).all():
             return Margins(0.0, 0.0)
@@ -118,8 +117,7 @@ class Certificate:
 
     def weakest(self, D: Array) -> Weakest:
         """Return the weakest direction under local stiffnesses D (12,), N m/rad."""
-        self._D[:] = D
-        self._graph()
+        self._evaluate(D)
         values, vectors = np.linalg.eigh(self._K_scaled[:, :6])
         u = vectors[:, 0]
         index = int(np.abs(u).argmax())
@@ -135,6 +133,10 @@ class Certificate:
 
     def failsafe_stiffness(self, D: Array) -> Array:
         """Return K_fail (6, 6) of local stiffnesses D (12,): N/m, N/rad and N m/rad."""
+        self._evaluate(D)
+        return self._K_fail.copy()
+
+    def _evaluate(self, D: Array) -> None:
+        """Compute `_K_scaled` and `_K_fail` of local stiffnesses D (12,), N m/rad."""
         self._D[:] = D
         self._graph()
-        return self._K_fail.copy()

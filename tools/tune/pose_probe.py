@@ -106,7 +106,7 @@ def in_lockstep(
 
     fleet = ProbedLockstep(robot, scenario, record=record, plant=plant)
     fleet.row, fleet.excitation = row, excitation
-    begin_standing(fleet)
+    begin_standing(fleet)  # or on the hoist, where it is never led: that is told below
     for truth in fleet.run():
         progress(max(0.0, truth.scenario_s))
         if truth.fallen:
