@@ -22,6 +22,9 @@ from types import TracebackType
 from typing import Final, Self
 
 _SUBNET: Final = "10.0.0"
+_ENDING_S: Final = 10.0
+"""A process that holds a namespace and is still there so long after its input's end hangs."""
+
 _NONLOCAL_BIND: Final = Path("/proc/sys/net/ipv4/ip_nonlocal_bind")
 
 _ISOLATIONS: Final = (("unshare", "--net"), ("unshare", "--user", "--map-root-user", "--net"))
@@ -145,6 +148,11 @@ def _held(*command: str) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.stdin.close()
+            try:
+                process.wait(_ENDING_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                raise
 
 
 def _path(pid: int) -> str:

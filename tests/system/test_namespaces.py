@@ -53,7 +53,8 @@ import sys, time
 from tests.system.namespaces import Network
 with Network(("one", "two")) as network:
     print(*network.namespaces(), flush=True)
-    time.sleep(600)
+    while True:
+        time.sleep(0.1)  # a signal that comes just before a sleep begins is seen after it
 """
 
 
@@ -80,7 +81,7 @@ def start(*arguments: str, **options: object) -> subprocess.Popen[str]:
     words, refusal = isolation()
     if refusal:
         pytest.skip(refusal)
-    command = [*words, sys.executable, *arguments]
+    command = [*words, sys.executable, "-X", "faulthandler", *arguments]
     # a session of its own: Ctrl-C reaches this process alone, which then ends the other
     return subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -155,7 +156,16 @@ def lead_in_a_process(out: Path, run_dir: Path) -> Ended:
         return Ended(leader.returncode, output)
     finally:
         leader.terminate()
-        leader.wait(ENDING_S)
+        wait_for_end(leader)
+
+
+def wait_for_end(process: subprocess.Popen[str]) -> None:
+    """Wait until a process has ended; fail with where it is in its program if it does not."""
+    try:
+        process.wait(ENDING_S)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGABRT)  # Python's fault handler then tells
+        pytest.fail(f"{process.args} has not ended: {process.communicate()[0]}")
 
 
 def spans(led: Led) -> list[tuple[Cut, int]]:
@@ -315,7 +325,7 @@ def test_namespaces_end_with_the_process_that_made_them(number: signal.Signals) 
         assert len(processes_in(namespaces)) == len(namespaces) == 3, namespaces
     finally:
         process.send_signal(number)
-        process.wait(ENDING_S)
+        wait_for_end(process)
         process.stdout.close()
     assert wait_until_empty(namespaces) == set()
     assert interfaces() == before
