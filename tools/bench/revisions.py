@@ -59,11 +59,17 @@ def unpacked(revision: str) -> Iterator[Path]:
         )
         if (tree / "tools/graph_libraries.py").is_file():
             command = [sys.executable, "-m", "tools.graph_libraries"]
-            subprocess.run(command, cwd=tree, env=_environment(tree), check=False)
+            subprocess.run(command, cwd=tree, env=environment(tree), check=False)
         yield tree
 
 
-def _environment(tree: Path) -> dict[str, str]:
+def its_config(config: Path, tree: Path) -> Path:
+    """Return the robot file for another tree: its own version of one that lies in this checkout."""
+    return tree / config.relative_to(CHECKOUT) if config.is_relative_to(CHECKOUT) else config
+
+
+def environment(tree: Path) -> dict[str, str]:
+    """Return the environment in which processes import from a source tree."""
     return os.environ | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
 
 
@@ -81,7 +87,7 @@ class Worker:
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed in __exit__
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tools.bench.worker", str(config)],
-            cwd=tree, env=_environment(tree), text=True,
+            cwd=tree, env=environment(tree), text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
         )  # fmt: skip
 

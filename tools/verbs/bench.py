@@ -1,4 +1,4 @@
-"""`xrl bench`: what each part of the fleet costs here, and its bus beside other transports.
+"""`xrl bench`: what each part of the fleet costs here; its bus and the whole fleet are beside it.
 
 Absolute times of a busy machine say little. Two versions are compared by `--against`, which runs
 both in turn, or by the ratio of each figure to a yardstick that ran beside it.
@@ -18,23 +18,20 @@ from rich.progress import track
 from rich.table import Table
 
 from shared.config import files as config_file
-from shared.exceptions import RunError
 from shared.process import CHECKOUT
 from shared.robot import gain_schedule
-from tools.bench import bus, revisions, table
+from tools.bench import bus_command, fleet_command, revisions, table
 from tools.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
-from tools.bench.revisions import Worker
+from tools.bench.revisions import Worker, its_config
 from tools.bench.table import Row
 from tools.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
-from tools.bench.transports.base import TRANSPORTS, installed
 from tools.bench.worker import READY, Request
-from tools.number_arguments import count, finite
+from tools.number_arguments import count
 from tools.verb_table import Subparsers, add_config, add_verb
 
 WARM_CALLS: Final = 200
 COLD_CALLS: Final = 60
 ROUNDS: Final = 9
-BUS_ROUNDS: Final = 3
 """Calls of a turn: a few tenths of a second."""
 SPEEDS: Final = {LOCKSTEP: 10.0, LOCKSTEP_RECORDED: 7.0}
 """Targets of docs/results.md#targets, times real time."""
@@ -50,6 +47,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl bench --against HEAD~1
         xrl bench --rounds 25 --json bench.json
         xrl bench bus                                # the bus beside other transports
+        xrl bench fleet --against HEAD~1             # the whole fleet, live
         """,
     )
     parser.set_defaults(bench=run_parts)
@@ -61,91 +59,22 @@ def add_parser(subparsers: Subparsers) -> None:
         "in this environment",
     )
     parser.add_argument(
-        "--rounds", type=count, metavar="N", help="turns of every measurement (9; of a transport 3)"
+        "--rounds",
+        type=count,
+        metavar="N",
+        help="turns of every measurement (9; of bus and fleet 3)",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
     parser.add_argument("--strict", action="store_true", help="exit 1 if a target is missed")
     others = parser.add_subparsers(metavar="WHAT", title="something else to measure")
-    bus_parser = others.add_parser(
-        "bus",
-        help="the fleet's pattern of messages over Zenoh and over other transports",
-        description="Run six modules at 500 Hz and a planner at 250 Hz, as processes that only "
-        "send and receive, over each transport that is installed. Those beyond Zenoh and "
-        "datagrams come with `pip install -e '.[bench]'`.",
-        epilog="examples:\n  xrl bench bus\n"
-        "  xrl bench bus --transport zenoh --transport datagrams --seconds 30",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    bus_parser.add_argument(
-        "--transport",
-        action="append",
-        choices=[row.name for row in TRANSPORTS],
-        help="one of them; repeat it for several (default: all that are installed)",
-    )
-    bus_parser.add_argument(
-        "--seconds", type=finite, default=10.0, metavar="S", help="of each run, s (10)"
-    )
-    bus_parser.add_argument(
-        "--rounds",
-        type=count,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help="of every transport (3)",
-    )
-    bus_parser.add_argument(
-        "--json",
-        type=Path,
-        default=argparse.SUPPRESS,
-        metavar="FILE",
-        help="write the figures there too",
-    )
-    bus_parser.set_defaults(bench=run_bus)
+    bus_command.add_parser(others)
+    fleet_command.add_parser(others)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
     code: int = args.bench(args)
     return code
-
-
-def run_bus(args: argparse.Namespace) -> int:
-    """Measure the transports in turn and print their medians."""
-    if not args.seconds > 0.0:
-        raise RunError(f"--seconds {args.seconds:g}: above 0")
-    present = installed()
-    names = args.transport or list(present)
-    for name in names:
-        if name not in present:
-            raise RunError(f"{name} is not installed; `pip install -e '.[bench]'` does it")
-    console = Console()
-    rounds = [
-        [bus.measure(name, args.seconds) for name in names]
-        for _ in track(
-            range(args.rounds or BUS_ROUNDS), "measuring", console=console, transient=True
-        )
-    ]
-    rows = [bus.median_of(column) for column in zip(*rounds, strict=True)]
-    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in ("", "p50", "p99", "p99.9", "missed", "lost", "CPU"):
-        shown.add_column(column, justify="right" if column else "left", no_wrap=True)
-    for row in rows:
-        shown.add_row(
-            row.transport,
-            *(f"{us * 1e-3:.2f} ms" for us in (row.p50_us, row.p99_us, row.p999_us)),
-            *(f"{100.0 * fraction:.2f} %" for fraction in (row.missed, row.lost)),
-            f"{100.0 * row.cpu:.0f} %",
-        )
-    console.print(shown)
-    console.print(
-        "From the planner's put to a module's cycle, every 2 ms; medians of the rounds. "
-        "Missed: a command came a cycle later than it could have. CPU: of all seven processes, in "
-        "percent of one core.",
-        style="dim",
-    )
-    if args.json is not None:
-        text = json.dumps([row._asdict() for row in rows], indent=2) + "\n"
-        args.json.write_text(text, encoding="utf-8")
-    return 0
 
 
 def run_parts(args: argparse.Namespace) -> int:
@@ -183,9 +112,7 @@ def measure(
         workers = [stack.enter_context(Worker(CHECKOUT, config))]
         if against is not None:
             other = stack.enter_context(revisions.unpacked(against))
-            inside = config.is_relative_to(CHECKOUT)
-            its_config = other / config.relative_to(CHECKOUT) if inside else config
-            workers.append(stack.enter_context(Worker(other, its_config)))
+            workers.append(stack.enter_context(Worker(other, its_config(config, other))))
         for worker in workers:  # the machine is then this measurement's alone
             worker.ask(READY)
         plan = [

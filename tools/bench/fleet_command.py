@@ -1,0 +1,133 @@
+"""`xrl bench fleet`: the whole fleet, led live; one revision beside another."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+from rich import box
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from shared.config import files as config_file
+from shared.process import CHECKOUT
+from shared.robot import gain_schedule
+from tools.bench import fleet
+from tools.bench.fleet import FleetRow, Turn
+from tools.bench.revisions import its_config, unpacked
+from tools.fleet.pace import check_pace
+from tools.number_arguments import count, finite
+from tools.runs.verdict_table import digits
+from tools.verb_table import Subparsers
+
+ROUNDS: Final = 3
+
+
+def add_parser(others: Subparsers) -> None:
+    """Add the command."""
+    parser = others.add_parser(
+        "fleet",
+        help="the whole fleet, led live through the paper's experiment",
+        description="Run `xrl demo`, half a minute a turn, and print what the fleet costs, how old "
+        "commands\nare when they are used, and what the hand meets. With --against another git "
+        "revision is\nrun in turn with this tree: a shared machine may be twice as slow from one "
+        "minute to the\nnext, so the ratio of two that ran side by side says more than a time.",
+        epilog="examples:\n  xrl bench fleet\n"
+        "  xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--against",
+        default=argparse.SUPPRESS,
+        metavar="REV",
+        help="run a git revision too, in turn with this tree",
+    )
+    parser.add_argument(
+        "--scenario",
+        default="squat",
+        metavar="NAME|FILE",
+        help="what happens, as of `xrl demo` (squat, the paper's Fig. 7)",
+    )
+    parser.add_argument(
+        "--pace",
+        type=finite,
+        default=1.0,
+        metavar="X",
+        help="clock rate of the fleet (1); it is not lowered on full cores, and the targets are "
+        "those of 1",
+    )
+    parser.add_argument(
+        "--rounds", type=count, default=argparse.SUPPRESS, metavar="N", help="turns (3)"
+    )
+    parser.add_argument(
+        "--json",
+        type=Path,
+        default=argparse.SUPPRESS,
+        metavar="FILE",
+        help="write the figures there too",
+    )
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help="exit 1 if a target is missed",
+    )
+    parser.set_defaults(bench=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Lead each tree in turn and print the medians; with --strict 1 if a target is missed."""
+    robot = config_file.load(args.config)
+    gain_schedule.require(robot, args.config)
+    check_pace(args.pace, simulated=True)
+    console = Console()
+    config = args.config.resolve()
+    turns: list[list[Turn]] = []
+    with ExitStack() as stack:
+        trees = [(CHECKOUT, config)]
+        if args.against is not None:
+            other = stack.enter_context(unpacked(args.against))
+            trees.append((other, its_config(config, other)))
+        runs = [tree for _ in range(args.rounds or ROUNDS) for tree in trees]
+        found = [
+            fleet.measure(tree, its, args.scenario, args.pace)
+            for tree, its in track(runs, "leading", console=console, transient=True)
+        ]
+        turns = [found[number :: len(trees)] for number in range(len(trees))]
+    rows = fleet.rows(turns[0], turns[1] if len(turns) > 1 else (), args.pace)
+    console.print(_table(rows, args.against))
+    console.print(
+        "Medians of the turns. CPU: in percent of one core. Late: later than two periods. "
+        "Age: of a command, from the module's state that it answers to the cycle that takes it.",
+        style="dim",
+    )
+    if args.json is not None:
+        text = json.dumps([row.as_dict() for row in rows], indent=2) + "\n"
+        args.json.write_text(text, encoding="utf-8")
+    return 1 if args.strict and not all(row.ok for row in rows) else 0
+
+
+def _table(rows: list[FleetRow], against: str | None) -> Table:
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    compared = ["least .. most"] if against is None else [against, "ratio"]
+    for column in ("", "here", *compared, "target"):
+        shown.add_column(column, justify="right" if column else "left", no_wrap=True)
+    for row in rows:
+        unit = row.figure.unit
+        cells = [row.figure.what, _number(row.value, unit)]
+        if against is None:
+            cells.append("" if row.spread is None else " .. ".join(map(digits, row.spread)))
+        else:
+            cells += [_number(row.other, unit), "" if row.ratio is None else f"{row.ratio:.2f}"]
+        mark = "[green]ok[/]" if row.ok else "[yellow]missed[/]"
+        cells.append("" if row.target is None else f"<= {row.target:g} {mark}")
+        shown.add_row(*cells)
+    return shown
+
+
+def _number(value: float | None, unit: str) -> str:
+    return "" if value is None else f"{digits(value)} {unit}"
