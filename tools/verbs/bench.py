@@ -135,13 +135,13 @@ def measure(
 
 def _table(rows: list[Row], against: str | None) -> Table:
     shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    compared = ["/ yard"] if against is None else [against, "ratio"]
-    for column in ("", "CPU", "wall", *compared, "target"):
+    compared = ["wall", "/ yard"] if against is None else [against, "ratio"]
+    for column in ("", "CPU", *compared, "target"):
         shown.add_column(column, justify="right" if column else "left", no_wrap=True)
     for row in rows:
-        cells = [row.what, f"{_number(row.value)} {row.unit}", _number(row.wall)]
+        cells = [row.what, f"{_number(row.value)} {row.unit}"]
         if against is None:
-            cells.append(_number(row.to_yardstick))
+            cells += [_number(row.wall), _number(row.to_yardstick)]
         else:
             cells += [_number(row.other), "" if row.ratio is None else f"{row.ratio:.2f}"]
         sign = ">=" if row.unit == "x" else "<="
