@@ -38,6 +38,10 @@ class Event(IntEnum):
     NONE = 11
 
 
+Q_REF_MAX: Final = 6.4
+"""Largest reference that is believed, rad: a little over a turn, no joint goes so far."""
+TAU_RATE_MAX: Final = 1e3
+"""Largest rate of the feedforward torque, N m/s for each N m of `Timing.tau_max`."""
 TRIPS: Final = (Event.SHAKING, Event.TORQUE_LIMIT, Event.TOO_FAST)
 """Trips that a module detects by itself while it tracks (`services.joint.trips`)."""
 
@@ -314,10 +318,10 @@ def within_limits(command: JointCommand, timing: Timing) -> bool:
             0.0 <= command.k_p[axis] <= timing.k_p_max
             and 0.0 <= command.k_d[axis] <= timing.k_d_max
             and abs(command.v_ref[axis]) <= timing.v_max
-            and abs(command.q_ref[axis]) <= 2.0 * 3.2
+            and abs(command.q_ref[axis]) <= Q_REF_MAX
             and abs(command.tau_ff[axis]) <= timing.tau_max
             and abs(command.tau_coupled[axis]) <= timing.tau_max
-            and abs(command.dtau_ff[axis]) <= 1e3 * timing.tau_max
+            and abs(command.dtau_ff[axis]) <= TAU_RATE_MAX * timing.tau_max
         ):
             return False
     return True
