@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-from pathlib import Path
 from typing import Final
 
 from rich import box
@@ -14,8 +12,9 @@ from rich.table import Table
 
 from shared.exceptions import RunError
 from tools.bench import bus
+from tools.bench.flags import add_flags, write_rows
 from tools.bench.transports.base import TRANSPORTS, installed
-from tools.number_arguments import count, finite
+from tools.number_arguments import finite
 from tools.verb_table import Subparsers
 
 ROUNDS: Final = 3
@@ -42,20 +41,7 @@ def add_parser(others: Subparsers) -> None:
     parser.add_argument(
         "--seconds", type=finite, default=10.0, metavar="S", help="of each run, s (10)"
     )
-    parser.add_argument(
-        "--rounds",
-        type=count,
-        default=argparse.SUPPRESS,
-        metavar="N",
-        help="of every transport (3)",
-    )
-    parser.add_argument(
-        "--json",
-        type=Path,
-        default=argparse.SUPPRESS,
-        metavar="FILE",
-        help="write the figures there too",
-    )
+    add_flags(parser, ROUNDS, nested=True)
     parser.set_defaults(bench=run)
 
 
@@ -91,7 +77,5 @@ def run(args: argparse.Namespace) -> int:
         "percent of one core.",
         style="dim",
     )
-    if args.json is not None:
-        text = json.dumps([row._asdict() for row in rows], indent=2) + "\n"
-        args.json.write_text(text, encoding="utf-8")
+    write_rows(args.json, [row._asdict() for row in rows])
     return 0

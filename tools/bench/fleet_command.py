@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Final
 
 from rich import box
@@ -17,10 +15,11 @@ from shared.config import files as config_file
 from shared.process import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import fleet
+from tools.bench.flags import add_flags, write_rows
 from tools.bench.fleet import FleetRow, Turn
 from tools.bench.revisions import its_config, unpacked
 from tools.fleet.pace import check_pace
-from tools.number_arguments import count, finite
+from tools.number_arguments import finite
 from tools.runs.verdict_table import digits
 from tools.verb_table import Subparsers
 
@@ -60,16 +59,7 @@ def add_parser(others: Subparsers) -> None:
         help="clock rate of the fleet (1); it is not lowered on full cores, and the targets are "
         "those of 1",
     )
-    parser.add_argument(
-        "--rounds", type=count, default=argparse.SUPPRESS, metavar="N", help="turns (3)"
-    )
-    parser.add_argument(
-        "--json",
-        type=Path,
-        default=argparse.SUPPRESS,
-        metavar="FILE",
-        help="write the figures there too",
-    )
+    add_flags(parser, ROUNDS, nested=True)
     parser.add_argument(
         "--strict",
         action="store_true",
@@ -105,9 +95,7 @@ def run(args: argparse.Namespace) -> int:
         "Age: of a command, from the module's state that it answers to the cycle that takes it.",
         style="dim",
     )
-    if args.json is not None:
-        text = json.dumps([row.as_dict() for row in rows], indent=2) + "\n"
-        args.json.write_text(text, encoding="utf-8")
+    write_rows(args.json, [row.as_dict() for row in rows])
     return 1 if args.strict and not all(row.ok for row in rows) else 0
 
 

@@ -7,7 +7,6 @@ both in turn, or by the ratio of each figure to a yardstick that ran beside it.
 from __future__ import annotations
 
 import argparse
-import json
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
@@ -21,12 +20,12 @@ from shared.config import files as config_file
 from shared.process import CHECKOUT
 from shared.robot import gain_schedule
 from tools.bench import bus_command, fleet_command, revisions, table
+from tools.bench.flags import add_flags, write_rows
 from tools.bench.parts import LOCKSTEP, LOCKSTEP_RECORDED, PARTS
 from tools.bench.revisions import Worker, its_config
 from tools.bench.table import Row
 from tools.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
 from tools.bench.worker import READY, Request
-from tools.number_arguments import count
 from tools.verb_table import Subparsers, add_config, add_verb
 
 WARM_CALLS: Final = 200
@@ -58,13 +57,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="measure a git revision too, in turn with this tree, and print the ratios; both run "
         "in this environment",
     )
-    parser.add_argument(
-        "--rounds",
-        type=count,
-        metavar="N",
-        help="turns of every measurement (9; of bus and fleet 3)",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
+    add_flags(parser, ROUNDS)
     parser.add_argument("--strict", action="store_true", help="exit 1 if a target is missed")
     others = parser.add_subparsers(metavar="WHAT", title="something else to measure")
     bus_command.add_parser(others)
@@ -91,9 +84,7 @@ def run_parts(args: argparse.Namespace) -> int:
         f"Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in NumPy.",
         style="dim",
     )
-    if args.json is not None:
-        text = json.dumps([row._asdict() for row in rows], indent=2) + "\n"
-        args.json.write_text(text, encoding="utf-8")
+    write_rows(args.json, [row._asdict() for row in rows])
     return 1 if args.strict and not all(row.ok for row in rows) else 0
 
 

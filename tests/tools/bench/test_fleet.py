@@ -120,7 +120,13 @@ except KeyboardInterrupt:
     assert (tree / "cleared").exists()
 
 
-@pytest.mark.parametrize("words", [("--pace", "3"), ("--against", "no-such"), ("--rounds", "0")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--pace", "3"), ("--against", "no-such"), ("--rounds", "0"),
+        ("--json", "/no-such-folder/fleet.json"), ("--json", "/"),
+    ],
+)  # fmt: skip
 def test_what_cannot_be_run_is_refused_before_a_fleet_starts(
     words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
