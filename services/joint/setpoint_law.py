@@ -108,7 +108,7 @@ class SetpointLaw:
             self.current = self._tracked(now_ns, failsafe.command, since_ns)
         elif mode is _DAMP:
             near = near._replace(stiffen=self._stiffened_ns > 0)
-            self.current = self.sinking.law(self._frozen, since_ns, q, near)
+            self.current = self.sinking.law(self._frozen, self.current, since_ns, q, near)
         else:
             self.current = self._held(since_ns)
             if self._stiffened_ns:

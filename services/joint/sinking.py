@@ -6,8 +6,9 @@ present angle when the other knee does not sink with it. A hip that knows the an
 knee holds the torso's attitude; a hip that does not know them damps, and the torso turns with the
 thighs (`services.joint.neighbours`).
 
-A module that must stiffen for a limp one stops sinking: it holds its position with all its stand
-gains and the load that it carries. A leg with a limp knee stands as a strut only on a stiff hip.
+A module that must stiffen for a limp one stops sinking: it holds its position with its support
+gains (`RobotConfig.support_gains`) and the load that it carries, feedforward or the spring of a
+stop. A leg with a limp knee stands as a strut only on a stiff hip.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class SinkingState(msgspec.Struct, frozen=True):
     stop: float | None = None
     """None: there is no stop (JSON has no infinity)."""
     upright: float | None = None
-    held: float | None = None
+    held: Setpoint | None = None
     below: float | None = None
     caught: bool = False
     doubt_ns: int = -1
@@ -52,7 +53,8 @@ class Sinking:
     Attributes:
         stop: where a knee is caught, rad; -inf: nowhere.
         upright: how the torso stood as it began, the leg's thetas together, rad; None: not known.
-        held: theta at which it stiffened for a limp module, rad; None: it has not.
+        held: the setpoint from which it stiffens for a limp module, at the angles that it had then,
+            its load as feedforward; None: it does not.
         held_ns: when it did, from the beginning on; -1: it has not.
         below: how ankle and knee had turned when that was known last, rad; None: never.
         caught: True if a knee does not sink any more for the others' sake.
@@ -74,7 +76,7 @@ class Sinking:
         self._stops = kind == "knee"
         self.stop = service.damp_knee_stop if kind == "knee" else -math.inf
         self.upright: float | None = None
-        self.held: float | None = None
+        self.held: Setpoint | None = None
         self.below: float | None = None
         self.caught = False
         self.doubt_ns = self.held_ns = -1
@@ -87,22 +89,28 @@ class Sinking:
         return pd_law.load_to_feedforward(setpoint, self._sinks, q)
 
     def law(
-        self, frozen_setpoint: Setpoint, since_ns: int, q: Pair, near: NeighbourView
+        self,
+        frozen_setpoint: Setpoint,
+        current: Setpoint,
+        since_ns: int,
+        q: Pair,
+        near: NeighbourView,
     ) -> Setpoint:
         """Return the local law.
 
         Args:
             frozen_setpoint: the setpoint that `begin` returned.
+            current: the setpoint in force until now.
             since_ns: time since then, ns.
             q: joint angles, rad.
             near: view of the other modules.
         """
         if near.stiffen and self.held is None:
-            self.held, self.held_ns = q[1], since_ns
+            self.held, self.held_ns = self._carried(current, q), since_ns
         if self.held is not None:
-            return self._stiffened(frozen_setpoint, since_ns, self.held)
+            return self._stiffened(self.held, since_ns - self.held_ns)
         holds = self._is_to_hold(since_ns, near)
-        sunk = self._sunk(frozen_setpoint, since_ns, since_ns)
+        sunk = self._sunk(frozen_setpoint, since_ns)
         if self._levels:
             return self._levelled(sunk, q[1], near, min(1.0, since_ns / self._blend_ns))
         if holds and self._stops and not self.caught:
@@ -111,21 +119,26 @@ class Sinking:
             return pd_law.add_stop(sunk, self.stop, self._k_p[1], self._k_d[1])
         return sunk
 
-    def _sunk(self, frozen_setpoint: Setpoint, since_ns: int, faded_ns: int) -> Setpoint:
-        """Return the law of sinking, with the load that is left after `faded_ns`."""
-        share = max(0.0, 1.0 - faded_ns / self._fade_ns)
+    def _sunk(self, frozen_setpoint: Setpoint, since_ns: int) -> Setpoint:
+        """Return the law of sinking."""
+        share = max(0.0, 1.0 - since_ns / self._fade_ns)
         risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
         held = pd_law.freeze(frozen_setpoint, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
         held = pd_law.raise_gains(held, self._k_p, self._k_d, 1.0 - share)
         return pd_law.damp(held, self._sinks, self._damp_k_d, share, risen)
 
-    def _stiffened(self, frozen_setpoint: Setpoint, since_ns: int, theta: float) -> Setpoint:
-        """Return the law of a module that holds at theta (rad), with the load it had then."""
-        sunk = self._sunk(frozen_setpoint, since_ns, self.held_ns)
-        q_ref = (sunk.q_ref[0], theta if self._sinks[1] else sunk.q_ref[1])
-        stands = msgspec.structs.replace(pd_law.stand(q_ref, *self._support), tau_ff=sunk.tau_ff)
-        risen = min(1.0, (since_ns - self.held_ns) / self._blend_ns)
-        return pd_law.blend(sunk, stands, risen)
+    def _carried(self, current: Setpoint, q: Pair) -> Setpoint:
+        """Return a setpoint with the same torque that holds the axes that sink where they are."""
+        carried = pd_law.load_to_feedforward(current, self._sinks, q)
+        theta = q[1] if self._sinks[1] else carried.q_ref[1]
+        return msgspec.structs.replace(carried, q_ref=(carried.q_ref[0], theta))
+
+    def _stiffened(self, held: Setpoint, after_ns: int) -> Setpoint:
+        """Return the law of a module that has held for `after_ns` with the load it had then."""
+        start = pd_law.freeze(held, max(0.0, 1.0 - after_ns / self._coupled_ramp_ns))
+        stands = pd_law.stand(held.q_ref, *self._support)
+        stands = msgspec.structs.replace(stands, tau_ff=held.tau_ff)
+        return pd_law.blend(start, stands, min(1.0, after_ns / self._blend_ns))
 
     def snapshot(self) -> SinkingState:
         """Return the state."""

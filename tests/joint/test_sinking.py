@@ -32,10 +32,10 @@ def begun(robot: RobotConfig, module: str, q: Pair = Q) -> tuple[Sinking, Setpoi
 def test_a_hip_holds_the_torso_as_it_stood_while_its_leg_folds(
     robot: RobotConfig, theta: float
 ) -> None:
-    sinking, frozen_setpoint = begun(robot, "hip_right")
-    sinking.law(frozen_setpoint, 0, Q, NeighbourView((0.3, 0.05)))
+    sinking, frozen = begun(robot, "hip_right")
+    sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.05)))
     assert sinking.upright == pytest.approx(0.3 - 0.4)
-    found = sinking.law(frozen_setpoint, LONG_NS, (0.02, theta), NeighbourView((0.32, 0.07)))
+    found = sinking.law(frozen, frozen, LONG_NS, (0.02, theta), NeighbourView((0.32, 0.07)))
     assert found.q_ref == pytest.approx((0.1, -0.42)), "0.02 rad farther back than it stood"
     assert found.v_ref == pytest.approx((0.0, -0.07))
     assert found.k_p[1] == robot.stand_gains("hip_right").k_p[1]
@@ -45,25 +45,25 @@ def test_a_hip_holds_the_torso_as_it_stood_while_its_leg_folds(
 def test_a_torso_that_is_far_off_is_brought_back_gently(
     robot: RobotConfig, below: float, clipped: float
 ) -> None:
-    sinking, frozen_setpoint = begun(robot, "hip_right")
-    sinking.law(frozen_setpoint, 0, Q, NeighbourView((0.3, 0.0)))
-    assert sinking.law(frozen_setpoint, LONG_NS, Q, NeighbourView((below, 0.0))).q_ref[
+    sinking, frozen = begun(robot, "hip_right")
+    sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.0)))
+    assert sinking.law(frozen, frozen, LONG_NS, Q, NeighbourView((below, 0.0))).q_ref[
         1
     ] == pytest.approx(clipped)
 
 
 def test_a_hip_levels_as_softly_as_its_stiffness_has_risen(robot: RobotConfig) -> None:
-    sinking, frozen_setpoint = begun(robot, "hip_left")
+    sinking, frozen = begun(robot, "hip_left")
     most = robot.stand_gains("hip_left").k_p[1]
     blend_ns = round(robot.joint_service.blend_ms * 1e6)
     for share in (0.0, 0.25, 1.0):
-        found = sinking.law(frozen_setpoint, round(share * blend_ns), Q, NeighbourView((0.3, 0.0)))
+        found = sinking.law(frozen, frozen, round(share * blend_ns), Q, NeighbourView((0.3, 0.0)))
         assert found.k_p[1] == pytest.approx(share * most)
 
 
 def test_a_hip_that_never_received_its_legs_states_damps(robot: RobotConfig) -> None:
-    sinking, frozen_setpoint = begun(robot, "hip_right")
-    found = sinking.law(frozen_setpoint, LONG_NS, Q, UNKNOWN)
+    sinking, frozen = begun(robot, "hip_right")
+    found = sinking.law(frozen, frozen, LONG_NS, Q, UNKNOWN)
     assert found.k_p[1] == 0.0
     assert found.k_d[1] == robot.joint_service.damp_k_d
     assert found.tau_ff[1] == 0.0
@@ -71,41 +71,57 @@ def test_a_hip_that_never_received_its_legs_states_damps(robot: RobotConfig) -> 
 
 
 def test_a_leg_without_fresh_states_is_taken_to_stay(robot: RobotConfig) -> None:
-    sinking, frozen_setpoint = begun(robot, "hip_right")
-    sinking.law(frozen_setpoint, 0, Q, NeighbourView((0.3, 0.05)))
-    sinking.law(frozen_setpoint, 1, Q, NeighbourView((0.35, 0.05)))
-    found = sinking.law(frozen_setpoint, LONG_NS, Q, UNKNOWN)
+    sinking, frozen = begun(robot, "hip_right")
+    sinking.law(frozen, frozen, 0, Q, NeighbourView((0.3, 0.05)))
+    sinking.law(frozen, frozen, 1, Q, NeighbourView((0.35, 0.05)))
+    found = sinking.law(frozen, frozen, LONG_NS, Q, UNKNOWN)
     assert found.q_ref[1] == pytest.approx(-0.45)
     assert found.v_ref[1] == 0.0
 
 
-@pytest.mark.parametrize("module", ["ankle_right", "knee_right", "hip_right"])
+BELOW_ITS_STOP = -2.6
+"""rad, of a knee."""
+PLACES = {
+    "ankle": ("ankle_right", -0.4, UNKNOWN),
+    "a knee that sinks": ("knee_right", -0.4, UNKNOWN),
+    "a knee at its stop": ("knee_right", BELOW_ITS_STOP, UNKNOWN),
+    "a knee that was caught": ("knee_right", -0.5, UNHEARD),
+    "a hip that damps": ("hip_right", -0.4, UNKNOWN),
+    "a hip that levels": ("hip_right", -0.45, NeighbourView((0.3, 0.2))),
+}
+"""A module on its way down: its theta, rad, and what it knows of its leg."""
+
+
+@pytest.mark.parametrize("when", [0.5, 2.0], ids=["while it fades", "when all has faded"])
+@pytest.mark.parametrize("place", PLACES)
 def test_for_a_limp_module_it_holds_where_it_is_with_the_load_it_has(
-    robot: RobotConfig, module: str
+    robot: RobotConfig, place: str, when: float
 ) -> None:
     """From then on, whatever it is told: a robot under load never softens by itself."""
-    sinking, frozen_setpoint = begun(robot, module)
-    half_ns = round(0.5 * robot.joint_service.damp_fade_s * NS_PER_S)
+    module, theta, near = PLACES[place]
+    sinking, frozen = begun(robot, module)
+    now_ns = round(when * robot.joint_service.damp_fade_s * NS_PER_S)
     blend_ns = round(robot.joint_service.blend_ms * 1e6)
-    before = sinking.law(frozen_setpoint, half_ns, Q, UNKNOWN)
-    limp = NeighbourView((0.3, 0.2), stiffen=True)
-    at_first = sinking.law(frozen_setpoint, half_ns, (0.02, -0.5), limp)
-    assert pd_law.torque(at_first, Q, pd_law.ZERO) == pytest.approx(
-        pd_law.torque(before, Q, pd_law.ZERO)
-    )
+    q = (0.02, theta)
+    before = frozen
+    for since_ns, at in ((0, Q), (DOUBT_NS, Q), (now_ns, q)):
+        before = sinking.law(frozen, before, since_ns, at, near)
+    limp = near._replace(stiffen=True)
+    current = sinking.law(frozen, before, now_ns, q, limp)
+    load = pd_law.torque(before, q, pd_law.ZERO)
+    assert pd_law.torque(current, q, pd_law.ZERO) == pytest.approx(load)
+    assert (current.k_p, current.k_d) == (before.k_p, before.k_d)
     k_p, k_d = robot.support_gains(module)
-    for later_ns in (blend_ns, LONG_NS):
-        found = sinking.law(
-            frozen_setpoint, half_ns + later_ns, (0.02, -0.47), NeighbourView((0.8, 0.2))
-        )
-        sinks = not module.startswith("ankle")
-        assert found.q_ref == (0.1, -0.5 if sinks else -1.0)
-        assert found.v_ref == found.tau_coupled == pd_law.ZERO
-        assert found.tau_ff == before.tau_ff
-        assert (found.k_p, found.k_d) == (k_p, k_d)
-    assert sinking.law(frozen_setpoint, half_ns + LONG_NS, (0.02, -0.4), limp).q_ref == found.q_ref
-    half_way = sinking.law(frozen_setpoint, half_ns + blend_ns // 2, Q, limp)
+    half_way = sinking.law(frozen, current, now_ns + blend_ns // 2, q, limp)
     assert half_way.k_p[1] == pytest.approx(0.5 * (before.k_p[1] + k_p[1]))
+    for later_ns in (blend_ns, LONG_NS):
+        found = sinking.law(frozen, half_way, now_ns + later_ns, Q, UNKNOWN)
+        assert found.q_ref == (before.q_ref[0], before.q_ref[1] if place == "ankle" else theta)
+        assert found.v_ref == found.tau_coupled == pd_law.ZERO
+        assert (found.k_p, found.k_d) == (k_p, k_d)
+        if place != "ankle":
+            spring = before.k_p[1] * (before.q_ref[1] - theta)
+            assert found.tau_ff[1] == pytest.approx(before.tau_ff[1] + spring)
 
 
 def test_of_a_hip_only_the_theta_is_stiffer_for_a_limp_knee_than_in_a_stand(
@@ -121,60 +137,60 @@ def test_of_a_hip_only_the_theta_is_stiffer_for_a_limp_knee_than_in_a_stand(
 
 
 def test_a_reason_that_passes_is_none(robot: RobotConfig) -> None:
-    sinking, frozen_setpoint = begun(robot, "knee_right")
-    sinking.law(frozen_setpoint, 0, Q, UNHEARD)
-    sinking.law(frozen_setpoint, DOUBT_NS - 1, Q, UNKNOWN)
+    sinking, frozen = begun(robot, "knee_right")
+    sinking.law(frozen, frozen, 0, Q, UNHEARD)
+    sinking.law(frozen, frozen, DOUBT_NS - 1, Q, UNKNOWN)
     assert sinking.doubt_ns == -1
-    sinking.law(frozen_setpoint, DOUBT_NS, Q, UNHEARD)
-    sinking.law(frozen_setpoint, 2 * DOUBT_NS - 1, Q, UNHEARD)
+    sinking.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
+    sinking.law(frozen, frozen, 2 * DOUBT_NS - 1, Q, UNHEARD)
     assert not sinking.caught
-    sinking.law(frozen_setpoint, 2 * DOUBT_NS, Q, UNHEARD)
+    sinking.law(frozen, frozen, 2 * DOUBT_NS, Q, UNHEARD)
     assert sinking.caught
 
 
 def test_a_knee_beside_one_that_does_not_sink_is_caught_where_it_is(robot: RobotConfig) -> None:
-    sinking, frozen_setpoint = begun(robot, "knee_left", (0.02, -1.0))
+    sinking, frozen = begun(robot, "knee_left", (0.02, -1.0))
     stand = robot.stand_gains("knee_left")
-    assert sinking.law(frozen_setpoint, 0, (0.02, -1.1), UNHEARD).k_p[1] == 0.0
-    found = sinking.law(frozen_setpoint, DOUBT_NS, (0.02, -1.2), UNHEARD)
+    assert sinking.law(frozen, frozen, 0, (0.02, -1.1), UNHEARD).k_p[1] == 0.0
+    found = sinking.law(frozen, frozen, DOUBT_NS, (0.02, -1.2), UNHEARD)
     assert sinking.stop == -1.2
     assert found.k_p[1] == 0.0, "at its stop nothing is sprung yet"
-    found = sinking.law(frozen_setpoint, LONG_NS, (0.02, -1.25), UNHEARD)
+    found = sinking.law(frozen, frozen, LONG_NS, (0.02, -1.25), UNHEARD)
     assert (found.q_ref[1], found.k_p[1], found.k_d[1]) == (-1.2, stand.k_p[1], stand.k_d[1])
     assert sinking.stop == -1.2, "where it was caught it stays"
     below_its_stop = robot.joint_service.damp_knee_stop - 0.1
-    sinking, frozen_setpoint = begun(robot, "knee_left", (0.02, -1.0))
-    sinking.law(frozen_setpoint, 0, (0.02, below_its_stop), UNHEARD)
-    sinking.law(frozen_setpoint, DOUBT_NS, (0.02, below_its_stop), UNHEARD)
+    sinking, frozen = begun(robot, "knee_left", (0.02, -1.0))
+    sinking.law(frozen, frozen, 0, (0.02, below_its_stop), UNHEARD)
+    sinking.law(frozen, frozen, DOUBT_NS, (0.02, below_its_stop), UNHEARD)
     assert sinking.stop == robot.joint_service.damp_knee_stop
 
 
 @pytest.mark.parametrize("module", ["ankle_right", "hip_right"])
 def test_only_knees_are_caught(robot: RobotConfig, module: str) -> None:
-    sinking, frozen_setpoint = begun(robot, module)
+    sinking, frozen = begun(robot, module)
     assert sinking.stop == -math.inf
-    sinking.law(frozen_setpoint, 0, Q, UNHEARD)
-    sinking.law(frozen_setpoint, DOUBT_NS, Q, UNHEARD)
+    sinking.law(frozen, frozen, 0, Q, UNHEARD)
+    sinking.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
     assert not sinking.caught
     assert sinking.stop == -math.inf
 
 
 def test_a_second_stop_begins_anew(robot: RobotConfig) -> None:
-    sinking, frozen_setpoint = begun(robot, "hip_right")
-    sinking.law(frozen_setpoint, DOUBT_NS, Q, NeighbourView((0.3, 0.2), stiffen=True))
+    sinking, frozen = begun(robot, "hip_right")
+    sinking.law(frozen, frozen, DOUBT_NS, Q, NeighbourView((0.3, 0.2), stiffen=True))
     assert sinking.snapshot().held_ns == DOUBT_NS
     sinking.begin(FULL, Q)
     assert sinking.snapshot() == SinkingState(doubt_ns=-1)
-    knee, frozen_setpoint = begun(robot, "knee_right", (0.0, -1.0))
-    knee.law(frozen_setpoint, 0, Q, UNHEARD)
-    knee.law(frozen_setpoint, DOUBT_NS, Q, UNHEARD)
+    knee, frozen = begun(robot, "knee_right", (0.0, -1.0))
+    knee.law(frozen, frozen, 0, Q, UNHEARD)
+    knee.law(frozen, frozen, DOUBT_NS, Q, UNHEARD)
     knee.begin(FULL, (0.0, -1.0))
     assert (knee.caught, knee.doubt_ns) == (False, -1)
 
 
 @pytest.mark.parametrize("stop", [None, -2.2])
 def test_it_goes_on_from_its_memory(robot: RobotConfig, stop: float | None) -> None:
-    memory = SinkingState(stop, 0.1, -0.3, 0.4, caught=True, doubt_ns=7, held_ns=9)
+    memory = SinkingState(stop, 0.1, FULL, 0.4, caught=True, doubt_ns=7, held_ns=9)
     sinking = Sinking(robot, "hip_right")
     sinking.restore(memory)
     assert sinking.stop == (-math.inf if stop is None else stop)
@@ -183,12 +199,12 @@ def test_it_goes_on_from_its_memory(robot: RobotConfig, stop: float | None) -> N
 
 def test_what_sinks_lets_go_of_its_feedforward_and_holds_the_rest(robot: RobotConfig) -> None:
     service = robot.joint_service
-    sinking, frozen_setpoint = begun(robot, "knee_right")
-    assert frozen_setpoint == pd_law.load_to_feedforward(FULL, (False, True), Q)
+    sinking, frozen = begun(robot, "knee_right")
+    assert frozen == pd_law.load_to_feedforward(FULL, (False, True), Q)
     half_ns = round(0.5 * service.damp_fade_s * NS_PER_S)
-    found = sinking.law(frozen_setpoint, half_ns, Q, UNKNOWN)
+    found = sinking.law(frozen, frozen, half_ns, Q, UNKNOWN)
     stand = robot.stand_gains("knee_right")
-    assert found.tau_ff == pytest.approx((3.0, 0.5 * frozen_setpoint.tau_ff[1]))
+    assert found.tau_ff == pytest.approx((3.0, 0.5 * frozen.tau_ff[1]))
     assert found.k_p == pytest.approx((100.0 + 0.5 * (stand.k_p[0] - 100.0), 0.0))
     assert found.k_d[1] == service.damp_k_d
     assert found.v_ref == found.tau_coupled == (0.0, 0.0)
