@@ -212,7 +212,8 @@ class Overload:
 
     It begins when the force or the moment has been beyond its limit for `after_ns`, or at once if a
     cell saturates. It ends when both have been below `RELEASE_FRACTION` of their limits for
-    `release_ns`. Invalid readings neither begin nor end it.
+    `release_ns`. An invalid reading neither begins it nor interrupts a beginning: among 600 N it
+    would otherwise be held off for ever by one in ten. It does interrupt an ending.
     """
 
     def __init__(self, force_max: float, moment_max: float, after_ns: int, release_ns: int) -> None:
@@ -251,7 +252,8 @@ class Overload:
         )
         beyond = wrench.valid and load_ratio > 1.0
         below = wrench.valid and load_ratio < RELEASE_FRACTION
-        self._beyond_since_ns = _since(self._beyond_since_ns, now_ns, beyond)
+        if wrench.valid:
+            self._beyond_since_ns = _since(self._beyond_since_ns, now_ns, beyond)
         self._below_since_ns = _since(self._below_since_ns, now_ns, below)
         if wrench.saturated or _lasted(self._beyond_since_ns, now_ns, self._after_ns):
             self.hold = True

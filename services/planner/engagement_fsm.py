@@ -3,12 +3,12 @@
 All six modules track or none does. While one module's state is stale, or one module is not in
 TRACK, every command carries `hold`, so that no leg works against the other. Modules report `ready`
 once commands have been fresh for long enough. When all are ready, the planner engages: it lifts
-`hold` for all in the same tick. An overload at the harness and gains that do not stand alone also
-set `hold`.
+`hold` for all in the same tick, and they have `GRACE_NS` to report TRACK. An overload at the
+harness and gains that do not stand alone also set `hold`.
 
-After a drop-out of any module the planner waits before it re-engages; the wait grows with the
-number of recent drop-outs. Six links that drop out in turn would otherwise make the robot flap
-between TRACK and HOLD. Pure: state, inputs -> outputs.
+After a drop-out of any module, a trip, or gains that do not stand alone, the planner waits before
+it re-engages; the wait grows with the number of recent drop-outs. Six links that drop out in turn
+would otherwise make the robot flap between TRACK and HOLD. Pure: state, inputs -> outputs.
 """
 
 from __future__ import annotations
@@ -33,8 +33,11 @@ would fit into a minute."""
 
 _NOT_TRACKABLE: Final = (Mode.FAULT, Mode.DAMP)
 """Modes from which no module returns to TRACK, so that waiting is useless."""
-_DROPPED: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED)
-"""Modes after LEADING that count as a drop-out."""
+_DROPPED: Final = (
+    PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED, PlannerMode.UNCERTIFIED,
+)  # fmt: skip
+"""Modes after LEADING that count as a drop-out. OVERLOADED, MISLOADED and the stance have a time or
+a band of their own before they end; gains at the edge of their margin have none."""
 
 # Compared in each tick: docs/contributing.md, The control path.
 _TRACK: Final = Mode.TRACK

@@ -17,8 +17,10 @@ robot file):
 The trips are checked while the planner is engaged. `unloaded` counts only once both legs have
 carried the torso, because on the hoist neither does. `sagging` counts only after the person has
 once not pressed, because a hand held up in HOLD first catches up. A trip ends when every value has
-been within its limit for `CALM_NS`. It counts as a drop-out (`services.planner.engagement_fsm`):
-after repeated trips the planner re-engages after ever longer waits.
+been within its limit for `CALM_NS` and the value that tripped was known all the while: a harness
+that falls silent does not end a trip on its force. It counts as a drop-out
+(`services.planner.engagement_fsm`): after repeated trips the planner re-engages after ever longer
+waits.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ from shared.robot.trip_table import PLANNER_TRIPS, limits_of
 Array = NDArray[np.float64]
 
 CALM_NS: Final = NS_PER_S
+"""A body that still swings passes through its limits several times a second."""
 LEADING_LOAD: Final = 40.0
 """N; force of a hand that leads down, by 0.4 m in 2 s."""
 ASSUMED_SINK_RATE: Final = 1.0
@@ -106,7 +109,8 @@ class PlannerTrips:
             for since, is_beyond in zip(state.since_ns, beyond, strict=True)
         )
         tripped, why = state.tripped, state.why
-        calm_ns = 0 if any(beyond) else (state.calm_ns or now_ns)
+        unknown = tripped > 0 and math.isnan(values[_TRIPS.index(tripped)])
+        calm_ns = 0 if unknown or any(beyond) else (state.calm_ns or now_ns)
         if tripped and calm_ns and now_ns - calm_ns >= CALM_NS:
             tripped, why = Trip.NONE, ""
         if leads and not tripped:

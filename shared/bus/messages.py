@@ -8,9 +8,13 @@ field is optional: a `null` in a payload can then only be a number that was not 
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Annotated
 
 import msgspec
 
+Int64 = Annotated[int, msgspec.Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
+"""An integer of 64 bits. JSON has no largest: one of 400 digits would be an exception where it
+first meets a float, so it is refused as it is decoded."""
 Pair = tuple[float, float]
 """(phi, theta) of one module."""
 Vector3 = tuple[float, float, float]
@@ -20,7 +24,7 @@ STRAIGHT: Vector4 = (0.0, 0.0, 0.0, 0.0)
 """No shift of x, y, roll and yaw."""
 AS_CONFIGURED: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """A stance with the feet where the robot file has them."""
-Modules = tuple[int, int, int, int, int, int]
+Modules = tuple[Int64, Int64, Int64, Int64, Int64, Int64]
 """One integer for each module, in `shared.robot.joints.MODULES` order."""
 
 
@@ -219,9 +223,9 @@ class RunEventKind(IntEnum):
 class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Base of all messages: the sender's monotonic time and a sequence number."""
 
-    t_ns: int
+    t_ns: Int64
     """Sender's monotonic time at which the content was true."""
-    seq: int
+    seq: Int64
     """Sequence number: one more for each message of this sender on this key."""
 
 
@@ -237,48 +241,48 @@ class JointState(Message, frozen=True):
     """Joint rates, rad/s."""
     tau: Pair
     """Joint torques sent to the drive in this cycle, N m, after the limiter."""
-    mode: int
+    mode: Int64
     """Mode of the service."""
-    cause: int
+    cause: Int64
     """Cause of the last change of mode; 0 before the first."""
     ready: bool
     """True if commands have been fresh for long enough to track as soon as `hold` is lifted."""
-    age_ns: int
+    age_ns: Int64
     """Age of the newest command in use (docs/architecture.md#age-rule); -1 if there is none."""
-    session: int
+    session: Int64
     """Session of the newest command in use; 0 if there is none."""
-    command_seq: int
+    command_seq: Int64
     """Sequence number of the newest command in use; -1 if there is none."""
-    cycle: int
+    cycle: Int64
     """Control cycles since the start."""
-    late: int
+    late: Int64
     """Cycles that came later than twice the period after the one before."""
-    dropouts: int
+    dropouts: Int64
     """Recent drop-outs that lengthen the wait before TRACK."""
-    refused: int
+    refused: Int64
     """Commands refused since the start: old, foreign, out of order or out of limits."""
-    drive: int
+    drive: Int64
     """Status of the drive."""
-    drive_error: int
+    drive_error: Int64
     """Error bits of both axes, or-ed; 0 if none."""
     stiffened: bool = False
     """True while this module holds with all of its stand gains because another may be limp."""
-    outside: int = 0
+    outside: Int64 = 0
     """Part of the newest command that lies outside the envelope; 0 if none."""
-    state_phase: int = 0
+    state_phase: Int64 = 0
     """Phase in which this module sends its states, as the planner asked (`JointCommand`)."""
-    refusal: int = 0
+    refusal: Int64 = 0
     """Cause of the newest refusal of a command, for a second; 0 if there was none."""
-    refused_session: int = 0
+    refused_session: Int64 = 0
     """Session of that command: of whom it came."""
 
 
 class JointCommand(Message, frozen=True):
     """References, local gains and torques for one module (docs/law.md#references-and-age)."""
 
-    session: int
+    session: Int64
     """Random number of this planner's life."""
-    echo_t_ns: int
+    echo_t_ns: Int64
     """The `t_ns` of this module's newest state: the age is measured on the module's clock."""
     hold: bool
     """True asks for HOLD, so that no leg works against the other."""
@@ -305,7 +309,7 @@ class JointCommand(Message, frozen=True):
     stiffen: bool = False
     """True while another module may be limp: in HOLD this one raises its gains to the stand
     gains."""
-    state_phase: int = 0
+    state_phase: Int64 = 0
     """The module is to send its state in the periods of this number, modulo the periods of a state
     (docs/architecture.md#rates)."""
 
@@ -313,13 +317,13 @@ class JointCommand(Message, frozen=True):
 class JointEvent(Message, frozen=True):
     """A change of mode of a joint service."""
 
-    mode_before: int
+    mode_before: Int64
     """Mode before the change."""
-    mode_after: int
+    mode_after: Int64
     """Mode after the change."""
-    cause: int
+    cause: Int64
     """Cause of the change."""
-    age_ns: int
+    age_ns: Int64
     """Age of the newest command at the change; -1 if there was none."""
     tau_before: Pair
     """Torque of the last cycle before the change, N m."""
@@ -343,9 +347,9 @@ class Wrench(Message, frozen=True):
     ones."""
     saturated: bool
     """True while a leg of the sensor is at its limit."""
-    tare: int
+    tare: Int64
     """Zero of the sensor."""
-    age_ns: int
+    age_ns: Int64
     """Age of the sensor's sample on the harness service's clock."""
 
 
@@ -358,7 +362,7 @@ class Attitude(Message, frozen=True):
     """Angular velocity of the torso, rad/s, torso axes."""
     valid: bool
     """False while the sensor is silent or reports no fix: the numbers are the last good ones."""
-    age_ns: int
+    age_ns: Int64
     """Age of the sensor's sample on the IMU service's clock; -1 before the first."""
 
 
@@ -379,9 +383,9 @@ class ToolRoster(Message, frozen=True):
 class PlannerStatus(Message, frozen=True):
     """Inputs and decisions of one planner tick."""
 
-    session: int
+    session: Int64
     """Random number of this planner's life."""
-    mode: int
+    mode: Int64
     """Mode of the planner."""
     hold: bool
     """True if the commands of this tick ask for HOLD."""
@@ -399,9 +403,9 @@ class PlannerStatus(Message, frozen=True):
     """Margin of the failsafe certificate, as in the commands; 0 before the first tick."""
     margin_onboard: float
     """The same with the drives' own loops only."""
-    split: int
+    split: Int64
     """Source of the local gains."""
-    ik_iterations: int
+    ik_iterations: Int64
     """Steps of the inverse kinematics."""
     ik_residual: float
     """Largest residual of the inverse kinematics, m or rad."""
@@ -409,7 +413,7 @@ class PlannerStatus(Message, frozen=True):
     """Duration of this tick, from reading the inputs to the last command put."""
     state_seq: Modules
     """Sequence number of the state consumed from each module."""
-    wrench_seq: int
+    wrench_seq: Int64
     """Sequence number of the wrench consumed; -1: none yet."""
     assist_requested_n: float
     """Assist requested by the operator, N."""
@@ -417,7 +421,7 @@ class PlannerStatus(Message, frozen=True):
     """Time since each module's newest state arrived, on the planner's clock; -1 if none yet."""
     wait_s: float = 0.0
     """Time until it may lead again after drop-outs, s; 0 if it does not wait."""
-    attitude_seq: int = -1
+    attitude_seq: Int64 = -1
     """Sequence number of the attitude consumed; -1: none yet."""
     slope: Pair = (0.0, 0.0)
     """Rise of the floor along x and y in the law, rad."""
@@ -428,14 +432,14 @@ class PlannerStatus(Message, frozen=True):
     and a rotation vector, rad, world axes."""
     why: str = ""
     """Reason for not leading, in words, where the mode does not say it all."""
-    trip: int = 0
+    trip: Int64 = 0
     """Trip for which it does not lead."""
     load: Vector3 = (0.0, 0.0, 0.0)
     """Load beyond the robot file: kg, and moments a and b about pitch, N m
     (`services.planner.load`)."""
     requested_by: str = ""
     """Source of the intent in use; empty: none, or it is stale."""
-    probe_row: int = -1
+    probe_row: Int64 = -1
     """Row of p that is asked to be offset; -1: none."""
     probe: float = 0.0
     """The offset that is asked for, m or rad."""
@@ -450,7 +454,7 @@ class OperatorIntent(Message, frozen=True):
     """Requested offset from a straight stand: COM x and y, m; torso's roll and yaw, rad."""
     source: str = ""
     """Name of the sender."""
-    probe_row: int = -1
+    probe_row: Int64 = -1
     """Row of p whose reference is offset to measure the answer; -1: none (`xrl tune`)."""
     probe: float = 0.0
     """Its offset, m or rad."""
@@ -541,7 +545,7 @@ class SimControl(Message, frozen=True):
 class RunEvent(Message, frozen=True):
     """An action of a tool on the run, for the log and the verdict."""
 
-    kind: int
+    kind: Int64
     """Kind of the event."""
     subject: str
     """Service or push."""

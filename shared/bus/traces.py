@@ -7,35 +7,35 @@ from __future__ import annotations
 
 import msgspec
 
-from shared.bus.messages import Message, Pair
+from shared.bus.messages import Int64, Message, Pair
 
 
 class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     """Inputs and decision of one cycle of a joint service."""
 
-    now_ns: int
+    now_ns: Int64
     """The cycle's time."""
-    sampled_ns: int
+    sampled_ns: Int64
     """Arrival of the drive's sample; -1: none came, and the next six fields are void."""
     pos: Pair
     """Motor positions from the joint's zero, turns."""
     vel: Pair
     """Motor rates, turn/s."""
-    status: int
+    status: Int64
     """Status of the drive."""
-    error: int
+    error: Int64
     """Error bits of the drive."""
     carried: Pair
     """Motor torques of a drive that was found armed, N m; valid if `carries`."""
     carries: bool
     """True if `carried` is valid."""
-    session: int
+    session: Int64
     """Session of the command that came in this cycle; see `command_seq`."""
-    command_seq: int
+    command_seq: Int64
     """Sequence number of the command that came in this cycle; -1: none came."""
     estop: bool
     """True while the emergency stop is engaged."""
-    drive_command: int
+    drive_command: Int64
     """Command to the drive: 0 nothing, 1 torques, 2 a target, 3 idle, 4 arm, 5 forget the zero."""
     tau: Pair
     """Joint torques of this cycle, N m, after the limiter."""
@@ -61,7 +61,7 @@ class JointTrace(Message, frozen=True):
 class PlannerCheckpoint(Message, frozen=True):
     """State of the planner before a tick: execution can start here."""
 
-    session: int
+    session: Int64
     """Random number of this planner's life."""
     snapshot: str
     """State, as JSON."""
@@ -80,7 +80,7 @@ class SimState(Message, frozen=True):
     """MuJoCo's qacc_warmstart."""
     hoist: float
     """Fraction of the hoist's support: 1 hanging, 0 free."""
-    armed: tuple[int, ...]
+    armed: tuple[Int64, ...]
     """1 for each axis in closed loop; 12 values, as in all that follow."""
     input_pos: tuple[float, ...]
     """Position targets, turns as the drive counts them."""
@@ -109,7 +109,7 @@ class LinkEvent(Message, frozen=True):
     """One direction, as named in `shared.bus.links`."""
     requested: str
     """The link as requested: this direction, or a group of directions."""
-    number: int
+    number: Int64
     """Number of the impairment: the same for all its directions, and for its begin and end."""
     active: bool
     """True from the begin on, unless a partition or a later impairment hides it; False at its
@@ -124,7 +124,7 @@ class LinkEvent(Message, frozen=True):
     """True if nothing passes."""
     detail: str
     """The impairment in the words of `--inject`."""
-    passed: int
+    passed: Int64
     """Messages (live: Zenoh batches) that passed while it was active; 0 at the begin."""
-    lost: int
+    lost: Int64
     """Messages lost to it."""

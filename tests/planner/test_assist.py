@@ -281,6 +281,25 @@ def test_hold_ends_below_the_lower_limit_for_its_time(kind: str, share: float, f
     assert overload.hold is not (share < RELEASE_FRACTION and for_ns >= RELEASE)
 
 
+def test_an_invalid_reading_now_and_then_does_not_hold_an_overload_off() -> None:
+    overload = make_overload()
+    for t in range(0, 104, 4):
+        reading = wrench(valid=False) if t % 40 == 20 else at(1.1, "force")
+        overload.receive(reading, T0 + t * NS_PER_MS)
+    assert overload.hold
+
+
+def test_an_invalid_reading_begins_the_end_of_an_overload_anew() -> None:
+    overload = make_overload()
+    overload.receive(wrench(valid=False, saturated=True), T0)
+    overload.receive(at(0.0, "force"), T0)
+    overload.receive(wrench(valid=False), T0 + RELEASE // 2)
+    overload.receive(at(0.0, "force"), T0 + RELEASE)
+    assert overload.hold
+    overload.receive(at(0.0, "force"), T0 + 2 * RELEASE)
+    assert not overload.hold
+
+
 def test_numbers_that_are_not_valid_neither_begin_nor_end_it() -> None:
     overload = make_overload()
     old = msgspec.structs.replace(at(2.0, "force"), valid=False)

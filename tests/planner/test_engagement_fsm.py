@@ -174,6 +174,17 @@ def test_allowed_again_it_aligns_before_it_leads(inhibit: PlannerMode) -> None:
     assert (engagement.mode, engagement.hold) == (PlannerMode.LEADING, False)
 
 
+def test_gains_at_the_edge_of_their_margin_do_not_make_it_flap() -> None:
+    """They stand alone in every other tick of 4 ms, for a minute."""
+    engagement, led = leading(), 0
+    for tick in range(15_000):
+        inhibit = PlannerMode.UNCERTIFIED if tick % 2 else None
+        before = engagement.mode
+        engagement.advance(T0 + tick * 4_000_000, YES, YES, TRACK, inhibit)
+        led += engagement.mode is PlannerMode.LEADING is not before
+    assert led <= 6
+
+
 @pytest.mark.parametrize("inhibit", FORBIDDEN)
 def test_a_silent_module_counts_before_what_is_forbidden(inhibit: PlannerMode) -> None:
     engagement = leading()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from services.planner.certificate import Margins
+from services.planner.engagement_fsm import WAITS_NS
 from services.planner.intents import OperatorRequest
 from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX_S, Planner
 from shared.bus.messages import (
@@ -276,14 +277,17 @@ def test_commands_and_status_hold_both_margins_and_where_the_gains_come_from(
 def test_gains_that_would_not_stand_ask_for_hold_in_that_very_tick(
     robot: RobotConfig, planner: Planner, q: Array
 ) -> None:
-    """The mode follows a tick later; when the gains stand again the planner takes over anew."""
+    """The mode follows a tick later; when the gains stand again it waits as after a drop-out."""
     now = lead(planner, q)
     split = planner._law._split
     least = split._margins_min
     seen = []
-    for tick, fails in enumerate((False, True, True, False, False, False)):
+    wait_ns = WAITS_NS[1]
+    for tick, (fails, after_ns) in enumerate(
+        ((False, 0), (True, 0), (True, 0), (False, 0), (False, 0), (False, wait_ns), (False, 0))
+    ):
         split._margins_min = Margins(1e9, 1e9) if fails else least
-        now += 4 * NS_PER_MS
+        now += 4 * NS_PER_MS + after_ns
         receive_all(planner, q, now, seq=50 + tick)
         commands = planner.tick(now)
         status = planner.status(now, 0.0)
@@ -295,6 +299,7 @@ def test_gains_that_would_not_stand_ask_for_hold_in_that_very_tick(
         (PlannerMode.UNCERTIFIED, {True}),
         (PlannerMode.UNCERTIFIED, {True}),
         (PlannerMode.ALIGNING, {True}),
+        (PlannerMode.LEADING, {False}),
         (PlannerMode.LEADING, {False}),
     ]
 

@@ -97,6 +97,24 @@ def test_it_ends_after_a_second_within_all_limits(robot: RobotConfig, trip: Trip
     assert (trips.tripped, trips.why) == (Trip.NONE, "")
 
 
+@pytest.mark.parametrize("trip", TRIPS)
+def test_it_goes_on_while_what_tripped_is_not_known(robot: RobotConfig, trip: Trip) -> None:
+    """A harness that falls silent takes no load off the person."""
+    trips, values = led(robot), beyond(robot, trip)
+    for tick in range(1000):
+        trips.advance(T0 + tick * TICK_NS, values, leads=trips.tripped is Trip.NONE)
+    unknown = list(CALM)
+    unknown[TRIPS.index(trip)] = math.nan
+    calm_from = T0 + 3000 * TICK_NS
+    for tick in range(1000, 3000):
+        trips.advance(T0 + tick * TICK_NS, tuple(unknown), leads=False)
+    trips.advance(calm_from, CALM, leads=False)
+    trips.advance(calm_from + CALM_NS - 1, CALM, leads=False)
+    assert trips.tripped is trip
+    trips.advance(calm_from + CALM_NS, CALM, leads=False)
+    assert trips.tripped is Trip.NONE
+
+
 def test_on_the_hoist_no_leg_is_missed(robot: RobotConfig) -> None:
     trips, hanging = PlannerTrips(robot), beyond(robot, Trip.UNLOADED)
     for tick in range(1000):

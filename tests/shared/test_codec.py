@@ -1,4 +1,5 @@
 import math
+import re
 import struct
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -173,3 +174,17 @@ def test_every_key_has_one_topic() -> None:
     assert not [key for key in every if "*" in key]
     for key, topic in all_keys("lab").items():
         assert key in keys(topic, "lab")
+
+
+@pytest.mark.parametrize("number", [2**63, -(2**63) - 1, 10**400], ids=["above", "below", "huge"])
+@pytest.mark.parametrize("message_type", sorted({row.type for row in TOPICS}, key=str))
+def test_no_field_of_any_message_takes_an_integer_beyond_64_bits(
+    message_type: type[Message], number: int
+) -> None:
+    """Divided by a float one of 400 digits is an exception, in the middle of the control path."""
+    payload, decoder = encode(plain(message_type)).decode(), Decoder(message_type)
+    places = list(re.finditer(r"(?<=[:,\[])7(?=[,}\]])", payload))
+    assert len(places) >= 2, "each has a stamp and a sequence number"
+    for place in places:
+        damaged = f"{payload[: place.start()]}{number}{payload[place.end() :]}"
+        assert decoder.decode(damaged.encode()) is None, damaged[:400]
