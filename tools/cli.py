@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import importlib
 import signal
 import sys
@@ -53,6 +54,11 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
     )
     subparsers = parser.add_subparsers(metavar="VERB", required=True)
     wanted = next((word for word in arguments if not word.startswith("-")), "")
+    names = [verb.name for verb in VERBS]
+    if wanted and wanted not in names:
+        near = difflib.get_close_matches(wanted, names, n=3)
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        parser.error(f"no verb {wanted[:40]!r}; {hint}`xrl --help` lists them")
     for verb in VERBS:
         if whole or verb.name == wanted:
             module = importlib.import_module(f"tools.verbs.{verb.name}")

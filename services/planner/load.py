@@ -97,10 +97,11 @@ class Load:
         reasons = []
         if abs(self.kg) > RESUME_FRACTION * self._kg_max:
             more = "more" if self.kg > 0.0 else "less"
+            held_up = "" if self.kg > 0.0 else "if nothing holds it up, "
             reasons.append(
                 f"the robot carries {abs(self.kg):.1f} kg {more} than its file says: at most "
                 f"{self._kg_max:g} kg are accepted "
-                f"({RESUME_FRACTION * self._kg_max:g} once refused); set "
+                f"({RESUME_FRACTION * self._kg_max:g} once refused); {held_up}set "
                 "mass.payload, then `xrl gains`"
             )
         for moment, positive, negative in ((self.a, "behind", "ahead"), (self.b, "low", "high")):

@@ -186,7 +186,8 @@ def test_a_service_that_is_up_is_not_asked_for_anew_by_starting_it(
 ) -> None:
     """It knows itself what it has held; should it crash after, the next has to know as well."""
     calls = Calls({MODULE: PID}, suspended=suspended)
-    fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
+    runs = fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
+    assert runs == (None if suspended else PID), "it runs already"
     assert [made[0] for made in calls.made] == ["kill"] * suspended
     assert left.read() is LastState.HELD
 

@@ -62,6 +62,12 @@ def test_an_unknown_verb_is_refused() -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_a_misspelt_verb_is_told_what_it_is_like() -> None:
+    done = xrl("staus")
+    assert done.returncode == 2
+    assert "did you mean status" in done.stderr
+
+
 def test_no_fleet_is_one_line(tmp_path: Path) -> None:
     for verb in (("status",), ("kill", "planner"), ("tare",)):
         assert_one_line_error(xrl(*verb, "--run-dir", str(tmp_path)))

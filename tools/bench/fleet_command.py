@@ -18,6 +18,7 @@ from tools.bench import fleet
 from tools.bench.flags import add_flags, write_rows
 from tools.bench.fleet import FleetRow, Turn
 from tools.bench.revisions import its_config, unpacked
+from tools.fleet.others import warn_of_others
 from tools.fleet.pace import check_pace
 from tools.number_arguments import finite
 from tools.runs.verdict_table import digits
@@ -75,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
     gain_schedule.require(robot, args.config)
     check_pace(args.pace, simulated=True)
     console = Console()
+    warn_of_others(console)
     config = args.config.resolve()
     turns: list[list[Turn]] = []
     with ExitStack() as stack:

@@ -54,6 +54,18 @@ def describe_refusals(status: FleetStatus) -> list[str]:
     ]
 
 
+def describe_ways_out(status: FleetStatus) -> list[str]:
+    """Return a line for each way out of a state that a person must end, with its modules."""
+    found: dict[str, list[str]] = {}
+    for name, module in status.modules.items():
+        if module.way_out:
+            found.setdefault(module.way_out, []).append(name)
+    return [
+        f"{', '.join(names)}: {words.replace('MODULE', names[0] if len(names) == 1 else 'each')}"
+        for words, names in found.items()
+    ]
+
+
 def describe_stop(status: FleetStatus) -> list[str]:
     """Return a line for each source of an emergency stop that holds."""
     found: dict[str, list[str]] = {}
@@ -94,7 +106,9 @@ def tables(status: FleetStatus) -> Group:
     services = Table(
         title=f"services in {status.run_dir}", title_justify="left", box=box.SIMPLE_HEAD
     )
-    services.add_column("service", no_wrap=True, min_width=max(map(len, status.services)))
+    services.add_column(
+        "service", no_wrap=True, min_width=max(map(len, status.services), default=0)
+    )
     for heading in (
         "state",
         "pid",
@@ -120,8 +134,8 @@ def tables(status: FleetStatus) -> Group:
             row.last_exit,
         )
     modules = Table(title="modules", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("module", "mode", "tier", "because", "drive", "phi", "theta", "way out"):
-        modules.add_column(heading, no_wrap=heading != "way out")
+    for heading in ("module", "mode", "tier", "because", "drive", "phi", "theta"):
+        modules.add_column(heading, no_wrap=True)
     for name, module in status.modules.items():
         mode = module.mode or "silent"
         if module.stiffened:
@@ -135,12 +149,12 @@ def tables(status: FleetStatus) -> Group:
             module.cause or "",
             drive if drive == DriveStatus.ARMED.name else f"[bold red]{drive}[/]",
             *angles,
-            module.way_out.replace("MODULE", name),
         )
     way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear"
     line = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
     slow = f" in slow motion: the fleet's clock goes at {status.pace:g} of real time"
     lines = [f" {describe_lead(status.lead)}"]
+    lines += [f" [bold yellow]way out[/], {escape(text)}" for text in describe_ways_out(status)]
     lines += [f" [bold red]{OPEN}[/]"] if status.security == "open" else []
     lines += [f" [bold yellow]{text}[/]" for text in describe_stop(status)]
     lines += [slow] if status.pace != 1.0 else []

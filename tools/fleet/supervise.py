@@ -185,12 +185,13 @@ class SupervisedFleet:
         """Have the next process of a joint service arm its drive, whatever the last left."""
         rearm_guard.clear(self.run.path, service)
 
-    def start_service(self, service: str) -> None:
-        """Start a service that is down, before any delayed restart.
+    def start_service(self, service: str) -> int | None:
+        """Start a service that is down, before any delayed restart; return None.
+
+        One that runs is left alone, and its process id returned.
 
         A person has requested it, so a drive that lost torque is armed again
-        (`services.joint.rearm_guard`). A suspended service is continued; a running one is left
-        alone.
+        (`services.joint.rearm_guard`). A suspended service is continued.
 
         Raises:
             FleetError: the service is unknown, or cannot be started.
@@ -207,6 +208,9 @@ class SupervisedFleet:
                 raise FleetError(f"{service}: cannot be started: {refusal}") from None
         elif procfs.is_suspended(pid):
             os.kill(pid, signal.SIGCONT)
+        else:
+            return pid
+        return None
 
     def stop(self, *, keep_logs: bool = False, keep_stops: bool = False) -> None:
         """Stop every service and the supervisor, and remove their files.

@@ -15,15 +15,15 @@ class VerdictLimit(NamedTuple):
 
 
 LIMITS: Final = (
-    VerdictLimit("alive_com_x_max_mm", 20.0, "mm", "COM x, planner leading"),
-    VerdictLimit("alive_com_y_max_mm", 10.0, "mm", "COM y, planner leading"),
-    VerdictLimit("alive_roll_max_rad", 0.02, "rad", "roll, planner leading"),
-    VerdictLimit("alive_yaw_max_rad", 0.02, "rad", "yaw, planner leading"),
-    VerdictLimit("alive_sole_tilt_max_rad", 0.02, "rad", "soles' tilt, planner leading"),
+    VerdictLimit("alive_com_x_max_mm", 20.0, "mm", "COM x, before any kill"),
+    VerdictLimit("alive_com_y_max_mm", 10.0, "mm", "COM y, before any kill"),
+    VerdictLimit("alive_roll_max_rad", 0.02, "rad", "roll, before any kill"),
+    VerdictLimit("alive_yaw_max_rad", 0.02, "rad", "yaw, before any kill"),
+    VerdictLimit("alive_sole_tilt_max_rad", 0.02, "rad", "soles' tilt, before any kill"),
     VerdictLimit("torque_at_limit_ms", 50.0, "ms", "module's torque at its limit, longest"),
     VerdictLimit("shaking_nm", 15.0, "N m", "torque above 8 Hz, root mean square"),
     VerdictLimit("sinking_m_s", 0.8, "m/s", "torso's fastest way down"),
-    VerdictLimit("operator_peak_n", 40.0, "N", "operator's force, planner leading"),
+    VerdictLimit("operator_peak_n", 40.0, "N", "operator's force, before any kill"),
     VerdictLimit("assist_error_n", 10.0, "N", "assist force against what was asked"),
     VerdictLimit("hold_com_x_max_mm", 80.0, "mm", "COM x after the kill, or in HOLD"),
     VerdictLimit("hold_com_y_max_mm", 100.0, "mm", "COM y after the kill, or in HOLD"),

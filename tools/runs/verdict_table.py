@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tools.runs.verdict import Summary
-from tools.runs.verdict_limits import LIMITS, VerdictLimit
+from tools.runs.verdict_limits import LIMITS, SOUND, VerdictLimit
 
 OK: Final = "ok"
 OVER: Final = "over"
@@ -36,6 +36,13 @@ def show(summary: Summary, console: Console) -> None:
             row.what, f"{digits(value)}{unit}", f"{row.limit:g}{unit}", f"[{colour}]{word}[/]"
         )
     console.print(table)
+    if summary["stood"] and any(_is_over(row, summary) for row in LIMITS):
+        decide = ", ".join(row.what for row in LIMITS if row.key in SOUND)
+        console.print(
+            f"A figure over its limit is told, and does not decide: standing to the end does, and "
+            f"{decide}.",
+            style="dim",
+        )
     for line in network(summary):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if summary.get("pace", 1.0) != 1.0:
@@ -61,6 +68,10 @@ def mark(row: VerdictLimit, summary: Summary) -> str:
         return "of a service that was stopped"
     impaired = summary.get("links_impaired") and row.key not in OF_THE_MACHINE
     return f"{OVER}, links impaired" if impaired else OVER
+
+
+def _is_over(row: VerdictLimit, summary: Summary) -> bool:
+    return summary.get(row.key) is not None and mark(row, summary) != OK
 
 
 def network(summary: Summary) -> list[str]:

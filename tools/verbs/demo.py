@@ -19,7 +19,7 @@ from shared.bus.messages import PlannerStatus
 from shared.bus.session import Session
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
-from tools.fleet import procfs
+from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
 from tools.fleet.supervise import SupervisedFleet
 from tools.runs import experiment, verdict_table
@@ -84,11 +84,7 @@ def run(args: argparse.Namespace) -> int:
     plant_from(args.plant)  # refused before anything is started
     out = experiment.make_out(args.out, "demo")
     experiment.introduce(scenario, console)
-    for other in procfs.fleets():
-        console.print(
-            f"[yellow]another fleet runs in {other}: two do not fit on two cores; "
-            f"`xrl down --run-dir {other}` stops it[/]"
-        )
+    warn_of_others(console)
     try:
         ended = lead_run(args, robot, scenario, out, console)
     except KeyboardInterrupt:

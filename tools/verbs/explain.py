@@ -20,7 +20,14 @@ from services.planner.kinematics import Kinematics
 from services.planner.push_limit import PushLimits
 from services.planner.torque_breakdown import TorqueBreakdown, torque_breakdown
 from shared.bus import topics
-from shared.bus.messages import JointCommand, JointState, PlannerMode, PlannerStatus, SplitSource
+from shared.bus.messages import (
+    JointCommand,
+    JointState,
+    PlannerMode,
+    PlannerStatus,
+    SplitSource,
+    Trip,
+)
 from shared.clock import NS_PER_MS
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
@@ -227,9 +234,10 @@ def _joined(messages: list[Any], name: str) -> Array:
 def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, console: Console) -> None:
     status = tick.status
     ages = max(status.state_age_ns) / NS_PER_MS
+    trip = f" ({Trip(status.trip).name})" if status.trip else ""
     console.print(
         f"[bold]tick {status.seq}[/] at {(status.t_ns - zero_ns) / 1e9:.3f} s: planner "
-        f"{PlannerMode(status.mode).name}{' with hold' if status.hold else ''}, states up to "
+        f"{PlannerMode(status.mode).name}{trip}{' with hold' if status.hold else ''}, states up to "
         f"{ages:.1f} ms old, assist {status.assist_n:.1f} N, IK {status.ik_iterations} steps, "
         f"residual {status.ik_residual:.1e}"
     )

@@ -23,7 +23,7 @@ from tools.output import printable
 from tools.runs.host_clocks import HostClocks
 from tools.runs.host_clocks import describe as describe_clocks
 from tools.runs.impairment_intervals import impairments
-from tools.runs.run_files import files_of_run
+from tools.runs.run_files import files_in, files_of_run
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import NOTHING, RunLog, clocks_of
 from tools.runs.run_parts import zero_ns
@@ -49,7 +49,12 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl info out/a/run.mcap --json | jq '.topics | map_values(.lost)'
         """,
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="an MCAP file, finished or not")
+    parser.add_argument(
+        "file",
+        type=Path,
+        metavar="FILE",
+        help="an MCAP file, finished or not; of a directory its run's first",
+    )
     parser.add_argument(
         "--run",
         dest="whole_run",
@@ -68,8 +73,9 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print it; 0 if the file can be read."""
     survey = Survey()
-    first = _add(survey, args.file, full=args.full)
-    run_files = files_of_run(args.file, first.metadata)
+    file = files_in(args.file)[0] if args.file.is_dir() else args.file
+    first = _add(survey, file, full=args.full)
+    run_files = files_of_run(file, first.metadata)
     if args.whole_run and len(run_files) > 1:
         survey = Survey()
         for path in run_files:

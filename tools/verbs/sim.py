@@ -105,10 +105,18 @@ def run(args: argparse.Namespace) -> int:
         def watch(truth: SimTruth) -> None:
             progress.update(task, completed=max(0.0, truth.scenario_s))
 
-        simulated_s = recorded_lockstep.simulate(
-            robot, scenario, network, args.seed, out, watch, args.control, true_plant, hand,
-            args.controller,
-        )  # fmt: skip
+        try:
+            simulated_s = recorded_lockstep.simulate(
+                robot, scenario, network, args.seed, out, watch, args.control, true_plant, hand,
+                args.controller,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            console.print(
+                f"interrupted; what was recorded until then is in {out}, and `xrl recover` "
+                "finishes its file",
+                soft_wrap=True,
+            )
+            raise
     factor = simulated_s / (time.monotonic() - begin)
     summary = recorded_lockstep.judge_in_lockstep(scenario, out, speed=factor)
     verdict_table.show(summary, console)

@@ -24,6 +24,9 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Start it."""
-    SupervisedFleet.attach(args.run_dir).start_service(args.service)
-    print(f"{args.service}: started; `xrl status` shows how it does")
+    runs = SupervisedFleet.attach(args.run_dir).start_service(args.service)
+    if runs is not None:
+        print(f"{args.service}: runs already, as process {runs}; nothing was done")
+    else:
+        print(f"{args.service}: started; `xrl status` shows how it does")
     return 0

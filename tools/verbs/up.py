@@ -21,6 +21,7 @@ from shared.exceptions import FleetError, RunError
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import OPEN
+from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
 from tools.fleet.process_table import check_known, is_simulated, load_table
 from tools.fleet.supervise import SupervisedFleet
@@ -165,6 +166,7 @@ def run(args: argparse.Namespace) -> int:
         pace=args.pace,
         disarmed=args.disarmed,
     )
+    warn_of_others(Console(), own=fleet.run.path)
     up = len(fleet.manifest.services) - not_started
     record = f", record: {out}" if recorders & set(fleet.manifest.services) else ""
     print(

@@ -81,8 +81,12 @@ def run(args: argparse.Namespace) -> int:
     log = read_asked(args, RunIndex(args.log), as_sent=True)
     refuse_own_controller(log)
     robot, scenario = robot_of(log), scenario_of(log)
-    moments = moments_of(log, robot, args.every)
     kill = tuple(dict.fromkeys(args.kill))
+    moments = [moment for moment in moments_of(log, robot, args.every) if moment.runs(kill)]
+    if not moments:
+        raise RunError(
+            f"{' and '.join(kill)}: ran at no moment of this part; another --from or --to"
+        )
     true_plant = plant_of(log)
     led = hand_path(log)
     tasks = [Task(robot, scenario, true_plant, moment, kill, args.for_s, led) for moment in moments]
@@ -154,7 +158,8 @@ def show(counterfactuals: list[Counterfactual], names: str, for_s: float, consol
         counterfactuals, key=lambda one: (not one.stood, max(one.com_x_max_mm, one.com_y_max_mm))
     )
     console.print(
-        f"{names} killed at {len(counterfactuals)} moments, each continued for {for_s:g} s: "
+        f"{names} killed at {len(counterfactuals)} moments at which it ran, each continued for "
+        f"{for_s:g} s: "
         f"{len(counterfactuals) - len(fell)} stood, {len(fell)} fell"
     )
     if fell:

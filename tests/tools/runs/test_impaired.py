@@ -104,6 +104,15 @@ def test_a_limit_passed_with_links_impaired_is_marked_and_otherwise_not() -> Non
     assert verdict_table.mark(row, good) == "ok"
 
 
+def test_beside_a_figure_over_its_limit_it_is_told_what_decides() -> None:
+    (row,) = (row for row in LIMITS if row.key == "operator_peak_n")
+    words = "does not decide: standing to the end does"
+    assert words in shown(judged(operator_peak_n=row.limit + 1.0))
+    assert words not in shown(judged(operator_peak_n=row.limit))
+    fell = {"stood": False, "began": True, "fallen_at_s": 3.0}
+    assert words not in shown(judged(operator_peak_n=row.limit + 1.0, **fell))
+
+
 def test_the_verdict_has_a_line_for_each_impairment_and_one_of_ages() -> None:
     rows = impairments(told(("planner->joints", LATE, 3.0, 7.0), ("all", CUT, 8.0, 9.0)))
     summary = judged(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from itertools import product
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ from typing import cast
 
 import msgspec
 import pytest
+from rich.console import Console
 
 from shared.bus.messages import (
     Cause,
@@ -38,6 +40,8 @@ from tools.fleet.status_table import (
     describe_refusals,
     describe_sessions,
     describe_tools,
+    describe_ways_out,
+    tables,
 )
 
 
@@ -123,6 +127,21 @@ def test_a_refusal_that_is_over_is_not_told() -> None:
     tracks = state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED)
     before = msgspec.structs.replace(tracks, refusal=int(Refusal.TOO_OLD), refused=9)
     assert describe_refusals(fleet_with(7, module_status(before, 0.0))) == []
+
+
+def test_each_way_out_is_told_once_with_its_modules_at_any_width() -> None:
+    """In a column of the table it was cut off at 80 columns, when it was needed."""
+    stopped = module_status(state(Mode.DAMP, Cause.ESTOP, DriveStatus.ARMED))
+    lost = module_status(state(Mode.FAULT, Cause.DRIVE_LOST, DriveStatus.LOST))
+    well = module_status(state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED))
+    status = fleet_with(7, stopped, lost, stopped, well)
+    lines = describe_ways_out(status)
+    assert [line.partition(":")[0] for line in lines] == ["ankle_right, hip_right", "knee_right"]
+    assert "xrl kill knee_right" in lines[1]
+    printed = io.StringIO()
+    Console(width=60, file=printed).print(tables(status))
+    words = " ".join(printed.getvalue().split())
+    assert all(line in words for line in lines)
 
 
 def test_modules_that_follow_another_planner_are_named() -> None:

@@ -20,6 +20,7 @@ from shared.bus.messages import (
     RunEventKind,
     SimTruth,
     Tare,
+    Trip,
     Wrench,
 )
 from shared.bus.topics import Topic
@@ -261,12 +262,13 @@ def _planner(run: RunData, successive: Successive) -> Iterator[TimelineEvent]:
         (_, before), (t, after) = rows[index - 1], rows[index]
         fresh = " in a new session" if before.session != after.session else ""
         text = f"planner: {_name(PlannerMode, before.mode)} to {_name(PlannerMode, after.mode)}"
+        trip = f", {_name(Trip, after.trip)}" if after.mode == PlannerMode.TRIPPED else ""
         bad = after.mode not in _NORMAL_MODES
-        yield TimelineEvent(t, "bad" if bad else "note", text + fresh)
+        yield TimelineEvent(t, "bad" if bad else "note", text + trip + fresh)
     for index in _changes([row.wait_s > 0.0 for _, row in rows]):
         t, row = rows[index]
         if row.wait_s >= BACKOFF_MIN_S:
-            text = f"planner: backs off for {row.wait_s:.1f} s or more, after drop-outs"
+            text = f"planner: backs off for {row.wait_s:.1f} s or more, after drop-outs or trips"
             yield TimelineEvent(t, "note", text)
 
 

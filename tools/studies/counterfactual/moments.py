@@ -47,6 +47,13 @@ class Moment(msgspec.Struct):
         """Scenario time."""
         return self.state.scenario_s
 
+    def runs(self, services: Sequence[str]) -> bool:
+        """Return True if one of some services, or a service not kept here, runs at this moment."""
+        return any(
+            self.planner is not None if name == "planner" else name in self.modules
+            for name in services
+        )
+
 
 def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
     """Return the moments of a run's scenario, so far apart.

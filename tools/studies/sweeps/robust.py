@@ -45,6 +45,8 @@ TABLE: Final = "trials.csv"
 PICTURE: Final = "trials.png"
 CODE: Final = code_of("tools.studies.sweeps.robust_trial")
 FALLS_SHOWN: Final = 10
+RANKED_LEAST: Final = 30
+"""Trials from which errors are ranked: among fewer a correlation of 0.36 is chance."""
 MARGIN: Final = "com_led_max_mm"
 """Columns of the ranking: the COM's excursion while the planner leads and the robot is pushed."""
 FIGURES: Final = (
@@ -173,7 +175,8 @@ def _draw(rows: Sequence[Row], args: argparse.Namespace, path: Path) -> None:
     left.barh([key for key, _ in ranked], [value for _, value in ranked], color="#1f5f8b")
     left.axvline(0.0, color="black", linewidth=0.8)
     left.set_xlabel("rank correlation with the COM's excursion while led")
-    left.set_title("Which error takes most of the margin")
+    few = f" ({len(rows)} trials: too few to tell)" if len(rows) < RANKED_LEAST else ""
+    left.set_title(f"Which error takes most of the margin{few}")
     for ending, marker, colour in ((True, "o", "#1f5f8b"), (False, "x", "#c0392b")):
         some = [row for row in rows if (row["ending"] == Ending.STOOD) == ending]
         right.scatter(
@@ -215,7 +218,10 @@ def _show(rows: Sequence[Row], command: str, console: Console) -> int:
             if values:
                 printed.add_row(words, f"{np.median(values):.3g}", f"{max(values):.3g}", unit)
         console.print(printed)
-    most = ", ".join(f"{key} {value:+.2f}" for key, value in ranking(rows)[:5])
+    if len(rows) < RANKED_LEAST:
+        most = f"{len(rows)} trials are too few to tell; from {RANKED_LEAST} on they are ranked"
+    else:
+        most = ", ".join(f"{key} {value:+.2f}" for key, value in ranking(rows)[:5])
     console.print(f"takes most of the margin (rank correlation): {most}", soft_wrap=True)
     low, high = wilson(len(fallen), len(rows))
     console.print(

@@ -116,6 +116,17 @@ def test_a_fall_is_a_fall_there_as_well(
     assert '"stood": false' in (tmp_path / "whatif.json").read_text(encoding="utf-8")
 
 
+def test_no_moment_counts_at_which_the_service_was_dead_already(
+    robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(robot, still(2.0, kill=kill(0.7)), tmp_path)
+    words = [str(tmp_path / "run.mcap"), "--kill", "planner", "--for", "0.3", "--workers", "1"]
+    assert _main([*words, "--every", "0.5"]) == 0
+    assert "planner killed at 2 moments at which it ran" in capsys.readouterr().out
+    with pytest.raises(RunError, match="planner: ran at no moment"):
+        _main([*words, "--from", "1.2"])
+
+
 def test_a_run_without_a_simulated_world_is_refused(log: RunLog) -> None:
     key = topics.SIM_STATE.key(log.robot)
     kept = log._series.pop(key)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from shared.bus import topics
-from shared.bus.messages import DriveStatus
+from shared.bus.messages import DriveStatus, PlannerMode, Trip
 from shared.bus.traces import LinkEvent
 from shared.robot.joints import MODULES
 from tests.tools.analysis.reports import pages, runs
@@ -171,6 +171,20 @@ def test_the_back_off_of_the_planner_is_in_the_timeline(log: RunLog, tmp_path: P
     (row,) = [row for row in found if "backs off" in row.text]
     assert row.t == pytest.approx(2.5, abs=0.01)
     assert row.text.startswith("planner: backs off for 1.0 s or more")
+
+
+def test_a_trip_of_the_planner_is_named_in_the_timeline(log: RunLog, tmp_path: Path) -> None:
+    zero_ns = RunData(log).zero_ns
+
+    def tripped(name: str, body: bytes) -> bytes:
+        status = msgspec.json.decode(body)
+        if name != "planner/status" or (status["t_ns"] - zero_ns) / 1e9 < 2.5:
+            return body
+        changed = {"mode": int(PlannerMode.TRIPPED), "trip": int(Trip.SAGGING)}
+        return msgspec.json.encode(status | changed)
+
+    found = timeline_events(RunData(runs.rewritten(log, tmp_path, payload=tripped)))
+    assert any(row.text.startswith("planner: LEADING to TRIPPED, SAGGING") for row in found)
 
 
 def panel_and_rows(log: RunLog) -> tuple[dict[str, Any], list[str]]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
 import math
 import random
 from pathlib import Path
 
 import msgspec
 import pytest
+from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
 from tests.tools.exit_codes import exit_code
@@ -57,6 +59,16 @@ def test_the_ranking_finds_the_error_that_moves_the_com(pushes: PushRange, cause
     assert ranked[0][0] == cause
     assert ranked[0][1] > 0.9
     assert abs(ranked[1][1]) < 0.6
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_of_a_few_trials_no_error_is_ranked(pushes: PushRange, few: bool) -> None:
+    figures = dict.fromkeys((key for key, _, _ in robust.FIGURES), "")
+    rows = [figures | row for row in rows_by(pushes, "drive.lag_s")[: robust.RANKED_LEAST - few]]
+    printed = io.StringIO()
+    robust._show(rows, "xrl sweep robust", Console(width=200, file=printed))
+    assert ("too few to tell" in printed.getvalue()) is few
+    assert ("drive.lag_s" in printed.getvalue()) is not few
 
 
 def test_a_picture_is_drawn_and_falls_are_in_it(pushes: PushRange, tmp_path: Path) -> None:
