@@ -103,6 +103,8 @@ class SetpointLaw:
         limp = near.stiffen and (mode is _HOLD or mode is _DAMP)
         if not self._stiffened_ns and (limp or failsafe.stiffen_requested):
             self._stiffened_ns = now_ns
+            if mode is _HOLD:
+                self._bound_stiffening(now_ns, q)
         since_ns = now_ns - self._changed_ns
         if mode is _TRACK:
             self.current = self._tracked(now_ns, failsafe.command, since_ns)
@@ -146,6 +148,16 @@ class SetpointLaw:
         if since_ns >= self._blend_ns:
             return fresh
         return pd_law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
+
+    def _bound_stiffening(self, now_ns: int, q: Pair) -> None:
+        """Have no spring of HOLD pull too hard once it has risen to its support gain.
+
+        A hip whose theta is soft may be far from its reference: a hand has turned the torso.
+        """
+        held = self._held(now_ns - self._changed_ns)
+        near = pd_law.limit_stiffening(held, q, self._support_k_p, self._hold_torque)
+        if near is not held:
+            self._frozen, self._changed_ns = near, now_ns
 
     def _held(self, since_ns: int) -> Setpoint:
         """Return HOLD's setpoint: frozen, and some gains rise to the stand gains."""

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services.joint import pd_law
 from services.joint.controller import JointController
 from services.joint.neighbours import NeighbourView
 from services.joint.snapshots import ControllerSnapshot
@@ -66,6 +67,32 @@ def test_on_request_it_rises_to_its_support_gains_within_the_blend_time(
     assert (stiffened.k_p, stiffened.k_d) == at_least(robot, module, SOFT_P, SOFT_D)
     frozen = (plain.q_ref, plain.v_ref, plain.tau_ff, plain.tau_coupled)
     assert (stiffened.q_ref, stiffened.v_ref, stiffened.tau_ff, stiffened.tau_coupled) == frozen
+
+
+@pytest.mark.parametrize("away", [0.05, 0.3, -0.3])
+@pytest.mark.parametrize("at_once", [True, False], ids=["as it holds", "later"])
+def test_a_hip_that_a_hand_has_turned_is_not_pulled_back_beyond_the_envelopes_bound(
+    robot: RobotConfig, away: float, at_once: bool
+) -> None:
+    """At 0.3 rad the spring rose to 810 N m within the blend, against the person's hand."""
+    bench = holding(robot, "hip_left", k_p=(500.0, 26.0))
+    if not at_once:
+        bench.run(2 * blended(bench, robot), fresh=True, hold=True)
+    for _ in range(100):
+        bench.q = (bench.q[0], bench.q[1] + 0.01 * away)
+        bench.run(1, fresh=True, hold=True)
+    assert bench.mode is Mode.HOLD
+    before = pd_law.torque(bench.controller.setpoint, bench.q, pd_law.ZERO)
+    bench.run(1, fresh=True, hold=True, stiffen=True)
+    after = pd_law.torque(bench.controller.setpoint, bench.q, pd_law.ZERO)
+    assert after == pytest.approx(before, abs=1.0), "no step"
+    most = 0.0
+    for _ in range(2 * blended(bench, robot)):
+        bench.run(1, fresh=True, hold=True, stiffen=True)
+        setpoint = bench.controller.setpoint
+        most = max(most, abs(setpoint.k_p[1] * (setpoint.q_ref[1] - bench.q[1])))
+    assert setpoint.k_p[1] >= robot.support_gains("hip_left")[0][1]
+    assert most <= robot.envelope.hold_torque
 
 
 def test_a_hip_without_the_flag_stays_as_soft_as_the_hand_needs_it(robot: RobotConfig) -> None:

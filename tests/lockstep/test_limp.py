@@ -9,7 +9,7 @@ import pytest
 
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Fault, FaultKind, Kill
+from shared.config.scenarios import Fault, FaultKind, Keyframe, Kill
 from shared.robot.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import Run, kill, push, run, variant
 from tools.runs.lockstep import Lockstep
@@ -39,6 +39,27 @@ def limp(
         push=(push(at + PUSHED_AFTER, *force),),
     )
     return run(robot, scenario)
+
+
+@pytest.mark.parametrize(("height", "pitch"), [(1.1, 0.5), (0.95, 0.9)])
+def test_a_torso_that_a_hand_has_turned_stays_there_when_a_knee_goes_limp(
+    robot: RobotConfig, height: float, pitch: float
+) -> None:
+    """Six such robots without a planner: pulled upright against the hand, two fell."""
+    turned = (Keyframe(at=0.0, height=height), Keyframe(at=2.0, height=height, pitch=pitch))
+    scenario = variant(
+        "stand",
+        duration=5.5,
+        keyframe=turned,
+        kill=kill(0.5),
+        restart=(),
+        fault=(Fault(module="knee_left", kind="disarmed", at=3.0),),
+    )
+    outcome = run(robot, scenario)
+    assert outcome.stood
+    before, after = (outcome.angles[outcome.t < 3.0][-1, 1], outcome.angles[-1, 1])
+    assert abs(before) > 0.3
+    assert after == pytest.approx(before, abs=0.15)
 
 
 def stiffened(outcome: Run) -> list[str]:
