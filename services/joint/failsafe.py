@@ -108,11 +108,15 @@ def timing_of(config: RobotConfig) -> Timing:
         k_p_max=service.k_p_max,
         k_d_max=service.k_d_max,
         v_max=service.v_max,
-        tau_max=4.0 * config.joint.tau_module_max,
+        tau_max=TAU_ACCEPTED_MAX * config.joint.tau_module_max,
     )
 
 
 RETIRED_SESSIONS_KEPT: Final = 256
+"""Planners that a module remembers; after more restarts the first of them could come back."""
+TAU_ACCEPTED_MAX: Final = 4.0
+"""Largest feedforward and coupled torque that is believed, as a multiple of what a module's motors
+give: far from its reference the law may want more than they do, and the limiter cuts it."""
 SEQ_AHEAD_MAX: Final = 500
 """Largest step of a command's number: a wrong one, accepted, has all right ones refused."""
 TICKS_PER_S_MAX: Final = 2000
@@ -136,7 +140,7 @@ class Failsafe(msgspec.Struct):
     session: int = 0
     """Session of the accepted commands; 0 before the first."""
     retired: tuple[int, ...] = ()
-    """Earlier sessions; their commands are refused for good."""
+    """Earlier sessions, the last `RETIRED_SESSIONS_KEPT`; their commands are refused."""
     fresh_since_ns: int = -1
     """Start of the unbroken time with usable commands; -1 if there is none."""
     dropouts: Dropouts = msgspec.field(default_factory=Dropouts)

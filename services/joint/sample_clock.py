@@ -27,7 +27,7 @@ class SampleClock(msgspec.Struct):
     """When the present period began, smoothed."""
 
     def advance(self, now_ns: int, period_ns: int) -> None:
-        """Take the time of a sample, and the drive's period."""
+        """Take the time of a cycle, and the drive's period."""
         self.before = self.count
         if not self.count:
             self.count, self.at_ns = 1, now_ns

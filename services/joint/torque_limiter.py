@@ -1,4 +1,4 @@
-"""The last step before the drive: apart from the soft stop it only reduces torque.
+"""The last step before the drive: bounds the torque and its rate.
 
 In order: a one-sided spring at the joint's soft stop, finite, the rate, and last the torque
 diamond |tau_phi| + |tau_theta| <= tau_module_max, which nothing may exceed. Pure.

@@ -27,7 +27,9 @@ from shared.config.robot_config import RobotConfig
 from shared.robot import trip_table
 
 SHAKE_ABOVE_HZ: Final = 8.0
+"""Above the law's band: the coupled torque's low-pass and a hand lie below it."""
 SHAKE_S: Final = 0.1
+"""Time constant of the mean square."""
 AT_LIMIT: Final = 0.995
 """Share of the torque diamond: a motor there gives all it has."""
 _NONE: Final = Event.NONE  # returned in each cycle: docs/contributing.md

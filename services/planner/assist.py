@@ -57,6 +57,8 @@ def force_up(force: Vector3, roll: float, pitch: float) -> float:
 def wrench_in_world(wrench: Wrench, roll: float, pitch: float) -> tuple[Array, float]:
     """Return the operator's force (3,), N, and moment about pitch, N m, in world axes without yaw.
 
+    The force to the side is left out (0): nothing here asks for it.
+
     Args:
         wrench: of the operator on the torso.
         roll: of the torso, rad.

@@ -11,7 +11,7 @@ One tick, in the paper's letters:
     K_q, B_q             at q_ref
     D, D_B               local gains that the joint services hold: schedule and certificate
     K_c, B_c             the part of K_p and B_p that D and D_B lack
-    tau_ff  = J^T (m g up) + J_harness^T F_assist up
+    tau_ff  = J^T (m g up) + J_harness^T (F_assist + F_load) up
     tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot)] }
 
 Pure: no clock, bus or thread.

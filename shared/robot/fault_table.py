@@ -138,9 +138,10 @@ LOSSES: Final[dict[str, LossRow]] = {
     ),
     "harness lost": LossRow(
         "nothing",
-        "the planner leads on without closed assist force and without easing the lead",
+        "the planner leads on without closed assist force and without easing the lead; no overload "
+        "and no trip by harness, sagging or unattended is seen, and one that is there stays",
         "harness/wrench: not valid",
-        "automatic",
+        "automatic; a trip that stays ends with the harness back, or by `xrl kill planner`",
     ),
     "IMU lost, where one is fitted": LossRow(
         "nothing",
