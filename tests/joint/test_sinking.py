@@ -124,6 +124,21 @@ def test_for_a_limp_module_it_holds_where_it_is_with_the_load_it_has(
             assert found.tau_ff[1] == pytest.approx(before.tau_ff[1] + spring)
 
 
+def test_rates_and_coupling_fade_in_a_module_that_stiffens_as_in_any_that_stops(
+    robot: RobotConfig,
+) -> None:
+    sinking, frozen = begun(robot, "knee_right")
+    limp = NeighbourView(stiffen=True)
+    ramp_ns = round(robot.joint_service.coupled_ramp_ms * 1e6)
+    blend_ns = round(robot.joint_service.blend_ms * 1e6)
+    sinking.law(frozen, FULL, 0, Q, limp)
+    for part in (0.0, 0.5, 1.0):
+        found = sinking.law(frozen, FULL, round(part * ramp_ns), Q, limp)
+        left = (1.0 - part) * (1.0 - part * ramp_ns / blend_ns)
+        assert found.tau_coupled == pytest.approx((5.0 * left, -6.0 * left))
+    assert found.v_ref == pd_law.ZERO
+
+
 def test_of_a_hip_only_the_theta_is_stiffer_for_a_limp_knee_than_in_a_stand(
     robot: RobotConfig,
 ) -> None:
