@@ -68,7 +68,7 @@ class SetpointLaw:
     def start(self, mode: Mode, now_ns: int, setpoint: Setpoint) -> None:
         """Start a mode from a given setpoint: until now the module was DISARMED."""
         self._note_change(mode, now_ns)
-        self._frozen = setpoint
+        self._frozen = self.current = setpoint
 
     def change(self, mode: Mode, now_ns: int, q: Pair) -> None:
         """Freeze the setpoint in force for a new mode.

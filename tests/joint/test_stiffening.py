@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from services.joint import pd_law
 from services.joint.controller import JointController
+from services.joint.failsafe import Failsafe
 from services.joint.neighbours import NeighbourView
+from services.joint.setpoint_law import SetpointLaw
 from services.joint.snapshots import ControllerSnapshot
 from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS
@@ -98,6 +100,17 @@ def test_a_hip_that_a_hand_has_turned_is_not_pulled_back_beyond_the_envelopes_bo
         most = max(most, abs(setpoint.k_p[1] * (setpoint.q_ref[1] - bench.q[1])))
     assert setpoint.k_p[1] >= robot.support_gains("hip_left")[0][1]
     assert most <= robot.envelope.hold_torque
+
+
+@pytest.mark.parametrize("module", ["ankle_left", "knee_left", "hip_left"])
+@pytest.mark.parametrize("mode", [Mode.HOLD, Mode.DAMP])
+def test_a_service_that_begins_beside_a_limp_module_begins_with_the_torque_it_takes_over(
+    robot: RobotConfig, module: str, mode: Mode
+) -> None:
+    law, q, tau = SetpointLaw(robot, module), POSES[kind_of(module)], (4.0, -30.0)
+    law.start(mode, 1, pd_law.take_over(q, pd_law.ZERO, tau, SOFT_P, SOFT_D))
+    found = law.evaluate(1, Failsafe(mode=mode), q, NeighbourView(stiffen=True))
+    assert pd_law.torque(found, q, pd_law.ZERO) == pytest.approx(tau)
 
 
 def test_a_hip_without_the_flag_stays_as_soft_as_the_hand_needs_it(robot: RobotConfig) -> None:
