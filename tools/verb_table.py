@@ -82,7 +82,8 @@ def add_verb(subparsers: Subparsers, name: str, examples: str) -> argparse.Argum
         examples: command lines, one per line.
     """
     lines = "\n".join(f"  {line.strip()}" for line in examples.strip().splitlines())
-    sentence = f"{HELP[name][0].upper()}{HELP[name][1:]}."
+    sentence = f"{HELP[name][0].upper()}{HELP[name][1:]}"
+    sentence += "" if sentence.endswith("?") else "."
     return subparsers.add_parser(
         name,
         help=HELP[name],

@@ -22,13 +22,14 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shared.bus.messages import Mode, Pair
-from shared.clock import NS_PER_MS
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.config.sections import LOST_S
 from shared.robot.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
 from shared.robot.limp_leg_support import SUPPORT_FOR
 
 STALE_NS: Final = 20 * NS_PER_MS
 """An older angle says nothing of where the joint is now."""
-GONE_NS: Final = 100 * NS_PER_MS
+GONE_NS: Final = round(LOST_S * NS_PER_S)
 """Age of a row beyond which its service is dead or its drive is lost, ns."""
 _ROW: Final = struct.Struct("<QQddQQ")
 """A number that is odd while it is written, then a `NeighbourRow`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from shared.config.toml_file import Range, Section
 
@@ -368,6 +368,11 @@ class Ros2Config(Section, frozen=True):
     """Rate of `/clock`, of a simulated robot only; 0: not published."""
 
 
+LOST_S: Final = 0.1
+"""Silence after which a drive without a watchdog is lost; `services.joint.neighbours` takes a
+module for gone after the same."""
+
+
 class DriveConfig(Section, frozen=True):
     """ODrive settings that the joint service relies on (docs/drives.md)."""
 
@@ -381,6 +386,15 @@ class DriveConfig(Section, frozen=True):
     zero_mark_turns: Annotated[float, Range(0.0, 4096.0, "turns")]
     encoder_bandwidth: Annotated[float, Range(100.0, 8000.0, "rad/s")] = 2000.0
     """Bandwidth of the drives' estimate of position and velocity."""
+
+    @property
+    def lost_after_s(self) -> float:
+        """Silence after which a drive is lost, s.
+
+        Not before its own watchdog has fired: until then a silent drive holds its last torque and
+        comes back as if nothing had been, while a FAULT is for good.
+        """
+        return self.watchdog_timeout or LOST_S
 
 
 class CanConfig(Section, frozen=True):

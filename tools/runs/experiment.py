@@ -258,7 +258,9 @@ def make_scenario(args: argparse.Namespace) -> Scenario:
         restart=_inside(restarts, duration) if not args.restart else restarts,
         push=pushes,
     )
-    scenarios.check(str(path), scenario)
+    flags = (args.kill, args.restart, args.push, args.fault, args.inject, args.duration)
+    by_flags = " with the flags of this command" if any(flag is not None for flag in flags) else ""
+    scenarios.check(f"{path}{by_flags}", scenario)
     return scenario
 
 

@@ -6,7 +6,6 @@ from typing import Final
 
 from services.joint.drive_manager import DriveAction, DriveCommand
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.drivers.odrive_can import LOST_MS
 from services.joint.drivers.wired_drive import MotorFrame, Signs
 from services.simulator.axis_bank import AxisBank
 from shared.bus.messages import Pair
@@ -32,7 +31,7 @@ class VirtualDrive:
         self._module = slice(2 * index, 2 * index + 2)
         self._drive = drive
         self._frame = MotorFrame(drive.zero_mark_turns, signs)
-        self._lost_after_ns = round((drive.watchdog_timeout or LOST_MS * 1e-3) * NS_PER_S)
+        self._lost_after_ns = round(drive.lost_after_s * NS_PER_S)
         self._sampled_ns = now_ns
         self._written = True
         """False: the service is new, and reads the torques of a drive that it finds armed."""

@@ -47,8 +47,6 @@ in the next heartbeat, and a watchdog may run out before it."""
 INSIST_MS: Final = 1000
 """Time after `idle` from which an axis that still reports closed loop is commanded again at
 once."""
-LOST_MS: Final = 100
-"""Silence of a drive without a watchdog after which it counts as lost."""
 CLOSE_MS: Final = 20
 """Time for which a command that the bus had no room for may hold up `close`."""
 
@@ -94,10 +92,7 @@ class OdriveCan:
         self._node_ids = node_ids
         self._drive = drive
         self._counts_per_turn = encoder_counts_per_turn
-        # Not before its own watchdog has fired: until then a silent drive holds its last
-        # torque and comes back as if nothing had been, while a FAULT is for good.
-        lost_s = drive.watchdog_timeout or LOST_MS * 1e-3
-        self._lost_after_ns = round(lost_s * NS_PER_S)
+        self._lost_after_ns = round(drive.lost_after_s * NS_PER_S)
         self._frames = Frames(node_ids, drive)
         # The firmware takes it as food for the watchdog, and 0.6 tells its version besides.
         self._food = [message(n, Command06.GET_VERSION, b"") for n in node_ids]

@@ -42,8 +42,6 @@ PATIENCE: Final = 1.5
 """Periods of the exchange for which `read` waits at least: one alone is often just missed."""
 FEED_MS: Final = 1000
 """Time after `arm` in which the watchdogs are fed without a target: the control loop waits."""
-LOST_S: Final = 0.1
-"""Silence of a drive without a watchdog after which it counts as lost."""
 RETRY_S: Final = 0.2
 """Between two attempts to connect."""
 STATES_EVERY: Final = 4
@@ -95,9 +93,7 @@ class OdriveUsb:
         self._serial_number = serial_number.upper()
         self._period_s = max(1.0 / EXCHANGE_HZ, drive.encoder_period_ms * 1e-3)
         self._torque_max = drive.current_lim * drive.torque_constant
-        # Not before its own watchdog has fired: until then a silent drive may come back as
-        # it was, while a FAULT is for good.
-        self._lost_after_s = drive.watchdog_timeout or LOST_S
+        self._lost_after_s = drive.lost_after_s
         # Written by the control thread:
         self._target: MotorTarget | None = None
         self._request: _Request | None = None
