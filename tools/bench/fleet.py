@@ -32,7 +32,7 @@ ENDING_S: Final = 30.0
 """Time for an interrupted run to end its fleet."""
 
 LAST_LINES: Final = 3
-"""Of a run that failed: they are told."""
+"""Lines of a failed run's output that the error quotes."""
 
 Turn: TypeAlias = dict[str, float | None]
 """A run's figures by name; None: its record has no such."""

@@ -23,7 +23,7 @@ def describe_lead(lead: LeadStatus | None) -> str:
         return "planner silent: each module holds by itself"
     words = f"planner {lead.mode}, margin {lead.margin:.2f}"
     if lead.wait_s > 0.0:
-        words += f"; leads again in {lead.wait_s:.0f} s at the earliest, for links have dropped out"
+        words += f"; leads again in {lead.wait_s:.0f} s at the earliest, after drop-outs or trips"
     if lead.why:
         words += f"; {lead.why}"
     return words
@@ -61,7 +61,7 @@ def describe_ways_out(status: FleetStatus) -> list[str]:
         if module.way_out:
             found.setdefault(module.way_out, []).append(name)
     return [
-        f"{', '.join(names)}: {words.replace('MODULE', names[0] if len(names) == 1 else 'each')}"
+        f"{', '.join(names)}: {words.replace('MODULE', names[0]) if len(names) == 1 else words}"
         for words, names in found.items()
     ]
 

@@ -39,8 +39,8 @@ def show(summary: Summary, console: Console) -> None:
     if summary["stood"] and any(_is_over(row, summary) for row in LIMITS):
         decide = ", ".join(row.what for row in LIMITS if row.key in SOUND)
         console.print(
-            f"A figure over its limit is told, and does not decide: standing to the end does, and "
-            f"{decide}.",
+            "A figure over its limit is reported and does not decide: standing to the end does, "
+            f"and {decide}.",
             style="dim",
         )
     for line in network(summary):
@@ -71,7 +71,7 @@ def mark(row: VerdictLimit, summary: Summary) -> str:
 
 
 def _is_over(row: VerdictLimit, summary: Summary) -> bool:
-    return summary.get(row.key) is not None and mark(row, summary) != OK
+    return summary.get(row.key) is not None and mark(row, summary).startswith(OVER)
 
 
 def network(summary: Summary) -> list[str]:

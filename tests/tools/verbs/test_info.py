@@ -133,6 +133,13 @@ def test_the_other_files_of_the_run_are_named_in_order(
     assert "run_2.mcap, run_3.mcap" in as_text(capsys, split_run[1])
 
 
+def test_a_directory_stands_for_the_first_file_of_its_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = runs.write(tmp_path, [state(0, 0), state(1, 1)])
+    assert as_json(capsys, tmp_path) == as_json(capsys, path)
+
+
 def test_a_run_is_counted_over_all_its_files(
     split_run: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

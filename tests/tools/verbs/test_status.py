@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from itertools import product
+from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
@@ -26,6 +27,7 @@ from shared.bus.session import Latest, place_of_tool
 from shared.clock import NS_PER_S, now_ns
 from shared.robot.joints import MODULES
 from shared.robot.trip_table import JOINT_TRIPS
+from tools.fleet import procfs
 from tools.fleet.fleet_status import (
     FleetStatus,
     LeadStatus,
@@ -35,6 +37,7 @@ from tools.fleet.fleet_status import (
     module_status,
     tools_of,
 )
+from tools.fleet.others import warn_of_others
 from tools.fleet.status_table import (
     describe_lead,
     describe_refusals,
@@ -137,11 +140,20 @@ def test_each_way_out_is_told_once_with_its_modules_at_any_width() -> None:
     status = fleet_with(7, stopped, lost, stopped, well)
     lines = describe_ways_out(status)
     assert [line.partition(":")[0] for line in lines] == ["ankle_right, hip_right", "knee_right"]
+    assert "MODULE" in lines[0]
     assert "xrl kill knee_right" in lines[1]
     printed = io.StringIO()
     Console(width=60, file=printed).print(tables(status))
     words = " ".join(printed.getvalue().split())
     assert all(line in words for line in lines)
+
+
+def test_another_fleet_is_named_and_the_own_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(procfs, "fleets", lambda: {"/tmp/mine", "/tmp/other"})
+    printed = io.StringIO()
+    warn_of_others(Console(file=printed, width=60), own=Path("/tmp/mine"))
+    assert "xrl down --run-dir /tmp/other" in printed.getvalue()
+    assert "mine" not in printed.getvalue()
 
 
 def test_modules_that_follow_another_planner_are_named() -> None:

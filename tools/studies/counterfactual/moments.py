@@ -48,7 +48,7 @@ class Moment(msgspec.Struct):
         return self.state.scenario_s
 
     def runs(self, services: Sequence[str]) -> bool:
-        """Return True if one of some services, or a service not kept here, runs at this moment."""
+        """Return True if at least one of some services (planner, modules) runs at this moment."""
         return any(
             self.planner is not None if name == "planner" else name in self.modules
             for name in services
