@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import logging
+import os
+import stat
 
 
 def setup(service: str) -> logging.Logger:
-    """Send this process's log lines to stderr with its name and return its logger."""
+    """Send this process's log lines to stderr with its name and return its logger.
+
+    A line that a pipe does not take at once is lost: a supervisor that hangs holds nobody up.
+    """
+    if stat.S_ISFIFO(os.fstat(2).st_mode):
+        os.set_blocking(2, False)
     logging.basicConfig(
         level=logging.INFO,
         format=f"%(asctime)s.%(msecs)03d {service:<12} %(levelname)-7s %(message)s",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 from services.joint.drive_manager import DriveManager
@@ -55,6 +56,8 @@ def main() -> int:
         )
         drive = open_drive(robot, module, arguments.run_dir, read_only=arguments.readonly)
         rearm_guard = None if arguments.readonly else RearmGuard(arguments.run_dir, module)
+        if rearm_guard is not None:
+            rearm_guard.stop_on(signal.SIGUSR1)  # where the disk with its file is gone
         last_state = LastState.NOTHING if rearm_guard is None else rearm_guard.read()
         neighbours = None if arguments.readonly else Neighbours(arguments.run_dir, module)
         loop = JointLoop(

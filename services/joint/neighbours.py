@@ -15,12 +15,12 @@ host are unknown: hips then damp, knees sink, and only a planner makes the other
 
 from __future__ import annotations
 
-import mmap
 import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from services.joint.rearm_guard import mapped
 from shared.bus.messages import Mode, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import LOST_S
@@ -119,10 +119,12 @@ class Neighbours:
     """A module's place in the file."""
 
     def __init__(self, run_dir: Path, module: str) -> None:
-        """Open the file, or make it; the directory is there."""
-        with path_of(run_dir).open("a+b") as file:
-            file.truncate(_SIZE)
-            self._memory = mmap.mmap(file.fileno(), _SIZE)
+        """Open the file, or make it; the directory is there.
+
+        Raises:
+            FleetError: it cannot be made.
+        """
+        self._memory = mapped(path_of(run_dir), _SIZE)
         self._module = module
         self._at = MODULES.index(module) * _ROW.size
         self._written: int = _ROW.unpack_from(self._memory, self._at)[0] & ~1

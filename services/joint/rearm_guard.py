@@ -19,12 +19,16 @@ from __future__ import annotations
 
 import mmap
 import os
+import signal
 import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
+from types import FrameType
 from typing import Final
+
+from shared.exceptions import FleetError
 
 _LAST_STATE, _STOP = range(2)
 _BEATS: Final = struct.Struct("<Q")
@@ -48,6 +52,25 @@ class LastState(IntEnum):
     """It sank after an emergency stop: so does the next."""
 
 
+def mapped(path: Path, size: int) -> mmap.mmap:
+    """Return a shared file as memory, made if it is not there, for this user alone.
+
+    Its space is allocated now: on a full disk the first store would end the process (SIGBUS).
+
+    Raises:
+        FleetError: it cannot be made.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        try:
+            os.posix_fallocate(descriptor, 0, size)
+            return mmap.mmap(descriptor, size)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise FleetError(f"{path}: no shared memory: {error.strerror}") from None
+
+
 def path_of(run_dir: Path, module: str) -> Path:
     """Return the path of a module's rearm-guard file."""
     return run_dir / f"{module}.rearm"
@@ -57,12 +80,12 @@ class RearmGuard:
     """A module's rearm guard, a file in its run directory that processes map."""
 
     def __init__(self, run_dir: Path, module: str) -> None:
-        """Open it, or make it; the directory is there."""
-        path = path_of(run_dir, module)
-        with path.open("a+b") as file:
-            file.write(_NEW[file.seek(0, 2) :])
-            file.flush()
-            self._memory = mmap.mmap(file.fileno(), len(_NEW))
+        """Open it, or make it; the directory is there.
+
+        Raises:
+            FleetError: it cannot be made.
+        """
+        self._memory = mapped(path_of(run_dir, module), len(_NEW))
         self._written = self.read()
 
     def read(self) -> LastState:
@@ -83,6 +106,15 @@ class RearmGuard:
         if self._memory[_SOURCE_AT] == 0 and source:
             kept = _kept(source)
             self._memory[_SOURCE_AT : _SOURCE_AT + len(kept)] = kept
+
+    def stop_on(self, number: signal.Signals) -> None:
+        """Engage the emergency stop at a signal: the memory outlives its file and the disk."""
+
+        def engage(_number: int, _frame: FrameType | None) -> None:
+            self._memory[_STOP] = 1
+            self.note_stop(f"signal {number.name}")
+
+        signal.signal(number, engage)
 
     @property
     def stop_requested(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -19,6 +20,8 @@ from services.joint.rearm_guard import (
     path_of,
     request_stop,
 )
+from shared.exceptions import FleetError
+from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tools.fleet import process_table, procfs, supervise
 from tools.fleet.run_dir import RunDir
@@ -176,7 +179,7 @@ def test_a_service_that_is_down_is_started_as_if_none_had_been_before(
 ) -> None:
     calls = Calls({}, suspended=False)
     fleet_of(tmp_path, monkeypatch, calls, (MODULE,)).start_service(MODULE)
-    assert ("startProcess", MODULE, False) in calls.made
+    assert ("supervisor.startProcess", MODULE, False) in calls.made
     assert left.read() is LastState.NOTHING
 
 
@@ -233,9 +236,11 @@ def test_a_fleet_does_not_hear_of_what_held_before_it(
     assert left.read() is LastState.HELD
     neighbours.Neighbours(tmp_path, MODULE)
     if ends == "a new fleet":
-        plan = SimpleNamespace(listeners=(), processes=(), config_path=tmp_path / "robot.toml")
-        plan.processes = (SimpleNamespace(name=MODULE, topic="", stop_s=1.0),)
-        RunDir(tmp_path).prepare(cast("process_table.FleetPlan", plan))
+        plan = process_table.make_plan(
+            DEFAULT_CONFIG, Path("/nowhere"), overrides={}, services=[MODULE], simulation=True,
+            table_path=process_table.TABLE,
+        )  # fmt: skip
+        RunDir(tmp_path).prepare(plan)
     else:
         run = RunDir(tmp_path)
         lock = run.claim()
@@ -243,3 +248,31 @@ def test_a_fleet_does_not_hear_of_what_held_before_it(
         os.close(lock)
     assert not path_of(tmp_path, MODULE).exists()
     assert not neighbours.path_of(tmp_path).exists()
+
+
+def test_the_memory_of_a_service_takes_its_space_when_it_is_made(tmp_path: Path) -> None:
+    """A store to memory that a full disk cannot back ends the process with SIGBUS."""
+    RearmGuard(tmp_path, MODULE)
+    neighbours.Neighbours(tmp_path, MODULE)
+    for path in (path_of(tmp_path, MODULE), neighbours.path_of(tmp_path)):
+        found = path.stat()
+        assert found.st_blocks * 512 >= found.st_size > 0
+        assert found.st_mode & 0o077 == 0, "for this user alone"
+
+
+def test_memory_that_cannot_be_made_is_refused_by_its_name(tmp_path: Path) -> None:
+    path_of(tmp_path, MODULE).mkdir()
+    with pytest.raises(FleetError, match=rf"{MODULE}\.rearm: no shared memory: Is a directory"):
+        RearmGuard(tmp_path, MODULE)
+
+
+def test_a_signal_stops_a_service_whose_file_is_gone(tmp_path: Path, file: RearmGuard) -> None:
+    before = signal.getsignal(signal.SIGUSR1)
+    try:
+        file.stop_on(signal.SIGUSR1)
+        path_of(tmp_path, MODULE).unlink()
+        assert not file.stop_requested
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert file.stop_requested
+    finally:
+        signal.signal(signal.SIGUSR1, before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,11 +17,12 @@ from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import PENDANT, Pendant, stop_source
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode, SimTruth
-from shared.bus.session import open_session
+from shared.bus.session import Latest, open_session
 from shared.config.robot_config import RobotConfig
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
 from tests.system.verbs import xrl
+from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
@@ -41,6 +43,18 @@ def wait_for_modes(robot: RobotConfig, run_dir: Path, wanted: dict[str, Mode]) -
                 if state is not None:
                     modes[module] = state.mode
             time.sleep(0.01)
+
+
+def wait_until_all(states: dict[str, Latest[JointState]], wanted: Mode) -> None:
+    """Wait until every module that this open session hears tells a mode, from now on."""
+    modes: dict[str, int] = {}
+    deadline = time.monotonic() + 40.0
+    while [modes.get(module) for module in MODULES] != [wanted] * len(MODULES):
+        assert time.monotonic() < deadline, modes
+        for module, latest in states.items():
+            if (state := latest.take()) is not None:
+                modes[module] = state.mode
+        time.sleep(0.01)
 
 
 def wait_for_beats(run_dir: Path) -> None:
@@ -110,20 +124,37 @@ def test_a_pendant_that_is_killed_stops_all_six_without_a_planner(
         fleet.stop()
 
 
-def test_it_needs_no_supervisor(run_dir: Path, robot: RobotConfig) -> None:
-    """With the supervisor hung the bus way ends in an error; by then the six have been asked."""
+@pytest.mark.parametrize("disaster", ["hung", "dead, disk full", "dead, directory gone"])
+def test_it_needs_no_supervisor(disaster: str, run_dir: Path, robot: RobotConfig) -> None:
+    """The services hold on without it, and hear both ways, or else a signal."""
     fleet = SupervisedFleet.start(DEFAULT_CONFIG, run_dir, services=["simulator", *MODULES])
-    pid = int(fleet.run.supervisor_pid.read_text(encoding="utf-8"))
+    supervisor = int(fleet.run.supervisor_pid.read_text(encoding="utf-8"))
     try:
-        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.HOLD))
-        os.kill(pid, signal.SIGSTOP)
-        done = xrl("estop", run_dir=run_dir)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "not over the bus" in done.stderr
-        wait_for_modes(robot, run_dir, dict.fromkeys(MODULES, Mode.DAMP))
+        with open_session(robot, "test", run_dir) as session:
+            states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
+            wait_until_all(states, Mode.HOLD)
+            if disaster == "hung":
+                os.kill(supervisor, signal.SIGSTOP)
+            else:
+                for log in fleet.run.logs.iterdir():
+                    log.unlink()
+                    log.symlink_to("/dev/full")
+                os.kill(supervisor, signal.SIGKILL)
+            if disaster.endswith("gone"):
+                shutil.rmtree(run_dir)
+            pids = fleet.pids()
+            time.sleep(1.0)
+            assert fleet.pids() == pids, "every service goes on"
+            wait_until_all(states, Mode.HOLD)
+            done = xrl("estop", run_dir=run_dir)
+            gone = disaster.endswith("gone")
+            assert ("unconfirmed" in done.stderr) == gone, done.stderr
+            assert done.returncode == (2 if gone else 0), done.stdout + done.stderr
+            wait_until_all(states, Mode.DAMP)
     finally:
-        os.kill(pid, signal.SIGCONT)
+        os.kill(supervisor, signal.SIGCONT)
         fleet.stop()
+    assert procfs.fleet_pids(run_dir) == set()
 
 
 @pytest.mark.parametrize(("typed", "ends_in"), [(b"q\n", Mode.HOLD), (b"\n", Mode.DAMP)])

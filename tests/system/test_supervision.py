@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -12,16 +13,20 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from supervisor.states import ProcessStates
 
 from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
 from tests.system.waiting import wait_for
 from tools import cli
 from tools.fleet import procfs
+from tools.fleet import run_dir as run_dir_module
 from tools.fleet.run_dir import MARKER
 from tools.fleet.supervise import ServiceInfo, SupervisedFleet
+from tools.fleet.supervisor_process import BACKOFF_MAX_S, Service
 
 pytestmark = pytest.mark.system
 
@@ -177,25 +182,114 @@ def test_a_suspended_supervisor_does_not_hold_the_stop(start: Start, run_dir: Pa
     assert_nothing_left(run_dir, [pid])
 
 
-def test_no_service_outlives_a_killed_supervisor(start: Start, run_dir: Path) -> None:
+@pytest.mark.usefixtures("signal_handlers")
+def test_services_outlive_their_supervisor_and_are_shown_signalled_and_ended(
+    start: Start,
+    run_dir: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """They keep a robot standing, and nothing but a person may end that."""
     fleet = start({"planner": STUBBORN, "harness": SLEEPER})
-    pids = list(fleet.pids().values())
-    fleet.kill("harness", signal.SIGSTOP)
+    pids = fleet.pids()
+    where = ["--run-dir", str(run_dir)]
     os.kill(supervisor_pid(fleet), signal.SIGKILL)
-    assert wait_for(lambda: all(procfs.is_gone(pid) for pid in pids))
-    with pytest.raises(FleetError, match="does not answer"):
-        SupervisedFleet.attach(run_dir)
-    SupervisedFleet(run_dir).stop()
-    assert_nothing_left(run_dir, pids)
+    assert wait_for(lambda: bool(fleet.supervision_fault()))
+    assert [row.state for row in fleet.info()] == ["unsupervised", "unsupervised"]
+    assert cli.main(["status", *where]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "nothing restarts what ends" in shown
+    assert fleet.pids() == pids
+    with pytest.raises(FleetError, match="processes of a fleet without a supervisor"):
+        start()
+    assert fleet.pids() == pids, "a refused start ends nothing"
+    assert cli.main(["start", "planner", *where]) == 0
+    assert "runs already" in capsys.readouterr().out
+    assert cli.main(["kill", "harness", *where]) == 0
+    assert "nothing restarts what ends" in caplog.text
+    assert wait_for(lambda: [row.state for row in fleet.info()] == ["unsupervised", "gone"])
+    assert cli.main(["start", "harness", *where]) == 2
+    assert cli.main(["down", *where]) == 0
+    assert_nothing_left(run_dir, list(pids.values()))
 
 
-def test_a_fleet_can_start_where_one_was_killed(start: Start) -> None:
-    first = start()
+def test_a_start_that_nobody_asked_for_takes_the_place_of_an_unsupervised_fleet(
+    start: Start, run_dir: Path
+) -> None:
+    first = start(simulation=False)
     pids = list(first.pids().values())
     os.kill(supervisor_pid(first), signal.SIGKILL)
-    assert wait_for(lambda: all(procfs.is_gone(pid) for pid in pids))
-    assert wait_for(lambda: procfs.is_gone(supervisor_pid(first)))
+    assert wait_for(lambda: bool(first.supervision_fault()))
+    second = start(simulation=False, disarmed=True)
+    assert all(procfs.is_gone(pid) for pid in pids)
+    assert not second.supervision_fault()
+    assert len(second.pids()) == 2
+
+
+def test_a_fleet_can_start_where_one_was_killed(start: Start, run_dir: Path) -> None:
+    start()
+    procfs.signal_all(procfs.fleet_pids(run_dir), signal.SIGKILL)
+    assert wait_for(lambda: not procfs.fleet_pids(run_dir))
     assert len(start().pids()) == 2
+
+
+@pytest.mark.usefixtures("signal_handlers")
+@pytest.mark.parametrize("disaster", ["full", "removed", "a file in the place of the folder"])
+def test_supervision_goes_on_without_a_place_for_its_logs(
+    start: Start, run_dir: Path, disaster: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """supervisord itself died of a log line on a full disk, and its services with it."""
+    fleet = start({"planner": SLEEPER, "harness": SLEEPER})
+    logs = fleet.run.logs
+    if disaster == "full":
+        for log in logs.iterdir():
+            log.unlink()
+            log.symlink_to("/dev/full")
+    else:
+        shutil.rmtree(logs)
+    if disaster.startswith("a file"):
+        logs.write_text("in the way")
+    for restarts in range(1, 4):
+        fleet.kill("planner")
+        assert wait_for(lambda n=restarts: service(fleet, "planner").restarts == n)
+        assert wait_for(lambda: service(fleet, "planner").pid is not None)
+    assert "SIGKILL" in service(fleet, "planner").last_exit
+    assert service(fleet, "harness").restarts == 0
+    if disaster == "removed":
+        assert wait_for(lambda: "awake" in fleet.run.log_of("planner").read_text())
+        return
+    assert wait_for(lambda: fleet.lost_lines()[0] > 3)
+    assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "log lines are lost" in shown
+    assert fleet.lost_lines()[1] in shown
+
+
+@pytest.mark.usefixtures("signal_handlers")
+def test_status_says_why_a_service_does_not_come_up(
+    start: Start, run_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet = start({"planner": FAILING, "harness": SLEEPER}, disarmed=True)
+    assert wait_for(lambda: service(fleet, "planner").restarts > 0)
+    assert cli.main(["status", "--run-dir", str(run_dir)]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "planner: exit status 3" in shown
+    assert "no drive on can0" in shown
+
+
+def test_the_wait_before_another_start_is_bounded() -> None:
+    """After a power cut a planner failed 135 starts, and a mended one waited for minutes."""
+    waiting = Service.__new__(Service)
+    waiting.state, waiting.backoff = ProcessStates.STARTING, 135
+    waiting.config = SimpleNamespace(name="planner")
+    waiting.change_state(ProcessStates.BACKOFF)
+    assert waiting.delay <= time.time() + BACKOFF_MAX_S
+
+
+def test_a_start_on_a_full_disk_says_so(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_dir_module, "free_mib_at", lambda _path: 0.4)
+    with pytest.raises(FleetError, match=r"0\.4 MiB free, and a fleet needs 4 MiB"):
+        start()
 
 
 def test_a_second_fleet_in_the_same_directory_is_refused_and_harms_nothing(start: Start) -> None:

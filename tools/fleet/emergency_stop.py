@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import os
 import platform
+import signal
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
+from tools.fleet import procfs
 
 REPEAT_S: Final = 0.05
 """The bus may drop a message: the stop is repeated until all six have stopped."""
@@ -31,16 +33,24 @@ STOPPED: Final = (Mode.DAMP, Mode.FAULT)
 def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
     """Request a stop by shared memory from the services on this host.
 
+    A service whose memory has no file any more, as on a disk that vanished, is asked by SIGUSR1.
+
     Returns:
-        The modules that received it, and one line for each that could not.
+        The modules that received it, and one line for each that could not or cannot confirm it.
     """
     here, errors = [], []
+    processes: dict[str, int] | None = None
     for module in MODULES:
         try:
             if request_stop(run_dir, module, _source()):
                 here.append(module)
+                continue
         except OSError as error:
             errors.append(f"{module}: no stop by shared memory: {error.strerror}")
+        processes = procfs.service_pids(run_dir) if processes is None else processes
+        if module in processes:
+            procfs.signal_all([processes[module]], signal.SIGUSR1)
+            errors.append(f"{module}: its shared memory is gone: asked by SIGUSR1, unconfirmed")
     return here, errors
 
 

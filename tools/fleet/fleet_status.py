@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 import msgspec
@@ -29,7 +29,9 @@ from shared.exceptions import FleetError
 from shared.robot.joints import MODULES
 from shared.robot.remedies import reason_of, remedy_of
 from tools.fleet.proxy_client import ProxyClient
+from tools.fleet.run_dir import SPACE_LOW_MIB, free_mib_at
 from tools.fleet.supervise import SupervisedFleet
+from tools.fleet.supervisor_client import ServiceInfo
 
 TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
 """Who holds a module up: the planner (1) or its joint service alone (2). In every other
@@ -127,6 +129,8 @@ class FleetStatus(msgspec.Struct, frozen=True):
     """`bus.security.mode` of the robot file."""
     tools: tuple[str, ...] = ()
     """Tools that are linked beside this one, each as NAME.HOST.PID, as it names itself."""
+    trouble: tuple[str, ...] = ()
+    """What is wrong with supervision, logs and disk, a line each."""
 
 
 class RateMonitor:
@@ -220,8 +224,8 @@ def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: 
     # before the call to the supervisor, which takes a while on a busy machine
     present = {name: (monitor.age_s(), monitor.rate_hz()) for name, monitor in monitors.items()}
     fresh = {name for name, monitor in monitors.items() if monitor.is_fresh()}
-    services = {}
-    for service in fleet.info():
+    services, infos = {}, fleet.info()
+    for service in infos:
         age_s, rate_hz = present.get(service.name, (None, None))
         services[service.name] = ServiceStatus(
             pid=service.pid,
@@ -245,7 +249,32 @@ def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: 
     tools = tools_of(monitors[ROSTER].newest if ROSTER in fresh else None)
     config, network = fleet.manifest.config, impairments(fleet)
     return FleetStatus(
-        str(fleet.run.path), config, services, modules, lead, network, pace(), security, tools
+        str(fleet.run.path), config, services, modules, lead, network, pace(), security, tools,
+        trouble_of(fleet, infos),
+    )  # fmt: skip
+
+
+def trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tuple[str, ...]:
+    """Return what is wrong with supervision, logs and disk, a line each."""
+    fault = fleet.supervision_fault()
+    lines = [fault] if fault else []
+    lost, why = fleet.lost_lines()
+    if lost:
+        lines.append(f"{lost} log lines are lost: {why}: {fleet.run.logs}")
+    try:
+        free_mib = free_mib_at(fleet.run.path)
+    except OSError as error:
+        lines.append(f"{fleet.run.path}: {error.strerror}")
+    else:
+        if free_mib < SPACE_LOW_MIB:
+            lines.append(f"{fleet.run.path}: {free_mib:.1f} MiB free; free some space")
+    return (
+        *lines,
+        *(
+            f"{row.name}: {row.last_exit}, start {row.restarts + 1} so far; {row.last_line}"
+            for row in services
+            if row.state in ("backoff", "starting") and row.last_exit
+        ),
     )
 
 

@@ -16,6 +16,8 @@ _POLL_S = 0.05
 
 FLEET_VARIABLE = "XRL_FLEET"
 """Environment variable that marks a fleet's processes; set by the supervisor only."""
+_SERVICE_VARIABLE = b"SUPERVISOR_PROCESS_NAME="
+"""Set by supervisord: the service's name."""
 
 
 def fleet_pids(run_dir: Path) -> set[int]:
@@ -24,16 +26,31 @@ def fleet_pids(run_dir: Path) -> set[int]:
     return {pid for pid in pids if pid != os.getpid() and belongs(pid, run_dir)}
 
 
+def service_pids(run_dir: Path) -> dict[str, int]:
+    """Return the process of each service of the fleet, with or without its supervisor."""
+    found = {}
+    for pid in fleet_pids(run_dir):
+        for variable in _environment(pid):
+            if variable.startswith(_SERVICE_VARIABLE):
+                found[os.fsdecode(variable.removeprefix(_SERVICE_VARIABLE))] = pid
+    return found
+
+
 def belongs(pid: int, run_dir: Path) -> bool:
     """Return True if a process is this user's and of the fleet in this run directory."""
-    mark = os.fsencode(f"{FLEET_VARIABLE}={run_dir}")
-    entry = Path(f"/proc/{pid}")
     try:
-        return entry.stat().st_uid == os.getuid() and mark in (
-            (entry / "environ").read_bytes().split(b"\0")
-        )
+        own = Path(f"/proc/{pid}").stat().st_uid == os.getuid()
     except OSError:
-        return False  # it has just ended, or is somebody else's
+        return False  # it has just ended
+    return own and os.fsencode(f"{FLEET_VARIABLE}={run_dir}") in _environment(pid)
+
+
+def _environment(pid: int) -> list[bytes]:
+    """Return a process's variables; none if it has ended or is somebody else's."""
+    try:
+        return Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    except OSError:
+        return []
 
 
 def fleets() -> set[str]:
@@ -41,12 +58,7 @@ def fleets() -> set[str]:
     mark = os.fsencode(f"{FLEET_VARIABLE}=")
     found = set()
     for entry in Path("/proc").iterdir():
-        if not entry.name.isdecimal():
-            continue
-        try:
-            variables = (entry / "environ").read_bytes().split(b"\0")
-        except OSError:
-            continue
+        variables = _environment(int(entry.name)) if entry.name.isdecimal() else ()
         found |= {os.fsdecode(v.removeprefix(mark)) for v in variables if v.startswith(mark)}
     return found
 
@@ -70,6 +82,16 @@ def use_of(pids: Iterable[int]) -> dict[int, ProcessUse]:
         memory_mib = pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
         found[pid] = ProcessUse(ticks / os.sysconf("SC_CLK_TCK"), memory_mib)
     return found
+
+
+def uptime_s(pid: int) -> float:
+    """Return how long ago a process was started; 0 if it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    booted_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return max(0.0, booted_s - int(fields[19]) / os.sysconf("SC_CLK_TCK"))
 
 
 def is_suspended(pid: int) -> bool:

@@ -34,8 +34,14 @@ _BY_HAND: Final = ("*.zenoh.lock", "*.rearm", "*.near", PACE_FILE, usb_standin.F
 _LOGGED: Final = (*SERVICES, "network_proxy", "ros2_gateway", "supervisord", "view")
 """What has a log in a run directory."""
 
+FILES_MIN: Final = 128
+"""Files that the supervisor may have open at the least: three for each of some twelve services."""
+SPACE_MIN_MIB: Final = 4
+"""Free space that a start needs in the run directory, for sockets, shared memory and logs."""
+SPACE_LOW_MIB: Final = 64
+"""Free space below which `xrl status` says so: each of twelve logs may take 10 MB."""
 _NEVER_GIVE_UP = 1_000_000
-"""Starts that may fail in a row; each waits a second longer than the one before."""
+"""Starts that may fail in a row (`supervisor_process.BACKOFF_MAX_S`)."""
 
 
 class Manifest(msgspec.Struct, frozen=True):
@@ -145,15 +151,44 @@ class RunDir:
         except FileNotFoundError:
             return False
 
-    def prepare(self, plan: FleetPlan, pace: float = 1.0, *, disarmed: bool = False) -> None:
-        """Start with empty logs and no dead sockets; write the manifest and the clock's pace.
+    def prepare(
+        self,
+        plan: FleetPlan,
+        pace: float = 1.0,
+        no_restart: Collection[str] = (),
+        *,
+        disarmed: bool = False,
+    ) -> None:
+        """Start with empty logs and no dead sockets; write what supervisor and services read.
 
         Args:
             plan: of the fleet.
             pace: clock rate.
+            no_restart: services that stay down when they end.
             disarmed: no person asks for this start: a drive that does not hold stays idle, an
-                emergency stop holds on, and the logs of what ended are kept.
+                emergency stop holds on, and the logs of what ended are kept. A disk that is nearly
+                full is no reason not to start.
+
+        Raises:
+            FleetError: the disk is full, or cannot be written.
         """
+        try:
+            self._prepare(plan, pace, no_restart, disarmed=disarmed)
+            free_mib = free_mib_at(self.path)
+        except OSError as error:
+            raise FleetError(
+                f"{self.path}: {error.strerror}: a fleet keeps its sockets, shared memory and "
+                "logs there; free some space, or give another directory with --run-dir"
+            ) from None
+        if free_mib < SPACE_MIN_MIB and not disarmed:
+            raise FleetError(
+                f"{self.path}: {free_mib:.1f} MiB free, and a fleet needs {SPACE_MIN_MIB} MiB "
+                "there for sockets, shared memory and logs; free some, or give another --run-dir"
+            )
+
+    def _prepare(
+        self, plan: FleetPlan, pace: float, no_restart: Collection[str], *, disarmed: bool
+    ) -> None:
         self.pace.unlink(missing_ok=True)
         if pace != 1.0:
             self.pace.write_text(f"{pace:g}\n", encoding="ascii")
@@ -170,6 +205,8 @@ class RunDir:
             stop_s=max(row.stop_s for row in plan.processes),
         )
         self.manifest.write_bytes(msgspec.json.format(msgspec.json.encode(manifest)))
+        text = supervisor_config(self, plan, no_restart)
+        self.supervisor_config.write_text(text, encoding="utf-8")
         for path in (*manifest.sockets, str(self.supervisor_socket)):
             _remove_socket(Path(path))
         if disarmed:
@@ -217,11 +254,21 @@ class RunDir:
 
     def _remove_logs(self) -> None:
         """Remove the services' logs, and their folder if it is then empty."""
-        for name in _LOGGED:
-            for ending in (".log", ".log.1", ".stderr"):
-                (self.logs / f"{name}{ending}").unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # none there, or it holds files of others
+            for name in _LOGGED:
+                for ending in (".log", ".log.1", ".stderr"):
+                    (self.logs / f"{name}{ending}").unlink(missing_ok=True)
             self.logs.rmdir()
+
+
+def free_mib_at(path: Path) -> float:
+    """Return the free space where a directory is, MiB.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    found = os.statvfs(path)
+    return found.f_bavail * found.f_frsize / (1 << 20)
 
 
 def supervisor_config(run: RunDir, plan: FleetPlan, no_restart: Collection[str]) -> str:
@@ -242,11 +289,16 @@ def supervisor_config(run: RunDir, plan: FleetPlan, no_restart: Collection[str])
                 "nodaemon": "true",
                 "silent": "true",
                 "nocleanup": "true",
+                "minfds": FILES_MIN,
             },
         ),
         (
             "rpcinterface:supervisor",
             {"supervisor.rpcinterface_factory": "supervisor.rpcinterface:make_main_rpcinterface"},
+        ),
+        (
+            "rpcinterface:xrl",  # tools.fleet.supervisor_process, which is the main module there
+            {"supervisor.rpcinterface_factory": "__main__:make_interface"},
         ),
     ]
     for priority, row in enumerate(plan.processes):

@@ -163,4 +163,5 @@ def tables(status: FleetStatus) -> Group:
     lines += [f" linked: {escape(describe_tools(status))}"] if status.tools else []
     sessions = describe_sessions(status)
     lines += [f" [bold yellow]{sessions}[/]"] if sessions else []
+    lines += [f" [bold red]{printable(words)}[/]" for words in status.trouble]
     return Group(services, modules, *lines)

@@ -1,13 +1,14 @@
 """A fleet of services under supervisord: start, look, signal, stop.
 
-supervisord restarts what ends, with a growing delay for what ends at once. It runs on a
-leash (`tools.fleet.parent_death`): if it is killed, so is every service.
+supervisord restarts what ends (`tools.fleet.supervisor_process`). If it dies, the services of a
+robot go on: they keep it standing. They are then found by their environment (`tools.fleet.procfs`).
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -23,7 +24,7 @@ from shared.exceptions import FleetError
 from shared.run_directory import check_own
 from tools.fleet import process_table, procfs
 from tools.fleet.pace import check_pace, usual_pace
-from tools.fleet.run_dir import Manifest, RunDir, supervisor_config
+from tools.fleet.run_dir import FILES_MIN, Manifest, RunDir
 from tools.fleet.supervisor_client import RefusedError, ServiceInfo, Supervisor
 
 _POLL_S = 0.1
@@ -75,7 +76,7 @@ class SupervisedFleet:
             injected: with the network proxy on the links of planner, joints and sensors.
             ros2: with the gateway to ROS 2.
             pace: clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1.
-            leashed: stop the fleet if this process dies.
+            leashed: stop the fleet if this process or the supervisor dies.
             disarmed: for a start that no person asks for: it arms no drive, takes those over that
                 hold, keeps an emergency stop, and ends nothing if a service does not come up, for
                 the drives of the others would be idled: the supervisor goes on trying.
@@ -104,48 +105,53 @@ class SupervisedFleet:
         simulated = "simulator" in plan.commands
         clock_pace = pace if pace is not None else usual_pace() if simulated else 1.0
         check_pace(clock_pace, simulated=simulated)
+        files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        if 0 <= files < FILES_MIN:
+            raise FleetError(f"{files} files may be open, and a fleet needs {FILES_MIN}: ulimit -n")
         lock = started.run.claim()
         try:
-            process_table.check_free(plan.listeners)
-            started.run.prepare(plan, clock_pace, disarmed=disarmed)
-            text = supervisor_config(started.run, plan, no_restart)
-            started.run.supervisor_config.write_text(text, encoding="utf-8")
-            environment = dict(plan.environment)
-            if plan.emulated_usb:
-                environment |= usb_standin.prepare(started.run.path)
-            started._launch(environment, lock, leashed=leashed)
-            try:
-                started._wait_until_up(plan, timeout_s)
-            except FleetError as error:
-                if not (disarmed and started._is_supervised):
-                    raise
-                log.get("xrl").warning("%s; the supervisor goes on trying", error)
-        except BaseException as error:
-            with _uninterrupted():
-                started._end()
-                started._clear(keep_logs=isinstance(error, FleetError), keep_stops=disarmed)
-            raise
+            started._end_unsupervised(take_over=disarmed and not simulated)
+            started._start(plan, lock, clock_pace, no_restart, leashed, disarmed, timeout_s)
         finally:
             os.close(lock)
         return started
 
     @classmethod
-    def attach(cls, run_dir: Path) -> Self:
+    def attach(cls, run_dir: Path, *, warn: bool = True) -> Self:
         """Return the fleet that is up in a run directory.
+
+        Args:
+            run_dir: the directory.
+            warn: log that its supervisor is dead, if it is.
 
         Raises:
             FleetError: none is.
         """
         attached = cls(run_dir)
-        check_own(attached.run.path)
-        if (
-            not attached.run.is_marked
-            or attached.run.read_manifest() is None
-            or not attached.run.supervisor_socket.exists()
-        ):
-            raise FleetError(f"no fleet is up in {attached.run.path}; `xrl up` starts one")
-        attached._supervisor.call("getState")
+        run = attached.run
+        check_own(run.path)
+        running = procfs.fleet_pids(run.path)
+        if not run.is_marked or run.read_manifest() is None:
+            if running:
+                raise FleetError(
+                    f"{run.path}: {len(running)} processes of a fleet run, and its files are gone; "
+                    "`xrl estop` stops the robot, `xrl down` ends them"
+                )
+            raise FleetError(f"no fleet is up in {run.path}; `xrl up` starts one")
+        if fault := attached.supervision_fault():
+            if not running:
+                raise FleetError(f"no fleet is up in {run.path}; `xrl up` starts one ({fault})")
+            if warn:
+                log.get("xrl").warning("%s", fault)
         return attached
+
+    def supervision_fault(self) -> str:
+        """Return why nothing restarts what ends, and the way out; empty if all is well."""
+        try:
+            self._supervisor.call("supervisor.getState")
+        except FleetError as error:
+            return str(error)
+        return ""
 
     @property
     def manifest(self) -> Manifest:
@@ -156,12 +162,29 @@ class SupervisedFleet:
         return manifest
 
     def info(self) -> list[ServiceInfo]:
-        """Return every service, in the order of the process table."""
-        return self._supervisor.info(self.manifest.services)
+        """Return every service, in the order of the process table.
+
+        Raises:
+            FleetError: there is neither a supervisor nor a service.
+        """
+        names = self.manifest.services
+        try:
+            return self._supervisor.info(names)
+        except FleetError:
+            if pids := self.pids():
+                return [_unsupervised(name, pids.get(name)) for name in names]
+            raise
+
+    def lost_lines(self) -> tuple[int, str]:
+        """Return how many log lines no disk took, and why; none where nobody knows."""
+        try:
+            return self._supervisor.lost_lines()
+        except FleetError:
+            return 0, ""
 
     def pids(self) -> dict[str, int]:
         """Return the process id of each service that has a process."""
-        return self._supervisor.pids()
+        return procfs.service_pids(self.run.path)
 
     def kill(self, service: str, number: int = signal.SIGKILL) -> int:
         """Send a signal to a service, at once, and return the process id it went to.
@@ -173,8 +196,6 @@ class SupervisedFleet:
         pid = self.pids().get(service)
         if pid is None:
             raise FleetError(f"{service} has no process to signal now; see `xrl status`")
-        if not procfs.belongs(pid, self.run.path):
-            raise FleetError(f"{service}: process {pid} is not of this fleet, and gets no signal")
         try:
             os.kill(pid, number)
         except ProcessLookupError:
@@ -200,10 +221,10 @@ class SupervisedFleet:
         pid = self.pids().get(service)
         if pid is None:
             self.forget(service)
-            with contextlib.suppress(RefusedError):
-                self._supervisor.call("stopProcess", service)  # ends the wait of a backoff
+            with contextlib.suppress(RefusedError):  # it ends the wait of a backoff
+                self._supervisor.call("supervisor.stopProcess", service)
             try:
-                self._supervisor.call("startProcess", service, False)
+                self._supervisor.call("supervisor.startProcess", service, False)
             except RefusedError as refusal:
                 raise FleetError(f"{service}: cannot be started: {refusal}") from None
         elif procfs.is_suspended(pid):
@@ -234,10 +255,63 @@ class SupervisedFleet:
         finally:
             os.close(lock)
 
+    def _start(
+        self,
+        plan: process_table.FleetPlan,
+        lock: int,
+        clock_pace: float,
+        no_restart: frozenset[str],
+        leashed: bool,
+        disarmed: bool,
+        timeout_s: float,
+    ) -> None:
+        try:
+            process_table.check_free(plan.listeners)
+            self.run.prepare(plan, clock_pace, no_restart, disarmed=disarmed)
+            environment = dict(plan.environment)
+            if plan.emulated_usb:
+                environment |= usb_standin.prepare(self.run.path)
+            self._launch(environment, lock, leashed=leashed)
+            try:
+                self._wait_until_up(plan, timeout_s)
+            except FleetError as error:
+                if not (disarmed and self._is_supervised):
+                    raise
+                log.get("xrl").warning("%s; the supervisor goes on trying", error)
+        except BaseException as error:
+            with _uninterrupted():
+                self._end()
+                self._clear(keep_logs=isinstance(error, FleetError), keep_stops=disarmed)
+            raise
+
     @property
     def _is_supervised(self) -> bool:
         """True while the supervisor that this process has started is alive."""
         return self._process is not None and self._process.poll() is None
+
+    def _end_unsupervised(self, *, take_over: bool) -> None:
+        """End the services that a dead supervisor has left here, if their drives then hold.
+
+        Args:
+            take_over: the services that start now take over the drives that hold meanwhile.
+
+        Raises:
+            FleetError: they are not to end, or do not.
+        """
+        left = procfs.fleet_pids(self.run.path)
+        if not left:
+            return
+        if not take_over:
+            raise FleetError(
+                f"{self.run.path}: {len(left)} processes of a fleet without a supervisor run here; "
+                "`xrl down` ends them, which lets go of the robot"
+            )
+        procfs.signal_all(left, signal.SIGCONT)
+        procfs.signal_all(left, signal.SIGTERM)  # by which a drive goes on holding
+        left = procfs.wait_until_gone(self.run.path, _KILLED_S)
+        procfs.signal_all(left, signal.SIGKILL)
+        if procfs.wait_until_gone(self.run.path, _KILLED_S):
+            raise FleetError(f"processes {sorted(left)} do not end, not even by SIGKILL")
 
     def _clear(self, *, keep_logs: bool, keep_stops: bool) -> None:
         """Remove the fleet's files from the run directory."""
@@ -251,8 +325,8 @@ class SupervisedFleet:
         try:
             if manifest is None:
                 raise FleetError(f"no fleet is up in {self.run.path}")
-            self._supervisor.call("stopAllProcesses", False)  # all at once,
-            self._supervisor.call("shutdown")  # which by itself goes one by one
+            self._supervisor.call("supervisor.stopAllProcesses", False)  # all at once,
+            self._supervisor.call("supervisor.shutdown")  # which by itself goes one by one
         except FleetError:
             # no supervisor, or none that answers: the processes are signalled directly
             # (SIGINT: a joint service then leaves its drive idle)
@@ -273,7 +347,7 @@ class SupervisedFleet:
         command = [
             sys.executable,
             "-m",
-            "tools.fleet.parent_death",
+            "tools.fleet.supervisor_process",
             *leash,
             "--",
             "--nodaemon",
@@ -281,7 +355,7 @@ class SupervisedFleet:
         command += ["--configuration", str(self.run.supervisor_config)]
         marked = {**os.environ, **environment, procfs.FLEET_VARIABLE: str(self.run.path)}
         # An interrupt between fork and exec would leave a process that nobody can find;
-        # `tools.fleet.parent_death` unblocks in the child.
+        # `tools.fleet.supervisor_process` unblocks in the child.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
         try:
             with self.run.supervisor_stderr.open("wb") as output:
@@ -338,7 +412,16 @@ class SupervisedFleet:
         """Return what to say of a service that ended while the fleet was starting."""
         log = self.run.log_of(service.name)
         how = service.last_exit or "could not be run"
-        return f"{service.name} ended at once ({how}); {log}:\n{_tail(log)}".rstrip()
+        words = _tail(log) or service.last_line
+        return f"{service.name} ended at once ({how}); {log}:\n{words}".rstrip()
+
+
+def _unsupervised(name: str, pid: int | None) -> ServiceInfo:
+    """Return what the kernel knows of a service whose supervisor is dead."""
+    if pid is None:
+        return ServiceInfo(name, None, "gone", 0.0, 0, "")
+    state = "suspended" if procfs.is_suspended(pid) else "unsupervised"
+    return ServiceInfo(name, pid, state, procfs.uptime_s(pid), 0, "")
 
 
 @contextlib.contextmanager

@@ -1,14 +1,12 @@
-"""What supervisord says of its services, by XML-RPC over its UNIX socket and by its log."""
+"""What supervisord says of its services, by XML-RPC over its UNIX socket."""
 
 from __future__ import annotations
 
-import contextlib
-import re
 import xmlrpc.client
 from collections.abc import Callable, Iterable, Mapping
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 from supervisor.xmlrpc import SupervisorTransport
@@ -18,8 +16,11 @@ from tools.fleet.procfs import is_suspended
 from tools.fleet.run_dir import RunDir
 
 _TIMEOUT_S = 3.0
-_ENDED = re.compile(r"(?:exited|stopped): (\S+) \((.*?)(?:; (?:not )?expected)?\)$")
-_SPAWNED = re.compile(r"spawned: '(\S+)' with pid \d+$")
+UNSUPERVISED: Final = (
+    "what runs goes on and hears `xrl estop`, but nothing restarts what ends: hang the robot, then "
+    "`xrl down`"
+)
+"""What a dead supervisor means, and the way out."""
 
 
 class ServiceInfo(msgspec.Struct, frozen=True):
@@ -30,13 +31,16 @@ class ServiceInfo(msgspec.Struct, frozen=True):
     """None while it has no process."""
     state: str
     """starting, running, suspended (SIGSTOP), stopping, or without a process: backoff
-    (the next start is delayed), exited, fatal (not started again), stopped."""
+    (the next start is delayed), exited, fatal (not started again), stopped. Without a supervisor:
+    unsupervised, suspended or gone."""
     uptime_s: float
-    """Since its start, in whole seconds; 0 while it has no process."""
+    """Since its start; 0 while it has no process."""
     restarts: int
     """Starts since the first one, wanted or not."""
     last_exit: str
     """How it ended last, for example "terminated by SIGKILL"; empty if it never has."""
+    last_line: str = ""
+    """Newest line of its log, also if no disk took it."""
 
 
 class RefusedError(FleetError):
@@ -49,20 +53,18 @@ class Supervisor:
     def __init__(self, run: RunDir) -> None:
         self._run = run
 
-    def pids(self) -> dict[str, int]:
-        """Return the process id of each service that has a process."""
-        return {row["name"]: row["pid"] for row in self.call("getAllProcessInfo") if row["pid"]}
-
     def info(self, services: Iterable[str]) -> list[ServiceInfo]:
         """Return these services, in this order."""
-        rows = {row["name"]: row for row in self.call("getAllProcessInfo")}
-        starts, ends = self._history()  # after the states: it then explains them
-        return [
-            _service_info(rows[name], starts.get(name, 0), ends.get(name, "")) for name in services
-        ]
+        rows = {row["name"]: row for row in self.call("xrl.services")}
+        return [_service_info(rows[name]) for name in services]
+
+    def lost_lines(self) -> tuple[int, str]:
+        """Return how many log lines no disk took, and why the newest was lost."""
+        answer = self.call("xrl.logs")
+        return answer["lost"], answer["why"]
 
     def call(self, method: str, *arguments: object) -> Any:
-        """Call the supervisor.
+        """Call the supervisor; the method has its namespace, `supervisor` or `xrl`.
 
         Raises:
             FleetError: it does not answer.
@@ -71,26 +73,13 @@ class Supervisor:
         transport = _Transport(self._run.supervisor_socket)
         try:
             with xmlrpc.client.ServerProxy("http://localhost", transport=transport) as proxy:
-                return getattr(proxy.supervisor, method)(*arguments)
+                return getattr(proxy, method)(*arguments)
         except xmlrpc.client.Fault as fault:
             raise RefusedError(fault.faultString) from None
         except (OSError, HTTPException, xmlrpc.client.ProtocolError) as error:
             raise FleetError(
-                f"the supervisor in {self._run.path} does not answer ({error}); "
-                "`xrl down` clears it away"
+                f"the supervisor in {self._run.path} does not answer ({error}); {UNSUPERVISED}"
             ) from None
-
-    def _history(self) -> tuple[dict[str, int], dict[str, str]]:
-        """Return how often each service was started and how it ended last."""
-        starts: dict[str, int] = {}
-        ends: dict[str, str] = {}
-        with contextlib.suppress(FileNotFoundError):
-            for line in self._run.supervisor_log.read_text(encoding="utf-8").splitlines():
-                if match := _SPAWNED.search(line):
-                    starts[match[1]] = starts.get(match[1], 0) + 1
-                elif match := _ENDED.search(line):
-                    ends[match[1]] = match[2]
-        return starts, ends
 
 
 class _Transport(SupervisorTransport):  # type: ignore[misc]  # supervisor has no types
@@ -109,14 +98,15 @@ class _Transport(SupervisorTransport):  # type: ignore[misc]  # supervisor has n
         self.__dict__["_get_connection"] = connect
 
 
-def _service_info(row: Mapping[str, Any], starts: int, last_exit: str) -> ServiceInfo:
+def _service_info(row: Mapping[str, Any]) -> ServiceInfo:
     pid = row["pid"] or None
     suspended = pid is not None and is_suspended(pid)
     return ServiceInfo(
         name=row["name"],
         pid=pid,
-        state="suspended" if suspended else row["statename"].lower(),
-        uptime_s=float(row["now"] - row["start"]) if pid else 0.0,
-        restarts=max(0, starts - 1),
-        last_exit=last_exit,
+        state="suspended" if suspended else row["state"],
+        uptime_s=row["uptime_s"],
+        restarts=max(0, row["starts"] - 1),
+        last_exit=row["last_exit"],
+        last_line=row["last_line"],
     )

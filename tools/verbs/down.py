@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
@@ -31,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
     """Stop every service, also of a fleet whose supervisor is dead; keep the logs."""
     fleet = SupervisedFleet(args.run_dir)
     was_up = fleet.run.is_marked and fleet.run.read_manifest() is not None
+    was_up |= bool(procfs.fleet_pids(fleet.run.path))  # its directory may have been removed
     fleet.stop(keep_logs=True, keep_stops=args.keep_stops)
     if was_up:
         print(f"the fleet in {fleet.run.path} is down; its logs stay in {fleet.run.logs}")

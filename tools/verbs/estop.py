@@ -19,7 +19,6 @@ from shared.process import StopFlag
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
 from tools.fleet.run_dir import RunDir
-from tools.fleet.supervise import SupervisedFleet
 from tools.typed_line import typed_line
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
@@ -119,8 +118,12 @@ def _robot(args: argparse.Namespace) -> RobotConfig:
     Raises:
         ConfigError, FleetError: there is none.
     """
-    config = args.config or Path(SupervisedFleet.attach(args.run_dir).manifest.config)
-    return load(config)
+    if args.config is not None:
+        return load(args.config)
+    manifest = RunDir(args.run_dir).read_manifest()  # whether or not its supervisor lives
+    if manifest is None:
+        raise FleetError(f"no fleet is up in {args.run_dir}; name its robot file with --config")
+    return load(Path(manifest.config))
 
 
 def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:

@@ -42,7 +42,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Look at the fleet once, or until interrupted."""
-    fleet = SupervisedFleet.attach(args.run_dir)
+    fleet = SupervisedFleet.attach(args.run_dir, warn=False)  # it is in the table
     robot = load(Path(fleet.manifest.config))
     security = robot.bus.security.mode
     with open_session(robot, "status", fleet.run.path) as session:

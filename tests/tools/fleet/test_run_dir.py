@@ -180,15 +180,13 @@ def test_a_file_is_no_run_directory(tmp_path: Path) -> None:
         check_own(tmp_path / "file")
 
 
-def test_a_process_that_is_not_of_the_fleet_gets_no_signal(
-    claimed: RunDir, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as stranger:
-        assert not procfs.belongs(stranger.pid, claimed.path)
-        fleet = SupervisedFleet(claimed.path)
-        monkeypatch.setattr(fleet, "pids", lambda: {"planner": stranger.pid})
-        with pytest.raises(FleetError, match="is not of this fleet, and gets no signal"):
-            fleet.kill("planner", signal.SIGKILL)
+def test_a_service_of_another_fleet_gets_no_signal(claimed: RunDir) -> None:
+    other = {procfs.FLEET_VARIABLE: "/tmp/other", "SUPERVISOR_PROCESS_NAME": "planner"}
+    with subprocess.Popen(
+        [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, env={**os.environ, **other}
+    ) as stranger:
+        with pytest.raises(FleetError, match="planner has no process to signal now"):
+            SupervisedFleet(claimed.path).kill("planner", signal.SIGKILL)
         assert stranger.poll() is None
         stranger.communicate(b"\n")
 

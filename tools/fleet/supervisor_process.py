@@ -1,0 +1,202 @@
+"""supervisord that needs no disk: `python -m tools.fleet.supervisor_process -- ARGUMENTS`.
+
+Supervision must stand a full, read-only or vanished disk. A log line that cannot be written is
+counted and dropped; the file is tried again at each line. The services outlive their supervisor:
+they are what keeps a robot standing, and they still hear an emergency stop. With `--parent PID`,
+the fleet belongs to a tool and has no robot on it: it ends when that process or its supervisor
+dies.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+import time
+from io import FileIO
+from pathlib import Path
+from typing import Any, ClassVar, Final
+
+from supervisor import loggers, process, supervisord
+from supervisor.options import ServerOptions, decode_wait_status
+from supervisor.states import ProcessStates, getProcessStateDescription
+
+from tools.fleet.parent_death import die_with_parent
+
+BACKOFF_MAX_S: Final = 5.0
+"""Longest wait before a service that ends at once is started again, s. supervisord adds a second
+each time without a bound: after 135 failed starts a mended service stayed down for two minutes."""
+NEWEST_MAX: Final = 300
+"""Bytes of a log's newest line that are kept."""
+
+
+class LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no types
+    """A log that rotates, comes back after its folder was removed, and never raises."""
+
+    lost = 0
+    """Lines that could not be written, in all logs of this process."""
+    why = ""
+    """Why the newest of them could not."""
+    newest: ClassVar[dict[str, str]] = {}
+    """By file: its newest line, also where no disk took it."""
+
+    def __init__(self, filename: str, _mode: str, maxBytes: int, _backups: int) -> None:
+        super().__init__(None)
+        self.stream: FileIO | None = None
+        self.baseFilename = filename
+        self._max_bytes = maxBytes
+        self._missing = 0
+        with contextlib.suppress(OSError):
+            self._open()
+
+    def emit(self, record: loggers.LogRecord) -> None:
+        """Write one record; drop it if the disk does not take it."""
+        message = record.msg
+        text = message if isinstance(message, bytes) else (self.fmt % record.asdict()).encode()
+        if words := text.strip():
+            newest = words.rpartition(b"\n")[2][:NEWEST_MAX]
+            LogFile.newest[self.baseFilename] = newest.decode(errors="replace")
+        try:
+            self._open()
+            if self._missing:
+                self._write(f"({self._missing} lines are missing: {LogFile.why})\n".encode())
+                self._missing = 0
+            self._write(text)
+            if 0 < self._max_bytes <= Path(self.baseFilename).stat().st_size:
+                Path(self.baseFilename).replace(f"{self.baseFilename}.1")
+        except OSError as error:
+            self.close()
+            self._missing += 1
+            LogFile.lost, LogFile.why = LogFile.lost + 1, error.strerror or str(error)
+
+    def flush(self) -> None:
+        """Do nothing: nothing is buffered."""
+
+    def close(self) -> None:
+        """Close the file; the next line opens it."""
+        if self.stream is not None:
+            self.stream.close()
+            self.stream = None
+
+    reopen = close
+
+    def remove(self) -> None:
+        """Close the file and remove it."""
+        self.close()
+        Path(self.baseFilename).unlink(missing_ok=True)
+
+    def _open(self) -> None:
+        """Open the file unless it is open and still has its name."""
+        path = Path(self.baseFilename)
+        if self.stream is not None:
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(self.stream.fileno()), path.stat()):
+                    return
+            self.close()
+        with contextlib.suppress(FileExistsError):
+            path.parent.mkdir(mode=0o700)
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+        self.stream = FileIO(os.open(path, flags, 0o600), "a")
+
+    def _write(self, text: bytes) -> None:
+        while text and self.stream is not None:
+            text = text[self.stream.write(text) or 0 :]
+
+
+class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no types
+    """One service: how often it was started and how it ended are kept without a log."""
+
+    starts = 0
+    last_exit = ""
+    delay: float
+
+    def spawn(self) -> Any:
+        """Start the process."""
+        pid = super().spawn()
+        self.starts += pid is not None
+        return pid
+
+    def finish(self, pid: int, status: int) -> None:
+        """Note how the process ended."""
+        self.last_exit = decode_wait_status(status)[1]
+        super().finish(pid, status)
+
+    def change_state(self, new_state: int, expected: bool = True) -> Any:
+        """Take a new state; a delayed start waits for a bounded time."""
+        changed = super().change_state(new_state, expected)
+        if new_state == ProcessStates.BACKOFF:
+            self.delay = min(self.delay, time.time() + BACKOFF_MAX_S)
+        return changed
+
+    def row(self) -> dict[str, Any]:
+        """Return what is known of it; XML-RPC has no None."""
+        return {
+            "name": self.config.name,
+            "pid": self.pid or 0,
+            "state": getProcessStateDescription(self.get_state()).lower(),
+            "uptime_s": max(0.0, time.time() - self.laststart) if self.pid else 0.0,
+            "starts": self.starts,
+            "last_exit": self.last_exit or self.spawnerr or "",
+            "last_line": LogFile.newest.get(self.config.stdout_logfile, ""),
+        }
+
+
+class FleetInterface:
+    """What `tools.fleet.supervisor_client` calls as `xrl.services` and `xrl.logs`."""
+
+    def __init__(self, supervisor: Any) -> None:
+        self._supervisor = supervisor
+
+    def services(self) -> list[dict[str, Any]]:
+        """Return one row for each service."""
+        groups = self._supervisor.process_groups.values()
+        return [service.row() for group in groups for service in group.processes.values()]
+
+    def logs(self) -> dict[str, Any]:
+        """Return how many log lines were lost, and why the newest was."""
+        return {"lost": LogFile.lost, "why": LogFile.why}
+
+
+def make_interface(supervisor: Any, **_settings: str) -> FleetInterface:
+    """Return the calls that `xrl` adds; supervisord's configuration names this function."""
+    return FleetInterface(supervisor)
+
+
+class _Options(ServerOptions):  # type: ignore[misc]  # supervisor has no types
+    """supervisord's options and system calls."""
+
+    leashed = False
+    _supervisor_pid = os.getpid()
+
+    def setpgrp(self) -> None:
+        """Put a leashed service on its leash; supervisord calls this first thing after fork."""
+        super().setpgrp()
+        if self.leashed:
+            die_with_parent(self._supervisor_pid, signal.SIGKILL)
+
+    def cleanup_fds(self) -> None:
+        """Keep the inherited descriptors: one of them holds the run directory's lock."""
+
+
+def main() -> None:
+    """Run supervisord in this process until it is stopped."""
+    # The tool that starts us blocks signals meanwhile, and a mask is inherited.
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--parent", type=int, help="stop the fleet when this process dies")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="for supervisord, after --")
+    args = parser.parse_args()
+    if args.parent is not None:
+        die_with_parent(args.parent, signal.SIGTERM)
+        _Options.leashed = True
+    loggers.RotatingFileHandler = LogFile
+    process.Subprocess = Service
+    supervisord.ServerOptions = _Options
+    supervisord.main([word for word in args.arguments if word != "--"])
+    sys.stderr.close()  # on a full disk it could not be flushed, which would be an exit code
+
+
+if __name__ == "__main__":
+    main()
