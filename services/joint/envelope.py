@@ -6,6 +6,10 @@ position, and with the command before. A command outside is refused, counted and
 (`JointState.outside`). If a planner goes on like that its last good command becomes too old, and
 the module holds.
 
+The coupled torque answers to what the body's pose lacks, so in each module it pulls the way the
+local spring pulls. One that drives the joint away from its reference is wrong however small it is:
+ramped up together inside their bounds, those of knees and hips made the robot fall.
+
 A command with `hold` is obeyed anyway, but a module that refused its numbers is not ready to track
 (`Failsafe.ready`), so no planner leads with such numbers.
 """
@@ -44,6 +48,7 @@ class Envelope:
         self._room = own.tau_ff_margin
         self._distance, self._spring = own.q_ref_distance, own.spring_torque
         self._coupled, self._dtau_ff = own.tau_coupled, own.dtau_ff
+        self._work = -own.coupled_work
         self._step, self._rate = own.torque_step, own.torque_rate
         self._gap_s = GAP_TICKS / config.planner.rate_hz
         self._margin = (1.0 - ROUNDING) * least.margin_min
@@ -82,6 +87,7 @@ class Envelope:
         if not _within(c.k_d, self._k_d):
             return Outside.K_D
         lowest, highest = self._tau_ff_at(bounds, q[1])
+        work = 0.0
         for axis in (0, 1):
             if not lowest[axis] - self._room <= c.tau_ff[axis] <= highest[axis] + self._room:
                 return Outside.TAU_FF
@@ -91,10 +97,14 @@ class Envelope:
                 return Outside.TAU_COUPLED
             if not abs(c.v_ref[axis]) <= self._v_ref[axis]:
                 return Outside.V_REF
-            distance = abs(c.q_ref[axis] + age_s * c.v_ref[axis] - q[axis])
+            deflection = c.q_ref[axis] + age_s * c.v_ref[axis] - q[axis]
+            work += c.tau_coupled[axis] * deflection
+            distance = abs(deflection)
             spring = c.k_p[axis] * distance if settled else 0.0
             if not (distance <= self._distance and spring <= self._spring):
                 return Outside.Q_REF
+        if not work >= self._work:
+            return Outside.COUPLED_WORK
         if last is None or last.hold or last.session != c.session:
             return _INSIDE
         most = self._step + self._rate * clamp(1e-9 * (c.t_ns - last.t_ns), 0.0, self._gap_s)

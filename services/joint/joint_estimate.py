@@ -23,6 +23,9 @@ JUMP_TURNS: Final = 0.1
 JUMP_SPEED: Final = 10.0
 """turn/s that a motor may have gained since the last sample, which may be 100 ms old: a leg
 in free fall gains 8."""
+SPEED_MAX: Final = 300.0
+"""turn/s: 100 rad/s at a joint behind 18:1, as `services.planner.plausible` has it. A speed of 1e30
+would also excuse any jump after it."""
 REJECTED_MAX: Final = 3
 """Number of rejected samples in a row after which the position is lost."""
 
@@ -87,6 +90,9 @@ class JointEstimate(msgspec.Struct):
         dt_s = (reading.t_ns - self.accepted_ns) / NS_PER_S
         (a, b), (was_a, was_b), (vel_a, vel_b) = reading.pos_turns, self.pos, self.vel
         free = JUMP_TURNS + JUMP_SPEED * dt_s
+        speed_a, speed_b = reading.vel_turns
+        if not (abs(speed_a) <= SPEED_MAX and abs(speed_b) <= SPEED_MAX):
+            return False
         return abs(a - was_a) <= free + abs(vel_a) * dt_s and (
             abs(b - was_b) <= free + abs(vel_b) * dt_s
         )

@@ -127,13 +127,17 @@ class Planner:
         self._tau[2 * module : 2 * module + 2] = state.tau
 
     def receive_wrench(self, wrench: Wrench, now_ns: int) -> None:
-        """Store the harness's newest wrench."""
+        """Store the harness's newest wrench, if it is plausible."""
+        if not self._plausible.is_wrench(wrench):
+            return
         self._wrench_seq = wrench.seq
         self._wrench, self._wrench_ns = wrench, now_ns
         self._overload.receive(wrench, now_ns)
 
     def receive_attitude(self, attitude: Attitude, now_ns: int) -> None:
-        """Store the IMU's newest attitude."""
+        """Store the IMU's newest attitude, if it is plausible."""
+        if not self._plausible.is_attitude(attitude):
+            return
         self._attitude_seq = attitude.seq
         self._attitude, self._attitude_ns = attitude, now_ns
 
@@ -238,6 +242,7 @@ class Planner:
             self._phases.snapshot(),
             msgspec.structs.replace(self._rival),
             self._guard.snapshot() if self._guard is not None else None,
+            refused=self._plausible.refused,
         )
 
     def restore(self, snapshot: TickState) -> None:
@@ -246,7 +251,7 @@ class Planner:
         for module, (state, arrived_ns) in enumerate(zip(m.states, m.arrived_ns, strict=True)):
             if state is not None:
                 self.receive_state(module, state, arrived_ns)
-        self._request = m.request
+        self._request, self._plausible.refused = m.request, m.refused
         self._unattended.restore(m.unattended)
         self._phases.restore(m.phases)
         self._wrench, self._wrench_ns, self._wrench_seq = m.wrench, m.wrench_ns, m.wrench_seq
@@ -418,6 +423,7 @@ class Planner:
             or self._trips.why
             or (self._guard.why if self._guard is not None else ""),
             trip=int(self._trips.tripped),
+            refused=self._plausible.refused,
         )
 
 

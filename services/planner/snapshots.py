@@ -167,3 +167,5 @@ class TickState(msgspec.Struct, frozen=True):
     rival: RivalWatch = msgspec.field(default_factory=RivalWatch)
     guard: GuardState | None = None
     """None without a controller of somebody's own."""
+    refused: int = 0
+    """Implausible measurements so far."""

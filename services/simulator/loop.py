@@ -14,11 +14,12 @@ from services.simulator.harness_front import HarnessFront
 from services.simulator.imu_front import ImuFront
 from services.simulator.state import taken
 from services.simulator.world import World
-from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth
+from shared.bus.messages import HandLead, OperatorIntent, SimControl, SimTruth, Vector4
 from shared.bus.session import Latest, Publisher
 from shared.bus.topics import SIM_STATE
 from shared.bus.traces import SimState
 from shared.can.cansimple import AxisState
+from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns, sleep_until
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
@@ -39,6 +40,17 @@ class SimulatorPorts(msgspec.Struct, frozen=True):
     state: Publisher[SimState]
     asked: Latest[OperatorIntent]
     hand: Latest[HandLead]
+
+
+def granted(asked: OperatorIntent, assist_max: float, shift_max: Vector4) -> tuple[float, Vector4]:
+    """Return the assist, N, and the shift that the planner would grant: the person rests no more.
+
+    Asked for 1e9 N, the simulated person rested 1e9 N on the robot.
+    """
+    x, y, roll, yaw = (
+        clamp(part, -most, most) for part, most in zip(asked.shift, shift_max, strict=True)
+    )
+    return clamp(asked.assist_n, 0.0, assist_max), (x, y, roll, yaw)
 
 
 class SimulatorLoop:
@@ -71,6 +83,7 @@ class SimulatorLoop:
         self._truth_every = max(1, round(rate / simulation.truth_rate_hz))
         self._intent_every = max(1, round(rate / INTENT_RATE_HZ))
         self._state_every = max(1, round(rate / STATE_RATE_HZ))
+        self._assist_max, self._shift_max = config.assist.force_max, config.law.shift_max
         self._states = 0
         self._slip_ns = round(simulation.late_slip_ms * NS_PER_MS)
         self.autostart_s: float | None = None
@@ -134,7 +147,7 @@ class SimulatorLoop:
         world, other = self._world, self._ports.asked.take()
         if other is not None and other.source != SCENARIO:
             self._unasked = 0
-            world.asked = other.assist_n, other.shift
+            world.asked = granted(other, self._assist_max, self._shift_max)
             return
         self._unasked += 1
         if world.asked is not None and self._unasked < SILENT_INTENTS:

@@ -113,6 +113,8 @@ class Outside(IntEnum):
     """The torque would change faster than the law changes it."""
     MARGIN = 9
     """The margin is below the least that the planner may publish."""
+    COUPLED_WORK = 10
+    """The coupled torque drives the joint away from its reference."""
 
 
 class Refusal(IntEnum):
@@ -443,6 +445,8 @@ class PlannerStatus(Message, frozen=True):
     """Row of p that is asked to be offset; -1: none."""
     probe: float = 0.0
     """The offset that is asked for, m or rad."""
+    refused: Int64 = 0
+    """States, wrenches and attitudes refused so far: no sensor can have measured them."""
 
 
 class OperatorIntent(Message, frozen=True):

@@ -269,6 +269,9 @@ class EnvelopeConfig(Section, frozen=True):
     position."""
     tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
     """Largest coupled torque."""
+    coupled_work: Annotated[float, Range(0.01, 1e3, "J")] = 1.0
+    """Work of the coupled torque against the joint's way to its reference. The law's is 0.1 J on
+    drawn plants pushed as hard as soles and motors bear, and 0.6 J in a fall."""
     dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
     """Largest rate of the feedforward."""
     v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0

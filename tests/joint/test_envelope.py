@@ -210,6 +210,37 @@ def test_the_feedforward_is_that_of_the_joints_own_angle(robot: RobotConfig, the
         assert envelope.judge(told, None, (0.02, theta), V) is outside
 
 
+@pytest.mark.parametrize("signs", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
+@pytest.mark.parametrize("settled", [True, False])
+def test_a_coupled_torque_that_drives_the_joint_from_its_reference_is_not_believed(
+    robot: RobotConfig, signs: tuple[int, int], settled: bool
+) -> None:
+    """One axis may pull the wrong way if the other pulls harder: the work of both counts."""
+    away, most = (0.05, 0.04), robot.envelope.coupled_work
+    k_p = tuple(low for low in bounds_of(robot).k_p[0])
+    for phi_work, theta_work, outside in (
+        (-0.5 * most, -0.49 * most, Outside.NOTHING),
+        (-0.5 * most, -0.51 * most, Outside.COUPLED_WORK),
+        (-1.4 * most, 0.45 * most, Outside.NOTHING),
+        (2.0 * most, 1.0 * most, Outside.NOTHING),
+    ):
+        told = middle(
+            robot, v_ref=(0.0, 0.0), k_p=k_p,
+            q_ref=tuple(q + s * d for q, s, d in zip(Q, signs, away, strict=True)),
+            tau_coupled=(signs[0] * phi_work / away[0], signs[1] * theta_work / away[1]),
+        )  # fmt: skip
+        assert Envelope(robot, MODULE).judge(told, None, Q, V, settled=settled) is outside
+
+
+def test_the_reference_at_its_age_is_what_a_coupled_torque_must_not_drive_from(
+    robot: RobotConfig,
+) -> None:
+    told = middle(robot, q_ref=Q, v_ref=(0.0, 1.0), tau_coupled=(0.0, -55.0))
+    envelope = Envelope(robot, MODULE)
+    assert envelope.judge(told, None, Q, V, age_s=0.01) is Outside.NOTHING
+    assert envelope.judge(told, None, Q, V, age_s=0.03) is Outside.COUPLED_WORK
+
+
 def test_a_stamp_that_goes_back_leaves_no_more_room_than_none(robot: RobotConfig) -> None:
     last = middle(robot)
     phi, theta = last.tau_coupled

@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import DriveReading, DriveStatus
 from services.joint.failsafe import Event
-from services.joint.joint_estimate import JUMP_SPEED, JUMP_TURNS, REJECTED_MAX, JointEstimate
+from services.joint.joint_estimate import (
+    JUMP_SPEED,
+    JUMP_TURNS,
+    REJECTED_MAX,
+    SPEED_MAX,
+    JointEstimate,
+)
 from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 
@@ -56,6 +62,18 @@ def test_a_fast_motor_may_go_on_fast(samples: JointEstimate, vel: Pair, moved: P
     samples.take(reading(T0 + PERIOD, vel=vel), armed=True)
     assert samples.take(reading(T0 + 2 * PERIOD, moved), armed=True) is Event.DRIVE_ARMED
     assert samples.pos == moved
+
+
+@pytest.mark.parametrize("speed", [1.001 * SPEED_MAX, -1e30, float("nan")])
+def test_a_speed_that_no_motor_has_is_not_believed_and_excuses_no_jump(
+    samples: JointEstimate, speed: float
+) -> None:
+    before = samples.pos
+    for axis in ((speed, 0.0), (0.0, speed)):
+        assert samples.take(reading(T0 + PERIOD, vel=axis), armed=True) is Event.NONE
+        assert samples.vel == (0.0, 0.0)
+    assert samples.take(reading(T0 + PERIOD, (9.0, -2.0)), armed=True) is not Event.DRIVE_ARMED
+    assert samples.pos == before
 
 
 def test_a_few_odd_samples_in_a_row_and_the_position_is_lost(samples: JointEstimate) -> None:

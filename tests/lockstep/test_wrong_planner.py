@@ -107,6 +107,7 @@ def test_it_stands_whatever_its_planner_sends(
         ("q_ref of hip_right theta off by 0.5 rad", Outside.Q_REF),
         ("tau_coupled noisy", Outside.TORQUE_STEP),
         ("margin 0", Outside.MARGIN),
+        ("tau_coupled of all ramps up in 1 s, +0 +0 +0 +1 +0 +1", Outside.COUPLED_WORK),
     ],
 )
 def test_it_holds_and_reports_what_it_does_not_believe(

@@ -38,6 +38,14 @@ BITS: Final = (0, 40, 50, 51, 52, 55, 60, 62, 63)
 """Which bit of a float64 flips: from what nobody notices to the sign."""
 
 
+CONSPIRACIES: Final = (
+    (0, 0, 0, 1, 0, 1), (0, 0, 0, -1, 0, -1), (0, 0, 0, 1, 0, -1), (1, -1, -1, -1, -1, -1),
+    (-1, 0, 1, 0, 0, 1), (1, 1, -1, 0, 1, 1), (0, -1, -1, -1, 1, 0),
+)  # fmt: skip
+"""Signs of the coupled torque of ankle, knee and hip, phi and theta each, alike in both legs. Each
+one inside its bound; before `Outside.COUPLED_WORK` 13 of 30 drawn ones made the robot fall."""
+
+
 def faults() -> dict[str, Fault]:
     """Return every wrong planner by its name."""
     return dict(_all())
@@ -75,6 +83,10 @@ def _all() -> Iterator[tuple[str, Fault]]:
         yield f"{name} zero in every other tick", _every_other(_scaled(name, 0.0, range(6)))
     for name, size in (("q_ref", 0.02), ("tau_ff", 20.0), ("tau_coupled", 40.0), ("v_ref", 3.0)):
         yield f"{name} noisy", _noisy(name, size)
+    for signs in CONSPIRACIES:
+        for ramp_s in (0.3, 1.0, 3.0):
+            words = " ".join(f"{axis:+d}" for axis in signs)
+            yield f"tau_coupled of all ramps up in {ramp_s:g} s, {words}", _ramped(signs, ramp_s)
     for margin in (0.0, -1.0, math.nan):
         yield f"margin {margin:g}", _told_margin(margin)
 
@@ -182,6 +194,21 @@ def _flipped(name: str, bit: int) -> Fault:
         (whole,) = struct.unpack("<Q", struct.pack("<d", values[axis]))
         (values[axis],) = struct.unpack("<d", struct.pack("<Q", whole ^ (1 << bit)))
         changed[index] = _changed(changed[index], name, (values[0], values[1]))
+        return changed
+
+    return fault
+
+
+def _ramped(signs: tuple[int, ...], ramp_s: float, most: float = 57.0) -> Fault:
+    def fault(commands: Commands, tick: int) -> Commands:
+        size = most * min(1.0, 0.004 * tick / ramp_s)
+        changed = []
+        for index, command in enumerate(commands):
+            at = 2 * (index % (N_MODULES // 2))
+            phi, theta = command.tau_coupled
+            pair = (phi + signs[at] * size, theta + signs[at + 1] * size)
+            within = (max(-most, min(most, pair[0])), max(-most, min(most, pair[1])))
+            changed.append(_changed(command, "tau_coupled", within))
         return changed
 
     return fault

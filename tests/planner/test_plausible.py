@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from services.planner.planner import Planner
 from services.planner.plausible import BEYOND_RAD, SPEED_MAX, Plausible
-from shared.bus.messages import PlannerMode
+from shared.bus.messages import Attitude, Mode, PlannerMode, Tare, Vector3, Wrench
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import N_JOINTS, N_MODULES
@@ -93,3 +93,58 @@ def test_whatever_angles_come_no_tick_ends_and_it_leads_again_by_good_ones(
             break
     assert planner.status(now_ns, 0.0).mode == PlannerMode.LEADING
     assert all(math.isfinite(value) for command in commands for value in command.tau_coupled)
+
+
+def wrench(seq: int, force: float, moment: float = 0.0) -> Wrench:
+    return Wrench(
+        t_ns=seq, seq=seq, force=(0.0, 0.0, force), moment=(0.0, moment, 0.0), valid=True,
+        saturated=False, tare=int(Tare.DONE), age_ns=0,
+    )  # fmt: skip
+
+
+def test_a_wrench_is_taken_up_to_what_the_cells_together_can_carry(robot: RobotConfig) -> None:
+    plausible, most = Plausible(robot), 6.0 * robot.harness.leg_force_max
+    for force, taken in ((most, True), (-most, True), (1.001 * most, False), (-1e300, False)):
+        assert plausible.is_wrench(wrench(1, force)) is taken
+    assert not plausible.is_wrench(wrench(1, 0.0, moment=-1e300))
+    assert plausible.refused == 3
+
+
+@pytest.mark.parametrize(
+    ("up", "rate", "valid", "taken"),
+    [
+        ((0.0, 0.0, 1.0), 0.0, True, True),
+        ((0.0, 0.0, 1.05), 99.0, True, True),
+        ((0.0, 0.0, 1.2), 0.0, True, False),
+        ((0.0, 0.0, 0.0), 0.0, True, False),
+        ((0.0, 0.0, 0.0), 0.0, False, True),
+        ((1e300, 0.0, 0.0), 0.0, False, False),
+        ((0.0, 0.0, 1.0), 1e300, True, False),
+    ],
+)
+def test_an_attitude_is_a_direction_and_a_rate_that_a_torso_can_turn_at(
+    robot: RobotConfig, up: Vector3, rate: float, valid: bool, taken: bool
+) -> None:
+    attitude = Attitude(t_ns=1, seq=1, up=up, rate=(rate, 0.0, 0.0), valid=valid, age_ns=0)
+    assert Plausible(robot).is_attitude(attitude) is taken
+
+
+@pytest.mark.parametrize("force", [1e300, 8999.0])
+def test_a_second_of_an_absurd_wrench_leaves_no_trace(
+    robot: RobotConfig, closed: Closed, force: float
+) -> None:
+    """1e300 N left a load of 300 digits behind: MISLOADED until the planner was killed."""
+    planner, q = Planner(robot, SESSION), closed(1.188)
+    now_ns = lead(planner, q)
+    for seq in range(10, 2500):
+        now_ns += STEP_NS
+        receive_all(planner, q, now_ns, seq, mode=int(Mode.TRACK))
+        planner.receive_wrench(wrench(seq, force if seq < 260 else 0.0), now_ns)
+        commands = planner.tick(now_ns)
+        if seq > 300 and planner.status(now_ns, 0.0).mode == PlannerMode.LEADING:
+            break
+    status = planner.status(now_ns, 0.0)
+    assert status.mode == PlannerMode.LEADING
+    assert abs(status.load[0]) < (robot.law.load_correction[0] if force < 9000.0 else 0.1)
+    assert status.refused == (250 if force > 9000.0 else 0)
+    assert max(abs(tau) for command in commands for tau in command.tau_coupled) < 1.0
