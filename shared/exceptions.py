@@ -6,6 +6,10 @@ Exceptions are for start-up, tools and files. On the control path a fault is a s
 
 from __future__ import annotations
 
+import errno
+import os
+from typing import Final
+
 
 class XrlError(Exception):
     """Root of the errors that this project raises.
@@ -15,6 +19,11 @@ class XrlError(Exception):
     """
 
     exit_code = 2
+
+
+BUG_EXIT_CODE: Final = 70
+"""Exit code of a process that an unforeseen exception ended: a fault of this project (EX_SOFTWARE
+of sysexits.h). Python's own would be 1, and here that is a robot that fell."""
 
 
 class ConfigError(XrlError):
@@ -47,3 +56,29 @@ class FleetError(XrlError):
 
 class RunError(XrlError):
     """A run could not be carried out or its record could not be read."""
+
+
+_REMEDIES: Final = {
+    errno.ENOSPC: "a disk is full: that of the output, /tmp or /dev/shm",
+    errno.EDQUOT: "this user's share of a disk is used up",
+    errno.EMFILE: "this process may open no more files: `ulimit -n`",
+    errno.ENOMEM: "the machine has no memory left",
+}
+
+
+def os_error_in_words(error: OSError) -> str:
+    """Return in one line what the system refused, and the file if it named one."""
+    said = error.strerror or str(error) or type(error).__name__
+    name = "" if error.filename is None else f"{str(error.filename)[:200]}: "
+    remedy = _REMEDIES.get(error.errno or 0, "")
+    if error.errno == errno.ENOENT and error.filename is None and not _has_folder():
+        remedy = "the folder in which this was started has been removed: cd to another"
+    return f"{name}{said}{'; ' if remedy else ''}{remedy}"
+
+
+def _has_folder() -> bool:
+    try:
+        os.getcwd()  # noqa: PTH109 - Path.cwd is this, and its error is what is asked for
+    except OSError:
+        return False
+    return True

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 
 from shared import log
-from shared.exceptions import XrlError
+from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
 from shared.run_directory import default_run_dir
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -76,9 +76,15 @@ def freeze_garbage() -> None:
 
 
 def run_service(main: Callable[[], int]) -> None:
-    """Run a service's main; an expected error becomes one line and an exit code."""
+    """Run a service's main; an error becomes one line and an exit code, a bug its traceback too."""
     try:
         sys.exit(main())
     except XrlError as error:
         log.get("xrl").error("%s", error)
         sys.exit(error.exit_code)
+    except OSError as error:
+        log.get("xrl").error("%s", os_error_in_words(error), exc_info=error.filename is None)
+        sys.exit(XrlError.exit_code)
+    except Exception:  # noqa: BLE001 - Python's own exit code would be 1
+        log.get("xrl").exception("a fault of this service, please report it")
+        sys.exit(BUG_EXIT_CODE)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from shared.config.toml_file import read_toml
 from tools import mutants
 from tools.mutants import FILE, ROOT, Group, GroupResult, MutantsFile, Mutation, Reason, change_of
+from tools.terminal import Console
 
 DIFF = """--- services/joint/torque_limiter.py
 +++ services/joint/torque_limiter.py

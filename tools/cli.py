@@ -3,41 +3,75 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import difflib
 import importlib
+import importlib.metadata
+import os
 import signal
 import sys
+import traceback
 from collections.abc import Sequence
 from types import FrameType
+from typing import Any
 
-from shared.exceptions import XrlError
+from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
+from shared.process import CHECKOUT
+from tools.guarded_streams import guarded_streams
 from tools.verb_table import VERBS
 
 INTERRUPTED = 128 + signal.SIGINT
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb and return the exit code: 0, the verb's own, or that of an `XrlError`."""
+    """Run one verb and return the exit code (docs/reference/verbs.md)."""
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _leave)
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
+    with guarded_streams():
+        try:
+            return _run(arguments)
+        except XrlError as error:
+            print(f"xrl: {error}", file=sys.stderr)
+            return error.exit_code
+        except BrokenPipeError:
+            _drop_output()
+            return 128 + signal.SIGPIPE
+        except OSError as error:
+            _drop_output()
+            print(f"xrl: {os_error_in_words(error)}", file=sys.stderr)
+            return XrlError.exit_code
+        except KeyboardInterrupt:
+            print("xrl: interrupted", file=sys.stderr)
+            return INTERRUPTED
+        except Exception:  # noqa: BLE001 - Python's own exit code would be 1: a robot that fell
+            traceback.print_exc()
+            print("xrl: a fault of xrl itself: please report the lines above", file=sys.stderr)
+            return BUG_EXIT_CODE
+
+
+def _run(arguments: Sequence[str]) -> int:
     try:
         args = _parser(arguments).parse_args(arguments)
-        return int(args.run(args))
-    except XrlError as error:
-        print(f"xrl: {error}", file=sys.stderr)
-        return error.exit_code
-    except BrokenPipeError:
-        sys.stderr.close()  # else the interpreter complains about stdout once more
-        return 128 + signal.SIGPIPE
-    except OSError as error:  # a path that cannot be, a full disk
-        if error.filename is None:
-            raise
-        print(f"xrl: {str(error.filename)[:200]}: {error.strerror}", file=sys.stderr)
-        return XrlError.exit_code
-    except KeyboardInterrupt:
-        print("xrl: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        code = int(args.run(args))
+    except SystemExit:
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()  # a full disk is told here; at the interpreter's end it would be a traceback
+    return code
+
+
+def _drop_output() -> None:
+    """Take what nobody can be given from the standard output, or Python tries again at its end."""
+    with contextlib.suppress(ValueError):
+        try:
+            sys.stdout.flush()
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)
 
 
 def whole_parser() -> argparse.ArgumentParser:
@@ -50,8 +84,9 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
     parser = argparse.ArgumentParser(
         prog="xrl",
         description="Runtime for Extra Robotic Legs: start, watch and break a fleet of services.",
-        epilog="`xrl VERB --help` shows a verb's arguments and examples.",
+        epilog="`xrl help VERB` or `xrl VERB --help` shows a verb's arguments and examples.",
     )
+    parser.add_argument("--version", action=_Version, help="print version and commit, and end")
     subparsers = parser.add_subparsers(metavar="VERB", required=True)
     wanted = next((word for word in arguments if not word.startswith("-")), "")
     names = [verb.name for verb in VERBS]
@@ -67,6 +102,22 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
         else:
             subparsers.add_parser(verb.name, help=verb.help)
     return parser
+
+
+class _Version(argparse.Action):
+    """`--version`: of the package, and of the checkout if it runs from one."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **options: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, **options)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from shared.mcap_log.provenance import UNKNOWN, code  # noqa: PLC0415 - for this alone
+
+        found = code(CHECKOUT)
+        commit, changed = found["git_commit"], found["git_dirty"] == "true"
+        words = "" if commit == UNKNOWN else f" ({commit[:12]}{' with changes' if changed else ''})"
+        print(f"xrl {importlib.metadata.version('xrl')}{words}")
+        parser.exit()
 
 
 def _leave(number: int, _frame: FrameType | None) -> None:

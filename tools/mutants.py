@@ -21,11 +21,11 @@ from typing import Annotated, Final, NamedTuple
 
 import msgspec
 import tomli_w
-from rich.console import Console
 
 from shared.config.toml_file import Section, read_toml
 from shared.exceptions import RunError, XrlError
 from tools.number_arguments import count
+from tools.terminal import Console, marked
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 FILE: Final = ROOT / "tests" / "mutants.toml"
@@ -140,7 +140,9 @@ def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResul
     elif not args.resume and folder.exists():
         shutil.rmtree(folder)
     _prepare(group, folder)
-    console.print(f"[bold]{group.name}[/]: {len(group.modules)} modules; log: {folder}/run.log")
+    console.print(
+        marked("[bold]{}[/]: {} modules; log: {}/run.log", group.name, len(group.modules), folder)
+    )
     _mutmut_run(folder, ["--max-children", str(args.children), *patterns], console)
     ran = [row for row in _statuses(folder) if row[1] != UNTRIED]
     alive = [

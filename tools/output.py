@@ -8,16 +8,10 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import Progress
 
 from shared.exceptions import RunError
-
-
-def printable(text: str) -> str:
-    """Return a text of a file, which may be foreign or damaged, safe to print with Rich."""
-    return escape("".join(c if c.isprintable() else "?" for c in text))
+from tools.terminal import Console
 
 
 @contextlib.contextmanager

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import errno
+import importlib.metadata
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from shared.exceptions import BUG_EXIT_CODE, RunError
+from shared.mcap_log import provenance
+from shared.process import CHECKOUT, run_service
+from tools import cli
+from tools.studies.sweeps import pool
 from tools.verb_table import VERBS
+from tools.verbs import faults
 
 MINE = ("up", "status", "kill", "tare", "down")
 
@@ -90,3 +99,95 @@ def test_an_unknown_scenario_is_one_line_that_lists_the_known(tmp_path: Path) ->
     assert_one_line_error(done)
     assert "moonwalk" in done.stderr
     assert "squat" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "words", [["stiffness"], ["faults"], ["--help"], ["help", "sim"], ["completion", "bash"]]
+)
+def test_an_output_that_takes_nothing_is_one_line_and_no_fall(words: list[str]) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "tools.cli", *words],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert done.returncode == 2
+    assert re.fullmatch(r"xrl: No space left on device; a disk is full: .*\n", done.stderr)
+
+
+def test_a_reader_that_has_gone_ends_a_verb_without_words() -> None:
+    script = '"$0" -m tools.cli faults | true; echo "${PIPESTATUS[0]}"'
+    done = subprocess.run(
+        ["bash", "-c", script, sys.executable],
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
+    assert (done.stdout, done.stderr) == ("141\n", "")
+
+
+def test_a_folder_that_is_gone_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert cli.main(["up", "--run-dir", "run"]) == 2
+    assert "the folder in which this was started has been removed" in capsys.readouterr().err
+
+
+def test_workers_without_shared_memory_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOENT, "No such file or directory")
+
+    monkeypatch.setattr(pool, "ProcessPoolExecutor", no_locks)
+    with pytest.raises(RunError, match=r"no worker process can be started: .*/dev/shm"):
+        list(pool.results(str, [1], 1, str))
+
+
+def test_a_bug_is_a_traceback_and_neither_a_fall_nor_bad_input(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(faults, "run", lambda args: args.none)
+    assert cli.main(["faults"]) == BUG_EXIT_CODE
+    told = capsys.readouterr().err
+    assert "AttributeError" in told
+    assert told.endswith("xrl: a fault of xrl itself: please report the lines above\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(RunError("x"), 2), (OSError(errno.ENOSPC, "full"), 2), (ValueError("x"), BUG_EXIT_CODE)],
+)
+def test_a_service_that_ends_by_an_error_has_its_exit_code(error: Exception, code: int) -> None:
+    def main() -> int:
+        raise error
+
+    with pytest.raises(SystemExit) as left:
+        run_service(main)
+    assert left.value.code == code
+
+
+def test_the_version_is_that_of_the_package_and_of_the_checkout(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        cli.main(["--version"])
+    assert left.value.code == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"xrl {importlib.metadata.version('xrl')}")
+    commit = provenance.code(CHECKOUT)["git_commit"]
+    assert commit == provenance.UNKNOWN or commit[:12] in said
+
+
+@pytest.mark.parametrize(
+    ("words", "same"), [(["help"], ["--help"]), (["help", "hz"], ["hz", "--help"])]
+)
+def test_help_is_a_word_too(
+    words: list[str], same: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = []
+    for line in (words, same):
+        with pytest.raises(SystemExit) as left:
+            cli.main(line)
+        assert left.value.code == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1] != ""

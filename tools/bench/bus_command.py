@@ -6,7 +6,6 @@ import argparse
 from typing import Final
 
 from rich import box
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
@@ -15,6 +14,7 @@ from tools.bench import bus
 from tools.bench.flags import add_flags, write_rows
 from tools.bench.transports.base import TRANSPORTS, installed
 from tools.number_arguments import finite
+from tools.terminal import Console
 from tools.verb_table import Subparsers
 
 ROUNDS: Final = 3

@@ -7,9 +7,9 @@ from contextlib import ExitStack
 from typing import Final
 
 from rich import box
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from rich.text import Text
 
 from shared.config import files as config_file
 from shared.process import CHECKOUT
@@ -22,6 +22,7 @@ from tools.fleet.others import warn_of_others
 from tools.fleet.pace import check_pace
 from tools.number_arguments import finite
 from tools.runs.verdict_table import digits
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers
 
 ROUNDS: Final = 3
@@ -113,9 +114,8 @@ def _table(rows: list[FleetRow], against: str | None) -> Table:
             cells.append("" if row.spread is None else " .. ".join(map(digits, row.spread)))
         else:
             cells += [_number(row.other, unit), "" if row.ratio is None else f"{row.ratio:.2f}"]
-        mark = "[green]ok[/]" if row.ok else "[yellow]missed[/]"
-        cells.append("" if row.target is None else f"<= {row.target:g} {mark}")
-        shown.add_row(*cells)
+        mark = Text("ok", "green") if row.ok else Text("missed", "yellow")
+        shown.add_row(*cells, "" if row.target is None else marked("<= {:g} {}", row.target, mark))
     return shown
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from rich import box
 from rich.console import Group
-from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -27,8 +26,8 @@ def shown(difference: Sequence[SettingChange]) -> Group:
         rows.add_row(
             change.module,
             f"{head}.\n{tail}" if head else tail,
-            escape(changes.describe(change.before)),
-            escape(changes.describe(change.after)),
+            changes.describe(change.before),
+            changes.describe(change.after),
         )
         if change.why:
             reasons.setdefault(f"{tail}: {change.why}")

@@ -8,14 +8,14 @@ from typing import Final
 
 import msgspec
 from rich import box
-from rich.console import Console, Group, RenderableType
-from rich.markup import escape
+from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
 from tools.bringup.rows import Finding, FindingKind, count, merged
 from tools.bringup.survey import Groups
+from tools.terminal import Console
 
 WIDE: Final = 110
 """Columns from which what to do stands beside a finding; else it stands below its table."""
@@ -81,9 +81,9 @@ def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
     if wide:
         table.add_column("what to do", overflow="fold")
     for row in rows:
-        cells = [escape(cell) for cell in (row.subject, names[row.what], row.found, row.wanted)]
-        cells.append(f"[{COLOURS[row.verdict]}]{row.verdict}[/]")
-        table.add_row(*cells, *([escape(row.fix)] if wide else []))
+        cells = (row.subject, names[row.what], row.found, row.wanted)
+        verdict = Text(row.verdict, COLOURS[row.verdict])
+        table.add_row(*cells, verdict, *([row.fix] if wide else []))
     below = [Padding(Text(note), (0, 1, 0, 2)) for note in _notes(rows, wide=wide)]
     return Group(table, *below, *([Text("")] if below else []))
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-
 from tools.fleet import procfs
+from tools.terminal import Console, marked
 
 
 def warn_of_others(console: Console, own: Path | None = None) -> None:
@@ -19,7 +18,11 @@ def warn_of_others(console: Console, own: Path | None = None) -> None:
     for other in sorted(procfs.fleets()):
         if own is None or Path(other) != own:
             console.print(
-                f"[yellow]another fleet runs in {other}: two do not fit on two cores, and drives "
-                f"of either may be lost; `xrl down --run-dir {other}` stops it[/]",
+                marked(
+                    "[yellow]another fleet runs in {}: two do not fit on two cores, and drives "
+                    "of either may be lost; `xrl down --run-dir {}` stops it[/]",
+                    other,
+                    other,
+                ),
                 soft_wrap=True,
             )

@@ -6,12 +6,13 @@ from typing import Final
 
 from rich import box
 from rich.console import Group
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from shared.bus.messages import DriveStatus, Refusal
 from tools.fleet.fleet_status import OPEN, SILENT_PROXY, FleetStatus, LeadStatus
-from tools.output import printable
+from tools.guarded_streams import printable
+from tools.terminal import marked
 
 _LABELS: Final = ("state", "last exit")
 GOOD_STATES: Final = ("running", "starting")
@@ -125,7 +126,7 @@ def tables(status: FleetStatus) -> Group:
     for name, row in status.services.items():
         services.add_row(
             name,
-            row.state if row.state in GOOD_STATES else f"[bold red]{row.state}[/]",
+            row.state if row.state in GOOD_STATES else Text(row.state, "bold red"),
             "-" if row.pid is None else str(row.pid),
             f"{row.uptime_s:.0f}",
             "-" if row.age_s is None else f"{1e3 * row.age_s:.0f}",
@@ -147,21 +148,23 @@ def tables(status: FleetStatus) -> Group:
             mode,
             str(module.tier or "-"),
             module.cause or "",
-            drive if drive == DriveStatus.ARMED.name else f"[bold red]{drive}[/]",
+            drive if drive == DriveStatus.ARMED.name else Text(drive, "bold red"),
             *angles,
         )
     way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear"
-    line = f"[bold yellow]impaired on purpose: {'; '.join(status.network)}[/] (xrl {way_out})"
+    line = marked(
+        "[bold yellow]impaired on purpose: {}[/] (xrl {})", "; ".join(status.network), way_out
+    )
     slow = f" in slow motion: the fleet's clock goes at {status.pace:g} of real time"
-    lines = [f" {describe_lead(status.lead)}"]
-    lines += [f" [bold yellow]way out[/], {escape(text)}" for text in describe_ways_out(status)]
-    lines += [f" [bold red]{OPEN}[/]"] if status.security == "open" else []
-    lines += [f" [bold yellow]{text}[/]" for text in describe_stop(status)]
+    lines: list[str | Text] = [f" {describe_lead(status.lead)}"]
+    lines += [marked(" [bold yellow]way out[/], {}", text) for text in describe_ways_out(status)]
+    lines += [marked(" [bold red]{}[/]", OPEN)] if status.security == "open" else []
+    lines += [marked(" [bold yellow]{}[/]", text) for text in describe_stop(status)]
     lines += [slow] if status.pace != 1.0 else []
     lines += [line] if status.network else []
-    lines += [f" [bold yellow]{text}[/]" for text in describe_refusals(status)]
-    lines += [f" linked: {escape(describe_tools(status))}"] if status.tools else []
+    lines += [marked(" [bold yellow]{}[/]", text) for text in describe_refusals(status)]
+    lines += [f" linked: {describe_tools(status)}"] if status.tools else []
     sessions = describe_sessions(status)
-    lines += [f" [bold yellow]{sessions}[/]"] if sessions else []
-    lines += [f" [bold red]{printable(words)}[/]" for words in status.trouble]
+    lines += [marked(" [bold yellow]{}[/]", sessions)] if sessions else []
+    lines += [marked(" [bold red]{}[/]", words) for words in status.trouble]
     return Group(services, modules, *lines)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from tools.fleet.procfs import ProcessUse
 from tools.fleet.status_table import GOOD_STATES
@@ -80,7 +81,7 @@ def process_table(
         pid = row.pid or 0
         table.add_row(
             row.name,
-            row.state if row.state in GOOD_STATES else f"[bold red]{row.state}[/]",
+            row.state if row.state in GOOD_STATES else Text(row.state, "bold red"),
             str(row.pid or "-"),
             f"{shares[pid]:.1f}" if pid in shares else "-",
             f"{after[pid].memory_mib:.0f}" if pid in after else "-",

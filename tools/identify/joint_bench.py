@@ -9,9 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, Generic, NamedTuple, TypeVar
 
-from rich.console import Console
 from rich.live import Live
-from rich.markup import escape
 from rich.text import Text
 
 from services.joint.__main__ import open_drive
@@ -28,6 +26,7 @@ from tools.identify import joint_drive, report
 from tools.identify.estimates import JointResult, of_joints
 from tools.identify.sines import SinePlan, fit_sines
 from tools.output import make_folder
+from tools.terminal import Console, marked
 
 P = TypeVar("P", bound=MotionPlan)
 LIFTED: Final = 0.2
@@ -90,9 +89,9 @@ def tell_stopped(stopped: Stopped, console: Console) -> int:
     if stopped.declined:
         console.print(stopped.why)
         return 2
-    console.print(f"[bold red]STOPPED[/]: {escape(stopped.why)}")
+    console.print(marked("[bold red]STOPPED[/]: {}", stopped.why))
     for module in stopped.not_idle:
-        console.print(f"[bold red]{module}: {jog_drive.NOT_IDLE}[/]")
+        console.print(marked("[bold red]{}: {}[/]", module, jog_drive.NOT_IDLE))
     return 1
 
 
@@ -231,7 +230,7 @@ def _give_limits_back(
 ) -> None:
     for module in modules:
         if why := limits.not_given_back(robot, module, run_dir):
-            console.print(f"[yellow]{module}: {escape(why)}[/]")
+            console.print(marked("[yellow]{}: {}[/]", module, why))
 
 
 def _described(joint: str, plan: SinePlan) -> str:

@@ -7,7 +7,6 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -25,6 +24,7 @@ from tools.identify.estimates import (
     remarks,
 )
 from tools.identify.robot_file_edit import apply
+from tools.terminal import Console
 
 _STYLES = {
     Verdict.CHANGE: "bold yellow", Verdict.AGREES: "green", Verdict.MEASURED: "",

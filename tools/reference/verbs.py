@@ -14,8 +14,19 @@ _INTRODUCTION: Final = """\
 # Verbs
 
 `xrl` is `.venv/bin/xrl`; `./deploy/demo`, `up`, `down`, `status` and `kill` are the same verbs with
-the environment made first. Exit codes: 0 good; 1 the robot fell, or something is not as it should
-be; 2 bad input, or a fleet that cannot be started; 130 interrupted.
+the environment made first. `xrl --version` prints version and commit, `xrl help VERB` what
+`xrl VERB --help` does.
+
+| exit code | meaning |
+|---|---|
+| 0 | good |
+| 1 | the robot fell, or something is not as it should be |
+| 2 | bad input, a fleet that cannot be started, or what the system refuses: a full disk |
+| 70 | a fault of `xrl` itself: please report its traceback |
+| 130, 141, 143 | interrupted; its reader has gone (`xrl ... \\| head`); SIGTERM |
+
+A pipe or a file gets tables whole, without frames and colours. Control characters of a log, of the
+bus or of a file's name are printed as `\u001b`.
 """
 
 

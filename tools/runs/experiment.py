@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TypeVar, get_args, get_type_hints
 
 import msgspec
-from rich.console import Console
 
 from services.simulator import plant
 from services.simulator.plant import NAMED, PlantConfig
@@ -35,9 +34,10 @@ from shared.exceptions import FleetError, RunError
 from shared.process import DEFAULT_CONFIG
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
+from tools.guarded_streams import printable
 from tools.number_arguments import finite, natural
-from tools.output import printable
 from tools.runs.describe_inject import in_words_of, parse_inject
+from tools.terminal import Console, marked
 from tools.verb_table import add_config
 
 E = TypeVar("E", Kill, Restart, Push, Fault, Inject)
@@ -281,7 +281,7 @@ def describe(scenario: Scenario) -> str:
 def introduce(scenario: Scenario, console: Console) -> None:
     """Print what is about to happen."""
     about = printable(f"{scenario.about}{describe(scenario)}")
-    console.print(f"[bold]{printable(scenario.name)}[/]: {about}")
+    console.print(marked("[bold]{}[/]: {}", scenario.name, about))
 
 
 def make_robot(args: argparse.Namespace) -> RobotConfig:

@@ -6,13 +6,13 @@ import time
 from collections.abc import Sequence
 from typing import Protocol
 
-from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
 from shared.bus.messages import PlannerStatus
 from shared.config.scenarios import Inject
 from tools.runs.scenario_runner import LiveSnapshot
+from tools.terminal import Console
 
 PERIOD_S = 0.1
 PLAIN_PERIOD_S = 1.0

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from tools.runs.verdict import Summary
 from tools.runs.verdict_limits import LIMITS, SOUND, VerdictLimit
+from tools.terminal import Console, marked
 
 OK: Final = "ok"
 OVER: Final = "over"
@@ -33,7 +34,7 @@ def show(summary: Summary, console: Console) -> None:
         colour = "green" if word == OK else "yellow" if word.startswith(OVER) else "default"
         unit = f" {row.unit}" if row.unit else ""
         table.add_row(
-            row.what, f"{digits(value)}{unit}", f"{row.limit:g}{unit}", f"[{colour}]{word}[/]"
+            row.what, f"{digits(value)}{unit}", f"{row.limit:g}{unit}", Text(word, colour)
         )
     console.print(table)
     if summary["stood"] and any(_is_over(row, summary) for row in LIMITS):
@@ -53,9 +54,13 @@ def show(summary: Summary, console: Console) -> None:
         )
     if not summary["in_real_time"]:
         console.print(
-            f"[yellow]The machine was too slow for real time: real-time factor "
-            f"{summary['real_time_factor']:.3f}, {summary['world_time_lost_s']:.2f} s of world "
-            f"time given up. The times above are not those of a robot.[/]"
+            marked(
+                "[yellow]The machine was too slow for real time: real-time factor "
+                "{:.3f}, {:.2f} s of world "
+                "time given up. The times above are not those of a robot.[/]",
+                summary["real_time_factor"],
+                summary["world_time_lost_s"],
+            )
         )
     console.print(_sentence(summary))
 
@@ -101,18 +106,18 @@ def digits(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
-def _sentence(summary: Summary) -> str:
+def _sentence(summary: Summary) -> Text:
     if summary["stood"]:
-        return f"[bold green]STOOD[/] for {summary['duration_s']:.1f} s"
+        return marked("[bold green]STOOD[/] for {:.1f} s", summary["duration_s"])
     if not summary["began"]:
-        return (
-            f"[bold red]FELL[/] {summary['fallen_at_s']:.1f} s after the hoist let go, before the "
-            "scenario began"
+        return marked(
+            "[bold red]FELL[/] {:.1f} s after the hoist let go, before the scenario began",
+            summary["fallen_at_s"],
         )
     if summary["fallen_at_s"] is not None:
-        return f"[bold red]FELL[/] at {summary['fallen_at_s']:.1f} s"
+        return marked("[bold red]FELL[/] at {:.1f} s", summary["fallen_at_s"])
     if summary["why_not"]:
-        return f"[bold red]DOES NOT STAND[/] at the end: {summary['why_not']}"
+        return marked("[bold red]DOES NOT STAND[/] at the end: {}", summary["why_not"])
     if summary["unsound"]:
-        return f"[bold red]STOOD, BUT NOT SOUNDLY[/]: {summary['unsound']}"
-    return f"[bold red]NOT FINISHED[/]: the log ends at {summary['duration_s']:.1f} s"
+        return marked("[bold red]STOOD, BUT NOT SOUNDLY[/]: {}", summary["unsound"])
+    return marked("[bold red]NOT FINISHED[/]: the log ends at {:.1f} s", summary["duration_s"])

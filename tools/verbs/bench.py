@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from rich import box
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from rich.text import Text
 
 from shared.config import files as config_file
 from shared.process import CHECKOUT
@@ -26,6 +26,7 @@ from tools.bench.revisions import Worker, its_config
 from tools.bench.table import Row
 from tools.bench.timing import ASLEEP_S, SWEPT_BYTES, YARDSTICK_CALLS
 from tools.bench.worker import READY, Request
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 
 WARM_CALLS: Final = 200
@@ -77,7 +78,7 @@ def run_parts(args: argparse.Namespace) -> int:
     rows, missing = measure(args.config.resolve(), args.against, args.rounds or ROUNDS, console)
     console.print(_table(rows, args.against))
     for line in missing:
-        console.print(f"[yellow]{line}[/]")
+        console.print(marked("[yellow]{}[/]", line))
     console.print(
         "Medians of the rounds' medians, us; CPU is the calling thread's. "
         f"Cold: {SWEPT_BYTES >> 20} MiB are swept and {1e3 * ASLEEP_S:g} ms slept before a call. "
@@ -136,9 +137,9 @@ def _table(rows: list[Row], against: str | None) -> Table:
         else:
             cells += [_number(row.other), "" if row.ratio is None else f"{row.ratio:.2f}"]
         sign = ">=" if row.unit == "x" else "<="
-        mark = "[green]ok[/]" if row.ok else "[yellow]missed[/]"
-        cells.append("" if row.target is None else f"{sign} {row.target:g} {mark}")
-        shown.add_row(*cells)
+        mark = Text("ok", "green") if row.ok else Text("missed", "yellow")
+        target = "" if row.target is None else marked("{} {:g} {}", sign, row.target, mark)
+        shown.add_row(*cells, target)
     return shown
 
 

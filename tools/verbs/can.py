@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from rich import box
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from shared.can.cansimple import AxisState
 from shared.config.files import load
@@ -32,10 +31,12 @@ from tools.bringup.check_can import bus_nodes
 from tools.bringup.check_socketcan import setup_commands
 from tools.bringup.reach import drives_within_reach
 from tools.number_arguments import count, finite
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 COMMAND_S: Final = 10.0
 REQUESTS: Final = 200
+SILENT: Final = Text("silent", "red")
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -124,7 +125,7 @@ def _ran(words: list[str]) -> bool:
         raise FleetError(f"{shlex.join(words)}: {error}; package iproute2 has `ip`") from None
     if done.returncode != 0:
         Console(stderr=True).print(
-            f"[red]{escape(done.stderr.strip())}[/]; as root? is it plugged in?"
+            marked("[red]{}[/]; as root? is it plugged in?", done.stderr.strip())
         )
     return done.returncode == 0
 
@@ -149,21 +150,21 @@ def _listen(
             console.print(_node_table(robot, traffic))
         complete &= all(traffic.nodes[node].heartbeats_s for node in nodes)
         if name == robot.harness.bus:
-            console.print(f"  load cells: {_rate(traffic.samples_s, traffic.seconds)}")
+            console.print("  load cells:", _rate(traffic.samples_s, traffic.seconds))
             complete &= bool(traffic.samples_s)
         if robot.imu.fitted and name == robot.imu.bus:
-            console.print(f"  IMU: {_rate(traffic.attitudes_s, traffic.seconds)}")
+            console.print("  IMU:", _rate(traffic.attitudes_s, traffic.seconds))
             complete &= bool(traffic.attitudes_s)
     return 0 if complete else 1
 
 
-def _heading(name: str, bus: CanConfig, traffic: BusTraffic) -> str:
-    which = f"[bold]{name}[/] ({bus.interface} {escape(bus.channel)})"
+def _heading(name: str, bus: CanConfig, traffic: BusTraffic) -> Text:
+    which = marked("[bold]{}[/] ({} {})", name, bus.interface, bus.channel)
     if traffic.trouble:
-        return f"{which}: [red]{escape(traffic.trouble)}[/]"
-    errors = f", [red]{traffic.error_frames} error frames[/]" if traffic.error_frames else ""
-    hz = traffic.frames / traffic.seconds
-    return f"{which}: {hz:.0f} frames/s{errors}"
+        return marked("{}: [red]{}[/]", which, traffic.trouble)
+    rate = marked("{}: {:.0f} frames/s", which, traffic.frames / traffic.seconds)
+    errors = traffic.error_frames
+    return marked("{}, [red]{} error frames[/]", rate, errors) if errors else rate
 
 
 def _node_table(robot: RobotConfig, traffic: BusTraffic) -> Table:
@@ -176,12 +177,12 @@ def _node_table(robot: RobotConfig, traffic: BusTraffic) -> Table:
     for heading in ("node", "axis", "state", "heartbeat ms", "estimates ms", "turns"):
         table.add_column(heading, no_wrap=True)
     for node, axis in sorted(traffic.nodes.items()):
-        state = "[red]silent[/]"
+        state = SILENT
         if axis.heartbeat is not None:
             known = axis.heartbeat.axis_state in set(AxisState)
-            state = AxisState(axis.heartbeat.axis_state).name if known else "?"
+            state = Text(AxisState(axis.heartbeat.axis_state).name if known else "?")
         turns = "-" if axis.pos_turns is None else f"{axis.pos_turns:.3f}"
-        owner = owners.get(node, "[red]nobody's[/]")
+        owner = owners.get(node, Text("nobody's", "red"))
         table.add_row(str(node), owner, state, *_periods(axis), turns)
     return table
 
@@ -194,8 +195,8 @@ def _periods(axis: NodeTraffic) -> tuple[str, str]:
     return heartbeat, estimates
 
 
-def _rate(times_s: list[float], seconds: float) -> str:
-    return f"{len(times_s) / seconds:.0f} Hz" if times_s else "[red]silent[/]"
+def _rate(times_s: list[float], seconds: float) -> Text:
+    return Text(f"{len(times_s) / seconds:.0f} Hz") if times_s else SILENT
 
 
 def _measure(

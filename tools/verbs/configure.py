@@ -10,9 +10,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-from rich.markup import escape
-
 from shared.can import drive_settings
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
@@ -32,6 +29,7 @@ from tools.bringup.reach import (
     no_fleet_meanwhile,
 )
 from tools.fleet.process_table import is_simulated
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 BACKUPS: Final = Path("out") / "drive-backups"
@@ -263,7 +261,7 @@ def apply(
             with console.status(f"{module}: writing, saving, restarting"):
                 outcomes += changes.apply(board, serial)
         except DriveError as error:
-            console.print(f"[bold red]{module}[/]: {escape(str(error))}")
+            console.print(marked("[bold red]{}[/]: {}", module, error))
             outcomes += [ChangeResult(change, None, good=False) for change in serial]
     return outcomes
 
@@ -275,7 +273,9 @@ def conclude(
     bad = [outcome for outcome in outcomes if not outcome.good]
     for change, now, _ in bad:
         what = change.inhibit or f"it is {changes.describe(now)} after the restart"
-        console.print(f"[bold red]not as wanted[/]: {change.module} {change.name}: {escape(what)}")
+        console.print(
+            marked("[bold red]not as wanted[/]: {} {}: {}", change.module, change.name, what)
+        )
     done = len(outcomes) - len(bad)
     console.print(f"{done} settings written, saved, and read back after the restart")
     if done and robot.drive.zero_mark_turns > 0.0:

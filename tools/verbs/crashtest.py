@@ -10,7 +10,6 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from shared.config.robot_config import RobotConfig
@@ -25,6 +24,7 @@ from tools.studies.crash import report
 from tools.studies.crash.cases import CASES, CrashCase, CrashVerdict
 from tools.studies.crash.report import JUNIT, RESULTS, Result
 from tools.studies.crash.runner import run_case
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 
 EXIT_FELL: Final = 1
@@ -79,7 +79,9 @@ def run(args: argparse.Namespace) -> int:
     robot = experiment.load_robot(args.config)
     out = _make_out(args.out)
     for other in procfs.fleets():
-        console.print(f"[yellow]another fleet runs in {other}: two do not fit on two cores[/]")
+        console.print(
+            marked("[yellow]another fleet runs in {}: two do not fit on two cores[/]", other)
+        )
     console.print(
         f"{len(cases)} cases, loop {robot.joint_service.loop!r}, about "
         f"{_minutes(len(cases) * CASE_S)}; each with a fleet of its own",
@@ -158,7 +160,7 @@ def _run_all(
             report.write(results, out, about, planned=len(cases))
             bar.update(shown, advance=1)
             left = _minutes(_left_s(results, len(cases) - number - 1))
-            place = f"[dim]{number + 1}/{len(cases)}, {left} left[/]"
+            place = marked("[dim]{}/{}, {} left[/]", number + 1, len(cases), left)
             bar.console.print(report.line_of(results[-1]), place, highlight=False, soft_wrap=True)
             last = results[-UNJUDGED_MAX:]
             if len(last) == UNJUDGED_MAX and all(_is_unjudged(result) for result in last):

@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 
-from rich.console import Console
-
 from services.planner.controller_file import controller_maker
 from services.simulator.plant import plant_from
 from shared.bus import topics
@@ -27,6 +25,7 @@ from tools.runs.judgement import judge_run
 from tools.runs.live import run_live
 from tools.runs.live_view import LiveView
 from tools.runs.scenario_runner import EndOfRun, ScenarioRunner
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_verb
 from tools.view.serving import add_port, served_beside
 
@@ -126,7 +125,9 @@ def lead_run(
         true_plant=plant_from(args.plant),
         pace=args.pace,
         controller=args.controller,
-        tell=lambda text: console.print(f"[yellow]{text}[/]", highlight=False, soft_wrap=True),
+        tell=lambda text: console.print(
+            marked("[yellow]{}[/]", text), highlight=False, soft_wrap=True
+        ),
         no_restart=robot.services if args.no_restart else {kill.service for kill in scenario.kill},
     )
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 
 import msgspec
-from rich.console import Console
 
 from shared.config import files as config_file
 from tools.bringup import bench
 from tools.bringup.reach import add_plant, check_plants
 from tools.bringup.report import report_of, show
 from tools.bringup.survey import survey
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 

@@ -8,8 +8,6 @@ import time
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-
 from shared.bus.operator_key import require_operator
 from shared.bus.session import open_session
 from shared.config.files import load
@@ -19,6 +17,7 @@ from shared.process import StopFlag
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, BusStop, request_here, stop_all, wait_here
 from tools.fleet.run_dir import RunDir
+from tools.terminal import Console
 from tools.typed_line import typed_line
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
@@ -145,10 +144,8 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
             silent = stop.listen()
             if silent != told and time.monotonic() - since_s > LINKS_S:
                 told = silent
-                words = (
-                    f"[bold red]not heard: {', '.join(silent)}[/]" if silent else "all six heard"
-                )
-                console.print(words)
+                words = f"not heard: {', '.join(silent)}" if silent else "all six heard"
+                console.print(words, style="bold red" if silent else None)
         if not asked and typed is not None and typed.strip().lower() == "q":
             console.print("left without a stop")
             return 0

@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import Progress
 
 from shared.clock import NS_PER_S
@@ -36,6 +34,7 @@ from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, RunPart, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
+from tools.terminal import Console, marked
 from tools.topic_keys import keys_named
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
@@ -153,7 +152,7 @@ def run(args: argparse.Namespace) -> int:
         out: Path = args.out or path.with_name(path.name.removesuffix(SUFFIX) + SCENE_SUFFIX)
         _free(out, path, force=args.force)
         count = export_scene(index, out)
-        console.print(f"[bold]{escape(str(out))}[/]: {count} messages", soft_wrap=True)
+        console.print(marked("[bold]{}[/]: {} messages", out, count), soft_wrap=True)
     if args.gif is not None:
         _free(args.gif, path, force=args.force)
         _draw(read_part(index, part), args.gif, console, with_curves=args.curves)
@@ -167,7 +166,7 @@ def run(args: argparse.Namespace) -> int:
         write_atomically(
             args.layout, json.dumps(layout_for(index.robot), indent=2).encode() + b"\n"
         )
-        console.print(f"[bold]{escape(str(args.layout))}[/]: import it in Foxglove")
+        console.print(marked("[bold]{}[/]: import it in Foxglove", args.layout))
     return 0
 
 
@@ -194,7 +193,7 @@ def _write_tables(
         if not any(rows.values()):
             raise RunError(f"{index.path}: has no message of these topics in this part")
     told = f"{len(rows)} table{'s' * (len(rows) != 1)}, {sum(rows.values())} rows"
-    console.print(f"[bold]{escape(str(out))}[/]: {told}", soft_wrap=True)
+    console.print(marked("[bold]{}[/]: {}", out, told), soft_wrap=True)
 
 
 def _write_bag(index: RunIndex, part: RunPart, args: argparse.Namespace, console: Console) -> None:
@@ -206,7 +205,7 @@ def _write_bag(index: RunIndex, part: RunPart, args: argparse.Namespace, console
         rate_hz = args.rate or BAG_RATE_HZ
         count = write_bag(index, part, robot_of(index), folder, rate_hz, done)
     told = f"{count} messages; ros2 bag play {args.ros2bag}"
-    console.print(f"[bold]{escape(str(args.ros2bag))}[/]: {escape(told)}", soft_wrap=True)
+    console.print(marked("[bold]{}[/]: {}", args.ros2bag, told), soft_wrap=True)
 
 
 def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> None:
@@ -217,7 +216,7 @@ def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> Non
             log, robot_of(log), out, lambda part: shown.update(bar, completed=part),
             with_curves=with_curves,
         )  # fmt: skip
-    console.print(f"[bold]{escape(str(out))}[/]: {count} frames", soft_wrap=True)
+    console.print(marked("[bold]{}[/]: {} frames", out, count), soft_wrap=True)
 
 
 def export_scene(index: RunIndex, out: Path) -> int:

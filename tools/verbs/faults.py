@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 
 import msgspec
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from shared.config.files import load
@@ -14,6 +12,7 @@ from shared.config.scenarios import FAULT_KINDS
 from shared.config.sections import TripLimit
 from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 
 _LABEL_WIDTH = 12
@@ -54,30 +53,34 @@ def run(args: argparse.Namespace) -> int:
         return 0
     console = Console(highlight=False)
     console.print(
-        "[bold]A drive's fault.[/] Its module goes to FAULT, and the planner has the other five "
-        "HOLD. An axis that disarms floats; its sibling keeps its torque until the service idles "
-        "it, at once. Nothing is re-armed automatically: mend it, then restart the module's "
-        "service (`xrl kill MODULE`).\n"
+        marked(
+            "[bold]A drive's fault.[/] Its module goes to FAULT, and the planner has the other "
+            "five HOLD. An axis that disarms floats; its sibling keeps its torque until the "
+            "service idles it, at once. Nothing is re-armed automatically: mend it, then restart "
+            "the module's service (`xrl kill MODULE`).\n"
+        )
     )
     for kind, row in DRIVE_FAULTS.items():
         limp = "limp" if row.limp else "held"
-        console.print(f"[bold]{kind}[/]: {FAULT_KINDS[kind].about}")
+        console.print(marked("[bold]{}[/]: {}", kind, FAULT_KINDS[kind].about))
         _say(console, "the drive", f"{row.drive} ({limp})")
         _say(console, "because", row.cause.name)
         _say(console, "way out", row.recovery)
-    console.print("\n[bold]What else can be lost.[/]\n")
+    console.print(marked("\n[bold]What else can be lost.[/]\n"))
     for name, loss in LOSSES.items():
-        console.print(f"[bold]{name}[/]")
+        console.print(marked("[bold]{}[/]", name))
         _say(console, "module", loss.module)
         _say(console, "others", loss.others)
         _say(console, "you see", loss.visible)
         _say(console, "it ends", loss.recovery)
     console.print(
-        "\n[bold]What trips.[/] Noticed while the robot is led, by each module or by the planner: "
-        "all six HOLD, and are led again after a wait that each one lengthens.\n"
+        marked(
+            "\n[bold]What trips.[/] Noticed while the robot is led, by each module or by the "
+            "planner: all six HOLD, and are led again after a wait that each one lengthens.\n"
+        )
     )
     for name, (trip, limit) in trips.items():
-        console.print(f"[bold]{name}[/]: {trip.measured}")
+        console.print(marked("[bold]{}[/]: {}", name, trip.measured))
         _say(console, "trips", _describe_limit(trip, limit))
         _say(console, "you do", trip.recovery)
     return 0
@@ -94,5 +97,5 @@ def _say(console: Console, label: str, text: str) -> None:
     grid = Table.grid(padding=(0, 1))
     grid.add_column(width=_LABEL_WIDTH, justify="right", style="dim")
     grid.add_column()
-    grid.add_row(label, escape(text))
+    grid.add_row(label, text)
     console.print(grid)

@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 
 import msgspec
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -17,6 +16,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.robot import gain_schedule
 from shared.robot.gain_table import GainSchedule
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_verb
 
 ROOM_EVERY = 5

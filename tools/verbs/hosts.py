@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rich import box
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
@@ -24,6 +23,7 @@ from tools.hosts.remote import Remote, on_all
 from tools.keys import authority as authorities
 from tools.keys.authority import Authority
 from tools.output import write_atomically
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 
 DEFAULT_HOSTS: Final = Path("hosts.toml")
@@ -188,7 +188,7 @@ def _up(given: _Given) -> int:
 def _estop(given: _Given) -> int:
     failed = _each(given, lambda remote: running.estop(given.hosts, remote))
     if failed:
-        Console().print("[bold red]not all have stopped: cut the power[/]")
+        Console().print(marked("[bold red]not all have stopped: cut the power[/]"))
     return failed
 
 
@@ -253,7 +253,7 @@ def _check(given: _Given) -> int:
     console.print(_table(rows))
     others = installation.disagreements(rows)
     for text in others:
-        console.print(f"[bold red]{escape(text)}[/]")
+        console.print(marked("[bold red]{}[/]", text))
     return 1 if others or any(row.wrong for row in rows) else 0
 
 
@@ -265,8 +265,9 @@ def _each(given: _Given, work: Callable[[Remote], str]) -> int:
 
 def _tell(name: str, result: str | FleetError) -> None:
     bad = isinstance(result, FleetError)
-    text = escape(str(result)) if bad else f"{name}: {result}"
-    Console().print(f"[bold red]{text}[/]" if bad else text, highlight=False, soft_wrap=True)
+    text = str(result) if bad else f"{name}: {result}"
+    style = "bold red" if bad else None
+    Console().print(text, style=style, highlight=False, soft_wrap=True)
 
 
 def _table(rows: list[HostRow]) -> Table:
@@ -275,14 +276,14 @@ def _table(rows: list[HostRow]) -> Table:
         table.add_column(heading, no_wrap=heading != "")
     for row in rows:
         clock = row.clock
-        words = [f"[bold red]{escape(text)}[/]" for text in row.wrong]
-        words += [f"[yellow]{escape(text)}[/]" for text in row.warnings]
+        words = [Text(text, "bold red") for text in row.wrong]
+        words += [Text(text, "yellow") for text in row.warnings]
         table.add_row(
             row.name,
             row.revision or "-",
             row.unit,
             "-" if clock is None else f"{1e3 * clock.offset_s:+.1f} ms",
             "-" if clock is None else f"{1e3 * clock.round_trip_s:.1f} ms",
-            "\n".join(words) or "ok",
+            Text("\n").join(words) or "ok",
         )
     return table

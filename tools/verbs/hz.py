@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
 from rich.live import Live
 
 from shared.bus.session import open_session
@@ -19,6 +18,7 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.traffic import LINKS_S, Traffic
 from tools.fleet.traffic_table import traffic_table
 from tools.number_arguments import finite
+from tools.terminal import Console
 from tools.topic_keys import keys_named
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final
 
 from rich import box
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -37,6 +36,7 @@ from tools.output import make_folder
 from tools.runs import experiment
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_log import RunLog, read_run
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 LEVEL_SD: Final = 0.003

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -19,7 +18,7 @@ from shared.mcap_log.reader import LostBytes
 from shared.mcap_log.recover import clock_time, describe_lost
 from shared.mcap_log.writer import SCHEMA_VERSION
 from tools.analysis.logs.survey import FileFacts, Survey, TopicFacts
-from tools.output import printable
+from tools.guarded_streams import printable
 from tools.runs.host_clocks import HostClocks
 from tools.runs.host_clocks import describe as describe_clocks
 from tools.runs.impairment_intervals import impairments
@@ -27,6 +26,7 @@ from tools.runs.run_files import files_in, files_of_run
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import NOTHING, RunLog, clocks_of
 from tools.runs.run_parts import zero_ns
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_verb
 
 SLOW: Final = 0.9
@@ -147,11 +147,11 @@ def show(survey: Survey, run_files: list[Path], console: Console) -> None:
 
 
 def _show_file(file: FileFacts, console: Console) -> None:
-    state = "finished"
+    state = Text("finished")
     if not file.finished:
-        state = "[yellow]being written[/]" if file.in_use else "[yellow]not finished[/]"
+        state = Text("being written" if file.in_use else "not finished", "yellow")
     size = f"{file.size / MIB:.2f} MiB" if file.size >= MIB else f"{file.size} bytes"
-    console.print(f"[bold]{printable(str(file.path))}[/]: {size}, {state}", soft_wrap=True)
+    console.print(marked("[bold]{}[/]: {}, {}", file.path, size, state), soft_wrap=True)
     if not file.finished or file.damage:
         for line in describe_lost(file.cut, file.damage, finished=file.finished):
             console.print(f"  {line}", style="yellow", soft_wrap=True)

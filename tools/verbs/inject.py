@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Final
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from shared.bus.links import GROUPS
@@ -23,6 +22,7 @@ from tools.runs.describe_inject import (
     make,
     parse_inject,
 )
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 ALL: Final = "all"

@@ -7,9 +7,8 @@ import sys
 from typing import Final
 
 from rich import box
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from services.joint.__main__ import open_drive
 from services.joint.differential import joint_from_motor
@@ -21,6 +20,7 @@ from tools.bringup import bench, limits
 from tools.bringup.jog_drive import NOT_IDLE, Interrupts, JogResult, first_reading, jog_drive
 from tools.bringup.jogging import JogPlan, Sample, gentle, judge, outside, what_to_see
 from tools.number_arguments import count, finite
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 BY: Final = 0.05
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
             return 2
         why = limits.not_given_back(robot, args.module, args.run_dir) if outcome.is_idle else ""
         if why:
-            console.print(f"[yellow]{escape(why)}[/]")
+            console.print(marked("[yellow]{}[/]", why))
     code = report(outcome, module, plan, console)
     if interrupts.number:
         sys.exit(128 + interrupts.number)
@@ -181,19 +181,19 @@ def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> 
     """Print how it went; return 0 if the joint followed, else 1."""
     code = 1
     if outcome.trouble:
-        console.print(f"[bold red]STOPPED[/]: {escape(outcome.trouble)}")
+        console.print(marked("[bold red]STOPPED[/]: {}", outcome.trouble))
     else:
         rows = judge(outcome.samples, plan)
         table = Table(box=box.SIMPLE_HEAD)
         for heading in ("", "measured", "wanted", ""):
             table.add_column(heading)
         for row in rows:
-            verdict = "" if not row.wanted else "ok" if row.good else "[bold red]not good[/]"
-            table.add_row(row.what, row.value, row.wanted, verdict)
+            verdict = Text("ok") if row.good else Text("not good", "bold red")
+            table.add_row(row.what, row.value, row.wanted, verdict if row.wanted else "")
         console.print(table)
         code = 0 if all(row.good for row in rows) else 1
-        words = "[bold green]FOLLOWED[/]" if code == 0 else "[bold red]DID NOT FOLLOW[/]"
-        console.print(f"{words}: {module} {AXES[plan.axis]}")
+        words = "[bold red]DID NOT FOLLOW[/]" if code else "[bold green]FOLLOWED[/]"
+        console.print(marked(f"{words}: {{}} {{}}", module, AXES[plan.axis]))
         console.print(
             f"right only if you saw this: {what_to_see(module, plan.axis, plan.by)}; "
             "an encoder on the motor cannot tell"
@@ -201,7 +201,7 @@ def report(outcome: JogResult, module: str, plan: JogPlan, console: Console) -> 
     if outcome.is_idle:
         console.print("both axes are idle")
         return code
-    console.print(f"[bold red]{NOT_IDLE}[/]")
+    console.print(marked("[bold red]{}[/]", NOT_IDLE))
     return 1
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import Progress
 
 from shared.mcap_log.files import FIRST
-from tools.output import printable
+from tools.guarded_streams import printable
 from tools.runs.experiment import make_out
 from tools.runs.joined_records import host_record, join
 from tools.runs.run_index import RunIndex
+from tools.terminal import Console
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 

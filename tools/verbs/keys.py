@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from shared.bus.access import PRINCIPALS
 from shared.bus.credentials import keys_folder
@@ -22,6 +22,7 @@ from tools.keys.certificates import CERTIFICATE_DAYS
 from tools.keys.inspection import KeyRow, look
 from tools.number_arguments import count
 from tools.output import write_atomically
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_verb
 
 _EXAMPLES = """
@@ -189,8 +190,6 @@ def _table(folder: Path, rows: list[KeyRow]) -> Table:
     for heading in ("name", "expires", "dialled as", ""):
         table.add_column(heading, no_wrap=heading != "")
     for row in rows:
-        words = f"[bold red]{row.wrong}[/]" if row.wrong else f"[yellow]{row.warning}[/]"
-        if not row.wrong and not row.warning:
-            words = "ok"
-        table.add_row(row.name, row.expires, ", ".join(row.hosts) or "-", words)
+        words = Text(row.wrong, "bold red") if row.wrong else Text(row.warning, "yellow")
+        table.add_row(row.name, row.expires, ", ".join(row.hosts) or "-", words or "ok")
     return table

@@ -11,7 +11,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
@@ -30,6 +29,7 @@ from tools.fleet.gamepad import BUTTONS, Gamepad, open_pad
 from tools.fleet.pilot import Deflection, Led, Pilot
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 PERIOD_S: Final = 0.05

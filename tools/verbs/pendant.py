@@ -6,14 +6,13 @@ import argparse
 import time
 from typing import Final
 
-from rich.console import Console
-
 from services.joint.rearm_guard import Pendant
 from shared.exceptions import FleetError
 from shared.process import StopFlag
 from shared.robot.joints import MODULES
 from tools.fleet.emergency_stop import GIVE_UP_S, request_here, wait_here
 from tools.number_arguments import finite
+from tools.terminal import Console
 from tools.typed_line import typed_line
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import msgspec
-from rich.console import Console
-from rich.markup import escape
 
 from shared.bus.session import RawPublisher, Session, open_session
 from shared.clock import NS_PER_S, now_ns
@@ -32,6 +30,7 @@ from tools.analysis.playback.stream import EntryStream
 from tools.cli import INTERRUPTED
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_verb
 
 _POLL_S: Final = 0.01
@@ -169,7 +168,7 @@ def _permitted(
     out = [target for key, target in targets.items() if key not in left]
     if out:
         words = f"{live}: left out even with --force: {guard.describe(out)}"
-        console.print(escape(words), style="yellow", soft_wrap=True)
+        console.print(words, style="yellow", soft_wrap=True)
     return left
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rich.console import Console
-
 from shared.exceptions import RunError
 from shared.mcap_log import recover
 from shared.mcap_log.files import in_use, recovered_name
 from shared.mcap_log.reader import open_log
-from tools.output import printable
+from tools.guarded_streams import printable
 from tools.runs.run_files import MetadataByName, head_of
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_verb
 
 
@@ -54,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     if _in_use(path):
         console.print("a recorder is writing this file: what follows is not in the copy")
     outcome = recover.recover(path, out)
-    console.print(f"[bold]{printable(str(out))}[/]: a finished file", soft_wrap=True)
+    console.print(marked("[bold]{}[/]: a finished file", out), soft_wrap=True)
     for line in recover.describe(outcome):
         console.print(f"  {line}", soft_wrap=True)
     flush_ms = _head(path).get("recorder", {}).get("flush_ms", "")

@@ -9,14 +9,12 @@ import webbrowser
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-from rich.markup import escape
-
 from shared.exceptions import RunError
 from tools.analysis.reports.page import render_parts
 from tools.output import progress_along, write_atomically
 from tools.runs.run_index import RunIndex
 from tools.runs.run_parts import add_part, part_of
+from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 MIB: Final = 1 << 20
@@ -63,8 +61,9 @@ def run(args: argparse.Namespace) -> int:
     with progress_along("reading", min(part.end_s, index.length_s)) as done:
         page = render_parts(index, part, done=done).encode()
     write_atomically(out, page)
-    name = escape(str(out))
-    Console().print(f"[bold]{name}[/]: {len(page) / MIB:.2f} MiB, one file", soft_wrap=True)
+    Console().print(
+        marked("[bold]{}[/]: {:.2f} MiB, one file", out, len(page) / MIB), soft_wrap=True
+    )
     if args.open == "yes" or (args.open == "auto" and _has_display()):
         webbrowser.open(out.resolve().as_uri())
     return 0

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Final
 
 from rich import box
-from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
+from rich.text import Text
 
 from services.planner.controller_file import controller_maker
 from shared.bus.messages import Message
@@ -30,6 +30,7 @@ from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, parts_of, read_part
 from tools.runs.run_parts import add_part, part_of
 from tools.studies.sweeps.pool import cores, results
+from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 SERVICES: Final = ("planner", *MODULES)
@@ -219,11 +220,11 @@ def summary(outcomes: list[ReexecutionResult]) -> Table:
     for outcome in outcomes:
         comparison = outcome.comparison
         if not outcome.ticks:
-            result = "[yellow]nothing executed[/]"
+            result = Text("nothing executed", "yellow")
         elif comparison.first is None:
-            result = f"{outcome.ticks} ticks, all equal"
+            result = Text(f"{outcome.ticks} ticks, all equal")
         else:
-            result = f"[bold red]{comparison.differing} differ[/]"
+            result = Text(f"{comparison.differing} differ", "bold red")
         table.add_row(
             outcome.service,
             str(outcome.ticks),
@@ -246,7 +247,9 @@ def tell(outcome: ReexecutionResult, index: RunIndex, console: Console, *, chang
         return
     began_ns = index.began_ns - index.offset_ns
     at_s = (first.t_ns - began_ns) / 1e9
-    console.print(f"[bold]{outcome.service}[/], first at {at_s:.3f} s: {first.describe()}")
+    console.print(
+        marked("[bold]{}[/], first at {:.3f} s: {}", outcome.service, at_s, first.describe())
+    )
     if not changed:
         return
     table = Table(title="largest changes", title_justify="left", box=box.SIMPLE_HEAD)

@@ -6,14 +6,13 @@ import argparse
 import os
 
 import msgspec
-from rich.console import Console
-from rich.markup import escape
 
 from services.ros2_gateway.rmw import domain
 from shared.config import checks
 from shared.config.files import load
 from tools.fleet.ros2_check import check
 from tools.number_arguments import finite
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_verb
 
 
@@ -61,8 +60,8 @@ def run(args: argparse.Namespace) -> int:
     rows = check(robot, args.domain, args.wait)
     console = Console(highlight=False)
     for row in rows:
-        mark = "[green]ok[/]" if row.good else "[bold red]no[/]"
-        console.print(f"{mark}  {escape(row.what)}: {escape(row.found)}", soft_wrap=True)
+        mark = marked("[green]ok[/]") if row.good else marked("[bold red]no[/]")
+        console.print(marked("{}  {}: {}", mark, row.what, row.found), soft_wrap=True)
         if not row.good:
-            console.print(f"      {escape(row.fix)}", soft_wrap=True)
+            console.print(f"      {row.fix}", soft_wrap=True)
     return 0 if all(row.good for row in rows) else 1

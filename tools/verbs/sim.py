@@ -6,7 +6,6 @@ import argparse
 import time
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from services.planner.controller_file import controller_maker
@@ -20,6 +19,7 @@ from tools.runs import experiment, recorded_lockstep, verdict_table
 from tools.runs.centralised.fleet import CONTROLS, SHIPPED
 from tools.runs.hand_path import HandRow, hand_path
 from tools.runs.run_log import read_run
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_verb
 
 

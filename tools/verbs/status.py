@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
-from rich.console import Console
 from rich.live import Live
 
 from shared.bus.session import open_session
@@ -20,6 +19,7 @@ from tools.fleet.fleet_status import (
 )
 from tools.fleet.status_table import tables
 from tools.fleet.supervise import SupervisedFleet
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 
-from rich.console import Console
 from rich.table import Table
 
 from services.planner.body_stiffness import BodyStiffness, for_robot
 from shared.config import files as config_file
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_config, add_verb
 
 ROWS = (

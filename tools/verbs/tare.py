@@ -9,8 +9,6 @@ import time
 from pathlib import Path
 from typing import Final, Protocol
 
-from rich.console import Console
-
 from shared.bus import topics
 from shared.bus.messages import Tare, TareRequest, Wrench
 from shared.bus.session import open_session
@@ -18,6 +16,7 @@ from shared.clock import now_ns
 from shared.config.files import load
 from shared.exceptions import FleetError
 from tools.fleet.supervise import SupervisedFleet
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 LOADED_N: Final = 30.0

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 
 from shared.bus.session import open_session
@@ -18,6 +18,7 @@ from tools.fleet.procfs import use_of
 from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.traffic import LINKS_S, Traffic
 from tools.fleet.traffic_table import process_table, traffic_table
+from tools.terminal import Console
 from tools.topic_keys import keys_named
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 

@@ -9,8 +9,6 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
 
 from services.simulator.plant import IDEAL, PlantConfig, plant_from
 from shared.bus.operator_key import require_operator
@@ -26,6 +24,7 @@ from tools.identify import joint_bench, joint_drive
 from tools.number_arguments import finite
 from tools.output import make_folder, progress_along
 from tools.runs import experiment
+from tools.terminal import Console, marked
 from tools.tune import module_probe
 from tools.tune.excitation import Excitation, excitation
 from tools.tune.pose_probe import DIRECTIONS, LiveProbe, ProbeCourse, in_lockstep, inertia_along
@@ -146,7 +145,7 @@ def _tune_direction(args: argparse.Namespace, console: Console) -> int:
             return 2
         course = live
     if course.ended:
-        console.print(f"[bold red]STOPPED[/]: {escape(course.ended)}")
+        console.print(marked("[bold red]STOPPED[/]: {}", course.ended))
         return 1
     answer = _answer(course, plan)
     courses, answers = {"measured": course}, {"measured": answer}
@@ -184,7 +183,7 @@ def _simulate(
         answers[name] = _answer(course, plan)
         courses[name] = course
     except RunError as error:
-        console.print(f"[yellow]{name}: {escape(str(error))}[/]")
+        console.print(marked("[yellow]{}: {}[/]", name, error))
 
 
 def _live(
@@ -262,8 +261,12 @@ def _proposed(
     )  # fmt: skip
     if new.K_p <= 0.0 or new.B_p <= 0.0:
         console.print(
-            f"[yellow]no gains: with K_p = {new.K_p:.3g} and B_p = {new.B_p:.3g} it would be so; "
-            "local gains and joints give more stiffness or damping than was wanted[/]"
+            marked(
+                "[yellow]no gains: with K_p = {:.3g} and B_p = {:.3g} it would be so; "
+                "local gains and joints give more stiffness or damping than was wanted[/]",
+                new.K_p,
+                new.B_p,
+            )
         )
         return None
     K_p, B_p = list(law.K_p), list(law.B_p)

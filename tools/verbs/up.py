@@ -7,8 +7,6 @@ import sys
 import time
 from pathlib import Path
 
-from rich.console import Console
-
 from services.planner.controller_file import ATTACHED, absolute, controller_maker, split_spec
 from services.ros2_gateway.inbound import acceptable
 from services.ros2_gateway.rmw import domain
@@ -27,6 +25,7 @@ from tools.fleet.process_table import check_known, is_simulated, load_table
 from tools.fleet.supervise import SupervisedFleet
 from tools.number_arguments import finite
 from tools.runs.experiment import add_controller, add_plant, make_out, scenario_file
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 from tools.view.live import LiveSource
 from tools.view.serving import add_port, serve
@@ -174,7 +173,7 @@ def run(args: argparse.Namespace) -> int:
         f"(logs: {fleet.run.logs}{record}); `xrl status` shows them, `xrl down` stops them"
     )
     if robot.bus.security.mode == "open":
-        Console().print(f"[bold red]{OPEN}[/]")
+        Console().print(marked("[bold red]{}[/]", OPEN))
     if args.view:
         live = LiveSource(robot, fleet, act="simulator" in fleet.manifest.services)
         try:

@@ -8,8 +8,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from rich.console import Console
-
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
@@ -20,6 +18,7 @@ from tools.runs.experiment import load_robot
 from tools.runs.recorded_robot import robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_parts import add_part, read_asked
+from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_run_dir, add_verb
 from tools.view import foxglove_server
 from tools.view.foxglove_server import FoxgloveServer
@@ -146,8 +145,10 @@ def confirm(robot: RobotConfig) -> None:
         raise FleetError("a page may act on a real robot only if somebody types its name here")
     console = Console()
     console.print(
-        "[bold red]This is a real robot.[/] A page can kill its services and stop it, and replaces "
-        "no switch that cuts the power."
+        marked(
+            "[bold red]This is a real robot.[/] A page can kill its services and stop it, and "
+            "replaces no switch that cuts the power."
+        )
     )
     typed = console.input(f"Type its name ({robot.name}) to go on: ")
     if typed.strip() != robot.name:

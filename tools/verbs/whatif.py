@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
@@ -28,6 +27,7 @@ from tools.studies.counterfactual import picture
 from tools.studies.counterfactual.moments import moments_of
 from tools.studies.counterfactual.run import Counterfactual, Task, counterfactual_of
 from tools.studies.sweeps.pool import cores, results
+from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_verb
 
 KILLABLE: Final = ("planner", *MODULES)
@@ -151,7 +151,7 @@ def show(counterfactuals: list[Counterfactual], names: str, for_s: float, consol
         row = counterfactuals[begin : begin + WIDTH]
         strip = Text(f"{row[0].at_s:6.1f} s ")
         for one in row:
-            strip.append("█", style="green" if one.stood else "red")
+            strip.append("█" if one.stood else "X", style="green" if one.stood else "red")
         console.print(strip)
     fell = [one for one in counterfactuals if not one.stood]
     worst = max(
@@ -164,7 +164,9 @@ def show(counterfactuals: list[Counterfactual], names: str, for_s: float, consol
     )
     if fell:
         times = ", ".join(f"{one.at_s:.1f}" for one in fell[:20])
-        console.print(f"[red]fell[/] when killed at {times}{' ...' if len(fell) > 20 else ''} s")
+        console.print(
+            marked("[red]fell[/] when killed at {}{} s", times, " ..." if len(fell) > 20 else "")
+        )
     margin = "" if worst.margin is None else f", margin {worst.margin:.2f}"
     console.print(
         f"worst at {worst.at_s:.1f} s: COM up to x {worst.com_x_max_mm:.0f}, "

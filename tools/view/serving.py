@@ -12,10 +12,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from rich.console import Console
-
 from shared.exceptions import FleetError
 from tools.number_arguments import natural
+from tools.terminal import Console
 from tools.view.server import HOST, PORT, ViewServer
 from tools.view.source import Source
 

@@ -6,12 +6,12 @@ import io
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from shared.can.drive_settings import AXES
 from shared.robot.joints import MODULES
 from tools.bringup.report import Report, report_of, show, verdict_line
 from tools.bringup.rows import Finding, FindingKind, merged, ok, warning, wrong
+from tools.terminal import Console
 
 FINE = [ok(f"m{i}", "supply", f"{volts:.1f} V", "8 to 60 V") for i, volts in enumerate((9.5, 48.0))]
 TRAP = wrong(

@@ -133,10 +133,7 @@ def test_its_services_are_executed_again_bit_for_bit(
     assert "all equal" in capsys.readouterr().out
 
 
-def test_info_tells_the_clocks(
-    record: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "150")
+def test_info_tells_the_clocks(record: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code(["info", record]) == 0
     told = capsys.readouterr().out
     assert f"{BODY}: the recorder's (planner" in told

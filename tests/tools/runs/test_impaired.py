@@ -6,7 +6,6 @@ import io
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from shared.bus.links import DIRECTIONS, directions_of
 from shared.bus.messages import PlannerMode, PlannerStatus, SimTruth
@@ -22,6 +21,7 @@ from tools.runs.live_view import LiveView, active, waiting
 from tools.runs.scenario_runner import LiveSnapshot
 from tools.runs.verdict import Summary
 from tools.runs.verdict_limits import LIMITS
+from tools.terminal import Console
 
 LATE = Impairment(delay_ms=30.0, jitter_ms=10.0)
 CUT = Impairment(partition=True)

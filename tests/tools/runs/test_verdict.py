@@ -7,7 +7,6 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from rich.console import Console
 
 from services.simulator.body import body_of
 from services.simulator.plant import IDEAL
@@ -22,6 +21,7 @@ from tools.runs.run_log import read_run
 from tools.runs.soundness import _longest_s, shaking_of, why_not_sound
 from tools.runs.standing import why_not_standing
 from tools.runs.verdict_limits import LIMITS, SOUND
+from tools.terminal import Console
 
 
 @pytest.fixture(scope="module")

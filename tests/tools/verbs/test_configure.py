@@ -16,7 +16,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from shared.can.drive_settings import of_module
 from shared.config.robot_config import RobotConfig, expand
@@ -30,6 +29,7 @@ from tools.bringup.boards import FoundBoards, Value
 from tools.bringup.jog_drive import Interrupts
 from tools.fleet import procfs
 from tools.fleet.run_dir import RunDir
+from tools.terminal import Console
 from tools.verbs import configure
 
 VEL_LIMIT = "axis0.controller.config.vel_limit"

@@ -42,16 +42,14 @@ def test_what_was_planted_is_found_within_its_interval_and_written(
     lab: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "80")  # no name is cut in two
     before = config_file.load_without_schedule(lab)
     words = ["identify", "body", record, "--config", lab, "--apply", "--out", tmp_path / "fit"]
     assert exit_code(words) == 0
     told = capsys.readouterr().out
     rows = {
         match[1].strip(): (float(match[2]), float(match[3]))
-        for match in re.finditer(r"^ +(\S.*?)  +[\d.-]* +(-?[\d.]+) +± ([\d.]+)", told, re.M)
+        for match in re.finditer(r"^ *(\S.*?)  +[\d.-]* +(-?[\d.]+) +± ([\d.]+)", told, re.M)
     }
     at = [TORSO / PAYLOAD * by for by in (0.012, -0.01, 0.02)]
     truth = {

@@ -41,7 +41,6 @@ class FakeProxy:
 def proxy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inject, "ProxyClient", FakeProxy)
     monkeypatch.setattr(FakeProxy, "began", None)
-    monkeypatch.setenv("COLUMNS", "150")
 
 
 def test_the_flags_state_what_where_and_when_and_the_injector_waits() -> None:

@@ -11,7 +11,6 @@ from typing import cast
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from shared.bus.messages import (
     Cause,
@@ -46,6 +45,7 @@ from tools.fleet.status_table import (
     describe_ways_out,
     tables,
 )
+from tools.terminal import Console
 
 
 def state(mode: Mode, cause: Cause, drive: DriveStatus) -> JointState:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from services.joint.differential import joint_from_motor, motor_from_joint
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
@@ -24,6 +23,7 @@ from tools.bringup import bench, zeroing
 from tools.bringup.standing import standing
 from tools.bringup.zeroing import Back, DriveLook, is_right, look, outside, refusal, zero
 from tools.fleet.supervise import SupervisedFleet
+from tools.terminal import Console
 from tools.verbs import zero as verb
 
 MODULE = "knee_left"

@@ -6,31 +6,29 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
-
 from shared.bus.session import RawPublisher
 from shared.clock import NS_PER_MS, NS_PER_S
 from tools.analysis.playback.player import Player
 from tools.analysis.playback.reading import Recording
 from tools.analysis.playback.schedule import Window
 from tools.runs.run_files import further_files
+from tools.terminal import Console
 
 
 def introduce(recording: Recording, paths: list[Path], note: str, console: Console) -> None:
     """Print the facts of a log that a person needs before playing it."""
     if note:
-        console.print(escape(note), style="dim", soft_wrap=True)
+        console.print(note, style="dim", soft_wrap=True)
     for path in recording.unfinished:
         words = f"{path}: not finished; plays as far as it goes"
-        console.print(escape(words), style="yellow", soft_wrap=True)
+        console.print(words, style="yellow", soft_wrap=True)
     for path in recording.damaged:
         words = f"{path}: parts of it cannot be read and are left out; see `xrl info`"
-        console.print(escape(words), style="yellow", soft_wrap=True)
+        console.print(words, style="yellow", soft_wrap=True)
     if len(paths) == 1 and (others := further_files(paths[0])):
         names = ", ".join(path.name for path in others)
         words = f"further files of this run: {names}; give the directory to play all"
-        console.print(escape(words), style="dim", soft_wrap=True)
+        console.print(words, style="dim", soft_wrap=True)
 
 
 def where(keys: Sequence[str], robot: str, part: Window, listening: str) -> str:

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import msgspec
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from tools.studies.crash.cases import BACK_S, CRASH_S, CrashCase, CrashVerdict, scenario_of
 from tools.studies.crash.outcome import CrashResult, as_expected
+from tools.terminal import Console, marked
 
 RESULTS: Final = "results.json"
 JUNIT: Final = "junit.xml"
@@ -68,27 +69,28 @@ def list_cases(cases: Sequence[CrashCase], console: Console) -> None:
     table.add_column("at worst")
     table.add_column("why", overflow="fold")
     for case in cases:
-        name = f"{case.name} [dim](quick)[/]" if case.quick else case.name
-        table.add_row(name, f"[{COLOUR[case.expected]}]{case.expected}[/]", case.why)
+        name = marked("{} [dim](quick)[/]", case.name) if case.quick else case.name
+        table.add_row(name, Text(case.expected, COLOUR[case.expected]), case.why)
     console.print(table)
 
 
-def line_of(result: Result) -> str:
+def line_of(result: Result) -> Text:
     """Return a result in one line."""
     case, outcome = result
-    words = [f"[{COLOUR[outcome.verdict]}]{outcome.verdict.upper():8}[/] {case.name}"]
+    verdict = Text(f"{outcome.verdict.upper():8}", COLOUR[outcome.verdict])
+    words = [marked("{} {}", verdict, case.name)]
     if outcome.fell_after_s is not None:
-        words.append(f"{outcome.fell_after_s:.2f} s after the crash")
+        words.append(Text(f"{outcome.fell_after_s:.2f} s after the crash"))
     if outcome.safe_ms is not None:
-        words.append(f"safe after {outcome.safe_ms:.0f} ms")
+        words.append(Text(f"safe after {outcome.safe_ms:.0f} ms"))
     if outcome.leads_again_s is not None:
-        words.append(f"leads again {outcome.leads_again_s:.2f} s after the request")
+        words.append(Text(f"leads again {outcome.leads_again_s:.2f} s after the request"))
     if outcome.tries > 1:
-        words.append(f"at try {outcome.tries}")
+        words.append(Text(f"at try {outcome.tries}"))
     if not result.good:
-        words.append(f"[bold red]expected at worst: {case.expected}[/]")
-    words += [f"[yellow]{text}[/]" for text in _remarks(outcome)]
-    return ", ".join(words)
+        words.append(marked("[bold red]expected at worst: {}[/]", case.expected))
+    words += [Text(text, "yellow") for text in _remarks(outcome)]
+    return Text(", ").join(words)
 
 
 def show(results: Sequence[Result], console: Console) -> None:
@@ -99,7 +101,7 @@ def show(results: Sequence[Result], console: Console) -> None:
     for case, outcome in results:
         table.add_row(
             case.name,
-            f"[{COLOUR[outcome.verdict]}]{outcome.verdict}[/]",
+            Text(outcome.verdict, COLOUR[outcome.verdict]),
             "" if case.expected is CrashVerdict.STOOD else str(case.expected),
             _figure(outcome.fell_after_s, ".2f"),
             _figure(outcome.safe_ms, ".0f"),
@@ -112,17 +114,23 @@ def show(results: Sequence[Result], console: Console) -> None:
     console.print(LEGEND, style="dim", highlight=False)
     for case, outcome in results:
         for text in _remarks(outcome):
-            console.print(f"[yellow]{case.name}[/]: {text}", highlight=False)
+            console.print(marked("[yellow]{}[/]: {}", case.name, text), highlight=False)
     bad = [result for result in results if not result.good]
     for case, outcome in bad:
-        console.print(f"[bold red]{outcome.verdict.upper()}[/] {case.name}: {case.why}")
+        console.print(
+            marked("[bold red]{}[/] {}: {}", outcome.verdict.upper(), case.name, case.why)
+        )
     counts = ", ".join(
         f"{number} {name}" for name, number in count_by_verdict(results).items() if number
     )
     colour = "red" if bad else "green"
     console.print(
-        f"[bold {colour}]{len(results) - len(bad)} of {len(results)} as expected or better[/]: "
-        f"{counts}",
+        marked(
+            f"[bold {colour}]{{}} of {{}} as expected or better[/]: {{}}",
+            len(results) - len(bad),
+            len(results),
+            counts,
+        ),
         highlight=False,
     )
 

@@ -6,8 +6,6 @@ import argparse
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from rich.console import Console
-
 from services.planner.certificate import DIRECTIONS
 from services.simulator.plant import IDEAL, PlantConfig
 from shared.config import files as config_file
@@ -16,6 +14,7 @@ from tools.number_arguments import count
 from tools.studies.sweeps import certificate_study, study
 from tools.studies.sweeps.certificate_study import CertificateCases, CertificateResult
 from tools.studies.sweeps.table import code_of
+from tools.terminal import Console
 from tools.verb_table import add_config
 
 N: Final = 200

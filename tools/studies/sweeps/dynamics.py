@@ -10,7 +10,6 @@ from typing import Final, TypeAlias
 import matplotlib as mpl
 import msgspec
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from services.planner.dynamic_certificate import HALF_NAMES
 from shared.config.robot_config import RobotConfig
@@ -25,6 +24,7 @@ from tools.studies.sweeps.dynamics_trial import (
     run_trial,
 )
 from tools.studies.sweeps.table import Row, code_of
+from tools.terminal import Console
 from tools.verb_table import add_config
 
 mpl.use("Agg")

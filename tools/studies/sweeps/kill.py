@@ -7,7 +7,6 @@ from functools import partial
 from typing import Final, TypeAlias
 
 import msgspec
-from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
 from tools.number_arguments import count, natural
@@ -18,6 +17,7 @@ from tools.studies.sweeps.outcome import KillResult, plant_of, run_case
 from tools.studies.sweeps.prepare import needs_schedule, prepare
 from tools.studies.sweeps.record import run_alone
 from tools.studies.sweeps.table import code_of
+from tools.terminal import Console
 from tools.verb_table import add_config
 
 N: Final = 500

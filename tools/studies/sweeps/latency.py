@@ -10,7 +10,6 @@ from itertools import product
 from typing import Final, TypeAlias
 
 import msgspec
-from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
 from shared.config.toml_file import check_ranges
@@ -31,6 +30,7 @@ from tools.studies.sweeps.latency_trial import (
 )
 from tools.studies.sweeps.record import run_alone
 from tools.studies.sweeps.table import code_of
+from tools.terminal import Console
 from tools.verb_table import add_config
 
 DELAYS_MS: Final = "0,10,20,30,50,100,200"

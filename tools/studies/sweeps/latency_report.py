@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from statistics import median
 from typing import Final, NamedTuple
 
-from rich.console import Console
 from rich.table import Table
 
 from tools.studies.sweeps.figures import Ending
 from tools.studies.sweeps.latency_trial import CONTROLS
 from tools.studies.sweeps.table import Row
 from tools.studies.sweeps.wilson import wilson
+from tools.terminal import Console, marked
 
 WORST: Final = (
     ("com_max_mm", "COM {:.0f} mm off"),
@@ -105,12 +105,17 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
     for name in controls_in(rows):
         own = chosen(rows, name)
         counted = falls(own)
-        words = f"[bold]{name}[/]: [green]none of {counted.of} fell[/]"
+        words = marked("[bold]{}[/]: [green]none of {} fell[/]", name, counted.of)
         if counted.fallen:
             delay, there = _worst_delay(own)
-            words = (
-                f"[bold]{name}[/]: [red]{counted.fallen} of {counted.of} fell[/]; most at "
-                f"{delay:g} ms, {there.fallen} of {there.of}"
+            words = marked(
+                "[bold]{}[/]: [red]{} of {} fell[/]; most at {:g} ms, {} of {}",
+                name,
+                counted.fallen,
+                counted.of,
+                delay,
+                there.fallen,
+                there.of,
             )
         console.print(words, highlight=False)
         standing = [row for row in own if row["ending"] == Ending.STOOD]

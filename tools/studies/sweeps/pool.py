@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from threading import Thread
 from typing import TypeVar
 
-from shared.exceptions import RunError
+from shared.exceptions import RunError, os_error_in_words
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -40,14 +40,12 @@ def results(
         name: returns a task's name for an error.
 
     Raises:
-        RunError: the work failed on a task, or a worker died.
+        RunError: no worker can be started, the work failed on a task, or a worker died.
     """
     if not tasks:
         return
     before = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(
-        min(workers, len(tasks)), multiprocessing.get_context("spawn"), _begin
-    )
+    executor = _pool(min(workers, len(tasks)))
     try:
         futures = {executor.submit(work, task): task for task in tasks}
         for future in as_completed(futures):
@@ -59,6 +57,14 @@ def results(
         raise
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    try:
+        return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin)
+    except OSError as error:  # their locks are files in shared memory
+        words = os_error_in_words(error)
+        raise RunError(f"no worker process can be started: {words}; is /dev/shm there?") from None
 
 
 def _result(get: Callable[[], R], name: str) -> R:

@@ -13,7 +13,6 @@ import matplotlib as mpl
 import msgspec
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.table import Table as Printed
 
 from services.simulator import plant as plants
@@ -25,6 +24,7 @@ from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial, run_trial
 from tools.studies.sweeps.table import Row, code_of
+from tools.terminal import Console
 from tools.verb_table import add_config
 
 mpl.use("Agg")

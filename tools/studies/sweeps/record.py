@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 import msgspec
-from rich.console import Console
 
 from services.simulator.plant import PlantConfig
 from shared.bus.messages import SimTruth
@@ -17,6 +16,7 @@ from tools.runs.lockstep import Record, Watch
 from tools.runs.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
 from tools.studies.sweeps import study
 from tools.studies.sweeps.figures import Ended
+from tools.terminal import Console, marked
 
 Outcome_co = TypeVar("Outcome_co", bound=Ended, covariant=True)
 
@@ -83,5 +83,5 @@ def run_alone(
     study.show("Measured", msgspec.structs.asdict(outcome), console)
     if out is not None:
         console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
-    console.print(f"[bold]{outcome.ending}[/]")
+    console.print(marked("[bold]{}[/]", outcome.ending))
     return 0 if outcome.stood else 1

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from rich.console import Console
 from rich.table import Table
 
 from tools.studies.sweeps.figures import Ending
 from tools.studies.sweeps.table import Row
 from tools.studies.sweeps.wilson import wilson
+from tools.terminal import Console, marked
 
 FALLS_SHOWN: Final = 10
 
@@ -45,7 +45,7 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
     """
     fallen = falls(rows)
     for row in fallen[:FALLS_SHOWN]:
-        console.print(f"[red]{row['ending']}[/] {describe(row)}", highlight=False)
+        console.print(marked("[red]{}[/] {}", row["ending"], describe(row)), highlight=False)
         console.print(f"    {command} --only {row['number']}", style="dim", soft_wrap=True)
     if len(fallen) > FALLS_SHOWN:
         console.print(f"... and {len(fallen) - FALLS_SHOWN} more in the table")
@@ -56,8 +56,14 @@ def show(rows: Sequence[Row], command: str, console: Console) -> None:
     low, high = wilson(len(fallen), len(rows))
     colour = "red" if fallen else "green"
     console.print(
-        f"[bold {colour}]{len(fallen)} falls of {len(rows)}[/]; share of falls "
-        f"{100 * low:.2f} to {100 * high:.2f} % (95 %, Wilson)",
+        marked(
+            f"[bold {colour}]{{}} falls of {{}}[/]; share of falls {{:.2f}} to {{:.2f}} % "
+            "(95 %, Wilson)",
+            len(fallen),
+            len(rows),
+            100 * low,
+            100 * high,
+        ),
         highlight=False,
     )
 

@@ -12,7 +12,6 @@ import matplotlib as mpl
 import msgspec
 import numpy as np
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.table import Table as Printed
 from scipy.stats import spearmanr
 
@@ -35,6 +34,7 @@ from tools.studies.sweeps.robust_trial import (
 )
 from tools.studies.sweeps.table import Row, code_of
 from tools.studies.sweeps.wilson import wilson
+from tools.terminal import Console, marked
 from tools.verb_table import add_config
 
 mpl.use("Agg")
@@ -203,8 +203,14 @@ def _show(rows: Sequence[Row], command: str, console: Console) -> int:
     fallen = [row for row in rows if row["ending"] != Ending.STOOD]
     for row in fallen[:FALLS_SHOWN]:
         console.print(
-            f"[red]{row['ending']}[/] {row['kind']} {row['number']}: {command} --only "
-            f"{row['number']}",
+            marked(
+                "[red]{}[/] {} {}: {} --only {}",
+                row["ending"],
+                row["kind"],
+                row["number"],
+                command,
+                row["number"],
+            ),
             highlight=False,
             soft_wrap=True,
         )
@@ -223,10 +229,17 @@ def _show(rows: Sequence[Row], command: str, console: Console) -> int:
     else:
         most = ", ".join(f"{key} {value:+.2f}" for key, value in ranking(rows)[:5])
     console.print(f"takes most of the margin (rank correlation): {most}", soft_wrap=True)
+    colour = "red" if fallen else "green"
     low, high = wilson(len(fallen), len(rows))
     console.print(
-        f"[bold {'red' if fallen else 'green'}]{len(fallen)} falls of {len(rows)}[/]; share of "
-        f"falls {100 * low:.2f} to {100 * high:.2f} % (95 %, Wilson)",
+        marked(
+            f"[bold {colour}]{{}} falls of {{}}[/]; share of falls {{:.2f}} to {{:.2f}} % "
+            "(95 %, Wilson)",
+            len(fallen),
+            len(rows),
+            100 * low,
+            100 * high,
+        ),
         highlight=False,
     )
     return len(fallen)

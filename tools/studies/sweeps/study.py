@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
 import msgspec
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from shared.config import files as config_file
@@ -21,6 +20,7 @@ from shared.process import DEFAULT_CONFIG
 from tools.number_arguments import count, natural
 from tools.studies.sweeps import cluster, pool
 from tools.studies.sweeps.table import CaseTable, Row, Words, code_digest
+from tools.terminal import Console, marked
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -225,7 +225,7 @@ def bar(text: str, console: Console) -> Progress:
 
 def show(title: str, figures: Mapping[str, object], console: Console) -> None:
     """Print figures, one a line, but for those that are None."""
-    console.print(f"[bold]{title}[/]")
+    console.print(marked("[bold]{}[/]", title))
     for name, value in figures.items():
         if value is not None:
             text = f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -8,8 +8,8 @@ from itertools import product
 from typing import Final, TypeAlias
 
 import msgspec
-from rich.console import Console
 from rich.table import Table as Printed
+from rich.text import Text
 
 from shared.bus.messages import Cause, Trip
 from shared.config.robot_config import RobotConfig
@@ -18,6 +18,7 @@ from tools.runs import experiment
 from tools.studies.sweeps import study
 from tools.studies.sweeps.table import Row, code_of
 from tools.studies.sweeps.trips_trial import PLANTS, TROUBLES, TripResult, run_trial
+from tools.terminal import Console, marked
 from tools.verb_table import add_config
 
 TABLE: Final = "trips.csv"
@@ -122,15 +123,14 @@ def _show(rows: Sequence[Row], console: Console) -> None:
         console.print(f"  {trouble:16} {TROUBLES[trouble].about}", highlight=False)
 
 
-def _cell(row: Row) -> str:
+def _cell(row: Row) -> Text:
     after = row["tripped_after_s"]
     with_trips = f"{row['tripped'].split()[0].lower()} {float(after):.2f}" if after else "-"
     with_trips += f", {float(row['speed_max']):.2f}"
-    if row["fell_at_s"]:
-        with_trips = f"[red]fell[/] {with_trips}"
     fell = bool(row["untripped_fell_at_s"])
     without = "fell" if fell else f"{float(row['untripped_speed_max']):.2f}"
-    return f"{with_trips}\n[dim]{without}[/]"
+    cell = marked("{}\n[dim]{}[/]", with_trips, without)
+    return marked("[red]fell[/] {}", cell) if row["fell_at_s"] else cell
 
 
 def _run_task(task: Task) -> TripResult:

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from shared.bus.messages import Mode, RunEvent, RunEventKind
 from shared.config.robot_config import RobotConfig
@@ -23,6 +22,7 @@ from tools.studies.crash import report, runner
 from tools.studies.crash.cases import CASES, CrashCase, CrashVerdict, scenario_of
 from tools.studies.crash.outcome import CrashResult
 from tools.studies.crash.report import Result
+from tools.terminal import Console
 from tools.verbs import crashtest
 
 BY_NAME = {case.name: case for case in CASES}

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
 from tests.tools.exit_codes import exit_code
@@ -19,6 +18,7 @@ from tools.studies.sweeps import plants, robust
 from tools.studies.sweeps.figures import Ending
 from tools.studies.sweeps.push_range import PushRange
 from tools.studies.sweeps.robust_trial import KINDS, draw, plant_of, row_of, run_trial, scenario_of
+from tools.terminal import Console
 
 
 @pytest.fixture(scope="module")

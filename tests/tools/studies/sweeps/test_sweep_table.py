@@ -9,12 +9,12 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from rich.console import Console
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tools.studies.sweeps import study
 from tools.studies.sweeps.table import CaseTable, code_of
+from tools.terminal import Console
 
 INPUTS = {"study": "test", "seed": "1"}
 COLUMNS = ("number", "value")

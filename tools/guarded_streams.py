@@ -1,0 +1,89 @@
+"""The door for text to a terminal, a pipe or a file: control characters are shown, not obeyed.
+
+A log, the bus, another host or a file's name may hold escape sequences: they would retitle a
+window, clear it or paint a verdict. In JSON what is written for one means the same character.
+"""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Iterator
+from typing import IO, Any, Final, cast
+
+_CONTROL: Final = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 but tab and newline, DEL, C1
+    "\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"  # what turns or breaks a line
+    "\ud800-\udfff]"  # bytes of a file's name that are no UTF-8
+)
+
+DRAWN: Final = "xrl-drawn"
+"""Name of the codecs' error handler that replaces what a terminal cannot draw."""
+_ALIKE: Final = {"█": "#", "±": "+-", "…": "...", "µ": "u", "°": "deg", "→": "->"}
+
+
+def cleaned(text: str) -> str:
+    r"""Return a text with each control character but tab and newline written as `\u001b`."""
+    return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def is_clean(text: str) -> bool:
+    """Return True if `cleaned` changes nothing."""
+    return _CONTROL.search(text) is None
+
+
+def printable(text: str) -> str:
+    """Return a foreign text as a part of one line."""
+    return cleaned(text).replace("\n", "\\n")
+
+
+class _Guarded:
+    """A stream whose writer prints plain text; Rich, which writes its own colours, passes by."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self.rich_proxied_file = stream
+        """What Rich's console writes to."""
+        self._lost: OSError | None = None
+
+    def write(self, text: str) -> int:
+        """Write a text with its control characters shown."""
+        try:
+            self.rich_proxied_file.write(cleaned(text))
+        except OSError as error:
+            self._lost = error
+            raise
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, and raise what a writer passed over in silence, as argparse does."""
+        if self._lost is not None:
+            raise self._lost
+        self.rich_proxied_file.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.rich_proxied_file, name)
+
+
+@contextlib.contextmanager
+def guarded_streams() -> Iterator[None]:
+    """Guard `print` and the error stream, and let a terminal draw what it can."""
+    codecs.register_error(DRAWN, _as_it_can)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=DRAWN)
+    with (
+        contextlib.redirect_stdout(cast("IO[str]", _Guarded(sys.stdout))),
+        contextlib.redirect_stderr(cast("IO[str]", _Guarded(sys.stderr))),
+    ):
+        yield
+
+
+def _as_it_can(error: UnicodeError) -> tuple[str, int]:
+    """Replace what an encoding lacks, as a handler of `codecs`."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    lacking = error.object[error.start : error.end]
+    return "".join(_ALIKE.get(c, "?") for c in lacking), error.end

@@ -1,0 +1,101 @@
+"""Tables and styled text for a terminal, a pipe or a file.
+
+Text of a log, of the bus or of another host is data: Rich's markup is taken from `marked` templates
+alone, and control characters are shown (`tools.guarded_streams`). A pipe or a file gets tables
+whole: as wide as they need, without frames and colours. A terminal folds what does not fit.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any, Final
+
+import rich.console
+from rich.console import ConsoleOptions, RenderableType
+from rich.measure import Measurement
+from rich.segment import Segment
+from rich.table import Table
+from rich.text import Text
+
+from tools.guarded_streams import cleaned, is_clean
+
+WIDE: Final = 10_000
+"""Columns of a pipe or a file."""
+_FOLDED_MIN: Final = 8
+"""Columns that a folded column of text keeps at least."""
+
+_HOLE: Final = "\0"
+_FIELD: Final = re.compile(r"\{(?:![rs])?(?::[^{}]*)?\}")
+
+
+def marked(template: str, *values: object) -> Text:
+    """Return a text in which the template alone is markup.
+
+    Args:
+        template: Rich markup with fields as of `str.format`: `"[bold]{}[/]: {:.1f} s"`.
+        values: of the fields; data.
+    """
+    whole = Text()
+    given = zip(_FIELD.findall(template), values, strict=True)
+    frame = Text.from_markup(_FIELD.sub(_HOLE, template), emoji=False)
+    for part in frame.split(_HOLE, include_separator=True, allow_blank=True):
+        if not part.plain.endswith(_HOLE):
+            whole.append_text(part)
+            continue
+        field, value = next(given)
+        filling = value.copy() if isinstance(value, Text) else Text(cleaned(field.format(value)))
+        for span in part.spans:
+            if span.end == len(part):
+                filling.stylize_before(span.style)
+        part.right_crop(1)
+        whole.append_text(part)
+        whole.append_text(filling)
+    next(given, None)  # else a value too many would be left out silently
+    return whole
+
+
+class Console(rich.console.Console):
+    """Rich's console, for which a plain string is data."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**{"markup": False, "emoji": False, **options})
+        if not self.is_terminal and "width" not in options:
+            self.width = WIDE
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a plain string as text, its control characters shown."""
+        return super().render_str(cleaned(text), **options)
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        """Yield the segments of anything printable, whole and without foreign control."""
+        if isinstance(renderable, Table):
+            self._let_fit(renderable, options or self.options)
+        for segment in super().render(renderable, options):
+            if segment.control or is_clean(segment.text):
+                yield segment
+            else:
+                yield Segment(cleaned(segment.text), segment.style)
+
+    def on_broken_pipe(self) -> None:
+        """Leave it to the command line: Rich itself would exit with 1."""
+        raise BrokenPipeError
+
+    def _let_fit(self, table: Table, options: ConsoleOptions) -> None:
+        """Fold a table's cells where they would be cut; take its frame off in a pipe or a file."""
+        if not self.is_terminal:
+            table.box, table.pad_edge = None, False
+        wide = options.update(max_width=WIDE)
+        if Measurement.get(self, wide, table).maximum <= options.max_width:
+            return
+        text = [column for column in table.columns if column.justify == "left"]
+        for column in text:
+            column.no_wrap, column.min_width, column.width = False, None, _FOLDED_MIN
+        crowded = Measurement.get(self, wide, table).maximum > options.max_width
+        for column in text:
+            column.width = None
+        for column in table.columns:
+            column.overflow = "fold"
+            column.no_wrap = column.no_wrap and not crowded
