@@ -27,6 +27,7 @@ from typing import (
 import msgspec
 
 from shared.exceptions import ConfigError
+from shared.text_file import read_text
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -59,10 +60,10 @@ def read_toml(path: Path, into: type[S]) -> S:
             raise ConfigError(file, "(file)", "no ordinary file", "give the path of a TOML file")
         if found.st_size > SIZE_MAX:
             raise ConfigError(file, "(file)", f"over {SIZE_MAX >> 20} MiB", "a TOML file")
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except FileNotFoundError:
         raise ConfigError(file, "(file)", "not found", "give the path of a TOML file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeError) as error:
         raise ConfigError(file, "(file)", f"cannot be read: {error}", "a TOML file") from None
     return parse_toml(text, file, into)
 

@@ -19,6 +19,7 @@ from shared.config.toml_file import check_ranges
 from shared.exceptions import ConfigError
 from shared.robot.gain_table import GainSchedule, ModuleBounds
 from shared.robot.joints import MODULES, kind_of
+from shared.text_file import read_text
 
 VERSION = 2
 """Version of the file and of the program that makes it; a file of another version is made again."""
@@ -96,12 +97,12 @@ def read(path: Path) -> GainSchedule | None:
     """
     again = "make it again: `xrl gains`"
     try:
-        schedule = msgspec.json.decode(path.read_bytes(), type=GainSchedule)
+        schedule = msgspec.json.decode(read_text(path), type=GainSchedule)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise ConfigError(str(path), "(file)", f"cannot be read: {error}", again) from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeError) as error:
         raise ConfigError(str(path), "(file)", f"is no gain schedule: {error}", again) from None
     for name, nodes in (("z", schedule.z), ("pitch", schedule.pitch)):
         if len(nodes) < 2 or any(b <= a for a, b in pairwise(nodes)):

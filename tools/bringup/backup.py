@@ -10,6 +10,7 @@ from typing import Final
 import msgspec
 
 from shared.exceptions import DriveError
+from shared.text_file import read_text
 from tools.bringup.boards import Value
 
 VERSION: Final = 1
@@ -77,10 +78,10 @@ def read(path: Path) -> Backup:
         DriveError: it cannot be read, or is none.
     """
     try:
-        backup = msgspec.json.decode(path.read_bytes(), type=Backup)
+        backup = msgspec.json.decode(read_text(path), type=Backup)
     except OSError as error:
         raise DriveError(f"{path}: cannot be read: {error.strerror}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeError) as error:
         raise DriveError(f"{path}: no backup of `xrl configure`: {error}") from None
     if backup.version != VERSION:
         raise DriveError(f"{path}: a backup of version {backup.version}, not {VERSION}")

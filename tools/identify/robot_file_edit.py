@@ -11,6 +11,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from shared.config import files as config_file
 from shared.exceptions import RunError
+from shared.text_file import read_text
 from tools.identify.estimates import Value
 from tools.output import replace_file
 
@@ -59,12 +60,12 @@ def apply(path: Path, values: Mapping[str, Value], measured: Collection[str], st
         ConfigError: the new values make no robot file that can be used.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
         new = edited(text, str(path), values, measured)
         backup = path.with_name(f"{path.name}.{stamp}.bak")
         with backup.open("x", encoding="utf-8") as file:
             file.write(text)
         replace_file(path, new.encode())
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeError) as error:
         raise RunError(f"{path}: not changed: {error}") from None
     return backup

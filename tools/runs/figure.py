@@ -18,6 +18,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import files as config_file
 from shared.exceptions import ConfigError
 from shared.robot.joints import MODULES
+from shared.text_file import decoded
 from tools.runs.impairment_intervals import Impaired, impairments
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary, course
@@ -143,8 +144,8 @@ def _ages(axis: Any, log: RunLog, zero_ns: int) -> None:
 
 def _greatest_age_ms(log: RunLog) -> float:
     """Return the age from which on a command is not used, by the robot file in the log, ms."""
-    with contextlib.suppress(ConfigError, UnicodeDecodeError):
-        raw = log.attachments.get("robot.toml", b"").decode()
+    with contextlib.suppress(ConfigError, UnicodeError):
+        raw = decoded(log.attachments.get("robot.toml", b""))
         return config_file.parse(raw, "robot.toml").joint_service.max_command_age_ms
     return AGE_MOST_MS
 

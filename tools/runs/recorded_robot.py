@@ -9,6 +9,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot.gain_table import GainSchedule
+from shared.text_file import decoded
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog
 
@@ -26,8 +27,8 @@ def robot_of(log: RunLog | RunIndex) -> RobotConfig:
     if schedule is None:
         return robot
     try:
-        table = msgspec.json.decode(schedule, type=GainSchedule)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        table = msgspec.json.decode(decoded(schedule), type=GainSchedule)
+    except (msgspec.DecodeError, UnicodeError) as error:
         raise RunError(f"{log.path}: robot.gains.json in it is no gain schedule: {error}") from None
     return msgspec.structs.replace(robot, gain_schedule=table)
 
@@ -39,11 +40,11 @@ def text_of(log: RunLog | RunIndex, name: str) -> str:
         RunError: the log does not hold it, or it is no text.
     """
     try:
-        return log.attachments[name].decode()
+        return decoded(log.attachments[name])
     except KeyError:
         raise RunError(f"{log.path}: holds no {name}; a run of this project has one") from None
-    except UnicodeDecodeError:
-        raise RunError(f"{log.path}: {name} in it is no UTF-8 text") from None
+    except UnicodeError as error:
+        raise RunError(f"{log.path}: {name} in it {error}") from None
 
 
 def has_own_controller(log: RunLog | RunIndex) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 from shared.exceptions import RunError
 from shared.mcap_log.reader import LogRecord, LostBytes
 from shared.mcap_log.writer import SCHEMA_VERSION
+from shared.text_file import decoded
 from tools.runs.host_clocks import hosts_of
 from tools.runs.recorded_file import RecordedFile
 from tools.runs.run_files import MetadataByName, files_in
@@ -68,8 +69,8 @@ class RunIndex:
         """Host of each service, by the attached robot file; nothing if that says none."""
         text = self.attachments.get("robot.toml", b"")
         try:
-            endpoints = tomllib.loads(text.decode()).get("bus", {}).get("endpoints", {})
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, AttributeError, RecursionError):
+            endpoints = tomllib.loads(decoded(text)).get("bus", {}).get("endpoints", {})
+        except (tomllib.TOMLDecodeError, UnicodeError, AttributeError, RecursionError):
             return {}
         return hosts_of(endpoints) if isinstance(endpoints, dict) else {}
 

@@ -30,7 +30,7 @@ class Recording:
         text = next(
             (file.attachments[ROBOT_FILE] for file in files if ROBOT_FILE in file.attachments), None
         )
-        self.robot_file = None if text is None else text.decode(errors="replace")
+        self.robot_file = None if text is None else text.decode("utf-8-sig", errors="replace")
         """The robot file that was in use, as TOML; None if the log does not hold it."""
         self.offset_ns = files[0].offset_ns
         """Wall clock in ns since 1970 = time of an entry + this."""

@@ -9,18 +9,18 @@ from collections.abc import Iterable
 from datetime import datetime
 from typing import Any, Final, NamedTuple
 
-from rich.console import Console
-
 from shared.bus import topics
 from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from shared.mcap_log.recover import describe_lost
 from shared.mcap_log.sequence_stats import KeyCount
+from shared.text_file import decoded
 from tools.analysis.reports.run_data import RunData
 from tools.runs import verdict, verdict_table
 from tools.runs.run_log import RunLog
 from tools.runs.verdict import Summary
 from tools.runs.verdict_limits import LIMITS
+from tools.terminal import Console
 
 REAL_TIME_ONLY: Final = ("pd_cycles_late_pct", "planner_tick_us")
 """Figures without a meaning in virtual time."""
@@ -96,8 +96,8 @@ def _duration_s(run: RunData) -> float:
     """Return the planned duration of the scenario; without one, the duration of the run."""
     raw = run.log.attachments.get("scenario.toml", b"")
     try:
-        return float(tomllib.loads(raw.decode())["duration"])
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError):
+        return float(tomllib.loads(decoded(raw))["duration"])
+    except (ValueError, KeyError, TypeError, RecursionError):  # not TOML, or without it
         assert run.course is not None  # noqa: S101 - called with a course only
         return float(run.course.t[-1])
 
@@ -152,7 +152,7 @@ def _threads(raw: str) -> str:
     try:
         found = json.loads(raw or "{}")
         return ", ".join(f"{name}={value}" for name, value in sorted(found.items()))
-    except (json.JSONDecodeError, AttributeError):
+    except (ValueError, AttributeError, RecursionError):
         return raw
 
 
@@ -168,8 +168,8 @@ def _scenario(run: RunData) -> str:
     name = run.log.metadata["run"].get("scenario", "")
     raw = run.log.attachments.get("scenario.toml", b"")
     try:
-        about = str(tomllib.loads(raw.decode()).get("about", ""))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError):
+        about = str(tomllib.loads(decoded(raw)).get("about", ""))
+    except (ValueError, RecursionError):
         about = ""
     return ": ".join(part for part in (name, about) if part)
 

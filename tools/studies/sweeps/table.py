@@ -223,7 +223,7 @@ def _whole_rows(path: Path, columns: Sequence[str], words: Words) -> dict[int, R
     """
     if not path.exists():
         return {}
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
     lines = map(_cells, text.split("\n")[:-1])  # a line without an end is incomplete
     if next(lines, list(columns)) != list(columns):
         raise RunError(f"{path}: has other columns; choose another --out")
