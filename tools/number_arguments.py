@@ -71,6 +71,31 @@ def degrees(text: str) -> int:
     return sign * _whole(text.strip().removeprefix("-"), 0, 360)
 
 
+def finite_numbers(text: str, number: int, largest: float = FINITE_MAX) -> tuple[float, ...]:
+    """Return so many numbers of a text, separated by commas or spaces.
+
+    Args:
+        text: what was typed, or stands in a file.
+        number: how many are right.
+        largest: absolute value that none may exceed.
+
+    Raises:
+        ValueError: there are more or fewer, or one is none, not finite or too large; says which.
+    """
+    words = text.replace(",", " ").split()
+    if len(words) != number:
+        raise ValueError(f"{len(words)} numbers; {number} are right")
+    numbers = []
+    for place, word in enumerate(words, 1):
+        try:
+            numbers.append(float(word))
+        except ValueError:
+            numbers.append(math.nan)
+        if not abs(numbers[-1]) <= largest:
+            raise ValueError(f"number {place}, {word[:40]!r}: one within +-{largest:.4g} is right")
+    return tuple(numbers)
+
+
 def _whole(text: str, low: int, high: int) -> int:
     digits = text.strip()
     if digits.isdecimal() and len(digits) < 20 and low <= int(digits) <= high:

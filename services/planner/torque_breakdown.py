@@ -6,14 +6,14 @@ the joints, the references and the assist (docs/law.md).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.planner.certificate import Weakest, motor_mean
 from services.planner.gains import GainLaw
-from services.planner.kinematics import Measured
+from services.planner.kinematics import Kinematics, Measured
 from services.planner.law_terms import LawAtReference
 from services.planner.levelling import up_of
 from services.planner.push_limit import PushLimits, limits_at
@@ -21,8 +21,15 @@ from services.planner.reference import Reference
 from services.planner.split import GainSplit, LocalGains
 from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
 from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.exceptions import RunError
+from shared.robot.joints import N_LEG, SIDES
 
 Array = NDArray[np.float64]
+
+
+SINGULAR: Final = 1e-3
+"""Smallest singular value of a leg's Jacobian, m and rad mixed, with which there are gains: a knee
+bent by half a degree."""
 
 
 class TorqueBreakdown(NamedTuple):
@@ -86,6 +93,7 @@ def torque_breakdown(
 
     Raises:
         ConfigError: the gain split needs a schedule, and the robot's is missing or stale.
+        RunError: the pose is singular: a leg is straight.
     """
     measured, reference = Measured(config), Reference(config)
     measured.stance[:] = reference.stance[:] = stance
@@ -97,6 +105,7 @@ def torque_breakdown(
     reference.load(np.zeros(6), F_O, F_assist, np.zeros(3), measured.D_left)
     reference.evaluate(q_ref)
     at_ref = reference.kinematics()
+    _require_bent(at_ref)
     hessian_weight = at_ref.hessian_times(F_O, np.zeros(3)).copy()
     e_p, e_pdot = reference.p - measured.p, reference.J @ v_ref - measured.pdot
     terms = LawAtReference(law, split).evaluate(reference, e_p, e_pdot)
@@ -119,3 +128,14 @@ def torque_breakdown(
         coupled=terms.coupled,
         eased=np.zeros(12),
     )
+
+
+def _require_bent(kinematics: Kinematics) -> None:
+    for side, C in zip(SIDES, (kinematics.C[:, :N_LEG], kinematics.C[:, N_LEG:]), strict=True):
+        smallest = float(np.linalg.svd(C, compute_uv=False)[-1])
+        if not smallest >= SINGULAR:
+            raise RunError(
+                f"singular pose: the {side} leg is straight, or its hip or ankle is turned by 90 "
+                f"degrees; its Jacobian's smallest singular value is {smallest:.1g}, at least "
+                f"{SINGULAR:g} is right: bend the knee"
+            )

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol
 
-from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
@@ -24,7 +23,8 @@ from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 from shared.process import StopFlag
 from tools.fleet.supervise import SupervisedFleet
-from tools.number_arguments import finite
+from tools.number_arguments import finite, finite_numbers
+from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 REPEAT_S: Final = 0.02
@@ -202,9 +202,7 @@ def _first(statuses: Statuses, stop: Stop) -> PlannerStatus | None:
 
 def _shift(text: str) -> Vector4:
     try:
-        x, y, roll, yaw = map(float, text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: four numbers are right, such as 0.02,0,0,0"
-        ) from None
+        x, y, roll, yaw = finite_numbers(text, 4)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{error}; such as 0.02,0,0,0") from None
     return x, y, roll, yaw

@@ -10,8 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rich import box
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from services.planner.certificate import Weakest
 from services.planner.inverse_kinematics import InverseKinematics
@@ -35,16 +35,20 @@ from shared.exceptions import RunError
 from shared.robot import gain_schedule
 from shared.robot.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
-from tools.number_arguments import finite
+from shared.text_file import read_text
+from tools.number_arguments import finite, finite_numbers
 from tools.runs import snapshot_text
 from tools.runs.recorded_robot import refuse_own_controller, robot_of
 from tools.runs.run_index import RunIndex
 from tools.runs.run_log import RunLog, RunPart
 from tools.runs.run_parts import zero_ns
+from tools.terminal import Console, marked
 from tools.verb_table import RUN_HELP, Subparsers, add_config, add_verb
 
 Array = NDArray[np.float64]
 
+POSE_MAX: Final = 10.0
+"""m and rad; no pose of such a robot is beyond."""
 AWAY_S = 0.1
 """s; a tick that much older than the requested time does not describe the robot then."""
 LONG_S: Final = 60.0
@@ -110,7 +114,10 @@ def run(args: argparse.Namespace) -> int:
     if args.log is None:
         robot = config_file.load(args.config)
         gain_schedule.require(robot, args.config)
-        q = at_pose(robot, args.p) if args.q is None else parse("--q", args.q, N_JOINTS)
+        if args.q is None:
+            q = at_pose(robot, args.p)
+        else:
+            q = parse("--q", args.q, N_JOINTS, 2 * np.pi, "rad")
         still = np.zeros(N_JOINTS)
         show(robot, torque_breakdown(robot, q, still, q, still, args.assist), console)
         return 0
@@ -138,21 +145,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def parse(flag: str, text: str, count: int) -> Array:
+def parse(flag: str, text: str, count: int, largest: float, unit: str) -> Array:
     """Read so many numbers from a text, or from the file that it names.
 
     Raises:
         RunError: it is something else.
     """
-    path = Path(text)
     try:
-        content = path.read_text(encoding="utf-8") if path.is_file() else text
-        numbers = [float(part) for part in content.replace(",", " ").split()]
-    except (OSError, ValueError):
-        raise RunError(f"{flag} {text!r}: write {count} numbers, or a file of them") from None
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise RunError(f"{flag}: {len(numbers)} numbers; {count} finite ones are right")
-    return np.array(numbers)
+        path = Path(text)
+        text = read_text(path) if path.is_file() else text
+        return np.array(finite_numbers(text, count, largest))
+    except OSError as error:
+        raise RunError(
+            f"{flag} {text[:40]!r}: {error.strerror}; {count} numbers are right"
+        ) from None
+    except ValueError as error:
+        raise RunError(f"{flag}: {error}; {unit}, separated by commas, or a file of them") from None
 
 
 def at_pose(robot: RobotConfig, text: str) -> Array:
@@ -161,7 +169,7 @@ def at_pose(robot: RobotConfig, text: str) -> Array:
     Raises:
         RunError: the text is no pose, or the robot cannot reach it; says why.
     """
-    p_ref = parse("--p", text, 6)
+    p_ref = parse("--p", text, 6, POSE_MAX, "m and rad")
     limits = np.array(robot.joint_limits())
     ik = InverseKinematics(Kinematics(robot), limits)
     ik.q[:] = stand_pose(robot, robot.simulation.stand_height)
@@ -236,10 +244,19 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, consol
     ages = max(status.state_age_ns) / NS_PER_MS
     trip = f" ({Trip(status.trip).name})" if status.trip else ""
     console.print(
-        f"[bold]tick {status.seq}[/] at {(status.t_ns - zero_ns) / 1e9:.3f} s: planner "
-        f"{PlannerMode(status.mode).name}{trip}{' with hold' if status.hold else ''}, states up to "
-        f"{ages:.1f} ms old, assist {status.assist_n:.1f} N, IK {status.ik_iterations} steps, "
-        f"residual {status.ik_residual:.1e}"
+        marked(
+            "[bold]tick {}[/] at {:.3f} s: planner {}{}{}, states up to {:.1f} ms old, "
+            "assist {:.1f} N, IK {} steps, residual {:.1e}",
+            status.seq,
+            (status.t_ns - zero_ns) / 1e9,
+            PlannerMode(status.mode).name,
+            trip,
+            " with hold" if status.hold else "",
+            ages,
+            status.assist_n,
+            status.ik_iterations,
+            status.ik_residual,
+        )
     )
     words = snapshot_text.describe_modules(tick.states)
     console.print(f"modules, and how old their commands were: {words}", style="dim")
@@ -248,8 +265,14 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, consol
     if late_s > AWAY_S:
         words = snapshot_text.describe_modules(snapshot_text.states_at(log, at_ns))
         console.print(
-            f"[yellow]at {at_s:g} s the planner did not tick: its last, {late_s:.2f} s before, "
-            f"is shown. The modules at {at_s:g} s: {words}[/]"
+            marked(
+                "[yellow]at {:g} s the planner did not tick: its last, {:.2f} s before, "
+                "is shown. The modules at {:g} s: {}[/]",
+                at_s,
+                late_s,
+                at_s,
+                words,
+            )
         )
     network = snapshot_text.describe_network(log, at_ns, zero_ns)
     if network:
@@ -281,14 +304,14 @@ def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
     for who, weakest in (
         ("joint services alone", found.weakest), ("drives alone", found.weakest_onboard),
     ):  # fmt: skip
-        console.print(f"margin, {who}: {describe(weakest)}")
+        console.print(marked("margin, {}: {}", who, describe(weakest)))
     for name, limits in found.pushes.items():
         console.print(f"push {name}: {describe_limits(limits)}", highlight=False, soft_wrap=True)
     console.print()
     console.print(_torques(found))
 
 
-def describe(weakest: Weakest) -> str:
+def describe(weakest: Weakest) -> Text:
     """Return for example "0.24; weakest: lean forward, 71 N/m of 300"."""
     parts = ", ".join(
         f"{name} {value:.2f}"
@@ -296,10 +319,15 @@ def describe(weakest: Weakest) -> str:
         if abs(value) > 0.05 * np.abs(weakest.p).max()
     )
     outcome = "" if weakest.margin > 0.0 else ": [red]falls[/]"
-    return (
-        f"{weakest.margin:.2f}{outcome}; weakest: {weakest.direction}, "
-        f"{weakest.stiffness:.0f} {weakest.unit} of {weakest.required:.0f} "
-        f"(as a motion in m and rad: {parts})"
+    return marked(
+        f"{{:.2f}}{outcome}; weakest: {{}}, {{:.0f}} {{}} of {{:.0f}} "
+        "(as a motion in m and rad: {})",
+        weakest.margin,
+        weakest.direction,
+        weakest.stiffness,
+        weakest.unit,
+        weakest.required,
+        parts,
     )
 
 

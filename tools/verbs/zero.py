@@ -13,9 +13,8 @@ from typing import Final
 
 import msgspec
 from rich import box
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from services.joint.__main__ import open_drive
 from services.joint.drivers.base import Drive
@@ -30,7 +29,8 @@ from tools.bringup import bench
 from tools.bringup.stops import within_stops
 from tools.bringup.zeroing import DriveLook, is_right, look, outside, refusal, zero
 from tools.fleet.supervise import SupervisedFleet
-from tools.number_arguments import finite
+from tools.number_arguments import finite, finite_numbers
+from tools.terminal import Console, marked
 from tools.verb_table import Subparsers, add_config, add_run_dir, add_verb
 
 DEGREES_FROM: Final = 7.0
@@ -229,15 +229,18 @@ def _set_all(
         try:
             back = zero(drives[module], q, robot)
         except DriveError as error:  # one that fails does not stop the others
-            console.print(f"[bold red]{module}[/]: {escape(str(error))}")
+            console.print(marked("[bold red]{}[/]: {}", module, error))
             back = None
         good = is_right(back, q)
         code = code if good else 1
         read = "nothing" if back is None else _angles(back.q)
-        table.add_row(module, _angles(q), read, "zeroed" if good else "[bold red]NOT zeroed[/]")
+        outcome = Text("zeroed") if good else Text("NOT zeroed", "bold red")
+        table.add_row(module, _angles(q), read, outcome)
     console.print(table)
     if code:
-        console.print("[bold red]what is not zeroed must not be armed[/]: look at it, and again")
+        console.print(
+            marked("[bold red]what is not zeroed must not be armed[/]: look at it, and again")
+        )
     return code
 
 
@@ -270,8 +273,11 @@ def _warn(
     armed = [module for module in wanted if holders[module] is not None]
     if armed:
         console.print(
-            f"[yellow]{', '.join(armed)}: the joint service is up and, unless it is read-only, "
-            "arms the drive as soon as it is zeroed[/]"
+            marked(
+                "[yellow]{}: the joint service is up and, unless it is read-only, "
+                "arms the drive as soon as it is zeroed[/]",
+                ", ".join(armed),
+            )
         )
 
 
@@ -304,9 +310,9 @@ def _way_out(module: str, mode: Mode) -> str:
 
 def _pair(option: str, text: str) -> Pair:
     try:
-        phi, theta = (float(part) for part in text.split(","))
-    except ValueError:
-        raise DriveError(f"{option} {text!r}: write phi and theta in rad, such as 0,-0.5") from None
+        phi, theta = finite_numbers(text, 2)
+    except ValueError as error:
+        raise DriveError(f"{option}: {error}; phi and theta in rad, such as 0,-0.5") from None
     return phi, theta
 
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import math
 import re
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from services.planner.kinematics import Kinematics
 from services.planner.torque_breakdown import torque_breakdown
@@ -144,8 +149,15 @@ def test_a_pose_is_found_and_explained(
     ("flags", "words"),
     [
         ((), "one of them"),
-        (("--q", "1,2,3"), f"{N_JOINTS} finite ones"),
-        (("--q", "a,b"), f"write {N_JOINTS} numbers"),
+        (("--q", "1,2,3"), f"3 numbers; {N_JOINTS} are right; rad"),
+        (("--q", "0," * 13), f"13 numbers; {N_JOINTS} are right"),
+        (("--q", "0,0,nan" + ",0" * 9), "number 3, 'nan'"),
+        (("--q", "0,one" + ",0" * 10), "number 2, 'one'"),
+        (("--q", "inf" + ",0" * 11), "number 1, 'inf'"),
+        (("--q", "1e300" + ",0" * 11), "within +-6.283"),
+        (("--q", "0" + ",0" * 11), "singular pose: the right leg is straight"),
+        (("--q", "0,.14,0,-1,0,.9,0,0,0,-1e-9,0,0"), "the left leg is straight"),
+        (("--p", "0,0,1e300,0,0,0"), "number 3, '1e300'"),
         (("--p", "0,0,1.4,0,0,0"), "COM z 1.40 m wanted"),
         (("--p", "0,0,0.8,0,0,0", "--q", "0"), "one of them"),
         (("no_such.mcap",), "cannot be read"),
@@ -163,3 +175,11 @@ def test_a_time_without_ticks_names_the_times_with_some(
 ) -> None:
     assert cli.main(["explain", str(log.path), "--at", "60"]) == 2
     assert re.search(r"ticks in this log from -?\d", capsys.readouterr().err)
+
+
+@settings(max_examples=20)
+@given(q=st.lists(st.floats(-2 * math.pi, 2 * math.pi), min_size=N_JOINTS, max_size=N_JOINTS))
+def test_every_pose_within_a_turn_is_explained_or_called_singular(q: list[float]) -> None:
+    with contextlib.redirect_stderr(io.StringIO()) as told:
+        code = cli.main(["explain", f"--q={','.join(map(str, q))}"])
+    assert code == 0 or (code == 2 and "singular pose" in told.getvalue())
