@@ -7,12 +7,14 @@ whole: as wide as they need, without frames and colours. A terminal folds what d
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
 import rich.console
 from rich.console import ConsoleOptions, RenderableType
+from rich.live import Live
 from rich.measure import Measurement
 from rich.segment import Segment
 from rich.table import Table
@@ -99,3 +101,25 @@ class Console(rich.console.Console):
         for column in table.columns:
             column.overflow = "fold"
             column.no_wrap = column.no_wrap and not crowded
+
+
+@contextlib.contextmanager
+def renewed(
+    console: Console, *, screen: bool = False
+) -> Iterator[Callable[[RenderableType], None]]:
+    """Give what shows the newest of something: in its place on a terminal, else below the last.
+
+    Args:
+        console: to print on.
+        screen: take a terminal's whole screen meanwhile.
+    """
+    if not console.is_terminal:
+
+        def show(shown: RenderableType) -> None:
+            console.print(shown)
+            console.file.flush()
+
+        yield show
+        return
+    with Live(console=console, auto_refresh=False, screen=screen) as live:
+        yield lambda shown: live.update(shown, refresh=True)

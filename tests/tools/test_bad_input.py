@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -121,17 +121,22 @@ def made_up(
     metadata: Mapping[str, dict[str, str]] | None = None,
     attachments: Mapping[str, bytes] | None = None,
     change: Callable[[str, int, bytes], tuple[int, bytes]] = lambda _, t_ns, data: (t_ns, data),
+    foreign: Sequence[str] = (),
 ) -> str:
     """Write a copy of a run with something wrong in it."""
     log: RunLog = read_run(NEWEST)
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="xrl")
-        for name, entries in log.metadata.items():
+        more = {name: {} for name in metadata or {}}
+        for name, entries in (more | log.metadata).items():
             writer.add_metadata(name, entries | (metadata or {}).get(name, {}))
-        for name, content in log.attachments.items():
-            writer.add_attachment(0, 0, name, "", (attachments or {}).get(name, content))
+        for name, content in (log.attachments | (attachments or {})).items():
+            writer.add_attachment(0, 0, name, "", content)
         schema = writer.register_schema("x", "jsonschema", b"{}")
+        for key in foreign:
+            number = writer.register_channel(key, "json", schema, {"rate_hz": key})
+            writer.add_message(number, log.offset_ns, b"{}", log.offset_ns)
         for key in log.keys():  # noqa: SIM118 - a log is no mapping
             channel = writer.register_channel(key, "json", schema)
             for received_ns, payload, seq in log.raw(key):

@@ -14,6 +14,7 @@ from typing import Final
 from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import request_stop
 from shared.bus import topics
+from shared.bus.code_names import name_of
 from shared.bus.credentials import read_credentials
 from shared.bus.messages import Estop, JointState, Mode
 from shared.bus.session import Session, open_session
@@ -115,7 +116,8 @@ class BusStop:
             time.sleep(REPEAT_S)
             self.listen()
             going = [module for module in going if not self._has_stopped(module)]
-        told = [f"{m} {Mode(self._modes[m]).name if m in self._modes else 'silent'}" for m in going]
+        modes = {module: name_of(Mode, mode) for module, mode in self._modes.items()}
+        told = [f"{module} {modes.get(module, 'silent')}" for module in going]
         if told and self._robot.bus.security.mode == "mtls":
             name = read_credentials(self._robot, "estop").name
             told += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]

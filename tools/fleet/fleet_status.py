@@ -9,6 +9,7 @@ from typing import Final
 import msgspec
 
 from services.joint.rearm_guard import stop_source
+from shared.bus.code_names import name_of
 from shared.bus.messages import (
     Cause,
     DriveStatus,
@@ -300,17 +301,18 @@ def module_status(
     """
     if not isinstance(state, JointState):
         return ModuleStatus(None, None, None, None, None, "")
-    mode, cause, drive = Mode(state.mode), Cause(state.cause), DriveStatus(state.drive)
-    outside = Outside(state.outside).name if state.outside else ""
-    knows = drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
+    mode, drive = state.mode, name_of(DriveStatus, state.drive)
+    outside = name_of(Outside, state.outside) if state.outside else ""
+    knows = state.drive not in (DriveStatus.LOST, DriveStatus.UNZEROED)
     q = state.q if knows else None
     stiffened = state.stiffened and mode in (Mode.HOLD, Mode.DAMP)
-    tier = TIERS.get(mode)
+    tier = TIERS.get(Mode(mode)) if mode in tuple(Mode) else None
     return ModuleStatus(
-        mode.name, tier, cause.name, drive.name, q, remedy_of(state), stiffened, outside,
-        state.session, refused_hz, Refusal(state.refusal).name if refused_hz else "",
+        name_of(Mode, mode), tier, name_of(Cause, state.cause), drive, q, remedy_of(state),
+        stiffened, outside, state.session, refused_hz,
+        name_of(Refusal, state.refusal) if refused_hz else "",
         state.refused_session if refused_hz else 0,
-        stopped_by if cause is Cause.ESTOP else "",
+        stopped_by if state.cause == Cause.ESTOP else "",
     )  # fmt: skip
 
 
@@ -318,7 +320,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
     """Return the planner's state from its newest status."""
     if not isinstance(message, PlannerStatus):
         return None
-    mode = PlannerMode(message.mode).name
+    mode = name_of(PlannerMode, message.mode)
     return LeadStatus(mode, message.wait_s, message.margin, reason_of(message), message.session)
 
 

@@ -9,6 +9,7 @@ from typing import Final
 
 from services.planner.probe import NO_ROW
 from shared.bus import topics
+from shared.bus.code_names import name_of
 from shared.bus.messages import STRAIGHT, OperatorIntent, PlannerMode, PlannerStatus, Vector4
 from shared.bus.session import Session
 from shared.clock import NS_PER_S, now_ns
@@ -72,7 +73,7 @@ class LedPlanner:
             return "the planner is silent"
         if status.mode != PlannerMode.LEADING:
             why = f" ({status.why})" if status.why else ""
-            return f"the planner does not lead: {PlannerMode(status.mode).name}{why}"
+            return f"the planner does not lead: {name_of(PlannerMode, status.mode)}{why}"
         if status.requested_by not in ("", SCENARIO, self.source):
             return f"{status.requested_by} asks the robot for something else"
         return ""

@@ -26,7 +26,7 @@ def describe_lead(lead: LeadStatus | None) -> str:
     if lead.wait_s > 0.0:
         words += f"; leads again in {lead.wait_s:.0f} s at the earliest, after drop-outs or trips"
     if lead.why:
-        words += f"; {lead.why}"
+        words += f"; {printable(lead.why)}"
     return words
 
 

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 from shared.exceptions import FleetError
+from tools.guarded_streams import printable
 from tools.hosts.hosts_file import Host, Hosts
 from tools.hosts.private_network import IP, NAMESPACE
 
@@ -211,4 +212,4 @@ def on_all(
 def _last(text: str) -> str:
     """Return the last line of what a command said, without its control characters."""
     lines = [line for line in text.splitlines() if line.strip()]
-    return "".join(c if c.isprintable() else "?" for c in lines[-1]) if lines else "it said nothing"
+    return printable(lines[-1]) if lines else "it said nothing"

@@ -25,7 +25,7 @@ from tools.runs.verdict import Summary, course
 
 mpl.use("Agg")
 
-MODE_COLOURS: Final = {
+MODE_COLOURS: Final[dict[int, str]] = {
     Mode.DISARMED: "#d9d9d9",
     Mode.HOLD: "#f2a65a",
     Mode.TRACK: "#4c9f70",
@@ -161,12 +161,12 @@ def _modes(axis: Any, log: RunLog, start_ns: int, end_s: float) -> None:
     for place, module in enumerate(MODULES, 1):
         states: list[JointState] = log.messages(topics.JOINT_STATE, module)
         times = [(state.t_ns - start_ns) / NS_PER_S for state in states]
-        _bars(axis, place, times, [MODE_COLOURS[Mode(state.mode)] for state in states])
+        _bars(axis, place, times, [MODE_COLOURS.get(state.mode, "black") for state in states])
     axis.set_yticks(range(len(MODULES) + 1), ["planner", *MODULES], fontsize=8)
     axis.invert_yaxis()
     axis.set_xlim(0.0, end_s)
     axis.tick_params(labelsize=8)
-    handles = [Patch(color=colour, label=mode.name) for mode, colour in MODE_COLOURS.items()]
+    handles = [Patch(color=colour, label=Mode(mode).name) for mode, colour in MODE_COLOURS.items()]
     handles[2].set_label("TRACK; planner leads")
     if WAITS_COLOUR in leads:
         handles.append(Patch(color=WAITS_COLOUR, label="planner waits\nafter drop-outs"))

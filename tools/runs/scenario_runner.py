@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
 from shared.bus import topics
+from shared.bus.code_names import name_of
 from shared.bus.messages import (
     JointState,
     Mode,
@@ -262,7 +263,7 @@ class ScenarioRunner:
 
     def _describe_modes(self) -> str:
         return ", ".join(
-            f"{module} {Mode(self._modes[module]).name if module in self._modes else 'silent'}"
+            f"{module} {name_of(Mode, self._modes[module]) if module in self._modes else 'silent'}"
             for module in MODULES
         )
 
@@ -292,7 +293,7 @@ class ScenarioRunner:
         if truth is not None:
             self._truth, self._truth_at_s = truth, time.monotonic()
             modes = tuple(
-                Mode(self._modes[module]).name[0] if module in self._modes else "-"
+                name_of(Mode, self._modes[module])[0] if module in self._modes else "-"
                 for module in MODULES
             )
             self._show(LiveSnapshot(truth, modes, self._note))

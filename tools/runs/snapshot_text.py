@@ -6,6 +6,7 @@ import bisect
 from collections.abc import Sequence
 
 from shared.bus import topics
+from shared.bus.code_names import name_of
 from shared.bus.messages import JointState, Mode
 from shared.clock import NS_PER_MS
 from shared.robot.joints import MODULES
@@ -30,7 +31,7 @@ def describe_modules(states: Sequence[JointState | None]) -> str:
         words = "not heard yet"
         if state is not None:
             age = "none" if state.age_ns < 0 else f"{state.age_ns / NS_PER_MS:.1f} ms"
-            words = f"{Mode(state.mode).name} {age}"
+            words = f"{name_of(Mode, state.mode)} {age}"
         found.append(f"{module} {words}")
     return ", ".join(found)
 

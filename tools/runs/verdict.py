@@ -5,6 +5,7 @@ Everything is read from the MCAP file, so that a run can be judged again at any 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
@@ -110,7 +111,7 @@ def summarise(log: RunLog, duration_s: float) -> Summary:
             (float(s) for s, row in zip(t, truth, strict=True) if row.fallen), None
         ),
         "duration_s": float(t[-1]),
-        "pace": float(log.metadata.get("run", {}).get("pace", "1")),
+        "pace": _pace(log),
         "real_time_factor": last.real_time_factor,
         "world_time_lost_s": last.late_s,
         "in_real_time": last.real_time_factor >= REAL_TIME_FACTOR_MIN and last.late_s <= LATE_MAX_S,
@@ -378,3 +379,16 @@ def _late_share(log: RunLog, start_ns: int) -> float | None:
 def _tick(log: RunLog, start_ns: int) -> dict[str, float] | None:
     ticks = [row.tick_us for row in log.messages(topics.PLANNER_STATUS) if row.t_ns >= start_ns]
     return _middle_and_most(np.array(ticks))
+
+
+def _pace(log: RunLog) -> float:
+    """Return the pace of the fleet's clock; 1 where the log does not say it."""
+    text = log.metadata.get("run", {}).get("pace", "1")
+    try:
+        pace = float(text)
+    except ValueError:
+        pace = math.nan
+    if not 0.0 < pace <= 1.0:
+        right = "above 0 and up to 1 is right"
+        raise RunError(f"{log.path}: run.pace is {text[:40]!r}; {right}")
+    return pace

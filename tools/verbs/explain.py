@@ -20,6 +20,7 @@ from services.planner.kinematics import Kinematics
 from services.planner.push_limit import PushLimits
 from services.planner.torque_breakdown import TorqueBreakdown, torque_breakdown
 from shared.bus import topics
+from shared.bus.code_names import name_of
 from shared.bus.messages import (
     JointCommand,
     JointState,
@@ -242,14 +243,14 @@ def _joined(messages: list[Any], name: str) -> Array:
 def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, console: Console) -> None:
     status = tick.status
     ages = max(status.state_age_ns) / NS_PER_MS
-    trip = f" ({Trip(status.trip).name})" if status.trip else ""
+    trip = f" ({name_of(Trip, status.trip)})" if status.trip else ""
     console.print(
         marked(
             "[bold]tick {}[/] at {:.3f} s: planner {}{}{}, states up to {:.1f} ms old, "
             "assist {:.1f} N, IK {} steps, residual {:.1e}",
             status.seq,
             (status.t_ns - zero_ns) / 1e9,
-            PlannerMode(status.mode).name,
+            name_of(PlannerMode, status.mode),
             trip,
             " with hold" if status.hold else "",
             ages,

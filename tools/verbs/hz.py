@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from rich.live import Live
-
 from shared.bus.session import open_session
 from shared.clock import pace
 from shared.config.files import load
@@ -18,7 +16,7 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.traffic import LINKS_S, Traffic
 from tools.fleet.traffic_table import traffic_table
 from tools.number_arguments import finite
-from tools.terminal import Console
+from tools.terminal import Console, renewed
 from tools.topic_keys import keys_named
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
@@ -64,8 +62,8 @@ def run(args: argparse.Namespace) -> int:
             window_s = traffic.listen(args.for_s, lambda: bool(stop))
             console.print(traffic_table(traffic, window_s * pace()))
             return 0 if any(one.count for one in traffic.keys.values()) else 1
-        with Live(console=console, auto_refresh=False) as shown:
+        with renewed(console) as show:
             while not stop:
                 window_s = traffic.listen(WINDOW_S, lambda: bool(stop))
-                shown.update(traffic_table(traffic, window_s * pace()), refresh=True)
+                show(traffic_table(traffic, window_s * pace()))
     return 0

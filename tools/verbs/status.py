@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
-from rich.live import Live
 
 from shared.bus.session import open_session
 from shared.config.files import load
@@ -19,7 +18,7 @@ from tools.fleet.fleet_status import (
 )
 from tools.fleet.status_table import tables
 from tools.fleet.supervise import SupervisedFleet
-from tools.terminal import Console
+from tools.terminal import Console, renewed
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 
@@ -60,8 +59,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _watch(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str) -> None:
-    with Live(
-        tables(look(fleet, monitors, security)), console=Console(), auto_refresh=False
-    ) as live:
+    with renewed(Console()) as show:
         while True:
-            live.update(tables(look(fleet, monitors, security)), refresh=True)
+            show(tables(look(fleet, monitors, security)))

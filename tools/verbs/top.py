@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Final
 
 from rich.console import Group
-from rich.live import Live
 
 from shared.bus.session import open_session
 from shared.clock import pace
@@ -18,7 +17,7 @@ from tools.fleet.procfs import use_of
 from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.traffic import LINKS_S, Traffic
 from tools.fleet.traffic_table import process_table, traffic_table
-from tools.terminal import Console
+from tools.terminal import Console, renewed
 from tools.topic_keys import keys_named
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
@@ -51,9 +50,9 @@ def run(args: argparse.Namespace) -> int:
         if args.once:
             console.print(_screen(fleet, traffic, stop))
             return 0
-        with Live(console=console, auto_refresh=False, screen=console.is_terminal) as shown:
+        with renewed(console, screen=True) as show:
             while not stop:
-                shown.update(_screen(fleet, traffic, stop), refresh=True)
+                show(_screen(fleet, traffic, stop))
     return 0
 
 

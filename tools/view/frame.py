@@ -11,6 +11,7 @@ import numpy as np
 from services.planner.kinematics import Kinematics
 from services.simulator.soles import SoleLoad
 from shared.bus import topics
+from shared.bus.code_names import name_of
 from shared.bus.messages import (
     JointCommand,
     JointState,
@@ -224,7 +225,7 @@ class Newest:
 
 def _shown(status: PlannerStatus) -> PlannerShown:
     return PlannerShown(
-        mode=PlannerMode(status.mode).name,
+        mode=name_of(PlannerMode, status.mode),
         why=status.why,
         wait_s=status.wait_s,
         margin=status.margin,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
@@ -210,3 +211,30 @@ def test_refusals_are_counted_over_the_window_and_a_restart_counts_none(
     monitor.new_window()
     monitor.listen()
     assert monitor.refused_hz() == pytest.approx(hz)
+
+
+def test_what_others_say_is_data_in_the_status() -> None:
+    hostile = "[/b]\x1b[2J\x1b]0;owned\x07\n planner LEADING, margin 9.00"
+    stopped = msgspec.structs.replace(
+        module_status(state(Mode.DAMP, Cause.ESTOP, DriveStatus.ARMED)),
+        mode=hostile, drive=hostile, stopped_by=hostile, way_out=hostile,
+    )  # fmt: skip
+    status = msgspec.structs.replace(
+        fleet_with(7, stopped), lead=LeadStatus(hostile, 0.0, 1.0, why=hostile), tools=(hostile,)
+    )
+    printed = io.StringIO()
+    Console(file=printed).print(tables(status))
+    assert "[/b]" in printed.getvalue()
+    assert not re.search("[\x00-\x09\x0b-\x1f]", printed.getvalue())
+
+
+def test_codes_that_this_version_does_not_know_are_told() -> None:
+    strange = msgspec.structs.replace(
+        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED),
+        mode=99, cause=98, drive=97, refusal=96, outside=95,
+    )  # fmt: skip
+    status = module_status(strange, refused_hz=1.0)
+    assert (status.mode, status.cause, status.drive) == (
+        "unknown (99)", "unknown (98)", "unknown (97)",
+    )  # fmt: skip
+    assert "another version" in status.way_out

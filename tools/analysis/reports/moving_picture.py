@@ -38,7 +38,7 @@ VIEWS: Final = ((170.0, 0, 1.0), (465.0, 1, -1.0))
 """Centre, px; which horizontal axis (0: x, from the side; 1: y, from the front); its sign."""
 BACKGROUND, INK, LINK, TORSO, COM_INK = "#ffffff", "#30363d", "#7b858f", "#c9d1d9", "#0d5ea6"
 HAND_INK, PUSH_INK = "#c44f1c", "#8c3399"
-MODE_INK: Final = {
+MODE_INK: Final[dict[int, str]] = {
     Mode.DISARMED: "#8a8f98",
     Mode.HOLD: "#d98f1f",
     Mode.TRACK: "#2e8a5c",
@@ -231,8 +231,8 @@ def _draw_robot(
         canvas.polygon(box(f"ankle_{side}", foot, (0.0, 0.0, -foot[2] / 2)), INK)
         canvas.line(joints, LINK, 7.0)
         for kind, joint in zip(("ankle", "knee", "hip"), joints, strict=True):
-            mode = Mode(pose.modes[MODULES.index(f"{kind}_{side}")])
-            canvas.disc(joint, 8.5, MODE_INK[mode])
+            mode = pose.modes[MODULES.index(f"{kind}_{side}")]
+            canvas.disc(joint, 8.5, MODE_INK.get(mode, INK))
     canvas.disc(at(np.array(pose.com)), 5.0, COM_INK)
     harness = at(frames["harness"][0])
     if abs(pose.force[2]) >= scene.FORCE_MIN_N:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from shared.bus.code_names import name_of
 from tools.analysis.reports.signals import (
     GAP_S,
     Array,
@@ -321,9 +322,8 @@ def _data(panel: _Panel, signals: _Signals) -> dict[str, Any] | None:
     if panel.kind == "bars":
         rows = [{"label": label, "spans": spans} for label, spans in panel.bars.items() if spans]
         used = sorted({int(span[2]) for spans in panel.bars.values() for span in spans})
-        codes = {
-            str(code): [_name(panel.names, code), panel.colours.get(code, "idle")] for code in used
-        }  # an unknown code comes from another version
+        names, colours = panel.names, panel.colours
+        codes = {str(code): [name_of(names, code), colours.get(code, "idle")] for code in used}
         return {"kind": "bars", **head, "rows": rows, "codes": codes} if rows else None
     plot = {"kind": "plot", **head, "unit": panel.unit}
     if panel.kind == "choice":
@@ -353,10 +353,3 @@ def _go_on(spans: list[list[float]], more: list[list[float]]) -> None:
 
 def _levels(limits: Sequence[LevelLine]) -> list[dict[str, Any]]:
     return [limit._asdict() for limit in limits]
-
-
-def _name(names: type[IntEnum], code: int) -> str:
-    try:
-        return names(code).name
-    except ValueError:
-        return f"unknown ({code})"

@@ -8,6 +8,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from shared.bus import topics
+from shared.bus.code_names import name_of
 from shared.bus.messages import (
     Cause,
     DriveStatus,
@@ -145,7 +146,7 @@ def _describe_run_event(event: RunEvent) -> str:
         RunEventKind.FINISHED: f"{event.subject} ends {event.detail}".strip(),
         RunEventKind.FAULTED: f"{event.subject}: fault {event.detail} begins",
     }
-    other = f"{event.subject} {_name(RunEventKind, event.kind)} {event.detail}"
+    other = f"{event.subject} {name_of(RunEventKind, event.kind)} {event.detail}"
     return texts.get(_member(RunEventKind, event.kind), other.strip())
 
 
@@ -194,8 +195,8 @@ def _describe_mode_change(group: Sequence[tuple[float, str, JointEvent]]) -> str
     )
     within_ms = (group[-1][0] - group[0][0]) * 1e3
     text = (
-        f"{modules}: {_name(Mode, first.mode_before)} to {_name(Mode, first.mode_after)}, "
-        f"{_name(Cause, first.cause)}"
+        f"{modules}: {name_of(Mode, first.mode_before)} to {name_of(Mode, first.mode_after)}, "
+        f"{name_of(Cause, first.cause)}"
     )
     if len(group) > 1 and within_ms > 0.0:
         text += f", within {within_ms:.1f} ms"
@@ -249,7 +250,7 @@ def _describe_drive_change(row: tuple[float, str, JointState, JointState]) -> st
     parts = []
     if before.drive != after.drive:
         parts.append(
-            f"drive {_name(DriveStatus, before.drive)} to {_name(DriveStatus, after.drive)}"
+            f"drive {name_of(DriveStatus, before.drive)} to {name_of(DriveStatus, after.drive)}"
         )
     if before.drive_error != after.drive_error:
         parts.append(f"error bits {after.drive_error:#x}")
@@ -261,8 +262,8 @@ def _planner(run: RunData, successive: Successive) -> Iterator[TimelineEvent]:
     for index in _changes([(row.mode, row.session) for _, row in rows]):
         (_, before), (t, after) = rows[index - 1], rows[index]
         fresh = " in a new session" if before.session != after.session else ""
-        text = f"planner: {_name(PlannerMode, before.mode)} to {_name(PlannerMode, after.mode)}"
-        trip = f", {_name(Trip, after.trip)}" if after.mode == PlannerMode.TRIPPED else ""
+        text = f"planner: {name_of(PlannerMode, before.mode)} to {name_of(PlannerMode, after.mode)}"
+        trip = f", {name_of(Trip, after.trip)}" if after.mode == PlannerMode.TRIPPED else ""
         bad = after.mode not in _NORMAL_MODES
         yield TimelineEvent(t, "bad" if bad else "note", text + trip + fresh)
     for index in _changes([row.wait_s > 0.0 for _, row in rows]):
@@ -277,7 +278,7 @@ def _harness(run: RunData, successive: Successive) -> Iterator[TimelineEvent]:
     for index in _changes([(row.valid, row.saturated, row.tare) for _, row in rows]):
         t, row = rows[index]
         state = "valid" if row.valid else "saturated" if row.saturated else "not valid"
-        tare = "" if row.tare == Tare.DONE else f", tare {_name(Tare, row.tare)}"
+        tare = "" if row.tare == Tare.DONE else f", tare {name_of(Tare, row.tare)}"
         kind = "note" if row.valid else "bad"
         yield TimelineEvent(t, kind, f"harness sensor {state}{tare}")
 
@@ -337,11 +338,6 @@ def _merged(names: Sequence[str]) -> list[str]:
 
 def _changes(values: Sequence[Any]) -> list[int]:
     return [index for index in range(1, len(values)) if values[index] != values[index - 1]]
-
-
-def _name(enumeration: Any, code: int) -> str:
-    found = _member(enumeration, code)
-    return str(found.name) if found is not None else f"unknown ({code})"
 
 
 def _member(enumeration: Any, code: int) -> Any:
