@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from types import FrameType
 
 from shared import log
 from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
-from shared.run_directory import default_run_dir
+from shared.run_directory import default_run_dir, service_directory
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 """Top of this checkout; where the packages are installed, the folder that holds them."""
@@ -33,8 +34,8 @@ def service_parser(description: str, example: str) -> argparse.ArgumentParser:
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG, help="robot file (TOML)")
     parser.add_argument(
         "--run-dir",
-        type=Path,
-        default=default_run_dir(),
+        type=service_directory,
+        default=str(default_run_dir()),
         help="directory of the fleet's sockets",
     )
     return parser
@@ -76,7 +77,11 @@ def freeze_garbage() -> None:
 
 
 def run_service(main: Callable[[], int]) -> None:
-    """Run a service's main; an error becomes one line and an exit code, a bug its traceback too."""
+    """Run a service's main; an error becomes one line and an exit code, a bug its traceback too.
+
+    What it makes in the run directory is this user's alone.
+    """
+    os.umask(0o077)
     try:
         sys.exit(main())
     except XrlError as error:

@@ -8,15 +8,24 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import grp
 import os
+import pwd
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO, Final
 
 from shared.exceptions import FleetError
 
+PRIVATE: Final = stat.S_IRUSR | stat.S_IWUSR
+
 RUN_DIR_VARIABLE = "XRL_RUN_DIR"
 """Environment variable that names the run directory of the fleet."""
+
+
+FLEET_VARIABLE: Final = "XRL_FLEET"
+"""Environment variable of every process that a fleet's supervisor starts: its run directory."""
 
 
 def default_run_dir() -> Path:
@@ -33,7 +42,8 @@ def check_own(path: Path, *, alone: bool = True) -> None:
             such a one; it can be stopped, for it may have become one while the fleet was up.
 
     Raises:
-        FleetError: it is somebody else's, others may write to it, or it is no directory.
+        FleetError: it is somebody else's, others may write to it or to a directory above it, or it
+            is no directory.
     """
     try:
         found = path.lstat()
@@ -41,6 +51,8 @@ def check_own(path: Path, *, alone: bool = True) -> None:
             _check_owner(path, found.st_uid)
             found = path.stat()
     except FileNotFoundError:
+        if alone:
+            _check_parents(path)
         return
     except OSError as error:
         raise FleetError(f"{path}: cannot be a run directory: {error.strerror}") from None
@@ -51,16 +63,85 @@ def check_own(path: Path, *, alone: bool = True) -> None:
         raise FleetError(
             f"{path}: others may write to it; `chmod go-w {path}`, or give another --run-dir"
         )
+    if alone:
+        _check_parents(path)
+
+
+def _check_parents(path: Path) -> None:
+    """Refuse a directory that another user could replace: who may write to one above it can.
+
+    As sshd's StrictModes: each is this user's or root's, and if others may write to it, only the
+    owner of an entry may rename that (the sticky bit, as /tmp has it).
+    """
+    for above in dict.fromkeys((*path.absolute().parents, *path.resolve().parents)):
+        try:
+            found = above.stat()
+        except FileNotFoundError:
+            continue  # it is made for this user alone
+        if found.st_uid not in (0, os.getuid()):
+            wrong = f"{above} belongs to another user, who can replace it"
+        elif _others_may_rename_in(found):
+            wrong = f"others may write to {above} and replace it; `chmod go-w {above}`"
+        else:
+            continue
+        raise FleetError(f"{path}: {wrong}; or give another --run-dir")
+
+
+def _others_may_rename_in(directory: os.stat_result) -> bool:
+    if directory.st_mode & stat.S_ISVTX:
+        return False
+    by_group = directory.st_mode & stat.S_IWGRP and not _is_own_group(directory.st_gid)
+    return bool(directory.st_mode & stat.S_IWOTH or by_group)
+
+
+def _is_own_group(gid: int) -> bool:
+    """Return True for the group that many systems make for each user, with nobody else in it."""
+    try:
+        group, user = grp.getgrgid(gid), pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        return False
+    return group.gr_name == user and set(group.gr_mem) <= {user}
+
+
+def open_private(path: Path) -> BinaryIO:
+    """Open a file of this user alone to read and write, or make it, whatever the umask.
+
+    One that others could read or write, left by an older version, is taken from them.
+
+    Raises:
+        OSError: it cannot be opened, is a link or somebody else's.
+    """
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
+    os.fchmod(descriptor, PRIVATE)
+    return os.fdopen(descriptor, "r+b")
 
 
 @contextlib.contextmanager
 def private_files() -> Iterator[None]:
-    """Make what is created meanwhile this user's alone, whatever the umask: sockets."""
+    """Make what is created meanwhile this user's alone, whatever the umask."""
     before = os.umask(0o077)
     try:
         yield
     finally:
         os.umask(before)
+
+
+def service_directory(text: str) -> Path:
+    """Return the run directory of a service, which somebody may have started by hand.
+
+    Under a supervisor it was looked at when the fleet started; a successor of a service that
+    crashed begins whatever has become of it, for its module is to be held.
+
+    Raises:
+        argparse.ArgumentTypeError: it is somebody else's, or others may write to it.
+    """
+    path = Path(text)
+    if FLEET_VARIABLE not in os.environ:
+        try:
+            check_own(path)
+        except FleetError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+    return path
 
 
 def own_directory(text: str) -> Path:

@@ -29,6 +29,7 @@ from types import FrameType
 from typing import Final
 
 from shared.exceptions import FleetError
+from shared.run_directory import open_private
 
 _LAST_STATE, _STOP = range(2)
 _BEATS: Final = struct.Struct("<Q")
@@ -61,12 +62,9 @@ def mapped(path: Path, size: int) -> mmap.mmap:
         FleetError: it cannot be made.
     """
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
-        try:
-            os.posix_fallocate(descriptor, 0, size)
-            return mmap.mmap(descriptor, size)
-        finally:
-            os.close(descriptor)
+        with open_private(path) as file:
+            os.posix_fallocate(file.fileno(), 0, size)
+            return mmap.mmap(file.fileno(), size)
     except OSError as error:
         raise FleetError(f"{path}: no shared memory: {error.strerror}") from None
 

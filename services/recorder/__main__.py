@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import signal
 import time
 from datetime import UTC, datetime
@@ -67,6 +68,7 @@ class SnapshotRequest:
 
 def main() -> int:
     """Run the recorder; return the exit code."""
+    os.umask(0o027)  # a record may be read by the group, and is nobody's to change
     stop, asked = StopFlag(), SnapshotRequest()
     logger = log.setup("recorder")
     arguments = _arguments()

@@ -12,9 +12,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from shared.run_directory import FLEET_VARIABLE
+
 _POLL_S = 0.05
 
-FLEET_VARIABLE = "XRL_FLEET"
 """Environment variable that marks a fleet's processes; set by the supervisor only."""
 _SERVICE_VARIABLE = b"SUPERVISOR_PROCESS_NAME="
 """Set by supervisord: the service's name."""

@@ -21,7 +21,7 @@ from services.joint import rearm_guard
 from services.simulator import usb_standin
 from shared import log
 from shared.exceptions import FleetError
-from shared.run_directory import check_own
+from shared.run_directory import FLEET_VARIABLE, check_own, private_files
 from tools.fleet import process_table, procfs
 from tools.fleet.pace import check_pace, usual_pace
 from tools.fleet.run_dir import FILES_MIN, Manifest, RunDir
@@ -267,7 +267,8 @@ class SupervisedFleet:
     ) -> None:
         try:
             process_table.check_free(plan.listeners)
-            self.run.prepare(plan, clock_pace, no_restart, disarmed=disarmed)
+            with private_files():
+                self.run.prepare(plan, clock_pace, no_restart, disarmed=disarmed)
             environment = dict(plan.environment)
             if plan.emulated_usb:
                 environment |= usb_standin.prepare(self.run.path)
@@ -353,12 +354,12 @@ class SupervisedFleet:
             "--nodaemon",
         ]
         command += ["--configuration", str(self.run.supervisor_config)]
-        marked = {**os.environ, **environment, procfs.FLEET_VARIABLE: str(self.run.path)}
+        marked = {**os.environ, **environment, FLEET_VARIABLE: str(self.run.path)}
         # An interrupt between fork and exec would leave a process that nobody can find;
         # `tools.fleet.supervisor_process` unblocks in the child.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTS)
         try:
-            with self.run.supervisor_stderr.open("wb") as output:
+            with private_files(), self.run.supervisor_stderr.open("wb") as output:
                 self._process = subprocess.Popen(
                     command,
                     env=marked,

@@ -182,6 +182,7 @@ class _Options(ServerOptions):  # type: ignore[misc]  # supervisor has no types
 
 def main() -> None:
     """Run supervisord in this process until it is stopped."""
+    os.umask(0o077)  # logs, sockets and shared memory, whoever starts the fleet
     # The tool that starts us blocks signals meanwhile, and a mask is inherited.
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     parser = argparse.ArgumentParser(description=__doc__)

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from shared.exceptions import FleetError
+from shared.run_directory import private_files
 from tools.number_arguments import natural
 from tools.terminal import Console
 from tools.view.server import HOST, PORT, ViewServer
@@ -69,7 +70,7 @@ def served_beside(run_dir: Path, port: int) -> Iterator[str]:
     command = [sys.executable, "-m", "tools.view.leashed", str(os.getpid())]
     command += ["view", "--act", "--run-dir", str(run_dir), "--port", str(port)]
     log = run_dir / "logs" / "view.log"
-    with log.open("wb") as said:
+    with private_files(), log.open("wb") as said:
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,

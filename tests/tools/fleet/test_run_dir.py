@@ -17,7 +17,7 @@ from services.joint.rearm_guard import LastState, RearmGuard, request_stop, stop
 from shared.exceptions import FleetError
 from shared.process import DEFAULT_CONFIG
 from shared.robot.joints import MODULES
-from shared.run_directory import check_own
+from shared.run_directory import FLEET_VARIABLE, check_own
 from tools import cli
 from tools.fleet import process_table, procfs
 from tools.fleet.run_dir import MARKER, RunDir
@@ -192,7 +192,7 @@ def test_a_service_of_another_fleet_gets_no_signal(claimed: RunDir) -> None:
 
 
 def test_a_process_of_the_fleet_is_known_by_its_mark(claimed: RunDir) -> None:
-    marked = {**os.environ, procfs.FLEET_VARIABLE: str(claimed.path)}
+    marked = {**os.environ, FLEET_VARIABLE: str(claimed.path)}
     with subprocess.Popen(
         [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, env=marked
     ) as member:

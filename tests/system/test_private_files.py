@@ -1,0 +1,38 @@
+"""Nothing of a running fleet is for others, whatever the umask of who started it."""
+
+from __future__ import annotations
+
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tools import cli
+
+pytestmark = pytest.mark.system
+
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def test_a_fleet_that_was_started_with_umask_0_leaves_nothing_to_others(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    before = set(SHARED_MEMORY.iterdir())
+    out = tmp_path / "record"
+    words = [
+        "up", "--run-dir", str(run_dir), "--out", str(out), "--scenario", "stand",
+        "--only", "ankle_right,simulator,recorder",
+    ]  # fmt: skip
+    script = 'umask 0; exec "$0" -m tools.cli "$@"'
+    try:
+        subprocess.run(["bash", "-c", script, sys.executable, *words], check=True, timeout=90)
+        found = [run_dir, *run_dir.rglob("*"), *(set(SHARED_MEMORY.iterdir()) - before)]
+        modes = {str(path): stat.S_IMODE(path.lstat().st_mode) for path in found}
+        assert {path.suffix for path in found} >= {".rearm", ".near", ".log"}
+        assert {path: oct(mode) for path, mode in modes.items() if mode & 0o077} == {}
+        (record,) = out.glob("*.mcap")
+        assert stat.S_IMODE(record.stat().st_mode) == 0o640
+    finally:
+        assert cli.main(["down", "--run-dir", str(run_dir)]) == 0
