@@ -142,7 +142,7 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     """
     python, config = f"{hosts.checkout}/.venv/bin/python", f"{hosts.folder}/{ROBOT_FILE}"
     # the module is found in the installed package, wherever the command starts
-    words = ("-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)
+    words = ("-P", "-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)
     line, clock = remote.echoed(python, *words)
     try:
         probe = msgspec.json.decode(line.encode(), type=Probe)
