@@ -11,7 +11,7 @@ graphs=$venv/xrl-graphs/stamp  # what the law's graphs were translated into C fr
 unset PYTHONDONTWRITEBYTECODE
 
 say() { printf '%s\n' "deploy: $*" >&2; }
-die() { say "$*"; exit 1; }
+die() { say "$*"; exit 2; }  # 1 is a robot that fell
 
 full=$root/requirements.lock
 runtime=$root/requirements.runtime.lock  # what a robot runs: no test tools
@@ -54,7 +54,7 @@ make_environment() {  # LOCK
   [ "$lock" != "$runtime" ] || compiled=--compile  # who runs it may not write there
   rm -f "$stamp"
   if [ "$lock" = "$runtime" ] || ! venv_is_sound; then  # nothing else is left in a robot's
-    python=$(find_python) || exit 1
+    python=$(find_python) || exit 2
     say "making .venv with $("$python" --version) (once; a minute or two)"
     mkdir -p "$venv" && : >"$half_made"  # the mark stands while what was there before goes
     find "$venv" -mindepth 1 ! -path "$half_made" -delete

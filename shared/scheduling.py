@@ -100,11 +100,38 @@ def _pin(processors: set[int]) -> str:
 
 def raise_priority(fifo: int) -> str:
     """Set SCHED_FIFO, or what needs no privilege; return what was granted."""
+    limit_us = _real_time_limit_us()
+    if limit_us is not None:
+        return f"{short_slice()}, no real time: RLIMIT_RTTIME of {limit_us} us would kill it"
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo))
     except (OSError, AttributeError):
         return short_slice()
     return f"SCHED_FIFO {fifo}"
+
+
+def has_real_time(pid: int) -> bool | None:
+    """Return True if a process has a real-time priority; None if there is no such process."""
+    try:
+        return os.sched_getscheduler(pid) in (os.SCHED_FIFO, os.SCHED_RR)
+    except OSError:
+        return None
+
+
+def _real_time_limit_us() -> int | None:
+    """Lift the limit of computing without a pause in real time; return the one that stays, us.
+
+    Beyond it the kernel ends a process (SIGXCPU, then SIGKILL), which is no way for a service to
+    find that a cycle took long.
+    """
+    soft, _hard = resource.getrlimit(resource.RLIMIT_RTTIME)
+    if soft == resource.RLIM_INFINITY:
+        return None
+    try:
+        resource.setrlimit(resource.RLIMIT_RTTIME, (resource.RLIM_INFINITY,) * 2)
+    except (OSError, ValueError):  # the hard limit is lower, and only root may raise that
+        return soft
+    return None
 
 
 def short_slice() -> str:

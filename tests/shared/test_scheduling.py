@@ -127,3 +127,28 @@ def test_linear_algebra_runs_in_one_thread_whatever_is_imported_first(first: str
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=bare
     )
     assert done.stdout.strip() == "1"
+
+
+@pytest.mark.parametrize(("may", "granted"), [(True, "SCHED_FIFO 20"), (False, "RLIMIT_RTTIME")])
+def test_no_real_time_is_taken_that_the_kernel_would_kill_for(
+    may: bool, granted: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = [(200_000, resource.RLIM_INFINITY if may else 200_000)]
+    taken: list[int] = []
+
+    def set_limit(_kind: int, wanted: tuple[int, int]) -> None:
+        if not may:
+            raise ValueError("not allowed to raise maximum limit")
+        limits.append(wanted)
+
+    monkeypatch.setattr(resource, "getrlimit", lambda _kind: limits[-1])
+    monkeypatch.setattr(resource, "setrlimit", set_limit)
+    monkeypatch.setattr(scheduling, "short_slice", lambda: "a short slice")
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: taken.append(1))
+    assert granted in scheduling.raise_priority(20)
+    assert bool(taken) == may
+
+
+def test_who_has_real_time_is_seen() -> None:
+    assert scheduling.has_real_time(os.getpid()) is False
+    assert scheduling.has_real_time(2**22 + 1) is None

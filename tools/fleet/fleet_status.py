@@ -9,6 +9,7 @@ from typing import Final
 import msgspec
 
 from services.joint.rearm_guard import stop_source
+from shared import scheduling
 from shared.bus.code_names import name_of
 from shared.bus.messages import (
     Cause,
@@ -66,6 +67,8 @@ class ServiceStatus(msgspec.Struct, frozen=True):
     """Its messages per second, by their sequence numbers; None as for `age_s`."""
     restarts: int
     last_exit: str
+    real_time: bool | None = None
+    """It has a real-time priority; None if it does not run, or is to have none."""
 
 
 class ModuleStatus(msgspec.Struct, frozen=True):
@@ -236,6 +239,7 @@ def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: 
             rate_hz=rate_hz,
             restarts=service.restarts,
             last_exit=service.last_exit,
+            real_time=_real_time(service),
         )
     modules = {
         module: module_status(
@@ -277,6 +281,13 @@ def trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tuple
             if row.state in ("backoff", "starting") and row.last_exit
         ),
     )
+
+
+def _real_time(service: ServiceInfo) -> bool | None:
+    """Return whether a running service that is to have a real-time priority was given one."""
+    wanted = service.name in MODULES or service.name in scheduling.TABLE
+    running = service.pid is not None and service.state == "running"
+    return scheduling.has_real_time(service.pid) if wanted and running and service.pid else None
 
 
 def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:

@@ -92,6 +92,13 @@ def describe_sessions(status: FleetStatus) -> str:
     )
 
 
+def describe_real_time(status: FleetStatus) -> str:
+    """Return which services were refused a real-time priority; "" if none."""
+    without = [name for name, row in status.services.items() if row.real_time is False]
+    words = "without real-time priority, commands may come late (`xrl doctor` has the remedy)"
+    return f"{words}: {', '.join(without)}" if without else ""
+
+
 def describe_tools(status: FleetStatus) -> str:
     """Return the tools that are linked, for example "view on lab3, lead on pad"."""
     words = []
@@ -164,6 +171,8 @@ def tables(status: FleetStatus) -> Group:
     lines += [line] if status.network else []
     lines += [marked(" [bold yellow]{}[/]", text) for text in describe_refusals(status)]
     lines += [f" linked: {describe_tools(status)}"] if status.tools else []
+    refused = describe_real_time(status)
+    lines += [Text(f" {refused}", "dim")] if refused else []
     sessions = describe_sessions(status)
     lines += [marked(" [bold yellow]{}[/]", sessions)] if sessions else []
     lines += [marked(" [bold red]{}[/]", words) for words in status.trouble]

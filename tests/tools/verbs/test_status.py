@@ -33,6 +33,7 @@ from tools.fleet.fleet_status import (
     LeadStatus,
     ModuleStatus,
     RateMonitor,
+    ServiceStatus,
     lead_status,
     module_status,
     tools_of,
@@ -40,6 +41,7 @@ from tools.fleet.fleet_status import (
 from tools.fleet.others import warn_of_others
 from tools.fleet.status_table import (
     describe_lead,
+    describe_real_time,
     describe_refusals,
     describe_sessions,
     describe_tools,
@@ -238,3 +240,15 @@ def test_codes_that_this_version_does_not_know_are_told() -> None:
         "unknown (99)", "unknown (98)", "unknown (97)",
     )  # fmt: skip
     assert "another version" in status.way_out
+
+
+def test_services_without_real_time_are_told() -> None:
+    def row(real_time: bool | None) -> ServiceStatus:
+        return ServiceStatus(1, "running", 1.0, None, None, 0, "", real_time)
+
+    status = msgspec.structs.replace(
+        fleet_with(7), services={"planner": row(False), "hip_left": row(True), "view": row(None)}
+    )
+    assert describe_real_time(status).endswith(": planner")
+    served = msgspec.structs.replace(status, services={"hip_left": row(True)})
+    assert describe_real_time(served) == ""
