@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 import msgspec
+from rich.text import Text
 
 from shared.config import files as config_file
 from tools.bringup import bench
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
             path,
             args.run_dir,
             args.plant,
-            lambda words: status.update(f"looking at {words}"),
+            lambda words: status.update(Text(f"looking at {words}")),
         )
     report = report_of(groups)
     if args.json:

@@ -211,11 +211,11 @@ def asked(**changes: object) -> argparse.Namespace:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"at": "0.1"}, "write phi and theta"),
-        ({"at": "a,b"}, "write phi and theta"),
-        ({"at": "0,0,0"}, "write phi and theta"),
+        ({"at": "0.1"}, "phi and theta in rad"),
+        ({"at": "a,b"}, "phi and theta in rad"),
+        ({"at": "0,0,0"}, "phi and theta in rad"),
         ({"at": "0,0"}, r"knee_left: theta 0 rad is outside of -3 \.\. -0\.2"),
-        ({"at": "nan,-0.5"}, "phi nan"),
+        ({"at": "nan,-0.5"}, "number 1, .nan.: one within"),
         ({"at": "0,-0.5", "all": True, "module": None}, "for one module"),
         ({"at": "0,-28"}, r"outside .*if these are degrees: --at 0,-0\.4887$"),
         ({"at": "0,-3.1"}, "leg could then not be bent by lifting alone$"),
