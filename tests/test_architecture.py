@@ -48,6 +48,7 @@ SOURCES = {
 IMPORTS = {file: imports_in(source) for file, source in SOURCES.items()}
 
 VENDORS = {
+    "getpass": ["shared/user.py"],
     "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
     "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
     "gymnasium": ["tools/learning/environment.py"],

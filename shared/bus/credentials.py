@@ -20,6 +20,7 @@ from shared.bus.topics import OPERATOR, VIEWER
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.config.toml_file import Section, read_toml
 from shared.exceptions import BusError, ConfigError
+from shared.user import in_home
 
 AUTHORITY: Final = "authority.pem"
 NAMES: Final = "names.toml"
@@ -46,8 +47,12 @@ class Credentials(NamedTuple):
 
 
 def keys_folder(robot: RobotConfig) -> Path:
-    """Return the folder that `bus.security.keys` names."""
-    return Path(robot.bus.security.keys.replace("{robot}", robot.name)).expanduser()
+    """Return the folder that `bus.security.keys` names.
+
+    Raises:
+        XrlError: it is in a home that this user does not have.
+    """
+    return in_home(robot.bus.security.keys.replace("{robot}", robot.name))
 
 
 def certificate_file(folder: Path, name: str) -> Path:

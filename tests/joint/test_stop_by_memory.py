@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 from pathlib import Path
 
 import pytest
@@ -67,7 +68,7 @@ def test_a_user_without_a_name_or_with_a_broken_one_stops_the_robot_all_the_same
             raise name
         return name
 
-    monkeypatch.setattr(emergency_stop.getpass, "getuser", who)
+    monkeypatch.setattr(getpass, "getuser", who)
     guard = RearmGuard(tmp_path, MODULE)
     assert emergency_stop.request_here(tmp_path) == ([MODULE], [])
     assert guard.stop_requested

@@ -6,7 +6,7 @@ from typing import Final
 
 from shared.bus.credentials import keys_folder
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import BusError
+from shared.exceptions import XrlError
 from tools.bringup.rows import Finding, ok, warning, wrong
 from tools.keys.inspection import KeyRow, look
 
@@ -24,7 +24,7 @@ def security_rows(robot: RobotConfig) -> list[Finding]:
         return [ok(SUBJECT, "security", mode, "who may link: this user alone")]
     try:
         rows = look(keys_folder(robot), robot)
-    except BusError as error:
+    except XrlError as error:
         return [wrong(SUBJECT, "keys", str(error), "this host's own", "`xrl keys pack`")]
     return [_row(row) for row in rows]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
-import os
 import platform
 import signal
 import time
@@ -21,6 +19,7 @@ from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.robot.joints import MODULES
+from shared.user import user_name
 from tools.fleet import procfs
 
 REPEAT_S: Final = 0.05
@@ -148,11 +147,7 @@ def stop_all(robot: RobotConfig, run_dir: Path, *, here: bool) -> list[str]:
 
 def _source() -> str:
     """Return who asks for the stop; never raises, for nothing may keep a stop from going out."""
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):  # a user without a name, as in a container
-        user = f"uid {os.getuid()}"
-    text = f"xrl estop by {user} on {platform.node()}"
+    text = f"xrl estop by {user_name()} on {platform.node()}"
     return text.encode(errors="replace").decode()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import os
 import time
 from typing import Final
@@ -15,6 +14,7 @@ from shared.bus.session import Session
 from shared.clock import NS_PER_S, now_ns
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
+from shared.user import user_name
 
 LOOK_S: Final = 0.002
 LINKS_S: Final = 3.0
@@ -44,7 +44,7 @@ class LedPlanner:
         """
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
-        self.source = f"xrl {verb} by {getpass.getuser()} ({os.getpid()})"
+        self.source = f"xrl {verb} by {user_name()} ({os.getpid()})"
         self._sent = 0
         deadline = time.monotonic() + LINKS_S
         while (status := self._statuses.take()) is None:

@@ -18,6 +18,7 @@ from shared.bus.access import PRINCIPALS, common_name
 from shared.bus.credentials import Names, certificate_file, key_file
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError
+from shared.user import in_home
 from tools.keys import certificates
 from tools.keys.certificates import Issued
 from tools.output import replace_file
@@ -27,7 +28,7 @@ _KEY: Final = "authority.key"
 
 def default_folder(robot: RobotConfig) -> Path:
     """Return where a robot's authority lies unless a command says otherwise."""
-    return Path("~/.config/xrl").expanduser() / robot.name / "authority"
+    return in_home("~/.config/xrl") / robot.name / "authority"
 
 
 class Authority:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import getpass
 import os
 import time
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 from shared.process import StopFlag
+from shared.user import user_name
 from tools.fleet.supervise import SupervisedFleet
 from tools.number_arguments import finite, finite_numbers
 from tools.terminal import Console
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     if args.for_s is not None and not args.for_s > 0.0:
         raise FleetError(f"--for {args.for_s:g}: a time is right, such as 60")
     stop = StopFlag()
-    source = f"xrl assist by {getpass.getuser()} ({os.getpid()})"
+    source = f"xrl assist by {user_name()} ({os.getpid()})"
     with open_session(robot, "assist", args.run_dir) as session:
         intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)

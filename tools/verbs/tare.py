@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import getpass
 import math
 import time
 from pathlib import Path
@@ -15,6 +14,7 @@ from shared.bus.session import open_session
 from shared.clock import now_ns
 from shared.config.files import load
 from shared.exceptions import FleetError
+from shared.user import user_name
 from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
@@ -93,7 +93,7 @@ def tare(requests: TareClient, wrenches: Wrenches, *, anyway: bool) -> Wrench:
             f"the harness reads {describe(before)}: let go of it, and again; "
             "or --anyway, if nobody holds it and the sensor has drifted"
         )
-    source = f"xrl tare by {getpass.getuser()}"
+    source = f"xrl tare by {user_name()}"
     begun = False
     deadline = time.monotonic() + GIVE_UP_S
     seq = 0
