@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import getpass
 import os
 import time
 from collections.abc import Sequence
@@ -24,17 +23,22 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 from shared.process import StopFlag
+from shared.user import user_name
 from tools.fleet.emergency_stop import BusStop, request_here
-from tools.fleet.gamepad import BUTTONS, Gamepad, open_pad
-from tools.fleet.pilot import Deflection, Led, Pilot
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
+from tools.pads.calibration import calibrate, keep
+from tools.pads.controls import BUTTONS
+from tools.pads.gamepad import Gamepad, mapping_of, open_pad
+from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
 
 PERIOD_S: Final = 0.05
 """Repeats each request: an intent fades out, and a push ends, once nobody repeats it."""
 LINKS_S: Final = 3.0
+SETTLE_S: Final = 60.0
+"""Longest wait for a person to let go of the sticks and to press the dead man's button once."""
 KEY_HELD_S: Final = 0.1
 """A press of a key is a full deflection for the time since the last look, and no longer than so."""
 
@@ -68,6 +72,7 @@ def add_parser(subparsers: Subparsers) -> None:
         xrl lead                 # the first gamepad: hold the right shoulder and move the sticks
         xrl lead --keys          # arrows: height and pitch; + and -: assist; space: stop
         xrl lead --pad /dev/input/event7 --hold leftshoulder --stop x
+        xrl lead --calibrate     # a pad that is not known: asks for each stick, trigger and button
         """,
     )
     add_run_dir(parser)
@@ -78,32 +83,55 @@ def add_parser(subparsers: Subparsers) -> None:
         "--hold", choices=BUTTONS, default="rightshoulder", help="dead man's button (rightshoulder)"
     )
     parser.add_argument("--stop", choices=BUTTONS, default="b", help="emergency stop (b)")
+    parser.add_argument(
+        "--calibrate", action="store_true",
+        help="learn what the pad's axes and buttons mean, and keep it; needs no robot",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
     """Lead until q, Ctrl-C, the stop, or the loss of the pad.
 
     Raises:
-        FleetError: there is no pad, no terminal or no key that may act, or the robot is silent.
+        FleetError: there is no pad, no terminal or no key that may act, the robot is silent, or the
+            pad is lost.
     """
+    if args.calibrate:
+        return _calibrate(args)
     fleet = SupervisedFleet.attach(args.run_dir)
     robot = load(Path(fleet.manifest.config))
     require_operator(robot, "lead")
     if args.hold == args.stop:
         raise FleetError(f"--hold and --stop are both {args.hold}: two buttons are right")
-    pad = None if args.keys else Gamepad(open_pad(args.pad), hold=args.hold, stop=args.stop)
+    pad = None if args.keys else _opened(args)
     console = Console()
     with open_session(robot, "lead", fleet.run.path) as session:
         leader = Leader(robot, session, simulated="simulator" in fleet.manifest.services)
         ended = _by_pad(pad, leader, console) if pad is not None else _by_keys(leader, console)
         if ended is not Key.STOP:
             console.print(f"let go: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
-            return 0 if pad is None or not pad.gone else 1
+            if pad is not None and pad.gone:
+                raise FleetError(f"{pad.name}: lost: unplugged, or out of its receiver's reach")
+            return 0
         request_here(fleet.run.path)
         going = BusStop(robot, session, fleet.run.path).stop()
     if going:
         raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
     console.print("stopped: DAMP. It sinks slowly; `xrl status` names the way out")
+    return 0
+
+
+def _opened(args: argparse.Namespace) -> Gamepad:
+    device = open_pad(args.pad)
+    return Gamepad(device, mapping_of(device), hold=args.hold, stop=args.stop)
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    if args.keys:
+        raise FleetError("--calibrate --keys: keys need no calibration; one of the two is right")
+    device = open_pad(args.pad)
+    mapping = calibrate(device, print)
+    print(f"{device.name}: kept in {keep(device, mapping)}; `xrl lead` uses it from now on")
     return 0
 
 
@@ -130,7 +158,7 @@ class Leader:
             time.sleep(0.01)
         height, pitch = (truth.torso[2], truth.angles[1]) if truth is not None else (1.0, 0.0)
         self.pilot = Pilot(height, pitch, robot.assist.force_max)
-        self._source = f"xrl lead by {getpass.getuser()} ({os.getpid()})"
+        self._source = f"xrl lead by {user_name()} ({os.getpid()})"
         self._sent = 0
 
     def take_hold(self) -> None:
@@ -178,6 +206,7 @@ class Leader:
 def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
     """Lead by a pad until it is over; STOP if it was the stop."""
     console.print(f"{pad.name}: hold the dead man's button and move the sticks; Ctrl-C ends it")
+    settling = time.monotonic() + SETTLE_S
     stop = StopFlag()
     last, held = time.monotonic(), False
     with Live(console=console, refresh_per_second=4, transient=True) as shown:
@@ -186,6 +215,13 @@ def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
             if pad.stopped:
                 return Key.STOP
             now = time.monotonic()
+            if not pad.settled:
+                to_do = pad.settle()
+                if to_do and now > settling:
+                    raise FleetError(f"{pad.name}: not begun within {SETTLE_S:g} s: {to_do}")
+                shown.update(Text(to_do))
+                last = now
+                continue
             if pad.held and not held:
                 leader.take_hold()
             held = pad.held
@@ -193,8 +229,6 @@ def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
                 leader.lead(pad.deflection, min(now - last, 2 * PERIOD_S))
             last = now
             shown.update(leader.describe("held" if pad.held else "not held, nothing is sent"))
-    if pad.gone:
-        console.print("the pad is gone", style="bold yellow")
     return None
 
 

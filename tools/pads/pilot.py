@@ -13,8 +13,8 @@ PITCH_RATE: Final = 0.4
 """rad/s at full deflection."""
 ASSIST_RATE: Final = 40.0
 """N/s at full deflection."""
-DEAD_ZONE: Final = 0.12
-"""Deflection that counts as none: sticks do not return to their middle."""
+DEAD_ZONE: Final = 0.2
+"""Deflection that counts as none: a worn stick stays up to 15 % away from where it rested."""
 
 
 class Deflection(NamedTuple):
