@@ -144,10 +144,18 @@ class CanSensor(Generic[S]):
                 return newest, True
             if frame is None:
                 return newest, True
-            if frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id:
-                continue
-            newest = self._assembler.add(frame.arbitration_id, frame.data) or newest
+            if is_data_frame(frame):
+                newest = self._assembler.add(frame.arbitration_id, frame.data) or newest
         return newest, False
+
+
+def is_data_frame(message: can.Message) -> bool:
+    """Return True for a standard data frame: what drives and sensors send.
+
+    An error frame's id tells what is wrong with the bus, and an extended id may equal the standard
+    one of another sender. A request is a remote frame; so is the echo of an own one.
+    """
+    return not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
 
 
 def _unusable(interface: str, why: str) -> ConfigError:

@@ -18,6 +18,7 @@ import msgspec
 
 from shared.bus.messages import Vector6
 from shared.can import cansimple
+from shared.can.can_sensor import is_data_frame
 from shared.can.cansimple import Command, Heartbeat
 from shared.can.cansimple_06 import Command06, Version, unpack_version
 from shared.can.imu_can import IDS as IMU_IDS
@@ -36,6 +37,8 @@ HEARTBEATS: Final = 3.0
 _WAIT_S = 0.05
 _FRAME_BYTES = 8
 _GAPS_MIN = 3
+_WAITING_MAX = 10_000
+"""More frames than any queue holds: a bus that never falls silent ends it."""
 
 
 class NodeTraffic(msgspec.Struct):
@@ -149,15 +152,25 @@ def _asked(bus: can.BusABC, node: int) -> float | None:
     question = can.Message(
         arbitration_id=wanted, is_remote_frame=True, dlc=_FRAME_BYTES, is_extended_id=False
     )
+    _forget_waiting(bus)
     began = time.monotonic()
     bus.send(question, timeout=_WAIT_S)
     while (left := began + ANSWER_S - time.monotonic()) > 0.0:
         message = bus.recv(left)
         if message is None:
             return None
-        if message.arbitration_id == wanted and not message.is_remote_frame:
+        # Whoever answers is the axis that was asked: by its id, and with a whole answer.
+        answers = is_data_frame(message) and len(message.data) == _FRAME_BYTES
+        if answers and message.arbitration_id == wanted:
             return time.monotonic() - began
     return None
+
+
+def _forget_waiting(bus: can.BusABC) -> None:
+    """Drop what waits: an answer that comes too late is none to the next request."""
+    for _ in range(_WAITING_MAX):
+        if bus.recv(0.0) is None:
+            return
 
 
 def long_enough(heartbeat_period_ms: int) -> float:
@@ -206,7 +219,7 @@ def _take_in(
             continue
         if message.is_error_frame:
             traffic.error_frames += 1
-        elif not message.is_remote_frame and not message.is_extended_id:
+        elif is_data_frame(message):
             traffic.frames += 1
             if cells and message.arbitration_id in FRAME_IDS:
                 sample = assembler.add(message.arbitration_id, message.data)

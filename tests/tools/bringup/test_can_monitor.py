@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import can
 import pytest
 
 from services.simulator.unix_can_hub import UnixCanHub
 from shared.can import cansimple, imu_can, loadcell_can
 from shared.can.cansimple import AxisState, Command, Heartbeat, arbitration_id
 from shared.can.cansimple_06 import Command06, Version, pack_version
-from shared.can.unix_can import REMOTE_FLAG
+from shared.can.unix_can import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
 from shared.config.sections import CanConfig
-from tools.bringup.can_monitor import listen
+from tools.bringup import can_monitor
+from tools.bringup.can_monitor import listen, round_trips
 
 NODE = 8
 STRANGER = 30
@@ -127,3 +130,70 @@ def test_a_missing_bus_is_reported_and_not_raised(tmp_path: Path) -> None:
     assert "no.sock" in listen(nowhere, (NODE,), poll_nodes=True).trouble
     unknown = CanConfig(interface="carrier_pigeon", channel="0")
     assert "carrier_pigeon" in listen(unknown, (NODE,), poll_nodes=True).trouble
+
+
+ASKED = arbitration_id(NODE, Command.GET_VBUS)
+ANSWER = cansimple.pack_two_floats(47.5, 0.1)
+
+
+@contextlib.contextmanager
+def answering(folder: Path, *frames: Frame) -> Iterator[CanConfig]:
+    """Have a bus on which each request is answered by some frames."""
+    done = threading.Event()
+    path = folder / "can.sock"
+    with UnixCanHub(path) as hub:
+
+        def speak() -> None:
+            while not done.is_set():
+                for _ in hub.poll():
+                    hub.broadcast(frames)
+                time.sleep(0.001)
+
+        speaker = threading.Thread(target=speak)
+        speaker.start()
+        try:
+            yield CanConfig(interface="xrl_unix", channel=str(path))
+        finally:
+            done.set()
+            speaker.join()
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        (ASKED | EXTENDED_FLAG, ANSWER),
+        (ASKED | ERROR_FLAG, ANSWER),
+        (ASKED | REMOTE_FLAG, ANSWER),
+        (ASKED, ANSWER[:4]),
+        (arbitration_id(NODE + 1, Command.GET_VBUS), ANSWER),
+        (arbitration_id(NODE, Command.GET_IQ), ANSWER),
+    ],
+    ids=["extended", "error", "a request, or its echo", "short", "of another", "to another"],
+)
+def test_only_the_axis_that_was_asked_answers(tmp_path: Path, frame: Frame) -> None:
+    with answering(tmp_path, frame) as config:
+        trips = round_trips(config, (NODE,), 3)[NODE]
+    assert trips.lost == 3
+    with answering(tmp_path, frame, (ASKED, ANSWER)) as config:
+        assert round_trips(config, (NODE,), 3)[NODE].lost == 0
+
+
+class Twice:
+    """A bus on which the first request is answered twice, and no other one."""
+
+    def __init__(self) -> None:
+        self.waiting = [can.Message(arbitration_id=ASKED, data=ANSWER, is_extended_id=False)] * 2
+        self.sent = 0
+
+    def send(self, *_: object, **__: object) -> None:
+        self.sent += 1
+
+    def recv(self, _timeout: float) -> can.Message | None:
+        return self.waiting.pop() if self.sent and self.waiting else None
+
+
+def test_an_answer_that_comes_late_is_none_to_the_next_request() -> None:
+    bus = Twice()
+    took = [can_monitor._asked(bus, NODE) for _ in range(2)]  # type: ignore[arg-type]
+    assert took[0] is not None
+    assert took[1] is None
