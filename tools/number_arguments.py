@@ -34,7 +34,7 @@ def count(text: str) -> int:
     Raises:
         argparse.ArgumentTypeError: it is no whole number from 1 to a million.
     """
-    return _whole(text, 1, COUNT_MAX)
+    return whole(text, 1, COUNT_MAX)
 
 
 def natural(text: str) -> int:
@@ -43,7 +43,7 @@ def natural(text: str) -> int:
     Raises:
         argparse.ArgumentTypeError: it is no whole number from 0 on.
     """
-    return _whole(text, 0, NATURAL_MAX)
+    return whole(text, 0, NATURAL_MAX)
 
 
 def rate(text: str) -> float:
@@ -68,7 +68,7 @@ def degrees(text: str) -> int:
         argparse.ArgumentTypeError: it is no whole number from -360 to 360.
     """
     sign = -1 if text.strip().startswith("-") else 1
-    return sign * _whole(text.strip().removeprefix("-"), 0, 360)
+    return sign * whole(text.strip().removeprefix("-"), 0, 360)
 
 
 def finite_numbers(text: str, number: int, largest: float = FINITE_MAX) -> tuple[float, ...]:
@@ -96,7 +96,12 @@ def finite_numbers(text: str, number: int, largest: float = FINITE_MAX) -> tuple
     return tuple(numbers)
 
 
-def _whole(text: str, low: int, high: int) -> int:
+def whole(text: str, low: int, high: int) -> int:
+    """Return a whole number within two bounds.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+    """
     digits = text.strip()
     if digits.isdecimal() and len(digits) < 20 and low <= int(digits) <= high:
         return int(digits)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from services.network_proxy.listener import SocketListener
 from shared.bus.links import Pair
+from shared.config.endpoints import host_and_port
 from shared.exceptions import BusError
 
 
@@ -69,12 +70,12 @@ def address_of(endpoint: str) -> Address:
     kind, _, rest = endpoint.partition("/")
     if kind == "unixsock-stream":
         return Address(socket.AF_UNIX, rest)
-    host, _, port = rest.partition("?")[0].partition("#")[0].rpartition(":")
-    if kind != "tcp" or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+    if kind != "tcp":
         text = "cannot be stood before; unixsock-stream/PATH or tcp/HOST:PORT can"
         raise BusError(f"{endpoint}: {text}")
+    host, port = host_and_port(endpoint)
     try:
-        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
         raise BusError(f"{endpoint}: {error}; a host that can be found is needed") from None
     family, _, _, _, where = found[0]

@@ -17,6 +17,7 @@ import msgspec
 
 from shared.bus.access import PRINCIPALS
 from shared.bus.topics import OPERATOR, VIEWER
+from shared.config.endpoints import ROBOT, filled
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.config.toml_file import Section, read_toml
 from shared.exceptions import BusError, ConfigError
@@ -52,7 +53,7 @@ def keys_folder(robot: RobotConfig) -> Path:
     Raises:
         XrlError: it is in a home that this user does not have.
     """
-    return in_home(robot.bus.security.keys.replace("{robot}", robot.name))
+    return in_home(filled(robot.bus.security.keys, {ROBOT: robot.name}))
 
 
 def certificate_file(folder: Path, name: str) -> Path:

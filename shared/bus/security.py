@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -10,6 +9,7 @@ from shared import log
 from shared.bus import allow_list
 from shared.bus.access import access_control
 from shared.bus.credentials import read_credentials
+from shared.config.endpoints import host_and_port
 from shared.config.robot_config import ENDPOINTS_OF_MODE, RobotConfig
 from shared.exceptions import BusError
 
@@ -75,13 +75,6 @@ def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
     for name in unknown:
         log.get("xrl").warning("%s: no such host now; what comes from it is dropped", name)
     allow_list.restrict(ports, addresses)
-
-
-def host_and_port(locator: str) -> tuple[str, int]:
-    """Return the host and the port of tcp/HOST:PORT, tls/[HOST]:PORT and the like."""
-    address = re.split("[?#]", locator.partition("/")[2])[0]
-    host, _, port = address.rpartition(":")
-    return host.strip("[]"), int(port)
 
 
 def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:

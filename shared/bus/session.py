@@ -31,6 +31,7 @@ from shared.bus.links import PAIRS, Pair, endpoint_through
 from shared.bus.messages import Message
 from shared.bus.topics import Priority, Topic
 from shared.clock import keep_pace, now_ns
+from shared.config.endpoints import host_and_port
 from shared.config.robot_config import SERVICES, RobotConfig, expand
 from shared.exceptions import BusError, NonFiniteError
 from shared.process import SOCKET_PATH_MAX
@@ -438,7 +439,7 @@ def _meet_link(event: zenoh.LinkEvent) -> None:
     """
     link = event.link
     if event.kind == zenoh.SampleKind.PUT and link.src.startswith(security.TCP):
-        ends = security.host_and_port(link.src), security.host_and_port(link.dst)
+        ends = host_and_port(link.src), host_and_port(link.dst)
         socket_linger.reset_on_close(*ends)
 
 

@@ -14,6 +14,7 @@ import msgspec
 
 from shared.can.can_load import check_buses
 from shared.can.drive_settings import CURRENT_RANGE
+from shared.config.endpoints import PORT_MAX, ROBOT, RUN, is_endpoint, stray_braces
 from shared.config.robot_config import ENDPOINTS_OF_MODE, SERVICES, RobotConfig
 from shared.config.sections import LimitConfig
 from shared.exceptions import ConfigError
@@ -28,9 +29,6 @@ INTERFACES: Final = (
 
 ROS2_DISTRIBUTIONS: Final = ("jazzy", "kilted", "lyrical")
 """Those whose messages on Zenoh the gateway knows (`services.ros2_gateway`)."""
-_ENDPOINT: Final = re.compile(
-    r"unixsock-stream/.+|(tcp|tls)/(\[[0-9A-Fa-f:.%]+\]|[^\[\]:/]+):\d{1,5}([?#].*)?"
-)
 LEADABLE: Final = (2, 4)
 """Rows of p that a person may lead: height and pitch."""
 _POWER_UP_TURNS: Final = 1.0
@@ -65,6 +63,7 @@ def check_security(file: str, config: RobotConfig) -> None:
     if not re.match(r"[~/]", security.keys):
         found = f"{security.keys!r} depends on where a service is started"
         raise ConfigError(file, "bus.security.keys", found, "a path that begins with / or ~")
+    _check_placeholders(file, "bus.security.keys", security.keys, ROBOT)
     for index, host in enumerate(security.allow):
         if not _is_address(host):
             right = "an IP address, without a port: a name may not be known when a service starts"
@@ -139,7 +138,7 @@ def _check_ros2(file: str, config: RobotConfig) -> None:
         if ros2.distribution == "humble":
             found += ", whose topics have no type hash, so that nobody would find these"
         raise ConfigError(file, "ros2.distribution", found, f"one of {right}")
-    if not re.fullmatch(r"(tcp|tls)/.+:\d+", ros2.router):
+    if ros2.router.startswith("unixsock") or not is_endpoint(ros2.router):
         raise ConfigError(file, "ros2.router", f"{ros2.router!r}", "such as tcp/localhost:7447")
     if not re.fullmatch(r"([A-Za-z]\w*(/[A-Za-z]\w*)*)?", ros2.namespace):
         right = "letters, digits and _, such as legs; or nothing"
@@ -186,14 +185,23 @@ def _check_endpoints(file: str, config: RobotConfig) -> None:
         where = f"bus.endpoints.{service}"
         if service not in SERVICES:
             raise ConfigError(file, where, "no such service", f"one of {_words(SERVICES)}")
-        if not _ENDPOINT.fullmatch(endpoint):
+        if not is_endpoint(endpoint):
             right = "unixsock-stream/PATH, tcp/HOST:PORT or tls/HOST:PORT"
+            right += f", with a port from 1 to {PORT_MAX}"
             raise ConfigError(file, where, f"{endpoint!r}", right)
+        _check_placeholders(file, where, endpoint, RUN)
         if endpoint in seen:
             raise ConfigError(
                 file, where, f"{endpoint!r} is {seen[endpoint]}'s too", "one for each service"
             )
         seen[endpoint] = service
+
+
+def _check_placeholders(file: str, where: str, text: str, placeholder: str) -> None:
+    stray = stray_braces(text, [placeholder])
+    if stray:
+        found = f"{text!r}: {stray} is no placeholder"
+        raise ConfigError(file, where, found, f"only {placeholder} is filled in")
 
 
 def _check_physics(file: str, config: RobotConfig) -> None:
@@ -229,9 +237,10 @@ def _check_physics(file: str, config: RobotConfig) -> None:
 
 
 def _check_interfaces(file: str, config: RobotConfig) -> None:
-    """Check that python-can knows the interface of every bus."""
+    """Check that python-can knows each bus's interface, and what is filled into its channel."""
     known = set(INTERFACES)
     for name, bus in config.can.items():
+        _check_placeholders(file, f"can.{name}.channel", bus.channel, RUN)
         if bus.interface not in known:
             known |= {entry.name for entry in entry_points(group="can.interface")}
         if bus.interface not in known:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from shared.config.endpoints import RUN, filled, stray_braces
 from shared.config.sections import (
     AssistConfig,
     BusConfig,
@@ -31,6 +32,7 @@ from shared.config.sections import (
     TripsConfig,
 )
 from shared.config.toml_file import Section
+from shared.exceptions import BusError
 from shared.robot.gain_table import GainSchedule
 from shared.robot.joints import MODULES, kind_of
 
@@ -162,5 +164,12 @@ class RobotConfig(Section, frozen=True):
 
 
 def expand(text: str, run_dir: Path) -> str:
-    """Return a path or endpoint with `{run}` replaced by the run directory."""
-    return text.replace("{run}", str(run_dir))
+    """Return a path or endpoint with `{run}` replaced by the run directory.
+
+    Raises:
+        BusError: something else stands in braces; it would be taken as it is.
+    """
+    stray = stray_braces(text, [RUN])
+    if stray:
+        raise BusError(f"{text}: {stray} is no placeholder; only {RUN} is filled in")
+    return filled(text, {RUN: str(run_dir)})

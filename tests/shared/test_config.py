@@ -120,6 +120,22 @@ REFUSALS: list[tuple[Callable[[Table], object], str, str, str]] = [
     (setting("bus.endpoints.planner", "tls/10.0.0.1"), "bus.endpoints.planner", "", "HOST:PORT"),
     (setting("bus.endpoints.planner", "tcp/a:x"), "bus.endpoints.planner", "", "HOST:PORT"),
     (setting("bus.endpoints.planner", "udp/a:1"), "bus.endpoints.planner", "'udp/a:1'", "tcp/"),
+    (setting("bus.endpoints.planner", "tcp/a:65536"), "bus.endpoints.planner", "", "1 to 65535"),
+    (setting("bus.security.keys", "~/{Robot}"), "bus.security.keys", "{Robot} is", "{robot}"),
+    (setting("bus.endpoints.planner", "tcp/a:0"), "bus.endpoints.planner", "", "1 to 65535"),
+    (
+        setting("bus.endpoints.planner", "unixsock-stream/{Run}/planner.zenoh"),
+        "bus.endpoints.planner",
+        "{Run} is no placeholder",
+        "only {run}",
+    ),
+    (setting("can.hip_left.channel", "{rum}/x.sock"), "can.hip_left.channel", "{rum} is", "{run}"),
+    (
+        lambda raw: raw.update(ros2={"router": "tcp/a:99999"}),
+        "ros2.router",
+        "99999",
+        "localhost:7447",
+    ),
     (
         setting("bus.endpoints.harness", RAW["bus"]["endpoints"]["planner"]),
         "bus.endpoints.harness",

@@ -17,6 +17,7 @@ import msgspec
 
 from shared.bus.links import PAIRS, endpoint_through
 from shared.bus.topics import TOPICS
+from shared.config.endpoints import RUN, filled, host_and_port, stray_braces
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.toml_file import Range, Section, read_toml
@@ -27,6 +28,9 @@ from shared.robot.joints import MODULES
 
 TABLE = DEFAULT_CONFIG.parent / "processes.toml"
 """The process table of this checkout."""
+
+PYTHON, CONFIG, MODULE = "{python}", "{config}", "{module}"
+"""Placeholders of the table, beside that of the run directory."""
 
 SIMULATED_CAN = "xrl_unix"
 """python-can interface of the emulated drives: the robot is a simulated one."""
@@ -166,12 +170,25 @@ def load_table(path: Path = TABLE) -> ProcessTable:
         if row.topic and row.topic not in topics:
             right = f"one of {', '.join(topics)}"
             raise ConfigError(str(path), f"process[{index}].topic", f"{row.topic!r}", right)
-        rows += _for_each_module(row) if row.name == "{module}" else [row]
+        _check_placeholders(path, index, row)
+        rows += _for_each_module(row) if row.name == MODULE else [row]
     names = [row.name for row in rows]
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(str(path), "process", f"{name!r} stands twice", "each service once")
     return msgspec.structs.replace(table, process=tuple(rows))
+
+
+def _check_placeholders(path: Path, index: int, row: Process) -> None:
+    """Refuse what stands in braces and would reach a program as it is."""
+    known = [PYTHON, CONFIG, RUN, *([MODULE] if row.name == MODULE else [])]
+    texts = [("name", row.name, [MODULE]), *(("command", word, known) for word in row.command)]
+    for key, text, placeholders in texts:
+        stray = stray_braces(text, placeholders)
+        if stray:
+            found = f"{text!r}: {stray} is no placeholder here"
+            right = f"one of {', '.join(placeholders)}"
+            raise ConfigError(str(path), f"process[{index}].{key}", found, right)
 
 
 def is_simulated(config: RobotConfig) -> bool:
@@ -235,11 +252,8 @@ def check_known(names: Iterable[str], known: Collection[str]) -> None:
 
 def command_of(process: Process, config_path: Path, run_dir: Path) -> list[str]:
     """Return a row's command with its placeholders filled in."""
-    values = {"{python}": sys.executable, "{config}": str(config_path), "{run}": str(run_dir)}
-    words = list(process.command)
-    for placeholder, value in values.items():
-        words = [word.replace(placeholder, value) for word in words]
-    return words
+    values = {PYTHON: sys.executable, CONFIG: str(config_path), RUN: str(run_dir)}
+    return [filled(word, values) for word in process.command]
 
 
 def listeners_of(
@@ -327,7 +341,7 @@ def is_listening(endpoint: str) -> bool:
     """Return True if some process listens on a bus endpoint."""
     if endpoint.startswith(UNIX):
         return _accepts(socket.AF_UNIX, endpoint.removeprefix(UNIX))
-    host, port = _host_and_port(endpoint)
+    host, port = host_and_port(endpoint)
     return _accepts(socket.AF_INET6 if ":" in host else socket.AF_INET, (host, port))
 
 
@@ -336,23 +350,15 @@ def _for_each_module(row: Process) -> list[Process]:
         msgspec.structs.replace(
             row,
             name=module,
-            command=tuple(word.replace("{module}", module) for word in row.command),
+            command=tuple(filled(word, {MODULE: module}) for word in row.command),
         )
         for module in MODULES
     ]
 
 
-def _host_and_port(endpoint: str) -> tuple[str, int]:
-    address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal():
-        raise FleetError(f"{endpoint}: not a host and a port; tcp/HOST:PORT is")
-    return host.strip("[]"), int(port)
-
-
 def _tcp_fault(endpoint: str) -> str:
     """Return why a service could not listen there, or nothing."""
-    host, port = _host_and_port(endpoint)
+    host, port = host_and_port(endpoint)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -12,6 +12,7 @@ from rich.text import Text
 from shared.bus.access import PRINCIPALS
 from shared.bus.credentials import keys_folder
 from shared.config import files as config_file
+from shared.config.endpoints import ROBOT, filled
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError
 from tools.hosts import hosts_file
@@ -133,7 +134,7 @@ def _pack(args: argparse.Namespace, robot: RobotConfig) -> int:
         print(f"{folder}: {_count(names)}")
         return 0
     write_atomically(args.out, to_tar(files), private=True)
-    folder = Path(robot.bus.security.keys.replace("{robot}", robot.name)).parent
+    folder = Path(filled(robot.bus.security.keys, {ROBOT: robot.name})).parent
     print(f"{args.out}: {_count(names)}; on that host:")
     print(f"mkdir -p {folder} && tar -xf {args.out.name} -C {folder}")
     return 0

@@ -12,15 +12,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from shared.config.endpoints import PORT_MAX
 from shared.exceptions import FleetError
 from shared.run_directory import private_files
-from tools.number_arguments import natural
+from tools.number_arguments import whole
 from tools.terminal import Console
 from tools.view.server import HOST, PORT, ViewServer
 from tools.view.source import Source
 
 _END_S = 5.0
-_PORT_MAX = 65_535
 
 
 def add_port(parser: argparse.ArgumentParser) -> None:
@@ -31,10 +31,7 @@ def add_port(parser: argparse.ArgumentParser) -> None:
 
 
 def _port(text: str) -> int:
-    port = natural(text)
-    if port > _PORT_MAX:
-        raise argparse.ArgumentTypeError(f"{text!r}: up to {_PORT_MAX} is right")
-    return port
+    return whole(text, 0, PORT_MAX)
 
 
 def serve(source: Source, port: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -153,6 +154,25 @@ def test_a_bad_row_is_refused_with_its_key(tmp_path: Path, line: str, key: str) 
     with pytest.raises(ConfigError) as refusal:
         process_table.load_table(table)
     assert refusal.value.key == key
+
+
+@pytest.mark.parametrize(
+    ("word", "becomes", "key", "told"),
+    [
+        ('"{run}"', '"{Run}"', "command", "{Run} is no placeholder here; one of {python}"),
+        ('"{run}"', '"{module}"', "command", "{module} is no placeholder here"),
+        ('name = "simulator"', 'name = "{simulator}"', "name", "one of {module}"),
+    ],
+)
+def test_a_placeholder_that_the_table_does_not_know_is_refused(
+    tmp_path: Path, word: str, becomes: str, key: str, told: str
+) -> None:
+    text = process_table.TABLE.read_text(encoding="utf-8")
+    table = tmp_path / "processes.toml"
+    table.write_text(text.replace(word, becomes, 1), encoding="utf-8")
+    with pytest.raises(ConfigError, match=re.escape(f"process[0].{key}")) as refusal:
+        process_table.load_table(table)
+    assert told in str(refusal.value)
 
 
 def test_a_service_that_stands_twice_is_refused(tmp_path: Path) -> None:

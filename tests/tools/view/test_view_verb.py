@@ -40,7 +40,7 @@ def test_a_record_is_served_until_it_is_interrupted(number: signal.Signals) -> N
     ("words", "said"),
     [
         (["no-such-file.mcap"], "no-such-file.mcap"),
-        (["--port", "70000", "--sim"], "up to 65535 is right"),
+        (["--port", "70000", "--sim"], "at most 65535"),
         ([str(LOG), "--sim"], "do not go together"),
         ([str(LOG), "--act"], "--act is for the fleet that is up"),
         (["--html", "run.html"], "--html is for a record"),

@@ -1,0 +1,57 @@
+"""Endpoints of the bus, and what is filled into them and into other texts of files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+from shared.exceptions import BusError
+
+PORT_MAX: Final = 65_535
+RUN: Final = "{run}"
+"""Placeholder of the run directory, in endpoints and channels."""
+ROBOT: Final = "{robot}"
+"""Placeholder of the robot's name, in `bus.security.keys`."""
+_UNIX: Final = re.compile(r"unixsock-stream/.+")
+_ADDRESS: Final = re.compile(
+    r"(?:tcp|tls)/(\[[0-9A-Za-z:.%_-]+\]|[^\[\]:/]+):([0-9]{1,5})(?:[?#].*)?"
+)
+_PLACEHOLDER: Final = re.compile(r"\{[^{}]*\}")
+_BRACES: Final = re.compile(r"\{[^{}]*\}?|\}")
+
+
+def host_and_port(endpoint: str) -> tuple[str, int]:
+    """Return the host and the port of tcp/HOST:PORT, tls/[HOST]:PORT and the like.
+
+    Raises:
+        BusError: it is none, or has no port that there can be.
+    """
+    found = _ADDRESS.fullmatch(endpoint)
+    if found is None or not 0 < int(found[2]) <= PORT_MAX:
+        raise BusError(
+            f"{endpoint}: no host and port; tcp/HOST:PORT is right, a port from 1 to {PORT_MAX}"
+        )
+    return found[1].strip("[]"), int(found[2])
+
+
+def is_endpoint(text: str) -> bool:
+    """Return True for unixsock-stream/PATH, and for tcp/HOST:PORT and tls/HOST:PORT."""
+    if _UNIX.fullmatch(text):
+        return True
+    try:
+        host_and_port(text)
+    except BusError:
+        return False
+    return True
+
+
+def filled(text: str, values: Mapping[str, str]) -> str:
+    """Return a text with its placeholders filled in, as `{"{run}": "/tmp/x"}` says, all at once."""
+    return _PLACEHOLDER.sub(lambda found: values.get(found[0], found[0]), text)
+
+
+def stray_braces(text: str, placeholders: Iterable[str]) -> str:
+    """Return what stands in braces and is no placeholder, such as `{Run}`; "" if nothing does."""
+    found = _BRACES.search(filled(text, dict.fromkeys(placeholders, "")))
+    return found[0] if found else ""
