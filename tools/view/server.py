@@ -29,6 +29,8 @@ MESSAGE_MAX: Final = 4096
 CLIENTS_MAX: Final = 8
 ORDERS_MAX: Final = 64
 """Orders of a page that wait; a hand is moved 60 times a second."""
+CLOSE_S: Final = 1.0
+"""Longest wait for a page to take what is left and to close."""
 STOPS_MAX: Final = 4
 """Emergency stops under way at a time; each repeats itself for up to three seconds."""
 PAGE: Final = Path(__file__).parent / "page"
@@ -73,7 +75,7 @@ class ViewServer:
         self._model = msgspec.json.encode({"model": source.model()}).decode()
         self._files = _files()
         self._clients = 0
-        self._sockets: set[web.WebSocketResponse] = set()
+        self._sockets: dict[web.WebSocketResponse, asyncio.Transport | None] = {}
         self._lock = asyncio.Lock()
         self._stopper = ThreadPoolExecutor(STOPS_MAX, "stop")
         """An emergency stop waits for no other order."""
@@ -105,8 +107,7 @@ class ViewServer:
         try:
             yield
         finally:
-            for socket in set(self._sockets):
-                await socket.close()
+            await asyncio.gather(*(_end(*page) for page in self._sockets.items()))
             await runner.cleanup()
             self._stopper.shutdown(wait=False)
 
@@ -141,7 +142,7 @@ class ViewServer:
         socket = web.WebSocketResponse(max_msg_size=MESSAGE_MAX, heartbeat=20.0)
         await socket.prepare(request)
         self._clients += 1
-        self._sockets.add(socket)
+        self._sockets[socket] = request.transport
         try:
             async with self._lock:
                 await asyncio.to_thread(self._source.connect)
@@ -160,7 +161,7 @@ class ViewServer:
                 await socket.send_json({"error": str(error)})
         finally:
             self._clients -= 1
-            self._sockets.discard(socket)
+            del self._sockets[socket]
             async with self._lock:
                 if not self._clients:
                     await asyncio.to_thread(self._source.disconnect)
@@ -227,6 +228,16 @@ class ViewServer:
         loop = asyncio.get_running_loop()
         why = await loop.run_in_executor(self._stopper, self._source.carry_out, order)
         await _told(socket, why)
+
+
+async def _end(socket: web.WebSocketResponse, transport: asyncio.Transport | None) -> None:
+    """Close a page's connection; one whose page does not read is cut."""
+    try:
+        async with asyncio.timeout(CLOSE_S):
+            await socket.close()
+    except TimeoutError:
+        if transport is not None:
+            transport.abort()
 
 
 async def _told(socket: web.WebSocketResponse, why: str) -> None:

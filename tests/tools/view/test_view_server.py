@@ -325,3 +325,33 @@ def test_a_port_in_use_is_told(robot: RobotConfig) -> None:
         other.listen()
         with pytest.raises(FleetError, match="give another --port"):
             with_server(robot, work, other.getsockname()[1])
+
+
+class Wordy(Recorded):
+    """A source whose frames are longer than all buffers on their way."""
+
+    def frame(self, t_s: float) -> Frame | None:
+        return msgspec.structs.replace(frame_at(t_s), ways_out=("x" * 20_000_000,) * 6)
+
+
+def test_a_page_that_reads_nothing_does_not_hold_up_the_end(robot: RobotConfig) -> None:
+    async def main() -> None:
+        server = ViewServer(Wordy(robot), 0, TOKEN)
+        running = server.running()
+        await running.__aenter__()
+        origin = "/".join(server.address.split("/")[:3])
+        host = origin.removeprefix("http://")
+        _, writer = await asyncio.open_connection(*host.split(":"), limit=1)
+        writer.write(
+            f"GET /{TOKEN}/ws HTTP/1.1\r\nHost: {host}\r\nOrigin: {origin}\r\n"
+            "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+        )
+        async with asyncio.timeout(20.0):
+            while not any(page.prepared for page in server._sockets):
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(0.5)  # a frame is on its way
+            await running.__aexit__(None, None, None)
+        writer.close()
+
+    asyncio.run(main())
