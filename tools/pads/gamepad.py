@@ -201,6 +201,16 @@ class Gamepad:
 def open_pad(path: str | None) -> PadDevice:
     """Return a pad: of several, the first one with a known mapping.
 
+    Raises:
+        FleetError: there is none, a mapping for one cannot be used, or evdev is not installed.
+    """
+    found = open_pads(path)
+    return next((pad for pad in found if _mapping_or_none(pad) is not None), found[0])
+
+
+def open_pads(path: str | None) -> list[PadDevice]:
+    """Return the pads that are there, one at least, known or not.
+
     Args:
         path: such as /dev/input/event7; None: any.
 
@@ -226,7 +236,7 @@ def open_pad(path: str | None) -> PadDevice:
         raise FleetError(
             f"no gamepad: {where}; join group `input`, name it with --pad, or use --keys"
         )
-    return next((pad for pad in found if _mapping_or_none(pad) is not None), found[0])
+    return found
 
 
 def mapping_of(device: PadDevice) -> PadMapping:

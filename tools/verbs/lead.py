@@ -29,7 +29,7 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
 from tools.pads.calibration import calibrate, keep
 from tools.pads.controls import BUTTONS
-from tools.pads.gamepad import Gamepad, mapping_of, open_pad
+from tools.pads.gamepad import Gamepad, mapping_of, open_pad, open_pads
 from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
 from tools.verb_table import Subparsers, add_run_dir, add_verb
@@ -129,7 +129,8 @@ def _opened(args: argparse.Namespace) -> Gamepad:
 def _calibrate(args: argparse.Namespace) -> int:
     if args.keys:
         raise FleetError("--calibrate --keys: keys need no calibration; one of the two is right")
-    device = open_pad(args.pad)
+    device = open_pads(args.pad)[0]
+    print(f"{device.name}; another one: --pad DEVICE")
     mapping = calibrate(device, print)
     print(f"{device.name}: kept in {keep(device, mapping)}; `xrl lead` uses it from now on")
     return 0

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 from rich.text import Text
 
 from shared.exceptions import FleetError
+from tests.tools.exit_codes import exit_code
 from tests.tools.pads.fake_pad import PADS, FakePad
+from tools.pads import gamepad
 from tools.pads.controls import EV_KEY
 from tools.pads.gamepad import Gamepad
 from tools.pads.layouts import known_mapping
 from tools.pads.pilot import Deflection
+from tools.pads.sdl_mapping import guid_of
 from tools.verbs import lead
 
 XBOX = PADS["Xbox 360 by cable"]
@@ -90,3 +95,20 @@ def test_once_rest_is_known_it_leads_until_the_pad_is_lost(device: FakePad) -> N
     assert pad.gone
     assert leader.led
     assert all(wanted.height == pytest.approx(1.0) for wanted in leader.led)
+
+
+def test_a_pad_whose_kept_mapping_is_broken_can_be_calibrated(
+    device: FakePad, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    file = tmp_path / ".config/xrl/gamepads.txt"
+    file.parent.mkdir(parents=True)
+    file.write_text(f"{guid_of(device)},a pad,lefty:b99,\n")
+    fake = SimpleNamespace(list_devices=lambda: ["0"], InputDevice=lambda _: device)
+    monkeypatch.setattr(gamepad, "evdev", fake)
+    mapping = known_mapping(device)
+    assert mapping is not None
+    monkeypatch.setattr(lead, "calibrate", lambda *_: mapping)
+    assert exit_code(["lead", "--calibrate"]) == 0
+    assert gamepad.mapping_of(device) == mapping
+    assert len(file.read_text().splitlines()) == 1
