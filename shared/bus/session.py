@@ -449,8 +449,10 @@ def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
 
 
 def _endpoint(text: str, run_dir: Path) -> str:
-    """Return an endpoint with `{run}` filled in; a path too long for a UNIX socket is refused."""
+    """Return an endpoint with `{run}` filled in; one that there cannot be is refused."""
     endpoint = expand(text, run_dir)
+    if endpoint.startswith(security.TCP):
+        host_and_port(endpoint)
     length = len(os.fsencode(endpoint.removeprefix(security.UNIX)))
     if endpoint.startswith(security.UNIX) and length > SOCKET_PATH_MAX:
         raise BusError(
