@@ -26,10 +26,16 @@ def tls_endpoints(host: str = "127.0.0.1") -> dict[str, str]:
 
 
 def certified(
-    robot: RobotConfig, folder: Path, endpoints: Mapping[str, str] | None = None
+    robot: RobotConfig,
+    folder: Path,
+    endpoints: Mapping[str, str] | None = None,
+    allow: tuple[str, ...] = (),
 ) -> tuple[RobotConfig, Authority]:
-    """Return the robot under `mtls`, all of its keys installed in `folder`/keys."""
-    security = BusSecurityConfig(mode="mtls", keys=str(folder / "keys"))
+    """Return the robot under `mtls`, all of its keys installed in `folder`/keys.
+
+    Its services then take each other to be of this host, and listen at ports only with `allow`.
+    """
+    security = BusSecurityConfig(mode="mtls", keys=str(folder / "keys"), allow=allow)
     bus = msgspec.structs.replace(
         robot.bus, endpoints=dict(endpoints or tls_endpoints()), security=security
     )

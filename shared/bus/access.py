@@ -1,13 +1,14 @@
 """Access rules of the bus under `mtls`: who may put and receive which key (docs/security.md).
 
 Each process checks what its peers send by the name in their certificate: service and generation.
+A peer of this host, by a UNIX socket, may do what any of the keys here allows: its user reads them.
 The rules follow from the topics' columns `writers` and `readers`; what no rule allows is denied.
 Zenoh has no list of revoked certificates: the rules name the current generation of each name only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Final
 
 from shared.bus import topics
@@ -16,6 +17,7 @@ from shared.config.robot_config import SERVICES
 PRINCIPALS: Final = (*SERVICES, topics.OPERATOR, topics.VIEWER)
 """Every name that a certificate can have under `mtls`; the network proxy is no part of it."""
 
+_THIS_HOST: Final = "this-host"
 _RECEIVED: Final = ("declare_subscriber",)
 _TOKENS: Final = ("liveliness_token",)
 _QUERIES: Final = ("liveliness_query", "declare_liveliness_subscriber")
@@ -44,13 +46,16 @@ def token_key(robot: str, name: str, place: str = "") -> str:
     return f"{tools_prefix(robot)}/{name}{place and f'.{place}'}"
 
 
-def access_control(robot: str, own: str, generations: Mapping[str, int]) -> dict[str, Any]:
+def access_control(
+    robot: str, own: str, generations: Mapping[str, int], held: Collection[str] = ()
+) -> dict[str, Any]:
     """Return Zenoh's setting `access_control` of one process.
 
     Args:
         robot: its name.
         own: the process, one of `PRINCIPALS`.
         generations: the current generation of each certified name.
+        held: names whose keys this host holds, which its UNIX sockets serve.
     """
     shown = (f"{alive_prefix(robot)}/*", f"{tools_prefix(robot)}/*")
     rules = [
@@ -60,7 +65,8 @@ def access_control(robot: str, own: str, generations: Mapping[str, int]) -> dict
         _rule("be-looked-at", "ingress", _QUERIES, shown),
     ]
     everybody = [rule["id"] for rule in rules if rule is not None]
-    subjects, policies = [], []
+    subjects: list[dict[str, Any]] = []
+    policies, here = [], set(everybody)
     for name, generation in generations.items():
         own_rules = [
             # By receiver: until a new peer has told its subscriptions, Zenoh sends it everything.
@@ -73,6 +79,10 @@ def access_control(robot: str, own: str, generations: Mapping[str, int]) -> dict
         subjects.append({"id": name, "cert_common_names": [common_name(name, generation)]})
         own_ids = [rule["id"] for rule in own_rules if rule is not None]
         policies.append({"rules": [*everybody, *own_ids], "subjects": [name]})
+        here.update(own_ids if name in held else ())
+    if held:
+        subjects.append({"id": _THIS_HOST, "link_protocols": ["unixsock-stream"]})
+        policies.append({"rules": sorted(here), "subjects": [_THIS_HOST]})
     return {
         "enabled": True,
         "default_permission": "deny",

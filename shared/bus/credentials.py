@@ -86,6 +86,15 @@ def read_names(folder: Path) -> Names:
     return names
 
 
+def held_names(folder: Path) -> frozenset[str]:
+    """Return the current names whose private keys a folder holds.
+
+    Raises:
+        BusError: as `read_names`.
+    """
+    return frozenset(n for n in read_names(folder).generations if key_file(folder, n).exists())
+
+
 def read_credentials(robot: RobotConfig, process: str) -> Credentials:
     """Return what a process of this host proves itself with.
 

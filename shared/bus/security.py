@@ -8,7 +8,7 @@ from typing import Any, Final
 from shared import log
 from shared.bus import allow_list
 from shared.bus.access import access_control
-from shared.bus.credentials import read_credentials
+from shared.bus.credentials import held_names, read_credentials
 from shared.config.endpoints import host_and_port
 from shared.config.robot_config import ENDPOINTS_OF_MODE, RobotConfig
 from shared.exceptions import BusError
@@ -36,8 +36,9 @@ def settings(robot: RobotConfig, process: str, endpoints: Sequence[str]) -> dict
         BusError: an endpoint is none of the mode's, or a key is missing.
     """
     mode = robot.bus.security.mode
+    right_ones = ENDPOINTS_OF_MODE[mode] + ((UNIX,) if mode == "mtls" else ())
     for endpoint in endpoints:
-        if not endpoint.startswith(ENDPOINTS_OF_MODE[mode]):
+        if not endpoint.startswith(right_ones):
             right = " or ".join(f"{start}..." for start in ENDPOINTS_OF_MODE[mode])
             raise BusError(f"{endpoint}: not under bus.security.mode = {mode!r}; {right} is right")
     found: dict[str, object] = {
@@ -67,10 +68,12 @@ def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
     Raises:
         BusError: the kernel takes no filter.
     """
-    if robot.bus.security.mode != "mtls" or not listening:
+    if robot.bus.security.mode != "mtls":
         return
     hosts = {host_and_port(endpoint)[0] for endpoint in robot.bus.endpoints.values()}
-    ports = {host_and_port(endpoint)[1] for endpoint in listening}
+    ports = {host_and_port(each)[1] for each in listening if each.startswith(TCP)}
+    if not ports:
+        return
     addresses, unknown = allow_list.resolved([*hosts, *robot.bus.security.allow])
     for name in unknown:
         log.get("xrl").warning("%s: no such host now; what comes from it is dropped", name)
@@ -81,7 +84,7 @@ def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
     own = read_credentials(robot, process)
     certificate, key = str(own.certificate), str(own.key)
     return {
-        "transport/link/protocols": ["tls"],
+        "transport/link/protocols": ["tls", "unixsock-stream"],
         "transport/link/tls": {
             "root_ca_certificate": str(own.authority),
             "listen_certificate": certificate,
@@ -93,5 +96,7 @@ def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
             # An expiry must not cut a robot that stands; `xrl doctor` warns before.
             "close_link_on_expiration": False,
         },
-        "access_control": access_control(robot.name, own.name, own.generations),
+        "access_control": access_control(
+            robot.name, own.name, own.generations, held_names(own.authority.parent)
+        ),
     }

@@ -24,7 +24,7 @@ from typing import Final, Generic, Self, TypeAlias, TypeVar
 
 import zenoh
 
-from shared.bus import security, socket_linger
+from shared.bus import same_host, security, socket_linger
 from shared.bus.access import alive_prefix, token_key, tools_prefix
 from shared.bus.codec import Decoder, encode
 from shared.bus.links import PAIRS, Pair, endpoint_through
@@ -389,11 +389,12 @@ def open_session(
     keep_pace(run_dir)
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
         raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
-    own = [config.bus.endpoints[name]] if name in SERVICES else []
+    here = same_host.services_here(config)
+    own = same_host.listening(config, name, here) if name in SERVICES else ()
     peers = [
         endpoint_through(Pair(name, peer))
         if injected and Pair(name, peer) in PAIRS
-        else config.bus.endpoints[peer]
+        else same_host.endpoint_here(config, peer, here)
         for peer in peers_of(name, config.services)
         if only is None or peer in only
     ]

@@ -7,6 +7,7 @@ import fnmatch
 import json
 import os
 import shutil
+import socket
 import stat
 import tempfile
 import time
@@ -21,6 +22,7 @@ import zenoh
 from shared.bus import credentials, topics
 from shared.bus.access import PRINCIPALS, access_control, token_key
 from shared.bus.messages import Estop
+from shared.bus.same_host import services_here
 from shared.bus.session import open_session
 from shared.bus.topics import all_keys
 from shared.config import files as config_file
@@ -36,6 +38,8 @@ from tools.keys.certificates import Issued
 
 ROBOT = config_file.load(DEFAULT_CONFIG)
 TRIES_S = 8.0
+LOOPBACK = ("127.0.0.1",)
+LEG = ("ankle_left", "knee_left", "hip_left")
 
 PUTS = {
     "planner": ["joint/*/command", "planner/status", "planner/checkpoint"],
@@ -74,7 +78,7 @@ class Bus:
     def __init__(self, folder: Path) -> None:
         fitted = msgspec.structs.replace(ROBOT, imu=msgspec.structs.replace(ROBOT.imu, fitted=True))
         self.folder = folder
-        self.robot, self.authority = certified(fitted, folder)
+        self.robot, self.authority = certified(fitted, folder, allow=LOOPBACK)
         self.keys = folder / "keys"
 
     def endpoint(self, service: str) -> str:
@@ -259,7 +263,7 @@ def test_without_a_valid_certificate_there_is_no_link(
 
 
 def test_a_revoked_certificate_links_and_is_not_heard(bus: Bus, tmp_path: Path) -> None:
-    robot, authority = certified(bus.robot, tmp_path, bus.robot.bus.endpoints)
+    robot, authority = certified(bus.robot, tmp_path, bus.robot.bus.endpoints, LOOPBACK)
     old = tmp_path / "old"
     shutil.copytree(tmp_path / "keys", old)
     authority.revoke(robot, ["planner"], days=10)
@@ -289,7 +293,7 @@ def test_a_revoked_certificate_links_and_is_not_heard(bus: Bus, tmp_path: Path) 
 
 def test_a_service_is_dialled_only_where_its_certificate_says(bus: Bus, tmp_path: Path) -> None:
     """A peer with another host's certificate, at the planner's place, is not believed."""
-    robot, authority = certified(bus.robot, tmp_path, bus.robot.bus.endpoints)
+    robot, authority = certified(bus.robot, tmp_path, bus.robot.bus.endpoints, LOOPBACK)
     signer = signer_of(authority)
     now = dt.datetime.now(dt.UTC)
     elsewhere = certificates.issue(signer, "knee_left.1", ("10.9.9.9",), now, 10)
@@ -297,10 +301,11 @@ def test_a_service_is_dialled_only_where_its_certificate_says(bus: Bus, tmp_path
     shutil.copytree(tmp_path / "keys", other)
     (other / "knee_left.pem").write_bytes(elsewhere.certificate)
     (other / "knee_left.key").write_bytes(elsewhere.key)
+    install_all(authority, tmp_path / "body", "planner")
     with (
         open_session(_with_keys(robot, other), "knee_left", tmp_path),
         open_session(robot, "knee_right", tmp_path),
-        open_session(robot, "planner", tmp_path) as planner,
+        open_session(_with_keys(robot, tmp_path / "body"), "planner", tmp_path) as planner,
     ):
         assert waits_for(lambda: "knee_right" in planner.alive())
         time.sleep(0.5)
@@ -340,6 +345,67 @@ def test_a_viewer_cannot_stop_the_robot_and_an_operator_can(bus: Bus, tmp_path: 
         for _ in range(5):
             is_heard()
         assert heard == {"operator"}
+
+
+def alone(robot: RobotConfig, folder: Path) -> tuple[RobotConfig, Authority]:
+    """Return the robot with all of its services on this host, and no laptop allowed."""
+    robot, authority = certified(robot, folder, robot.bus.endpoints)
+    assert not robot.bus.security.allow
+    return robot, authority
+
+
+def listens(endpoint: str) -> bool:
+    host, port = endpoint.removeprefix("tls/").split(":")
+    with socket.socket() as probe:
+        return probe.connect_ex((host, int(port))) == 0
+
+
+def test_services_of_one_host_are_linked_without_a_port(bus: Bus, tmp_path: Path) -> None:
+    robot, _ = alone(bus.robot, tmp_path)
+    with (
+        open_session(robot, "knee_left", bus.folder),
+        open_session(robot, "planner", bus.folder) as planner,
+        open_session(robot, "status", bus.folder) as tool,
+    ):
+        assert waits_for(lambda: planner.alive() == {"planner", "knee_left"})
+        assert waits_for(lambda: tool.alive() == {"planner", "knee_left"})
+        assert not any(listens(robot.bus.endpoints[name]) for name in ("planner", "knee_left"))
+
+
+def test_a_service_listens_at_its_port_where_another_host_may_link_to_it(
+    bus: Bus, tmp_path: Path
+) -> None:
+    robot, authority = alone(bus.robot, tmp_path)
+    install_all(authority, tmp_path / "leg", *LEG)
+    leg = _with_keys(robot, tmp_path / "leg")
+    assert services_here(leg) == set(LEG)
+    elsewhere = robot.bus.endpoints | {"planner": "tls/192.0.2.1:7447"}
+    far = msgspec.structs.replace(robot.bus, endpoints=elsewhere)
+    assert services_here(msgspec.structs.replace(robot, bus=far)) == {*robot.services} - {"planner"}
+    with open_session(leg, "knee_left", bus.folder):
+        assert listens(robot.bus.endpoints["knee_left"])
+
+
+@pytest.mark.parametrize(("key", "heard"), [("viewer", False), ("operator", True)])
+def test_a_tool_by_socket_may_do_what_the_keys_of_its_host_allow(
+    bus: Bus, tmp_path: Path, key: str, heard: bool
+) -> None:
+    robot, authority = alone(bus.robot, tmp_path)
+    install_all(authority, tmp_path / key, *LEG, key)
+    leg = _with_keys(robot, tmp_path / key)
+    with (
+        open_session(leg, "knee_left", bus.folder) as knee,
+        open_session(leg, "estop", bus.folder) as tool,
+    ):
+        stops = knee.latest(topics.ESTOP, Estop)
+        call = tool.publisher(topics.ESTOP, Estop)
+
+        def stopped() -> bool:
+            call.put(Estop(t_ns=1, seq=1, source="tool"))
+            return stops.take() is not None
+
+        assert waits_for(lambda: "knee_left" in tool.alive())
+        assert waits_for(stopped, TRIES_S if heard else 0.5) is heard
 
 
 def _with_keys(robot: RobotConfig, folder: Path) -> RobotConfig:

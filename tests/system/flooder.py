@@ -8,13 +8,16 @@ certificate CONFIG's keys have.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
 import random
 import socket
+import ssl
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +34,9 @@ PER_S: Final = 10_000
 HELD: Final = 500
 STRANGER: Final = "127.0.0.66"
 """Address of somebody without a key, where the fleet is at 127.0.0.1."""
+CONNECTS_PER_S: Final = 640
+CONNECTS_MAX: Final = 60_000
+"""Of one flood; it then ends by itself."""
 LARGE: Final = 200_000_000
 VICTIMS: Final = ("planner", *MODULES, "recorder")
 
@@ -115,7 +121,7 @@ def large(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
         yield
 
 
-def connect(endpoint: str) -> socket.socket:
+def connect(endpoint: str, source: str = STRANGER) -> socket.socket:
     """Open a bare connection to an endpoint of the bus."""
     kind, _, rest = endpoint.partition("/")
     if kind == "unixsock-stream":
@@ -124,7 +130,7 @@ def connect(endpoint: str) -> socket.socket:
         one.connect(rest)
         return one
     host, _, port = rest.rpartition(":")
-    return socket.create_connection((host, int(port)), timeout=0.2, source_address=(STRANGER, 0))
+    return socket.create_connection((host, int(port)), timeout=0.2, source_address=(source, 0))
 
 
 def held(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
@@ -156,8 +162,45 @@ def noise(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
         yield
 
 
+def rubbish(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
+    """As somebody at an allowed address: connect, say nonsense, and leave."""
+    yield from _from_allowed(robot, random.randbytes(500), held_max=0)
+
+
+def half(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
+    """As somebody at an allowed address: begin a right handshake, and say nothing more."""
+    told = ssl.MemoryBIO()
+    hello = ssl.create_default_context().wrap_bio(ssl.MemoryBIO(), told, server_hostname="x")
+    try:
+        hello.do_handshake()
+    except ssl.SSLWantReadError:
+        yield from _from_allowed(robot, told.read(), held_max=HELD)
+
+
+def _from_allowed(robot: RobotConfig, said: bytes, held_max: int) -> Iterator[None]:
+    """Open `CONNECTS_PER_S` connections from the address that the fleet itself has."""
+    victims = [robot.bus.endpoints[name] for name in VICTIMS]
+    kept: deque[socket.socket] = deque()
+    due = time.monotonic()
+    for number in range(CONNECTS_MAX):
+        address = victims[number % len(victims)].partition("/")[2].rpartition(":")
+        one = socket.socket()
+        one.setblocking(False)
+        one.connect_ex((address[0], int(address[2])))
+        kept.append(one)
+        if len(kept) > 20 + held_max:
+            kept.popleft().close()
+        if len(kept) > 10:
+            with contextlib.suppress(OSError):  # refused: nothing listens there
+                kept[-10].send(said)
+        due = max(due + 1 / CONNECTS_PER_S, time.monotonic() - 0.1)
+        time.sleep(max(0.0, due - time.monotonic()))
+        yield
+
+
 KINDS: Final = {
-    "messages": messages, "garbage": garbage, "large": large, "held": held, "noise": noise
+    "messages": messages, "garbage": garbage, "large": large, "held": held, "noise": noise,
+    "rubbish": rubbish, "half": half,
 }  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 
+from shared.bus import same_host
 from shared.bus.links import PAIRS, endpoint_through
 from shared.bus.topics import TOPICS
 from shared.config.endpoints import RUN, filled, host_and_port, stray_braces
@@ -261,10 +262,13 @@ def listeners_of(
 ) -> tuple[ListenPoint, ...]:
     """Return where these services will listen: on the bus, and the emulated drives' buses."""
     listeners = []
+    here = same_host.services_here(config)
     for row in processes:
         if row.name in config.bus.endpoints:
-            endpoint = expand(config.bus.endpoints[row.name], run_dir)
-            listeners.append(ListenPoint(row.name, f"bus.endpoints.{row.name}", endpoint))
+            listeners += [
+                ListenPoint(row.name, f"bus.endpoints.{row.name}", expand(endpoint, run_dir))
+                for endpoint in same_host.listening(config, row.name, here)
+            ]
         if row.kind == "network_proxy":
             endpoints = [expand(endpoint_through(pair), run_dir) for pair in PAIRS]
             endpoints.append(f"{UNIX}{run_dir / SOCKET}")
@@ -284,11 +288,9 @@ def check_run_dir(run_dir: Path, config: RobotConfig) -> None:
     Raises:
         FleetError: naming the longest socket path.
     """
-    paths = [
-        expand(endpoint.removeprefix(UNIX), run_dir)
-        for endpoint in config.bus.endpoints.values()
-        if endpoint.startswith(UNIX)
-    ]
+    here = same_host.services_here(config)
+    endpoints = [same_host.endpoint_here(config, name, here) for name in config.bus.endpoints]
+    paths = [expand(at.removeprefix(UNIX), run_dir) for at in endpoints if at.startswith(UNIX)]
     paths += [
         expand(bus.channel, run_dir)
         for bus in config.can.values()

@@ -373,8 +373,10 @@ class SupervisedFleet:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _wait_until_up(self, plan: process_table.FleetPlan, timeout_s: float) -> None:
-        endpoints = {
-            item.service: item.endpoint for item in plan.listeners if item.key.startswith("bus.")
+        endpoints = {  # of a service that listens twice the first: its socket
+            item.service: item.endpoint
+            for item in reversed(plan.listeners)
+            if item.key.startswith("bus.")
         }
         waiting = {row.name: row for row in plan.processes if row.autostart}
         watched = tuple(waiting)
