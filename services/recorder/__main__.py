@@ -24,11 +24,14 @@ from typing import Final
 
 from services.recorder.auto_recover import AutoRecovery
 from services.recorder.disk_guard import MIB
+from services.recorder.flood_watch import FloodWatch
 from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
 from services.recorder.roster import Roster
 from services.recorder.snapshot import SnapshotRing
 from shared import log, scheduling
 from shared.bus import topics
+from shared.bus.arrivals import Arrivals
+from shared.bus.same_host import ports_here
 from shared.bus.session import open_session
 from shared.clock import keep_pace, now_ns, pace
 from shared.config.files import load
@@ -100,7 +103,8 @@ def main() -> int:
                 logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
                 auto_recovery.start()
                 roster = None if arguments.of else Roster(session)
-                _record(recording, stop, asked, roster)
+                floods = FloodWatch(Arrivals(ports_here(config)), logger, now_ns())
+                _record(recording, stop, asked, roster, floods)
         except RunError as error:
             logger.error("%s", error)
             return 1
@@ -124,7 +128,11 @@ def _recorded(robot: str, of: tuple[str, ...] | None) -> dict[str, topics.Topic]
 
 
 def _record(
-    recording: Recorder, stop: StopFlag, asked: SnapshotRequest, roster: Roster | None
+    recording: Recorder,
+    stop: StopFlag,
+    asked: SnapshotRequest,
+    roster: Roster | None,
+    floods: FloodWatch,
 ) -> None:
     """Record until `stop`, then the queued rest.
 
@@ -138,6 +146,7 @@ def _record(
         if roster is not None:
             roster.put_if_due(now)
         recording.cycle(now)
+        floods.look_if_due(now)
         time.sleep(DRAIN_PERIOD_S)
     recording.close()
     time.sleep(LAST_WORDS_S)

@@ -13,6 +13,7 @@ from typing import Final
 
 from shared.bus import credentials
 from shared.bus.allow_list import resolved
+from shared.bus.security import TCP
 from shared.config.endpoints import host_and_port
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError
@@ -65,6 +66,13 @@ def listening(robot: RobotConfig, service: str, here: frozenset[str]) -> tuple[s
     # The simulator runs where the fleet starts it; a real robot's hosts have no key of it.
     others = set(robot.services) - here - {"simulator"}
     return (own, public) if own != public and (others or robot.bus.security.allow) else (own,)
+
+
+def ports_here(robot: RobotConfig) -> frozenset[int]:
+    """Return the ports at which this host's services listen under `mtls`."""
+    here = services_here(robot)
+    endpoints = [endpoint for service in here for endpoint in listening(robot, service, here)]
+    return frozenset(host_and_port(each)[1] for each in endpoints if each.startswith(TCP))
 
 
 def _is_own(endpoint: str) -> bool:

@@ -20,6 +20,8 @@ MESSAGE_MAX: Final = 1 << 20
 """Largest message that is put together from its fragments, bytes."""
 PAYLOAD_MAX: Final = 1 << 16
 """Largest payload that is let in, bytes; the largest of the topics is a third of it."""
+HANDSHAKE_MS: Final = 2_000
+"""Longest TLS handshake that a listener waits for; Zenoh's own limit is 10 s."""
 SESSIONS_MAX: Final = 128
 """Peers at a time, of all names together: viewers that hang are not to shut a planner out."""
 
@@ -78,6 +80,12 @@ def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
     for name in unknown:
         log.get("xrl").warning("%s: no such host now; what comes from it is dropped", name)
     allow_list.restrict(ports, addresses)
+
+
+def listener(endpoint: str) -> str:
+    """Return an endpoint to listen on as Zenoh takes it: a silent handshake is dropped soon."""
+    of_tls = endpoint.startswith("tls/")
+    return f"{endpoint}#tls_handshake_timeout_ms={HANDSHAKE_MS}" if of_tls else endpoint
 
 
 def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
