@@ -17,18 +17,23 @@ import os
 import re
 import socket
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Generic, Self, TypeAlias, TypeVar
 
 import zenoh
 
-from shared.bus import same_host, security, socket_linger
+from shared import log
+from shared.bus import same_host, security, socket_linger, tls_probe
 from shared.bus.access import alive_prefix, token_key, tools_prefix
+from shared.bus.allow_list import resolved
 from shared.bus.codec import Decoder, encode
+from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.links import PAIRS, Pair, endpoint_through
 from shared.bus.messages import Message
+from shared.bus.socket_linger import Address
+from shared.bus.tls_probe import LinkWatch
 from shared.bus.topics import Priority, Topic
 from shared.clock import keep_pace, now_ns
 from shared.config.endpoints import host_and_port
@@ -229,8 +234,10 @@ class Session:
         self._session = session
         self._alive_prefix = f"{alive_prefix(robot)}/"
         self._token = session.liveliness().declare_token(token_key(robot, name, place_of_tool()))
+        self._link_watch: LinkWatch | None = None
+        self._linked: set[Address] = set()
         if over_tcp:  # held, or it would end
-            self._links = session.info.declare_link_events_listener(_meet_link, history=True)
+            self._links = session.info.declare_link_events_listener(self._meet, history=True)
 
     def __enter__(self) -> Self:
         """Return the session itself."""
@@ -250,6 +257,8 @@ class Session:
 
         Takes up to one lease if a peer is stopped; never raises.
         """
+        if self._link_watch is not None:
+            self._link_watch.end()
         with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
 
@@ -343,6 +352,32 @@ class Session:
             )
         )
 
+    def watch_links(self, own: Credentials, dialled: Mapping[str, str]) -> None:
+        """Log from now on why TLS links to these peers do not come (`shared.bus.tls_probe`).
+
+        Args:
+            own: with which they are dialled.
+            dialled: endpoint of each peer.
+        """
+        if dialled:
+            self._link_watch = LinkWatch(own, dialled, self.is_linked)
+
+    def is_linked(self, endpoint: str) -> bool:
+        """Return True if there is a link with tls/HOST:PORT."""
+        host, port = host_and_port(endpoint)
+        addresses, _ = resolved([host])
+        return any((str(address), port) in self._linked for address in addresses)
+
+    def _meet(self, event: zenoh.LinkEvent) -> None:
+        if not event.link.src.startswith(security.TCP):
+            return
+        there = host_and_port(event.link.dst)
+        if event.kind == zenoh.SampleKind.PUT:
+            self._linked.add(there)
+            _close_at_once(event.link)
+        else:
+            self._linked.discard(there)
+
     def _key(self, topic: Topic, message_type: type[Message], module: str) -> str:
         if message_type is not topic.type:
             right = topic.type.__name__
@@ -391,15 +426,15 @@ def open_session(
         raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
     here = same_host.services_here(config)
     own = same_host.listening(config, name, here) if name in SERVICES else ()
-    peers = [
+    peers = [peer for peer in peers_of(name, config.services) if only is None or peer in only]
+    endpoints = [
         endpoint_through(Pair(name, peer))
         if injected and Pair(name, peer) in PAIRS
         else same_host.endpoint_here(config, peer, here)
-        for peer in peers_of(name, config.services)
-        if only is None or peer in only
+        for peer in peers
     ]
     listening = [_endpoint(text, run_dir) for text in (*own, *listen)]
-    dialling = [_endpoint(text, run_dir) for text in (*peers, *connect)]
+    dialling = [_endpoint(text, run_dir) for text in (*endpoints, *connect)]
     settings = {
         **_SETTINGS,
         **security.settings(config, name, (*listening, *dialling)),
@@ -407,7 +442,7 @@ def open_session(
         # A stopped process takes a call but never answers; close() waits for that answer.
         "transport/unicast/open_timeout": config.bus.lease_ms,
         "transport/unicast/accept_timeout": config.bus.lease_ms,
-        "listen/endpoints": listening,
+        "listen/endpoints": [security.listener(endpoint) for endpoint in listening],
         "connect/endpoints": dialling,
     }
     os.environ.setdefault("ZENOH_RUNTIME", _ONE_RUNTIME)  # read when the first session opens
@@ -429,19 +464,32 @@ def open_session(
     except BusError:
         session.close()
         raise
+    if config.bus.security.mode == "mtls":
+        _look_after_links(session, config, name, dict(zip(peers, dialling, strict=False)))
     return session
 
 
-def _meet_link(event: zenoh.LinkEvent) -> None:
+def _look_after_links(
+    session: Session, config: RobotConfig, name: str, dialled: Mapping[str, str]
+) -> None:
+    """Log what keeps links from coming: a certificate that this host's clock does not believe."""
+    own = read_credentials(config, name)
+    fault = tls_probe.own_fault(own)
+    if fault:
+        log.get("xrl").error("no link over TLS: %s %s", own.certificate, fault)
+    if name in SERVICES:
+        over_tls = {peer: at for peer, at in dialled.items() if at.startswith(security.TCP)}
+        session.watch_links(own, over_tls)
+
+
+def _close_at_once(link: zenoh.Link) -> None:
     """Make the socket of a new TCP link close at once when the link is given up.
 
     Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut for longer
     than the lease, all links of the process stalled for up to 10 s for each lost link.
     """
-    link = event.link
-    if event.kind == zenoh.SampleKind.PUT and link.src.startswith(security.TCP):
-        ends = host_and_port(link.src), host_and_port(link.dst)
-        socket_linger.reset_on_close(*ends)
+    ends = host_and_port(link.src), host_and_port(link.dst)
+    socket_linger.reset_on_close(*ends)
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:

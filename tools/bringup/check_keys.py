@@ -36,4 +36,4 @@ def _row(row: KeyRow) -> Finding:
     if row.warning:
         why = "then no new link: those that stand stay"
         return warning(SUBJECT, what, row.warning, wanted, "`xrl keys renew`", why)
-    return ok(SUBJECT, what, f"until {row.expires}", wanted)
+    return ok(SUBJECT, what, f"from {row.begins} until {row.expires}", wanted)

@@ -30,6 +30,7 @@ from shared.clock import NS_PER_S, now_ns, pace
 from shared.exceptions import FleetError
 from shared.robot.joints import MODULES
 from shared.robot.remedies import reason_of, remedy_of
+from tools.fleet.bus_faults import BusFaults
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.run_dir import SPACE_LOW_MIB, free_mib_at
 from tools.fleet.supervise import SupervisedFleet
@@ -135,6 +136,8 @@ class FleetStatus(msgspec.Struct, frozen=True):
     """Tools that are linked beside this one, each as NAME.HOST.PID, as it names itself."""
     trouble: tuple[str, ...] = ()
     """What is wrong with supervision, logs and disk, a line each."""
+    bus_faults: tuple[str, ...] = ()
+    """Under `mtls`: links that TLS refuses, and who floods this host's ports, in words."""
 
 
 class RateMonitor:
@@ -214,14 +217,21 @@ def listen_for_all(monitors: Mapping[str, RateMonitor]) -> None:
     _listen(monitors, _LINKS_S, until=lambda: all(monitor.newest for monitor in monitors.values()))
 
 
-def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str) -> FleetStatus:
+def look(
+    fleet: SupervisedFleet,
+    monitors: Mapping[str, RateMonitor],
+    security: str,
+    bus: BusFaults,
+) -> FleetStatus:
     """Listen for one window and return the fleet's status.
 
     Args:
         fleet: by its supervisor.
         monitors: of `ears_of`.
         security: `bus.security.mode` of its robot file.
+        bus: what is looked at beside, of its links.
     """
+    bus.begin()
     for monitor in monitors.values():
         monitor.new_window()
     _listen(monitors, _WINDOW_S)
@@ -253,9 +263,10 @@ def look(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: 
     lead = lead_status(monitors[PLANNER].newest if PLANNER in fresh else None)
     tools = tools_of(monitors[ROSTER].newest if ROSTER in fresh else None)
     config, network = fleet.manifest.config, impairments(fleet)
+    faults = bus.told({name: row.pid for name, row in services.items() if row.pid is not None})
     return FleetStatus(
         str(fleet.run.path), config, services, modules, lead, network, pace(), security, tools,
-        trouble_of(fleet, infos),
+        trouble_of(fleet, infos), faults,
     )  # fmt: skip
 
 

@@ -6,12 +6,14 @@ it can be found without its supervisor, and a reused process id is never mistake
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from shared.bus.arrivals import established
 from shared.run_directory import FLEET_VARIABLE
 
 _POLL_S = 0.05
@@ -62,6 +64,18 @@ def fleets() -> set[str]:
         variables = _environment(int(entry.name)) if entry.name.isdecimal() else ()
         found |= {os.fsdecode(v.removeprefix(mark)) for v in variables if v.startswith(mark)}
     return found
+
+
+def connected(pid: int) -> set[tuple[str, int]]:
+    """Return the other ends of a process's TCP connections: numeric address and port."""
+    inodes = set()
+    with contextlib.suppress(OSError):  # it has just ended
+        for entry in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                found = str(entry.readlink())
+                if found.startswith("socket:["):
+                    inodes.add(int(found[8:-1]))
+    return established(inodes, Path(f"/proc/{pid}/net")) if inodes else set()
 
 
 class ProcessUse(NamedTuple):

@@ -166,6 +166,7 @@ def tables(status: FleetStatus) -> Group:
     lines: list[str | Text] = [f" {describe_lead(status.lead)}"]
     lines += [marked(" [bold yellow]way out[/], {}", text) for text in describe_ways_out(status)]
     lines += [marked(" [bold red]{}[/]", OPEN)] if status.security == "open" else []
+    lines += [marked(" [bold red]{}[/]", text) for text in status.bus_faults]
     lines += [marked(" [bold yellow]{}[/]", text) for text in describe_stop(status)]
     lines += [slow] if status.pace != 1.0 else []
     lines += [line] if status.network else []

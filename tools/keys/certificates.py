@@ -30,6 +30,7 @@ class Details(NamedTuple):
     """What a certificate says."""
 
     common_name: str
+    begins: dt.datetime
     expires: dt.datetime
     hosts: tuple[str, ...]
 
@@ -101,7 +102,8 @@ def read(certificate: bytes) -> Details:
     else:
         hosts += names.get_values_for_type(x509.DNSName)
         hosts += [str(address) for address in names.get_values_for_type(x509.IPAddress)]
-    return Details(str(name.value), found.not_valid_after_utc, tuple(hosts))
+    begins, expires = found.not_valid_before_utc, found.not_valid_after_utc
+    return Details(str(name.value), begins, expires, tuple(hosts))
 
 
 def is_signed_by(certificate: bytes, authority: bytes) -> bool:

@@ -13,7 +13,10 @@ from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError
 from tools.keys import certificates
 from tools.keys.authority import hosts_of
+from tools.keys.certificates import Details
 
+_DAY: Final = "%Y-%m-%d"
+_TIME: Final = "%Y-%m-%d %H:%M UTC"
 WARN_DAYS: Final = 60
 """An expiry within so many days is told."""
 
@@ -22,6 +25,7 @@ class KeyRow(NamedTuple):
     """What there is to say about one certificate."""
 
     name: str
+    begins: str
     expires: str
     hosts: tuple[str, ...]
     wrong: str = ""
@@ -30,7 +34,7 @@ class KeyRow(NamedTuple):
 
 
 def look(folder: Path, robot: RobotConfig) -> list[KeyRow]:
-    """Return a row for each certificate in a folder.
+    """Return a row for each certificate in a folder, the authority's own first.
 
     Raises:
         BusError: the folder holds no keys, or another robot's.
@@ -41,37 +45,52 @@ def look(folder: Path, robot: RobotConfig) -> list[KeyRow]:
         raise BusError(f"{folder}: keys of robot {names.robot!r}; {right}")
     try:
         authority = (folder / credentials.AUTHORITY).read_bytes()
-        certificates.read(authority)
+        signer = certificates.read(authority)
     except (OSError, ValueError) as error:
         raise BusError(f"{folder / credentials.AUTHORITY}: no certificate: {error}") from None
     held = [name for name in names.generations if key_file(folder, name).exists()]
     if not held:
         raise BusError(f"{folder}: holds no certificate of a process; `xrl keys pack` makes some")
-    return [_look(folder, robot, names, name, authority) for name in held]
+    own = _row(signer, *_validity(signer, "a new authority: `xrl keys make --authority DIR`"))
+    return [own, *(_look(folder, robot, names, name, authority) for name in held)]
+
+
+def _validity(found: Details, renewal: str) -> tuple[str, str]:
+    """Return what is wrong with a certificate's time by this host's clock, and a warning."""
+    now = dt.datetime.now(dt.UTC)
+    left = found.expires - now
+    if now < found.begins:
+        wrong = f"not valid before {found.begins:{_TIME}}, and this host's clock says {now:{_TIME}}"
+        return f"{wrong}: no new link; set the clock", ""
+    if left < dt.timedelta():
+        wrong = f"expired at {found.expires:{_TIME}}, and this host's clock says {now:{_TIME}}"
+        return f"{wrong}: no new link; {renewal}", ""
+    if left < dt.timedelta(days=WARN_DAYS):
+        return "", f"expires in {left.days} days; {renewal}"
+    return "", ""
+
+
+def _row(found: Details, wrong: str, warning: str) -> KeyRow:
+    begins, expires = f"{found.begins:{_DAY}}", f"{found.expires:{_DAY}}"
+    return KeyRow(found.common_name, begins, expires, found.hosts, wrong, warning)
 
 
 def _look(folder: Path, robot: RobotConfig, names: Names, name: str, authority: bytes) -> KeyRow:
-    now = dt.datetime.now(dt.UTC)
     try:
         credentials.check_private(key_file(folder, name))
         certificate = certificate_file(folder, name).read_bytes()
         found = certificates.read(certificate)
     except (OSError, ValueError, BusError) as error:
-        return KeyRow(name, "-", (), str(error))
+        return KeyRow(name, "-", "-", (), str(error))
     current = common_name(name, names.generations[name])
-    wrong, warning = "", ""
+    wrong, warning = _validity(found, f"`xrl keys renew {name}`, then pack")
     wanted = hosts_of(robot, name)
-    left = found.expires - now
     if not certificates.is_signed_by(certificate, authority):
         wrong = "signed by another authority; `xrl keys pack` anew"
     elif not certificates.is_key_of(key_file(folder, name).read_bytes(), certificate):
         wrong = "its key is another's; `xrl keys pack` anew"
     elif found.common_name != current:
         wrong = f"{found.common_name}, and {current} is let in; `xrl keys pack` anew"
-    elif left < dt.timedelta():
-        wrong = "expired: no new link; `xrl keys renew`, then pack"
-    elif name in SERVICES and not set(wanted) <= set(found.hosts):
+    elif not wrong and name in SERVICES and not set(wanted) <= set(found.hosts):
         wrong = f"not for {wanted[0]}, where the robot file has it; `xrl keys renew {name}`"
-    elif left < dt.timedelta(days=WARN_DAYS):
-        warning = f"expires in {left.days} days; `xrl keys renew {name}`, then pack"
-    return KeyRow(found.common_name, f"{found.expires:%Y-%m-%d}", found.hosts, wrong, warning)
+    return _row(found, wrong, warning)

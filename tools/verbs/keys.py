@@ -188,9 +188,9 @@ def _count(names: object) -> str:
 
 def _table(folder: Path, rows: list[KeyRow]) -> Table:
     table = Table(title=str(folder), title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("name", "expires", "dialled as", ""):
+    for heading in ("name", "from", "expires", "dialled as", ""):
         table.add_column(heading, no_wrap=heading != "")
     for row in rows:
         words = Text(row.wrong, "bold red") if row.wrong else Text(row.warning, "yellow")
-        table.add_row(row.name, row.expires, ", ".join(row.hosts) or "-", words or "ok")
+        table.add_row(row.name, row.begins, row.expires, ", ".join(row.hosts) or "-", words or "ok")
     return table

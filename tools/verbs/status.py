@@ -10,6 +10,7 @@ import msgspec
 
 from shared.bus.session import open_session
 from shared.config.files import load
+from tools.fleet.bus_faults import BusFaults
 from tools.fleet.fleet_status import (
     RateMonitor,
     ears_of,
@@ -47,10 +48,11 @@ def run(args: argparse.Namespace) -> int:
     with open_session(robot, "status", fleet.run.path) as session:
         monitors = ears_of(session, fleet.manifest.topics)
         listen_for_all(monitors)
+        bus = BusFaults(robot, session)
         if args.watch:
-            _watch(fleet, monitors, security)
+            _watch(fleet, monitors, security, bus)
         else:
-            status = look(fleet, monitors, security)
+            status = look(fleet, monitors, security, bus)
             if args.json:
                 print(msgspec.json.format(msgspec.json.encode(status)).decode())
             else:
@@ -58,7 +60,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _watch(fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str) -> None:
+def _watch(
+    fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str, bus: BusFaults
+) -> None:
     with renewed(Console()) as show:
         while True:
-            show(tables(look(fleet, monitors, security)))
+            show(tables(look(fleet, monitors, security, bus)))

@@ -11,11 +11,12 @@ from services.planner.controller_file import ATTACHED, absolute, controller_make
 from services.ros2_gateway.inbound import acceptable
 from services.ros2_gateway.rmw import domain
 from services.simulator.plant import plant_from
+from shared.bus.credentials import keys_folder
 from shared.bus.operator_key import require_operator
 from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.exceptions import FleetError, RunError
+from shared.exceptions import BusError, FleetError, RunError
 from shared.robot import gain_schedule
 from shared.robot.joints import MODULES
 from tools.fleet.fleet_status import OPEN
@@ -23,6 +24,7 @@ from tools.fleet.others import warn_of_others
 from tools.fleet.pace import add_pace
 from tools.fleet.process_table import check_known, is_simulated, load_table
 from tools.fleet.supervise import SupervisedFleet
+from tools.keys.inspection import look
 from tools.number_arguments import finite
 from tools.runs.experiment import add_controller, add_plant, make_out, scenario_file
 from tools.terminal import Console, marked
@@ -140,6 +142,8 @@ def run(args: argparse.Namespace) -> int:
     """Start the fleet and say where it is."""
     robot = config_file.load(args.config)
     gain_schedule.require(robot, args.config)
+    if robot.bus.security.mode == "mtls":
+        _check_keys(robot, must=not args.disarmed)
     services = _services(args)
     out = args.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
     if args.controller is not None:
@@ -181,6 +185,23 @@ def run(args: argparse.Namespace) -> int:
         finally:
             live.disconnect()
     return 0
+
+
+def _check_keys(robot: RobotConfig, *, must: bool) -> None:
+    """Refuse keys by which no link comes; where nobody looks on, the services start and wait.
+
+    Raises:
+        BusError: they cannot be used now, and they must.
+    """
+    folder = keys_folder(robot)
+    wrong = [f"{row.name}: {row.wrong}" for row in look(folder, robot) if row.wrong]
+    if not wrong:
+        return
+    more = f"; and {len(wrong) - 1} more, by `xrl keys check`" if len(wrong) > 1 else ""
+    words = f"{folder}: {wrong[0]}{more}"
+    if must:
+        raise BusError(words)
+    print(f"xrl: no link over TLS: {words}", file=sys.stderr)
 
 
 def _make_record_folder(out: Path, *, must: bool) -> None:

@@ -153,6 +153,7 @@ def _another_key(place: Place) -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[Place], object], int, str]] = {
+    "not valid yet": (lambda p: _issue(p, "planner.1", "127.0.0.1", 40, 10), 1, "not valid before"),
     "expired": (lambda p: _issue(p, "planner.1", "127.0.0.1", -40, 10), 1, "expired"),
     "expires soon": (lambda p: _issue(p, "planner.1", "127.0.0.1", 0, 20), 0, "expires in 19 days"),
     "an earlier generation": (lambda p: _issue(p, "planner.0", "127.0.0.1", 0, 90), 1, "planner.0"),

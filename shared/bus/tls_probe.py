@@ -1,0 +1,144 @@
+"""Why a link over TLS does not come: Zenoh tells nobody, so it is tried again beside Zenoh."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import os
+import socket
+import ssl
+import threading
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from shared import log
+from shared.bus.credentials import Credentials
+from shared.bus.security import host_and_port
+
+_CONNECT_S: Final = 1.0
+_ALERT_S: Final = 0.3
+"""A listener that does not believe our certificate says so after the handshake (RFC 8446)."""
+_EVERY_S: Final = 5.0
+
+_ALERTS: Final = {
+    "CERTIFICATE_EXPIRED": "by its clock our certificate has expired, or is not valid yet",
+    "UNKNOWN_CA": "our certificate is of an authority that it does not know",
+    "CERTIFICATE_REQUIRED": "it wants a certificate, and has got none",
+    "BAD_CERTIFICATE": "it does not believe our certificate",
+    "DECRYPT_ERROR": "our certificate is of another authority of the same name",
+    "CERTIFICATE_UNKNOWN": "it does not believe our certificate",
+}
+_VERDICTS: Final = {
+    "certificate is not yet valid": "is not valid yet",
+    "certificate has expired": "has expired",
+    "unable to get local issuer certificate": "is of another authority",
+    "self-signed certificate in certificate chain": "is of another authority",
+    "certificate signature failure": "is of another authority",
+}
+
+
+def own_fault(own: Credentials) -> str:
+    """Return what is wrong with a certificate by this host's clock and authority; else "".
+
+    A handshake in memory: no link, and no library beside Python's.
+    """
+    server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        server.load_cert_chain(own.certificate, own.key)
+        client = _client(own)
+    except OSError as error:
+        return f"cannot be read: {error}"
+    client.check_hostname = False
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ours = client.wrap_bio(back, there, server_hostname=None)
+    theirs = server.wrap_bio(there, back, server_side=True)
+    try:
+        for side in (ours, theirs, ours):
+            with contextlib.suppress(ssl.SSLWantReadError):
+                side.do_handshake()
+    except ssl.SSLCertVerificationError as error:
+        return _verdict(error)
+    except ssl.SSLError as error:
+        return f"is not believed: {error.reason}"
+    return ""
+
+
+def refusal(own: Credentials, endpoint: str) -> str:
+    """Return why a link to tls/HOST:PORT does not come, in words; empty if TLS takes it.
+
+    Takes up to 1.3 s; not for a control loop.
+    """
+    host, port = host_and_port(endpoint)
+    try:
+        with (
+            socket.create_connection((host, port), timeout=_CONNECT_S) as plain,
+            _client(own).wrap_socket(plain, server_hostname=host) as link,
+        ):
+            link.settimeout(_ALERT_S)
+            return "" if link.recv(1) else "it closes the link"
+    except ssl.SSLCertVerificationError as error:
+        return f"its certificate {_verdict(error)}"
+    except ssl.SSLError as error:
+        reason = (error.reason or "").partition("ALERT_")[2] or error.reason or str(error)
+        return _ALERTS.get(reason, f"TLS: {reason}")
+    except TimeoutError as error:
+        return "" if str(error) == "The read operation timed out" else "no answer"
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+class LinkWatch:
+    """Logs why the TLS links that a process dials do not come, in a thread of its own.
+
+    Only for processes that dial: a joint service dials nobody, and has one thread.
+    """
+
+    def __init__(
+        self,
+        own: Credentials,
+        dialled: Mapping[str, str],
+        is_linked: Callable[[str], bool],
+        every_s: float = _EVERY_S,
+    ) -> None:
+        """Begin.
+
+        Args:
+            own: with which links are tried.
+            dialled: endpoint of each peer.
+            is_linked: takes an endpoint.
+            every_s: between two looks.
+        """
+        self._own, self._dialled, self._is_linked = own, dialled, is_linked
+        self._every_s = every_s
+        self._told: dict[str, str] = {}
+        self._ended = threading.Event()
+        threading.Thread(target=self._run, daemon=True, name="link-watch").start()
+
+    def end(self) -> None:
+        """Look no more; what is being tried ends by itself."""
+        self._ended.set()
+
+    def _run(self) -> None:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # of this thread alone
+        while not self._ended.wait(self._every_s):
+            for peer, endpoint in self._dialled.items():
+                why = "" if self._is_linked(endpoint) else refusal(self._own, endpoint)
+                if why != self._told.get(peer, "") and not self._ended.is_set():
+                    self._told[peer] = why
+                    told = f"no link with {peer} at {endpoint}: {why}"
+                    log.get("xrl").warning("%s", told if why else f"link with {peer} is there")
+
+
+def _client(own: Credentials) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.load_verify_locations(own.authority)
+    context.load_cert_chain(own.certificate, own.key)
+    return context
+
+
+def _verdict(error: ssl.SSLCertVerificationError) -> str:
+    found = error.verify_message
+    if "mismatch" in found:
+        return f"is another host's ({found})"
+    now = f"{dt.datetime.now(dt.UTC):%Y-%m-%d %H:%M} UTC"
+    return f"{_VERDICTS.get(found, found)}, by this host's clock ({now})"

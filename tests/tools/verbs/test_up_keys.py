@@ -1,0 +1,51 @@
+"""`xrl up` under `mtls`: keys by which no link comes are told before anything starts."""
+
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from shared.config import files as config_file
+from shared.config.robot_config import RobotConfig
+from shared.exceptions import BusError
+from shared.process import DEFAULT_CONFIG
+from tests.certified import certified
+from tools import cli
+from tools.keys import authority as authority_module
+from tools.verbs import up
+
+
+@pytest.fixture
+def not_valid_yet(
+    robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> RobotConfig:
+    """Return a robot whose host's clock is before its certificates' time."""
+    later = dt.datetime.now(dt.UTC) + dt.timedelta(days=30)
+    clock = SimpleNamespace(UTC=dt.UTC, datetime=SimpleNamespace(now=lambda _zone: later))
+    monkeypatch.setattr(authority_module, "dt", clock)
+    return certified(robot, tmp_path)[0]
+
+
+def test_nothing_starts_while_the_clock_is_before_the_certificates_time(
+    not_valid_yet: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, run_dir = tmp_path / "robot.toml", tmp_path / "run"
+    config.write_text(config_file.to_toml(not_valid_yet), encoding="utf-8")
+    schedule = DEFAULT_CONFIG.with_suffix(".gains.json")
+    (tmp_path / "robot.gains.json").write_bytes(schedule.read_bytes())
+    where = ["--config", str(config), "--run-dir", str(run_dir), "--out", str(tmp_path / "out")]
+    assert cli.main(["up", *where]) == 2
+    assert "not valid before" in capsys.readouterr().err
+    assert not run_dir.exists()
+
+
+def test_where_nobody_looks_on_the_services_start_and_wait_for_the_clock(
+    not_valid_yet: RobotConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    up._check_keys(not_valid_yet, must=False)
+    assert "no link over TLS: " in capsys.readouterr().err
+    with pytest.raises(BusError, match="set the clock"):
+        up._check_keys(not_valid_yet, must=True)
