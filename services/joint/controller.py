@@ -245,6 +245,10 @@ class JointController:
             s.initial_torque = joint_torque(reading.torque, self._gear_ratio)
         return event
 
+    def count_malformed(self, count: int, now_ns: int) -> None:
+        """Count what came as a command and was none, before the cycle in which it came."""
+        self._state.failsafe.count_malformed(count, now_ns)
+
     def _offer(self, now_ns: int, command: JointCommand) -> None:
         """Let the age rule and the envelope decide about a command."""
         s = self._state

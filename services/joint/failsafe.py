@@ -178,9 +178,7 @@ class Failsafe(msgspec.Struct):
         if refusal is _USABLE and outside is not _INSIDE and not command.hold:
             refusal = Refusal.OUT_OF_ENVELOPE
         if refusal is not _USABLE:
-            self.refused += 1
-            self.refusal, self.refused_session = refusal, command.session
-            self.refused_ns = now_ns
+            self._count(refusal, command.session, 1, now_ns)
             return refusal
         if command.session != self.session:
             if self.session:
@@ -189,6 +187,14 @@ class Failsafe(msgspec.Struct):
             self.fresh_since_ns = -1
         self.command = command
         return refusal
+
+    def count_malformed(self, count: int, now_ns: int) -> None:
+        """Count what came as a command and was none."""
+        self._count(Refusal.MALFORMED, 0, count, now_ns)
+
+    def _count(self, refusal: Refusal, session: int, count: int, now_ns: int) -> None:
+        self.refused += count
+        self.refusal, self.refused_session, self.refused_ns = refusal, session, now_ns
 
     def copied(self) -> Failsafe:
         """Return a copy that does not change with this one."""
@@ -296,13 +302,13 @@ class Failsafe(msgspec.Struct):
         age = now_ns - command.echo_t_ns
         if age < 0:
             return Refusal.FROM_THE_FUTURE
+        # another session takes over only when no usable command of the present one is left
+        foreign = command.session != self.session
+        if foreign and (command.session in self.retired or self.is_fresh(now_ns, timing)):
+            return Refusal.FOREIGN_SESSION
         if age > timing.max_command_age_ns:
             return Refusal.TOO_OLD
-        if command.session != self.session:
-            # another session takes over only when no usable command of the present one is left
-            if command.session in self.retired or self.is_fresh(now_ns, timing):
-                return Refusal.FOREIGN_SESSION
-        elif self.command is not None:
+        if not foreign and self.command is not None:
             ahead = command.seq - self.command.seq
             if ahead <= 0:
                 return Refusal.NOT_NEWER

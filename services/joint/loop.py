@@ -89,6 +89,7 @@ class JointLoop:
         self._tracer = Tracer(module)
         self._reported = ArmingInhibit.NONE
         self._report_at_ns = 0
+        self._malformed = 0
         self._nowhere = (-config.drive.zero_mark_turns,) * 2
 
     def run(self, stop: StopFlag) -> None:
@@ -115,6 +116,10 @@ class JointLoop:
         now = now_ns()
         estop = self._is_stopped(now)
         command = ports.commands.take()
+        malformed = ports.commands.refused - self._malformed
+        if malformed:
+            self._malformed += malformed
+            module.controller.count_malformed(malformed, now)
         near = UNKNOWN
         if self._neighbours is not None and module.needs_neighbours:
             near = self._neighbours.view(now)
@@ -129,7 +134,7 @@ class JointLoop:
             ports.events.put(step.event)
         if self._rearm_guard is not None:
             self._rearm_guard.write(module.last_state)
-        trace = tracer.after(now, reading, command, estop, step, near)
+        trace = tracer.after(now, reading, command, estop, step, near, malformed)
         if trace is not None:
             ports.traces.put(trace)
         if step.event is not None or step.inhibit is not ArmingInhibit.NONE:

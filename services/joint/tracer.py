@@ -44,6 +44,7 @@ class Tracer:
         estop: bool,
         step: DriveAction,
         near: NeighbourView = UNKNOWN,
+        malformed: int = 0,
     ) -> JointTrace | None:
         """Take down a cycle; return a message when it is full."""
         r = reading
@@ -67,6 +68,7 @@ class Tracer:
                 near.below is not None,
                 near.sinks,
                 near.stiffen,
+                malformed,
             )
         )
         return self.take() if len(self._cycles) == CYCLES else None

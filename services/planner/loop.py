@@ -9,6 +9,7 @@ import msgspec
 from services.planner.checkpoint import Checkpoints
 from services.planner.intents import Intents
 from services.planner.planner import EARLY_FRACTION, Planner
+from shared import log
 from shared.bus.messages import (
     Attitude,
     JointCommand,
@@ -55,6 +56,7 @@ class PlannerLoop:
         self._due_ns = 0
         self._intents = Intents(config.assist)
         self._checkpoints = Checkpoints(config.planner.rate_hz)
+        self._yielded = False
 
     def run(self, stop: StopFlag) -> None:
         """Run until `stop` is set."""
@@ -110,3 +112,10 @@ class PlannerLoop:
         checkpoint = self._checkpoints.after(planner, now)
         if checkpoint is not None:
             ports.checkpoint.put(checkpoint)
+        if planner.yields != self._yielded:
+            self._report()
+
+    def _report(self) -> None:
+        """Log that it yields to another planner, or goes on; it leads nobody then."""
+        self._yielded = self._planner.yields
+        log.get("xrl").warning("%s", self._planner.rival or "no other planner leads: going on")

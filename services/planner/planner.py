@@ -160,7 +160,8 @@ class Planner:
     def tick(self, now_ns: int) -> list[JointCommand]:
         """Run the law; return six commands.
 
-        None until every module has sent a state, and none while another planner leads.
+        None until every module has sent a state. While another planner leads none that a module
+        would accept, and those rarely.
 
         Args:
             now_ns: the planner's monotonic clock.
@@ -216,7 +217,9 @@ class Planner:
         values = values_of(self._output, self._q, loads, lifted, rate, drift, leads=leads)
         self._trips.advance(now_ns, values, leads=leads)
         self._seq += 1
-        return [] if self._rival.yields else self._commands(now_ns, states, self._output)
+        if self._rival.yields:
+            return self._announcement(now_ns, states, self._output)
+        return self._commands(now_ns, states, self._output)
 
     def snapshot(self) -> TickState:
         """Return the state between two ticks; `restore` continues from it."""
@@ -271,6 +274,28 @@ class Planner:
         """Find out if another planner leads, and if modules have retired this one's session."""
         if self._rival.advance(self.session, states, self._command_age_ns):
             self.session += 1
+
+    def _announcement(
+        self, now_ns: int, states: Sequence[JointState], output: LawOutput
+    ) -> list[JointCommand]:
+        """Return now and then commands that answer no state: too old, whatever the network does."""
+        if not self._rival.announces(now_ns):
+            return []
+        earlier_ns = 2 * self._command_age_ns
+        return [
+            msgspec.structs.replace(command, hold=True, echo_t_ns=command.echo_t_ns - earlier_ns)
+            for command in self._commands(now_ns, states, output)
+        ]
+
+    @property
+    def yields(self) -> bool:
+        """True while another planner leads, and this one waits."""
+        return self._rival.yields
+
+    @property
+    def rival(self) -> str:
+        """What there is to say of another planner that leads; empty if there is none."""
+        return self._rival.describe()
 
     def _commands(
         self, now_ns: int, states: Sequence[JointState], output: LawOutput

@@ -2,7 +2,8 @@
 
 A module takes another planner's commands once those of the present one are too old. A second
 planner that sends takes one module after the other, each at the first message that comes late. So a
-planner that sees modules follow another one sends nothing until that one has ended.
+planner that sees modules follow another one leads none until that one has ended. It makes itself
+known by commands that every module refuses: `xrl status` and the log then tell of both.
 """
 
 from __future__ import annotations
@@ -21,6 +22,10 @@ AGAIN_NS: Final = 500 * NS_PER_MS
 other may only have been held up."""
 
 
+ANNOUNCE_NS: Final = 200 * NS_PER_MS
+"""Within the window of `xrl status`."""
+
+
 class RivalWatch(msgspec.Struct):
     """What a planner knows of another one."""
 
@@ -28,6 +33,8 @@ class RivalWatch(msgspec.Struct):
     """True while this planner sends nothing."""
     session: int = 0
     """Session of the other planner; 0 if none was seen."""
+    announced_ns: int = 0
+    """When this planner, as it yields, last made itself known."""
 
     def advance(self, own: int, states: Sequence[JointState], age_max_ns: int) -> bool:
         """Advance by one tick.
@@ -63,13 +70,20 @@ class RivalWatch(msgspec.Struct):
             for state in states
         )
 
+    def announces(self, now_ns: int) -> bool:
+        """Return True if a planner that yields is to make itself known now."""
+        due = now_ns - self.announced_ns >= ANNOUNCE_NS
+        if due:
+            self.announced_ns = now_ns
+        return due
+
     def describe(self) -> str:
         """Return what to say while it yields; else nothing."""
         if not self.yields:
             return ""
         return (
-            f"another planner leads (session {self.session}), and this one sends nothing; end one "
-            "of them: this one goes on when the other has ended"
+            f"another planner leads (session {self.session}), and this one waits; end one of them: "
+            "this one goes on when the other has ended"
         )
 
 

@@ -136,6 +136,8 @@ class Refusal(IntEnum):
     """It lies outside the envelope (`Outside`)."""
     TOO_FAR_AHEAD = 7
     """Its number is higher than any planner can have counted to since the last one."""
+    MALFORMED = 8
+    """It is no command: no JSON, or with a null or a number that is not finite. Of no session."""
 
 
 class DriveStatus(IntEnum):
@@ -262,7 +264,7 @@ class JointState(Message, frozen=True):
     dropouts: Int64
     """Recent drop-outs that lengthen the wait before TRACK."""
     refused: Int64
-    """Commands refused since the start: old, foreign, out of order or out of limits."""
+    """Commands refused since the start, for any cause (`Refusal`)."""
     drive: Int64
     """Status of the drive."""
     drive_error: Int64

@@ -13,7 +13,7 @@ from typing import Final
 
 from shared import log
 from shared.bus.credentials import Credentials
-from shared.bus.security import host_and_port
+from shared.config.endpoints import host_and_port
 
 _CONNECT_S: Final = 1.0
 _ALERT_S: Final = 0.3

@@ -47,6 +47,8 @@ class CycleTrace(msgspec.Struct, gc=False, frozen=True):
     """For a knee: it saw no reason not to sink."""
     stiffen: bool = False
     """It saw a limp module that it stiffens for."""
+    malformed: Int64 = 0
+    """What came as a command in this cycle and was none."""
 
 
 class JointTrace(Message, frozen=True):

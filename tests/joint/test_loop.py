@@ -13,7 +13,7 @@ from services.joint.drive_manager import ARM_EVERY_NS, ARM_TRIES, IDLE_EVERY_NS,
 from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.rearm_guard import LastState, RearmGuard
-from shared.bus.messages import Estop, JointEvent, JointState, Mode, Pair
+from shared.bus.messages import Estop, JointEvent, JointState, Mode, Pair, Refusal
 from shared.bus.traces import JointTrace
 from shared.config.robot_config import RobotConfig
 from tests.joint.helpers import T0, command, with_service
@@ -24,6 +24,7 @@ M = TypeVar("M")
 class Inbox(Generic[M]):
     def __init__(self) -> None:
         self.waiting: deque[M] = deque()
+        self.refused = 0
 
     def take(self) -> M | None:
         return self.waiting.popleft() if self.waiting else None
@@ -331,3 +332,13 @@ def test_every_cycle_is_traced_and_the_rest_when_the_service_ends(rig: Rig) -> N
     assert [len(trace.cycles) for trace in rig.traces.sent] == [10, 10, 8]
     assert [bool(trace.snapshot) for trace in rig.traces.sent] == [True, False, False]
     assert [trace.seq for trace in rig.traces.sent] == [1, 2, 3]
+
+
+def test_what_is_no_command_is_counted_and_traced_with_its_cycle(onboard: Rig) -> None:
+    onboard.run(5)
+    onboard.commands.refused = 3
+    onboard.run(20)
+    state = onboard.states.sent[-1]
+    assert (state.refused, state.refusal, state.refused_session) == (3, Refusal.MALFORMED, 0)
+    cycles = [cycle for trace in onboard.traces.sent for cycle in trace.cycles]
+    assert [cycle.malformed for cycle in cycles[:8]] == [0, 0, 0, 0, 0, 3, 0, 0]

@@ -5,10 +5,12 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import cast
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from services.joint.failsafe import Failsafe, timing_of
 from services.planner.planner import Planner
 from services.planner.rival_watch import AGAIN_NS, RivalWatch
 from shared.bus.messages import JointState, PlannerMode, Refusal
@@ -95,13 +97,21 @@ def q(closed: Closed) -> Array:
     return closed(1.188)
 
 
-def test_a_planner_beside_one_that_leads_sends_nothing_and_says_why(
-    planner: Planner, q: Array
+def test_a_planner_beside_one_that_leads_is_refused_by_each_module_and_says_why(
+    planner: Planner, q: Array, robot: RobotConfig
 ) -> None:
-    for tick in range(20):
+    timing = timing_of(robot)
+    told = 0
+    for tick in range(200):
         now_ns = START_NS + 4 * NS_PER_MS * tick
         receive_all(planner, q, now_ns, seq=tick, session=OTHER)
-        assert planner.tick(now_ns) == []
+        for command in planner.tick(now_ns):
+            told += 1
+            beside = msgspec.structs.replace(command, session=OTHER, echo_t_ns=now_ns)
+            led, alone = Failsafe(session=OTHER, command=beside), Failsafe()
+            assert led.offer(command, now_ns, timing) is Refusal.FOREIGN_SESSION
+            assert alone.offer(command, now_ns, timing) is Refusal.TOO_OLD
+    assert told == 4 * N_MODULES, "five times a second"
     status = planner.status(now_ns, 0.0)
     assert (status.mode, status.hold) == (PlannerMode.YIELDING, True)
     assert f"another planner leads (session {OTHER})" in status.why
@@ -123,7 +133,7 @@ def test_once_the_other_has_ended_it_leads_and_in_a_new_session_if_its_own_is_re
 ) -> None:
     """The modules retired its session for the other's while it was held up."""
     receive_all(planner, q, START_NS, session=OTHER)
-    assert planner.tick(START_NS) == []
+    assert all(command.echo_t_ns < START_NS - AGE_MAX_NS for command in planner.tick(START_NS))
     now_ns = START_NS + AGAIN_NS
     receive_all(planner, q, now_ns, seq=2, session=OTHER, age_ns=AGAIN_NS + 1)
     assert {command.session for command in planner.tick(now_ns)} == {SESSION}

@@ -408,8 +408,8 @@ def test_status_shows_mode_tier_age_and_rate(
     assert 0 <= ankle["age_s"] < 1
     assert status["modules"]["ankle_right"] == {
         "mode": "HOLD", "tier": 2, "cause": "NONE", "drive": "ARMED", "q": [0.0, 0.0],
-        "way_out": "", "stiffened": False, "outside": "", "session": 0, "refused_hz": 0.0,
-        "refusal": "", "refused_session": 0, "stopped_by": "",
+        "way_out": "", "stiffened": False, "outside": "", "session": 0, "refusals": [],
+        "stopped_by": "",
     }  # fmt: skip
     assert status["services"]["planner"]["rate_hz"] is None
     assert cli.main(["status", "--run-dir", str(run_dir)]) == 0

@@ -10,10 +10,11 @@ from shared.bus import same_host
 from shared.bus.allow_list import resolved
 from shared.bus.arrivals import Arrivals
 from shared.bus.credentials import Credentials, read_credentials
-from shared.bus.security import TCP, host_and_port
+from shared.bus.security import TCP
 from shared.bus.session import Session, peers_of
 from shared.bus.tls_probe import own_fault, refusal
 from shared.clock import now_ns
+from shared.config.endpoints import host_and_port
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError
 from tools.fleet import procfs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
@@ -72,6 +73,17 @@ class ServiceStatus(msgspec.Struct, frozen=True):
     """It has a real-time priority; None if it does not run, or is to have none."""
 
 
+class RefusedCommands(msgspec.Struct, frozen=True):
+    """Commands of one sender that a module refuses for one cause."""
+
+    cause: str
+    """Name of the `Refusal`."""
+    session: int
+    """Session of the planner that sends them; 0: they are no commands."""
+    hz: float
+    """Commands per second."""
+
+
 class ModuleStatus(msgspec.Struct, frozen=True):
     """One module, by the newest state of its joint service."""
 
@@ -93,12 +105,8 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """Name of the refused part of the newest command (`Outside`); empty if it is accepted."""
     session: int = 0
     """Session of the planner whose commands it uses; 0 if there is none."""
-    refused_hz: float = 0.0
-    """Commands that it refuses, per second."""
-    refusal: str = ""
-    """Name of the cause of the newest refusal (`Refusal`), while it refuses any."""
-    refused_session: int = 0
-    """Session of the planner that sent it."""
+    refusals: tuple[RefusedCommands, ...] = ()
+    """Commands that it refuses now, by cause and sender."""
     stopped_by: str = ""
     """Who engaged the emergency stop that holds, if its service is on this host."""
 
@@ -152,6 +160,7 @@ class RateMonitor:
         self._first: Message | None = None
         self.newest: Message | None = None
         self._heard_ns = 0
+        self._refused: Counter[tuple[int, int]] = Counter()
 
     def listen(self) -> None:
         """Receive new messages."""
@@ -161,11 +170,15 @@ class RateMonitor:
         restarted = self.newest is not None and message.seq < self.newest.seq
         if self._first is None or restarted:
             self._first = message
+        elif isinstance(message, JointState) and isinstance(self.newest, JointState):
+            cause = (message.refusal, message.refused_session)
+            self._refused[cause] += max(0, message.refused - self.newest.refused)
         self.newest, self._heard_ns = message, now_ns()
 
     def new_window(self) -> None:
-        """Count the rate from here on."""
+        """Count the rates from here on."""
         self._first = self.newest
+        self._refused.clear()
 
     def age_s(self) -> float | None:
         """Return the time since the newest message came."""
@@ -176,13 +189,17 @@ class RateMonitor:
         age_s = self.age_s()
         return age_s is not None and age_s < _FRESH_S
 
-    def refused_hz(self) -> float:
-        """Return commands refused per second in this window; 0 for other services than joints."""
+    def refusals(self) -> tuple[RefusedCommands, ...]:
+        """Return the commands refused in this window; none for other services than joints."""
         first, newest = self._first, self.newest
-        if not isinstance(first, JointState) or not isinstance(newest, JointState):
-            return 0.0
-        span_ns, refused = newest.t_ns - first.t_ns, newest.refused - first.refused
-        return max(0, refused) * NS_PER_S / span_ns if span_ns > 0 else 0.0
+        if first is None or newest is None or newest.t_ns <= first.t_ns:
+            return ()
+        per_s = NS_PER_S / (newest.t_ns - first.t_ns)
+        return tuple(
+            RefusedCommands(name_of(Refusal, cause), session, count * per_s)
+            for (cause, session), count in self._refused.items()
+            if count and cause
+        )
 
     def rate_hz(self) -> float | None:
         """Return messages per second in this window; 0 if none has come in it."""
@@ -254,7 +271,7 @@ def look(
     modules = {
         module: module_status(
             monitors[module].newest if module in fresh else None,
-            monitors[module].refused_hz(),
+            monitors[module].refusals(),
             stop_source(fleet.run.path, module),
         )
         for module in MODULES
@@ -312,13 +329,13 @@ def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
 
 
 def module_status(
-    state: Message | None, refused_hz: float = 0.0, stopped_by: str = ""
+    state: Message | None, refusals: tuple[RefusedCommands, ...] = (), stopped_by: str = ""
 ) -> ModuleStatus:
     """Return a module's mode and tier from the newest state of its joint service.
 
     Args:
         state: that state; None: it sends nothing now.
-        refused_hz: commands that it refuses, per second.
+        refusals: commands that it refuses.
         stopped_by: who engaged its emergency stop, if one holds.
     """
     if not isinstance(state, JointState):
@@ -331,9 +348,7 @@ def module_status(
     tier = TIERS.get(Mode(mode)) if mode in tuple(Mode) else None
     return ModuleStatus(
         name_of(Mode, mode), tier, name_of(Cause, state.cause), drive, q, remedy_of(state),
-        stiffened, outside, state.session, refused_hz,
-        name_of(Refusal, state.refusal) if refused_hz else "",
-        state.refused_session if refused_hz else 0,
+        stiffened, outside, state.session, refusals,
         stopped_by if state.cause == Cause.ESTOP else "",
     )  # fmt: skip
 

@@ -33,11 +33,12 @@ def describe_lead(lead: LeadStatus | None) -> str:
 REMEDIES: Final = {
     Refusal.TOO_OLD.name: "a slow link, a slow planner, or a record played onto the live keys",
     Refusal.FOREIGN_SESSION.name: "a second planner, or one that the module has left: end one",
-    Refusal.NOT_NEWER.name: "twice the same sender, or a network that repeats",
-    Refusal.OUT_OF_ENVELOPE.name: "a wrong planner: xrl kill planner",
-    Refusal.OUT_OF_LIMITS.name: "a wrong planner: xrl kill planner",
+    Refusal.NOT_NEWER.name: "a network that repeats, or a command forged in the planner's name",
+    Refusal.OUT_OF_ENVELOPE.name: "a wrong planner, or a forged command: xrl kill planner",
+    Refusal.OUT_OF_LIMITS.name: "a wrong planner, or a forged command: xrl kill planner",
     Refusal.TOO_FAR_AHEAD.name: "a number that no planner counts to: find out who sends it",
     Refusal.FROM_THE_FUTURE.name: "clocks of several hosts mixed up, or a forged command",
+    Refusal.MALFORMED.name: "no planner sends null, NaN or broken JSON: find out who does",
 }
 """By the cause of a refusal: what it is likely to be, or what to do."""
 
@@ -46,11 +47,12 @@ def describe_refusals(status: FleetStatus) -> list[str]:
     """Return a line for each cause and sender of refused commands."""
     found: dict[tuple[str, int], list[str]] = {}
     for name, module in status.modules.items():
-        if module.refusal in REMEDIES:
-            words = f"{name} {module.refused_hz:.0f}/s"
-            found.setdefault((module.refusal, module.refused_session), []).append(words)
+        for row in module.refusals:
+            words = f"{name} {row.hz:.0f}/s"
+            found.setdefault((row.cause, row.session), []).append(words)
     return [
-        f"refused, {cause} of session {session}: {', '.join(words)}; {REMEDIES[cause]}"
+        f"refused, {cause}{f' of session {session}' if session else ''}: {', '.join(words)}; "
+        f"{REMEDIES[cause]}"
         for (cause, session), words in found.items()
     ]
 

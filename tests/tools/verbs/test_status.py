@@ -33,6 +33,7 @@ from tools.fleet.fleet_status import (
     LeadStatus,
     ModuleStatus,
     RateMonitor,
+    RefusedCommands,
     ServiceStatus,
     lead_status,
     module_status,
@@ -122,17 +123,19 @@ def fleet_with(lead_session: int, *modules: ModuleStatus) -> FleetStatus:
 @pytest.mark.parametrize("refusal", [each for each in Refusal if each])
 def test_refused_commands_are_told_with_their_cause_sender_and_what_to_do(refusal: Refusal) -> None:
     tracks = state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED)
-    refusing = msgspec.structs.replace(tracks, refusal=int(refusal), refused_session=99)
-    rows = [module_status(refusing, 250.0), module_status(refusing, 120.0), module_status(tracks)]
-    (line,) = describe_refusals(fleet_with(7, *rows))
+    rows = [
+        module_status(tracks, (RefusedCommands(refusal.name, 99, hz),)) for hz in (250.0, 120.0)
+    ]
+    (line,) = describe_refusals(fleet_with(7, *rows, module_status(tracks)))
     assert f"refused, {refusal.name} of session 99: ankle_right 250/s, knee_right 120/s; " in line
     assert len(line.rpartition("; ")[2]) > 10, "and what to do"
 
 
-def test_a_refusal_that_is_over_is_not_told() -> None:
+def test_what_is_no_command_is_told_without_a_session() -> None:
+    malformed = RefusedCommands(Refusal.MALFORMED.name, 0, 40.0)
     tracks = state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED)
-    before = msgspec.structs.replace(tracks, refusal=int(Refusal.TOO_OLD), refused=9)
-    assert describe_refusals(fleet_with(7, module_status(before, 0.0))) == []
+    (line,) = describe_refusals(fleet_with(7, module_status(tracks, (malformed,))))
+    assert line.startswith("refused, MALFORMED: ankle_right 40/s; ")
 
 
 def test_each_way_out_is_told_once_with_its_modules_at_any_width() -> None:
@@ -199,20 +202,49 @@ def test_a_module_on_a_host_with_another_clock_is_as_old_as_its_last_message_cam
     assert not monitor.is_fresh(), "it has been silent since"
 
 
-@pytest.mark.parametrize(("first", "last", "hz"), [(10, 35, 250.0), (10, 10, 0.0), (90, 5, 0.0)])
-def test_refusals_are_counted_over_the_window_and_a_restart_counts_none(
-    first: int, last: int, hz: float
-) -> None:
-    begin = msgspec.structs.replace(
-        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED), refused=first
-    )
-    end = msgspec.structs.replace(begin, t_ns=begin.t_ns + 100_000_000, seq=26, refused=last)
-    messages = iter([begin, end])
+def heard(*states: JointState) -> RateMonitor:
+    """Return a monitor whose window began with the first of these states."""
+    messages = iter(states)
     monitor = RateMonitor(cast("Latest[Message]", SimpleNamespace(take=lambda: next(messages))))
     monitor.listen()
     monitor.new_window()
-    monitor.listen()
-    assert monitor.refused_hz() == pytest.approx(hz)
+    for _ in states[1:]:
+        monitor.listen()
+    return monitor
+
+
+def test_refusals_are_counted_by_cause_and_sender_over_the_window() -> None:
+    begin = msgspec.structs.replace(
+        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED), refused=10
+    )
+
+    def later(ms: int, refused: int, refusal: Refusal, session: int) -> JointState:
+        return msgspec.structs.replace(
+            begin, t_ns=begin.t_ns + ms * 1_000_000, seq=begin.seq + ms, refused=refused,
+            refusal=int(refusal), refused_session=session,
+        )  # fmt: skip
+
+    monitor = heard(
+        begin,
+        later(4, 12, Refusal.MALFORMED, 0),
+        later(8, 13, Refusal.NOT_NEWER, 99),
+        later(12, 13, Refusal.NOT_NEWER, 99),
+        later(100, 16, Refusal.MALFORMED, 0),
+    )
+    assert monitor.refusals() == (
+        RefusedCommands("MALFORMED", 0, 50.0),
+        RefusedCommands("NOT_NEWER", 99, 10.0),
+    )
+
+
+@pytest.mark.parametrize(("first", "last"), [(10, 10), (90, 5)])
+def test_no_refusal_is_told_where_none_came_or_the_service_restarted(first: int, last: int) -> None:
+    begin = msgspec.structs.replace(
+        state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED),
+        refused=first, refusal=int(Refusal.TOO_OLD), refused_session=9,
+    )  # fmt: skip
+    end = msgspec.structs.replace(begin, t_ns=begin.t_ns + 100_000_000, seq=26, refused=last)
+    assert heard(begin, end).refusals() == ()
 
 
 def test_what_others_say_is_data_in_the_status() -> None:
@@ -235,7 +267,7 @@ def test_codes_that_this_version_does_not_know_are_told() -> None:
         state(Mode.TRACK, Cause.COMMANDS_FRESH, DriveStatus.ARMED),
         mode=99, cause=98, drive=97, refusal=96, outside=95,
     )  # fmt: skip
-    status = module_status(strange, refused_hz=1.0)
+    status = module_status(strange)
     assert (status.mode, status.cause, status.drive) == (
         "unknown (99)", "unknown (98)", "unknown (97)",
     )  # fmt: skip

@@ -93,6 +93,8 @@ class JointExecution:
                 outcome.skipped += 1
                 self._module = None
                 return
+        if c.malformed:
+            module.controller.count_malformed(c.malformed, c.now_ns)
         near = NeighbourView(c.below if c.knows_below else None, c.sinks, c.stiffen)
         step = module.step(c.now_ns, _reading(c), command, c.estop, near)
         controller = module.controller
